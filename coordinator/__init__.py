@@ -1,0 +1,1 @@
+"""What runs once: discovery, sequencing, chain model, regressor, estimates, viewer, files."""

@@ -1,0 +1,1 @@
+"""What runs in every module: firmware, its published interface, its local estimate."""

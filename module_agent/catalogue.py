@@ -1,0 +1,123 @@
+"""The catalogue of module types: what a module knows of its own make.
+
+Figures are the manufacturer's published ones where they exist. A housing frame has its origin at the centre of
+the mounting face and z along the output axis; the output turns about that z axis.
+"""
+
+from typing import Literal, NamedTuple
+
+ModuleTypeName = Literal["X5-1", "X5-4", "X5-9", "SEA-snake"]
+
+
+class MotorConstants(NamedTuple):
+    """Electrical and friction constants; friction is seen at the output [Nm, Nm s/rad]."""
+
+    resistance_ohm: float
+    torque_constant_nm_a: float
+    back_emf_v_s_rad: float
+    velocity_constant_rpm_v: float
+    rotor_inertia_kg_m2: float
+    coulomb_nm: float
+    viscous_nm_s_rad: float
+    efficiency: float
+
+
+class ModuleType(NamedTuple):
+    """One type of module; lengths [m], masses [kg], inertia about the centre of mass in housing axes [kg m^2].
+
+    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz). `imu_xyz` and `output_xyz` are positions in the housing; the
+    IMU's axes and the output's axes (at q = 0) are parallel to the housing's.
+    """
+
+    name: ModuleTypeName
+    mass_kg: float
+    com_xyz: tuple[float, float, float]
+    inertia: tuple[float, float, float, float, float, float]
+    output_xyz: tuple[float, float, float]
+    imu_xyz: tuple[float, float, float]
+    max_effort_nm: float
+    max_speed_rad_s: float
+    gear_ratio: float
+    velocity_clamp_rad_s: float
+    spring_nm_rad: float
+    motor: MotorConstants
+    range_rad: tuple[float, float] | None
+
+
+_X5_COM = (-0.0142, -0.0031, 0.0165)
+_X5_INERTIA = (1.5e-4, 2.55e-4, 3.5e-4, 3.41e-5, 1.18e-5, 2.29e-6)
+
+
+def _motor(coulomb_nm: float, viscous_nm_s_rad: float) -> MotorConstants:
+    # Resistance and back-EMF: middle of the ranges read from a real X5-1 log. Rotor inertia: the same log's first
+    # step turns about 1.5 A (9.4 mNm) into 1.9e5 rad/s^2.
+    return MotorConstants(9.5, 0.00626, 0.00575, 1530.0, 4.0e-8, coulomb_nm, viscous_nm_s_rad, 0.65)
+
+
+def _x5(
+    name: ModuleTypeName,
+    mass_kg: float,
+    max_effort_nm: float,
+    max_speed_rad_s: float,
+    gear_ratio: float,
+    velocity_clamp_rad_s: float,
+    spring_nm_rad: float,
+) -> ModuleType:
+    # Friction at the output of the X5-1 is 0.076 Nm + 0.017 Nm s/rad (real log). The same gear train drives the
+    # other types through further stages, so it is scaled with the gear ratio, viscous friction with its square.
+    scale = gear_ratio / 272.22
+    return ModuleType(
+        name=name,
+        mass_kg=mass_kg,
+        com_xyz=_X5_COM,
+        inertia=_X5_INERTIA,
+        output_xyz=(0.0, 0.0, 0.03105),
+        imu_xyz=(0.025, 0.0, 0.003),
+        max_effort_nm=max_effort_nm,
+        max_speed_rad_s=max_speed_rad_s,
+        gear_ratio=gear_ratio,
+        velocity_clamp_rad_s=velocity_clamp_rad_s,
+        spring_nm_rad=spring_nm_rad,
+        motor=_motor(0.076 * scale, 0.017 * scale**2),
+        range_rad=None,
+    )
+
+
+CATALOGUE: dict[ModuleTypeName, ModuleType] = {
+    t.name: t
+    for t in (
+        # The X5-1's 40 Nm/rad is read from the log (effort = -k * deflection holds exactly); the other linear
+        # springs are within the published 70-170 Nm/rad, stiffer for the stronger types.
+        _x5("X5-1", 0.315, 2.5, 9.425, 272.22, 9.617128, 40.0),
+        _x5("X5-4", 0.335, 7.0, 3.351, 762.22, 3.434687, 100.0),
+        _x5("X5-9", 0.360, 13.0, 1.466, 1742.22, 1.502675, 150.0),
+        ModuleType(
+            name="SEA-snake",
+            mass_kg=0.205,
+            com_xyz=(0.0, 0.0, 0.016),
+            # A solid cylinder of 51 mm diameter and 64 mm length.
+            inertia=(1.03e-4, 1.03e-4, 6.67e-5, 0.0, 0.0, 0.0),
+            output_xyz=(0.0, 0.0, 0.032),
+            imu_xyz=(0.010, 0.0, 0.016),
+            max_effort_nm=7.0,
+            max_speed_rad_s=3.351,
+            gear_ratio=762.22,
+            velocity_clamp_rad_s=3.434687,
+            spring_nm_rad=100.0,
+            motor=_motor(0.213, 0.133),
+            range_rad=(-1.5708, 1.5708),
+        ),
+    )
+}
+
+
+def module_type(name: str) -> ModuleType:
+    """Look up a type by name.
+
+    Raises:
+        KeyError: unknown type; the message lists the known ones.
+    """
+    for known, found in CATALOGUE.items():
+        if known == name:
+            return found
+    raise KeyError(f"unknown module type {name!r}; the catalogue knows {', '.join(CATALOGUE)}")

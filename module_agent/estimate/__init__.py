@@ -1,0 +1,1 @@
+"""The estimates that a module computes from its own samples."""

@@ -1,0 +1,308 @@
+"""The messages on the wire, as frozen models; `codec` turns them into bytes and back.
+
+Times are integer nanoseconds of the module's own monotonic clock. A message from an agent carries the agent's
+boot id; a command carries the boot id of the module it is meant for, so that it dies with that boot.
+Unknown fields are ignored; another schema version is refused by name.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+SCHEMA_VERSION = 1
+
+Nanoseconds = Annotated[int, Field(ge=0, lt=2**63)]
+Counter = Annotated[int, Field(ge=0, lt=2**63)]
+Name = Annotated[str, Field(max_length=64)]
+Text = Annotated[str, Field(max_length=512)]
+Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+Vector3 = tuple[Finite, Finite, Finite]
+
+State = Literal["idle", "armed", "moving", "streaming", "expired", "stopped", "fault"]
+ExpiryAction = Literal["motor_off", "hold", "damping"]
+
+
+class Part(BaseModel):
+    """A piece of a message."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False, strict=True)
+
+
+class Message(Part):
+    """What every message carries."""
+
+    v: int = SCHEMA_VERSION
+    serial: Name
+    boot: Annotated[int, Field(ge=0, lt=2**64)]
+    seq: Counter
+
+
+# --------------------------------------------------------------------------- motion patterns
+
+
+class Rest(Part):
+    """Hold the present set position."""
+
+    kind: Literal["rest"] = "rest"
+    duration_s: Annotated[float, Field(gt=0.0, le=60.0)]
+
+
+class GoTo(Part):
+    """Move to a position on a minimum-jerk path at no more than the given speed."""
+
+    kind: Literal["goto"] = "goto"
+    target_rad: Finite
+    max_speed_rad_s: Positive
+
+
+class ConstantMotion(Part):
+    """The thesis' CM (eq. 13): constant velocity for a time, with ramps of `ramp_s` before and after it."""
+
+    kind: Literal["constant"] = "constant"
+    velocity_rad_s: Finite
+    duration_s: Annotated[float, Field(gt=0.0, le=60.0)]
+    ramp_s: Annotated[float, Field(ge=0.0, le=2.0)] = 0.15
+
+
+class WindowedSine(Part):
+    """The thesis' WSM (eq. 14): exp(-(t - Tm)^2 / (2 Ts^2)) * A sin(2 pi f t), tapered to exactly zero.
+
+    `of` says whether the amplitude is of position [rad] or of velocity [rad/s]. The motion lasts 2 Tm.
+    """
+
+    kind: Literal["windowed_sine"] = "windowed_sine"
+    amplitude: Positive
+    of: Literal["position", "velocity"] = "position"
+    frequency_hz: Annotated[float, Field(gt=0.0, le=50.0)] = 2.0
+    centre_s: Annotated[float, Field(gt=0.0, le=30.0)] = 2.8
+    sigma_s: Annotated[float, Field(gt=0.0, le=30.0)] = 1.0
+
+
+class DynamicPattern(Part):
+    """The thesis' dynamic pattern (table 6, figure 44): the steep part of a WSM, cut out and repeated.
+
+    One period is q = A exp(-s^2 / (2 Ts^2)) sin(2 pi f s) for s in +-`half_width_s`, which begins and ends at
+    rest but for the taper; it is repeated `repeats` times, every second time mirrored when `alternate` is set.
+    """
+
+    kind: Literal["dynamic"] = "dynamic"
+    amplitude_rad: Positive
+    frequency_hz: Annotated[float, Field(gt=0.0, le=50.0)] = 1.0
+    sigma_s: Annotated[float, Field(gt=0.0, le=30.0)] = 0.1
+    half_width_s: Annotated[float, Field(gt=0.0, le=10.0)] = 0.5
+    repeats: Annotated[int, Field(ge=1, le=50)] = 4
+    alternate: bool = False
+
+
+Pattern = Annotated[
+    Rest | GoTo | ConstantMotion | WindowedSine | DynamicPattern, Field(discriminator="kind")
+]
+
+
+# --------------------------------------------------------------------------- from the agent
+
+
+class MotionRecord(Part):
+    """A motion as the module ran it; rows are feedback rows, `end_row` is one past the last."""
+
+    motion_id: Counter
+    pattern: Pattern
+    outcome: Literal["running", "done", "superseded", "stopped", "expired"]
+    start_ns: Nanoseconds
+    start_row: Counter
+    end_row: Counter | None
+    origin_rad: Finite
+
+
+class Limits(Part):
+    """What the module refuses to exceed."""
+
+    max_speed_rad_s: Positive
+    max_effort_nm: Positive
+    min_position_rad: Finite | None
+    max_position_rad: Finite | None
+
+
+class Info(Message):
+    """Who a module is. Answer to an `Ask` on `info`."""
+
+    module_type: Name
+    firmware: Name
+    feedback_rate_hz: Positive
+    batch_rows: Annotated[int, Field(ge=1, le=64)]
+    history_rows: Counter
+    tick_ns: Nanoseconds
+    imu_period_ns: Nanoseconds
+    lifetime_ns: Nanoseconds
+    expiry_action: ExpiryAction
+    limits: Limits
+    t_ns: Nanoseconds
+
+
+class Feedback(Message):
+    """A run of consecutive feedback rows, `first_row` first: one block of `feedback_rows.ROW` records.
+
+    Published on `feedback`; also the answer to a `HistoryRequest`.
+    """
+
+    first_row: Counter
+    count: Annotated[int, Field(ge=0, le=512)]
+    rows: Annotated[bytes, Field(max_length=65536)]
+
+
+class Status(Message):
+    """How a module is. Published on `status` at every change and at least twice a second; also on an `Ask`."""
+
+    t_ns: Nanoseconds
+    state: State
+    holder: Name | None
+    lease_left_ns: Nanoseconds
+    token: Counter
+    next_row: Counter
+    motion: MotionRecord | None
+    refusals: dict[Name, Counter]
+    expiries: Counter
+    dropped_events: Counter
+    note: Text = ""
+
+
+class CircleEstimate(Part):
+    """A circle point analysis of one joint in one IMU's frame, with its quality figures.
+
+    `axis` is the direction about which the IMU's body turns when the joint's position grows; `radial_m` points
+    from the joint's axis to the IMU; `sigma_*` are one standard deviation.
+    """
+
+    axis: Vector3
+    tangent: Vector3
+    radial_m: Vector3
+    distance_m: Finite
+    sigma_axis_rad: Annotated[float, Field(ge=0.0, le=10.0)]
+    sigma_distance_m: Annotated[float, Field(ge=0.0, le=1e3)]
+    residual_rms_m_s2: Annotated[float, Field(ge=0.0, le=1e6)]
+    singular_values: Vector3
+    delay_s: Finite
+    samples: Counter
+
+
+class Estimate(Message):
+    """What this module (`serial`) makes of the motion of one joint (`joint`). Published on `estimate`."""
+
+    joint: Name
+    motion_ids: Annotated[tuple[Counter, ...], Field(max_length=16)]
+    moved: bool
+    rate_ratio: Annotated[float, Field(ge=0.0, le=1e6)]
+    gravity_m_s2: Vector3
+    circle: CircleEstimate | None
+    note: Text = ""
+
+
+class Ack(Message):
+    """The answer to a command."""
+
+    accepted: bool
+    reason: Name = ""
+    detail: Text = ""
+    t_ns: Nanoseconds
+    holder: Name | None
+    lease_left_ns: Nanoseconds
+    token: Counter
+
+
+# --------------------------------------------------------------------------- to the agent
+
+
+class Ask(Message):
+    """A question that takes no argument: on `info`, `status`, `gains` and `estimate` (`boot` 0 = any)."""
+
+    sender: Name
+
+
+class HistoryRequest(Message):
+    """Ask for feedback rows `first_row` up to and without `end_row`, all at once up to 256."""
+
+    sender: Name
+    first_row: Counter
+    end_row: Counter
+
+
+class LeaseRequest(Message):
+    """Acquire (which arms), renew (the keep-alive of a motion) or release the command of a joint."""
+
+    sender: Name
+    action: Literal["acquire", "renew", "release"]
+    token: Counter
+    echo_ns: Nanoseconds
+    duration_ns: Annotated[int, Field(gt=0, le=10_000_000_000)] = 1_000_000_000
+
+
+class MotionCommand(Message):
+    """Start a motion that runs on the module. The same `motion_id` again is the same command."""
+
+    sender: Name
+    token: Counter
+    echo_ns: Nanoseconds
+    motion_id: Annotated[int, Field(gt=0, lt=2**32)]
+    pattern: Pattern
+
+
+class Setpoint(Message):
+    """One streamed setpoint; an unset value disables its loop."""
+
+    sender: Name
+    token: Counter
+    echo_ns: Nanoseconds
+    position_rad: Finite | None
+    velocity_rad_s: Finite | None
+    effort_nm: Finite | None
+
+
+class Stop(Message):
+    """Stop at once. Needs no lease; holds until somebody acquires the lease again."""
+
+    sender: Name
+    why: Text = ""
+
+
+class PidGains(Part):
+    """One loop's parameters, with the manufacturer's meanings (see `firmware.pid`)."""
+
+    kp: Finite
+    ki: Finite = 0.0
+    kd: Finite = 0.0
+    feed_forward: Finite = 0.0
+    dead_zone: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    i_clamp: Annotated[float, Field(ge=0.0, le=1e6)] = 0.25
+    punch: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    min_target: Finite = -1e6
+    max_target: Finite = 1e6
+    target_lowpass: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    min_output: Finite = -1.0
+    max_output: Finite = 1.0
+    output_lowpass: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    d_on_error: bool = True
+
+
+class GainSet(Part):
+    """A control strategy and its three loops."""
+
+    strategy: Annotated[int, Field(ge=0, le=4)]
+    position: PidGains
+    velocity: PidGains
+    effort: PidGains
+
+
+class GainsCommand(Message):
+    """Replace the gains; needs the lease and no motion."""
+
+    sender: Name
+    token: Counter
+    echo_ns: Nanoseconds
+    gains: GainSet
+
+
+class Gains(Message):
+    """The gains in force. Answer to an `Ask` on `gains`."""
+
+    gains: GainSet

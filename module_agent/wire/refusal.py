@@ -1,0 +1,33 @@
+"""Why a message was refused; the order is the order in which a module checks."""
+
+from enum import StrEnum
+
+
+class Refusal(StrEnum):
+    """A reason that a module counts, publishes in its status and names in its answer."""
+
+    TOO_LONG = "too_long"
+    MALFORMED = "malformed"
+    VERSION = "version"
+    TYPES = "types"
+    NOT_FINITE = "not_finite"
+    RANGE = "range"
+    WRONG_SERIAL = "wrong_serial"
+    WRONG_BOOT = "wrong_boot"
+    HELD = "held"
+    NO_LEASE = "no_lease"
+    SEQUENCE = "sequence"
+    STALE = "stale"
+    NOT_ARMED = "not_armed"
+    BUSY = "busy"
+    LIMIT = "limit"
+    GONE = "gone"
+
+
+class WireError(ValueError):
+    """Bytes that are not a valid message; `reason` is what a module counts."""
+
+    def __init__(self, reason: Refusal, detail: str):
+        super().__init__(f"{reason.value}: {detail}")
+        self.reason = reason
+        self.detail = detail

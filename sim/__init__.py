@@ -1,0 +1,1 @@
+"""The world in place of hardware: physics, sensors, network, launcher, score."""
