@@ -56,7 +56,10 @@ class Hardware(Protocol):
         ...
 
     def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
-        """Hand over one PWM in [-1, 1] per module, wait for the next tick, return one sample per module.
+        """Hand over one PWM per module, wait for the next tick, return one sample per module.
+
+        A PWM is in [-1, 1] and normalised to 48 V, as the gains are: the motor sees the duty
+        `clip(pwm * 48 / voltage_v, -1, 1)` of the bus voltage.
 
         Raises:
             HardwareLost: no further tick will come.

@@ -100,6 +100,37 @@ Pattern = Annotated[
 ]
 
 
+# --------------------------------------------------------------------------- gains
+
+
+class PidGains(Part):
+    """One loop's parameters, with the manufacturer's meanings (see `firmware.pid`)."""
+
+    kp: Finite
+    ki: Finite = 0.0
+    kd: Finite = 0.0
+    feed_forward: Finite = 0.0
+    dead_zone: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    i_clamp: Annotated[float, Field(ge=0.0, le=1e6)] = 0.25
+    punch: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    min_target: Finite = -1e6
+    max_target: Finite = 1e6
+    target_lowpass: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    min_output: Finite = -1.0
+    max_output: Finite = 1.0
+    output_lowpass: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
+    d_on_error: bool = True
+
+
+class GainSet(Part):
+    """A control strategy and its three loops."""
+
+    strategy: Annotated[int, Field(ge=0, le=4)]
+    position: PidGains
+    velocity: PidGains
+    effort: PidGains
+
+
 # --------------------------------------------------------------------------- from the agent
 
 
@@ -137,6 +168,7 @@ class Info(Message):
     lifetime_ns: Nanoseconds
     expiry_action: ExpiryAction
     limits: Limits
+    gains: GainSet
     t_ns: Nanoseconds
 
 
@@ -152,8 +184,12 @@ class Feedback(Message):
 
 
 class Status(Message):
-    """How a module is. Published on `status` at every change and at least twice a second; also on an `Ask`."""
+    """How a module is. Published on `status` at every change and at least twice a second; also on an `Ask`.
 
+    `re` is the sequence number of the question that this answers, 0 when published.
+    """
+
+    re: Counter = 0
     t_ns: Nanoseconds
     state: State
     holder: Name | None
@@ -199,8 +235,9 @@ class Estimate(Message):
 
 
 class Ack(Message):
-    """The answer to a command."""
+    """The answer to a command, whose sequence number is `re`."""
 
+    re: Counter
     accepted: bool
     reason: Name = ""
     detail: Text = ""
@@ -214,9 +251,16 @@ class Ack(Message):
 
 
 class Ask(Message):
-    """A question that takes no argument: on `info`, `status`, `gains` and `estimate` (`boot` 0 = any)."""
+    """A question that takes no argument, on `info` and `status` (`boot` 0 = any)."""
 
     sender: Name
+
+
+class EstimateRequest(Message):
+    """Ask for what this module made of the latest motion of `joint`."""
+
+    sender: Name
+    joint: Name
 
 
 class HistoryRequest(Message):
@@ -265,44 +309,10 @@ class Stop(Message):
     why: Text = ""
 
 
-class PidGains(Part):
-    """One loop's parameters, with the manufacturer's meanings (see `firmware.pid`)."""
-
-    kp: Finite
-    ki: Finite = 0.0
-    kd: Finite = 0.0
-    feed_forward: Finite = 0.0
-    dead_zone: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
-    i_clamp: Annotated[float, Field(ge=0.0, le=1e6)] = 0.25
-    punch: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
-    min_target: Finite = -1e6
-    max_target: Finite = 1e6
-    target_lowpass: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
-    min_output: Finite = -1.0
-    max_output: Finite = 1.0
-    output_lowpass: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
-    d_on_error: bool = True
-
-
-class GainSet(Part):
-    """A control strategy and its three loops."""
-
-    strategy: Annotated[int, Field(ge=0, le=4)]
-    position: PidGains
-    velocity: PidGains
-    effort: PidGains
-
-
 class GainsCommand(Message):
-    """Replace the gains; needs the lease and no motion."""
+    """Replace the gains; needs the lease and no motion. The gains in force are part of `Info`."""
 
     sender: Name
     token: Counter
     echo_ns: Nanoseconds
-    gains: GainSet
-
-
-class Gains(Message):
-    """The gains in force. Answer to an `Ask` on `gains`."""
-
     gains: GainSet

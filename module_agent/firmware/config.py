@@ -1,0 +1,56 @@
+"""What a module is told once, before its first tick."""
+
+from typing import NamedTuple
+
+from module_agent.catalogue import ModuleType, module_type
+from module_agent.wire.messages import ExpiryAction, Limits
+
+FIRMWARE_NAME = "x5-agent 0.1"
+
+
+class FirmwareConfig(NamedTuple):
+    """The settings of one module's firmware; times and rates in the module's own clock."""
+
+    serial: str
+    kind: ModuleType
+    boot: int
+    limits: Limits
+    tick_ns: int = 1_000_000
+    imu_period_ns: int = 4_000_000
+    feedback_rate_hz: float = 250.0
+    batch_rows: int = 5
+    history_s: float = 60.0
+    lifetime_ns: int = 250_000_000
+    expiry_action: ExpiryAction = "motor_off"
+    strategy: int = 3
+
+
+def catalogue_limits(kind: ModuleType) -> Limits:
+    """Return the limits of a module type."""
+    low, high = kind.range_rad if kind.range_rad is not None else (None, None)
+    return Limits(
+        max_speed_rad_s=kind.max_speed_rad_s,
+        max_effort_nm=kind.max_effort_nm,
+        min_position_rad=low,
+        max_position_rad=high,
+    )
+
+
+MAX_LIFETIME_NS = 1_000_000_000
+MAX_FEEDBACK_RATE_HZ = 1000.0
+
+
+def check_config(config: FirmwareConfig) -> FirmwareConfig:
+    """Return the configuration if it can be run.
+
+    Raises:
+        ValueError: a lifetime that is infinite or over 1 s, or a rate that the tick or a message cannot carry.
+    """
+    if not 0 < config.lifetime_ns <= MAX_LIFETIME_NS:
+        raise ValueError(f"lifetime {config.lifetime_ns / 1e6:.0f} ms: it must be over 0 and at most 1000 ms")
+    if not 1.0 <= config.feedback_rate_hz <= MAX_FEEDBACK_RATE_HZ:
+        raise ValueError(f"feedback rate {config.feedback_rate_hz} Hz: it must be 1 to 1000 Hz")
+    if not 1 <= config.batch_rows <= 64:
+        raise ValueError(f"{config.batch_rows} rows a batch: it must be 1 to 64")
+    module_type(config.kind.name)
+    return config

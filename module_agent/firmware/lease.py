@@ -1,0 +1,58 @@
+"""Who may command a joint: one holder at a time, with a token that grows with every grant."""
+
+from module_agent.wire.messages import LeaseRequest
+from module_agent.wire.refusal import Refusal, WireError
+
+
+class Lease:
+    """The lease of one joint; times are the module's own nanoseconds."""
+
+    __slots__ = ("_until_ns", "holder", "token")
+
+    def __init__(self) -> None:
+        self.holder: str | None = None
+        self.token = 0
+        self._until_ns = 0
+
+    def left_ns(self, now_ns: int) -> int:
+        """Return the time until the lease lapses, 0 when nobody holds it."""
+        return max(0, self._until_ns - now_ns) if self.holder is not None else 0
+
+    def lapsed(self, now_ns: int) -> bool:
+        """Return whether a holder has let its lease run out."""
+        return self.holder is not None and now_ns >= self._until_ns
+
+    def acquire(self, request: LeaseRequest, now_ns: int) -> None:
+        """Grant the lease to the sender under a new token.
+
+        Raises:
+            WireError: HELD, naming the holder and the time left.
+        """
+        if self.holder not in (None, request.sender):
+            left_s = self.left_ns(now_ns) / 1e9
+            raise WireError(Refusal.HELD, f"held by {self.holder} for another {left_s:.2f} s")
+        self.holder = request.sender
+        self.token += 1
+        self._until_ns = now_ns + request.duration_ns
+
+    def extend(self, duration_ns: int, now_ns: int) -> None:
+        """Let the present holder's lease run for `duration_ns` from now."""
+        self._until_ns = max(self._until_ns, now_ns + duration_ns)
+
+    def release(self) -> None:
+        """Let go; the token stays, so that old commands stay refused."""
+        self.holder = None
+        self._until_ns = 0
+
+    def check(self, sender: str, token: int) -> None:
+        """Check that a command comes from the present holder under the present token.
+
+        Raises:
+            WireError: HELD by somebody else, or NO_LEASE.
+        """
+        if self.holder is None:
+            raise WireError(Refusal.NO_LEASE, f"{sender} holds no lease: acquire it first")
+        if self.holder != sender:
+            raise WireError(Refusal.HELD, f"held by {self.holder}, not by {sender}")
+        if token != self.token:
+            raise WireError(Refusal.NO_LEASE, f"token {token} is not the lease's token {self.token}")

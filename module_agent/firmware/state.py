@@ -1,0 +1,60 @@
+"""The states of a module and their transitions, as a table.
+
+    idle       nobody holds the lease; motor off
+    armed      leased; holds the last set position
+    moving     leased; a motion pattern runs on the module
+    streaming  leased; follows setpoints from the network
+    expired    no fresh command within the lifetime; the expiry action runs until somebody acquires again
+    stopped    somebody said stop; motor holds still by damping until somebody acquires again
+    fault      the module protects itself (over-temperature); motor off until the cause is gone and re-armed
+
+What is not in the table cannot happen; a command that would need it is refused.
+"""
+
+from typing import Literal
+
+from module_agent.wire.messages import State
+
+Trigger = Literal[
+    "acquire", "release", "lapse", "motion", "motion_done", "setpoint", "expire", "stop", "fault"
+]
+
+TRANSITIONS: dict[tuple[State, Trigger], State] = {
+    ("idle", "acquire"): "armed",
+    ("idle", "stop"): "stopped",
+    ("idle", "fault"): "fault",
+    ("armed", "acquire"): "armed",
+    ("armed", "release"): "idle",
+    ("armed", "motion"): "moving",
+    ("armed", "setpoint"): "streaming",
+    ("armed", "expire"): "expired",
+    ("armed", "stop"): "stopped",
+    ("armed", "fault"): "fault",
+    ("moving", "acquire"): "armed",
+    ("moving", "release"): "idle",
+    ("moving", "motion_done"): "armed",
+    ("moving", "expire"): "expired",
+    ("moving", "stop"): "stopped",
+    ("moving", "fault"): "fault",
+    ("streaming", "acquire"): "armed",
+    ("streaming", "release"): "idle",
+    ("streaming", "motion"): "moving",
+    ("streaming", "setpoint"): "streaming",
+    ("streaming", "expire"): "expired",
+    ("streaming", "stop"): "stopped",
+    ("streaming", "fault"): "fault",
+    ("expired", "acquire"): "armed",
+    ("expired", "release"): "expired",
+    ("expired", "stop"): "stopped",
+    ("expired", "fault"): "fault",
+    ("stopped", "acquire"): "armed",
+    ("stopped", "release"): "stopped",
+    ("stopped", "stop"): "stopped",
+    ("stopped", "fault"): "fault",
+    ("fault", "acquire"): "armed",
+    ("fault", "release"): "fault",
+    ("fault", "stop"): "fault",
+}
+
+# States in which the motor follows commands, so that it must hear from their sender within the lifetime.
+COMMANDED: frozenset[State] = frozenset({"armed", "moving", "streaming"})

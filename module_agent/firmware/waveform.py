@@ -1,0 +1,130 @@
+"""Motion patterns as position and velocity over time, relative to where the motion begins.
+
+All functions are vectorised over the time samples. Sources: thesis eq. 13 (constant motion), eq. 14 (windowed
+sine), table 6 and figure 44 (dynamic pattern); the minimum-jerk path is that of Flash and Hogan, 1985.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from module_agent.wire.messages import (
+    ConstantMotion,
+    DynamicPattern,
+    GoTo,
+    Pattern,
+    Rest,
+    WindowedSine,
+)
+
+Array = NDArray[np.float64]
+
+# The window is cut at +-Tm, where the Gaussian is not yet zero (2 % at Tm = 2.8 s, Ts = 1 s). This share of the
+# duration at either end carries it to exactly zero: a step there would put a spike into the acceleration.
+TAPER_SHARE = 0.15
+SHORTEST_GOTO_S = 0.2
+
+
+class Waveform(NamedTuple):
+    """Samples of a motion: offset from the origin [rad] and velocity [rad/s], each of shape (samples,)."""
+
+    offset_rad: Array
+    velocity_rad_s: Array
+
+
+def duration_s(pattern: Pattern, origin_rad: float) -> float:
+    """Return how long the pattern lasts when it begins at `origin_rad`."""
+    match pattern:
+        case Rest():
+            return pattern.duration_s
+        case GoTo():
+            # The peak speed of a minimum-jerk path is 15/8 of its mean speed.
+            travel = abs(pattern.target_rad - origin_rad)
+            return max(1.875 * travel / pattern.max_speed_rad_s, SHORTEST_GOTO_S)
+        case ConstantMotion():
+            return pattern.duration_s + 2.0 * pattern.ramp_s
+        case WindowedSine():
+            return 2.0 * pattern.centre_s
+        case DynamicPattern():
+            return 2.0 * pattern.half_width_s * pattern.repeats
+
+
+def waveform(pattern: Pattern, origin_rad: float, t_s: Array) -> Waveform:
+    """Sample a pattern at the times `t_s` (samples,) since its start, 0 <= t <= duration, ascending."""
+    match pattern:
+        case Rest():
+            return Waveform(np.zeros_like(t_s), np.zeros_like(t_s))
+        case GoTo():
+            return _minimum_jerk(pattern.target_rad - origin_rad, duration_s(pattern, origin_rad), t_s)
+        case ConstantMotion():
+            return _constant(pattern, t_s)
+        case WindowedSine():
+            return _windowed_sine(pattern, t_s)
+        case DynamicPattern():
+            return _dynamic(pattern, t_s)
+
+
+def _minimum_jerk(travel_rad: float, total_s: float, t_s: Array) -> Waveform:
+    s = np.clip(t_s / total_s, 0.0, 1.0)
+    return Waveform(
+        travel_rad * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
+        travel_rad / total_s * 30.0 * s**2 * (1.0 - s) ** 2,
+    )
+
+
+def _constant(pattern: ConstantMotion, t_s: Array) -> Waveform:
+    ramp, top = pattern.ramp_s, pattern.ramp_s + pattern.duration_s
+    knots = np.array([0.0, ramp, top, top + ramp])
+    velocity = pattern.velocity_rad_s * np.interp(t_s, knots, [0.0, 1.0, 1.0, 0.0])
+    # The integral of a trapezoid, piece by piece.
+    rising = np.minimum(t_s, ramp) ** 2 / (2.0 * ramp) if ramp else np.zeros_like(t_s)
+    level = np.clip(t_s - ramp, 0.0, pattern.duration_s)
+    falling = np.clip(t_s - top, 0.0, ramp)
+    fall = falling - falling**2 / (2.0 * ramp) if ramp else np.zeros_like(t_s)
+    return Waveform(pattern.velocity_rad_s * (rising + level + fall), velocity)
+
+
+def taper(t_s: Array, total_s: float) -> tuple[Array, Array]:
+    """Return a cosine taper, 0 at both ends and 1 between, and its time derivative."""
+    rise = TAPER_SHARE * total_s
+    edge = np.minimum(np.minimum(t_s, total_s - t_s), rise)
+    phase = np.pi * edge / rise
+    sign = np.where(t_s < 0.5 * total_s, 1.0, -1.0)
+    inside = edge < rise
+    return 0.5 * (1.0 - np.cos(phase)), np.where(inside, sign * 0.5 * np.pi / rise * np.sin(phase), 0.0)
+
+
+def _windowed_sine(pattern: WindowedSine, t_s: Array) -> Waveform:
+    omega = 2.0 * np.pi * pattern.frequency_hz
+    rel = t_s - pattern.centre_s
+    edge, edge_rate = taper(t_s, 2.0 * pattern.centre_s)
+    window = np.exp(-(rel**2) / (2.0 * pattern.sigma_s**2))
+    window_rate = window * (-rel / pattern.sigma_s**2) * edge + window * edge_rate
+    window = window * edge
+    wave = pattern.amplitude * window * np.sin(omega * t_s)
+    if pattern.of == "velocity":
+        steps = 0.5 * (wave[1:] + wave[:-1]) * np.diff(t_s)
+        return Waveform(np.concatenate(([0.0], np.cumsum(steps))), wave)
+    rate = pattern.amplitude * (
+        window_rate * np.sin(omega * t_s) + window * omega * np.cos(omega * t_s)
+    )
+    return Waveform(wave, rate)
+
+
+def _dynamic(pattern: DynamicPattern, t_s: Array) -> Waveform:
+    width = 2.0 * pattern.half_width_s
+    count = np.minimum(np.floor(t_s / width), pattern.repeats - 1)
+    inside = t_s - count * width
+    s = inside - pattern.half_width_s
+    sign = np.where(count % 2 == 1, -1.0, 1.0) if pattern.alternate else 1.0
+    omega = 2.0 * np.pi * pattern.frequency_hz
+    edge, edge_rate = taper(inside, width)
+    window = np.exp(-(s**2) / (2.0 * pattern.sigma_s**2))
+    window_rate = window * (-s / pattern.sigma_s**2) * edge + window * edge_rate
+    window = window * edge
+    scale = sign * pattern.amplitude_rad
+    return Waveform(
+        scale * window * np.sin(omega * s),
+        scale * (window_rate * np.sin(omega * s) + window * omega * np.cos(omega * s)),
+    )

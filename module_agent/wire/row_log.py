@@ -1,0 +1,86 @@
+"""The feedback rows of one module as they arrive from the network: in any order, with gaps, some of them twice.
+
+Rows are numbered since the module's boot, so whoever listens knows what is missing and can ask `history` for it.
+"""
+
+import numpy as np
+
+from module_agent.wire.feedback_rows import ROW, Rows, unpack
+from module_agent.wire.messages import Feedback
+
+_GROWTH = 4096
+
+
+class RowLog:
+    """Rows of one boot of one module, by row number."""
+
+    def __init__(self, boot: int):
+        self.boot = boot
+        self._base: int | None = None
+        self._rows = np.zeros(0, dtype=ROW)
+        self._have = np.zeros(0, dtype=bool)
+
+    @property
+    def end_row(self) -> int:
+        """One past the newest row, 0 before any."""
+        if self._base is None:
+            return 0
+        held = np.flatnonzero(self._have[-_GROWTH:])
+        tail = len(self._have) - min(len(self._have), _GROWTH)
+        return self._base + tail + int(held[-1]) + 1 if len(held) else self._base
+
+    def add(self, feedback: Feedback) -> Rows:
+        """Keep the rows of a message; return them.
+
+        Raises:
+            WireError: the block does not hold what the message announces.
+        """
+        rows = unpack(feedback)
+        if not len(rows):
+            return rows
+        self._reserve(feedback.first_row, feedback.first_row + len(rows))
+        assert self._base is not None
+        at = feedback.first_row - self._base
+        self._rows[at : at + len(rows)] = rows
+        self._have[at : at + len(rows)] = True
+        return rows
+
+    def _reserve(self, first: int, end: int) -> None:
+        if self._base is None:
+            self._base = first
+        before = max(0, self._base - first)
+        after = max(0, end - self._base - len(self._have))
+        if before or after:
+            after = max(after, _GROWTH, len(self._have) // 2) if after else 0
+            self._rows = np.concatenate((np.zeros(before, ROW), self._rows, np.zeros(after, ROW)))
+            self._have = np.concatenate((np.zeros(before, bool), self._have, np.zeros(after, bool)))
+            self._base -= before
+
+    def missing(self, first: int, end: int) -> list[tuple[int, int]]:
+        """Return the ranges within rows `first` up to and without `end` that have not arrived."""
+        if self._base is None:
+            return [(first, end)] if end > first else []
+        have = np.zeros(max(0, end - first), dtype=bool)
+        low, high = max(first, self._base), min(end, self._base + len(self._have))
+        if high > low:
+            have[low - first : high - first] = self._have[low - self._base : high - self._base]
+        edges = np.flatnonzero(np.diff(np.concatenate(([True], have, [True])).astype(np.int8)))
+        return [(first + int(a), first + int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+    def rows(self, first: int, end: int) -> Rows:
+        """Return the rows of a range that have arrived, in order, as a copy."""
+        if self._base is None:
+            return np.zeros(0, ROW)
+        low, high = max(first, self._base), min(end, self._base + len(self._have))
+        if high <= low:
+            return np.zeros(0, ROW)
+        span = slice(low - self._base, high - self._base)
+        return self._rows[span][self._have[span]]
+
+    def forget_before(self, row: int) -> None:
+        """Drop rows below `row`, for listeners with little memory."""
+        if self._base is None or row <= self._base:
+            return
+        cut = min(row - self._base, len(self._have))
+        self._rows, self._have = self._rows[cut:].copy(), self._have[cut:].copy()
+        self._base += cut
