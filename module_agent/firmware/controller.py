@@ -57,9 +57,7 @@ class Controller:
         self._velocity.reset()
         self._effort.reset()
 
-    def update(
-        self, command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float
-    ) -> float:
+    def update(self, command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
         """Return the PWM of this tick."""
         strategy = self._strategy
         if strategy == 0:

@@ -85,6 +85,7 @@ class Firmware:
         self._period_ns = round(1e9 / config.feedback_rate_hz)
         self._motion: Motion | None = None
         self._record: MotionRecord | None = None
+        self.last_rest: MotionRecord | None = None
         self._command: Command = UNSET
         self._setpoint: Command = UNSET
         self._fresh_ns = 0
@@ -186,9 +187,9 @@ class Firmware:
     def _finish_motion(self, outcome: str) -> None:
         if self._motion is None or self._record is None:
             return
-        self._record = self._record.model_copy(
-            update={"outcome": outcome, "end_row": self.history.next_row}
-        )
+        self._record = self._record.model_copy(update={"outcome": outcome, "end_row": self.history.next_row})
+        if outcome == "done" and self._record.pattern.kind == "rest":
+            self.last_rest = self._record
         self._command = Command(self._motion.last_position_rad, 0.0, None)
         self._motion = None
         self._status_due = True

@@ -106,9 +106,7 @@ def _windowed_sine(pattern: WindowedSine, t_s: Array) -> Waveform:
     if pattern.of == "velocity":
         steps = 0.5 * (wave[1:] + wave[:-1]) * np.diff(t_s)
         return Waveform(np.concatenate(([0.0], np.cumsum(steps))), wave)
-    rate = pattern.amplitude * (
-        window_rate * np.sin(omega * t_s) + window * omega * np.cos(omega * t_s)
-    )
+    rate = pattern.amplitude * (window_rate * np.sin(omega * t_s) + window * omega * np.cos(omega * t_s))
     return Waveform(wave, rate)
 
 

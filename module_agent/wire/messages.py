@@ -95,9 +95,7 @@ class DynamicPattern(Part):
     alternate: bool = False
 
 
-Pattern = Annotated[
-    Rest | GoTo | ConstantMotion | WindowedSine | DynamicPattern, Field(discriminator="kind")
-]
+Pattern = Annotated[Rest | GoTo | ConstantMotion | WindowedSine | DynamicPattern, Field(discriminator="kind")]
 
 
 # --------------------------------------------------------------------------- gains

@@ -10,11 +10,12 @@ Milliseconds = Annotated[float, Field(ge=0.0, le=10_000.0)]
 
 
 class NetworkProfile(BaseModel):
-    """One way through the network: delay = base + gamma-distributed jitter, then loss, reordering, duplication.
+    """One way through a network: delay = base + gamma-distributed jitter, loss, reordering, duplication.
 
-    `delay_ms` is the least delay, `jitter_ms` the mean of what comes on top and `jitter_shape` the gamma shape
-    (1 = exponential; smaller has the heavier tail). Messages keep their order, as over one TCP link, but for the
-    fraction `reorder`, which is delivered at its own time. `loss` drops, `duplicate` delivers twice.
+    `delay_ms` is the least delay, `jitter_ms` the mean of what comes on top and `jitter_shape` the gamma
+    shape (1 = exponential; smaller has the heavier tail). Messages keep their order, as over one TCP link,
+    but for the fraction `reorder`, which is delivered at its own time. `loss` drops, `duplicate` delivers
+    twice.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -35,10 +36,22 @@ PROFILES: dict[str, NetworkProfile] = {
         # A switched 100 Mbps segment: the real module's round trip is 0.70 ms in the median, 1.6 ms at most.
         NetworkProfile(name="lan", delay_ms=0.25, jitter_ms=0.1, jitter_shape=2.0),
         NetworkProfile(
-            name="wifi", delay_ms=1.5, jitter_ms=3.0, jitter_shape=0.7, loss=0.01, reorder=0.01, duplicate=0.001
+            name="wifi",
+            delay_ms=1.5,
+            jitter_ms=3.0,
+            jitter_shape=0.7,
+            loss=0.01,
+            reorder=0.01,
+            duplicate=0.001,
         ),
         NetworkProfile(
-            name="bad", delay_ms=10.0, jitter_ms=20.0, jitter_shape=0.5, loss=0.05, reorder=0.05, duplicate=0.01
+            name="bad",
+            delay_ms=10.0,
+            jitter_ms=20.0,
+            jitter_shape=0.5,
+            loss=0.05,
+            reorder=0.05,
+            duplicate=0.01,
         ),
     )
 }

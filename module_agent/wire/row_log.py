@@ -1,6 +1,6 @@
-"""The feedback rows of one module as they arrive from the network: in any order, with gaps, some of them twice.
+"""The feedback rows of one module as they arrive: in any order, with gaps, some of them twice.
 
-Rows are numbered since the module's boot, so whoever listens knows what is missing and can ask `history` for it.
+Rows are numbered since the module's boot, so whoever listens knows what is missing and can ask for it.
 """
 
 import numpy as np
@@ -19,6 +19,11 @@ class RowLog:
         self._base: int | None = None
         self._rows = np.zeros(0, dtype=ROW)
         self._have = np.zeros(0, dtype=bool)
+
+    @property
+    def first_row(self) -> int:
+        """The oldest row number that is known of, 0 before any."""
+        return self._base or 0
 
     @property
     def end_row(self) -> int:

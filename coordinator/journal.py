@@ -1,0 +1,36 @@
+"""The journal of a session: which step began and ended, with which motions, kept inside the recording.
+
+A crashed run resumes from it, and a replay knows from it which motion served which purpose.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from module_agent.wire.messages import MotionRecord
+
+Purpose = Literal["rest", "constant", "windowed_sine", "dynamic", "held_out", "other"]
+StepName = Literal[
+    "discover", "link", "prepare", "home", "rest", "explore", "topology", "excite", "held_out", "finish"
+]
+
+
+class JournalEvent(BaseModel):
+    """One line of the journal; `what` says which of the other fields are set."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    t_ns: int
+    what: Literal["session", "begin", "done", "motion", "note", "failed", "finished"]
+    step: str = ""
+    serial: str = ""
+    boot: Annotated[int, Field(ge=0)] = 0
+    purpose: Purpose = "other"
+    motion: MotionRecord | None = None
+    text: str = ""
+    robot: str = ""
+    wall_time_s: float | None = None
+
+    def encode(self) -> bytes:
+        """Return the event as JSON."""
+        return self.model_dump_json(exclude_defaults=True).encode()

@@ -1,0 +1,84 @@
+"""What a session does with a robot: which motions, how large, how long."""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from module_agent.catalogue import ModuleType
+from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
+
+Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
+
+
+class Plan(BaseModel):
+    """The settings of an identification run; defaults are the thesis' where the thesis has one."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    discover_s: Seconds = 1.0
+    link_s: Seconds = 1.0
+    home_rad: float = 0.0
+    travel_speed_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 0.8
+    settle_s: Seconds = 0.6
+    rest_s: Seconds = 2.0
+    # Thesis 6.2.1.1: from an offset of 0.5 rad at 1 rad/s for 0.75 s.
+    constant_velocity_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 1.0
+    constant_duration_s: Seconds = 0.75
+    # Thesis table 3, and amplitudes of tables 4 and 5.
+    sine_amplitude_rad: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    sine_frequency_hz: Annotated[float, Field(gt=0.0, le=10.0)] = 2.0
+    sine_centre_s: Seconds = 2.8
+    sine_sigma_s: Seconds = 1.0
+    # Thesis table 6 and figure 44.
+    dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
+    dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
+    dynamics: bool = True
+    hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 4.0
+    retries: Annotated[int, Field(ge=0, le=5)] = 2
+
+    def constant(self) -> ConstantMotion:
+        """Return the thesis' constant motion."""
+        return ConstantMotion(
+            velocity_rad_s=self.constant_velocity_rad_s, duration_s=self.constant_duration_s
+        )
+
+    def sine(self, kind: ModuleType) -> WindowedSine:
+        """Return the thesis' windowed sine motion, no faster than the module type can follow."""
+        return WindowedSine(
+            amplitude=self.sine_amplitude_rad or _amplitude(kind, self.sine_frequency_hz, 0.10),
+            frequency_hz=self.sine_frequency_hz,
+            centre_s=self.sine_centre_s,
+            sigma_s=self.sine_sigma_s,
+        )
+
+    def dynamic(self, kind: ModuleType) -> DynamicPattern:
+        """Return the thesis' dynamic pattern, wide enough to be followed."""
+        return DynamicPattern(
+            amplitude_rad=self.dynamic_amplitude_rad or _amplitude(kind, 0.7, 0.35),
+            frequency_hz=0.7,
+            sigma_s=0.5,
+            half_width_s=1.0,
+            repeats=self.dynamic_repeats,
+            alternate=True,
+        )
+
+    def held_out(self, kind: ModuleType) -> DynamicPattern:
+        """Return a motion that no parameter is fitted to: another frequency, amplitude and shape."""
+        return DynamicPattern(
+            amplitude_rad=_amplitude(kind, 1.0, 0.25),
+            frequency_hz=1.0,
+            sigma_s=0.35,
+            half_width_s=0.8,
+            repeats=2,
+            alternate=False,
+        )
+
+    def exploring_gains(self, default: GainSet) -> GainSet:
+        """Return gains that hold a joint stiffly, so that only the moving joint moves."""
+        position = default.position.model_copy(update={"kp": default.position.kp * self.hold_stiffness})
+        return default.model_copy(update={"position": position})
+
+
+def _amplitude(kind: ModuleType, frequency_hz: float, most_rad: float) -> float:
+    """Return an amplitude whose peak speed is 70 % of the type's, where its back-EMF leaves torque to spare."""
+    return min(most_rad, 0.7 * kind.max_speed_rad_s / (6.2832 * frequency_hz))

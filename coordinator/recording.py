@@ -1,0 +1,203 @@
+"""Everything that a session received and sent, in order, and what follows from it without looking further.
+
+The live session and a replay feed the same entries through the same `Recording`, so that both compute the same
+results. The recording's hash is the trace hash of the run.
+"""
+
+import hashlib
+import struct
+from typing import Literal, NamedTuple
+
+from coordinator.journal import JournalEvent
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.keys import Leaf, parse
+from module_agent.wire.messages import (
+    Ack,
+    Ask,
+    Estimate,
+    EstimateRequest,
+    Feedback,
+    GainsCommand,
+    HistoryRequest,
+    Info,
+    LeaseRequest,
+    Message,
+    MotionCommand,
+    Setpoint,
+    Status,
+    Stop,
+)
+from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.row_log import RowLog
+
+Kind = Literal["publication", "request", "reply", "journal"]
+JOURNAL_TOPIC = "journal"
+
+PUBLISHED: dict[Leaf, type[Message]] = {
+    Leaf.FEEDBACK: Feedback,
+    Leaf.STATUS: Status,
+    Leaf.ESTIMATE: Estimate,
+    Leaf.SETPOINT: Setpoint,
+}
+ASKED: dict[Leaf, type[Message]] = {
+    Leaf.INFO: Ask,
+    Leaf.STATUS: Ask,
+    Leaf.HISTORY: HistoryRequest,
+    Leaf.ESTIMATE: EstimateRequest,
+    Leaf.LEASE: LeaseRequest,
+    Leaf.MOTION: MotionCommand,
+    Leaf.STOP: Stop,
+    Leaf.GAINS: GainsCommand,
+}
+ANSWERED: dict[Leaf, type[Message]] = {
+    Leaf.INFO: Info,
+    Leaf.STATUS: Status,
+    Leaf.HISTORY: Feedback,
+    Leaf.ESTIMATE: Estimate,
+}
+
+
+class Entry(NamedTuple):
+    """One message as it passed: `topic` is its key (or `journal`), `t_ns` the session time."""
+
+    kind: Kind
+    topic: str
+    t_ns: int
+    payload: bytes
+
+
+class RoundTrip(NamedTuple):
+    """A question and its answer: session times of sending and receiving, module time of answering."""
+
+    sent_ns: int
+    received_ns: int
+    module_ns: int
+
+
+class ModuleRecord:
+    """What is known of one boot of one module."""
+
+    def __init__(self, serial: str, boot: int):
+        self.serial = serial
+        self.boot = boot
+        self.rows = RowLog(boot)
+        self.info: Info | None = None
+        self.status: Status | None = None
+        self.round_trips: list[RoundTrip] = []
+        self.arrivals: list[tuple[int, int]] = []
+        self.newest_ns = 0
+
+    def see(self, t_ns: int) -> None:
+        """Note a module time that was heard."""
+        self.newest_ns = max(self.newest_ns, t_ns)
+
+
+class Recording:
+    """The messages of one session and their indices. `modules` holds the latest boot of every serial."""
+
+    def __init__(self) -> None:
+        self.modules: dict[str, ModuleRecord] = {}
+        self.past: dict[tuple[str, int], ModuleRecord] = {}
+        self.estimates: dict[tuple[str, str], dict[tuple[int, ...], Estimate]] = {}
+        self.journal: list[JournalEvent] = []
+        self.refused: dict[str, int] = {}
+        self._hash = hashlib.sha256()
+        self._sent: dict[tuple[str, int], int] = {}
+
+    @property
+    def trace_hash(self) -> str:
+        """SHA-256 over kind, topic, session time and bytes of every message so far."""
+        return self._hash.hexdigest()
+
+    def module(self, serial: str, boot: int) -> ModuleRecord:
+        """Return the record of one boot of a module, new if it was not known."""
+        found = self.past.get((serial, boot))
+        if found is None:
+            found = self.past[serial, boot] = ModuleRecord(serial, boot)
+        self.modules[serial] = found
+        return found
+
+    def add(self, entry: Entry) -> Message | JournalEvent:
+        """Take in one entry; return what it says.
+
+        Raises:
+            WireError: the bytes are not what their key announces; they are counted in `refused`.
+        """
+        if entry.kind == "journal":
+            event = JournalEvent.model_validate_json(entry.payload)
+            self.journal.append(event)
+            return event
+        head = f"{entry.kind} {entry.topic} {len(entry.payload)} ".encode()
+        self._hash.update(head + struct.pack("<q", entry.t_ns) + entry.payload)
+        try:
+            return self._index(entry)
+        except WireError as error:
+            self.refused[error.reason.value] = self.refused.get(error.reason.value, 0) + 1
+            raise
+
+    def _index(self, entry: Entry) -> Message:
+        parts = parse(entry.topic)
+        message = self._decode(entry, parts.leaf)
+        if message.serial != parts.serial:
+            raise WireError(Refusal.WRONG_SERIAL, f"{message.serial} speaks on the key of {parts.serial}")
+        if entry.kind == "request":
+            self._sent[entry.topic, message.seq] = entry.t_ns
+            return message
+        if isinstance(message, Setpoint):
+            return message
+        module = self.module(message.serial, message.boot)
+        self._note(module, message, entry)
+        return message
+
+    def _decode(self, entry: Entry, leaf: Leaf) -> Message:
+        if entry.kind == "publication":
+            table = PUBLISHED
+        elif entry.kind == "request":
+            table = ASKED
+        else:
+            table = ANSWERED
+            if leaf not in table:
+                return decode(Ack, entry.payload)
+        if leaf not in table:
+            raise WireError(Refusal.MALFORMED, f"nothing is {entry.kind} on {leaf.value}")
+        try:
+            return decode(table[leaf], entry.payload, MAX_MESSAGE_BYTES)
+        except WireError as error:
+            if entry.kind == "reply" and error.reason is Refusal.TYPES:
+                return decode(Ack, entry.payload)
+            raise
+
+    def _note(self, module: ModuleRecord, message: Message, entry: Entry) -> None:
+        match message:
+            case Feedback():
+                rows = module.rows.add(message)
+                if len(rows):
+                    newest = int(rows["t_ns"][-1])
+                    module.see(newest)
+                    if entry.kind == "publication":
+                        module.arrivals.append((entry.t_ns, newest))
+            case Status():
+                module.status = message
+                module.see(message.t_ns)
+                self._note_round_trip(module, entry, message.re, message.t_ns)
+            case Ack():
+                module.see(message.t_ns)
+                self._note_round_trip(module, entry, message.re, message.t_ns)
+            case Info():
+                module.info = message
+                module.see(message.t_ns)
+            case Estimate():
+                found = self.estimates.setdefault((message.joint, message.serial), {})
+                found[message.motion_ids] = message
+            case _:
+                pass
+
+    def _note_round_trip(self, module: ModuleRecord, entry: Entry, re: int, module_ns: int) -> None:
+        sent_ns = self._sent.pop((entry.topic, re), None)
+        if entry.kind == "reply" and sent_ns is not None:
+            module.round_trips.append(RoundTrip(sent_ns, entry.t_ns, module_ns))
+
+    def rows(self, serial: str, first: int, end: int) -> Rows:
+        """Return the rows of a range of the latest boot of a module that have arrived."""
+        return self.modules[serial].rows.rows(first, end)

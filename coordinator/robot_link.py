@@ -1,0 +1,363 @@
+"""The coordinator's hold on all modules of a robot: leases, keep-alives, motions, complete recordings."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from typing import TypeVar
+
+from coordinator.clock import Clock
+from coordinator.radio import NoAnswer, Radio, Refused
+from coordinator.recording import ModuleRecord, Recording
+from module_agent.catalogue import ModuleType, module_type
+from module_agent.firmware.waveform import duration_s
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import (
+    Ack,
+    Ask,
+    Estimate,
+    EstimateRequest,
+    GainsCommand,
+    GainSet,
+    HistoryRequest,
+    Info,
+    LeaseRequest,
+    MotionCommand,
+    MotionRecord,
+    Pattern,
+    Status,
+    Stop,
+)
+from module_agent.wire.refusal import Refusal
+
+POLL_S = 0.02
+# Four keep-alives within the default lifetime of 250 ms.
+KEEP_ALIVE_S = 0.06
+LEASE_NS = 1_000_000_000
+ATTEMPTS = 8
+SILENT_NS = 1_000_000_000
+TOKEN_GONE_NS = 300_000_000
+# Refusals that the next attempt can mend: it carries a newer echo and a newer sequence number.
+PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
+
+T = TypeVar("T")
+
+
+class ModuleLost(RuntimeError):
+    """A module left in the middle of the session; `serial` says which."""
+
+    def __init__(self, serial: str, why: str):
+        super().__init__(f"module {serial} is lost: {why}")
+        self.serial = serial
+
+
+class MotionInterrupted(RuntimeError):
+    """A motion ended before its end; it can be tried again after re-arming."""
+
+    def __init__(self, serial: str, outcome: str):
+        super().__init__(f"the motion of module {serial} was {outcome}")
+        self.serial = serial
+
+
+class RobotLink:
+    """Commands to the modules of one robot under this sender's leases."""
+
+    def __init__(self, radio: Radio, recording: Recording, clock: Clock, sender: str):
+        self.serials: tuple[str, ...] = ()
+        self.sender = sender
+        self._radio = radio
+        self._recording = recording
+        self._clock = clock
+        self._tokens: dict[str, int] = {}
+        self._boots: dict[str, int] = {}
+        self._complete_row: dict[str, int] = {}
+        self._last_id = 0
+        self._renewals: set[asyncio.Task[None]] = set()
+        self._taken_by: dict[str, str] = {}
+
+    # ------------------------------------------------------------------ knowing them
+
+    def module(self, serial: str) -> ModuleRecord:
+        """Return what is recorded of a module."""
+        return self._recording.modules[serial]
+
+    def kind(self, serial: str) -> ModuleType:
+        """Return the catalogue entry of a module.
+
+        Raises:
+            KeyError: the catalogue does not know what the module says it is.
+        """
+        return module_type(self.info(serial).module_type)
+
+    def info(self, serial: str) -> Info:
+        """Return what a module says it is."""
+        info = self.module(serial).info
+        if info is None:
+            raise NoAnswer(serial, Leaf.INFO, "it has not told its type")
+        return info
+
+    async def meet(self, serials: Sequence[str]) -> None:
+        """Ask every module who it is, and remember its boot."""
+        for serial in serials:
+            info = await self._ask_info(serial)
+            if not isinstance(info, Info):
+                raise NoAnswer(serial, Leaf.INFO, f"its answer is {type(info).__name__}")
+            self._boots[serial] = info.boot
+        self.serials = tuple(serials)
+
+    async def _ask_info(self, serial: str) -> object:
+        return await self._persist(serial, lambda: self._ask(serial, Leaf.INFO))
+
+    async def ask_status(self, serial: str) -> Status:
+        """Return the present status of a module; also one round trip for its clock."""
+        status = await self._persist(serial, lambda: self._ask(serial, Leaf.STATUS))
+        if not isinstance(status, Status):
+            raise NoAnswer(serial, Leaf.STATUS, f"its answer is {type(status).__name__}")
+        return status
+
+    async def _ask(self, serial: str, leaf: Leaf) -> object:
+        ask = Ask(serial=serial, boot=0, seq=self._radio.next_seq(), sender=self.sender)
+        return await self._radio.ask(serial, leaf, ask)
+
+    async def _persist(self, serial: str, attempt: Callable[[], Awaitable[T]]) -> T:
+        """Try until answered; a network may lose questions and answers."""
+        for left in reversed(range(ATTEMPTS)):
+            try:
+                return await attempt()
+            except NoAnswer:
+                self.check()
+                if not left:
+                    raise
+            except Refused as refused:
+                if refused.ack.reason not in PASSING or not left:
+                    raise
+                # The echo is renewed by the next feedback.
+                await asyncio.sleep(POLL_S)
+        raise AssertionError("unreachable")
+
+    def check(self) -> None:
+        """Check that every module is still there.
+
+        Raises:
+            ModuleLost: a module's token is gone, it is silent, it booted anew, or somebody took its lease.
+        """
+        now = self._clock()
+        for serial in self.serials:
+            record = self.module(serial)
+            if record.boot != self._boots[serial]:
+                raise ModuleLost(serial, "it has booted anew")
+            heard = record.arrivals[-1][0] if record.arrivals else now
+            if serial not in self._radio.alive and now - heard > TOKEN_GONE_NS:
+                raise ModuleLost(serial, "its agent has left the network")
+            if record.arrivals and now - heard > SILENT_NS:
+                raise ModuleLost(serial, f"no feedback for {(now - heard) / 1e9:.1f} s")
+            if serial in self._taken_by:
+                raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
+
+    async def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until a condition holds; False when the time is up.
+
+        Raises:
+            ModuleLost: see `check`.
+        """
+        end = self._clock() + int(timeout_s * 1e9)
+        while not condition():
+            self.check()
+            if self._clock() >= end:
+                return False
+            await asyncio.sleep(POLL_S)
+        return True
+
+    # ------------------------------------------------------------------ leases
+
+    async def acquire(self, serial: str) -> None:
+        """Take the lease of a module and arm it.
+
+        Raises:
+            Refused: somebody else holds it; the message names the holder and the time left.
+        """
+
+        async def attempt() -> Ack:
+            return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "acquire"))
+
+        ack = await self._persist(serial, attempt)
+        self._tokens[serial] = ack.token
+
+    def _lease(self, serial: str, action: str) -> LeaseRequest:
+        return LeaseRequest.model_validate({**self._head(serial), "action": action, "duration_ns": LEASE_NS})
+
+    def _head(self, serial: str) -> dict[str, object]:
+        """Return what every command carries."""
+        return {
+            "serial": serial,
+            "boot": self._boots[serial],
+            "seq": self._radio.next_seq(),
+            "sender": self.sender,
+            "token": self._tokens.get(serial, 0),
+            "echo_ns": self.module(serial).newest_ns,
+        }
+
+    async def keep_alive(self) -> None:
+        """Renew all leases until cancelled; a late answer does not hold up the next renewal."""
+        while True:
+            for serial in list(self._tokens):
+                task = asyncio.create_task(self._renew(serial))
+                self._renewals.add(task)
+                task.add_done_callback(self._renewals.discard)
+            await asyncio.sleep(KEEP_ALIVE_S)
+
+    async def _renew(self, serial: str) -> None:
+        try:
+            await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
+        except NoAnswer:
+            return  # lost on the way; the next one follows, and silence is noticed by `check`
+        except Refused as refused:
+            if refused.ack.reason == Refusal.HELD.value:
+                self._taken_by[serial] = refused.ack.detail
+
+    async def release_all(self) -> None:
+        """Let go of all modules; their motors are off then."""
+        for serial in list(self._tokens):
+            request = self._lease(serial, "release")
+            self._tokens.pop(serial)
+            await self._radio.command(serial, Leaf.LEASE, request)
+
+    async def stop_all(self, why: str) -> list[str]:
+        """Tell every module to stop at once; return the serials that did not confirm."""
+        self._tokens.clear()
+        stops = [self._stop(serial, why) for serial in self.serials]
+        done = await asyncio.gather(*stops, return_exceptions=True)
+        return [s for s, r in zip(self.serials, done, strict=True) if isinstance(r, BaseException)]
+
+    async def _stop(self, serial: str, why: str) -> None:
+        for left in reversed(range(3)):
+            stop = Stop(serial=serial, boot=0, seq=self._radio.next_seq(), sender=self.sender, why=why)
+            try:
+                await self._radio.command(serial, Leaf.STOP, stop, timeout_s=0.3)
+                return
+            except NoAnswer:
+                if not left:
+                    raise
+
+    # ------------------------------------------------------------------ motions
+
+    async def set_gains(self, serial: str, gains: GainSet) -> None:
+        """Replace a module's gains."""
+
+        async def attempt() -> Ack:
+            command = GainsCommand.model_validate({**self._head(serial), "gains": gains})
+            return await self._radio.command(serial, Leaf.GAINS, command)
+
+        await self._persist(serial, attempt)
+
+    def _next_id(self) -> int:
+        # Numbers grow over coordinators too, so that a new one does not repeat an old one's.
+        clock_ms = self._clock() // 1_000_000 & 0x3FFFFFFF
+        self._last_id = max(self._last_id + 1, clock_ms)
+        return self._last_id
+
+    async def run(self, patterns: Mapping[str, Pattern]) -> dict[str, MotionRecord]:
+        """Run one motion on each of the given modules at the same time; return how they went.
+
+        Raises:
+            MotionInterrupted: one of them expired or was stopped.
+            ModuleLost: see `check`.
+        """
+        numbers = {serial: self._next_id() for serial in patterns}
+        for serial, pattern in patterns.items():
+            await self._start(serial, numbers[serial], pattern)
+        longest = max(duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items())
+        ended = await self.wait(
+            lambda: all(self._ended(serial, number) for serial, number in numbers.items()), longest + 3.0
+        )
+        records: dict[str, MotionRecord] = {}
+        for serial, number in numbers.items():
+            status = self.module(serial).status if ended else await self.ask_status(serial)
+            motion = status.motion if status is not None else None
+            if motion is None or motion.motion_id != number or motion.outcome != "done":
+                raise MotionInterrupted(serial, motion.outcome if motion is not None else "lost")
+            records[serial] = motion
+        return records
+
+    def _origin(self, serial: str) -> float:
+        status = self.module(serial).status
+        return status.motion.origin_rad if status is not None and status.motion is not None else 0.0
+
+    def _ended(self, serial: str, number: int) -> bool:
+        status = self.module(serial).status
+        if status is None:
+            return False
+        motion = status.motion
+        if motion is None or motion.motion_id != number:
+            return status.state in ("expired", "stopped", "fault", "idle")
+        return motion.outcome != "running"
+
+    async def _start(self, serial: str, number: int, pattern: Pattern) -> None:
+        async def attempt() -> Ack:
+            command = MotionCommand.model_validate(
+                {**self._head(serial), "motion_id": number, "pattern": pattern}
+            )
+            return await self._radio.command(serial, Leaf.MOTION, command)
+
+        try:
+            await self._persist(serial, attempt)
+        except Refused as refused:
+            if refused.ack.reason in (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value):
+                raise MotionInterrupted(serial, f"refused: {refused.ack.detail}") from refused
+            raise
+
+    # ------------------------------------------------------------------ recordings
+
+    async def complete_rows(self) -> None:
+        """Fetch whatever feedback rows the network has dropped, of every module, up to now."""
+        for serial in self.serials:
+            status = await self.ask_status(serial)
+            await self._complete(serial, status.next_row)
+
+    async def _complete(self, serial: str, end: int) -> None:
+        rows = self.module(serial).rows
+        first = self._complete_row.get(serial, rows.first_row)
+        for _ in range(200):
+            missing = rows.missing(first, end)
+            if not missing:
+                break
+            await self._fetch(serial, *missing[0])
+        self._complete_row[serial] = end
+
+    async def _fetch(self, serial: str, first: int, end: int) -> None:
+        await self._persist(serial, lambda: self._ask_history(serial, first, end))
+
+    async def _ask_history(self, serial: str, first: int, end: int) -> object:
+        request = HistoryRequest(
+            serial=serial,
+            boot=self._boots[serial],
+            seq=self._radio.next_seq(),
+            sender=self.sender,
+            first_row=first,
+            end_row=end,
+        )
+        answer = await self._radio.ask(serial, Leaf.HISTORY, request)
+        if isinstance(answer, Ack):
+            raise Refused(serial, Leaf.HISTORY, answer)
+        return answer
+
+    async def estimate(self, observer: str, joint: str, motion_id: int, timeout_s: float) -> Estimate | None:
+        """Wait for what `observer` makes of a motion of `joint`; ask when it was lost; None if there is none."""
+
+        def found() -> Estimate | None:
+            for ids, estimate in self._recording.estimates.get((joint, observer), {}).items():
+                if motion_id in ids:
+                    return estimate
+            return None
+
+        if await self.wait(lambda: found() is not None, timeout_s):
+            return found()
+        for _ in range(ATTEMPTS):
+            request = EstimateRequest(
+                serial=observer, boot=0, seq=self._radio.next_seq(), sender=self.sender, joint=joint
+            )
+            try:
+                await self._radio.ask(observer, Leaf.ESTIMATE, request)
+            except NoAnswer:
+                self.check()
+            if await self.wait(lambda: found() is not None, 0.3):
+                break
+        return found()

@@ -1,0 +1,290 @@
+"""One identification run, from discovery to the last motion. Estimation from what it recorded is `identify`.
+
+Steps are journaled: a step that the journal says is done is not done again when a crashed run resumes.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Protocol
+
+import numpy as np
+
+from coordinator.clock import Clock
+from coordinator.journal import JournalEvent, Purpose
+from coordinator.plan import Plan
+from coordinator.radio import Radio
+from coordinator.recording import Recording
+from coordinator.robot_link import MotionInterrupted, RobotLink
+from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
+
+
+class Reporter(Protocol):
+    """Hears how the session goes; screen and viewer implement it."""
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """A step begins."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Something worth a line."""
+        ...
+
+    def estimates(self, joint: str) -> None:
+        """All estimates of the motions of a joint have arrived."""
+        ...
+
+
+class UnfitLink(RuntimeError):
+    """The network cannot carry a session; nothing has moved. The message says what was measured."""
+
+
+class NobodyThere(RuntimeError):
+    """No module, or not as many as expected, announced itself."""
+
+
+class Session:
+    """Runs the steps on a robot. `journal` records an event; `reporter` hears of progress."""
+
+    def __init__(
+        self,
+        link: RobotLink,
+        radio: Radio,
+        recording: Recording,
+        plan: Plan,
+        clock: Clock,
+        journal: Callable[[JournalEvent], None],
+        reporter: Reporter,
+    ):
+        self.link = link
+        self._radio = radio
+        self._recording = recording
+        self._plan = plan
+        self._clock = clock
+        self._journal = journal
+        self._reporter = reporter
+        self._done = {e.step: e for e in recording.journal if e.what == "done"}
+        self._index = 0
+        self._total = 4
+        self._keeper: asyncio.Task[None] | None = None
+
+    # ------------------------------------------------------------------ the run
+
+    async def run(self, expect: int | None = None) -> None:
+        """Discover, check, take, move, and let go; raises what went wrong after stopping the robot."""
+        await self._discover(expect)
+        await self._check_link()
+        serials = self.link.serials
+        self._total = 5 + len(serials) * (3 if self._plan.dynamics else 1)
+        self._mend_after_restart()
+        starts = {s: self._position(s) for s in serials}
+        try:
+            await self._take()
+            await self._step("home", "all joints to their home position", self._home)
+            await self._step("rest", "listening at rest", self._rest)
+            for serial in serials:
+                await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
+            if self._plan.dynamics:
+                for serial in serials:
+                    await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
+                for serial in serials:
+                    await self._step(
+                        f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial
+                    )
+            await self._finish(starts)
+        except BaseException as error:
+            await self._abandon(error)
+            raise
+
+    async def _discover(self, expect: int | None) -> None:
+        self._report("discovering modules")
+        quiet_since, known = self._clock(), frozenset[str]()
+        end = self._clock() + int((self._plan.discover_s + (10.0 if expect else 3.0)) * 1e9)
+        while self._clock() < end:
+            await asyncio.sleep(0.05)
+            if frozenset(self._radio.alive) != known:
+                known, quiet_since = frozenset(self._radio.alive), self._clock()
+            settled = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
+            if known and settled and (expect is None or len(known) >= expect):
+                break
+        if not known or (expect is not None and len(known) != expect):
+            names = ", ".join(sorted(known)) or "none"
+            wanted = "at least one" if expect is None else str(expect)
+            raise NobodyThere(f"{wanted} module expected, found {len(known)}: {names}")
+        await self.link.meet(sorted(known))
+        for serial in self.link.serials:
+            self.link.kind(serial)
+        self._reporter.note(f"found {len(known)}: {', '.join(self.link.serials)}")
+
+    async def _check_link(self) -> None:
+        """Measure rate, loss and round trip for a second, and refuse a link that cannot keep a motion alive."""
+        self._report("checking the link")
+        before = {s: self.link.module(s).rows.end_row for s in self.link.serials}
+        start = self._clock()
+        while self._clock() - start < int(self._plan.link_s * 1e9):
+            for serial in self.link.serials:
+                await self.link.ask_status(serial)
+            await asyncio.sleep(0.05)
+        span_s = (self._clock() - start) / 1e9
+        for serial in self.link.serials:
+            record, info = self.link.module(serial), self.link.info(serial)
+            rate = (record.rows.end_row - before[serial]) / span_s
+            trips = [(t.received_ns - t.sent_ns) / 1e6 for t in record.round_trips]
+            median, worst = float(np.median(trips)), float(np.percentile(trips, 95))
+            self._reporter.note(
+                f"{serial} ({info.module_type}): {rate:.0f} rows/s, round trip {median:.2f} ms, 95 % {worst:.2f} ms"
+            )
+            if rate < 0.5 * info.feedback_rate_hz:
+                raise UnfitLink(
+                    f"unfit: module {serial} delivers {rate:.0f} rows/s of {info.feedback_rate_hz:.0f}; "
+                    "check the network and the load of its machine"
+                )
+            if worst > 0.5 * info.lifetime_ns / 1e6:
+                raise UnfitLink(
+                    f"unfit: round trips to module {serial} take {worst:.0f} ms (95 %), commands live "
+                    f"{info.lifetime_ns / 1e6:.0f} ms; check the network"
+                )
+
+    def _mend_after_restart(self) -> None:
+        """Forget what the journal says is done if a module has booted since: its zero may have moved."""
+        for step, event in list(self._done.items()):
+            record = self._recording.modules.get(event.serial)
+            if event.serial and (record is None or record.boot != event.boot):
+                del self._done[step]
+                self._reporter.note(f"{step} is done again: module {event.serial} has booted since")
+        self._done.pop("home", None)
+        if self._done:
+            self._reporter.note(f"resuming: {len(self._done)} steps are done already")
+
+    async def _take(self) -> None:
+        for serial in self.link.serials:
+            await self.link.acquire(serial)
+        self._keeper = asyncio.create_task(self.link.keep_alive())
+        for serial in self.link.serials:
+            gains = self._plan.exploring_gains(self.link.info(serial).gains)
+            if self.link.info(serial).gains != gains:
+                await self.link.set_gains(serial, gains)
+
+    async def _step(
+        self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
+    ) -> None:
+        self._report(text)
+        if name in self._done:
+            return
+        self._journal(JournalEvent(t_ns=self._clock(), what="begin", step=name))
+        for left in reversed(range(self._plan.retries + 1)):
+            try:
+                await work(*arguments)
+                break
+            except MotionInterrupted as error:
+                if not left:
+                    raise
+                self._reporter.note(f"{error}; re-arming and trying again")
+                self._journal(JournalEvent(t_ns=self._clock(), what="note", step=name, text=str(error)))
+                for serial in self.link.serials:
+                    await self.link.acquire(serial)
+                await self._home()
+        await self.link.complete_rows()
+        serial = arguments[0] if arguments else ""
+        boot = self.link.module(serial).boot if serial else 0
+        self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
+
+    async def _finish(self, starts: dict[str, float]) -> None:
+        self._report("back to where it stood")
+        speed = self._plan.travel_speed_rad_s
+        await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in starts.items()})
+        await self.link.complete_rows()
+        await self._stop_keeping()
+        await self.link.release_all()
+
+    async def _stop_keeping(self) -> None:
+        if self._keeper is not None:
+            self._keeper.cancel()
+            await asyncio.gather(self._keeper, return_exceptions=True)
+            self._keeper = None
+
+    async def _abandon(self, error: BaseException) -> None:
+        await self._stop_keeping()
+        why = str(error) or type(error).__name__
+        deaf = await self.link.stop_all(why[:200])
+        text = f"stopped: {why}" + (f"; no confirmation from {', '.join(deaf)}" if deaf else "")
+        self._journal(JournalEvent(t_ns=self._clock(), what="failed", text=text))
+        self._reporter.note(text)
+
+    # ------------------------------------------------------------------ the steps
+
+    async def _home(self) -> None:
+        speed, home = self._plan.travel_speed_rad_s, self._plan.home_rad
+        await self.link.run({s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self.link.serials})
+        await asyncio.sleep(self._plan.settle_s)
+
+    async def _rest(self) -> None:
+        pattern = Rest(duration_s=self._plan.rest_s)
+        records = await self.link.run(dict.fromkeys(self.link.serials, pattern))
+        for serial, record in records.items():
+            self._note_motion("rest", serial, record, "rest")
+
+    async def _explore(self, serial: str) -> None:
+        """Constant motion through home, then the windowed sine about home (thesis 4.3.1)."""
+        plan, home = self._plan, self._plan.home_rad
+        constant = plan.constant()
+        travel = constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
+        await self._go(serial, home - 0.5 * travel)
+        await self._observe(serial, constant, "constant")
+        await self._go(serial, home)
+        await self._observe(serial, plan.sine(self.link.kind(serial)), "windowed_sine")
+        self._reporter.estimates(serial)
+
+    async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> None:
+        record = await self._move(f"explore/{serial}", serial, pattern, purpose)
+        for observer in self.link.serials:
+            found = await self.link.estimate(observer, serial, record.motion_id, 3.0)
+            if found is None:
+                self._reporter.note(f"{observer} has no estimate of the {purpose} motion of {serial}")
+            elif found.note:
+                self._reporter.note(f"{observer} on joint {serial}: {found.note}")
+
+    async def _excite(self, serial: str) -> None:
+        pattern = self._plan.dynamic(self.link.kind(serial))
+        await self._move(f"excite/{serial}", serial, pattern, "dynamic")
+        await self._go(serial, self._plan.home_rad)
+
+    async def _hold_out(self, serial: str) -> None:
+        pattern = self._plan.held_out(self.link.kind(serial))
+        await self._move(f"held_out/{serial}", serial, pattern, "held_out")
+        await self._go(serial, self._plan.home_rad)
+
+    # ------------------------------------------------------------------ pieces
+
+    async def _go(self, serial: str, target_rad: float) -> None:
+        await self.link.run(
+            {serial: GoTo(target_rad=target_rad, max_speed_rad_s=self._plan.travel_speed_rad_s)}
+        )
+        await asyncio.sleep(self._plan.settle_s)
+
+    async def _move(self, step: str, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
+        record = (await self.link.run({serial: pattern}))[serial]
+        self._note_motion(step, serial, record, purpose)
+        return record
+
+    def _note_motion(self, step: str, serial: str, record: MotionRecord, purpose: Purpose) -> None:
+        boot = self.link.module(serial).boot
+        self._journal(
+            JournalEvent(
+                t_ns=self._clock(),
+                what="motion",
+                step=step,
+                serial=serial,
+                boot=boot,
+                purpose=purpose,
+                motion=record,
+            )
+        )
+
+    def _position(self, serial: str) -> float:
+        log = self.link.module(serial).rows
+        rows = log.rows(log.end_row - 1, log.end_row)
+        return float(rows["position_rad"][-1]) if len(rows) else self._plan.home_rad
+
+    def _report(self, text: str) -> None:
+        self._index += 1
+        self._reporter.step(self._index, self._total, text)

@@ -1,0 +1,265 @@
+"""The thesis' circle point analysis of one joint in one IMU's frame (chapters 4.3.2 to 4.3.5 and 6.2.1).
+
+The estimator is the thesis' as written, with its known biases (only alpha is filtered, so that d comes out
+0.77 % long at 2 Hz and 250 Hz), but with one sign convention throughout:
+
+    j   direction about which the IMU's body turns when the joint's position grows
+    r   points from the joint's axis to the IMU (the thesis' points back to the joint)
+    n   j x r / |r|, so that the tangential acceleration is + alpha d, with d >= 0
+
+For these, eq. 24 reads r = d (n x j) as in the thesis.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
+from module_agent.estimate.windows import AlignedMotion, Array, ImuWindow
+from module_agent.wire.messages import CircleEstimate, Vector3
+
+Mask = NDArray[np.bool_]
+
+LEAST_SAMPLES = 3 * TAPS
+LEAST_RATE_RAD_S = 0.02  # 15 times the gyro's noise; slower motions say nothing about an axis
+LEAST_ACCELERATION_RAD_S2 = 0.1  # 100 mm give 0.01 m/s^2, below the noise of one sample
+QUIET_S = (
+    0.1  # the window of 5.6 s leaves 2 % of the amplitude in its first 0.1 s, 0.4 mrad of angle at 0.2 rad
+)
+
+
+class RestReading(NamedTuple):
+    """What an IMU reads at rest: means (3,) in frame u, and the scatter of one sample (rms over the axes)."""
+
+    gyro_offset_rad_s: Array
+    specific_force_m_s2: Array
+    gyro_scatter_rad_s: float
+    accel_scatter_m_s2: float
+    samples: int
+
+
+class JointAxis(NamedTuple):
+    """The unit axis j (3,) in frame u, one sigma of its direction, and how many samples gave it."""
+
+    axis: Array
+    sigma_rad: float
+    samples: int
+
+
+class CircleFit(NamedTuple):
+    """A circle point analysis; vectors (3,) in the IMU frame u, conventions as in the module's docstring.
+
+    sigma_distance_m: from the residual of eq. 23, widened for its autocorrelation, and from what the initial
+        gravity and the axis leave uncertain in eq. 16. It knows nothing of scale errors of the sensors.
+    residual_rms_m_s2: of the tangential acceleration about alpha d.
+    singular_values: of eq. 20 divided by sqrt(samples): rms accelerations [m/s^2], largest first.
+    """
+
+    axis: Array
+    tangent: Array
+    radial_m: Array
+    distance_m: float
+    sigma_axis_rad: float
+    sigma_distance_m: float
+    residual_rms_m_s2: float
+    singular_values: Array
+    samples: int
+
+
+def rest_reading(rest: ImuWindow) -> RestReading:
+    """Average an IMU at rest: the gyro offset of eq. 30, and gravity.
+
+    Raises:
+        ValueError: too few samples.
+    """
+    _enough(rest.t_ns.size, "rest")
+    gyro, accel = rest.gyro_rad_s.mean(axis=0), rest.accel_m_s2.mean(axis=0)
+    return RestReading(
+        _frozen(gyro),
+        _frozen(accel),
+        float(np.sqrt(np.mean((rest.gyro_rad_s - gyro) ** 2))),
+        float(np.sqrt(np.mean((rest.accel_m_s2 - accel) ** 2))),
+        int(rest.t_ns.size),
+    )
+
+
+def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
+    """Find the joint's axis in frame u from the constant motion: eq. 15 on the gyro less its offset (eq. 30).
+
+    Samples of less than half the top speed are left out. Every sample counts with the sign of the encoder's
+    rate, so that j does not depend on the direction of the motion; a motion forth and back cancels the gyro
+    offset.
+
+    Raises:
+        ValueError: too few samples, no motion of the joint, or none of the IMU.
+    """
+    _enough(constant.t_s.size, "constant motion")
+    speed = np.abs(constant.velocity_rad_s)
+    if speed.max() < LEAST_RATE_RAD_S:
+        raise ValueError(
+            f"the joint turned at {speed.max():.2g} rad/s at most in the constant motion, "
+            f"at least {LEAST_RATE_RAD_S} is needed for its axis"
+        )
+    steady = speed >= 0.5 * speed.max()
+    sign = np.sign(constant.velocity_rad_s[steady])
+    gyro = sign[:, None] * (constant.gyro_rad_s[steady] - rest.gyro_offset_rad_s)
+    mean = gyro.mean(axis=0)
+    rate = float(np.linalg.norm(mean))
+    if rate < 0.25 * LEAST_RATE_RAD_S:
+        raise ValueError(
+            f"the gyro saw {rate:.2g} rad/s while the joint turned: this IMU does not move with it"
+        )
+    axis = mean / rate
+    across = gyro - np.outer(gyro @ axis, axis)
+    # Both directions across the axis count, and so does the offset's own error where the motion goes one way.
+    variance = 0.5 * sum(_variance_of_mean(across[:, i]) for i in range(3))
+    variance += (float(sign.mean()) * rest.gyro_scatter_rad_s) ** 2 / rest.samples
+    return JointAxis(_frozen(axis), float(np.sqrt(variance)) / rate, int(np.count_nonzero(steady)))
+
+
+def circle_point_analysis(
+    rest: ImuWindow, constant: AlignedMotion, sine: AlignedMotion, quiet_s: float = QUIET_S
+) -> CircleFit:
+    """Run eqs. 12 to 24 and 30: axis from the constant motion, radial vector from the windowed sine motion.
+
+    The initial gravity of eq. 16 is the mean over the first `quiet_s` of the sine motion instead of its first
+    sample alone: one sample's noise (0.03 m/s^2, 3 mrad of tilt) would move d by 0.2 mm.
+
+    Args:
+        rest: about 2 s of the IMU at rest.
+        constant: the CM, on one time axis (`windows.align`).
+        sine: the WSM, likewise, beginning with at least `quiet_s` of near rest.
+        quiet_s: length of that near rest [s].
+
+    Returns:
+        The fit. An IMU on the axis comes out with a distance near zero and a sigma no smaller than its noise
+        warrants; its radial direction then means nothing.
+
+    Raises:
+        ValueError: too few samples or too little motion, with what would be enough.
+    """
+    _enough(sine.t_s.size, "windowed sine motion")
+    at_rest = rest_reading(rest)
+    found = joint_axis(constant, at_rest)
+    alpha = angular_acceleration(sine)
+    quiet = sine.t_s <= quiet_s
+    turns = _turns(found.axis, sine, quiet)
+    dynamic = _dynamic_acceleration(sine, turns, quiet)
+    _, spread, basis = np.linalg.svd(dynamic, full_matrices=False)  # eq. 20
+    tangent = basis[0]  # eq. 21; its sign follows from d >= 0
+    power = float(alpha @ alpha)
+    distance = float(alpha @ dynamic @ tangent) / power  # eq. 23
+    if distance < 0.0:
+        tangent, distance = -tangent, -distance
+    residual = dynamic @ tangent - alpha * distance
+    blocks = (
+        _variance_of_mean(residual) * residual.size / power,
+        _gravity_variance(alpha, turns, tangent, at_rest, int(np.count_nonzero(quiet))),
+        _tilt_variance(alpha, sine.position_rad, at_rest, found.sigma_rad),
+    )
+    return CircleFit(
+        axis=found.axis,
+        tangent=_frozen(tangent),
+        radial_m=_frozen(distance * np.cross(tangent, found.axis)),  # eq. 24
+        distance_m=distance,
+        sigma_axis_rad=found.sigma_rad,
+        sigma_distance_m=float(np.sqrt(sum(blocks))),
+        residual_rms_m_s2=float(np.sqrt(np.mean(residual**2))),
+        singular_values=_frozen(spread / np.sqrt(sine.t_s.size)),
+        samples=int(sine.t_s.size),
+    )
+
+
+def angular_acceleration(motion: AlignedMotion) -> Array:
+    """Differentiate the joint's rate and smooth it by the Gaussian of 11 taps (thesis 6.2.1.2): (n,) rad/s^2.
+
+    Raises:
+        ValueError: the joint hardly accelerated.
+    """
+    alpha = gaussian_filter(np.gradient(motion.velocity_rad_s, motion.t_s))
+    rms = float(np.sqrt(np.mean(alpha**2)))
+    if rms < LEAST_ACCELERATION_RAD_S2:
+        raise ValueError(
+            f"the joint accelerated by {rms:.2g} rad/s^2 rms in the windowed sine motion, "
+            f"at least {LEAST_ACCELERATION_RAD_S2} is needed for its radial distance"
+        )
+    return alpha
+
+
+def circle_estimate(fit: CircleFit, delay_s: float) -> CircleEstimate:
+    """Return the fit as the part of a message that carries it."""
+    return CircleEstimate(
+        axis=_vector(fit.axis),
+        tangent=_vector(fit.tangent),
+        radial_m=_vector(fit.radial_m),
+        distance_m=fit.distance_m,
+        sigma_axis_rad=min(fit.sigma_axis_rad, 10.0),
+        sigma_distance_m=min(fit.sigma_distance_m, 1e3),
+        residual_rms_m_s2=fit.residual_rms_m_s2,
+        singular_values=_vector(fit.singular_values),
+        delay_s=delay_s,
+        samples=fit.samples,
+    )
+
+
+def _turns(axis: Array, sine: AlignedMotion, quiet: Mask) -> Array:
+    """Return (n, 3, 3): what turns a vector fixed in the world, seen from u at the beginning, to sample n.
+
+    The body turns by +phi about j, so the world turns by -phi as seen from it: eq. 16 with this sign.
+    """
+    phi = sine.position_rad - sine.position_rad[quiet].mean()
+    return np.asarray(Rotation.from_rotvec(np.outer(-phi, axis)).as_matrix())
+
+
+def _dynamic_acceleration(sine: AlignedMotion, turns: Array, quiet: Mask) -> Array:
+    """Return eqs. 16 to 18: the specific force less the turned initial gravity, less its mean; (n, 3)."""
+    dynamic = sine.accel_m_s2 - turns @ sine.accel_m_s2[quiet].mean(axis=0)
+    return np.asarray(dynamic - dynamic.mean(axis=0))
+
+
+def _gravity_variance(alpha: Array, turns: Array, tangent: Array, rest: RestReading, quiet: int) -> float:
+    """Return the variance of d that the noise of the initial gravity causes through eqs. 16 and 23 [m^2]."""
+    seen = np.einsum("nij,i->nj", turns, tangent)  # n . (R_n g0) = seen_n . g0
+    gain = alpha @ (seen - seen.mean(axis=0)) / float(alpha @ alpha)
+    return float(gain @ gain) * rest.accel_scatter_m_s2**2 / max(quiet, 1)
+
+
+def _tilt_variance(alpha: Array, position: Array, rest: RestReading, sigma_axis_rad: float) -> float:
+    """Return the variance of d from the axis' error, which turns gravity wrongly by phi g sigma [m^2]."""
+    gain = float(alpha @ (position - position.mean())) / float(alpha @ alpha)
+    return (gain * float(np.linalg.norm(rest.specific_force_m_s2)) * sigma_axis_rad) ** 2
+
+
+def _variance_of_mean(series: Array) -> float:
+    """Return the variance of the mean of a correlated series: s^2 / n times 1 + 2 sum rho.
+
+    The sum of the autocorrelations ends at its first pair that is not positive (Geyer 1992, initial positive
+    sequence), and never makes the variance smaller than for white noise.
+    """
+    x = series - series.mean()
+    power = float(x @ x)
+    if power <= 0.0:
+        return 0.0
+    spectrum = np.fft.rfft(x, 2 * x.size)
+    rho = np.fft.irfft(np.abs(spectrum) ** 2)[: x.size] / power
+    pairs = rho[1 : 2 * ((x.size - 1) // 2) + 1].reshape(-1, 2).sum(axis=1)
+    ends = np.flatnonzero(pairs <= 0.0)
+    correlated = float(pairs[: ends[0] if ends.size else pairs.size].sum())
+    return float(power / x.size**2 * (1.0 + 2.0 * correlated))
+
+
+def _enough(samples: int, what: str) -> None:
+    if samples < LEAST_SAMPLES:
+        raise ValueError(f"{samples} samples of the {what}: at least {LEAST_SAMPLES} are needed")
+
+
+def _frozen(values: Array) -> Array:
+    found = np.array(values, dtype=float)
+    found.flags.writeable = False
+    return found
+
+
+def _vector(values: Array) -> Vector3:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,121 @@
+"""Find the offset between two modules' clocks from a motion that both saw: gyro against encoder rate.
+
+Round trips bound the offset to tens of milliseconds; the motion itself gives it to tens of microseconds. The
+gyro of whoever is carried reads gyro(t) = b + c v(t - delay) with v the joint's rate and c, b constant
+3-vectors, so no axis has to be known. A grid finds the basin, Gauss-Newton on (b, c, delay) the minimum.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from module_agent.estimate.gaussian_filter import SIGMA_SAMPLES, TAPS, gaussian_filter
+from module_agent.estimate.windows import Array, ImuWindow, JointWindow
+
+SEARCH_S = 0.08  # round trips are off by up to 60 ms, and the optimum must lie inside the grid
+GRID_S = 0.004
+STEPS = 8
+# Below this the gyro does not follow the joint, and the best of many poor delays would mean nothing. Reaction
+# motion of a held joint follows it well and is kept: motion_detection tells it from being carried by its
+# size.
+LEAST_EXPLAINED = 0.25
+
+
+class ClockDelay(NamedTuple):
+    """How the joint's clock maps to the IMU's: t_imu = t_joint + offset_ns.
+
+    delay_s: offset minus the rough offset it was started from.
+    sigma_s: one standard deviation; infinite if not found.
+    explained: fraction of the gyro's variance that the joint's rate explains, 0..1.
+    found: whether the motion was seen; if not, the offset is the rough one.
+    """
+
+    offset_ns: int
+    delay_s: float
+    sigma_s: float
+    explained: float
+    found: bool
+
+
+def clock_delay(
+    imu: ImuWindow, joint: JointWindow, rough_offset_ns: int, search_s: float = SEARCH_S
+) -> ClockDelay:
+    """Refine the offset between the joint's clock and the IMU's from one motion.
+
+    Both windows should hold the whole motion and a little rest about it. The offset is taken as constant: 100
+    ppm over 5 s are 0.5 ms from end to end, and what is found is the mean.
+
+    Raises:
+        ValueError: fewer than 3 filter lengths of samples, or windows that do not overlap by as much.
+    """
+    rate = _RateSpline(joint)
+    t_s = 1e-9 * (imu.t_ns - rough_offset_ns - int(joint.t_ns[0]))
+    inside = (t_s >= search_s) & (t_s <= rate.end_s - search_s)
+    if np.count_nonzero(inside) < 3 * TAPS:
+        raise ValueError(
+            f"only {np.count_nonzero(inside)} IMU samples lie {search_s} s inside the joint's window of "
+            f"{rate.end_s:.2f} s; {3 * TAPS} are needed"
+        )
+    gyro: Array = gaussian_filter(imu.gyro_rad_s)[inside]
+    at: Array = t_s[inside].astype(np.float64)
+    grid = np.arange(-search_s, search_s + 0.5 * GRID_S, GRID_S)
+    scores = np.array([_explained(gyro, rate.spline(at - delay)) for delay in grid])
+    delay, sigma = _refine(gyro, at, rate.spline, float(grid[np.argmax(scores)]))
+    delay = min(max(delay, -search_s), search_s)
+    explained = _explained(gyro, rate.spline(at - delay))
+    if explained < LEAST_EXPLAINED:
+        return ClockDelay(rough_offset_ns, 0.0, float("inf"), explained, found=False)
+    return ClockDelay(rough_offset_ns + round(1e9 * delay), delay, sigma, explained, found=True)
+
+
+class _RateSpline:
+    """The joint's rate over seconds from its first sample, smoothed by the same filter as the gyro.
+
+    The smoothing keeps the noise of the rate from preferring delays between samples, where interpolation
+    would average it away.
+    """
+
+    def __init__(self, joint: JointWindow):
+        if joint.t_ns.size < 3 * TAPS:
+            raise ValueError(
+                f"{joint.t_ns.size} joint samples; {3 * TAPS} are needed to find a clock's delay"
+            )
+        knots = 1e-9 * (joint.t_ns - int(joint.t_ns[0]))
+        self.spline = CubicSpline(knots, gaussian_filter(joint.velocity_rad_s))
+        self.end_s = float(knots[-1])
+
+
+def _explained(gyro: Array, rate: Array) -> float:
+    """Return the fraction of the gyro's variance, over all three axes, that is linear in the rate."""
+    g = gyro - gyro.mean(axis=0)
+    v = rate - rate.mean()
+    total, power = float((g * g).sum()), float(v @ v)
+    if total <= 0.0 or power <= 0.0:
+        return 0.0
+    return float(((v @ g) ** 2).sum()) / (total * power)
+
+
+def _refine(gyro: Array, at_s: Array, spline: CubicSpline, delay_s: float) -> tuple[float, float]:
+    """Least squares of gyro = b + c v(t - delay) by variable projection; returns the delay and its sigma."""
+    sigma = float("inf")
+    slope = spline.derivative()
+    for _ in range(STEPS):
+        v, dv = spline(at_s - delay_s), -slope(at_s - delay_s)
+        v, dv = v - v.mean(), dv - dv.mean()
+        power = float(v @ v)
+        if power <= 0.0:
+            return delay_s, float("inf")
+        g = gyro - gyro.mean(axis=0)
+        c = v @ g / power
+        free = dv - v * (v @ dv) / power  # what of the slope is not an amplitude
+        information = float(c @ c) * float(free @ free)
+        if information <= 0.0:
+            return delay_s, float("inf")
+        residual = g - np.outer(v, c)
+        # One step never goes farther than the grid cell that the search has chosen.
+        delay_s += float(np.clip(free @ residual @ c / information, -GRID_S, GRID_S))
+        # The filter correlates neighbours: about 10 samples (2 sqrt(pi) sigma) carry the information of one.
+        variance = float((residual**2).mean()) * 2 * np.sqrt(np.pi) * SIGMA_SAMPLES
+        sigma = float(np.sqrt(variance / information))
+    return delay_s, sigma

@@ -1,0 +1,109 @@
+"""What one module makes of the motions of all joints, its own included: the local estimate.
+
+`job` copies the samples that an estimate needs and returns the work as a function, so that it can run beside
+the firmware's tick.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from module_agent.estimate.circle_point_analysis import (
+    circle_estimate,
+    circle_point_analysis,
+    rest_reading,
+)
+from module_agent.estimate.clock_delay import clock_delay
+from module_agent.estimate.motion_detection import detect_motion
+from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, imu_window, joint_window
+from module_agent.firmware.history import History
+from module_agent.neighbours import JointMotion
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.messages import CircleEstimate, MotionRecord, Vector3
+
+# Own samples to either side of a motion: more than the rough clock mapping may be wrong by.
+MARGIN_NS = 150_000_000
+
+
+class Finding(NamedTuple):
+    """What a module makes of a joint: whether it moves with it, and the circle that it describes then."""
+
+    joint: str
+    motion_ids: tuple[int, ...]
+    moved: bool
+    rate_ratio: float
+    gravity_m_s2: Vector3
+    circle: CircleEstimate | None
+    note: str
+
+
+class _Aligned(NamedTuple):
+    boot: int
+    motion_id: int
+    motion: AlignedMotion
+
+
+class Observer:
+    """Keeps, per joint, the constant motion until the windowed sine comes, and the findings."""
+
+    def __init__(self, serial: str, boot: int):
+        self.serial = serial
+        self.boot = boot
+        self.findings: dict[str, Finding] = {}
+        self._constant: dict[str, _Aligned] = {}
+        self._rest: tuple[int, Rows] | None = None
+
+    def job(self, motion: JointMotion, history: History, rest: MotionRecord | None) -> Callable[[], Finding]:
+        """Copy what is needed of the own history; return the estimate as work to be done."""
+        own = _own_rows(history, motion, motion.rough_offset_ns.get(self.serial, 0))
+        still = self._rest_rows(history, rest)
+        return lambda: self._analyse(motion, imu_window(own), imu_window(still))
+
+    def _rest_rows(self, history: History, rest: MotionRecord | None) -> Rows:
+        """Return the rows of the last rest, kept longer than the history keeps them; none before any rest."""
+        if rest is None or rest.end_row is None:
+            return history.rows(history.next_row, history.next_row)
+        if self._rest is None or self._rest[0] != rest.motion_id:
+            end = max(rest.end_row, history.first_row)
+            self._rest = (rest.motion_id, history.rows(max(rest.start_row, history.first_row), end))
+        return self._rest[1]
+
+    def _analyse(self, motion: JointMotion, own: ImuWindow, rest: ImuWindow) -> Finding:
+        numbers: tuple[int, ...] = (motion.record.motion_id,)
+        gravity: Vector3 = (0.0, 0.0, 0.0)
+        moved, ratio, circle = False, 0.0, None
+        try:
+            still = rest_reading(rest)
+            x, y, z = (float(value) for value in still.specific_force_m_s2)
+            gravity = (x, y, z)
+            joint = joint_window(motion.rows)
+            rough = motion.rough_offset_ns.get(self.serial, 0)
+            delay = clock_delay(own, joint, rough)
+            aligned = align(own, joint, delay.offset_ns)
+            seen = detect_motion([aligned], still.gyro_offset_rad_s)
+            moved, ratio = seen.moved, seen.rate_ratio
+            if motion.record.pattern.kind == "constant":
+                self._constant[motion.serial] = _Aligned(motion.boot, motion.record.motion_id, aligned)
+            elif moved:
+                constant = self._constant_of(motion)
+                numbers = (constant.motion_id, *numbers)
+                fit = circle_point_analysis(rest, constant.motion, aligned)
+                circle = circle_estimate(fit, delay.delay_s)
+            note = ""
+        except ValueError as error:
+            # Said to whoever listens: an estimate that cannot be had is a finding too.
+            note = str(error)
+        return Finding(motion.serial, numbers, moved, ratio, gravity, circle, note[:512])
+
+    def _constant_of(self, motion: JointMotion) -> _Aligned:
+        constant = self._constant.get(motion.serial)
+        if constant is None or constant.boot != motion.boot:
+            raise ValueError(f"no constant motion of {motion.serial} was seen: its axis is not known")
+        return constant
+
+
+def _own_rows(history: History, motion: JointMotion, offset_ns: int) -> Rows:
+    """Return the own rows within the motion's time and a margin."""
+    start = int(motion.rows["t_ns"][0]) + offset_ns - MARGIN_NS
+    end = int(motion.rows["t_ns"][-1]) + offset_ns + MARGIN_NS
+    rows = history.rows(history.first_row, history.next_row)
+    return rows[(rows["t_ns"] >= start) & (rows["t_ns"] <= end)]

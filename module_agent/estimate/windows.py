@@ -1,0 +1,84 @@
+"""Windows of samples that the local estimate works on, and how they are brought onto one time axis."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from module_agent.wire.feedback_rows import Rows
+
+Array = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+
+class ImuWindow(NamedTuple):
+    """Samples of one IMU: `t_ns` (n,) in its module's clock, rates and specific forces (n, 3) in frame u."""
+
+    t_ns: Times
+    gyro_rad_s: Array
+    accel_m_s2: Array
+
+
+class JointWindow(NamedTuple):
+    """Samples of one joint, (n,) each; `t_ns` in the clock of the module that moves."""
+
+    t_ns: Times
+    position_rad: Array
+    velocity_rad_s: Array
+
+
+class AlignedMotion(NamedTuple):
+    """One motion at the times of the IMU samples, `t_s` (n,) from the first on; joint values interpolated."""
+
+    t_s: Array
+    gyro_rad_s: Array
+    accel_m_s2: Array
+    position_rad: Array
+    velocity_rad_s: Array
+
+
+def imu_window(rows: Rows) -> ImuWindow:
+    """Take the IMU's samples out of feedback rows (`feedback_rows.ROW`).
+
+    Rows may come faster than the IMU samples, or twice after a gap was filled: every IMU time counts once.
+    """
+    t_ns, first = np.unique(rows["imu_t_ns"].astype(np.int64), return_index=True)
+    return ImuWindow(
+        t_ns, rows["gyro_rad_s"][first].astype(np.float64), rows["accel_m_s2"][first].astype(np.float64)
+    )
+
+
+def joint_window(rows: Rows) -> JointWindow:
+    """Take the joint's samples out of feedback rows (`feedback_rows.ROW`); every row time counts once."""
+    t_ns, first = np.unique(rows["t_ns"].astype(np.int64), return_index=True)
+    return JointWindow(
+        t_ns, rows["position_rad"][first].astype(np.float64), rows["velocity_rad_s"][first].astype(np.float64)
+    )
+
+
+def align(imu: ImuWindow, joint: JointWindow, offset_ns: int) -> AlignedMotion:
+    """Interpolate the joint to the times of the IMU samples: t of the joint is t + offset_ns of the IMU.
+
+    IMU samples outside the joint's window are left out: nothing is extrapolated.
+
+    Raises:
+        ValueError: the windows do not overlap, or hold too few samples to interpolate.
+    """
+    if joint.t_ns.size < 4:
+        raise ValueError(f"{joint.t_ns.size} joint samples: at least 4 are needed to interpolate")
+    t_joint = imu.t_ns - offset_ns
+    inside = (t_joint >= joint.t_ns[0]) & (t_joint <= joint.t_ns[-1])
+    if not inside.any():
+        apart_s = 1e-9 * float(t_joint[0] - joint.t_ns[0]) if t_joint.size else float("nan")
+        raise ValueError(
+            f"no IMU sample falls into the joint's window; they begin {apart_s:.3f} s apart. Check the offset"
+        )
+    # Seconds from a common origin: nanoseconds of a long uptime do not fit a float64 mantissa.
+    origin = int(joint.t_ns[0])
+    knots = 1e-9 * (joint.t_ns - origin)
+    at = 1e-9 * (t_joint[inside] - origin)
+    values = CubicSpline(knots, np.stack([joint.position_rad, joint.velocity_rad_s], axis=1))(at)
+    return AlignedMotion(
+        at - at[0], imu.gyro_rad_s[inside], imu.accel_m_s2[inside], values[:, 0].copy(), values[:, 1].copy()
+    )

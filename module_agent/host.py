@@ -1,0 +1,313 @@
+"""One agent process: the modules that it hosts, between their hardware and the transport.
+
+`cycle` runs one tick of all of them. The same host runs in real time on the physics bus and Zenoh, and in virtual
+time inside the simulator; only hardware, transport and worker differ.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeVar
+
+from module_agent.estimate.observer import Finding, Observer
+from module_agent.firmware.config import FirmwareConfig
+from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
+from module_agent.hardware import Hardware, SensorSample
+from module_agent.inbox import Inbox
+from module_agent.neighbours import AskHistory, JointMotion, Listen, Neighbours
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.keys import Leaf, every, key, parse
+from module_agent.wire.messages import (
+    Ack,
+    Estimate,
+    EstimateRequest,
+    Feedback,
+    HistoryRequest,
+    Status,
+)
+from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.transport import Event, Liveness, Reply, Request, Sample, Transport, Undeclare
+
+SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.STOP, Leaf.GAINS, Leaf.ESTIMATE)
+HEARD = (Leaf.SETPOINT, Leaf.STOP)
+HISTORY_TIMEOUT_S = 0.4
+
+Job = Callable[[], Finding]
+M = TypeVar("M", Status, Feedback)
+
+
+class Worker(Protocol):
+    """Runs estimates: a thread in real time, at once in virtual time."""
+
+    def submit(self, job: Job, done: Callable[[Finding], None]) -> None:
+        """Run a job and hand its result to `done`, from any thread."""
+        ...
+
+    def check(self) -> None:
+        """Raise what a job raised."""
+        ...
+
+
+class InlineWorker:
+    """Runs a job at once, for virtual time."""
+
+    def submit(self, job: Job, done: Callable[[Finding], None]) -> None:
+        """Run the job now."""
+        done(job())
+
+    def check(self) -> None:
+        """Nothing is left to raise: a job raises where it runs."""
+
+
+class HostedModule:
+    """One module of this process: its firmware, its observer, and what waits for them."""
+
+    def __init__(self, robot: str, config: FirmwareConfig):
+        self.robot = robot
+        self.serial = config.serial
+        self.firmware = Firmware(config)
+        self.observer = Observer(config.serial, config.boot)
+        self.inbox = Inbox()
+        self.now_ns = 0
+        self.requests: dict[int, Request] = {}
+        self._request_id = 0
+        self._estimate_seq = 0
+        self._keys = {leaf: key(robot, config.serial, leaf) for leaf in Leaf}
+        self._leaves = {text: leaf for leaf, text in self._keys.items()}
+
+    def key(self, leaf: Leaf) -> str:
+        """Return the key of one of this module's leaves."""
+        return self._keys[leaf]
+
+    def step(self, sample: SensorSample) -> tuple[float, list[Outgoing]]:
+        """Run one tick on what has arrived."""
+        self.now_ns = sample.t_ns
+        firmware = self.firmware
+        firmware.dropped_events = self.inbox.dropped
+        events = self.inbox.drain() if len(self.inbox) else ()
+        incoming: list[Incoming] = []
+        answers: list[Outgoing] = []
+        for event in events:
+            self._sort(event, incoming, answers)
+        pwm, out = firmware.step(sample.t_ns, sample, incoming)
+        return pwm, answers + out if answers else out
+
+    def _sort(self, event: Event, incoming: list[Incoming], answers: list[Outgoing]) -> None:
+        if not isinstance(event, Request | Sample):
+            return
+        leaf = self._leaves[event.key]
+        number: int | None = None
+        if isinstance(event, Request):
+            self._request_id += 1
+            number = self._request_id
+            self.requests[number] = event
+        if leaf is Leaf.ESTIMATE and number is not None:
+            answers.append(Answer(number, self._answer_estimate(event.payload)))
+        else:
+            incoming.append(Incoming(leaf, event.payload, number))
+
+    def _answer_estimate(self, payload: bytes) -> bytes:
+        admission = self.firmware.admission
+        try:
+            request = admission.read(EstimateRequest, payload, any_boot=True)
+            finding = self.observer.findings.get(request.joint)
+            if finding is None:
+                raise WireError(Refusal.GONE, f"{self.serial} has no estimate of joint {request.joint}")
+            return encode(self.estimate(finding))
+        except WireError as error:
+            admission.count(error.reason)
+            return encode(self._refusal(error))
+
+    def _refusal(self, error: WireError) -> Ack:
+        lease = self.firmware.lease
+        self._estimate_seq += 1
+        return Ack(
+            serial=self.serial,
+            boot=self.firmware.config.boot,
+            seq=self._estimate_seq,
+            re=0,
+            accepted=False,
+            reason=error.reason.value,
+            detail=error.detail[:512],
+            t_ns=self.now_ns,
+            holder=lease.holder,
+            lease_left_ns=lease.left_ns(self.now_ns),
+            token=lease.token,
+        )
+
+    def estimate(self, finding: Finding) -> Estimate:
+        """Return the message that publishes a finding."""
+        self._estimate_seq += 1
+        return Estimate(
+            serial=self.serial,
+            boot=self.firmware.config.boot,
+            seq=self._estimate_seq,
+            joint=finding.joint,
+            motion_ids=finding.motion_ids,
+            moved=finding.moved,
+            rate_ratio=finding.rate_ratio,
+            gravity_m_s2=finding.gravity_m_s2,
+            circle=finding.circle,
+            note=finding.note,
+        )
+
+
+class AgentHost:
+    """All modules of one agent process. Declares everything on construction; `close` ends it."""
+
+    def __init__(
+        self,
+        robot: str,
+        hardware: Hardware,
+        transport: Transport,
+        configs: Sequence[FirmwareConfig],
+        worker: Worker,
+    ):
+        self.modules = [HostedModule(robot, config) for config in configs]
+        self._robot = robot
+        self._hardware = hardware
+        self._transport = transport
+        self._worker = worker
+        self._pwm = [0.0] * len(self.modules)
+        self._neighbours = Neighbours()
+        self._heard = Inbox(capacity=4096)
+        self._found: list[tuple[HostedModule, Finding]] = []
+        self._listening: dict[str, Undeclare] = {}
+        self._declared: list[Undeclare] = []
+        self._tag = 0
+        self._seq = 0
+        self._boots = {m.serial: m.firmware.config.boot for m in self.modules}
+        self._declare()
+
+    def _declare(self) -> None:
+        transport = self._transport
+        for module in self.modules:
+            for leaf in SERVED:
+                self._declared.append(transport.serve(module.key(leaf), module.inbox.put))
+            for leaf in HEARD:
+                self._declared.append(transport.subscribe(module.key(leaf), module.inbox.put))
+        self._declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._heard.put))
+        # Last, so that whoever sees the token finds everything else in place.
+        for module in self.modules:
+            self._declared.append(transport.declare_alive(module.key(Leaf.ALIVE)))
+
+    def cycle(self) -> None:
+        """Run one tick of all modules: exchange with the hardware, step, send.
+
+        Raises:
+            HardwareLost: no further tick will come.
+        """
+        samples = self._hardware.exchange(self._pwm)
+        if len(self._heard):
+            self._hear()
+        for index, (module, sample) in enumerate(zip(self.modules, samples, strict=True)):
+            self._pwm[index], out = module.step(sample)
+            for outgoing in out:
+                self._send(module, outgoing)
+        self._estimate()
+
+    def _send(self, module: HostedModule, outgoing: Outgoing) -> None:
+        if isinstance(outgoing, Answer):
+            module.requests.pop(outgoing.request).reply(outgoing.payload)
+        else:
+            self._transport.publish(module.key(outgoing.leaf), outgoing.payload)
+
+    # ------------------------------------------------------------------ the other modules
+
+    def _clocks(self) -> dict[str, int]:
+        return {module.serial: module.now_ns for module in self.modules}
+
+    def _hear(self) -> None:
+        clocks = self._clocks()
+        now_ns = self.modules[0].now_ns
+        for event in self._heard.drain(limit=512):
+            try:
+                self._hear_one(event, now_ns, clocks)
+            except WireError as error:
+                for module in self.modules:
+                    module.firmware.admission.count(error.reason)
+
+    def _hear_one(self, event: Event, now_ns: int, clocks: dict[str, int]) -> None:
+        if isinstance(event, Liveness | Request):
+            return
+        if isinstance(event, Reply):
+            if event.payload is not None:
+                self._hear_history(event.payload, clocks)
+            return
+        parts = parse(event.key)
+        if parts.leaf is Leaf.STATUS:
+            status = _of(parts.serial, decode(Status, event.payload))
+            self._neighbours.on_status(status, now_ns, clocks)
+        else:
+            feedback = _of(parts.serial, decode(Feedback, event.payload, MAX_MESSAGE_BYTES))
+            self._neighbours.on_feedback(feedback, clocks)
+
+    def _hear_history(self, payload: bytes, clocks: dict[str, int]) -> None:
+        try:
+            feedback = decode(Feedback, payload, MAX_MESSAGE_BYTES)
+        except WireError:
+            decode(Ack, payload)  # a refusal (rows gone) is an answer too; anything else is malformed
+            return
+        self._neighbours.on_feedback(feedback, clocks, live=False)
+
+    def _estimate(self) -> None:
+        now_ns = self.modules[0].now_ns
+        wishes, motions = self._neighbours.poll(now_ns)
+        for wish in wishes:
+            if isinstance(wish, Listen):
+                self._listen(wish)
+            else:
+                self._ask_history(wish)
+        for motion in motions:
+            for module in self.modules:
+                self._submit(module, motion)
+        self._worker.check()
+        while self._found:
+            module, finding = self._found.pop(0)
+            module.observer.findings[finding.joint] = finding
+            self._transport.publish(module.key(Leaf.ESTIMATE), encode(module.estimate(finding)))
+
+    def _submit(self, module: HostedModule, motion: JointMotion) -> None:
+        job = module.observer.job(motion, module.firmware.history, module.firmware.last_rest)
+        self._worker.submit(job, lambda finding: self._found.append((module, finding)))
+
+    def _listen(self, wish: Listen) -> None:
+        held = self._listening.pop(wish.serial, None)
+        if held is not None:
+            held.undeclare()
+        if wish.on:
+            self._listening[wish.serial] = self._transport.subscribe(
+                key(self._robot, wish.serial, Leaf.FEEDBACK), self._heard.put
+            )
+
+    def _ask_history(self, wish: AskHistory) -> None:
+        self._tag += 1
+        self._seq += 1
+        question = HistoryRequest(
+            serial=wish.serial,
+            boot=wish.boot,
+            seq=self._seq,
+            sender=self.modules[0].serial,
+            first_row=wish.first_row,
+            end_row=wish.end_row,
+        )
+        self._transport.query(
+            key(self._robot, wish.serial, Leaf.HISTORY),
+            encode(question),
+            HISTORY_TIMEOUT_S,
+            self._heard.put,
+            self._tag,
+        )
+
+    def close(self) -> None:
+        """Leave the network and let go of the hardware, whose motors then get zero PWM."""
+        for declared in [*self._listening.values(), *reversed(self._declared)]:
+            declared.undeclare()
+        self._listening.clear()
+        self._declared.clear()
+        self._transport.close()
+        self._hardware.close()
+
+
+def _of(serial: str, message: M) -> M:
+    if message.serial != serial:
+        raise WireError(Refusal.WRONG_SERIAL, f"{message.serial} speaks on the key of {serial}")
+    return message

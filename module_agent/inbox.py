@@ -1,0 +1,31 @@
+"""A bounded queue between a transport's threads and the cyclic executive."""
+
+from collections import deque
+
+from module_agent.wire.transport import Event
+
+
+class Inbox:
+    """Events in order of arrival. When full, what arrives is dropped and counted: old commands go first."""
+
+    def __init__(self, capacity: int = 256):
+        self._events: deque[Event] = deque()
+        self._capacity = capacity
+        self.dropped = 0
+
+    def put(self, event: Event) -> None:
+        """Enqueue from any thread; never blocks."""
+        if len(self._events) >= self._capacity:
+            self.dropped += 1
+        else:
+            self._events.append(event)
+
+    def drain(self, limit: int = 64) -> list[Event]:
+        """Take up to `limit` events, oldest first."""
+        events: list[Event] = []
+        while self._events and len(events) < limit:
+            events.append(self._events.popleft())
+        return events
+
+    def __len__(self) -> int:
+        return len(self._events)
