@@ -155,7 +155,7 @@ def circle_point_analysis(
         tangent, distance = -tangent, -distance
     residual = dynamic @ tangent - alpha * distance
     blocks = (
-        _variance_of_mean(residual) * residual.size / power,
+        float(residual @ residual) / residual.size / power * _widening(residual, alpha),
         _gravity_variance(alpha, turns, tangent, at_rest, int(np.count_nonzero(quiet))),
         _tilt_variance(alpha, sine.position_rad, at_rest, found.sigma_rad),
     )
@@ -232,22 +232,34 @@ def _tilt_variance(alpha: Array, position: Array, rest: RestReading, sigma_axis_
     return (gain * float(np.linalg.norm(rest.specific_force_m_s2)) * sigma_axis_rad) ** 2
 
 
-def _variance_of_mean(series: Array) -> float:
-    """Return the variance of the mean of a correlated series: s^2 / n times 1 + 2 sum rho.
+def _widening(residual: Array, regressor: Array) -> float:
+    """Return by how much correlated residuals widen the variance of a regression coefficient: 1 + 2 sum rho
+    kappa.
 
-    The sum of the autocorrelations ends at its first pair that is not positive (Geyer 1992, initial positive
-    sequence), and never makes the variance smaller than for white noise.
+    rho and kappa are the autocorrelations of residual and regressor: what counts is the residual's power
+    where the regressor has its own. The sum ends where rho first has a pair that is not positive (Geyer 1992,
+    initial positive sequence), and never narrows the variance below that of white noise.
     """
-    x = series - series.mean()
-    power = float(x @ x)
+    rho, kappa = _autocorrelation(residual), _autocorrelation(regressor)
+    even = 2 * ((rho.size - 1) // 2) + 1
+    ends = np.flatnonzero(rho[1:even].reshape(-1, 2).sum(axis=1) <= 0.0)
+    last = 1 + 2 * int(ends[0]) if ends.size else even
+    return max(1.0, 1.0 + 2.0 * float(rho[1:last] @ kappa[1:last]))
+
+
+def _autocorrelation(series: Array) -> Array:
+    """Return the biased autocorrelation at lags 0 to n - 1; all zero for a series that is zero."""
+    power = float(series @ series)
     if power <= 0.0:
-        return 0.0
-    spectrum = np.fft.rfft(x, 2 * x.size)
-    rho = np.fft.irfft(np.abs(spectrum) ** 2)[: x.size] / power
-    pairs = rho[1 : 2 * ((x.size - 1) // 2) + 1].reshape(-1, 2).sum(axis=1)
-    ends = np.flatnonzero(pairs <= 0.0)
-    correlated = float(pairs[: ends[0] if ends.size else pairs.size].sum())
-    return float(power / x.size**2 * (1.0 + 2.0 * correlated))
+        return np.zeros_like(series)
+    spectrum = np.fft.rfft(series, 2 * series.size)
+    return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2)[: series.size] / power)
+
+
+def _variance_of_mean(series: Array) -> float:
+    """Return the variance of the mean of a correlated series."""
+    x = series - series.mean()
+    return float(x @ x / x.size**2) * _widening(x, np.ones_like(x))
 
 
 def _enough(samples: int, what: str) -> None:

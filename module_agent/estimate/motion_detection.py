@@ -51,7 +51,7 @@ def detect_motion(motions: Sequence[AlignedMotion], gyro_offset_rad_s: ArrayLike
     power = float(rate @ rate)
     if power <= 1e-6 * rate.size:
         raise ValueError(
-            f"the joint hardly turned, {np.sqrt(power / max(rate.size, 1)):.2g} rad/s rms; above 1e-3 is needed"
+            f"the joint turned at only {np.sqrt(power / max(rate.size, 1)):.2g} rad/s rms; 1e-3 is needed"
         )
     coefficient = rate @ gyro / power
     scatter = float(((gyro - np.outer(rate, coefficient)) ** 2).mean())
