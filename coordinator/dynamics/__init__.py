@@ -1,0 +1,1 @@
+"""Dynamics of the robot: regressor, identification of inertial parameters, prediction of torques."""
