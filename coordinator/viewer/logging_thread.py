@@ -1,0 +1,87 @@
+"""One thread that does the logging, behind a bounded queue, so that control never waits for a viewer."""
+
+import logging
+import queue
+import threading
+from collections.abc import Callable
+
+# Ten seconds of feedback of 16 modules at 50 batches a second.
+QUEUE_LENGTH = 8192
+# Places that data may not take, so that steps, topology and chain still fit behind a flood of rows.
+RESERVED = 512
+IDLE_SECONDS = 0.25
+
+Job = Callable[[], None]
+
+logger = logging.getLogger(__name__)
+
+
+class LoggingThread:
+    """Runs jobs in the order they come; drops and counts them when there are too many."""
+
+    def __init__(self, on_idle: Job, length: int = QUEUE_LENGTH, reserved: int = RESERVED) -> None:
+        """Start the thread; `on_idle` runs in it whenever nothing came for a while."""
+        self._jobs: queue.Queue[Job | None] = queue.Queue(length + reserved)
+        self._length = length
+        self._on_idle = on_idle
+        self._dropped = 0
+        self._failures: dict[str, int] = {}
+        self._closed = False
+        # A run that ends without `close` must still be able to end.
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """How many jobs found the queue full."""
+        return self._dropped
+
+    @property
+    def failed(self) -> int:
+        """How many jobs raised; the first of every kind is in the log."""
+        return sum(self._failures.values())
+
+    def submit(self, job: Job, *, essential: bool = False) -> bool:
+        """Queue a job and return at once; False if it was dropped. Data keeps out of the reserved places.
+
+        Raises:
+            RuntimeError: the thread is closed.
+        """
+        if self._closed:
+            raise RuntimeError("the viewer is closed; nothing can be logged any more")
+        if not essential and self._jobs.qsize() >= self._length:
+            self._dropped += 1
+            return False
+        try:
+            self._jobs.put_nowait(job)
+        except queue.Full:
+            self._dropped += 1
+            return False
+        return True
+
+    def close(self) -> None:
+        """Run what is queued, then end the thread. May be called twice."""
+        if not self._closed:
+            self._closed = True
+            self._jobs.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            try:
+                job = self._jobs.get(timeout=IDLE_SECONDS)
+            except queue.Empty:
+                job = self._on_idle
+            if job is None:
+                return
+            self._attempt(job)
+
+    def _attempt(self, job: Job) -> None:
+        try:
+            job()
+        except Exception as failure:
+            # The next job is worth trying, and a run must not end for want of a picture.
+            kind = f"{type(failure).__name__}: {failure}"
+            self._failures[kind] = self._failures.get(kind, 0) + 1
+            if self._failures[kind] == 1:
+                logger.exception("the viewer could not log something")

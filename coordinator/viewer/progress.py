@@ -1,0 +1,68 @@
+"""What is said as the run goes on: steps, estimates, held-out torque, the network."""
+
+import math
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from coordinator.viewer import layout
+from coordinator.viewer.time_series import IntArray, send_scalars
+
+
+def set_time(stream: rr.RecordingStream, t_ns: int) -> None:
+    """Set the session time of what is logged next; only the logging thread does so."""
+    stream.set_time(layout.TIMELINE, duration=np.timedelta64(t_ns, "ns"))
+
+
+def log_phase(stream: rr.RecordingStream, text: str) -> None:
+    """Log a step of the run: a line of the log, and the heading that says what is going on."""
+    stream.log(layout.PHASE_LOG, rr.TextLog(text, level=rr.TextLogLevel.INFO))
+    stream.log(layout.PHASE_NOW, rr.TextDocument(text))
+
+
+def log_estimate(
+    stream: rr.RecordingStream,
+    name: str,
+    serial: str,
+    value: float,
+    sigma: float,
+    units: str,
+    colour: layout.Colour,
+) -> None:
+    """Log a value with its variance, drawn as a line in a band of one sigma; not finite sigma: no band."""
+    known = math.isfinite(sigma)
+    drawn = rr.Measurements(
+        [value],
+        variances=[sigma**2] if known else None,
+        units=units,
+        names=serial,
+        colors=[colour],
+        widths=[2.0],
+        # An estimate stays what it is until the next one.
+        interpolation_mode="stepafter",
+    )
+    stream.log(layout.estimate_path(name, serial), drawn)
+
+
+def log_network(
+    stream: rr.RecordingStream, serial: str, round_trip_ms: float, age_ms: float, refusals: int
+) -> None:
+    """Log the state of a module's connection."""
+    stream.log(layout.network_path(serial, layout.ROUND_TRIP), rr.Scalars(round_trip_ms))
+    stream.log(layout.network_path(serial, layout.AGE), rr.Scalars(age_ms))
+    stream.log(layout.network_path(serial, layout.REFUSALS), rr.Scalars(float(refusals)))
+
+
+def send_residuals(
+    stream: rr.RecordingStream,
+    serial: str,
+    t_ns: IntArray,
+    measured_nm: NDArray[np.float64],
+    predicted_nm: NDArray[np.float64],
+) -> None:
+    """Log held-out torque (m,) as measured and as predicted, and the difference."""
+    both = np.stack([measured_nm, predicted_nm], axis=1)
+    send_scalars(stream, layout.residual_path(serial, layout.HELD_OUT), t_ns, both)
+    error = (measured_nm - predicted_nm)[:, None]
+    send_scalars(stream, layout.residual_path(serial, layout.ERROR), t_ns, error)

@@ -1,0 +1,131 @@
+"""Logging as it is done in the logging thread: keeps what is known of the run and writes it to the stream."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import rerun as rr
+
+from coordinator.chain import Array, Chain
+from coordinator.viewer import blueprint, layout, progress, robot_geometry, robot_scene, time_series
+from coordinator.viewer import topology_graph as graphs
+from coordinator.viewer.time_series import Batch, IntArray
+
+
+class Recorder:
+    """Everything that one run has logged so far; used by one thread only."""
+
+    def __init__(self, stream: rr.RecordingStream, robot: str) -> None:
+        self._stream = stream
+        self._palette = layout.Palette()
+        self._types: dict[str, str] = {}
+        self._contents = blueprint.Contents(robot)
+        self._shown: blueprint.Contents | None = None
+        self._batcher = time_series.RowBatcher()
+        self._states = time_series.StateChanges()
+        self._scenes: dict[str, robot_scene.Scene] = {}
+
+    def modules(self, serials: Sequence[str], types: Mapping[str, str]) -> None:
+        """Make modules known: their types, names, colours and places in the layout."""
+        self._types.update(types)
+        self._know(serials)
+
+    def rows(self, batch: Batch) -> None:
+        """Gather rows, and log the batches that are complete."""
+        self._know([batch.serial])
+        for complete in self._batcher.add(batch):
+            self._send(complete)
+
+    def drain(self) -> None:
+        """Log the rows gathered so far."""
+        for batch in self._batcher.drain():
+            self._send(batch)
+
+    def phase(self, t_ns: int, text: str) -> None:
+        """Log a step of the run."""
+        progress.set_time(self._stream, t_ns)
+        progress.log_phase(self._stream, text)
+
+    def network(self, serial: str, t_ns: int, round_trip_ms: float, age_ms: float, refusals: int) -> None:
+        """Log a module's connection."""
+        self._know([serial])
+        progress.set_time(self._stream, t_ns)
+        progress.log_network(self._stream, serial, round_trip_ms, age_ms, refusals)
+
+    def topology(self, t_ns: int, topology: graphs.Topology) -> None:
+        """Log the tree of modules."""
+        self._know(topology.serials)
+        progress.set_time(self._stream, t_ns)
+        for drawn in graphs.graph(topology, self._types, self._colours(topology.serials)):
+            self._stream.log(layout.TOPOLOGY, drawn)
+        self._contents = self._contents._replace(topology=topology)
+        self._show()
+
+    def estimate(self, name: str, serial: str, t_ns: int, value: float, sigma: float, units: str) -> None:
+        """Log an estimated parameter of a module, or of whatever else `serial` names."""
+        self._contents = blueprint.with_estimate(self._contents, name, serial, units)
+        self._show()
+        progress.set_time(self._stream, t_ns)
+        colour = self._palette.colour(serial)
+        progress.log_estimate(self._stream, name, serial, value, sigma, units, colour)
+
+    def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.Look) -> None:
+        """Draw the robot from now on; it has its posture at q = 0 until the next pose."""
+        self._know(chain.serials)
+        scene = robot_scene.build_scene(chain, self._types, self._colours(chain.serials), sigma_m, look)
+        progress.set_time(self._stream, t_ns)
+        before = self._scenes.get(look.world)
+        if before is not None:
+            robot_scene.clear_bodies(self._stream, before, chain)
+        robot_scene.log_scene(self._stream, scene)
+        self._scenes[look.world] = scene
+        self._frame(chain)
+
+    def pose(self, t_ns: int, q_rad: Array) -> None:
+        """Turn the robots that are drawn; `q_rad` (n,) is in the order of the identified chain."""
+        progress.set_time(self._stream, t_ns)
+        first = self._scenes.get(layout.ESTIMATED_WORLD, self._scenes.get(layout.TRUE_WORLD))
+        if first is None:
+            return  # before there is a robot there is nothing to turn
+        if q_rad.shape != (len(first.chain.serials),):
+            raise ValueError(
+                f"a pose of shape {q_rad.shape} for a robot of {len(first.chain.serials)} joints"
+            )
+        by_serial = dict(zip(first.chain.serials, q_rad, strict=True))
+        for scene in self._scenes.values():
+            own = np.array([by_serial.get(serial, 0.0) for serial in scene.chain.serials])
+            robot_scene.log_pose(self._stream, scene, own)
+
+    def residuals(self, serial: str, t_ns: IntArray, measured_nm: Array, predicted_nm: Array) -> None:
+        """Log held-out torque."""
+        self._know([serial])
+        progress.send_residuals(self._stream, serial, t_ns, measured_nm, predicted_nm)
+
+    def _send(self, batch: Batch) -> None:
+        time_series.send_rows(self._stream, batch)
+        time_series.send_states(self._stream, batch.serial, *self._states.of(batch))
+
+    def _know(self, serials: Sequence[str]) -> None:
+        new = [serial for serial in dict.fromkeys(serials) if serial not in self._contents.serials]
+        if not new:
+            return
+        for serial in new:
+            time_series.log_module_styles(self._stream, serial, serial, self._palette.colour(serial))
+        self._contents = self._contents._replace(serials=(*self._contents.serials, *new))
+        self._show()
+
+    def _frame(self, chain: Chain) -> None:
+        placed = robot_geometry.modules(chain, self._types)
+        reach = robot_geometry.reach_m(chain, placed)
+        self._stream.log(layout.GRAVITY, robot_scene.gravity_arrow(chain, reach))
+        # The eye is set once, so that a refined chain does not take it out of the hands of whoever looks.
+        if self._contents.reach_m is None:
+            self._contents = self._contents._replace(reach_m=reach)
+            self._show()
+
+    def _colours(self, serials: Sequence[str]) -> dict[str, layout.Colour]:
+        return {serial: self._palette.colour(serial) for serial in serials}
+
+    def _show(self) -> None:
+        if self._contents != self._shown:
+            self._shown = self._contents
+            self._stream.send_blueprint(blueprint.build(self._contents))

@@ -1,0 +1,150 @@
+"""Pictures of a recording without a screen: a headless viewer, waited for until it has stopped changing.
+
+Needs Vulkan in software, on Debian the packages `mesa-vulkan-drivers` and `libvulkan1`.
+"""
+
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rerun.experimental import ViewerClient
+
+from coordinator.viewer import layout, viewer_process
+from coordinator.viewer.blueprint import TABS
+from coordinator.viewer.targets import proxy_url
+
+SETTLE_SECONDS = 40.0
+SAME_PICTURES = 3
+_POLL_SECONDS = 0.4
+
+
+class ScreenshotFailed(RuntimeError):
+    """No picture could be taken; the message says what to do."""
+
+
+def screenshot(
+    rrd: Path,
+    out: Path,
+    tab: str | None = None,
+    t_s: float | None = None,
+    size: tuple[int, int] = (1600, 900),
+) -> None:
+    """Write one picture of a recording as a PNG.
+
+    Args:
+        rrd: the recording.
+        out: the PNG.
+        tab: one of `blueprint.TABS`; the one that the recording opens with if left out.
+        t_s: session time to show [s]; the recording's last if left out.
+        size: width and height [pixels].
+
+    Raises:
+        FileNotFoundError: there is no such recording.
+        ScreenshotFailed: no software Vulkan, not a recording of a run, or the viewer did not settle.
+        ValueError: there is no such tab.
+    """
+    screenshots(rrd, [(tab, out)], t_s, size)
+
+
+def screenshots(
+    rrd: Path,
+    pictures: Sequence[tuple[str | None, Path]],
+    t_s: float | None = None,
+    size: tuple[int, int] = (1600, 900),
+) -> None:
+    """Write several pictures, as (tab, PNG), with one start of the viewer. See `screenshot`."""
+    for tab, _ in pictures:
+        if tab is not None and tab not in TABS:
+            raise ValueError(f"no tab {tab!r}; there are {', '.join(TABS)}")
+    if not rrd.is_file():
+        raise FileNotFoundError(f"no recording at {rrd}")
+    port = viewer_process.free_port()
+    process = _start(port, size)
+    try:
+        client = ViewerClient.connect(proxy_url(port))
+        _open(client, rrd, t_s)
+        for tab, out in pictures:
+            if tab is not None:
+                _turn_to(client, tab)
+            _settle(client)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            out.write_bytes(client.take_screenshot())
+    finally:
+        viewer_process.stop(process)
+
+
+def _start(port: int, size: tuple[int, int]) -> subprocess.Popen[bytes]:
+    options = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
+    try:
+        return viewer_process.start(options, port, detached=False)
+    except viewer_process.ViewerNotStarted as failure:
+        raise ScreenshotFailed(_advice(str(failure))) from failure
+
+
+def _advice(said: str) -> str:
+    return (
+        "the headless viewer does not run here; it needs Vulkan in software: "
+        f"`apt-get install mesa-vulkan-drivers libvulkan1`. It said:\n{said}"
+    )
+
+
+def _open(client: ViewerClient, rrd: Path, t_s: float | None) -> None:
+    client.open(str(rrd.resolve()))
+    deadline = time.monotonic() + SETTLE_SECONDS
+    while True:
+        state = client.get_state()
+        ends = [
+            line.end
+            for recording in state.recordings
+            for line in recording.timelines
+            if line.name == layout.TIMELINE and line.end is not None
+        ]
+        if ends and not state.loading:
+            break
+        if time.monotonic() > deadline:
+            raise ScreenshotFailed(f"{rrd} has no timeline {layout.TIMELINE!r}: it is no recording of a run")
+        time.sleep(_POLL_SECONDS)
+    t_ns = ends[0] if t_s is None else round(1e9 * t_s)
+    client.set_time(layout.TIMELINE, duration=np.timedelta64(t_ns, "ns"), play_state="paused")
+
+
+def _turn_to(client: ViewerClient, tab: str) -> None:
+    blueprint = client.get_blueprint("recording").blueprint
+    client.set_blueprint(with_active_tab(blueprint, tab), "recording")
+
+
+def with_active_tab(blueprint: Mapping[str, Any], tab: str) -> dict[str, Any]:
+    """Return a blueprint, as the viewer hands it out, in which the tab of that name is in front.
+
+    Raises:
+        ScreenshotFailed: no tabs of it contain one of that name.
+    """
+    containers = {
+        path: entry["ContainerBlueprint"]
+        for path, entry in blueprint.items()
+        if "ContainerBlueprint" in entry
+    }
+    named = [path.lstrip("/") for path, entry in containers.items() if entry.get("display_name") == tab]
+    for path, entry in containers.items():
+        if entry.get("container_kind") == "Tabs" and named and named[0] in entry.get("contents", ()):
+            turned = {"ContainerBlueprint": {**entry, "active_tab": named[0]}}
+            return {**blueprint, path: {**blueprint[path], **turned}}
+    raise ScreenshotFailed(f"the recording has no tab {tab!r}, so it is none of a run")
+
+
+def _settle(client: ViewerClient) -> None:
+    """Wait until pictures in a row are the same: the viewer says that it is ready before it has drawn."""
+    deadline = time.monotonic() + SETTLE_SECONDS
+    last, same = b"", 0
+    while same < SAME_PICTURES:
+        if time.monotonic() > deadline:
+            raise ScreenshotFailed(f"the viewer kept changing for {SETTLE_SECONDS:.0f} s")
+        state = client.get_state()
+        picture = client.take_screenshot(max_size=960)
+        still = picture == last and not state.loading
+        same = same + 1 if still else 0
+        last = picture
+        time.sleep(_POLL_SECONDS)

@@ -1,0 +1,118 @@
+"""Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page."""
+
+import logging
+import socket
+import subprocess
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from coordinator.viewer import viewer_process
+
+NATIVE_PORT = 9876
+# Attaching a sink with nobody listening blocks for seconds, so every target is tried with this patience.
+PROBE_SECONDS = 0.5
+WEB_MEMORY = "256MB"
+
+logger = logging.getLogger(__name__)
+
+
+class ViewerTargets(NamedTuple):
+    """Where to send a recording; any may be left out.
+
+    rrd: file to write, which is complete whatever happens to the live viewers.
+    spawn: start a native viewer (or use the one that listens already) and leave it open at the end.
+    connect: gRPC address of a running viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
+    serve_port: serve a web page on this port of 127.0.0.1 and its data on the next one, until the run ends.
+    """
+
+    rrd: Path | None = None
+    spawn: bool = False
+    connect: str | None = None
+    serve_port: int | None = None
+
+
+class Opened(NamedTuple):
+    """What came of the targets: whether anything records, and the web server to end with the run."""
+
+    records: bool
+    live: tuple[str, ...]
+    web_server: subprocess.Popen[bytes] | None
+
+
+def open_targets(stream: rr.RecordingStream, targets: ViewerTargets, blueprint: rrb.Blueprint) -> Opened:
+    """Attach the stream to its targets; a live one that cannot be reached is reported and left out.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    sinks: list[rr.FileSink | rr.GrpcSink] = []
+    if targets.rrd is not None:
+        targets.rrd.parent.mkdir(parents=True, exist_ok=True)
+        targets.rrd.open("wb").close()  # says why in the system's words if it cannot be written
+        sinks.append(rr.FileSink(str(targets.rrd)))
+    web_server = _serve(targets.serve_port)
+    live = [url for url in (_native(targets.spawn), targets.connect, _web_url(web_server, targets)) if url]
+    reached = tuple(url for url in dict.fromkeys(live) if _reachable(url))
+    sinks += [rr.GrpcSink(url) for url in reached]
+    if sinks:
+        stream.set_sinks(*sinks, default_blueprint=blueprint)
+    return Opened(bool(sinks), reached, web_server)
+
+
+def proxy_url(port: int) -> str:
+    """Return the address of a viewer on this machine."""
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+def listens(host: str, port: int) -> bool:
+    """Return whether somebody accepts connections there."""
+    try:
+        socket.create_connection((host, port), timeout=PROBE_SECONDS).close()
+    except OSError:
+        return False
+    return True
+
+
+def _reachable(url: str) -> bool:
+    parts = urlsplit(url)
+    if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or parts.hostname is None:
+        logger.warning("%r is no viewer's address; one looks like %r", url, proxy_url(NATIVE_PORT))
+        return False
+    if listens(parts.hostname, parts.port or NATIVE_PORT):
+        return True
+    logger.warning("no viewer listens at %s, so the run is not shown there", url)
+    return False
+
+
+def _native(wanted: bool) -> str | None:
+    if not wanted:
+        return None
+    if not listens("127.0.0.1", NATIVE_PORT):
+        try:
+            viewer_process.start([], NATIVE_PORT, detached=True)
+        except viewer_process.ViewerNotStarted as failure:
+            logger.warning("the native viewer did not start, so the run is not shown: %s", failure)
+            return None
+    return proxy_url(NATIVE_PORT)
+
+
+def _serve(port: int | None) -> subprocess.Popen[bytes] | None:
+    if port is None:
+        return None
+    options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
+    try:
+        return viewer_process.start(options, port + 1, detached=False)
+    except viewer_process.ViewerNotStarted as failure:
+        logger.warning("the web viewer did not start, so the run is not served: %s", failure)
+        return None
+
+
+def _web_url(server: subprocess.Popen[bytes] | None, targets: ViewerTargets) -> str | None:
+    if server is None or targets.serve_port is None:
+        return None
+    logger.info("watch at http://127.0.0.1:%d?url=%s", targets.serve_port, proxy_url(targets.serve_port + 1))
+    return proxy_url(targets.serve_port + 1)

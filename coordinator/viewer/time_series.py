@@ -1,0 +1,184 @@
+"""Feedback rows into columns of time series: batches of about 100 ms, one vector entity per group of sensors.
+
+A call of `send_columns` costs the same for 25 rows as for 250, so rows are gathered before they are logged.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from coordinator.viewer import layout
+from module_agent.wire.feedback_rows import STATE_NAMES, Rows
+
+IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+BATCH_NS = 100_000_000
+# A batch whose module fell silent is logged once another module is this much further.
+STALE_NS = 400_000_000
+
+
+class Batch(NamedTuple):
+    """Rows of one module: `t_ns` (m,) in session time, `rows` (m,) records of `feedback_rows.ROW`."""
+
+    serial: str
+    t_ns: IntArray
+    rows: Rows
+
+
+class Series(NamedTuple):
+    """What a group of sensors is called in plots: its entity's last part, its unit and its components."""
+
+    group: str
+    unit: str
+    components: tuple[str, ...]
+
+
+# The order of the components is that of the columns of `groups`.
+SERIES: tuple[Series, ...] = (
+    Series(layout.POSITION, "rad", ("measured", "command")),
+    Series(layout.VELOCITY, "rad/s", ("measured", "command")),
+    Series(layout.EFFORT, "Nm", ("measured", "command")),
+    Series(layout.GYRO, "rad/s", ("x", "y", "z")),
+    Series(layout.ACCEL, "m/s²", ("x", "y", "z")),
+    Series(layout.MOTOR, "1, A", ("PWM", "current")),
+    Series(layout.SUPPLY, "V, °C", ("bus voltage", "winding temperature")),
+)
+
+
+class RowBatcher:
+    """Gathers the rows of every module until there are about 100 ms of them."""
+
+    def __init__(self) -> None:
+        self._pending: dict[str, list[Batch]] = {}
+
+    def add(self, batch: Batch) -> list[Batch]:
+        """Take rows in; return the batches that are now complete, this module's or those gone stale."""
+        if not batch.t_ns.size:
+            return []
+        self._pending.setdefault(batch.serial, []).append(batch)
+        newest = int(batch.t_ns[-1])
+        complete = [
+            serial
+            for serial, parts in self._pending.items()
+            if newest - int(parts[0].t_ns[0]) >= (BATCH_NS if serial == batch.serial else STALE_NS)
+        ]
+        return [self._take(serial) for serial in complete]
+
+    def drain(self) -> list[Batch]:
+        """Return whatever is left."""
+        return [self._take(serial) for serial in tuple(self._pending)]
+
+    def _take(self, serial: str) -> Batch:
+        parts = self._pending.pop(serial)
+        return Batch(serial, np.concatenate([p.t_ns for p in parts]), np.concatenate([p.rows for p in parts]))
+
+
+def groups(rows: Rows) -> Iterator[tuple[str, FloatArray]]:
+    """Return the vector entities of m rows, as (group, (m, k)) in the order of `SERIES`."""
+    yield layout.POSITION, _columns(rows, "position_rad", "position_command_rad")
+    yield layout.VELOCITY, _columns(rows, "velocity_rad_s", "velocity_command_rad_s")
+    yield layout.EFFORT, _columns(rows, "effort_nm", "effort_command_nm")
+    yield layout.GYRO, rows["gyro_rad_s"].astype(float)
+    yield layout.ACCEL, rows["accel_m_s2"].astype(float)
+    yield layout.MOTOR, _columns(rows, "pwm", "motor_current_a")
+
+
+def send_rows(stream: rr.RecordingStream, batch: Batch) -> None:
+    """Log a batch: every row of the fast groups, the last row of the slow one."""
+    for group, values in groups(batch.rows):
+        send_scalars(stream, layout.module_path(batch.serial, group), batch.t_ns, values)
+    # Voltage and temperature change over seconds: one value per batch.
+    supply = _columns(batch.rows[-1:], "voltage_v", "winding_temperature_c")
+    send_scalars(stream, layout.module_path(batch.serial, layout.SUPPLY), batch.t_ns[-1:], supply)
+
+
+def send_scalars(stream: rr.RecordingStream, path: str, t_ns: IntArray, values: FloatArray) -> None:
+    """Log `values` (m, k) at `t_ns` (m,) as one entity of k series."""
+    stream.send_columns(path, [time_column(t_ns)], rr.Scalars.columns(scalars=values))
+
+
+def time_column(t_ns: IntArray) -> rr.TimeColumn:
+    """Return the session time as integer nanoseconds; as float seconds rows would be misaligned by 1 ns."""
+    return rr.TimeColumn(layout.TIMELINE, duration=np.asarray(t_ns, dtype=np.int64).astype("timedelta64[ns]"))
+
+
+class StateChanges:
+    """The firmware's state per module, logged when it changes."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}
+
+    def of(self, batch: Batch) -> tuple[IntArray, list[str]]:
+        """Return the times and names of the states that differ from the row before, in the batch's order."""
+        states = batch.rows["state"].astype(int)
+        before = np.concatenate([[self._last.get(batch.serial, -1)], states[:-1]])
+        self._last[batch.serial] = int(states[-1])
+        at = np.flatnonzero(states != before)
+        return batch.t_ns[at], [_state_name(int(s)) for s in states[at]]
+
+
+def send_states(stream: rr.RecordingStream, serial: str, t_ns: IntArray, names: Sequence[str]) -> None:
+    """Log changes of a module's state at `t_ns` (m,)."""
+    if names:
+        path = layout.module_path(serial, layout.STATE)
+        stream.send_columns(path, [time_column(t_ns)], rr.StateChange.columns(state=list(names)))
+
+
+def log_module_styles(stream: rr.RecordingStream, serial: str, label: str, colour: layout.Colour) -> None:
+    """Log the names and colours of all series of a module, static."""
+    for series in SERIES:
+        names = [f"{label} {component}" for component in series.components]
+        style = rr.SeriesLines(names=names, colors=_colours(series, colour), widths=_widths(series))
+        stream.log(layout.module_path(serial, series.group), style, static=True)
+    stream.log(layout.module_path(serial, layout.STATE), _state_style(), static=True)
+    _log_residual_styles(stream, serial, label, colour)
+    _log_network_styles(stream, serial, label, colour)
+
+
+def _log_residual_styles(stream: rr.RecordingStream, serial: str, label: str, colour: layout.Colour) -> None:
+    held_out = rr.SeriesLines(
+        names=[f"{label} measured", f"{label} predicted"],
+        colors=[colour, layout.PREDICTION_COLOUR],
+        widths=[2.0, 1.5],
+    )
+    stream.log(layout.residual_path(serial, layout.HELD_OUT), held_out, static=True)
+    error = rr.SeriesLines(names=label, colors=[colour], widths=[1.0])
+    stream.log(layout.residual_path(serial, layout.ERROR), error, static=True)
+
+
+def _log_network_styles(stream: rr.RecordingStream, serial: str, label: str, colour: layout.Colour) -> None:
+    for group in (layout.ROUND_TRIP, layout.AGE, layout.REFUSALS):
+        style = rr.SeriesLines(names=label, colors=[colour], widths=[1.5])
+        stream.log(layout.network_path(serial, group), style, static=True)
+
+
+def _colours(series: Series, colour: layout.Colour) -> list[layout.Colour]:
+    if series.components[-1] == "command":
+        return [colour, layout.COMMAND_COLOUR]
+    return list(layout.axis_shades(colour)[: len(series.components)])
+
+
+def _widths(series: Series) -> list[float]:
+    # Commands are drawn thin over the measurement, so that both can be seen where they agree.
+    return [2.0, 0.8] if series.components[-1] == "command" else [1.0] * len(series.components)
+
+
+def _state_style() -> rr.StateConfiguration:
+    return rr.StateConfiguration(
+        values=list(layout.STATE_COLOURS),
+        labels=list(layout.STATE_COLOURS),
+        colors=list(layout.STATE_COLOURS.values()),
+    )
+
+
+def _state_name(state: int) -> str:
+    # A newer firmware may know more states; show its number rather than lose the rows.
+    return STATE_NAMES[state] if state < len(STATE_NAMES) else f"state {state}"
+
+
+def _columns(rows: Rows, *fields: str) -> FloatArray:
+    return np.stack([rows[field] for field in fields], axis=1).astype(float)

@@ -1,0 +1,94 @@
+"""Start the viewer's own program, which comes with the SDK: with a window, as a web server, or headless."""
+
+import importlib.util
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+START_SECONDS = 15.0
+_POLL_SECONDS = 0.05
+# The end of what it printed is where the reason is.
+_LINES_TOLD = 12
+
+
+class ViewerNotStarted(RuntimeError):
+    """The viewer's program ended, or did not listen in time; the message has what it printed."""
+
+
+def executable() -> Path:
+    """Return the viewer that belongs to the installed SDK, whether or not it is on the PATH.
+
+    Raises:
+        ViewerNotStarted: there is none.
+    """
+    package = importlib.util.find_spec("rerun_cli")
+    if package is not None and package.origin is not None:
+        bundled = Path(package.origin).parent / "rerun"
+        if bundled.is_file():
+            return bundled
+    found = shutil.which("rerun")
+    if found is None:
+        raise ViewerNotStarted("no viewer in the rerun-sdk package nor on the PATH; reinstall rerun-sdk")
+    return Path(found)
+
+
+def start(options: Sequence[str], port: int, *, detached: bool) -> subprocess.Popen[bytes]:
+    """Start the viewer, listening for data on `port` of 127.0.0.1, and wait until it does.
+
+    A detached viewer has its own session, so that neither Ctrl-C nor the end of this process ends it.
+
+    Raises:
+        ViewerNotStarted: it ended or was not ready within `START_SECONDS`.
+    """
+    # By default the viewer listens on all interfaces; a run is nobody else's business unless asked for.
+    command = [str(executable()), "--bind", "127.0.0.1", "--port", str(port), *options]
+    environment = {**os.environ, "RERUN_APP_ONLY": "true", "NO_COLOR": "1"}
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            start_new_session=detached,
+        )
+        if _wait_until_ready(process, port):
+            return process
+        stop(process)
+        output.seek(0)
+        told = output.read().decode(errors="replace").strip().splitlines()
+    raise ViewerNotStarted("\n".join([f"{' '.join(command)} did not get ready:", *told[-_LINES_TOLD:]]))
+
+
+def stop(process: subprocess.Popen[bytes], patience_s: float = 5.0) -> None:
+    """End a viewer that was started here, by force if it does not end by itself."""
+    process.terminate()
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def free_port() -> int:
+    """Return a port of 127.0.0.1 that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _wait_until_ready(process: subprocess.Popen[bytes], port: int) -> bool:
+    deadline = time.monotonic() + START_SECONDS
+    while process.poll() is None and time.monotonic() < deadline:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=_POLL_SECONDS).close()
+        except OSError:
+            time.sleep(_POLL_SECONDS)
+        else:
+            return True
+    return False
