@@ -68,7 +68,7 @@ def test_the_stated_sigmas_are_those_of_the_errors(horizontal_link: Any) -> None
     level = horizontal_link._replace(gravity=9.81 * horizontal_link.axis)
     fits = [analyse(level, seed=s, amplitude=0.1) for s in range(25)]
     distances = np.array([f.distance_m for f in fits])
-    # 25 draws tell a standard deviation to 14 %. The sigma errs on the safe side, by 2.3 here: the residual is
+    # 25 draws tell a standard deviation to 14 %. The sigma is on the safe side, by 2.3 here: the residual is
     # differentiated encoder noise, whose negative correlations the truncated sum does not count.
     assert 0.3 < distances.std(ddof=1) / np.mean([f.sigma_distance_m for f in fits]) < 1.3
     # Two directions across the axis: the rms of the angle is sqrt(2) sigma; 25 draws tell it to 10 %.
