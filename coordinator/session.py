@@ -33,6 +33,10 @@ class Reporter(Protocol):
         """All estimates of the motions of a joint have arrived."""
         ...
 
+    async def explored(self) -> None:
+        """All joints are explored: topology and chain can be assembled. Raises if they cannot."""
+        ...
+
 
 class UnfitLink(RuntimeError):
     """The network cannot carry a session; nothing has moved. The message says what was measured."""
@@ -74,7 +78,7 @@ class Session:
         await self._discover(expect)
         await self._check_link()
         serials = self.link.serials
-        self._total = 5 + len(serials) * (3 if self._plan.dynamics else 1)
+        self._total = 6 + len(serials) * (3 if self._plan.dynamics else 1)
         self._mend_after_restart()
         starts = {s: self._position(s) for s in serials}
         try:
@@ -83,6 +87,8 @@ class Session:
             await self._step("rest", "listening at rest", self._rest)
             for serial in serials:
                 await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
+            self._report("topology and chain")
+            await self._reporter.explored()
             if self._plan.dynamics:
                 for serial in serials:
                     await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)

@@ -1,0 +1,135 @@
+"""`result.json`: what a session found, in a versioned schema; written whole or not at all."""
+
+import os
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from coordinator.chain import Chain
+
+SCHEMA = 1
+
+
+class Part(BaseModel):
+    """A piece of the result."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ChainPart(Part):
+    """The chain as lists; see `chain.Chain` for frames and units."""
+
+    serials: list[str]
+    parent: list[int]
+    reversed: list[bool]
+    axis: list[list[float]]
+    point: list[list[float]]
+    imu_home: list[list[list[float]]]
+    gravity: list[float]
+
+
+class LinkPart(Part):
+    """The thesis' link length: perpendicular distance from the parent's axis to the child's IMU at q = 0."""
+
+    parent: str
+    child: str
+    link_length_mm: float
+    link_length_sigma_mm: float
+
+
+class UnresolvedPart(Part):
+    """What the data does not tell, in words."""
+
+    kind: str
+    joint: str
+    modules: list[str]
+    words: str
+
+
+class PairPart(Part):
+    """The agent's circle point analysis of one joint by one IMU."""
+
+    joint: str
+    observer: str
+    moved: bool
+    rate_ratio: float
+    distance_mm: float | None
+    distance_sigma_mm: float | None
+    axis: list[float] | None
+
+
+class DhPart(Part):
+    """Denavit-Hartenberg parameters of one path from the root to a leaf (thesis eq. 2)."""
+
+    path: list[str]
+    theta_offset_rad: list[float]
+    d_m: list[float]
+    a_m: list[float]
+    alpha_rad: list[float]
+
+
+class HeldOutPart(Part):
+    """How well the model predicts torques of a motion that it was not fitted to: |e| / |tau|, 2-norms."""
+
+    relative_error: float
+    relative_error_per_joint: dict[str, float]
+    mean_baseline: float
+    samples: int
+
+
+class DynamicsPart(Part):
+    """The inertial parameters; see `dynamics.regressor` for their order and frame."""
+
+    phi: list[float]
+    rank: int
+    parameters: int
+    condition: float
+    sigma: list[float]
+    identifiable: list[bool]
+    residual_rms_nm: dict[str, float]
+    held_out: HeldOutPart | None
+
+
+class Result(Part):
+    """Everything that one session found."""
+
+    robot: str
+    serials: list[str]
+    types: dict[str, str]
+    topology_confidence: float
+    chain: ChainPart
+    rank: int
+    condition: float
+    reduced_chi2: float
+    unresolved: list[UnresolvedPart]
+    null_basis: list[list[float]]
+    links: list[LinkPart]
+    pairs: list[PairPart]
+    denavit_hartenberg: list[DhPart]
+    dynamics: DynamicsPart | None
+    notes: list[str]
+    robot_time_s: float
+    wall_time_s: float | None
+    trace_hash: str
+    schema_version: int = Field(default=SCHEMA, alias="schema")
+
+
+def chain_part(chain: Chain) -> ChainPart:
+    """Return a chain as lists."""
+    return ChainPart(
+        serials=list(chain.serials),
+        parent=list(chain.parent),
+        reversed=list(chain.reversed),
+        axis=chain.axis.tolist(),
+        point=chain.point.tolist(),
+        imu_home=chain.imu_home.tolist(),
+        gravity=chain.gravity.tolist(),
+    )
+
+
+def write_result(path: Path, result: Result) -> None:
+    """Write the result; the file is the complete old or the complete new one."""
+    text = result.model_dump_json(indent=1, by_alias=True)
+    temporary = path.with_suffix(".json.part")
+    temporary.write_text(text + "\n")
+    os.replace(temporary, path)

@@ -1,0 +1,175 @@
+"""A whole identification run: session, recording, estimates, viewer and files, on any transport and clock."""
+
+import asyncio
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+from coordinator.clock import Clock
+from coordinator.identify import (
+    Identified,
+    identify,
+    identify_kinematics,
+    write_held_out,
+)
+from coordinator.journal import JournalEvent
+from coordinator.plan import Plan
+from coordinator.radio import Post, Radio
+from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
+from coordinator.result import Result, write_result
+from coordinator.robot_link import RobotLink
+from coordinator.run_folder import HELD_OUT, RESULT, SESSION, URDF, VIEW, open_run_folder
+from coordinator.session import Session
+from coordinator.session_file import SessionWriter, read_session
+from coordinator.urdf import write_urdf
+from coordinator.viewer.targets import ViewerTargets
+from coordinator.viewer.viewer import Viewer
+from coordinator.viewer_feed import Screen, ViewerFeed
+from module_agent.wire.messages import Message
+from module_agent.wire.refusal import WireError
+from module_agent.wire.transport import Transport
+
+T = TypeVar("T")
+
+
+class RunConfig(NamedTuple):
+    """What a run is told. `inline` computes on the event loop, as virtual time needs it."""
+
+    robot: str
+    out: Path
+    sender: str
+    plan: Plan = Plan()
+    expect: int | None = None
+    resume: bool = False
+    spawn_viewer: bool = False
+    connect_viewer: str | None = None
+    serve_viewer: int | None = None
+    inline: bool = False
+
+
+class Run:
+    """One run in one folder."""
+
+    def __init__(self, config: RunConfig, transport: Transport, clock: Clock, post: Post, screen: Screen):
+        crashed = open_run_folder(config.out, config.resume)
+        self._config = config
+        self._clock = clock
+        self._screen = screen
+        self._crashed = crashed
+        self._started_s = time.monotonic()
+        self.recording = Recording()
+        self._writer = SessionWriter(config.out / SESSION)
+        targets = ViewerTargets(
+            config.out / VIEW, config.spawn_viewer, config.connect_viewer, config.serve_viewer
+        )
+        self._viewer = Viewer(config.robot, config.out.name, targets)
+        self._feed = ViewerFeed(self._viewer, self.recording)
+        if crashed is not None:
+            self._take_over(crashed)
+        self._radio = Radio(transport, config.robot, clock, post, self._record)
+        self._link = RobotLink(self._radio, self.recording, clock, config.sender)
+
+    def _take_over(self, crashed: Path) -> None:
+        for entry in read_session(crashed):
+            self._record(entry)
+        self._writer.flush()
+
+    # ------------------------------------------------------------------ recording
+
+    def _record(self, entry: Entry) -> Message | None:
+        self._writer.write(entry)
+        try:
+            message = self.recording.add(entry)
+        except (WireError, ValueError):
+            return None  # counted by the recording, by reason
+        if isinstance(message, Message):
+            self._feed.on_message(entry, message)
+            return message
+        return None
+
+    def _journal(self, event: JournalEvent) -> None:
+        entry = Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode())
+        self._writer.write(entry)
+        self.recording.add(entry)
+        if event.what in ("begin", "failed"):
+            self._viewer.phase(event.t_ns, event.text or event.step)
+
+    # ------------------------------------------------------------------ reporter of the session
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """Pass on that a step begins."""
+        self._screen.step(index, total, text)
+        self._feed.met({s: self._link.kind(s).name for s in self._link.serials})
+
+    def note(self, text: str) -> None:
+        """Pass on a line."""
+        self._screen.note(text)
+
+    def estimates(self, joint: str) -> None:
+        """Show the local estimates of a joint."""
+        self._feed.estimates(joint, self._clock())
+
+    async def explored(self) -> None:
+        """Assemble topology and chain as soon as all joints are explored, and show them."""
+        found = await self._compute(lambda: identify_kinematics(self.recording))
+        self._feed.chain(self._clock(), found.fit.chain, list(found.fit.link_length_sigma_m))
+        for line in found.words():
+            self._screen.note(line)
+
+    # ------------------------------------------------------------------ the run
+
+    async def run(self) -> Result:
+        """Run to the end and write the files; on any error what was recorded is complete on disk."""
+        config = self._config
+        try:
+            self._radio.start()
+            self._journal(JournalEvent(t_ns=self._clock(), what="session", robot=config.robot))
+            session = Session(
+                self._link, self._radio, self.recording, config.plan, self._clock, self._journal, self
+            )
+            await session.run(config.expect)
+            self._journal(
+                JournalEvent(
+                    t_ns=self._clock(), what="finished", wall_time_s=time.monotonic() - self._started_s
+                )
+            )
+            # From here on nothing more is recorded, so that a replay sees exactly what this result is made of.
+            self._radio.close()
+            self._writer.close()
+            self._screen.note("estimating")
+            found = await self._compute(lambda: identify(self.recording))
+            self._write(found)
+            if self._crashed is not None:
+                self._crashed.unlink()
+            return found.result
+        finally:
+            self._radio.close()
+            self._writer.close()
+            self._viewer.close()
+
+    async def _compute(self, work: Callable[[], T]) -> T:
+        if self._config.inline:
+            return work()
+        return await asyncio.to_thread(work)
+
+    def _write(self, found: Identified) -> None:
+        out = self._config.out
+        write_outputs(out, found)
+        if found.held_out is not None:
+            for index, serial in enumerate(found.held_out.serials):
+                self._viewer.residuals(
+                    serial,
+                    found.held_out.session_ns,
+                    found.held_out.tau_measured_nm[:, index],
+                    found.held_out.tau_predicted_nm[:, index],
+                )
+
+
+def write_outputs(out: Path, found: Identified) -> None:
+    """Write everything that follows from a recording into a folder, each file whole or not at all."""
+    write_result(out / RESULT, found.result)
+    phi = found.inertia.phi if found.inertia is not None else None
+    write_urdf(out / URDF, found.kinematics.fit.chain, phi)
+    if found.held_out is not None:
+        write_held_out(out / HELD_OUT, found.held_out)

@@ -1,0 +1,59 @@
+"""The folder of one run: `session.mcap`, `session.rrd`, `result.json`, `robot.urdf`, `held_out.npz`."""
+
+from pathlib import Path
+
+from coordinator.recording import Recording
+from coordinator.session_file import read_session
+
+from module_agent.wire.refusal import WireError
+
+SESSION, VIEW, RESULT, URDF, HELD_OUT = (
+    "session.mcap",
+    "session.rrd",
+    "result.json",
+    "robot.urdf",
+    "held_out.npz",
+)
+
+
+class RunFolderError(ValueError):
+    """The folder cannot be used; the message says why and what to do."""
+
+
+def open_run_folder(path: Path, resume: bool) -> Path | None:
+    """Make the folder; return the recording of the crashed run to resume from, if there is one.
+
+    The crashed run's recording is set aside under another name and kept until the resumed run is complete.
+
+    Raises:
+        RunFolderError: the folder holds a run already and is not to be resumed, or there is nothing to resume.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    session = path / SESSION
+    aside = path / "session.crashed.mcap"
+    if not resume:
+        if session.exists() or aside.exists():
+            raise RunFolderError(f"{path} holds a run already: choose another --out, or --resume it")
+        return None
+    if (path / RESULT).exists():
+        raise RunFolderError(f"{path} holds a complete run: there is nothing to resume")
+    # Crashed while resuming: what was set aside first has everything that the new file had begun to repeat,
+    # unless the new file went further.
+    if aside.exists() and session.exists() and session.stat().st_size < aside.stat().st_size:
+        return aside
+    if session.exists():
+        session.replace(aside)
+    if not aside.exists():
+        raise RunFolderError(f"{path} holds no recording to resume")
+    return aside
+
+
+def load_recording(path: Path) -> Recording:
+    """Read a recording; entries that could not be understood when they came are left out as they were then."""
+    recording = Recording()
+    for entry in read_session(path):
+        try:
+            recording.add(entry)
+        except WireError:
+            continue  # counted in `recording.refused`
+    return recording

@@ -1,0 +1,44 @@
+"""What a person sees of a run in the terminal: one line of progress, notes above it; plain lines in a pipe."""
+
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+
+class Terminal:
+    """Progress and notes on standard error, so that standard output stays for results."""
+
+    def __init__(self, quiet: bool = False):
+        self.console = Console(stderr=True, highlight=False, quiet=quiet)
+        self._live = self.console.is_terminal and not quiet
+        self._progress = Progress(
+            TextColumn("[bold]{task.description}"),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=self.console,
+            transient=True,
+        )
+        self._task = self._progress.add_task("starting", total=None)
+        self._start_s = time.monotonic()
+
+    def __enter__(self) -> "Terminal":
+        if self._live:
+            self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live:
+            self._progress.stop()
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """A step begins."""
+        if self._live:
+            self._progress.update(self._task, description=text, completed=index - 1, total=total)
+        else:
+            self.console.print(f"[{index}/{total}] {text}", markup=False, soft_wrap=True)
+
+    def note(self, text: str) -> None:
+        """Something worth a line."""
+        self.console.print(f"  {text}", markup=False, soft_wrap=True)

@@ -1,0 +1,128 @@
+"""`x5-agent`: the process that runs one or several modules on a physics bus and the network."""
+
+import logging
+import os
+import secrets
+import signal
+import sys
+from types import FrameType
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from module_agent.bus_client import BusClient
+from module_agent.catalogue import module_type
+from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.hardware import HardwareLost, HardwareModule
+from module_agent.host import AgentHost
+from module_agent.wire.impaired_transport import ImpairedTransport
+from module_agent.wire.keys import check_chunk
+from module_agent.wire.messages import ExpiryAction
+from module_agent.wire.network_profile import profile
+from module_agent.wire.timer_thread import TimerThread
+from module_agent.wire.transport import Transport, TransportError
+from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
+from module_agent.worker import ThreadWorker
+
+log = logging.getLogger("x5-agent")
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+EXIT_USAGE, EXIT_LOST = 2, 3
+
+
+class Stopped(SystemExit):
+    """Raised in the main thread by SIGINT and SIGTERM, so that even a blocked tick ends cleanly."""
+
+
+def _stop(number: int, _frame: FrameType | None) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise Stopped(0 if number == signal.SIGTERM else 130)
+
+
+def _config(
+    module: HardwareModule, rate_hz: float, lifetime_ms: float, expiry: ExpiryAction, strategy: int
+) -> FirmwareConfig:
+    kind = module_type(module.module_type)
+    return FirmwareConfig(
+        serial=module.serial,
+        kind=kind,
+        boot=secrets.randbits(64),
+        limits=catalogue_limits(kind),
+        tick_ns=module.tick_ns,
+        imu_period_ns=module.imu_period_ns,
+        feedback_rate_hz=rate_hz,
+        lifetime_ns=round(lifetime_ms * 1e6),
+        expiry_action=expiry,
+        strategy=strategy,
+    )
+
+
+def _transport(connect: list[str], listen: list[str], network: str, seed: int) -> Transport:
+    found = profile(network)
+    transport: Transport = open_zenoh(
+        ZenohConfig(mode="client", connect=tuple(connect), listen=tuple(listen))
+    )
+    if network == "none":
+        return transport
+    return ImpairedTransport(transport, found, np.random.default_rng(seed), TimerThread())
+
+
+@app.command()
+def main(
+    serial: Annotated[list[str], typer.Option(help="Serial of a module to run; repeat for several.")],
+    bus: Annotated[str, typer.Option(help="Path of the physics bus of the world.")],
+    robot: Annotated[str, typer.Option(help="Name of the robot, part of every key.")] = "robot",
+    connect: Annotated[
+        list[str] | None, typer.Option(help=f"Zenoh endpoint of the coordinator or a router [{DEFAULT_ENDPOINT}].")
+    ] = None,
+    listen: Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on.")] = None,
+    network: Annotated[str, typer.Option(help="Injected network: none, lan, wifi, bad.")] = "none",
+    seed: Annotated[int, typer.Option(help="Seed of the injected network.")] = 0,
+    feedback_rate: Annotated[float, typer.Option(help="Feedback rows per second, up to 1000.")] = 250.0,
+    lifetime_ms: Annotated[float, typer.Option(help="Command lifetime, at most 1000 ms.")] = 250.0,
+    expiry: Annotated[str, typer.Option(help="On expiry: motor_off, hold or damping.")] = "motor_off",
+    strategy: Annotated[int, typer.Option(min=0, max=4, help="Control strategy at start.")] = 3,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
+) -> None:
+    """Run the agent of one or several modules until the world ends or a signal comes."""
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="%(name)s %(levelname)s %(message)s"
+    )
+    signal.signal(signal.SIGTERM, _stop)
+    signal.signal(signal.SIGINT, _stop)
+    # Estimates run on a second thread; a tick must not wait for it the default 5 ms.
+    sys.setswitchinterval(0.0005)
+    try:
+        check_chunk("robot", robot)
+        if expiry not in ("motor_off", "hold", "damping"):
+            raise ValueError(f"--expiry {expiry}: it must be motor_off, hold or damping")
+        action: ExpiryAction = expiry  # type: ignore[assignment]
+        hardware = BusClient(bus, serial)
+        configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in hardware.modules]
+        transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], network, seed)
+    except (ValueError, KeyError, OSError, TransportError) as error:
+        text = error.args[0] if isinstance(error, KeyError) else error
+        typer.echo(f"x5-agent: {text}", err=True)
+        raise typer.Exit(EXIT_USAGE) from error
+    _serve(AgentHost(robot, hardware, transport, configs, worker := ThreadWorker()), worker)
+
+
+def _serve(host: AgentHost, worker: ThreadWorker) -> None:
+    names = ", ".join(module.serial for module in host.modules)
+    log.info("%s up, process %d", names, os.getpid())
+    try:
+        while True:
+            host.cycle()
+    except HardwareLost as error:
+        typer.echo(f"x5-agent: {names}: the world is gone: {error}", err=True)
+        raise typer.Exit(EXIT_LOST) from error
+    finally:
+        host.close()
+        worker.close()
+
+
+if __name__ == "__main__":
+    app()

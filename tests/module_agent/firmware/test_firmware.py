@@ -1,0 +1,443 @@
+"""A module obeys one holder, refuses what is late or wrong and says so, and never moves on its own."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from module_agent.catalogue import CATALOGUE
+from module_agent.firmware.config import FirmwareConfig, catalogue_limits, check_config
+from module_agent.firmware.firmware import Answer, Firmware, Incoming, Publication
+from module_agent.firmware.state import COMMANDED, TRANSITIONS
+from module_agent.hardware import SensorSample
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.feedback_rows import unpack
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import (
+    Ack,
+    Ask,
+    Feedback,
+    GainsCommand,
+    GoTo,
+    HistoryRequest,
+    Info,
+    LeaseRequest,
+    Message,
+    MotionCommand,
+    Rest,
+    Setpoint,
+    Status,
+    Stop,
+    WindowedSine,
+)
+from module_agent.wire.refusal import Refusal
+
+MS = 1_000_000
+BOOT = 77
+
+
+class Bench:
+    """One module on a bench: its position is what the test sets, its clock what the test lets pass."""
+
+    def __init__(self, kind: str = "X5-9", **settings: Any) -> None:
+        found = CATALOGUE[kind]  # type: ignore[index]
+        limits = settings.pop("limits", catalogue_limits(found))
+        self.firmware = Firmware(FirmwareConfig("A", found, BOOT, limits, **settings))
+        self.now = 5_000 * MS
+        self.position = 0.2
+        self.winding_c = 40.0
+        self.pwm = 0.0
+        self.seq = 0
+        self.published: list[Publication] = []
+        self.tick()
+
+    def tick(self, *incoming: Incoming) -> list[bytes]:
+        self.now += MS
+        imu = self.now // (4 * MS) * 4 * MS
+        sample = SensorSample(
+            self.now, imu, self.position, 0.0, 0.5, 0.0, 0.0, 0.1, self.winding_c, 24.0, 0, 0, 0, 0, 0, 9.8
+        )
+        self.pwm, out = self.firmware.step(self.now, sample, incoming)
+        self.published += [o for o in out if isinstance(o, Publication)]
+        return [o.payload for o in out if isinstance(o, Answer)]
+
+    def ticks(self, count: int) -> None:
+        for _ in range(count):
+            self.tick()
+
+    def head(self, **changes: Any) -> dict[str, Any]:
+        self.seq += 1
+        head = {
+            "serial": "A",
+            "boot": BOOT,
+            "seq": self.seq,
+            "sender": "me",
+            "token": self.firmware.lease.token,
+            "echo_ns": self.now,
+        }
+        return {**head, **changes}
+
+    def ask(self, leaf: Leaf, message: Message | bytes) -> Ack:
+        payload = message if isinstance(message, bytes) else encode(message)
+        (answer,) = self.tick(Incoming(leaf, payload, 1))
+        return decode(Ack, answer)
+
+    def acquire(self, **changes: Any) -> Ack:
+        return self.ask(Leaf.LEASE, LeaseRequest(**self.head(action="acquire", **changes)))
+
+    def renew(self, **changes: Any) -> Ack:
+        return self.ask(Leaf.LEASE, LeaseRequest(**self.head(action="renew", **changes)))
+
+    def move(self, number: int = 1, pattern: Any = None, **changes: Any) -> Ack:
+        pattern = pattern or WindowedSine(amplitude=0.1)
+        return self.ask(Leaf.MOTION, MotionCommand(**self.head(motion_id=number, pattern=pattern, **changes)))
+
+    def setpoint(self, position: float | None = 0.3, **changes: Any) -> Ack:
+        values = {"position_rad": position, "velocity_rad_s": None, "effort_nm": None}
+        return self.ask(Leaf.SETPOINT, Setpoint(**self.head(**values, **changes)))
+
+    def status(self) -> Status:
+        payload = encode(Ask(serial="A", boot=0, seq=9, sender="me"))
+        (answer,) = self.tick(Incoming(Leaf.STATUS, payload, 1))
+        return decode(Status, answer)
+
+
+def refused(ack: Ack, reason: Refusal) -> bool:
+    return not ack.accepted and ack.reason == reason.value
+
+
+def test_a_module_that_nobody_holds_has_its_motor_off() -> None:
+    bench = Bench()
+    bench.ticks(500)
+    assert bench.pwm == 0.0
+    assert bench.firmware.state == "idle"
+
+
+def test_acquiring_arms_and_holds_the_present_position() -> None:
+    bench = Bench()
+    assert bench.acquire().accepted
+    bench.position = 0.1
+    bench.tick()
+    assert bench.firmware.state == "armed"
+    assert bench.pwm > 0.0
+
+
+def test_a_second_sender_is_refused_with_the_holder_s_name_and_the_time_left() -> None:
+    bench = Bench()
+    bench.acquire()
+    answer = bench.acquire(sender="other")
+    assert refused(answer, Refusal.HELD)
+    assert "me" in answer.detail
+    assert answer.holder == "me"
+    assert 0 < answer.lease_left_ns <= 1000 * MS
+
+
+def test_a_lapsed_lease_goes_to_the_next_sender_under_a_larger_token() -> None:
+    bench = Bench()
+    first = bench.acquire(duration_ns=300 * MS)
+    bench.ticks(400)
+    second = bench.acquire(sender="other")
+    assert second.accepted
+    assert second.token > first.token
+    assert refused(bench.move(token=first.token), Refusal.HELD)
+
+
+def test_an_old_token_of_the_same_sender_is_refused() -> None:
+    bench = Bench()
+    first = bench.acquire()
+    bench.acquire()
+    assert refused(bench.move(token=first.token), Refusal.NO_LEASE)
+
+
+@pytest.mark.parametrize(("action", "pwm_is_zero"), [("motor_off", True), ("hold", False), ("damping", True)])
+def test_without_commands_the_expiry_action_runs_one_tick_after_the_lifetime(
+    action: str, pwm_is_zero: bool
+) -> None:
+    bench = Bench(expiry_action=action)
+    bench.acquire()
+    bench.move(pattern=Rest(duration_s=10.0))
+    bench.position = 0.1  # pushed aside, so that holding needs PWM
+    bench.ticks(250)
+    assert bench.firmware.state == "moving"
+    bench.tick()
+    assert bench.firmware.state == "expired"
+    bench.position = 0.05
+    bench.tick()
+    assert (bench.pwm == 0.0) == pwm_is_zero
+    status = bench.status()
+    assert status.motion is not None
+    assert status.motion.outcome == "expired"
+    assert status.expiries == 1
+
+
+def test_keep_alives_keep_a_motion_going_and_an_expired_module_needs_re_arming() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move(pattern=Rest(duration_s=10.0))
+    for _ in range(20):
+        bench.ticks(99)
+        assert bench.renew().accepted
+    assert bench.firmware.state == "moving"
+    bench.ticks(300)
+    assert bench.firmware.state == "expired"
+    assert bench.renew().accepted
+    bench.tick()
+    assert bench.firmware.state == "expired"
+    assert refused(bench.move(2), Refusal.NOT_ARMED)
+    assert bench.acquire().accepted
+    assert bench.move(3).accepted
+
+
+def test_the_expiry_refuses_before_commands_of_the_same_tick_are_read() -> None:
+    """A thawed module finds its whole backlog in one tick; none of it may move the motor."""
+    bench = Bench()
+    bench.acquire()
+    before = bench.now
+    backlog = [
+        Incoming(
+            Leaf.SETPOINT,
+            encode(
+                Setpoint(**bench.head(echo_ns=before, position_rad=2.0, velocity_rad_s=None, effort_nm=None))
+            ),
+            None,
+        )
+        for _ in range(668)
+    ]
+    bench.now += 3_000 * MS
+    bench.tick(*backlog)
+    assert bench.firmware.state == "expired"
+    assert bench.pwm == 0.0
+    assert bench.firmware.admission.refusals[Refusal.NO_LEASE.value] == 668
+
+
+def test_a_late_command_is_refused_by_the_time_it_echoes() -> None:
+    bench = Bench()
+    bench.acquire()
+    assert refused(bench.move(echo_ns=bench.now - 251 * MS), Refusal.STALE)
+    assert bench.firmware.state == "armed"
+    assert bench.move(2, echo_ns=bench.now - 200 * MS).accepted
+
+
+def test_a_command_that_echoes_the_future_is_refused() -> None:
+    bench = Bench()
+    bench.acquire()
+    assert refused(bench.move(echo_ns=bench.now + 5_000 * MS), Refusal.STALE)
+
+
+def test_a_replayed_command_is_refused_by_its_sequence() -> None:
+    bench = Bench()
+    bench.acquire()
+    old = encode(
+        Setpoint(**bench.head(position_rad=0.3, velocity_rad_s=None, effort_nm=None))
+    )
+    assert bench.ask(Leaf.SETPOINT, old).accepted
+    assert refused(bench.ask(Leaf.SETPOINT, old), Refusal.SEQUENCE)
+
+
+def test_a_keep_alive_that_overtakes_a_motion_does_not_refuse_it() -> None:
+    bench = Bench()
+    bench.acquire()
+    motion = MotionCommand(**bench.head(motion_id=1, pattern=Rest(duration_s=1.0)))
+    assert bench.renew().accepted
+    assert bench.ask(Leaf.MOTION, motion).accepted
+
+
+def test_the_same_motion_twice_is_one_motion() -> None:
+    bench = Bench()
+    bench.acquire()
+    assert bench.move(5).accepted
+    row = bench.status().motion
+    assert bench.move(5).accepted
+    again = bench.status().motion
+    assert row is not None
+    assert again is not None
+    assert again.start_row == row.start_row
+    assert refused(bench.move(6), Refusal.BUSY)
+
+
+def test_a_command_for_another_boot_or_module_is_refused() -> None:
+    bench = Bench()
+    assert refused(bench.acquire(boot=BOOT + 1), Refusal.WRONG_BOOT)
+    assert refused(bench.acquire(serial="B"), Refusal.WRONG_SERIAL)
+
+
+def test_stop_needs_no_lease_and_holds_until_somebody_acquires() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move()
+    stop = Stop(serial="A", boot=0, seq=1, sender="anybody", why="test")
+    assert bench.ask(Leaf.STOP, stop).accepted
+    assert bench.firmware.state == "stopped"
+    bench.ticks(1000)
+    assert bench.firmware.state == "stopped"
+    assert refused(bench.setpoint(), Refusal.NO_LEASE) or bench.firmware.state == "stopped"
+    assert bench.acquire().accepted
+    assert bench.firmware.state == "armed"
+
+
+def test_release_turns_the_motor_off() -> None:
+    bench = Bench()
+    bench.acquire()
+    assert bench.ask(Leaf.LEASE, LeaseRequest(**bench.head(action="release"))).accepted
+    bench.tick()
+    assert bench.pwm == 0.0
+    assert bench.firmware.state == "idle"
+
+
+def test_a_motion_beyond_the_position_limits_is_refused_with_both_ranges() -> None:
+    bench = Bench(kind="SEA-snake")
+    bench.acquire()
+    answer = bench.move(pattern=GoTo(target_rad=2.0, max_speed_rad_s=1.0))
+    assert refused(answer, Refusal.LIMIT)
+    assert "2.000" in answer.detail
+    assert "1.5708" in answer.detail
+    assert refused(bench.setpoint(1.7), Refusal.LIMIT)
+
+
+def test_an_overheated_winding_turns_the_motor_off_and_must_cool_before_re_arming() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.winding_c = 154.5
+    bench.tick()
+    assert bench.firmware.state == "fault"
+    assert bench.pwm == 0.0
+    answer = bench.acquire()
+    assert refused(answer, Refusal.NOT_ARMED)
+    assert "C" in answer.detail
+    bench.winding_c = 120.0
+    assert bench.acquire().accepted
+
+
+def test_the_duty_stays_below_the_winding_s_ceiling() -> None:
+    """1 - 1/(155 - T), as a real X5-1 log shows: 0.9636 at 127.6 C."""
+    bench = Bench()
+    bench.acquire()
+    bench.winding_c = 127.58
+    for _ in range(5):
+        bench.setpoint(50.0)
+    assert bench.pwm * 48.0 / 24.0 == pytest.approx(0.96353, abs=1e-4)
+
+
+def test_gains_are_refused_during_a_motion_and_reported_after_a_change() -> None:
+    bench = Bench()
+    bench.acquire()
+    (answer,) = bench.tick(
+        Incoming(Leaf.INFO, encode(Ask(serial="A", boot=0, seq=1, sender="me")), 1)
+    )
+    gains = decode(Info, answer).gains
+    stiff = gains.model_copy(update={"position": gains.position.model_copy(update={"kp": 6.0})})
+    assert bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=stiff))).accepted
+    (answer,) = bench.tick(
+        Incoming(Leaf.INFO, encode(Ask(serial="A", boot=0, seq=1, sender="me")), 1)
+    )
+    assert decode(Info, answer).gains == stiff
+    bench.move()
+    assert refused(bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=gains))), Refusal.BUSY)
+
+
+def test_feedback_comes_at_its_rate_without_gaps_and_history_serves_every_row_again() -> None:
+    bench = Bench()
+    bench.ticks(20)  # rows have fallen into step with the IMU by then
+    bench.published.clear()
+    first = bench.firmware.history.next_row
+    bench.ticks(1000)
+    blocks = [
+        unpack(decode(Feedback, p.payload, MAX_MESSAGE_BYTES)) for p in bench.published if p.leaf is Leaf.FEEDBACK
+    ]
+    times = [int(t) for block in blocks for t in block["t_ns"]]
+    assert len(times) == pytest.approx(250, abs=5)
+    assert {b - a for a, b in zip(times, times[1:], strict=False)} == {4 * MS}
+    request = HistoryRequest(serial="A", boot=BOOT, seq=1, sender="me", first_row=first, end_row=first + 200)
+    (answer,) = bench.tick(Incoming(Leaf.HISTORY, encode(request), 1))
+    rows = unpack(decode(Feedback, answer, MAX_MESSAGE_BYTES))
+    assert len(rows) == 200
+    assert set(times[10:150]) <= {int(t) for t in rows["t_ns"]}
+
+
+def test_rows_are_taken_when_the_imu_has_a_new_sample() -> None:
+    bench = Bench()
+    bench.ticks(400)
+    history = bench.firmware.history
+    rows = history.rows(history.next_row - 50, history.next_row)
+    assert (rows["t_ns"] == rows["imu_t_ns"]).all()
+
+
+def test_rows_that_are_gone_are_refused_with_what_is_kept() -> None:
+    bench = Bench(history_s=1.0)
+    bench.ticks(3000)
+    answer = bench.ask(
+        Leaf.HISTORY, HistoryRequest(serial="A", boot=BOOT, seq=1, sender="me", first_row=0, end_row=10)
+    )
+    assert refused(answer, Refusal.GONE)
+    assert str(bench.firmware.history.first_row) in answer.detail
+
+
+SEND: dict[Leaf, Callable[[Bench], Message]] = {
+    Leaf.LEASE: lambda b: LeaseRequest(**b.head(action="renew")),
+    Leaf.MOTION: lambda b: MotionCommand(**b.head(motion_id=9, pattern=Rest(duration_s=1.0))),
+    Leaf.SETPOINT: lambda b: Setpoint(
+        **b.head(position_rad=1.0, velocity_rad_s=None, effort_nm=None)
+    ),
+    Leaf.GAINS: lambda b: GainsCommand(**b.head(gains=b.firmware._controller.gains)),
+    Leaf.STOP: lambda b: Stop(serial="A", boot=0, seq=1, sender="me"),
+}
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from(sorted(SEND)), st.binary(max_size=300), st.data())
+def test_garbage_is_counted_and_changes_nothing(leaf: Leaf, noise: bytes, data: st.DataObject) -> None:
+    """Random bytes, and valid messages with one byte changed, either act as valid ones or are refused."""
+    bench = Bench()
+    bench.acquire()
+    good = encode(SEND[leaf](bench))
+    at = data.draw(st.integers(0, len(good) - 1))
+    broken = good[:at] + bytes([good[at] ^ data.draw(st.integers(1, 255))]) + good[at + 1 :]
+    refusals = sum(bench.firmware.admission.refusals.values())
+    assert not bench.ask(leaf, noise).accepted
+    assert sum(bench.firmware.admission.refusals.values()) == refusals + 1
+    answer = bench.ask(leaf, broken)
+    if not answer.accepted:
+        assert sum(bench.firmware.admission.refusals.values()) == refusals + 2
+        assert bench.firmware.state == "armed"
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.sampled_from(["acquire", "renew", "move", "setpoint", "stop", "wait", "hot"]), max_size=40))
+def test_no_sequence_of_commands_drives_a_motor_that_is_not_commanded(actions: list[str]) -> None:
+    bench = Bench()
+    for number, action in enumerate(actions, start=1):
+        bench.winding_c = 155.0 if action == "hot" else 40.0
+        match action:
+            case "acquire":
+                bench.acquire()
+            case "renew":
+                bench.renew()
+            case "move":
+                bench.move(number)
+            case "setpoint":
+                bench.setpoint()
+            case "stop":
+                bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=number, sender="x"))
+            case _:
+                bench.ticks(120)
+        bench.tick()
+        if bench.firmware.state not in COMMANDED:
+            assert bench.pwm == 0.0
+
+
+def test_every_transition_leads_to_a_state_that_can_be_left_again() -> None:
+    states = {state for state, _ in TRANSITIONS}
+    assert set(TRANSITIONS.values()) <= states
+    for state in states:
+        assert TRANSITIONS[state, "acquire"] in COMMANDED
+
+
+@pytest.mark.parametrize(
+    "settings", [{"lifetime_ns": 0}, {"lifetime_ns": 2_000 * MS}, {"feedback_rate_hz": 2000.0}, {"batch_rows": 0}]
+)
+def test_a_configuration_that_cannot_be_run_is_refused(settings: dict[str, Any]) -> None:
+    kind = CATALOGUE["X5-1"]
+    with pytest.raises(ValueError, match="must be"):
+        check_config(FirmwareConfig("A", kind, 1, catalogue_limits(kind), **settings))

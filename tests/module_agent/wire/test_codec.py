@@ -1,0 +1,238 @@
+"""Bytes on the wire: what goes in comes out, plain msgpack reads it, and what is wrong is refused by its reason."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from module_agent.wire import keys
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.feedback_rows import ROW, unpack
+from module_agent.wire.messages import (
+    Ack,
+    Ask,
+    CircleEstimate,
+    Estimate,
+    EstimateRequest,
+    Feedback,
+    GainsCommand,
+    GainSet,
+    HistoryRequest,
+    Info,
+    LeaseRequest,
+    Limits,
+    Message,
+    MotionCommand,
+    MotionRecord,
+    PidGains,
+    Setpoint,
+    Status,
+    Stop,
+    WindowedSine,
+)
+from module_agent.wire.refusal import Refusal, WireError
+
+GOLDEN = Path(__file__).parent / "golden.json"
+HEAD: dict[str, Any] = {"serial": "J1", "boot": 0xFEDCBA9876543210, "seq": 7}
+COMMAND: dict[str, Any] = {**HEAD, "sender": "coordinator-1@host", "token": 3, "echo_ns": 123_456_789_012}
+LOOP = PidGains(kp=1.5)
+GAINS = GainSet(strategy=3, position=LOOP, velocity=LOOP, effort=LOOP)
+RECORD = MotionRecord(
+    motion_id=4,
+    pattern=WindowedSine(amplitude=0.09),
+    outcome="running",
+    start_ns=1,
+    start_row=2,
+    end_row=None,
+    origin_rad=0.5,
+)
+CIRCLE = CircleEstimate(
+    axis=(0.0, 0.0, 1.0),
+    tangent=(0.0, 1.0, 0.0),
+    radial_m=(0.484, 0.0, 0.0),
+    distance_m=0.484,
+    sigma_axis_rad=0.001,
+    sigma_distance_m=0.0005,
+    residual_rms_m_s2=0.03,
+    singular_values=(3.0, 0.1, 0.03),
+    delay_s=0.002,
+    samples=1400,
+)
+
+
+def rows(count: int) -> "np.ndarray[Any, Any]":
+    block = np.zeros(count, dtype=ROW)
+    block["t_ns"] = 1_000_000_000 + 4_000_000 * np.arange(count)
+    block["position_rad"] = 0.25
+    block["accel_m_s2"] = [0.0, 0.0, 9.81]
+    return block
+
+
+EXAMPLES: list[Message] = [
+    Ask(**HEAD, sender="coordinator-1@host"),
+    EstimateRequest(**HEAD, sender="coordinator-1@host", joint="J2"),
+    HistoryRequest(**HEAD, sender="coordinator-1@host", first_row=10, end_row=20),
+    LeaseRequest(**COMMAND, action="acquire"),
+    MotionCommand(**COMMAND, motion_id=4, pattern=WindowedSine(amplitude=0.09)),
+    Setpoint(**COMMAND, position_rad=0.5, velocity_rad_s=None, effort_nm=1.25),
+    Stop(**HEAD, sender="anybody", why="test"),
+    GainsCommand(**COMMAND, gains=GAINS),
+    Info(
+        **HEAD,
+        module_type="X5-9",
+        firmware="f",
+        feedback_rate_hz=250.0,
+        batch_rows=5,
+        history_rows=15000,
+        tick_ns=1_000_000,
+        imu_period_ns=4_000_000,
+        lifetime_ns=250_000_000,
+        expiry_action="motor_off",
+        limits=Limits(max_speed_rad_s=1.4, max_effort_nm=13.0, min_position_rad=None, max_position_rad=None),
+        gains=GAINS,
+        t_ns=5,
+    ),
+    Feedback(**HEAD, first_row=100, count=2, rows=rows(2).tobytes()),
+    Status(
+        **HEAD,
+        t_ns=5,
+        state="moving",
+        holder="coordinator-1@host",
+        lease_left_ns=900_000_000,
+        token=3,
+        next_row=99,
+        motion=RECORD,
+        refusals={"stale": 2},
+        expiries=1,
+        dropped_events=0,
+    ),
+    Estimate(
+        **HEAD,
+        joint="J2",
+        motion_ids=(3, 4),
+        moved=True,
+        rate_ratio=0.99,
+        gravity_m_s2=(0.0, 0.0, 9.81),
+        circle=CIRCLE,
+    ),
+    Ack(**HEAD, re=6, accepted=False, reason="held", detail="d", t_ns=5, holder=None, lease_left_ns=0, token=3),
+]
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda m: type(m).__name__)
+def test_a_message_survives_its_bytes(message: Message) -> None:
+    assert decode(type(message), encode(message), MAX_MESSAGE_BYTES) == message
+
+
+@pytest.mark.parametrize("message", EXAMPLES, ids=lambda m: type(m).__name__)
+def test_the_bytes_are_the_committed_ones_and_plain_msgpack_reads_them(message: Message) -> None:
+    """A client in another language sees these very bytes: they change only with the schema version."""
+    golden = bytes.fromhex(json.loads(GOLDEN.read_text())[type(message).__name__])
+    assert encode(message) == golden
+    plain = msgpack.unpackb(golden, use_list=False)
+    assert plain == message.model_dump()
+
+
+def test_plain_struct_knowledge_reads_the_rows() -> None:
+    """The block is what the table in the README says: 101 bytes a row, little-endian, packed."""
+    data = rows(3).tobytes()
+    assert len(data) == 3 * 101
+    assert int.from_bytes(data[101:109], "little", signed=True) == 1_004_000_000
+    assert np.frombuffer(data[202 + 21 : 202 + 29], "<f8")[0] == 0.25
+
+
+def test_unknown_fields_are_ignored() -> None:
+    message = EXAMPLES[0]
+    data = msgpack.packb({**message.model_dump(), "later": {"x": 1}})
+    assert decode(Ask, data) == message
+
+
+def test_another_schema_version_is_refused_by_name() -> None:
+    data = msgpack.packb({**EXAMPLES[0].model_dump(), "v": 2, "something": "new"})
+    with pytest.raises(WireError, match="module J1 speaks v2, v1 is spoken here") as caught:
+        decode(Ask, data)
+    assert caught.value.reason is Refusal.VERSION
+
+
+def changed(**values: Any) -> bytes:
+    packed: bytes = msgpack.packb({**EXAMPLES[5].model_dump(), **values})
+    return packed
+
+
+def nested(depth: int) -> Any:
+    return [nested(depth - 1)] if depth else 1
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"x" * 5000, Refusal.TOO_LONG),
+        (b"", Refusal.MALFORMED),
+        (b"\xc1", Refusal.MALFORMED),
+        (msgpack.packb([1, 2]), Refusal.MALFORMED),
+        (b"\x91" * 4000 + b"\x01", Refusal.MALFORMED),
+        (changed(why=nested(8)), Refusal.MALFORMED),
+        (changed(why=list(range(100))), Refusal.MALFORMED),
+        (msgpack.packb({1: 2}), Refusal.MALFORMED),
+        (changed(v=None), Refusal.VERSION),
+        (changed(position_rad="far"), Refusal.TYPES),
+        (changed(position_rad=True), Refusal.TYPES),
+        (changed(token=1.5), Refusal.TYPES),
+        (changed(position_rad=math.nan), Refusal.NOT_FINITE),
+        (changed(effort_nm=math.inf), Refusal.NOT_FINITE),
+        (changed(effort_nm=-math.inf), Refusal.NOT_FINITE),
+        (changed(effort_nm=1e9), Refusal.RANGE),
+        (changed(seq=-1), Refusal.RANGE),
+        # Types come before finiteness, finiteness before ranges.
+        (changed(seq=-1, effort_nm=math.nan), Refusal.NOT_FINITE),
+        (changed(seq="x", effort_nm=math.nan), Refusal.TYPES),
+    ],
+)
+def test_what_is_wrong_is_refused_by_the_first_reason(data: bytes, reason: Refusal) -> None:
+    with pytest.raises(WireError) as caught:
+        decode(Setpoint, data)
+    assert caught.value.reason is reason
+
+
+@given(st.binary(max_size=600))
+def test_no_bytes_whatever_raise_anything_but_a_wire_error(data: bytes) -> None:
+    for kind in (Setpoint, MotionCommand, Status):
+        with pytest.raises(WireError):
+            decode(kind, data)
+
+
+def test_a_block_that_is_shorter_than_announced_is_refused() -> None:
+    whole = Feedback(**HEAD, first_row=0, count=3, rows=rows(2).tobytes())
+    with pytest.raises(WireError, match="3 rows"):
+        unpack(whole)
+
+
+def test_a_row_that_is_not_finite_is_refused_with_its_field() -> None:
+    block = rows(2)
+    block["gyro_rad_s"][1, 2] = np.nan
+    with pytest.raises(WireError, match="gyro_rad_s of serial J1"):
+        unpack(Feedback(**HEAD, first_row=0, count=2, rows=block.tobytes()))
+
+
+def test_keys_are_built_and_taken_apart_alike() -> None:
+    for leaf in keys.Leaf:
+        assert keys.parse(keys.key("arm", "X5-01", leaf)) == ("arm", "X5-01", leaf)
+    assert keys.every("arm", keys.Leaf.FEEDBACK) == "x5/arm/*/feedback"
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "$x", "a b", "x" * 65, "-a"])
+def test_a_name_that_cannot_stand_in_a_key_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="cannot be part of a key"):
+        keys.key("arm", name, keys.Leaf.STATUS)
+
+
+@pytest.mark.parametrize("text", ["x5/arm/J1", "x5/arm/J1/other", "y/arm/J1/status", "x5/a/b/c/status"])
+def test_a_foreign_key_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="not a key"):
+        keys.parse(text)

@@ -1,0 +1,39 @@
+"""Whatever order rows arrive in, what is there is right and what is missing is known."""
+
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from module_agent.wire.feedback_rows import ROW
+from module_agent.wire.messages import Feedback
+from module_agent.wire.row_log import RowLog
+
+
+def block(first: int, count: int) -> Feedback:
+    rows: Any = np.zeros(count, dtype=ROW)
+    rows["t_ns"] = np.arange(first, first + count)
+    return Feedback(serial="A", boot=1, seq=0, first_row=first, count=count, rows=rows.tobytes())
+
+
+@given(st.lists(st.tuples(st.integers(0, 300), st.integers(0, 40)), max_size=30), st.integers(0, 350))
+def test_a_row_log_agrees_with_a_set_of_row_numbers(blocks: list[tuple[int, int]], first: int) -> None:
+    log, model = RowLog(1), {n for start, count in blocks for n in range(start, start + count)}
+    for start, count in blocks:
+        log.add(block(start, count))
+    end = first + 60
+    wanted = set(range(first, end))
+    assert log.rows(first, end)["t_ns"].tolist() == sorted(wanted & model)
+    missing = {n for a, b in log.missing(first, end) for n in range(a, b)}
+    assert missing == wanted - model
+    assert all(b > a for a, b in log.missing(first, end))
+    assert log.end_row == max(model, default=-1) + 1
+
+
+def test_forgetting_keeps_what_is_newer() -> None:
+    log = RowLog(1)
+    log.add(block(0, 100))
+    log.forget_before(60)
+    assert log.rows(0, 100)["t_ns"].tolist() == list(range(60, 100))
+    assert log.end_row == 100
