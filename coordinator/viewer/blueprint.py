@@ -9,22 +9,15 @@ from typing import NamedTuple
 import rerun.blueprint as rrb
 
 from coordinator.viewer import layout
+from coordinator.viewer.parameter import Parameter, is_dynamic
 from coordinator.viewer.topology_graph import Topology, extent
 
 IDENTIFICATION, DYNAMICS, IMU, NETWORK = TABS = ("Identification", "Dynamics", "IMU", "Network")
 LINK_LENGTH = "link_length"
 
-# More modules than this on one page leave plots too small to read; they get further pages.
+# More than this on one page leaves plots too small to read; there are further pages for the rest.
 MODULES_PER_PAGE = 4
-VIEWS_PER_PAGE = 3
-
-
-class Estimated(NamedTuple):
-    """An estimated parameter that has been logged: its name, its units and what has it."""
-
-    name: str
-    units: str
-    serials: tuple[str, ...]
+PARAMETERS_PER_PAGE = 3
 
 
 class Contents(NamedTuple):
@@ -32,21 +25,9 @@ class Contents(NamedTuple):
 
     robot: str
     serials: tuple[str, ...] = ()
-    estimated: tuple[Estimated, ...] = ()
+    estimated: tuple[Parameter, ...] = ()
     topology: Topology | None = None
     reach_m: float | None = None
-
-
-def with_estimate(contents: Contents, name: str, serial: str, units: str) -> Contents:
-    """Return the contents with this estimate among them; the units are those said first.
-
-    A new parameter is taken to concern all modules, so that the layout changes once and not once per module.
-    """
-    known = {e.name: e for e in contents.estimated}
-    found = known.get(name, Estimated(name, units, contents.serials))
-    if serial not in found.serials:
-        found = found._replace(serials=(*found.serials, serial))
-    return contents._replace(estimated=tuple((known | {name: found}).values()))
 
 
 def build(contents: Contents, active_tab: str = IDENTIFICATION) -> rrb.Blueprint:
@@ -84,8 +65,8 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
     if contents.reach_m is not None:
         size = max(contents.reach_m, 0.2)
         eye = rrb.EyeControls3D(
-            position=[1.0 * size, -1.5 * size, 1.0 * size],
-            look_target=[0.0, 0.0, 0.3 * size],
+            position=[0.6 * size, -0.95 * size, 0.65 * size],
+            look_target=[0.0, 0.0, 0.25 * size],
             eye_up=[0.0, 0.0, 1.0],
         )
     return rrb.Spatial3DView(
@@ -99,17 +80,55 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
 
 
 def _identification(contents: Contents) -> rrb.Vertical:
-    geometric = [e for e in contents.estimated if not _is_dynamic(e)]
-    # The link length comes first and is announced by an empty plot, so that one knows what to wait for.
-    first = [e for e in geometric if e.name == LINK_LENGTH] or [Estimated(LINK_LENGTH, "m", contents.serials)]
-    plots = [_estimate(e) for e in (*first, *(e for e in geometric if e.name != LINK_LENGTH))]
+    geometric = [parameter for parameter in contents.estimated if not is_dynamic(parameter)]
+    log = rrb.TextLogView(
+        origin=layout.PHASE_LOG, name="Log", columns=rrb.TextLogColumns(text_log_columns=["Body"])
+    )
     return rrb.Vertical(
-        _paged(plots, VIEWS_PER_PAGE, "Estimates"),
-        rrb.Horizontal(
-            _topology(contents), rrb.TextLogView(origin=layout.PHASE_LOG, name="Log"), column_shares=[1, 1]
-        ),
+        _parameters(geometric, "Estimates") if geometric else _awaited(contents),
+        rrb.Horizontal(_topology(contents), log, column_shares=[2, 3]),
         row_shares=[3, 2],
         name=IDENTIFICATION,
+    )
+
+
+def _awaited(contents: Contents) -> rrb.View:
+    # One empty plot says what to wait for.
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[layout.estimate_path(LINK_LENGTH, serial) for serial in contents.serials],
+        name="Link length [m]: no estimate yet",
+    )
+
+
+def _parameters(parameters: Sequence[Parameter], name: str) -> rrb.Container:
+    """Give every parameter a row and every module a column, on as many pages as it takes."""
+    serials = list(dict.fromkeys(serial for p in parameters for serial in p.ranges_by_serial()))
+    pages = [
+        _parameter_page(parameters[i : i + PARAMETERS_PER_PAGE], serials[k : k + MODULES_PER_PAGE])
+        for i in range(0, len(parameters), PARAMETERS_PER_PAGE)
+        for k in range(0, len(serials), MODULES_PER_PAGE)
+    ]
+    return pages[0] if len(pages) == 1 else rrb.Tabs(*pages, name=name)
+
+
+def _parameter_page(parameters: Sequence[Parameter], serials: Sequence[str]) -> rrb.Container:
+    rows = [
+        rrb.Horizontal(*(_estimate(p, serial) for serial in serials if serial in p.ranges_by_serial()))
+        for p in parameters
+    ]
+    whose = serials[0] if len(serials) == 1 else f"{serials[0]} to {serials[-1]}"
+    what = ", ".join(p.title() for p in parameters)
+    return rrb.Vertical(*rows, name=f"{what}: {whose}")
+
+
+def _estimate(parameter: Parameter, serial: str) -> rrb.View:
+    seen = parameter.ranges_by_serial()[serial]
+    return rrb.TimeSeriesView(
+        origin=layout.estimate_path(parameter.name, serial),
+        name=f"{serial} {parameter.title()} [{parameter.units}] ± 1σ",
+        axis_y=None if seen is None else rrb.ScalarAxis(range=seen),
+        plot_legend=rrb.PlotLegend(visible=False),
     )
 
 
@@ -127,20 +146,21 @@ def _dynamics(contents: Contents) -> rrb.Vertical:
     held_out = [
         rrb.TimeSeriesView(
             origin=layout.residual_path(serial, layout.HELD_OUT),
-            name=f"{serial}: held-out torque, predicted in orange [Nm]",
+            name=f"{serial} held-out torque [Nm]",
         )
         for serial in contents.serials
     ]
-    plots = [
-        _of_modules("Torque at the springs [Nm]", contents.serials, layout.module_path, layout.EFFORT),
+    of_all = rrb.Vertical(
         _of_modules(
-            "Held-out torque, measured - predicted [Nm]", contents.serials, layout.residual_path, layout.ERROR
+            "Held-out torque, measured − predicted [Nm]", contents.serials, layout.residual_path, layout.ERROR
         ),
-        *(_estimate(e) for e in contents.estimated if _is_dynamic(e)),
-    ]
+        _of_modules("Torque at the springs [Nm]", contents.serials, layout.module_path, layout.EFFORT),
+        name="All modules",
+    )
+    inertial = [parameter for parameter in contents.estimated if is_dynamic(parameter)]
     return rrb.Vertical(
-        _paged(held_out, MODULES_PER_PAGE, "Held-out torque", columns=2),
-        _paged(plots, 2, "Estimates"),
+        _paged(held_out, MODULES_PER_PAGE, "Held-out torque"),
+        rrb.Tabs(of_all, _parameters(inertial, "Parameters"), active_tab=0) if inertial else of_all,
         row_shares=[1, 1],
         name=DYNAMICS,
     )
@@ -153,7 +173,7 @@ def _imu(contents: Contents) -> rrb.Container:
             path = layout.module_path(serial, group)
             plots.append(rrb.TimeSeriesView(origin=path, name=f"{serial} {title}"))
     # No container around a single one: the viewer takes such out, and its name with it.
-    return _paged(plots, 2 * MODULES_PER_PAGE, IMU, columns=2)
+    return _paged(plots, 2 * MODULES_PER_PAGE, IMU)
 
 
 def _network(contents: Contents) -> rrb.Vertical:
@@ -176,25 +196,12 @@ def _of_modules(
     return rrb.TimeSeriesView(origin="/", contents=[path(serial, group) for serial in serials], name=name)
 
 
-def _estimate(estimated: Estimated) -> rrb.TimeSeriesView:
-    paths = [layout.estimate_path(estimated.name, serial) for serial in estimated.serials]
-    title = f"{estimated.name.replace('_', ' ')} [{estimated.units}], band: 1 sigma"
-    return rrb.TimeSeriesView(origin="/", contents=paths, name=title[0].upper() + title[1:])
-
-
-def _is_dynamic(estimated: Estimated) -> bool:
-    # Mass, its moments, friction and springs have a unit of mass or torque in them; geometry has not.
-    return "kg" in estimated.units or "Nm" in estimated.units
-
-
-def _paged(views: Sequence[rrb.View], per_page: int, name: str, columns: int = 1) -> rrb.Container:
+def _paged(views: Sequence[rrb.View], per_page: int, name: str) -> rrb.Container:
+    """Put views into two columns, on as many pages as it takes."""
     pages = [views[i : i + per_page] for i in range(0, len(views), per_page)]
     if len(pages) <= 1:
-        return rrb.Grid(*views, grid_columns=columns, name=name)
-    return rrb.Tabs(
-        *(
-            rrb.Grid(*page, grid_columns=columns, name=f"{name} {number}")
-            for number, page in enumerate(pages, start=1)
-        ),
-        name=name,
-    )
+        return rrb.Grid(*views, grid_columns=2, name=name)
+    grids = [
+        rrb.Grid(*page, grid_columns=2, name=f"{name} {number}") for number, page in enumerate(pages, start=1)
+    ]
+    return rrb.Tabs(*grids, name=name)

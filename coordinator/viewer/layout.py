@@ -55,6 +55,7 @@ PHASE_NOW: Final = "/phase/now"
 
 GYRO, ACCEL = "gyro", "accel"
 POSITION, VELOCITY, EFFORT = "position", "velocity", "effort"
+POSITION_COMMAND, VELOCITY_COMMAND, EFFORT_COMMAND = "position_command", "velocity_command", "effort_command"
 MOTOR, SUPPLY, STATE = "motor", "supply", "state"
 HELD_OUT, ERROR = "torque", "error"
 ROUND_TRIP, AGE, REFUSALS = "round_trip", "age", "refusals"

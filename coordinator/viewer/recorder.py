@@ -8,6 +8,7 @@ import rerun as rr
 from coordinator.chain import Array, Chain
 from coordinator.viewer import blueprint, layout, progress, robot_geometry, robot_scene, time_series
 from coordinator.viewer import topology_graph as graphs
+from coordinator.viewer.parameter import with_estimate
 from coordinator.viewer.time_series import Batch, IntArray
 
 
@@ -32,13 +33,18 @@ class Recorder:
     def rows(self, batch: Batch) -> None:
         """Gather rows, and log the batches that are complete."""
         self._know([batch.serial])
-        for complete in self._batcher.add(batch):
-            self._send(complete)
+        complete = self._batcher.add(batch)
+        for each in complete:
+            self._send(each)
+        if complete:
+            # Estimates of many modules come in bursts: one layout shows them all.
+            self._show()
 
     def drain(self) -> None:
         """Log the rows gathered so far."""
         for batch in self._batcher.drain():
             self._send(batch)
+        self._show()
 
     def phase(self, t_ns: int, text: str) -> None:
         """Log a step of the run."""
@@ -62,8 +68,10 @@ class Recorder:
 
     def estimate(self, name: str, serial: str, t_ns: int, value: float, sigma: float, units: str) -> None:
         """Log an estimated parameter of a module, or of whatever else `serial` names."""
-        self._contents = blueprint.with_estimate(self._contents, name, serial, units)
-        self._show()
+        before = self._contents.estimated
+        self._contents = self._contents._replace(
+            estimated=with_estimate(before, name, serial, value, sigma, units)
+        )
         progress.set_time(self._stream, t_ns)
         colour = self._palette.colour(serial)
         progress.log_estimate(self._stream, name, serial, value, sigma, units, colour)
@@ -75,7 +83,7 @@ class Recorder:
         progress.set_time(self._stream, t_ns)
         before = self._scenes.get(look.world)
         if before is not None:
-            robot_scene.clear_bodies(self._stream, before, chain)
+            robot_scene.clear_gone(self._stream, before, scene)
         robot_scene.log_scene(self._stream, scene)
         self._scenes[look.world] = scene
         self._frame(chain)

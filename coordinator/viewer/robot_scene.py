@@ -16,7 +16,7 @@ LINK_RADIUS_M = 0.009
 OUTPUT_RADIUS_M = 0.024
 OUTPUT_THICKNESS_M = 0.008
 AXIS_LENGTH_M = 0.09
-IMU_AXIS_LENGTH_M = 0.03
+IMU_AXIS_LENGTH_M = 0.05
 # So that a spread of millimetres can be seen next to a housing, its sphere is drawn at three sigma.
 SPREAD = 3.0
 
@@ -24,15 +24,28 @@ Drawn = rr.AsComponents
 
 
 class Look(NamedTuple):
-    """How a robot is drawn in one world: `link` for what joins modules; `plain` paints everything so."""
+    """How a robot is drawn in one world: `link` for what joins modules; `plain` paints everything so.
+
+    The truth is of wire and without labels, so that it does not hide the estimate that it coincides with.
+    """
 
     world: str
     link: layout.Colour
     plain: layout.Colour | None
+    fill: rr.components.FillMode
+    labels: bool
 
 
-ESTIMATE_LOOK = Look(layout.ESTIMATED_WORLD, layout.ESTIMATE_COLOUR, None)
-TRUTH_LOOK = Look(layout.TRUE_WORLD, layout.TRUTH_COLOUR, layout.TRUTH_COLOUR)
+ESTIMATE_LOOK = Look(
+    layout.ESTIMATED_WORLD, layout.ESTIMATE_COLOUR, None, rr.components.FillMode.Solid, labels=True
+)
+TRUTH_LOOK = Look(
+    layout.TRUE_WORLD,
+    layout.TRUTH_COLOUR,
+    layout.TRUTH_COLOUR,
+    rr.components.FillMode.MajorWireframe,
+    labels=False,
+)
 
 
 class Scene(NamedTuple):
@@ -93,22 +106,22 @@ def log_pose(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
         stream.log(path, rr.Transform3D(translation=motion[:3, 3], mat3x3=motion[:3, :3]))
 
 
-def clear_bodies(stream: rr.RecordingStream, before: Scene, after: Chain) -> None:
-    """Take away, from the stream's present time on, the bodies that the new chain no longer has."""
-    for serial in before.chain.serials:
-        if serial not in after.serials:
-            stream.log(layout.body_path(before.look.world, serial), rr.Clear(recursive=True))
+def clear_gone(stream: rr.RecordingStream, before: Scene, after: Scene) -> None:
+    """Take away, from the stream's present time on, what the new scene no longer has."""
+    kept = {path for path, _ in after.drawn}
+    for path, _ in before.drawn:
+        if path not in kept:
+            stream.log(path, rr.Clear(recursive=False))
 
 
 def gravity_arrow(chain: Chain, reach_m: float) -> rr.Arrows3D:
     """Return gravity as an arrow beside the robot, in the upright world."""
     length = 0.25 * max(reach_m, 0.2)
     strength = float(np.linalg.norm(chain.gravity))
-    beside = -0.45 * max(reach_m, 0.2)
     return rr.Arrows3D(
-        origins=[[beside, beside, 1.4 * length]],
+        origins=[[-length, -0.4 * length, 1.4 * length]],
         vectors=[[0.0, 0.0, -length]],
-        radii=0.004,
+        radii=0.008,
         colors=[(200, 200, 210, 255)],
         labels=[f"gravity {strength:.2f} m/s²"],
         show_labels=True,
@@ -127,18 +140,18 @@ def _body(
     housed = [k for k, module in enumerate(placed) if module.housing_body == body]
     drawn: list[tuple[str, tuple[Drawn, ...]]] = []
     if housed:
-        drawn.append((f"{path}/housing", (_housings(chain, placed, paint, sigma_m, housed),)))
+        drawn.append((f"{path}/housing", (_housings(chain, placed, paint, sigma_m, look, housed),)))
         drawn += [(f"{path}/imu/{layout.part(chain.serials[k])}", _imu(chain, k)) for k in housed]
     turning = [k for k, module in enumerate(placed) if module.output_body == body]
     if turning:
-        drawn.append((f"{path}/output", (_outputs(placed, paint, turning),)))
+        drawn.append((f"{path}/output", (_outputs(placed, paint, look, turning),)))
     if body != BASE:
         drawn.append((f"{path}/axis", (_axis(placed[body], paint[body]),)))
         if sigma_m is not None and np.isfinite(sigma_m[body]):
             drawn.append((f"{path}/spread", (_spread(placed[body], sigma_m[body], look),)))
     joined = [link for link in links(chain, placed) if link.body == body and _length(link) > 1e-4]
     if joined:
-        drawn.append((f"{path}/link", (_links(joined, look.link),)))
+        drawn.append((f"{path}/link", (_links(joined, look),)))
     return drawn
 
 
@@ -147,6 +160,7 @@ def _housings(
     placed: tuple[Module, ...],
     paint: Sequence[layout.Colour],
     sigma_m: Sequence[float] | None,
+    look: Look,
     housed: Sequence[int],
 ) -> rr.Boxes3D:
     poses = [placed[k].housing for k in housed]
@@ -157,15 +171,15 @@ def _housings(
         ],
         quaternions=[_quaternion(Rotation.from_matrix(pose[:3, :3])) for pose in poses],
         colors=[paint[k] for k in housed],
-        fill_mode="solid",
+        fill_mode=look.fill,
         labels=[_label(chain, k, sigma_m) for k in housed],
-        show_labels=True,
+        show_labels=look.labels,
     )
 
 
 def _label(chain: Chain, k: int, sigma_m: Sequence[float] | None) -> str:
     how = " (reversed)" if chain.reversed[k] else ""
-    if sigma_m is None:
+    if sigma_m is None or sigma_m[k] == 0.0:  # the root is where the others are measured from
         return f"{chain.serials[k]}{how}"
     if not np.isfinite(sigma_m[k]):
         return f"{chain.serials[k]}{how}  place not known"
@@ -173,7 +187,7 @@ def _label(chain: Chain, k: int, sigma_m: Sequence[float] | None) -> str:
 
 
 def _outputs(
-    placed: tuple[Module, ...], paint: Sequence[layout.Colour], turning: Sequence[int]
+    placed: tuple[Module, ...], paint: Sequence[layout.Colour], look: Look, turning: Sequence[int]
 ) -> rr.Cylinders3D:
     return rr.Cylinders3D(
         lengths=[OUTPUT_THICKNESS_M] * len(turning),
@@ -181,7 +195,7 @@ def _outputs(
         centers=[placed[k].output for k in turning],
         quaternions=[_quaternion(from_z(placed[k].axis)) for k in turning],
         colors=[layout.shade(paint[k], 0.5) for k in turning],
-        fill_mode="solid",
+        fill_mode=look.fill,
     )
 
 
@@ -189,7 +203,7 @@ def _axis(module: Module, colour: layout.Colour) -> rr.Arrows3D:
     return rr.Arrows3D(
         origins=[module.output],
         vectors=[AXIS_LENGTH_M * module.axis],
-        radii=0.003,
+        radii=0.004,
         colors=[layout.shade(colour, 1.4)],
     )
 
@@ -203,14 +217,14 @@ def _spread(module: Module, sigma_m: float, look: Look) -> rr.Ellipsoids3D:
     )
 
 
-def _links(joined: Sequence[Link], colour: layout.Colour) -> rr.Capsules3D:
+def _links(joined: Sequence[Link], look: Look) -> rr.Capsules3D:
     return rr.Capsules3D(
         lengths=[_length(link) for link in joined],
         radii=[LINK_RADIUS_M] * len(joined),
         translations=[link.start for link in joined],
         quaternions=[_quaternion(from_z((link.end - link.start) / _length(link))) for link in joined],
-        colors=[colour] * len(joined),
-        fill_mode="solid",
+        colors=[look.link] * len(joined),
+        fill_mode=look.fill,
     )
 
 

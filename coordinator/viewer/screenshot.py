@@ -127,10 +127,13 @@ def with_active_tab(blueprint: Mapping[str, Any], tab: str) -> dict[str, Any]:
         for path, entry in blueprint.items()
         if "ContainerBlueprint" in entry
     }
-    named = [path.lstrip("/") for path, entry in containers.items() if entry.get("display_name") == tab]
+    named = [path for path, entry in containers.items() if entry.get("display_name") == tab]
     for path, entry in containers.items():
-        if entry.get("container_kind") == "Tabs" and named and named[0] in entry.get("contents", ()):
-            turned = {"ContainerBlueprint": {**entry, "active_tab": named[0]}}
+        inside = entry.get("contents", [])
+        # A single entry comes bare, and paths come with or without their slash.
+        inside = ["/" + p.lstrip("/") for p in ([inside] if isinstance(inside, str) else inside)]
+        if entry.get("container_kind") == "Tabs" and named and named[0] in inside:
+            turned = {"ContainerBlueprint": {**entry, "active_tab": named[0].lstrip("/")}}
             return {**blueprint, path: {**blueprint[path], **turned}}
     raise ScreenshotFailed(f"the recording has no tab {tab!r}, so it is none of a run")
 

@@ -37,15 +37,25 @@ class Series(NamedTuple):
     components: tuple[str, ...]
 
 
-# The order of the components is that of the columns of `groups`.
+# The components are in the order of the columns of `groups`.
 SERIES: tuple[Series, ...] = (
-    Series(layout.POSITION, "rad", ("measured", "command")),
-    Series(layout.VELOCITY, "rad/s", ("measured", "command")),
-    Series(layout.EFFORT, "Nm", ("measured", "command")),
+    Series(layout.POSITION, "rad", ("",)),
+    Series(layout.VELOCITY, "rad/s", ("",)),
+    Series(layout.EFFORT, "Nm", ("",)),
+    Series(layout.POSITION_COMMAND, "rad", ("command",)),
+    Series(layout.VELOCITY_COMMAND, "rad/s", ("command",)),
+    Series(layout.EFFORT_COMMAND, "Nm", ("command",)),
     Series(layout.GYRO, "rad/s", ("x", "y", "z")),
     Series(layout.ACCEL, "m/s²", ("x", "y", "z")),
     Series(layout.MOTOR, "1, A", ("PWM", "current")),
     Series(layout.SUPPLY, "V, °C", ("bus voltage", "winding temperature")),
+)
+
+
+_COMMANDS = (
+    (layout.POSITION_COMMAND, "position_command_rad"),
+    (layout.VELOCITY_COMMAND, "velocity_command_rad_s"),
+    (layout.EFFORT_COMMAND, "effort_command_nm"),
 )
 
 
@@ -78,10 +88,13 @@ class RowBatcher:
 
 
 def groups(rows: Rows) -> Iterator[tuple[str, FloatArray]]:
-    """Return the vector entities of m rows, as (group, (m, k)) in the order of `SERIES`."""
-    yield layout.POSITION, _columns(rows, "position_rad", "position_command_rad")
-    yield layout.VELOCITY, _columns(rows, "velocity_rad_s", "velocity_command_rad_s")
-    yield layout.EFFORT, _columns(rows, "effort_nm", "effort_command_nm")
+    """Return the vector entities of m rows, as (group, (m, k)); a command that is nowhere set is left out."""
+    yield layout.POSITION, _columns(rows, "position_rad")
+    yield layout.VELOCITY, _columns(rows, "velocity_rad_s")
+    yield layout.EFFORT, _columns(rows, "effort_nm")
+    for group, field in _COMMANDS:
+        if not np.isnan(rows[field]).all():
+            yield group, _columns(rows, field)
     yield layout.GYRO, rows["gyro_rad_s"].astype(float)
     yield layout.ACCEL, rows["accel_m_s2"].astype(float)
     yield layout.MOTOR, _columns(rows, "pwm", "motor_current_a")
@@ -131,8 +144,8 @@ def send_states(stream: rr.RecordingStream, serial: str, t_ns: IntArray, names: 
 def log_module_styles(stream: rr.RecordingStream, serial: str, label: str, colour: layout.Colour) -> None:
     """Log the names and colours of all series of a module, static."""
     for series in SERIES:
-        names = [f"{label} {component}" for component in series.components]
-        style = rr.SeriesLines(names=names, colors=_colours(series, colour), widths=_widths(series))
+        names = [f"{label} {component}".strip() for component in series.components]
+        style = rr.SeriesLines(names=names, colors=_colours(series, colour), widths=[1.5] * len(names))
         stream.log(layout.module_path(serial, series.group), style, static=True)
     stream.log(layout.module_path(serial, layout.STATE), _state_style(), static=True)
     _log_residual_styles(stream, serial, label, colour)
@@ -157,14 +170,9 @@ def _log_network_styles(stream: rr.RecordingStream, serial: str, label: str, col
 
 
 def _colours(series: Series, colour: layout.Colour) -> list[layout.Colour]:
-    if series.components[-1] == "command":
-        return [colour, layout.COMMAND_COLOUR]
+    if series.components == ("command",):
+        return [layout.COMMAND_COLOUR]
     return list(layout.axis_shades(colour)[: len(series.components)])
-
-
-def _widths(series: Series) -> list[float]:
-    # Commands are drawn thin over the measurement, so that both can be seen where they agree.
-    return [2.0, 0.8] if series.components[-1] == "command" else [1.0] * len(series.components)
 
 
 def _state_style() -> rr.StateConfiguration:

@@ -11,7 +11,7 @@ from coordinator.viewer import layout
 BASE_NODE = "base"
 BASE_COLOUR: layout.Colour = (200, 200, 210, 255)
 # In the graph's own units (points at zoom 1): room for a label of a dozen letters.
-COLUMN, ROW = 170.0, 70.0
+LEVEL, LEAF = 42.0, 130.0
 
 
 class Topology(NamedTuple):
@@ -23,14 +23,14 @@ class Topology(NamedTuple):
 
 
 def positions(topology: Topology) -> list[tuple[float, float]]:
-    """Return a place for the base, then for every module: the depth goes right, every leaf has its own row.
+    """Return a place for the base, then for every module: the depth goes down, every leaf has its own column.
 
-    A parent is level with the middle of its children, so no two edges cross.
+    A parent is above the middle of its children, so no two edges cross.
     """
     children: dict[int, list[int]] = {}
     for k, parent in enumerate(topology.parent):
         children.setdefault(parent, []).append(k)
-    rows: dict[int, float] = {}
+    across: dict[int, float] = {}
     depths: dict[int, int] = {BASE: 0}
     leaves = 0
     # Post-order without recursion: a chain of 64 modules is as deep as it is long.
@@ -39,16 +39,16 @@ def positions(topology: Topology) -> list[tuple[float, float]]:
         node, done = stack.pop()
         below = children.get(node, [])
         if done:
-            rows[node] = sum(rows[k] for k in below) / len(below)
+            across[node] = sum(across[k] for k in below) / len(below)
         elif below:
             depths |= dict.fromkeys(below, depths[node] + 1)
             stack.append((node, True))
             stack += [(k, False) for k in reversed(below)]
         else:
-            rows[node] = float(leaves)
+            across[node] = float(leaves)
             leaves += 1
     order = (BASE, *range(len(topology.serials)))
-    return [(COLUMN * depths[k], ROW * rows[k]) for k in order]
+    return [(LEAF * across[k], LEVEL * depths[k]) for k in order]
 
 
 def graph(
@@ -77,7 +77,7 @@ def graph(
 def extent(topology: Topology) -> tuple[float, float, float, float]:
     """Return the box (x_min, x_max, y_min, y_max) that shows all of the graph."""
     x, y = zip(*positions(topology), strict=True)
-    return (min(x) - 0.6 * COLUMN, max(x) + 0.8 * COLUMN, min(y) - ROW, max(y) + ROW)
+    return (min(x) - LEAF, max(x) + LEAF, min(y) - 0.6 * LEVEL, max(y) + 0.6 * LEVEL)
 
 
 def complaint(topology: Topology) -> str | None:

@@ -1,0 +1,71 @@
+"""An estimated parameter as it is plotted: whose it is, and a range in which its band can be seen."""
+
+import math
+from typing import NamedTuple
+
+Range = tuple[float, float]
+
+# The first band fills two fifths of the plot. Once it has shrunk below a thirtieth of it, the plot zooms in.
+FIRST_SIGMAS = 2.5
+ZOOM_BELOW = 1.0 / 30.0
+ZOOMED_SIGMAS = 8.0
+
+
+class Parameter(NamedTuple):
+    """A parameter that has been estimated.
+
+    ranges: what has it, in the order of the first estimates, and its plot's range (None: the viewer's own).
+    """
+
+    name: str
+    units: str
+    ranges: tuple[tuple[str, Range | None], ...] = ()
+
+    def ranges_by_serial(self) -> dict[str, Range | None]:
+        """Return the ranges as a dictionary in the same order."""
+        return dict(self.ranges)
+
+    def title(self) -> str:
+        """Return the name as one reads it."""
+        return self.name.replace("_", " ")
+
+    def seen(self, serial: str, value: float, sigma: float) -> "Parameter":
+        """Return the parameter with a plot in which this estimate and its band fit and can be told apart.
+
+        The range changes seldom: a new one means a new layout.
+        """
+        ranges = self.ranges_by_serial()
+        ranges[serial] = fitting(ranges.get(serial), value, sigma)
+        return self._replace(ranges=tuple(ranges.items()))
+
+
+def fitting(before: Range | None, value: float, sigma: float) -> Range | None:
+    """Return the range for an estimate, the one before if that still does.
+
+    The viewer fits a plot to the lines and cuts their bands off, so the range has to be set. Without a finite
+    positive sigma there is no band, and the viewer's own choice stays.
+    """
+    if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0.0):
+        return before
+    if before is None:
+        return (value - FIRST_SIGMAS * sigma, value + FIRST_SIGMAS * sigma)
+    low, high = before
+    if 2.0 * sigma < ZOOM_BELOW * (high - low):
+        return (value - ZOOMED_SIGMAS * sigma, value + ZOOMED_SIGMAS * sigma)
+    if low <= value - sigma and value + sigma <= high:
+        return before
+    return (min(low, value - FIRST_SIGMAS * sigma), max(high, value + FIRST_SIGMAS * sigma))
+
+
+def is_dynamic(parameter: Parameter) -> bool:
+    """Return whether it belongs to dynamics: masses, moments, friction and springs have units of kg or Nm."""
+    return "kg" in parameter.units or "Nm" in parameter.units
+
+
+def with_estimate(
+    parameters: tuple[Parameter, ...], name: str, serial: str, value: float, sigma: float, units: str
+) -> tuple[Parameter, ...]:
+    """Return the parameters with this estimate among them; the units are those said first."""
+    known = {parameter.name: parameter for parameter in parameters}
+    known[name] = known.get(name, Parameter(name, units)).seen(serial, value, sigma)
+    return tuple(known.values())
