@@ -191,5 +191,6 @@ def _check_uniform(times: NDArray[np.int64], rate_hz: float) -> None:
     if off.size and off.max() > 1.0:
         sample = int(np.argmax(off)) + 1
         raise ValueError(
-            f"t_ns is not uniform at {rate_hz} Hz: sample {sample} is {off.max() / 1e3:.1f} us off; resample first"
+            f"t_ns is not uniform at {rate_hz} Hz: sample {sample} is {off.max() / 1e3:.1f} us off; "
+            "resample first"
         )
