@@ -144,6 +144,7 @@ def _check_reversed(serials: list[str], observations: Observations) -> None:
         if seen.moved and seen.axis is not None and seen.axis[2] > -0.7:
             raise TopologyError(
                 f"{k} moved with its own joint, as a reversed module does, but about "
-                f"{seen.axis.round(2).tolist()} instead of -z of its IMU: check its encoder's sign, or how its IMU is mounted",
+                f"{seen.axis.round(2).tolist()} instead of -z of its IMU: check its encoder's sign, "
+                "or how its IMU is mounted",
                 (k,),
             )
