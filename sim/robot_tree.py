@@ -1,0 +1,152 @@
+"""A robot as rigid bodies and joints: frames, inertia, and where the IMUs are: the simulation's truth.
+
+Body i is everything rigid together on the distal side of joint i. Its frame has its origin on the joint's
+axis and is parallel to the module's output frame at q = 0; the world has z up.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Chain
+from module_agent.catalogue import ModuleType, module_type
+from sim.parts import placed
+from sim.pose import Array, inverse, pose, read_only
+from sim.rigid_body import RigidBody, joined, moved, negative, parameters, tensor
+from sim.robot_file import Robot
+
+GRAVITY_M_S2 = 9.81
+
+_FLANGE_KG, _FLANGE_RADIUS_M, _FLANGE_HEIGHT_M = 0.030, 0.018, 0.006
+
+
+class RobotTree(NamedTuple):
+    """A tree of n bodies, parents before children; poses are in the world at q = 0.
+
+    types: the modules' catalogue entries.
+    parent: index of the parent body, -1 for the fixed base.
+    axis_sign: (n,) the body turns about this times the z axis of its frame when the joint's position grows.
+    home: (n, 4, 4) the bodies' frames. origin: (n, 4, 4) the same in the parent's frame (the world for -1).
+    bodies: every body's mass and inertia in its own frame.
+    housing: (n, 4, 4) the modules' housing frames. output: (n, 4, 4) their output frames.
+    imu_body: the body that carries module i's IMU, -1 for the base. imu_pose: (n, 4, 4) its pose therein.
+    way: for every module the corners of its link, (k, 3), from the parent's distal frame to its own.
+    """
+
+    serials: tuple[str, ...]
+    types: tuple[ModuleType, ...]
+    parent: tuple[int, ...]
+    reversed: tuple[bool, ...]
+    axis_sign: Array
+    home: Array
+    origin: Array
+    bodies: tuple[RigidBody, ...]
+    housing: Array
+    output: Array
+    imu_body: tuple[int, ...]
+    imu_pose: Array
+    way: tuple[Array, ...]
+
+
+def flange(kind: ModuleType) -> RigidBody:
+    """Return what turns with a module's output, in the output frame: a small disc just below its face."""
+    across = _FLANGE_KG * (3 * _FLANGE_RADIUS_M**2 + _FLANGE_HEIGHT_M**2) / 12
+    along = _FLANGE_KG * _FLANGE_RADIUS_M**2 / 2
+    com = read_only(np.array([0.0, 0.0, -_FLANGE_HEIGHT_M / 2]))
+    return RigidBody(_FLANGE_KG, com, tensor(across, across, along, 0.0, 0.0, 0.0))
+
+
+def housing(kind: ModuleType) -> RigidBody:
+    """Return a module but for its flange, in the housing frame; both together are what the catalogue says."""
+    whole = RigidBody(kind.mass_kg, read_only(np.array(kind.com_xyz)), tensor(*kind.inertia))
+    return joined([whole, negative(moved(flange(kind), pose(kind.output_xyz)))])
+
+
+def build_tree(robot: Robot) -> RobotTree:
+    """Put a robot together at q = 0."""
+    parent = robot.parents
+    housings: list[Array] = []
+    outputs: list[Array] = []
+    ways: list[Array] = []
+    pieces: list[list[RigidBody]] = [[] for _ in robot.modules]
+    for i, module in enumerate(robot.modules):
+        p = parent[i]
+        here = robot.base.world_pose
+        if p >= 0:
+            here = housings[p] if robot.modules[p].mounted == "reversed" else outputs[p]
+        way = [here[:3, 3]]
+        held = pieces[p] if p >= 0 else []
+        for part in map(placed, module.link):
+            held.append(moved(part.body, here))
+            here = here @ part.output
+            way.append(here[:3, 3])
+        kind = module_type(module.type)
+        backwards = module.mounted == "reversed"
+        across = pose(kind.output_xyz)
+        housings.append(here @ inverse(across) if backwards else here)
+        outputs.append(here if backwards else here @ across)
+        own = moved(housing(kind), housings[i]), moved(flange(kind), outputs[i])
+        held.append(own[1] if backwards else own[0])
+        pieces[i].append(own[0] if backwards else own[1])
+        ways.append(read_only(np.array(way)))
+    return _tree(robot, np.array(housings), np.array(outputs), pieces, tuple(ways))
+
+
+def _tree(
+    robot: Robot, housings: Array, outputs: Array, pieces: list[list[RigidBody]], ways: tuple[Array, ...]
+) -> RobotTree:
+    parent = robot.parents
+    backwards = tuple(m.mounted == "reversed" for m in robot.modules)
+    types = tuple(module_type(m.type) for m in robot.modules)
+    imu_body = tuple(i if back else p for i, (back, p) in enumerate(zip(backwards, parent, strict=True)))
+    imu_home = np.array([h @ pose(kind.imu_xyz) for h, kind in zip(housings, types, strict=True)])
+
+    def seen_from(body: int, transform: Array) -> Array:
+        return transform if body < 0 else inverse(outputs[body]) @ transform
+
+    return RobotTree(
+        serials=robot.serials,
+        types=types,
+        parent=parent,
+        reversed=backwards,
+        axis_sign=read_only(np.where(backwards, -1.0, 1.0)),
+        home=read_only(outputs),
+        origin=read_only(np.array([seen_from(p, outputs[i]) for i, p in enumerate(parent)])),
+        bodies=tuple(moved(joined(own), inverse(outputs[i])) for i, own in enumerate(pieces)),
+        housing=read_only(housings),
+        output=read_only(outputs),
+        imu_body=imu_body,
+        imu_pose=read_only(np.array([seen_from(b, imu_home[i]) for i, b in enumerate(imu_body)])),
+        way=ways,
+    )
+
+
+def true_chain(robot: Robot) -> Chain:
+    """Return the kinematic truth in the root frame: the housing frame of the first module at q = 0."""
+    tree = build_tree(robot)
+    to_root = inverse(tree.housing[0])
+    joints = to_root @ tree.home
+    imu_in_housing = np.array([pose(kind.imu_xyz) for kind in tree.types])
+    return Chain(
+        serials=tree.serials,
+        parent=tree.parent,
+        reversed=tree.reversed,
+        axis=read_only(joints[:, :3, 2] * tree.axis_sign[:, None]),
+        point=read_only(joints[:, :3, 3]),
+        imu_home=read_only(to_root @ tree.housing @ imu_in_housing),
+        gravity=read_only(to_root[:3, :3] @ np.array([0.0, 0.0, GRAVITY_M_S2])),
+    )
+
+
+def true_inertia(robot: Robot) -> Array:
+    """Return every body's [m, m c (3), Ixx, Ixy, Ixz, Iyy, Iyz, Izz] at q = 0, (n, 10), read-only.
+
+    In the root frame and about its origin, in the order of the thesis' eq. 25.
+    """
+    tree = build_tree(robot)
+    to_root = inverse(tree.housing[0])
+    return read_only(
+        np.array(
+            [parameters(moved(b, to_root @ home)) for b, home in zip(tree.bodies, tree.home, strict=True)]
+        )
+    )

@@ -1,0 +1,192 @@
+"""The simulated world: a robot in gravity, its motors, sensors and module clocks, in ticks of 1 ms."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.hardware import HardwareLost, HardwareModule, SensorSample
+from sim.module_clock import draw_clock, module_time
+from sim.noise_profile import noise_profile
+from sim.physics.actuator import Actuators
+from sim.physics.imu import ImuKinematics
+from sim.physics.multibody import Multibody
+from sim.physics.sensor_noise import SensorNoise, generator
+from sim.physics.thermal import Windings
+from sim.pose import Array, read_only
+from sim.robot_file import Robot
+from sim.robot_tree import build_tree
+
+TICK_NS = 1_000_000
+TICK_S = 1e-3
+
+
+class Plant(NamedTuple):
+    """The true state at the instant of the last samples, (n,) each, read-only.
+
+    duty is what the bridges apply for `pwm`; motor positions and rates are seen at the output;
+    spring_torque_nm is what the springs exert on the outputs. With q, qd and qdd it fulfils the equations of motion but for the
+    integrator's error (velocity forces are those of half a tick before: 1e-3 Nm in brisk motion).
+    """
+
+    t_ns: int
+    pwm: Array
+    duty: Array
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+    motor_rad: Array
+    motor_rad_s: Array
+    spring_torque_nm: Array
+
+
+class World:
+    """A robot that lives in virtual time; the same seed and PWM give the same samples, bit by bit.
+
+    Position, velocity, effort and IMU of a sample belong to one instant, the beginning of the tick: `t_ns` is
+    that instant on the module's clock, and so is `imu_t_ns` in the ticks in which the IMU is read. In between
+    the last IMU values are repeated with their own time.
+
+    Raises:
+        ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number.
+        KeyError: unknown noise profile.
+    """
+
+    def __init__(self, robot: Robot, seed: int, noise: str | None = None, imu_rate_hz: float = 250.0):
+        self.robot = robot
+        profile = noise_profile(robot.noise if noise is None else noise)
+        tree = build_tree(robot)
+        self._imu_ticks = _whole_ticks(imu_rate_hz)
+        self.clocks = tuple(draw_clock(generator(seed, s, "clock"), profile) for s in robot.serials)
+        self._effort_limit = np.array([t.max_effort_nm for t in tree.types])
+        self._position_step = profile.position_step_rad
+        self._noise = SensorNoise(seed, robot.serials, profile, imu_rate_hz)
+        self._imu = ImuKinematics(tree)
+        self._imu_values = np.zeros((len(tree.serials), 6))
+        self._imu_ns = [0] * len(tree.serials)
+        self._windings = Windings(tree.types, TICK_S)
+        self._actuators = Actuators(tree.types, TICK_S)
+        self._body = Multibody(robot.name, tree, TICK_S)
+        self._tick = 0
+        self._q = robot.start_rad
+        self._qd = np.zeros_like(self._q)
+        self._body.place(self._q)
+        self._actuators.reset(self._q, self._body.bias(self._q.tolist(), self._qd.tolist()))
+        zero = np.zeros_like(self._q)
+        motor = self._actuators.motor_rad
+        self._plant = (0, zero, zero, self._q, zero, zero, motor, zero, self._actuators.torque_nm)
+        self.modules = tuple(
+            HardwareModule(m.serial, m.type, TICK_NS, self._imu_ticks * TICK_NS) for m in robot.modules
+        )
+
+    @property
+    def t_ns(self) -> int:
+        """The world's time [ns]: the end of the last tick."""
+        return self._tick * TICK_NS
+
+    @property
+    def plant(self) -> Plant:
+        """The true state at the instant of the last samples; at the start before the first tick."""
+        t_ns, *arrays = self._plant
+        return Plant(t_ns, *(read_only(a.copy()) for a in arrays))
+
+    @property
+    def imu_bias(self) -> Array:
+        """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
+        return self._noise.imu_bias
+
+    def step(self, pwm: Sequence[float]) -> list[SensorSample]:
+        """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.
+
+        Raises:
+            ValueError: a PWM is missing, too many or not finite.
+            HardwareLost: the world is closed.
+        """
+        u = self._checked(pwm)
+        actuators, q, qd = self._actuators, self._q, self._qd
+        q_list = q.tolist()
+        motor, speed = actuators.motor_rad, actuators.motor_rad_s
+        torque = actuators.step(
+            u, q, qd, self._body.mass_matrix(q_list), self._body.bias(q_list, qd.tolist())
+        )
+        self._q, self._qd = self._body.step(torque.tolist())
+        # The integrator is a leapfrog: its velocities live half a tick before its positions, so the velocity
+        # at this instant is the mean of the two around it, and the acceleration is their difference.
+        rate = (qd + self._qd) * 0.5
+        change = (self._qd - qd) * (1.0 / TICK_S)
+        motor_rate = (speed + actuators.motor_rad_s) * 0.5
+        self._plant = (self.t_ns, u, actuators.duty, q, rate, change, motor, motor_rate, torque)
+        samples = self._samples(q, rate, change, motor_rate)
+        self._windings.step(actuators.current_a)
+        self._tick += 1
+        return samples
+
+    def close(self) -> None:
+        """End the world. May be called twice."""
+        self._body.close()
+
+    def _checked(self, pwm: Sequence[float]) -> Array:
+        if self._body.closed:
+            raise HardwareLost("the world is closed")
+        if len(pwm) != len(self.modules):
+            raise ValueError(f"{len(pwm)} PWM values for {len(self.modules)} modules")
+        for module, value in zip(self.modules, pwm, strict=True):
+            if not math.isfinite(value):
+                raise ValueError(f"PWM of module {module.serial} is {value}; it must be a number in [-1, 1]")
+        return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
+
+    def _samples(self, q: Array, rate: Array, change: Array, motor_rate: Array) -> list[SensorSample]:
+        now = [module_time(clock, self.t_ns) for clock in self.clocks]
+        if self._tick % self._imu_ticks == 0:
+            self._imu_values = np.hstack(self._imu.feel(q, rate, change)) + self._noise.imu()
+            self._imu_ns = now
+        actuators, error = self._actuators, self._noise.joint()
+        step = self._position_step
+        effort = error[:, 1] * self._effort_limit - actuators.spring_nm_rad * actuators.deflection_rad
+        values = np.empty((len(q), 14))
+        values[:, 0] = np.rint(q / step) * step if step else q
+        values[:, 1] = rate + error[:, 0]
+        values[:, 2] = effort
+        values[:, 3] = effort / -actuators.spring_nm_rad
+        values[:, 4] = actuators.gear * motor_rate
+        values[:, 5] = actuators.current_a
+        values[:, 6] = self._windings.winding_c
+        values[:, 7] = actuators.voltage_v
+        values[:, 8:] = self._imu_values
+        rows = values.tolist()
+        return [SensorSample(t, imu, *row) for t, imu, row in zip(now, self._imu_ns, rows, strict=True)]
+
+
+class InProcessHardware:
+    """The `Hardware` of an agent that lives in the world's own process; the world stays the caller's."""
+
+    def __init__(self, world: World):
+        self._world = world
+        self._open = True
+
+    @property
+    def modules(self) -> Sequence[HardwareModule]:
+        """All modules of the world."""
+        return self._world.modules
+
+    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        """Step the world.
+
+        Raises:
+            HardwareLost: this or the world is closed.
+        """
+        if not self._open:
+            raise HardwareLost("this hardware has been closed")
+        return self._world.step(pwm)
+
+    def close(self) -> None:
+        """Let go of the world."""
+        self._open = False
+
+
+def _whole_ticks(imu_rate_hz: float) -> int:
+    ticks = round(1.0 / (TICK_S * imu_rate_hz)) if imu_rate_hz > 0.0 else 0
+    if ticks < 1 or not math.isclose(ticks * TICK_S * imu_rate_hz, 1.0, rel_tol=1e-9):
+        raise ValueError(f"imu_rate_hz {imu_rate_hz} is not 1000 Hz divided by a whole number")
+    return ticks
