@@ -26,8 +26,8 @@ class Plant(NamedTuple):
     """The true state at the instant of the last samples, (n,) each, read-only.
 
     duty is what the bridges apply for `pwm`; motor positions and rates are seen at the output;
-    spring_torque_nm is what the springs exert on the outputs. With q, qd and qdd it fulfils the equations of motion but for the
-    integrator's error (velocity forces are those of half a tick before: 1e-3 Nm in brisk motion).
+    spring_torque_nm is what the springs exert on the outputs. With q, qd and qdd it fulfils the equations of
+    motion but for the integrator's error (velocity forces are those of half a tick before: 1e-3 Nm in brisk motion).
     """
 
     t_ns: int
