@@ -20,7 +20,7 @@ class LoggingThread:
     """Runs jobs in the order they come; drops and counts them when there are too many."""
 
     def __init__(self, on_idle: Job, length: int = QUEUE_LENGTH, reserved: int = RESERVED) -> None:
-        """Start the thread; `on_idle` runs in it whenever nothing came for a while."""
+        """Start the thread; `on_idle` runs in it whenever nothing came for a while, and at the end."""
         self._jobs: queue.Queue[Job | None] = queue.Queue(length + reserved)
         self._length = length
         self._on_idle = on_idle
@@ -72,9 +72,9 @@ class LoggingThread:
                 job = self._jobs.get(timeout=IDLE_SECONDS)
             except queue.Empty:
                 job = self._on_idle
+            self._attempt(job if job is not None else self._on_idle)
             if job is None:
                 return
-            self._attempt(job)
 
     def _attempt(self, job: Job) -> None:
         try:

@@ -50,11 +50,11 @@ def fitting(before: Range | None, value: float, sigma: float) -> Range | None:
     if before is None:
         return (value - FIRST_SIGMAS * sigma, value + FIRST_SIGMAS * sigma)
     low, high = before
+    if value - sigma < low or high < value + sigma:
+        low, high = min(low, value - FIRST_SIGMAS * sigma), max(high, value + FIRST_SIGMAS * sigma)
     if 2.0 * sigma < ZOOM_BELOW * (high - low):
         return (value - ZOOMED_SIGMAS * sigma, value + ZOOMED_SIGMAS * sigma)
-    if low <= value - sigma and value + sigma <= high:
-        return before
-    return (min(low, value - FIRST_SIGMAS * sigma), max(high, value + FIRST_SIGMAS * sigma))
+    return (low, high)
 
 
 def is_dynamic(parameter: Parameter) -> bool:

@@ -24,6 +24,7 @@ class Recorder:
         self._batcher = time_series.RowBatcher()
         self._states = time_series.StateChanges()
         self._scenes: dict[str, robot_scene.Scene] = {}
+        self._q_rad: dict[str, float] = {}
 
     def modules(self, serials: Sequence[str], types: Mapping[str, str]) -> None:
         """Make modules known: their types, names, colours and places in the layout."""
@@ -77,14 +78,14 @@ class Recorder:
         progress.log_estimate(self._stream, name, serial, value, sigma, units, colour)
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.Look) -> None:
-        """Draw the robot from now on; it has its posture at q = 0 until the next pose."""
+        """Draw the robot from now on, in the posture it was last seen in; at q = 0 before the first pose."""
         self._know(chain.serials)
         scene = robot_scene.build_scene(chain, self._types, self._colours(chain.serials), sigma_m, look)
         progress.set_time(self._stream, t_ns)
         before = self._scenes.get(look.world)
         if before is not None:
             robot_scene.clear_gone(self._stream, before, scene)
-        robot_scene.log_scene(self._stream, scene)
+        robot_scene.log_scene(self._stream, scene, self._posture(chain))
         self._scenes[look.world] = scene
         self._frame(chain)
 
@@ -98,10 +99,9 @@ class Recorder:
             raise ValueError(
                 f"a pose of shape {q_rad.shape} for a robot of {len(first.chain.serials)} joints"
             )
-        by_serial = dict(zip(first.chain.serials, q_rad, strict=True))
+        self._q_rad.update(zip(first.chain.serials, q_rad.tolist(), strict=True))
         for scene in self._scenes.values():
-            own = np.array([by_serial.get(serial, 0.0) for serial in scene.chain.serials])
-            robot_scene.log_pose(self._stream, scene, own)
+            robot_scene.log_pose(self._stream, scene, self._posture(scene.chain))
 
     def residuals(self, serial: str, t_ns: IntArray, measured_nm: Array, predicted_nm: Array) -> None:
         """Log held-out torque."""
@@ -129,6 +129,9 @@ class Recorder:
         if self._contents.reach_m is None:
             self._contents = self._contents._replace(reach_m=reach)
             self._show()
+
+    def _posture(self, chain: Chain) -> Array:
+        return np.array([self._q_rad.get(serial, 0.0) for serial in chain.serials])
 
     def _colours(self, serials: Sequence[str]) -> dict[str, layout.Colour]:
         return {serial: self._palette.colour(serial) for serial in serials}

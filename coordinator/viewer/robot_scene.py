@@ -86,12 +86,12 @@ def build_scene(
     return Scene(chain, look, tuple(drawn))
 
 
-def log_scene(stream: rr.RecordingStream, scene: Scene) -> None:
-    """Log a scene at the stream's present time, in its posture at q = 0."""
+def log_scene(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
+    """Log a scene at the stream's present time, in the posture `q_rad` (n,)."""
     for path, archetypes in scene.drawn:
         for archetype in archetypes:
             stream.log(path, archetype)
-    log_pose(stream, scene, np.zeros(len(scene.chain.serials)))
+    log_pose(stream, scene, q_rad)
 
 
 def log_pose(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:

@@ -3,7 +3,6 @@
 Needs Vulkan in software, on Debian the packages `mesa-vulkan-drivers` and `libvulkan1`.
 """
 
-import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from coordinator.viewer.targets import proxy_url
 
 SETTLE_SECONDS = 40.0
 SAME_PICTURES = 3
+MAGIC = b"RRF"
 _POLL_SECONDS = 0.4
 
 
@@ -61,8 +61,11 @@ def screenshots(
             raise ValueError(f"no tab {tab!r}; there are {', '.join(TABS)}")
     if not rrd.is_file():
         raise FileNotFoundError(f"no recording at {rrd}")
+    with rrd.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise ScreenshotFailed(f"{rrd} is no Rerun recording: it does not begin with {MAGIC.decode()!r}")
     port = viewer_process.free_port()
-    process = _start(port, size)
+    viewer = _start(port, size)
     try:
         client = ViewerClient.connect(proxy_url(port))
         _open(client, rrd, t_s)
@@ -72,11 +75,14 @@ def screenshots(
             _settle(client)
             out.parent.mkdir(parents=True, exist_ok=True)
             out.write_bytes(client.take_screenshot())
+    except ConnectionError as failure:
+        # It listens before it draws, so without Vulkan it starts, and dies at the first picture.
+        raise ScreenshotFailed(_advice(viewer.told())) from failure
     finally:
-        viewer_process.stop(process)
+        viewer_process.stop(viewer)
 
 
-def _start(port: int, size: tuple[int, int]) -> subprocess.Popen[bytes]:
+def _start(port: int, size: tuple[int, int]) -> viewer_process.ViewerProcess:
     options = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
     try:
         return viewer_process.start(options, port, detached=False)

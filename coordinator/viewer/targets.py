@@ -2,10 +2,9 @@
 
 import logging
 import socket
-import subprocess
 from pathlib import Path
 from typing import NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -40,7 +39,7 @@ class Opened(NamedTuple):
 
     records: bool
     live: tuple[str, ...]
-    web_server: subprocess.Popen[bytes] | None
+    web_server: viewer_process.ViewerProcess | None
 
 
 def open_targets(stream: rr.RecordingStream, targets: ViewerTargets, blueprint: rrb.Blueprint) -> Opened:
@@ -100,7 +99,7 @@ def _native(wanted: bool) -> str | None:
     return proxy_url(NATIVE_PORT)
 
 
-def _serve(port: int | None) -> subprocess.Popen[bytes] | None:
+def _serve(port: int | None) -> viewer_process.ViewerProcess | None:
     if port is None:
         return None
     options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
@@ -111,8 +110,9 @@ def _serve(port: int | None) -> subprocess.Popen[bytes] | None:
         return None
 
 
-def _web_url(server: subprocess.Popen[bytes] | None, targets: ViewerTargets) -> str | None:
+def _web_url(server: viewer_process.ViewerProcess | None, targets: ViewerTargets) -> str | None:
     if server is None or targets.serve_port is None:
         return None
-    logger.info("watch at http://127.0.0.1:%d?url=%s", targets.serve_port, proxy_url(targets.serve_port + 1))
-    return proxy_url(targets.serve_port + 1)
+    url = proxy_url(targets.serve_port + 1)
+    logger.info("watch at http://127.0.0.1:%d?url=%s", targets.serve_port, quote(url, safe=""))
+    return url

@@ -132,7 +132,6 @@ class Viewer:
         if self._thread is None or self._closed:
             return
         self._closed = True
-        self._thread.submit(self._recorder.drain, essential=True)
         self._thread.close()
         if self.dropped:
             logger.warning("%d batches were dropped: they came faster than the viewer logs", self.dropped)

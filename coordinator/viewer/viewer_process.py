@@ -9,11 +9,25 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO, NamedTuple
 
 START_SECONDS = 15.0
 _POLL_SECONDS = 0.05
 # The end of what it printed is where the reason is.
-_LINES_TOLD = 12
+LINES_TOLD = 30
+
+
+class ViewerProcess(NamedTuple):
+    """A viewer that was started here, and the file that it prints to."""
+
+    process: subprocess.Popen[bytes]
+    output: IO[bytes]
+
+    def told(self) -> str:
+        """Return the end of what it has printed so far."""
+        self.output.seek(0)
+        lines = self.output.read().decode(errors="replace").strip().splitlines()
+        return "\n".join(lines[-LINES_TOLD:])
 
 
 class ViewerNotStarted(RuntimeError):
@@ -37,7 +51,7 @@ def executable() -> Path:
     return Path(found)
 
 
-def start(options: Sequence[str], port: int, *, detached: bool) -> subprocess.Popen[bytes]:
+def start(options: Sequence[str], port: int, *, detached: bool) -> ViewerProcess:
     """Start the viewer, listening for data on `port` of 127.0.0.1, and wait until it does.
 
     A detached viewer has its own session, so that neither Ctrl-C nor the end of this process ends it.
@@ -48,31 +62,32 @@ def start(options: Sequence[str], port: int, *, detached: bool) -> subprocess.Po
     # By default the viewer listens on all interfaces; a run is nobody else's business unless asked for.
     command = [str(executable()), "--bind", "127.0.0.1", "--port", str(port), *options]
     environment = {**os.environ, "RERUN_APP_ONLY": "true", "NO_COLOR": "1"}
-    with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=environment,
-            start_new_session=detached,
-        )
-        if _wait_until_ready(process, port):
-            return process
-        stop(process)
-        output.seek(0)
-        told = output.read().decode(errors="replace").strip().splitlines()
-    raise ViewerNotStarted("\n".join([f"{' '.join(command)} did not get ready:", *told[-_LINES_TOLD:]]))
+    output = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the viewer
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=subprocess.STDOUT,
+        env=environment,
+        start_new_session=detached,
+    )
+    started = ViewerProcess(process, output)
+    if _wait_until_ready(process, port):
+        return started
+    told = started.told()
+    stop(started)
+    raise ViewerNotStarted(f"{' '.join(command)} did not get ready:\n{told}")
 
 
-def stop(process: subprocess.Popen[bytes], patience_s: float = 5.0) -> None:
+def stop(viewer: ViewerProcess, patience_s: float = 5.0) -> None:
     """End a viewer that was started here, by force if it does not end by itself."""
-    process.terminate()
+    viewer.process.terminate()
     try:
-        process.wait(patience_s)
+        viewer.process.wait(patience_s)
     except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+        viewer.process.kill()
+        viewer.process.wait()
+    viewer.output.close()
 
 
 def free_port() -> int:

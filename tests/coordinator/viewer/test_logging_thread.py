@@ -1,0 +1,96 @@
+import threading
+
+import pytest
+
+from coordinator.viewer.logging_thread import LoggingThread
+
+
+def nothing() -> None:
+    pass
+
+
+@pytest.fixture
+def gate() -> threading.Event:
+    return threading.Event()
+
+
+def blocked(gate: threading.Event, length: int, reserved: int) -> LoggingThread:
+    """Start a thread whose first job waits for the gate, so that the queue stays as it is filled."""
+    thread = LoggingThread(nothing, length, reserved)
+    begun = threading.Event()
+
+    def wait() -> None:
+        begun.set()
+        gate.wait()
+
+    thread.submit(wait)
+    assert begun.wait(10.0)
+    return thread
+
+
+def test_jobs_run_in_order_and_all_before_it_closes() -> None:
+    ran: list[int] = []
+    thread = LoggingThread(nothing)
+    for i in range(1000):
+        thread.submit(lambda i=i: ran.append(i))  # type: ignore[misc]
+    thread.close()
+    assert ran == list(range(1000))
+    assert thread.dropped == 0
+
+
+def test_what_does_not_fit_is_dropped_and_counted_and_the_caller_never_waits(gate: threading.Event) -> None:
+    ran: list[int] = []
+    thread = blocked(gate, length=10, reserved=2)
+    taken = [thread.submit(lambda i=i: ran.append(i)) for i in range(25)]  # type: ignore[misc]
+    assert taken == [True] * 10 + [False] * 15
+    assert thread.dropped == 15
+    gate.set()
+    thread.close()
+    assert ran == list(range(10))
+
+
+def test_steps_still_fit_behind_a_flood_of_data(gate: threading.Event) -> None:
+    thread = blocked(gate, length=10, reserved=2)
+    for _ in range(25):
+        thread.submit(nothing)
+    assert [thread.submit(nothing, essential=True) for _ in range(3)] == [True, True, False]
+    assert thread.dropped == 16
+    gate.set()
+    thread.close()
+
+
+def test_a_job_that_raises_is_counted_told_once_and_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> None:
+        raise ValueError("a bad value")
+
+    ran: list[str] = []
+    thread = LoggingThread(nothing)
+    for _ in range(3):
+        thread.submit(fail)
+    thread.submit(lambda: ran.append("after"))
+    thread.close()
+    assert (thread.failed, ran) == (3, ["after"])
+    assert caplog.text.count("the viewer could not log something") == 1
+
+
+def test_the_idle_job_runs_while_nothing_comes_and_at_the_end() -> None:
+    idle = threading.Event()
+    counted: list[int] = []
+
+    def on_idle() -> None:
+        counted.append(1)
+        idle.set()
+
+    thread = LoggingThread(on_idle)
+    assert idle.wait(10.0)
+    before = len(counted)
+    thread.close()
+    assert len(counted) > before
+
+
+def test_closing_twice_is_no_mistake() -> None:
+    thread = LoggingThread(nothing)
+    thread.close()
+    thread.close()
+    with pytest.raises(RuntimeError, match="closed"):
+        thread.submit(nothing)

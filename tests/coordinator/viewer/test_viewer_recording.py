@@ -1,0 +1,232 @@
+"""What a run leaves in its file, read back with Rerun's own reader."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from rerun.chunk import RrdReader
+
+from coordinator.chain import Chain
+from coordinator.kinematics.forward import imu_poses
+from coordinator.viewer.targets import ViewerTargets
+from coordinator.viewer.viewer import Viewer
+from module_agent.wire.feedback_rows import Rows
+
+Read = Callable[[Path, str], pd.DataFrame]
+MakeRows = Callable[[int, int], Rows]
+PERIOD_NS = 4_000_001  # no round number, so that times kept as float seconds would show
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "run.rrd"
+
+
+@pytest.fixture
+def viewer(file: Path) -> Viewer:
+    return Viewer("arm", "run-1", ViewerTargets(rrd=file))
+
+
+def entities(file: Path) -> list[str]:
+    return sorted({chunk.entity_path for chunk in RrdReader(str(file)).stream()})
+
+
+def times_ns(table: pd.DataFrame) -> list[int]:
+    return table["session_time"].to_numpy().astype("timedelta64[ns]").astype(np.int64).tolist()
+
+
+def column(table: pd.DataFrame, name: str) -> np.ndarray:
+    return np.array([np.asarray(value.tolist()) for value in table[name].dropna()], dtype=float)
+
+
+def done(viewer: Viewer) -> None:
+    viewer.close()
+    assert (viewer.dropped, viewer.failed) == (0, 0)
+
+
+def test_every_row_is_in_the_file_at_its_own_nanosecond(
+    viewer: Viewer, file: Path, read: Read, make_rows: MakeRows
+) -> None:
+    t_ns = 10**15 + PERIOD_NS * np.arange(103)
+    for i in range(0, 103, 5):
+        count = min(5, 103 - i)
+        viewer.rows("a", t_ns[i : i + count], make_rows(i, count))
+    done(viewer)
+    gyro = read(file, "/modules/a/gyro")
+    assert times_ns(gyro) == t_ns.tolist()
+    expected = np.arange(103)[:, None] + np.array([0.0, 0.25, 0.5])
+    np.testing.assert_array_equal(column(gyro, "/modules/a/gyro:Scalars:scalars"), expected)
+    position = column(read(file, "/modules/a/position"), "/modules/a/position:Scalars:scalars")
+    np.testing.assert_array_equal(position[:, 0], 0.001 * np.arange(103))
+
+
+def test_a_command_that_is_not_set_is_not_drawn_at_nought(
+    viewer: Viewer, file: Path, make_rows: MakeRows, read: Read
+) -> None:
+    viewer.rows("a", np.arange(5), make_rows(0, 5))
+    done(viewer)
+    velocity = read(file, "/modules/a/velocity_command")
+    assert column(velocity, "/modules/a/velocity_command:Scalars:scalars")[:, 0].tolist() == [0, 2, 4, 6, 8]
+    position = read(file, "/modules/a/position_command")
+    assert "/modules/a/position_command:Scalars:scalars" not in position.columns
+
+
+def test_the_state_is_logged_when_it_changes_and_not_in_between(
+    viewer: Viewer, file: Path, make_rows: MakeRows, read: Read
+) -> None:
+    for i in range(0, 100, 5):
+        rows = make_rows(i, 5)
+        rows["state"] = [1 if n < 50 else 2 for n in range(i, i + 5)]
+        viewer.rows("a", PERIOD_NS * np.arange(i, i + 5), rows)
+    done(viewer)
+    states = read(file, "/modules/a/state")
+    named = [value[0] for value in states["/modules/a/state:StateChange:state"].dropna()]
+    assert named == ["armed", "moving"]
+    assert times_ns(states) == [0, 50 * PERIOD_NS]
+
+
+def test_an_estimate_keeps_its_value_variance_and_unit(viewer: Viewer, file: Path, read: Read) -> None:
+    viewer.estimate("link_length", "a", 5, 0.25, 0.01, "m")
+    viewer.estimate("link_length", "a", 7, 0.26, float("inf"), "m")
+    done(viewer)
+    path = "/estimates/link_length/a"
+    table = read(file, path)
+    assert times_ns(table) == [5, 7]
+    assert column(table, f"{path}:Measurements:values")[:, 0].tolist() == [0.25, 0.26]
+    variances = table[f"{path}:Measurements:variances"]
+    assert variances[0][0] == pytest.approx(1e-4)
+    assert variances[1] is None or len(variances[1]) == 0
+    assert table[f"{path}:Measurements:units"][0][0] == "m"
+
+
+def test_held_out_torque_and_what_is_left_of_it(viewer: Viewer, file: Path, read: Read) -> None:
+    viewer.residuals("a", np.array([1, 2]), [1.0, 2.0], [0.5, 2.25])
+    done(viewer)
+    error = read(file, "/residuals/a/error")
+    assert column(error, "/residuals/a/error:Scalars:scalars")[:, 0].tolist() == [0.5, -0.25]
+    torque = read(file, "/residuals/a/torque")
+    assert column(torque, "/residuals/a/torque:Scalars:scalars").tolist() == [[1.0, 0.5], [2.0, 2.25]]
+
+
+def test_steps_network_and_topology_are_at_their_times(viewer: Viewer, file: Path, read: Read) -> None:
+    viewer.modules(["a", "b"], {"a": "X5-9", "b": "X5-1"})
+    viewer.phase(3, "discover")
+    viewer.network("b", 4, 1.5, 6.0, 2)
+    viewer.topology(5, ["a", "b"], [-1, 0], [False, True])
+    done(viewer)
+    log = read(file, "/phase/log")
+    assert (times_ns(log), log["/phase/log:TextLog:text"][0][0]) == ([3], "discover")
+    assert column(read(file, "/network/b/age"), "/network/b/age:Scalars:scalars").tolist() == [[6.0]]
+    assert column(read(file, "/network/b/refusals"), "/network/b/refusals:Scalars:scalars").tolist() == [
+        [2.0]
+    ]
+    topology = read(file, "/topology")
+    edges = [tuple(edge.values()) for edge in topology["/topology:GraphEdges:edges"][0]]
+    assert (times_ns(topology), edges) == ([5], [("base", "a"), ("a", "b")])
+    assert topology["/topology:GraphNodes:labels"][0].tolist() == ["base", "a · X5-9", "b · X5-1 · reversed"]
+
+
+def test_there_is_no_robot_before_it_is_known(viewer: Viewer, file: Path, make_rows: MakeRows) -> None:
+    viewer.modules(["a"], {"a": "X5-9"})
+    viewer.rows("a", np.arange(5), make_rows(0, 5))
+    viewer.pose(1, [0.3])
+    done(viewer)
+    assert not [path for path in entities(file) if path.startswith("/world")]
+
+
+def test_the_bodies_turn_so_that_the_imus_are_where_the_kinematics_says(
+    viewer: Viewer, file: Path, read: Read, arm: Chain, types: dict[str, str]
+) -> None:
+    q = np.array([0.7, -1.1])
+    viewer.modules(arm.serials, types)
+    viewer.chain(10, arm, [0.0, 0.001])
+    viewer.pose(20, q)
+    done(viewer)
+    body = "/world/est/body/b\\/1"
+    table = read(file, "/world/est/**")
+    moved = _transform(table.iloc[-1], body)
+    imu = _transform(table.iloc[0], f"{body}/imu/b\\/1")
+    # Single precision in the recording: 1e-6 of lengths of a metre.
+    np.testing.assert_allclose(moved @ imu, imu_poses(arm, q[None, :])[0, 1], atol=1e-6)
+    assert times_ns(table) == [10, 20]
+
+
+def _transform(row: pd.Series, path: str) -> np.ndarray:
+    pose = np.eye(4)
+    # Rerun keeps matrices column by column.
+    pose[:3, :3] = np.asarray(row[f"{path}:Transform3D:mat3x3"][0]).reshape(3, 3).T
+    pose[:3, 3] = row[f"{path}:Transform3D:translation"][0]
+    return pose
+
+
+def test_a_refined_robot_keeps_its_posture_and_loses_what_is_no_longer_known(
+    viewer: Viewer, file: Path, read: Read, arm: Chain, types: dict[str, str]
+) -> None:
+    q = np.array([0.7, -1.1])
+    viewer.modules(arm.serials, types)
+    viewer.chain(10, arm, [0.0, 0.02])
+    viewer.pose(20, q)
+    viewer.chain(30, arm, [0.0, float("nan")])
+    done(viewer)
+    table = read(file, "/world/est/**")
+    body = "/world/est/body/b\\/1"
+    np.testing.assert_array_equal(_transform(table.iloc[1], body), _transform(table.iloc[2], body))
+    spread = table[f"{body}/spread:Ellipsoids3D:half_sizes"]
+    assert spread[0][0].tolist() == pytest.approx([0.06] * 3)  # three sigma
+    assert len(spread[2]) == 0
+
+
+def test_poses_come_at_most_thirty_times_a_second(
+    viewer: Viewer, file: Path, read: Read, arm: Chain, types: dict[str, str]
+) -> None:
+    viewer.modules(arm.serials, types)
+    viewer.chain(0, arm)
+    for i in range(1000):
+        viewer.pose(i * 4_000_000, [0.001 * i, 0.0])
+    done(viewer)
+    table = read(file, "/world/est/body/a")
+    # 4 s of poses every 4 ms: one in nine, every 36 ms.
+    assert len(table) == 112
+    assert np.diff(times_ns(table)).min() > 33_000_000
+
+
+def test_the_blueprint_of_the_same_application_is_in_the_file(viewer: Viewer, file: Path) -> None:
+    viewer.modules(["a"], {"a": "X5-9"})
+    done(viewer)
+    reader = RrdReader(str(file))
+    recordings = [(entry.application_id, entry.recording_id) for entry in reader.recordings()]
+    assert recordings == [("x5", "run-1")]
+    # One that the file opens with, and one for the modules.
+    assert [entry.application_id for entry in reader.blueprints()] == ["x5", "x5"]
+
+
+def test_a_module_without_a_type_is_reported_and_the_run_goes_on(
+    viewer: Viewer, file: Path, read: Read, arm: Chain, caplog: pytest.LogCaptureFixture
+) -> None:
+    viewer.chain(0, arm)
+    viewer.phase(1, "after")
+    viewer.close()
+    assert viewer.failed == 1
+    assert "the type of module 'a' is not known" in caplog.text
+    assert times_ns(read(file, "/phase/log")) == [1]
+
+
+def test_mistakes_of_the_caller_are_raised_at_the_call(viewer: Viewer, make_rows: MakeRows) -> None:
+    with pytest.raises(ValueError, match="times of shape"):
+        viewer.rows("a", np.arange(4), make_rows(0, 5))
+    with pytest.raises(ValueError, match="have shapes"):
+        viewer.residuals("a", np.arange(2), [1.0], [1.0, 2.0])
+    with pytest.raises(ValueError, match=r"'b'.*parent index 1"):
+        viewer.topology(0, ["a", "b"], [-1, 1], [False, False])
+    done(viewer)
+    with pytest.raises(RuntimeError, match="closed"):
+        viewer.phase(0, "late")
+
+
+def test_with_no_target_nothing_happens(make_rows: MakeRows) -> None:
+    viewer = Viewer("arm", "run-1", ViewerTargets())
+    viewer.rows("a", np.arange(5), make_rows(0, 5))
+    viewer.close()
+    assert (viewer.dropped, viewer.failed) == (0, 0)

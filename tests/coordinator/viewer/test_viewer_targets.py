@@ -1,0 +1,81 @@
+"""Live viewers that are there, are not there, and die: the file has everything all the same."""
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from coordinator.viewer import viewer_process
+from coordinator.viewer.targets import ViewerTargets, listens, proxy_url
+from coordinator.viewer.viewer import Viewer
+from module_agent.wire.feedback_rows import Rows
+
+Read = Callable[[Path, str], pd.DataFrame]
+MakeRows = Callable[[int, int], Rows]
+
+
+def log(viewer: Viewer, make_rows: MakeRows, first: int, count: int) -> None:
+    for i in range(first, first + count, 5):
+        viewer.rows("a", 4_000_000 * np.arange(i, i + 5), make_rows(i, 5))
+
+
+def test_with_nobody_at_the_address_the_file_is_complete(
+    tmp_path: Path, make_rows: MakeRows, read: Read, caplog: pytest.LogCaptureFixture
+) -> None:
+    file, url = tmp_path / "run.rrd", proxy_url(viewer_process.free_port())
+    viewer = Viewer("arm", "r", ViewerTargets(rrd=file, connect=url))
+    log(viewer, make_rows, 0, 500)
+    viewer.close()
+    assert f"no viewer listens at {url}" in caplog.text
+    assert len(read(file, "/modules/a/gyro")) == 500
+
+
+def test_an_address_of_another_kind_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    viewer = Viewer("arm", "r", ViewerTargets(rrd=tmp_path / "run.rrd", connect="127.0.0.1:9876"))
+    viewer.close()
+    assert "'127.0.0.1:9876' is no viewer's address; one looks like 'rerun+http://" in caplog.text
+
+
+def test_a_file_that_cannot_be_written_is_said_at_once(tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError):
+        Viewer("arm", "r", ViewerTargets(rrd=tmp_path))
+
+
+@pytest.mark.integration
+def test_a_viewer_that_dies_in_the_middle_leaves_the_file_complete(
+    tmp_path: Path, make_rows: MakeRows, read: Read, caplog: pytest.LogCaptureFixture
+) -> None:
+    file, port = tmp_path / "run.rrd", viewer_process.free_port()
+    other = viewer_process.start(["--serve-grpc"], port, detached=False)
+    viewer = Viewer("arm", "r", ViewerTargets(rrd=file, connect=proxy_url(port)))
+    log(viewer, make_rows, 0, 250)
+    other.process.kill()
+    other.process.wait()
+    log(viewer, make_rows, 250, 250)
+    viewer.close()
+    assert viewer.failed == 0
+    assert "a live viewer did not get everything" in caplog.text
+    assert len(read(file, "/modules/a/gyro")) == 500
+
+
+@pytest.mark.integration
+def test_the_web_page_is_served_to_this_machine_only_and_ends_with_the_run() -> None:
+    port = viewer_process.free_port()
+    viewer = Viewer("arm", "r", ViewerTargets(serve_port=port))
+    try:
+        listening = subprocess.run(["ss", "-ltnH"], capture_output=True, text=True, check=True).stdout
+        ours = [line.split()[3] for line in listening.splitlines() if line.split()[3].endswith(f":{port}")]
+        assert ours == [f"127.0.0.1:{port}"]
+        assert listens("127.0.0.1", port + 1)
+    finally:
+        viewer.close()
+    assert not listens("127.0.0.1", port)
+
+
+@pytest.mark.integration
+def test_a_viewer_that_does_not_start_says_why() -> None:
+    with pytest.raises(viewer_process.ViewerNotStarted, match="--no-such-option"):
+        viewer_process.start(["--no-such-option"], viewer_process.free_port(), detached=False)
