@@ -33,4 +33,4 @@ class JournalEvent(BaseModel):
 
     def encode(self) -> bytes:
         """Return the event as JSON."""
-        return self.model_dump_json(exclude_defaults=True).encode()
+        return self.model_dump_json(exclude_none=True).encode()

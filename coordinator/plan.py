@@ -33,7 +33,7 @@ class Plan(BaseModel):
     dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
     dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
     dynamics: bool = True
-    hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 4.0
+    hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
     retries: Annotated[int, Field(ge=0, le=5)] = 2
 
     def constant(self) -> ConstantMotion:

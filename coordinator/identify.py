@@ -1,0 +1,325 @@
+"""From a recording to what it says of the robot: pure, so that a replay computes the same.
+
+Topology from who moved, a first chain from the agents' circle point analyses, one batch refinement of it over all
+exploration motions, then the inertial parameters, checked on motions that nothing was fitted to.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array
+from coordinator.clock_map import ClockMap, map_clock
+from coordinator.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
+from coordinator.dynamics.identification import InertialFit, solve_pseudo_inverse
+from coordinator.dynamics.prediction import TorqueError, torque_error
+from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
+from coordinator.journal import JournalEvent, Purpose
+from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
+from coordinator.kinematics.chain_observations import (
+    DISTANCE_FLOOR_M,
+    DISTANCE_FLOOR_RELATIVE,
+    PairObservation,
+    RestObservation,
+)
+from coordinator.kinematics.null_space import name_null_space
+from coordinator.kinematics.refinement import Refinement, refine_chain
+from coordinator.kinematics.topology import MotionSeen, Topology, TopologyError, find_topology
+from coordinator.motion_window import RATE_HZ, Window, sensor_data, window
+from coordinator.recording import Recording
+from coordinator.result import Result
+from coordinator.result_parts import build_result
+from module_agent.catalogue import ModuleType, module_type
+from module_agent.wire.messages import Estimate
+
+# Five times the 2 Hz of the windowed sine, and above the first resonance of a held joint's spring.
+KINEMATIC_CUTOFF_HZ = 15.0
+# Half the time constant of that low-pass: about as many independent samples as there are.
+KINEMATIC_KEEP_EVERY = 5
+MOST_KINEMATIC_SAMPLES = 4000
+DYNAMIC_CUTOFF_HZ = 12.0
+
+
+class IdentificationError(ValueError):
+    """The recording does not hold what is needed; the message says what is missing and where."""
+
+
+class HeldOutMotion(NamedTuple):
+    """Torques of the held-out motions, measured (low-passed) and predicted, columns in the chain's order.
+
+    session_ns: (m,). module_ns: (m, n) the same instants in every module's own clock. The others (m, n).
+    """
+
+    serials: tuple[str, ...]
+    session_ns: "np.ndarray[tuple[int], np.dtype[np.int64]]"
+    module_ns: "np.ndarray[tuple[int, int], np.dtype[np.int64]]"
+    q_rad: Array
+    tau_measured_nm: Array
+    tau_predicted_nm: Array
+    error: TorqueError
+
+
+class Kinematics(NamedTuple):
+    """Topology and chain: `first` as assembled from the circles, `fit` after the batch refinement."""
+
+    topology: Topology
+    first: ChainFit
+    fit: ChainFit
+    refinement: Refinement
+    clocks: dict[str, ClockMap]
+    notes: tuple[str, ...]
+
+    def words(self) -> list[str]:
+        """Return the tree and the links in lines to read."""
+        lines = []
+        for k, serial in enumerate(self.topology.serials):
+            parent = self.topology.parent[k]
+            mounted = ", mounted reversed" if self.topology.reversed[k] else ""
+            if parent < 0:
+                lines.append(f"{serial} on the base{mounted}")
+                continue
+            length, sigma = 1e3 * self.fit.link_length_m[k], 1e3 * self.fit.link_length_sigma_m[k]
+            lines.append(
+                f"{serial} on {self.topology.serials[parent]}{mounted}: {length:.1f} +- {sigma:.1f} mm"
+            )
+        return lines
+
+
+class Identified(NamedTuple):
+    """Everything that follows from a recording."""
+
+    kinematics: Kinematics
+    inertia: InertialFit | None
+    held_out: HeldOutMotion | None
+    result: Result
+
+
+def identify(recording: Recording) -> Identified:
+    """Compute everything from a recording.
+
+    Raises:
+        IdentificationError: what is needed is not there, or contradicts itself.
+    """
+    kinematics = identify_kinematics(recording)
+    inertia, held_out = None, None
+    if _motions(recording, "dynamic"):
+        inertia, means = _inertia(recording, kinematics)
+        if _motions(recording, "held_out"):
+            held_out = _held_out(recording, kinematics, inertia, means)
+    return Identified(
+        kinematics, inertia, held_out, build_result(recording, kinematics, inertia, held_out)
+    )
+
+
+# ---------------------------------------------------------------------- kinematics
+
+
+def identify_kinematics(recording: Recording) -> Kinematics:
+    """Find topology and chain.
+
+    Raises:
+        IdentificationError: see `identify`.
+    """
+    serials = _explored(recording)
+    try:
+        topology = find_topology(_seen(recording, serials))
+        clocks = {s: map_clock(recording.modules[s].round_trips) for s in serials}
+        types = [_type(recording, s) for s in topology.serials]
+        windows = _exploration(recording, clocks, topology.serials)
+        first = assemble(
+            topology, types, _pairs(recording, topology.serials, windows), [_rest(recording, topology.serials)]
+        )
+        samples = sum(len(w.t_ns) for w in windows) // MOST_KINEMATIC_SAMPLES
+        data = sensor_data(windows, KINEMATIC_CUTOFF_HZ, max(KINEMATIC_KEEP_EVERY, samples))
+        refined = refine_chain(first.chain, data)
+    except (TopologyError, AssemblyError, ValueError) as error:
+        raise IdentificationError(str(error)) from error
+    notes = tuple(
+        f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"
+        for found in recording.estimates.values()
+        for estimate in found.values()
+        if estimate.note
+    )
+    return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
+
+
+def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
+    length, sigma = link_lengths(refined.chain, refined.covariance)
+    # What no motion can tell: the accelerometer's scale, and its place in the housing.
+    believed = np.sqrt(sigma**2 + DISTANCE_FLOOR_M**2 + (DISTANCE_FLOOR_RELATIVE * length) ** 2)
+    believed.flags.writeable = False
+    return first._replace(
+        chain=refined.chain,
+        covariance=refined.covariance,
+        rank=refined.rank,
+        condition=refined.condition,
+        unresolved=name_null_space(refined.chain, refined.null_basis),
+        null_basis=refined.null_basis,
+        link_length_m=length,
+        link_length_sigma_m=believed,
+    )
+
+
+def _motions(recording: Recording, *purposes: Purpose) -> list[JournalEvent]:
+    """Return the last motion of every purpose of every joint, in the order of the journal."""
+    latest: dict[tuple[str, str], JournalEvent] = {}
+    for event in recording.journal:
+        if event.what == "motion" and event.purpose in purposes and event.motion is not None:
+            latest[event.serial, event.purpose] = event
+    return list(latest.values())
+
+
+def _explored(recording: Recording) -> list[str]:
+    rested = sorted({e.serial for e in _motions(recording, "rest")})
+    explored = {e.serial for e in _motions(recording, "windowed_sine")}
+    missing = [s for s in rested if s not in explored]
+    if not rested or missing:
+        raise IdentificationError(
+            "no rest was recorded" if not rested else f"no exploration of {', '.join(missing)} was recorded"
+        )
+    return rested
+
+
+def _type(recording: Recording, serial: str) -> ModuleType:
+    info = recording.modules[serial].info
+    if info is None:
+        raise IdentificationError(f"module {serial} has not told its type")
+    return module_type(info.module_type)
+
+
+def _latest(recording: Recording, joint: str, observer: str) -> Estimate | None:
+    """Return the estimate of the latest motion, the windowed sine's."""
+    sine = [e for e in _motions(recording, "windowed_sine") if e.serial == joint]
+    number = sine[-1].motion.motion_id if sine and sine[-1].motion is not None else -1
+    for ids, estimate in recording.estimates.get((joint, observer), {}).items():
+        if number in ids:
+            return estimate
+    return None
+
+
+def _seen(recording: Recording, serials: Sequence[str]) -> dict[tuple[str, str], MotionSeen]:
+    seen: dict[tuple[str, str], MotionSeen] = {}
+    for joint in serials:
+        for observer in serials:
+            estimate = _latest(recording, joint, observer)
+            if estimate is None:
+                continue
+            axis = np.array(estimate.circle.axis) if estimate.circle is not None else None
+            seen[joint, observer] = MotionSeen(estimate.moved, estimate.rate_ratio, axis)
+    return seen
+
+
+def _pairs(
+    recording: Recording, serials: Sequence[str], windows: Sequence[Window]
+) -> list[PairObservation]:
+    """Return the circles as observations; one that turned by more than the joint did is believed less."""
+    sines = {e.serial: i for i, e in enumerate(_exploration_motions(recording)) if e.purpose == "windowed_sine"}
+    pairs = []
+    for joint in serials:
+        q_mean = windows[sines[joint]].q_rad.mean(axis=0)
+        for observer in serials:
+            estimate = _latest(recording, joint, observer)
+            if estimate is None or estimate.circle is None or joint == observer:
+                continue
+            circle, excess = estimate.circle, abs(estimate.rate_ratio - 1.0)
+            pairs.append(
+                PairObservation(
+                    joint,
+                    observer,
+                    np.array(circle.axis),
+                    np.array(circle.radial_m),
+                    circle.sigma_axis_rad + excess,
+                    circle.sigma_distance_m + excess * circle.distance_m,
+                    q_mean,
+                )
+            )
+    return pairs
+
+
+def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
+    """Average every IMU and encoder over its rest."""
+    force, scatter, position = [], [], []
+    events = {e.serial: e for e in _motions(recording, "rest")}
+    for serial in serials:
+        motion = events[serial].motion
+        assert motion is not None
+        assert motion.end_row is not None
+        rows = recording.rows(serial, motion.start_row, motion.end_row)
+        if len(rows) < 10:
+            raise IdentificationError(f"module {serial} has {len(rows)} rows at rest, 10 are needed")
+        accel = rows["accel_m_s2"].astype(float)
+        force.append(accel.mean(axis=0))
+        scatter.append(float(accel.std(axis=0).max()) / np.sqrt(len(rows)))
+        position.append(float(rows["position_rad"].mean()))
+    return RestObservation(np.array(force), max(scatter), np.array(position))
+
+
+def _exploration_motions(recording: Recording) -> list[JournalEvent]:
+    return _motions(recording, "constant", "windowed_sine")
+
+
+def _exploration(
+    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]
+) -> list[Window]:
+    margin = settling_samples(RATE_HZ, KINEMATIC_CUTOFF_HZ) / RATE_HZ
+    return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording)]
+
+
+# ---------------------------------------------------------------------- dynamics
+
+
+def _filtered(recording: Recording, kinematics: Kinematics, event: JournalEvent) -> JointMotion:
+    margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
+    one = window(recording, kinematics.clocks, kinematics.topology.serials, event, margin)
+    return filtered_motion(one.t_ns, one.q_rad, one.qd_rad_s, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)
+
+
+def _joined(motions: Sequence[JointMotion]) -> JointMotion:
+    return JointMotion(*(np.concatenate(column) for column in zip(*motions, strict=True)))
+
+
+def _inertia(recording: Recording, kinematics: Kinematics) -> tuple[InertialFit, Array]:
+    """Solve thesis eq. 29 over all dynamic motions; also the mean torques, a baseline."""
+    motion = _joined([_filtered(recording, kinematics, e) for e in _motions(recording, "dynamic")])
+    regressor = torque_regressor(kinematics.fit.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+    fit = solve_pseudo_inverse(
+        regressor, motion.tau_nm, independent_fraction=min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
+    )
+    return fit, motion.tau_nm.mean(axis=0)
+
+
+def _held_out(
+    recording: Recording, kinematics: Kinematics, inertia: InertialFit, means: Array
+) -> HeldOutMotion:
+    motion = _joined([_filtered(recording, kinematics, e) for e in _motions(recording, "held_out")])
+    predicted = inverse_dynamics(
+        kinematics.fit.chain, inertia.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
+    )
+    serials = kinematics.topology.serials
+    return HeldOutMotion(
+        serials,
+        motion.t_ns,
+        np.stack([kinematics.clocks[s].to_module(motion.t_ns) for s in serials], axis=1),
+        motion.q_rad,
+        motion.tau_nm,
+        predicted,
+        torque_error(motion.tau_nm, predicted, means),
+    )
+
+
+def write_held_out(path: Path, held_out: HeldOutMotion) -> None:
+    """Write the held-out torques as npz, whole or not at all."""
+    temporary = path.with_name("held_out.part.npz")
+    np.savez_compressed(
+        temporary,
+        serials=np.array(held_out.serials),
+        t_ns=held_out.module_ns,
+        session_ns=held_out.session_ns,
+        q_rad=held_out.q_rad,
+        tau_measured_nm=held_out.tau_measured_nm,
+        tau_predicted_nm=held_out.tau_predicted_nm,
+    )
+    os.replace(temporary, path)
