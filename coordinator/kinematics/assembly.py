@@ -1,0 +1,237 @@
+"""Assemble the chain from what every module saw of every joint further up, and of gravity.
+
+Unknown are the poses of all housings at q = 0, against the first root's, and the direction of gravity; a
+module's own axis follows from its housing by the catalogue. All observations of all pairs are fitted
+together, so that a distal module that saw a joint far up tells what the modules between did not. What no
+observation tells is named and stays at its neutral value: the fit only ever moves in directions that the
+observations resolve.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array, Chain
+from coordinator.kinematics.chain_observations import (
+    ChainObservations,
+    PairObservation,
+    RestObservation,
+    jacobian,
+    pack,
+    predict,
+    residuals,
+)
+from coordinator.kinematics.forward import BASE
+from coordinator.kinematics.increments import apply_increment, frozen, skew
+from coordinator.kinematics.initial_guess import initial_chain
+from coordinator.kinematics.null_space import Unresolved, name_null_space
+from coordinator.kinematics.topology import Topology
+from module_agent.catalogue import ModuleType
+
+# A direction counts as resolved if its one sigma is below this (rad or m). A parallel pair of axes is never
+# parallel to the last digit: the noise of the axes would "resolve" the offset along them to half a metre.
+RESOLVED_BELOW = 0.25
+STEPS = 60
+HALVINGS = 12
+STILL = 1e-13
+
+
+class ChainFit(NamedTuple):
+    """An assembled chain and what is known of it; arrays read-only.
+
+    covariance: (6 n, 6 n) of the increments of `increments.apply_increment` over what is resolved; zero for
+    the
+        first root, which is the root frame, and along unresolved directions.
+    rank: of the weighted Jacobian over `unknowns` = 6 (n - 1) + 2 parameters, the last two gravity's
+    direction.
+    singular_values: (unknowns,) of it, largest first: each is 1 / sigma of a direction.
+    condition: the largest over the smallest resolved.
+    null_basis: (6 n, k) orthonormal increments that no observation tells.
+    link_length_m: (n,) perpendicular distance from the parent's axis to the module's IMU at q = 0; NaN for
+    roots.
+    reduced_chi2: weighted squares over degrees of freedom; about 1 if the sigmas are right. NaN without
+    freedom.
+    misfit_sigma: how far each pair observation is off, in the order given (rms of its four residuals); NaN
+    for
+        what a module saw of its own joint, which is not used.
+    """
+
+    chain: Chain
+    covariance: Array
+    rank: int
+    unknowns: int
+    singular_values: Array
+    condition: float
+    unresolved: tuple[Unresolved, ...]
+    null_basis: Array
+    link_length_m: Array
+    link_length_sigma_m: Array
+    reduced_chi2: float
+    misfit_sigma: Array
+
+
+class AssemblyError(ValueError):
+    """The observations contradict each other beyond any noise; the message names the worst pair."""
+
+
+def assemble(
+    topology: Topology,
+    types: Sequence[ModuleType],
+    pairs: Sequence[PairObservation],
+    rests: Sequence[RestObservation],
+) -> ChainFit:
+    """Fit the chain; `types` are those of the modules in the order of the topology.
+
+    The steps are those of Gauss and Newton in the resolved directions only (least squares of least norm by a
+    truncated SVD), so that unresolved directions stay where the neutral first guess has put them.
+
+    Raises:
+        ValueError: no rest observation, unknown serials or wrong shapes.
+        AssemblyError: an axis comes out opposite to what was observed.
+    """
+    if len(types) != len(topology.serials):
+        raise ValueError(f"{len(types)} module types for {len(topology.serials)} modules")
+    seen = pack(topology.serials, pairs, rests)
+    size = float(np.mean([np.linalg.norm(r.specific_force_m_s2, axis=1).mean() for r in rests]))
+    chain = _refine(initial_chain(topology, types, seen, size), seen)
+    _check_directions(chain, seen)
+    return _describe(chain, seen, pairs)
+
+
+class _Solved(NamedTuple):
+    """The weighted Jacobian over the unknowns taken apart, J = u s v^T; the first `rank` are resolved."""
+
+    u: Array
+    s: Array
+    vt: Array
+    rank: int
+
+
+def _solve(chain: Chain, seen: ChainObservations) -> _Solved:
+    slopes = jacobian(chain, seen)
+    width = 6 * len(chain.serials)
+    # The first root is the frame, and turning gravity about itself does nothing: neither is an unknown.
+    slopes = np.concatenate([slopes[:, 6:width], slopes[:, width:] @ _level(chain)], axis=1)
+    if slopes.shape[0] < slopes.shape[1]:
+        slopes = np.concatenate([slopes, np.zeros((slopes.shape[1] - slopes.shape[0], slopes.shape[1]))])
+    u, s, vt = np.linalg.svd(slopes, full_matrices=False)
+    return _Solved(u[: seen.rows], s, vt, int(np.count_nonzero(s > 1.0 / RESOLVED_BELOW)))
+
+
+def _level(chain: Chain) -> Array:
+    """Return (3, 2) axes across gravity about which it can tilt."""
+    _, _, vt = np.linalg.svd(chain.gravity[None, :])
+    return np.asarray(vt[1:].T)
+
+
+def _refine(chain: Chain, seen: ChainObservations) -> Chain:
+    rest = residuals(chain, seen)
+    for _ in range(STEPS):
+        parts = _solve(chain, seen)
+        keep = slice(parts.rank)
+        step = -parts.vt[keep].T @ ((parts.u[:, keep].T @ rest) / parts.s[keep])
+        better = _shortened(chain, seen, step, float(rest @ rest))
+        if better is None:
+            return chain
+        chain, rest = better
+        if np.abs(step).max() < STILL:
+            return chain
+    return chain
+
+
+def _shortened(chain: Chain, seen: ChainObservations, step: Array, cost: float) -> tuple[Chain, Array] | None:
+    """Return the chain after the longest of the halved steps that makes the cost smaller, or nothing."""
+    for halving in range(HALVINGS):
+        moved = _stepped(chain, 0.5**halving * step)
+        rest = residuals(moved, seen)
+        if float(rest @ rest) < cost:
+            return moved, rest
+    return None
+
+
+def _stepped(chain: Chain, step: Array) -> Chain:
+    tilt = skew(_level(chain) @ step[-2:])
+    moved = apply_increment(chain, np.concatenate([np.zeros(6), step[:-2]]))
+    gravity = chain.gravity + tilt @ chain.gravity
+    gravity *= np.linalg.norm(chain.gravity) / np.linalg.norm(gravity)
+    return moved._replace(gravity=frozen(gravity))
+
+
+def _check_directions(chain: Chain, seen: ChainObservations) -> None:
+    """Raise an AssemblyError if an axis points the other way; the residuals, being sines, do not show it."""
+    along = np.sum(predict(chain, seen).axis * seen.axis, axis=1)
+    if along.size and along.min() <= 0.0:
+        worst = int(np.argmin(along))
+        joint, observer = chain.serials[seen.joint[worst]], chain.serials[seen.observer[worst]]
+        raise AssemblyError(
+            f"{observer} saw the axis of joint {joint} {np.degrees(np.arccos(along[worst])):.0f} degrees "
+            f"away from where the fit puts it: what {observer} saw of the joints further up does not fit one "
+            "robot. Check the encoders' signs, the topology, and the data of these motions"
+        )
+
+
+def _describe(chain: Chain, seen: ChainObservations, pairs: Sequence[PairObservation]) -> ChainFit:
+    parts = _solve(chain, seen)
+    rest = residuals(chain, seen)
+    poses = 6 * (len(chain.serials) - 1)
+    resolved = parts.vt[: parts.rank, :poses] / parts.s[: parts.rank, None]
+    covariance = np.zeros((poses + 6, poses + 6))
+    covariance[6:, 6:] = resolved.T @ resolved
+    null_basis = _null_basis(parts.vt[parts.rank :, :poses])
+    freedom = seen.rows - parts.rank
+    length, sigma = link_lengths(chain, covariance)
+    return ChainFit(
+        chain=chain,
+        covariance=frozen(covariance),
+        rank=parts.rank,
+        unknowns=parts.s.size,
+        singular_values=frozen(parts.s),
+        condition=float(parts.s[0] / parts.s[parts.rank - 1]) if parts.rank else float("nan"),
+        unresolved=name_null_space(chain, null_basis),
+        null_basis=null_basis,
+        link_length_m=length,
+        link_length_sigma_m=sigma,
+        reduced_chi2=float(rest @ rest) / freedom if freedom > 0 else float("nan"),
+        misfit_sigma=_misfit(rest, pairs),
+    )
+
+
+def _null_basis(null_rows: Array) -> Array:
+    """Return orthonormal columns (6 n, k), the first root's rows zero, of null vectors (k, 6 (n - 1))."""
+    basis, _ = np.linalg.qr(null_rows.T)
+    return frozen(np.concatenate([np.zeros((6, basis.shape[1])), basis]))
+
+
+def _misfit(rest: Array, pairs: Sequence[PairObservation]) -> Array:
+    used = np.array([p.joint != p.observer for p in pairs], dtype=bool)
+    count = int(np.count_nonzero(used))
+    axis, place = rest[: 4 * count].reshape(2, count, 2)
+    found = np.full(len(pairs), np.nan)
+    found[used] = np.sqrt(np.mean(np.concatenate([axis, place], axis=1) ** 2, axis=1))
+    return frozen(found)
+
+
+def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
+    """Return the lengths (n,) from each parent's axis to the module's IMU at q = 0 and their sigmas; NaN for
+    roots.
+
+    Where the length is zero it has no slope; the sigma is then that of the place across the axis.
+    """
+    length, sigma = np.full((2, len(chain.serials)), np.nan)
+    for k, parent in enumerate(chain.parent):
+        if parent == BASE:
+            continue
+        axis, place = chain.axis[parent], chain.imu_home[k, :3, 3]
+        off = place - chain.point[parent]
+        radial = off - axis * (axis @ off)
+        length[k] = float(np.linalg.norm(radial))
+        # Only the motion of the IMU against the axis counts: that of the line, as a body, is taken off.
+        slope = np.zeros((3, covariance.shape[0]))
+        slope[:, 6 * k : 6 * k + 6] = np.concatenate([-skew(place), np.eye(3)], axis=1)
+        slope[:, 6 * parent : 6 * parent + 6] -= np.concatenate([-skew(place), np.eye(3)], axis=1)
+        across = np.eye(3) - np.outer(axis, axis)
+        outward = radial[None, :] / length[k] if length[k] > 1e-6 else across
+        spread = outward @ slope @ covariance @ slope.T @ outward.T
+        sigma[k] = float(np.sqrt(np.trace(spread)))
+    return frozen(length), frozen(sigma)

@@ -1,0 +1,168 @@
+"""Name what the observations leave open: which parameter of which module, and what would tell it.
+
+The null space of a fit is a set of vectors of numbers. Here it is compared with the motions of the robot's
+parts that are known to be able to hide: a branch along the axis of the joint that carries it or about it, and
+a second tree on the base against the first.
+"""
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array, Chain
+from coordinator.kinematics.forward import BASE, ancestors, descendants
+from coordinator.kinematics.increments import frozen
+
+Kind = Literal[
+    "offset_along_axis", "rotation_about_axis", "rotation_about_gravity", "position", "combination"
+]
+# The cosine between a named motion and the null space above which they are taken for the same.
+SAME_ABOVE = 0.995
+
+
+class Unresolved(NamedTuple):
+    """One way in which the robot could be different without any observation telling.
+
+    joint: serial of the joint about or along whose axis it goes; empty for positions and combinations.
+    modules: serials of the modules that would stand elsewhere, that next to the joint first.
+    directions: (6 n, m) increments (see `increments`), one column each; rotations in rad, offsets in m.
+    resolved_by: what would tell it, or that nothing does.
+    """
+
+    kind: Kind
+    joint: str
+    modules: tuple[str, ...]
+    text: str
+    resolved_by: str
+    directions: Array
+
+
+def name_null_space(chain: Chain, null_basis: Array) -> tuple[Unresolved, ...]:
+    """Name the null space of a fit, `null_basis` (6 n, k) with orthonormal columns, motion by motion.
+
+    What is left when all that have a name are taken out is reported as combinations, so that nothing is lost.
+    """
+    named = [item for item in _candidates(chain) if _hidden(item, null_basis)]
+    left = null_basis
+    if named:
+        known, _ = np.linalg.qr(null_basis.T @ np.concatenate([u.directions for u in named], axis=1))
+        rest = np.eye(null_basis.shape[1]) - known @ known.T
+        vectors, size, _ = np.linalg.svd(rest)
+        left = null_basis @ vectors[:, size > 0.5]
+    return (*named, *(_combination(chain, left[:, c]) for c in range(left.shape[1])))
+
+
+def _hidden(item: Unresolved, null_basis: Array) -> bool:
+    columns = item.directions / np.linalg.norm(item.directions, axis=0)
+    return bool(np.all(np.linalg.norm(null_basis.T @ columns, axis=0) > SAME_ABOVE))
+
+
+def _candidates(chain: Chain) -> Iterator[Unresolved]:
+    # Branch by branch: two children of one joint do not see each other, so each can hide on its own.
+    for child, joint in enumerate(chain.parent):
+        if joint != BASE:
+            yield _offset(chain, joint, child)
+            yield _rotation(chain, joint, child)
+    roots = [k for k, parent in enumerate(chain.parent) if parent == BASE]
+    for root in roots[1:]:
+        yield _position(chain, root)
+        yield _heading(chain, root)
+
+
+def _offset(chain: Chain, joint: int, child: int) -> Unresolved:
+    name, further = chain.serials[joint], ancestors(chain, joint)[:-1]
+    beyond = descendants(chain, child)
+    text = f"offset of {_branch(chain, child)} along {name}'s axis"
+    if not further:
+        text += ": not observable from inertial sensors on a fixed base"
+        cure = "nothing: no joint further up moves it; measure it, or take it from the drawing"
+    else:
+        text += f": every joint further up ({_names(chain, further)}) is parallel to it"
+        cure = f"moving a joint further up while {name}'s axis is not parallel to it"
+    return _item(chain, "offset_along_axis", joint, beyond, text, cure, np.r_[np.zeros(3), chain.axis[joint]])
+
+
+def _rotation(chain: Chain, joint: int, child: int) -> Unresolved:
+    name, further = chain.serials[joint], ancestors(chain, joint)[:-1]
+    beyond = descendants(chain, child)
+    text = f"rotation of {_branch(chain, child)} about {name}'s axis at {name}'s zero"
+    text += (
+        f": the axis is parallel to gravity and to every joint further up ({_names(chain, further)})"
+        if further
+        else " (base yaw): the axis is parallel to gravity and no joint further up moves it"
+    )
+    cure = (
+        f"resting, or moving a joint further up, while {name}'s axis is not parallel to it"
+        if further
+        else "tilting the base; on a level base nothing does"
+    )
+    axis, point = chain.axis[joint], chain.point[joint]
+    return _item(chain, "rotation_about_axis", joint, beyond, text, cure, np.r_[axis, np.cross(point, axis)])
+
+
+def _position(chain: Chain, root: int) -> Unresolved:
+    tree, name = descendants(chain, root), chain.serials[root]
+    twists = np.concatenate([np.zeros((3, 3)), np.eye(3)])
+    text = f"position of {name}'s tree relative to {chain.serials[0]}: nothing moves both"
+    return _item(chain, "position", None, tree, text, "nothing: both stand on the base; measure it", twists)
+
+
+def _heading(chain: Chain, root: int) -> Unresolved:
+    tree, name = descendants(chain, root), chain.serials[root]
+    up = chain.gravity / np.linalg.norm(chain.gravity)
+    twist = np.r_[up, np.cross(chain.imu_home[root, :3, 3], up)]
+    text = f"heading of {name}'s tree relative to {chain.serials[0]}: gravity does not tell it"
+    return _item(
+        chain,
+        "rotation_about_gravity",
+        None,
+        tree,
+        text,
+        "nothing: both stand on the base; measure it",
+        twist,
+    )
+
+
+def _item(
+    chain: Chain,
+    kind: Kind,
+    joint: int | None,
+    modules: tuple[int, ...],
+    text: str,
+    resolved_by: str,
+    twists: Array,
+) -> Unresolved:
+    columns = np.atleast_2d(twists.T).T.reshape(6, -1)
+    directions = np.zeros((len(chain.serials), 6, columns.shape[1]))
+    directions[list(modules)] = columns
+    return Unresolved(
+        kind=kind,
+        joint="" if joint is None else chain.serials[joint],
+        modules=tuple(chain.serials[k] for k in modules),
+        text=text,
+        resolved_by=resolved_by,
+        directions=frozen(directions.reshape(-1, columns.shape[1])),
+    )
+
+
+def _combination(chain: Chain, direction: Array) -> Unresolved:
+    size = np.linalg.norm(direction.reshape(-1, 6), axis=1)
+    moved = tuple(int(k) for k in np.flatnonzero(size > 0.1 * size.max()))
+    return Unresolved(
+        kind="combination",
+        joint="",
+        modules=tuple(chain.serials[k] for k in moved),
+        text=f"a combination of the poses of {_names(chain, moved)} that no observation tells apart",
+        resolved_by="motions of the joints further up at other positions of the joints between",
+        directions=frozen(direction[:, None]),
+    )
+
+
+def _branch(chain: Chain, child: int) -> str:
+    name = chain.serials[child]
+    return name if len(descendants(chain, child)) == 1 else f"{name} and everything beyond it"
+
+
+def _names(chain: Chain, modules: tuple[int, ...]) -> str:
+    return ", ".join(chain.serials[k] for k in modules)

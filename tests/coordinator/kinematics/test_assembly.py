@@ -1,0 +1,248 @@
+"""The chain must come out of circles and gravity, with what it cannot know named and left alone."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from coordinator.chain import Chain
+from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble
+from coordinator.kinematics.chain_observations import (
+    AXIS_FLOOR_RAD,
+    DISTANCE_FLOOR_M,
+    DISTANCE_FLOOR_RELATIVE,
+    GRAVITY_FLOOR_RAD,
+)
+from coordinator.kinematics.forward import imu_poses
+from coordinator.kinematics.increments import apply_increment
+from module_agent.catalogue import CATALOGUE
+
+X5 = CATALOGUE["X5-4"]
+
+
+def fit_exact(robots: Any, chain: Chain, types: Any, seed: int) -> ChainFit:
+    positions = robots.positions(chain, seed)
+    return assemble(
+        robots.topology(chain), types, robots.observe(chain, positions), [robots.rest(chain, positions[0])]
+    )
+
+
+def without_null_space(fit: ChainFit, truth: Chain) -> Chain:
+    """Move the estimate along its null space, and nowhere else, as near to the truth as it goes."""
+
+    def off(amounts: np.ndarray) -> np.ndarray:
+        return (apply_increment(fit.chain, fit.null_basis @ amounts).imu_home - truth.imu_home).ravel()
+
+    start = np.zeros(fit.null_basis.shape[1])
+    best = least_squares(off, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x if start.size else start
+    return apply_increment(fit.chain, fit.null_basis @ best)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_exact_observations_of_any_tree_give_the_exact_chain_up_to_the_named_null_space(
+    robots: Any, seed: int
+) -> None:
+    chain, types = robots.random(seed, joints=2 + seed % 7)
+    fit = fit_exact(robots, chain, types, seed)
+    found = without_null_space(fit, chain)
+    np.testing.assert_allclose(found.imu_home, chain.imu_home, atol=1e-6)
+    np.testing.assert_allclose(found.axis, chain.axis, atol=1e-6)
+    np.testing.assert_allclose(found.point, chain.point, atol=1e-6)
+    np.testing.assert_allclose(fit.chain.gravity, chain.gravity, atol=1e-5)
+    q = np.random.default_rng(seed).uniform(-2, 2, (4, len(types)))
+    np.testing.assert_allclose(imu_poses(found, q), imu_poses(chain, q), atol=1e-5)
+    assert fit.rank + fit.null_basis.shape[1] == fit.unknowns
+    assert fit.reduced_chi2 < 1e-10
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_only_the_offset_along_the_first_axis_is_open_in_a_general_serial_robot(
+    robots: Any, seed: int
+) -> None:
+    chain, types = robots.random(50 + seed, joints=5, serial=True)
+    fit = fit_exact(robots, chain, types, seed)
+    assert [(u.kind, u.joint) for u in fit.unresolved] == [("offset_along_axis", "M00")]
+    assert "nothing" in fit.unresolved[0].resolved_by
+
+
+def test_two_trees_on_one_base_cannot_know_where_the_other_stands(robots: Any) -> None:
+    chain, types = robots.random(7, joints=6, roots=2)
+    fit = fit_exact(robots, chain, types, 7)
+    kinds = [(u.kind, u.joint) for u in fit.unresolved]
+    assert ("position", "") in kinds
+    assert ("rotation_about_gravity", "") in kinds
+    assert all(kind != "combination" for kind, _ in kinds)
+    # Heading and place of the other tree may be far off: compared are the links, which depend on neither.
+    for k, parent in enumerate(chain.parent):
+        if parent >= 0:
+            off = chain.imu_home[k, :3, 3] - chain.point[parent]
+            length = np.linalg.norm(np.cross(off, chain.axis[parent]))
+            assert fit.link_length_m[k] == pytest.approx(length, abs=1e-6)
+
+
+def test_every_branch_of_a_tree_has_an_offset_of_its_own_that_nothing_tells(robots: Any) -> None:
+    homes = np.tile(np.eye(4), (3, 1, 1))
+    homes[0] = robots.root_pose(X5)
+    homes[1, :3, 3], homes[2, :3, 3] = [0.2, 0.0, 0.05], [-0.2, 0.1, 0.15]
+    homes[1:, :3, :3] = Rotation.random(2, rng=np.random.default_rng(1)).as_matrix()
+    chain = robots.build([-1, 0, 0], [False] * 3, homes, [X5] * 3, np.array([1.0, 0.0, 0.3]))
+    fit = fit_exact(robots, chain, [X5] * 3, 1)
+    assert [(u.kind, u.joint, u.modules) for u in fit.unresolved] == [
+        ("offset_along_axis", "M00", ("M01",)),
+        ("offset_along_axis", "M00", ("M02",)),
+    ]
+
+
+def noisy(robots: Any, chain: Chain, seed: int, positions: np.ndarray) -> tuple[Any, Any]:
+    """Observations with errors of exactly the size that the fit believes in."""
+    rng = np.random.default_rng(seed)
+    pairs = []
+    for p in robots.observe(chain, positions):
+        floor = DISTANCE_FLOOR_M + DISTANCE_FLOOR_RELATIVE * np.linalg.norm(p.radial_m)
+        size = np.hypot(1e-3, floor)
+        tilt = Rotation.from_rotvec(rng.normal(0, np.hypot(1e-3, AXIS_FLOOR_RAD), 3))
+        pairs.append(
+            p._replace(
+                axis=tilt.apply(p.axis),
+                radial_m=p.radial_m + rng.normal(0, size, 3),
+                sigma_axis_rad=1e-3,
+                sigma_distance_m=1e-3,
+            )
+        )
+    rest = robots.rest(chain, positions[0])
+    tilt = Rotation.from_rotvec(rng.normal(0, GRAVITY_FLOOR_RAD, (len(chain.serials), 3)))
+    return pairs, [rest._replace(specific_force_m_s2=tilt.apply(rest.specific_force_m_s2))]
+
+
+def test_with_noise_the_errors_are_those_that_the_covariance_states(robots: Any) -> None:
+    """Mahalanobis distances of the resolved errors over 20 draws, and the chi2 of the residuals."""
+    chain, types = robots.random(3, joints=5, serial=True)
+    positions = robots.positions(chain, 3)
+    chi2, lengths, distances = [], [], []
+    truth = assemble(
+        robots.topology(chain), types, robots.observe(chain, positions), [robots.rest(chain, positions[0])]
+    ).link_length_m
+    for seed in range(20):
+        fit = assemble(robots.topology(chain), types, *noisy(robots, chain, seed, positions))
+        chi2.append(fit.reduced_chi2)
+        lengths.append((fit.link_length_m - truth)[1:] / fit.link_length_sigma_m[1:])
+        aligned = without_null_space(fit, chain)
+        distances.append(mahalanobis(aligned, chain, fit))
+    freedom = 4 * 10 + 2 * 5 - fit.rank
+    # 20 draws of `freedom` squares each: sigma of the mean is sqrt(2 / (20 freedom)), four times that.
+    assert np.mean(chi2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (20 * freedom)))
+    assert np.sqrt(np.mean(np.square(lengths))) == pytest.approx(1.0, abs=4 / np.sqrt(2 * 80))
+    assert np.abs(lengths).max() < 4.5
+    # Squares over the resolved directions of the poses: rank less the two of gravity.
+    assert np.mean(distances) / (fit.rank - 2) == pytest.approx(1.0, abs=0.3)
+
+
+def mahalanobis(found: Chain, truth: Chain, fit: ChainFit) -> float:
+    """Squared distance of two chains by the fit's covariance, null space left out."""
+    error = RigidTransform.from_matrix(truth.imu_home @ np.linalg.inv(found.imu_home)).as_exp_coords().ravel()
+    return float(error @ np.linalg.pinv(fit.covariance, rcond=1e-9, hermitian=True) @ error)
+
+
+def test_a_worse_observation_is_named_by_its_misfit(robots: Any) -> None:
+    chain, types = robots.random(11, joints=4, serial=True)
+    positions = robots.positions(chain, 11)
+    pairs, rests = noisy(robots, chain, 1, positions)
+    bad = next(n for n, p in enumerate(pairs) if (p.joint, p.observer) == ("M01", "M03"))
+    pairs[bad] = pairs[bad]._replace(radial_m=pairs[bad].radial_m + np.array([0.03, -0.03, 0.03]))
+    fit = assemble(robots.topology(chain), types, pairs, rests)
+    assert fit.reduced_chi2 > 3.0
+    assert int(np.nanargmax(fit.misfit_sigma)) == bad
+
+
+def two_modules(robots: Any, up: np.ndarray, yaw: float) -> Chain:
+    """A root whose axis is z, and a link of 0.3 m with the next module turned by `yaw` about it."""
+    homes = np.tile(np.eye(4), (2, 1, 1))
+    homes[0] = robots.root_pose(X5)
+    homes[1, :3, :3] = Rotation.from_euler("zx", [yaw, 0.4]).as_matrix()
+    homes[1, :3, 3] = [0.3 * np.cos(yaw), 0.3 * np.sin(yaw), 0.12]
+    return robots.build([-1, 0], [False, False], homes, [X5, X5], up)
+
+
+def test_on_a_vertical_axis_the_yaw_of_the_next_module_is_unknown_and_said_so(robots: Any) -> None:
+    chain = two_modules(robots, np.array([0.0, 0.0, 1.0]), yaw=0.9)
+    fit = fit_exact(robots, chain, [X5, X5], 0)
+    assert [(u.kind, u.joint, u.modules) for u in fit.unresolved] == [
+        ("offset_along_axis", "M00", ("M01",)),
+        ("rotation_about_axis", "M00", ("M01",)),
+    ]
+    assert "base yaw" in fit.unresolved[1].text
+    assert "fixed base" in fit.unresolved[0].text
+    assert fit.link_length_m[1] == pytest.approx(0.3 - 0.0, abs=0.05)
+    np.testing.assert_allclose(without_null_space(fit, chain).imu_home, chain.imu_home, atol=1e-6)
+    # Left at neutral, in the plane of the root's output face, but for what the first guess was off (0.1 mm).
+    assert fit.chain.imu_home[1, 2, 3] == pytest.approx(X5.output_xyz[2], abs=1e-4)
+
+
+def test_on_a_horizontal_axis_gravity_tells_the_yaw_but_not_the_offset(robots: Any) -> None:
+    chain = two_modules(robots, np.array([1.0, 0.2, 0.0]), yaw=-0.7)
+    fit = fit_exact(robots, chain, [X5, X5], 0)
+    assert [(u.kind, u.joint) for u in fit.unresolved] == [("offset_along_axis", "M00")]
+    np.testing.assert_allclose(fit.chain.imu_home[1, :3, :3], chain.imu_home[1, :3, :3], atol=1e-6)
+
+
+def test_a_single_module_is_a_chain_with_nothing_unknown_but_gravity(robots: Any) -> None:
+    chain = robots.build([-1], [True], robots.root_pose(X5)[None], [X5], np.array([0.1, 0.0, 1.0]))
+    fit = assemble(robots.topology(chain), [X5], [], [robots.rest(chain, np.array([0.8]))])
+    np.testing.assert_allclose(fit.chain.gravity, chain.gravity, atol=1e-9)
+    np.testing.assert_allclose(fit.chain.axis, [[0, 0, -1]])
+    assert fit.unresolved == ()
+    assert np.isnan(fit.link_length_m[0])
+
+
+def test_parallel_axes_leave_the_offset_along_them_open_however_many_they_are(robots: Any) -> None:
+    """A planar arm: three parallel axes, and gravity across them."""
+    homes = np.tile(np.eye(4), (3, 1, 1))
+    homes[0] = robots.root_pose(X5)
+    homes[1, :3, 3], homes[2, :3, 3] = [0.3, 0.0, 0.05], [0.5, 0.1, 0.11]
+    chain = robots.build([-1, 0, 1], [False] * 3, homes, [X5] * 3, np.array([0.0, 1.0, 0.0]))
+    fit = fit_exact(robots, chain, [X5] * 3, 4)
+    assert [(u.kind, u.joint) for u in fit.unresolved] == [
+        ("offset_along_axis", "M00"),
+        ("offset_along_axis", "M01"),
+    ]
+    assert "parallel" in fit.unresolved[1].text
+    np.testing.assert_allclose(without_null_space(fit, chain).imu_home, chain.imu_home, atol=1e-6)
+
+
+def test_noise_does_not_resolve_what_parallel_axes_leave_open(robots: Any) -> None:
+    homes = np.tile(np.eye(4), (3, 1, 1))
+    homes[0] = robots.root_pose(X5)
+    homes[1, :3, 3], homes[2, :3, 3] = [0.3, 0.0, 0.05], [0.5, 0.1, 0.11]
+    chain = robots.build([-1, 0, 1], [False] * 3, homes, [X5] * 3, np.array([0.0, 0.0, 1.0]))
+    positions = robots.positions(chain, 5)
+    for seed in range(5):
+        fit = assemble(robots.topology(chain), [X5] * 3, *noisy(robots, chain, seed, positions))
+        kinds = [(u.kind, u.joint) for u in fit.unresolved]
+        assert ("offset_along_axis", "M00") in kinds
+        assert ("offset_along_axis", "M01") in kinds
+        assert ("rotation_about_axis", "M00") in kinds
+
+
+def test_a_wrong_sign_of_an_axis_is_reported_and_not_fitted(robots: Any) -> None:
+    chain, types = robots.random(21, joints=4, serial=True)
+    positions = robots.positions(chain, 21)
+    pairs = [
+        p._replace(axis=-p.axis) if (p.joint, p.observer) == ("M00", "M03") else p
+        for p in robots.observe(chain, positions)
+    ]
+    with pytest.raises(AssemblyError, match="M03 saw the axis of joint"):
+        assemble(robots.topology(chain), types, pairs, [robots.rest(chain, positions[0])])
+
+
+def test_a_missing_rest_and_unknown_serials_are_refused(robots: Any) -> None:
+    chain, types = robots.random(1, joints=2)
+    positions = robots.positions(chain, 1)
+    pairs, rest = robots.observe(chain, positions), robots.rest(chain, positions[0])
+    with pytest.raises(ValueError, match="gravity"):
+        assemble(robots.topology(chain), types, pairs, [])
+    with pytest.raises(ValueError, match="M99 is not in the topology"):
+        assemble(robots.topology(chain), types, [pairs[0]._replace(joint="M99")], [rest])
+    with pytest.raises(ValueError, match="1 module types for 2 modules"):
+        assemble(robots.topology(chain), types[:1], pairs, [rest])
