@@ -17,7 +17,7 @@ LINK_LENGTH = "link_length"
 
 # More than this on one page leaves plots too small to read; there are further pages for the rest.
 MODULES_PER_PAGE = 4
-PARAMETERS_PER_PAGE = 3
+ROWS_PER_PAGE, COLUMNS_PER_PAGE = 3, 3
 
 
 class Contents(NamedTuple):
@@ -104,22 +104,26 @@ def _awaited(contents: Contents) -> rrb.View:
 def _parameters(parameters: Sequence[Parameter], name: str) -> rrb.Container:
     """Give every parameter a row and every module a column, on as many pages as it takes."""
     serials = list(dict.fromkeys(serial for p in parameters for serial in p.ranges_by_serial()))
+    rows = [parameters[i : i + ROWS_PER_PAGE] for i in range(0, len(parameters), ROWS_PER_PAGE)]
+    columns = [serials[i : i + COLUMNS_PER_PAGE] for i in range(0, len(serials), COLUMNS_PER_PAGE)]
+    if len(rows) == len(columns) == 1:
+        return _parameter_page(parameters, serials, name)
+    what = [f": {some[0].title()} …" if len(rows) > 1 else "" for some in rows]
+    whose = [f"{some[0]} to {some[-1]}" if len(some) > 1 else some[0] for some in columns]
     pages = [
-        _parameter_page(parameters[i : i + PARAMETERS_PER_PAGE], serials[k : k + MODULES_PER_PAGE])
-        for i in range(0, len(parameters), PARAMETERS_PER_PAGE)
-        for k in range(0, len(serials), MODULES_PER_PAGE)
+        _parameter_page(rows[i], columns[k], whose[k] + what[i])
+        for i in range(len(rows))
+        for k in range(len(columns))
     ]
-    return pages[0] if len(pages) == 1 else rrb.Tabs(*pages, name=name)
+    return rrb.Tabs(*pages, name=name)
 
 
-def _parameter_page(parameters: Sequence[Parameter], serials: Sequence[str]) -> rrb.Container:
+def _parameter_page(parameters: Sequence[Parameter], serials: Sequence[str], name: str) -> rrb.Container:
     rows = [
         rrb.Horizontal(*(_estimate(p, serial) for serial in serials if serial in p.ranges_by_serial()))
         for p in parameters
     ]
-    whose = serials[0] if len(serials) == 1 else f"{serials[0]} to {serials[-1]}"
-    what = ", ".join(p.title() for p in parameters)
-    return rrb.Vertical(*rows, name=f"{what}: {whose}")
+    return rrb.Vertical(*rows, name=name)
 
 
 def _estimate(parameter: Parameter, serial: str) -> rrb.View:
@@ -186,6 +190,7 @@ def _network(contents: Contents) -> rrb.Vertical:
             contents=[layout.module_path(serial, layout.STATE) for serial in contents.serials],
             name="Firmware state",
         ),
+        row_shares=[2, 2, 2, 3],
         name=NETWORK,
     )
 

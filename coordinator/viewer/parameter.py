@@ -9,6 +9,17 @@ Range = tuple[float, float]
 FIRST_SIGMAS = 2.5
 ZOOM_BELOW = 1.0 / 30.0
 ZOOMED_SIGMAS = 8.0
+AGREEING_SIGMAS = 4.0
+
+
+class Estimate(NamedTuple):
+    """One estimate of a parameter with its standard deviation; `serial` names what has it."""
+
+    name: str
+    serial: str
+    value: float
+    sigma: float
+    units: str
 
 
 class Parameter(NamedTuple):
@@ -29,21 +40,19 @@ class Parameter(NamedTuple):
         """Return the name as one reads it."""
         return self.name.replace("_", " ")
 
-    def seen(self, serial: str, value: float, sigma: float) -> "Parameter":
-        """Return the parameter with a plot in which this estimate and its band fit and can be told apart.
-
-        The range changes seldom: a new one means a new layout.
-        """
+    def seen(self, serial: str, value: float, sigma: float, previous: float | None) -> "Parameter":
+        """Return the parameter with a plot in which this estimate and its band can be seen."""
         ranges = self.ranges_by_serial()
-        ranges[serial] = fitting(ranges.get(serial), value, sigma)
+        ranges[serial] = fitting(ranges.get(serial), value, sigma, previous)
         return self._replace(ranges=tuple(ranges.items()))
 
 
-def fitting(before: Range | None, value: float, sigma: float) -> Range | None:
-    """Return the range for an estimate, the one before if that still does.
+def fitting(before: Range | None, value: float, sigma: float, previous: float | None) -> Range | None:
+    """Return the range for an estimate, the one before if that still does: a new one means a new layout.
 
     The viewer fits a plot to the lines and cuts their bands off, so the range has to be set. Without a finite
-    positive sigma there is no band, and the viewer's own choice stays.
+    positive sigma there is no band, and the viewer's own choice stays. The plot zooms in only on an estimate
+    that agrees with the previous one: a jump of many sigmas says that sigma is wrong, and is to be seen.
     """
     if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0.0):
         return before
@@ -52,7 +61,8 @@ def fitting(before: Range | None, value: float, sigma: float) -> Range | None:
     low, high = before
     if value - sigma < low or high < value + sigma:
         low, high = min(low, value - FIRST_SIGMAS * sigma), max(high, value + FIRST_SIGMAS * sigma)
-    if 2.0 * sigma < ZOOM_BELOW * (high - low):
+    agrees = previous is not None and abs(value - previous) < AGREEING_SIGMAS * sigma
+    if agrees and 2.0 * sigma < ZOOM_BELOW * (high - low):
         return (value - ZOOMED_SIGMAS * sigma, value + ZOOMED_SIGMAS * sigma)
     return (low, high)
 
@@ -63,9 +73,10 @@ def is_dynamic(parameter: Parameter) -> bool:
 
 
 def with_estimate(
-    parameters: tuple[Parameter, ...], name: str, serial: str, value: float, sigma: float, units: str
+    parameters: tuple[Parameter, ...], estimate: Estimate, previous: float | None
 ) -> tuple[Parameter, ...]:
     """Return the parameters with this estimate among them; the units are those said first."""
     known = {parameter.name: parameter for parameter in parameters}
-    known[name] = known.get(name, Parameter(name, units)).seen(serial, value, sigma)
+    parameter = known.get(estimate.name, Parameter(estimate.name, estimate.units))
+    known[estimate.name] = parameter.seen(estimate.serial, estimate.value, estimate.sigma, previous)
     return tuple(known.values())

@@ -7,6 +7,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from coordinator.viewer import layout
+from coordinator.viewer.parameter import Estimate
 from coordinator.viewer.time_series import IntArray, send_scalars
 
 
@@ -21,28 +22,21 @@ def log_phase(stream: rr.RecordingStream, text: str) -> None:
     stream.log(layout.PHASE_NOW, rr.TextDocument(text))
 
 
-def log_estimate(
-    stream: rr.RecordingStream,
-    name: str,
-    serial: str,
-    value: float,
-    sigma: float,
-    units: str,
-    colour: layout.Colour,
-) -> None:
+def log_estimate(stream: rr.RecordingStream, estimate: Estimate, colour: layout.Colour) -> None:
     """Log a value with its variance, drawn as a line in a band of one sigma; not finite sigma: no band."""
-    known = math.isfinite(sigma)
+    known = math.isfinite(estimate.sigma)
     drawn = rr.Measurements(
-        [value],
-        variances=[sigma**2] if known else None,
-        units=units,
-        names=serial,
+        [estimate.value],
+        # None would leave the variance of the estimate before standing.
+        variances=[estimate.sigma**2] if known else [],
+        units=estimate.units,
+        names=estimate.serial,
         colors=[colour],
         widths=[2.0],
         # An estimate stays what it is until the next one.
         interpolation_mode="stepafter",
     )
-    stream.log(layout.estimate_path(name, serial), drawn)
+    stream.log(layout.estimate_path(estimate.name, estimate.serial), drawn)
 
 
 def log_network(

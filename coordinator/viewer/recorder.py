@@ -8,7 +8,7 @@ import rerun as rr
 from coordinator.chain import Array, Chain
 from coordinator.viewer import blueprint, layout, progress, robot_geometry, robot_scene, time_series
 from coordinator.viewer import topology_graph as graphs
-from coordinator.viewer.parameter import with_estimate
+from coordinator.viewer.parameter import Estimate, with_estimate
 from coordinator.viewer.time_series import Batch, IntArray
 
 
@@ -25,6 +25,7 @@ class Recorder:
         self._states = time_series.StateChanges()
         self._scenes: dict[str, robot_scene.Scene] = {}
         self._q_rad: dict[str, float] = {}
+        self._values: dict[tuple[str, str], float] = {}
 
     def modules(self, serials: Sequence[str], types: Mapping[str, str]) -> None:
         """Make modules known: their types, names, colours and places in the layout."""
@@ -67,15 +68,14 @@ class Recorder:
         self._contents = self._contents._replace(topology=topology)
         self._show()
 
-    def estimate(self, name: str, serial: str, t_ns: int, value: float, sigma: float, units: str) -> None:
-        """Log an estimated parameter of a module, or of whatever else `serial` names."""
-        before = self._contents.estimated
-        self._contents = self._contents._replace(
-            estimated=with_estimate(before, name, serial, value, sigma, units)
-        )
+    def estimate(self, t_ns: int, estimate: Estimate) -> None:
+        """Log an estimated parameter."""
+        which = (estimate.name, estimate.serial)
+        estimated = with_estimate(self._contents.estimated, estimate, self._values.get(which))
+        self._contents = self._contents._replace(estimated=estimated)
+        self._values[which] = estimate.value
         progress.set_time(self._stream, t_ns)
-        colour = self._palette.colour(serial)
-        progress.log_estimate(self._stream, name, serial, value, sigma, units, colour)
+        progress.log_estimate(self._stream, estimate, self._palette.colour(estimate.serial))
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.Look) -> None:
         """Draw the robot from now on, in the posture it was last seen in; at q = 0 before the first pose."""

@@ -165,7 +165,8 @@ def _log_residual_styles(stream: rr.RecordingStream, serial: str, label: str, co
 
 def _log_network_styles(stream: rr.RecordingStream, serial: str, label: str, colour: layout.Colour) -> None:
     for group in (layout.ROUND_TRIP, layout.AGE, layout.REFUSALS):
-        style = rr.SeriesLines(names=label, colors=[colour], widths=[1.5])
+        shape: rr.components.InterpolationModeLike = "stepafter" if group == layout.REFUSALS else "linear"
+        style = rr.SeriesLines(names=label, colors=[colour], widths=[1.5], interpolation_mode=shape)
         stream.log(layout.network_path(serial, group), style, static=True)
 
 

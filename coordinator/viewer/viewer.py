@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from coordinator.chain import Chain
 from coordinator.viewer import blueprint, layout, robot_scene, viewer_process
 from coordinator.viewer.logging_thread import Job, LoggingThread
+from coordinator.viewer.parameter import Estimate
 from coordinator.viewer.recorder import Recorder
 from coordinator.viewer.targets import ViewerTargets, open_targets
 from coordinator.viewer.time_series import Batch, IntArray
@@ -96,8 +97,8 @@ class Viewer:
 
     def estimate(self, name: str, serial: str, t_ns: int, value: float, sigma: float, units: str) -> None:
         """Show an estimate with its standard deviation; `sigma` not finite means that it is not known."""
-        job = partial(self._recorder.estimate, name, serial, t_ns, value, sigma, units)
-        self._submit(job, essential=True)
+        found = Estimate(name, serial, float(value), float(sigma), units)
+        self._submit(partial(self._recorder.estimate, t_ns, found), essential=True)
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None = None) -> None:
         """Draw the robot as identified, with (n,) standard deviations of its joints' places [m]."""

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coordinator.viewer.layout import Palette, axis_shades, nth_colour
-from coordinator.viewer.parameter import Parameter, fitting, with_estimate
+from coordinator.viewer.parameter import Estimate, Parameter, fitting, with_estimate
 from coordinator.viewer.time_series import BATCH_NS, Batch, RowBatcher, StateChanges
 from module_agent.wire.feedback_rows import ROW
 
@@ -61,31 +61,38 @@ def test_states_change_across_batches_and_an_unknown_state_is_shown_by_number() 
     assert found == [["idle", "armed"], [], ["state 9", "idle"]]
 
 
-@given(st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(1e-6, 1.0)), min_size=1, max_size=40))
+@given(st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(1e-6, 1.0)), min_size=2, max_size=40))
 def test_the_newest_estimate_and_its_band_can_always_be_seen(estimates: list[tuple[float, float]]) -> None:
-    seen = None
+    seen, previous = None, None
     for value, sigma in estimates:
-        seen = fitting(seen, value, sigma)
+        seen = fitting(seen, value, sigma, previous)
         assert seen is not None
         low, high = seen
         assert low <= value - sigma < value + sigma <= high
-        # A band below a thirtieth of the plot cannot be told from a line.
-        assert 2.0 * sigma > (high - low) / 30.001
+        if previous is not None and abs(value - previous) < sigma:
+            # A band below a thirtieth of the plot cannot be told from a line.
+            assert 2.0 * sigma > (high - low) / 30.001
+        previous = value
+
+
+def test_a_jump_of_many_sigmas_is_not_zoomed_away() -> None:
+    low, high = fitting((0.2, 0.4), 0.3, 1e-5, previous=0.29) or (0.0, 0.0)
+    assert low < 0.29 < 0.3 < high
 
 
 def test_a_converging_estimate_changes_its_plot_seldom() -> None:
     ranges = []
     seen = None
     for k in range(1, 1001):
-        seen = fitting(seen, 0.3, 0.1 / k)
+        seen = fitting(seen, 0.3, 0.1 / k, 0.3)
         ranges.append(seen)
     # From 0.1 down to 0.0001 by zooms of a factor of about two and more.
     assert 1 < len(dict.fromkeys(ranges)) < 12
 
 
 def test_an_estimate_without_a_sigma_leaves_the_range_to_the_viewer() -> None:
-    assert fitting(None, 1.0, float("inf")) is None
-    parameters = with_estimate((), "mass", "a", 1.0, float("nan"), "kg")
+    assert fitting(None, 1.0, float("inf"), None) is None
+    parameters = with_estimate((), Estimate("mass", "a", 1.0, float("nan"), "kg"), None)
     assert parameters == (Parameter("mass", "kg", (("a", None),)),)
 
 
