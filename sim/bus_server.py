@@ -2,8 +2,8 @@
 
 An agent is in the barrier while it answers every tick within the bound. One that does not (frozen, or just
 starting) is out of it: its motors get zero PWM and it is sent nothing more until it answers the frame that it
-owes. That answer is late and so discarded, and the agent is back in the barrier with the next samples: a thawed
-agent finds no backlog. Measured on 2 cores with one process per module and a trivial world: 60 us a tick for 4
+owes. That answer is late and so discarded, and the agent is back in the barrier with the next samples: a
+thawed agent finds no backlog. Measured on 2 cores, one process per module, trivial world: 60 us a tick for 4
 agents, 120 us for 7, 270 us for 16.
 """
 

@@ -325,6 +325,9 @@ def _session_config(config: ZenohConfig) -> zenoh.Config:
         "scouting/delay": 0,
         "transport/link/tx/lease": 1000,
         "transport/link/tx/keep_alive": 4,
+        # Closing waits for a handshake under way, such as one with a frozen hub: not for the default 10 s.
+        "transport/unicast/open_timeout": 1000,
+        "transport/unicast/accept_timeout": 1000,
         # Zenoh's default is 1 GiB; the largest message here has 80 KiB.
         "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
     }
