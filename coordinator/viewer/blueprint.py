@@ -30,6 +30,11 @@ class Contents(NamedTuple):
     reach_m: float | None = None
 
 
+def views(contents: Contents) -> Contents:
+    """Return the contents without the ranges of the plots: what differs in it has other views."""
+    return contents._replace(estimated=tuple(p.without_ranges() for p in contents.estimated))
+
+
 def build(contents: Contents, active_tab: str = IDENTIFICATION) -> rrb.Blueprint:
     """Return the layout for the modules, estimates and topology there are.
 

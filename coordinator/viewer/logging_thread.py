@@ -19,11 +19,14 @@ logger = logging.getLogger(__name__)
 class LoggingThread:
     """Runs jobs in the order they come; drops and counts them when there are too many."""
 
-    def __init__(self, on_idle: Job, length: int = QUEUE_LENGTH, reserved: int = RESERVED) -> None:
-        """Start the thread; `on_idle` runs in it whenever nothing came for a while, and at the end."""
+    def __init__(
+        self, on_idle: Job, on_end: Job, length: int = QUEUE_LENGTH, reserved: int = RESERVED
+    ) -> None:
+        """Start the thread; `on_idle` runs in it whenever nothing came for a while, `on_end` last of all."""
         self._jobs: queue.Queue[Job | None] = queue.Queue(length + reserved)
         self._length = length
         self._on_idle = on_idle
+        self._on_end = on_end
         self._dropped = 0
         self._failures: dict[str, int] = {}
         self._closed = False
@@ -72,7 +75,7 @@ class LoggingThread:
                 job = self._jobs.get(timeout=IDLE_SECONDS)
             except queue.Empty:
                 job = self._on_idle
-            self._attempt(job if job is not None else self._on_idle)
+            self._attempt(job if job is not None else self._on_end)
             if job is None:
                 return
 

@@ -36,6 +36,10 @@ class Parameter(NamedTuple):
         """Return the ranges as a dictionary in the same order."""
         return dict(self.ranges)
 
+    def without_ranges(self) -> "Parameter":
+        """Return the parameter with the viewer's own ranges."""
+        return self._replace(ranges=tuple((serial, None) for serial, _ in self.ranges))
+
     def title(self) -> str:
         """Return the name as one reads it."""
         return self.name.replace("_", " ")

@@ -40,16 +40,22 @@ class Recorder:
             self._send(each)
         if complete:
             # Estimates of many modules come in bursts: one layout shows them all.
-            self._show()
+            self._show_if_new()
 
     def drain(self) -> None:
         """Log the rows gathered so far."""
         for batch in self._batcher.drain():
             self._send(batch)
+        self._show_if_new()
+
+    def finish(self) -> None:
+        """Log the rows gathered so far, and the layout that the file opens with."""
+        self.drain()
         self._show()
 
     def phase(self, t_ns: int, text: str) -> None:
         """Log a step of the run."""
+        self._show()
         progress.set_time(self._stream, t_ns)
         progress.log_phase(self._stream, text)
 
@@ -135,6 +141,12 @@ class Recorder:
 
     def _colours(self, serials: Sequence[str]) -> dict[str, layout.Colour]:
         return {serial: self._palette.colour(serial) for serial in serials}
+
+    def _show_if_new(self) -> None:
+        # A new layout puts the first tab in front again. Ranges of plots alone are not worth that in the
+        # middle of a step; they come with the next one.
+        if self._shown is None or blueprint.views(self._contents) != blueprint.views(self._shown):
+            self._show()
 
     def _show(self) -> None:
         if self._contents != self._shown:

@@ -47,7 +47,11 @@ class Viewer:
         first = blueprint.build(blueprint.Contents(robot))
         self._opened = open_targets(self._stream, targets, first)
         self._recorder = Recorder(self._stream, robot)
-        self._thread = LoggingThread(on_idle=self._recorder.drain) if self._opened.records else None
+        self._thread = (
+            LoggingThread(on_idle=self._recorder.drain, on_end=self._recorder.finish)
+            if self._opened.records
+            else None
+        )
         self._next_pose_ns: int | None = None
         self._closed = False
 

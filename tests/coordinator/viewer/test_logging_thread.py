@@ -16,7 +16,7 @@ def gate() -> threading.Event:
 
 def blocked(gate: threading.Event, length: int, reserved: int) -> LoggingThread:
     """Start a thread whose first job waits for the gate, so that the queue stays as it is filled."""
-    thread = LoggingThread(nothing, length, reserved)
+    thread = LoggingThread(nothing, nothing, length, reserved)
     begun = threading.Event()
 
     def wait() -> None:
@@ -30,7 +30,7 @@ def blocked(gate: threading.Event, length: int, reserved: int) -> LoggingThread:
 
 def test_jobs_run_in_order_and_all_before_it_closes() -> None:
     ran: list[int] = []
-    thread = LoggingThread(nothing)
+    thread = LoggingThread(nothing, nothing)
     for i in range(1000):
         thread.submit(lambda i=i: ran.append(i))  # type: ignore[misc]
     thread.close()
@@ -64,7 +64,7 @@ def test_a_job_that_raises_is_counted_told_once_and_stops_nothing(caplog: pytest
         raise ValueError("a bad value")
 
     ran: list[str] = []
-    thread = LoggingThread(nothing)
+    thread = LoggingThread(nothing, nothing)
     for _ in range(3):
         thread.submit(fail)
     thread.submit(lambda: ran.append("after"))
@@ -73,23 +73,18 @@ def test_a_job_that_raises_is_counted_told_once_and_stops_nothing(caplog: pytest
     assert caplog.text.count("the viewer could not log something") == 1
 
 
-def test_the_idle_job_runs_while_nothing_comes_and_at_the_end() -> None:
+def test_one_job_runs_while_nothing_comes_and_another_last_of_all() -> None:
     idle = threading.Event()
-    counted: list[int] = []
-
-    def on_idle() -> None:
-        counted.append(1)
-        idle.set()
-
-    thread = LoggingThread(on_idle)
+    ran: list[str] = []
+    thread = LoggingThread(idle.set, lambda: ran.append("end"))
     assert idle.wait(10.0)
-    before = len(counted)
+    thread.submit(lambda: ran.append("job"))
     thread.close()
-    assert len(counted) > before
+    assert ran == ["job", "end"]
 
 
 def test_closing_twice_is_no_mistake() -> None:
-    thread = LoggingThread(nothing)
+    thread = LoggingThread(nothing, nothing)
     thread.close()
     thread.close()
     with pytest.raises(RuntimeError, match="closed"):

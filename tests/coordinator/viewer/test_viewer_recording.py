@@ -202,6 +202,18 @@ def test_the_blueprint_of_the_same_application_is_in_the_file(viewer: Viewer, fi
     assert [entry.application_id for entry in reader.blueprints()] == ["x5", "x5"]
 
 
+def test_a_narrowing_estimate_does_not_change_the_layout_in_the_middle_of_a_step(
+    viewer: Viewer, file: Path, make_rows: MakeRows
+) -> None:
+    viewer.modules(["a"], {"a": "X5-9"})
+    for i in range(100):
+        viewer.estimate("link_length", "a", 120_000_000 * i, 0.25, 0.1 / (1 + i), "m")
+        viewer.rows("a", 120_000_000 * i + np.array([0, 110_000_000]), make_rows(0, 2))
+    done(viewer)
+    # The first one, the modules, the new parameter, and at the end its narrower plot.
+    assert len(RrdReader(str(file)).blueprints()) == 4
+
+
 def test_a_module_without_a_type_is_reported_and_the_run_goes_on(
     viewer: Viewer, file: Path, read: Read, arm: Chain, caplog: pytest.LogCaptureFixture
 ) -> None:
