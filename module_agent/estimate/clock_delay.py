@@ -116,6 +116,7 @@ def _refine(gyro: Array, at_s: Array, spline: CubicSpline, delay_s: float) -> tu
         # One step never goes farther than the grid cell that the search has chosen.
         delay_s += float(np.clip(free @ residual @ c / information, -GRID_S, GRID_S))
         # The filter correlates neighbours: about 10 samples (2 sqrt(pi) sigma) carry the information of one.
-        variance = float((residual**2).mean()) * 2 * np.sqrt(np.pi) * SIGMA_SAMPLES
+        # Only what lies along c counts; there the noise of the joint's rate comes on top of the gyro's.
+        variance = float(((residual @ c) ** 2).mean() / (c @ c)) * 2 * np.sqrt(np.pi) * SIGMA_SAMPLES
         sigma = float(np.sqrt(variance / information))
     return delay_s, sigma
