@@ -153,8 +153,8 @@ def _inertial(link: Element, phi: Array, home: Array) -> None:
         _comment(
             link,
             f"The identified parameters of this link are no real body's (mass {phi[0]:.4g} kg, smallest "
-            f"eigenvalue of the pseudo-inertia {smallest_eigenvalue(pseudo):.3g} kg): torques do not show all of "
-            "them. This is the nearest real body; for torques use the parameters in result.json.",
+            f"eigenvalue of the pseudo-inertia {smallest_eigenvalue(pseudo):.3g} kg): torques do not show "
+            "all of them. This is the nearest real body; for torques use the parameters in result.json.",
         )
         pseudo = nearest_consistent(pseudo)
     real = body(pseudo)
