@@ -9,7 +9,7 @@ from math import cos, pi, radians, sin
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from sim.pose import Array, pose, read_only
 from sim.rigid_body import RigidBody, joined, tensor
@@ -97,9 +97,14 @@ class Part(_Strict):
     def _exactly_one(self) -> "Part":
         if sum(x is not None for x in (self.tube, self.bracket, self.pose)) != 1:
             raise ValueError("a part of a link is exactly one of: tube, bracket, pose")
-        if self.bracket is not None and self.bracket not in BRACKETS:
-            raise ValueError(f"unknown bracket {self.bracket!r}; known are {', '.join(BRACKETS)}")
         return self
+
+    @field_validator("bracket")
+    @classmethod
+    def _known_bracket(cls, name: str | None) -> str | None:
+        if name is not None and name not in BRACKETS:
+            raise ValueError(f"unknown bracket {name!r}; known are {', '.join(BRACKETS)}")
+        return name
 
 
 def placed(part: Part) -> PlacedPart:

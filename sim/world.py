@@ -27,7 +27,7 @@ class Plant(NamedTuple):
 
     duty is what the bridges apply for `pwm`; motor positions and rates are seen at the output;
     spring_torque_nm is what the springs exert on the outputs. With q, qd and qdd it fulfils the equations of
-    motion but for the integrator's error (velocity forces are those of half a tick before: 1e-3 Nm in brisk motion).
+    motion but for the integrator's error: velocity forces are half a tick old, 1e-3 Nm in brisk motion.
     """
 
     t_ns: int
