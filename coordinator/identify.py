@@ -109,9 +109,7 @@ def identify(recording: Recording) -> Identified:
         inertia, means = _inertia(recording, kinematics)
         if _motions(recording, "held_out"):
             held_out = _held_out(recording, kinematics, inertia, means)
-    return Identified(
-        kinematics, inertia, held_out, build_result(recording, kinematics, inertia, held_out)
-    )
+    return Identified(kinematics, inertia, held_out, build_result(recording, kinematics, inertia, held_out))
 
 
 # ---------------------------------------------------------------------- kinematics
@@ -130,7 +128,10 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         types = [_type(recording, s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
         first = assemble(
-            topology, types, _pairs(recording, topology.serials, windows), [_rest(recording, topology.serials)]
+            topology,
+            types,
+            _pairs(recording, topology.serials, windows),
+            [_rest(recording, topology.serials)],
         )
         samples = sum(len(w.t_ns) for w in windows) // MOST_KINEMATIC_SAMPLES
         data = sensor_data(windows, KINEMATIC_CUTOFF_HZ, max(KINEMATIC_KEEP_EVERY, samples))
@@ -212,11 +213,11 @@ def _seen(recording: Recording, serials: Sequence[str]) -> dict[tuple[str, str],
     return seen
 
 
-def _pairs(
-    recording: Recording, serials: Sequence[str], windows: Sequence[Window]
-) -> list[PairObservation]:
+def _pairs(recording: Recording, serials: Sequence[str], windows: Sequence[Window]) -> list[PairObservation]:
     """Return the circles as observations; one that turned by more than the joint did is believed less."""
-    sines = {e.serial: i for i, e in enumerate(_exploration_motions(recording)) if e.purpose == "windowed_sine"}
+    sines = {
+        e.serial: i for i, e in enumerate(_exploration_motions(recording)) if e.purpose == "windowed_sine"
+    }
     pairs = []
     for joint in serials:
         q_mean = windows[sines[joint]].q_rad.mean(axis=0)
@@ -261,9 +262,7 @@ def _exploration_motions(recording: Recording) -> list[JournalEvent]:
     return _motions(recording, "constant", "windowed_sine")
 
 
-def _exploration(
-    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]
-) -> list[Window]:
+def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:
     margin = settling_samples(RATE_HZ, KINEMATIC_CUTOFF_HZ) / RATE_HZ
     return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording)]
 

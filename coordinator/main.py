@@ -20,7 +20,7 @@ from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.robot_link import ModuleLost, MotionInterrupted
 from coordinator.run import Run, RunConfig, write_outputs
-from coordinator.run_folder import RunFolderError, load_recording
+from coordinator.run_folder import load_recording
 from coordinator.scaled_loop import ScaledLoop
 from coordinator.session import NobodyThere, UnfitLink
 from coordinator.session_file import SessionFileError
@@ -46,7 +46,8 @@ EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
 Robot = Annotated[str, typer.Option(help="Name of the robot, part of every key.")]
 Listen = Annotated[str, typer.Option(help="Zenoh endpoint to listen on, the hub of the agents.")]
 Connect = Annotated[
-    list[str] | None, typer.Option(help="Zenoh router to connect to, instead of listening; repeat for several.")
+    list[str] | None,
+    typer.Option(help="Zenoh router to connect to, instead of listening; repeat for several."),
 ]
 Network = Annotated[str, typer.Option(help="Injected network: none, lan, wifi, bad.")]
 
@@ -92,7 +93,9 @@ def run(
         float | None, typer.Option(help="Amplitude of the windowed sine [rad]; by module type if not given.")
     ] = None,
     home: Annotated[float, typer.Option(help="Home position of all joints [rad].")] = 0.0,
-    viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")] = "none",
+    viewer: Annotated[
+        str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
+    ] = "none",
     serve_port: Annotated[int, typer.Option(help="Port of the viewer served to a browser.")] = 9090,
     resume: Annotated[bool, typer.Option(help="Go on with the crashed run in --out.")] = False,
     speed: Annotated[float, typer.Option(help="Speed of a simulated world.")] = 1.0,
@@ -101,7 +104,10 @@ def run(
     """Discover a robot, move it joint by joint, and identify topology, chain and inertia."""
     plan = Plan(dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home)
     if viewer not in ("none", "spawn", "serve") and "://" not in viewer:
-        _fail(f"--viewer {viewer}: it must be none, spawn, serve or an address like rerun+http://...", EXIT_USAGE)
+        _fail(
+            f"--viewer {viewer}: it must be none, spawn, serve or an address like rerun+http://...",
+            EXIT_USAGE,
+        )
     config = RunConfig(
         robot=robot,
         out=out,
@@ -189,9 +195,10 @@ def replay(
 
 @app.command("list")
 def list_modules(
-    robot: Robot = "robot", listen: Listen = DEFAULT_ENDPOINT, connect: Connect = None, as_json: Annotated[
-        bool, typer.Option("--json", help="Machine-readable.")
-    ] = False
+    robot: Robot = "robot",
+    listen: Listen = DEFAULT_ENDPOINT,
+    connect: Connect = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
 ) -> None:
     """List the modules on the network: state, holder, refusals."""
     terminal = Terminal()
@@ -238,11 +245,12 @@ def screenshot(
     tab: Annotated[str | None, typer.Option(help="Tab to show.")] = None,
 ) -> None:
     """Picture a recording as the viewer shows it, without a screen."""
-    from coordinator.viewer.screenshot import ScreenshotError, take_screenshot
+    from coordinator.viewer.screenshot import ScreenshotFailed
+    from coordinator.viewer.screenshot import screenshot as picture
 
     try:
-        take_screenshot(recording, out, tab)
-    except (ScreenshotError, OSError) as error:
+        picture(recording, out, tab)
+    except (ScreenshotFailed, ValueError, OSError) as error:
         _fail(error, EXIT_FAILED)
 
 

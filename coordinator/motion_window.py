@@ -81,7 +81,11 @@ def window(
 
 
 def _imu_axis(
-    times: Sequence[NDArray[np.int64]], picked: Sequence[NDArray[np.void]], field: str, axis: int, common: NDArray[np.int64]
+    times: Sequence[NDArray[np.int64]],
+    picked: Sequence[NDArray[np.void]],
+    field: str,
+    axis: int,
+    common: NDArray[np.int64],
 ) -> Array:
     unique = [np.unique(t, return_index=True) for t in times]
     values = [rows[field][index, axis] for rows, (_, index) in zip(picked, unique, strict=True)]

@@ -58,14 +58,21 @@ class PairPart(Part):
     axis: list[float] | None
 
 
-class DhPart(Part):
-    """Denavit-Hartenberg parameters of one path from the root to a leaf (thesis eq. 2)."""
+class DhRowPart(Part):
+    """One joint's parameters (thesis eq. 2); `theta_rad` is added to the joint's position."""
 
-    path: list[str]
-    theta_offset_rad: list[float]
-    d_m: list[float]
-    a_m: list[float]
-    alpha_rad: list[float]
+    serial: str
+    theta_rad: float
+    d_m: float
+    a_m: float
+    alpha_rad: float
+
+
+class DhPart(Part):
+    """Denavit-Hartenberg parameters of one path from the base to a leaf, and the pose of frame 0."""
+
+    base: list[list[float]]
+    rows: list[DhRowPart]
 
 
 class HeldOutPart(Part):

@@ -2,10 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-from coordinator.kinematics.denavit_hartenberg import denavit_hartenberg
+from coordinator.kinematics.denavit_hartenberg import dh_paths
 from coordinator.recording import Recording
 from coordinator.result import (
     DhPart,
+    DhRowPart,
     DynamicsPart,
     HeldOutPart,
     LinkPart,
@@ -41,7 +42,9 @@ def build_result(
         condition=fit.condition,
         reduced_chi2=fit.reduced_chi2,
         unresolved=[
-            UnresolvedPart(kind=u.kind, joint=u.joint, modules=list(u.modules), words=f"{u.text} ({u.resolved_by})")
+            UnresolvedPart(
+                kind=u.kind, joint=u.joint, modules=list(u.modules), words=f"{u.text} ({u.resolved_by})"
+            )
             for u in fit.unresolved
         ],
         null_basis=fit.null_basis.tolist(),
@@ -96,14 +99,8 @@ def _pairs(recording: Recording) -> list[PairPart]:
 
 def _dh(kinematics: "Kinematics") -> list[DhPart]:
     return [
-        DhPart(
-            path=list(path.serials),
-            theta_offset_rad=path.theta_offset_rad.tolist(),
-            d_m=path.d_m.tolist(),
-            a_m=path.a_m.tolist(),
-            alpha_rad=path.alpha_rad.tolist(),
-        )
-        for path in denavit_hartenberg(kinematics.fit.chain)
+        DhPart(base=path.base.tolist(), rows=[DhRowPart(**row._asdict()) for row in path.rows])
+        for path in dh_paths(kinematics.fit.chain)
     ]
 
 
@@ -129,7 +126,9 @@ def _held_out(serials: tuple[str, ...], held_out: "HeldOutMotion") -> HeldOutPar
     error = held_out.error
     return HeldOutPart(
         relative_error=error.overall,
-        relative_error_per_joint={s: e for s, e in zip(serials, error.per_joint.tolist(), strict=True) if e == e},
+        relative_error_per_joint={
+            s: e for s, e in zip(serials, error.per_joint.tolist(), strict=True) if e == e
+        },
         mean_baseline=error.mean_overall,
         samples=len(held_out.session_ns),
     )

@@ -216,9 +216,19 @@ class RobotLink:
     async def release_all(self) -> None:
         """Let go of all modules; their motors are off then."""
         for serial in list(self._tokens):
-            request = self._lease(serial, "release")
+            await self._release(serial)
             self._tokens.pop(serial)
-            await self._radio.command(serial, Leaf.LEASE, request)
+
+    async def _release(self, serial: str) -> None:
+        async def attempt() -> Ack:
+            return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "release"))
+
+        try:
+            await self._persist(serial, attempt)
+        except Refused as refused:
+            # The first answer may have been lost: then there is nothing left to release.
+            if refused.ack.reason not in (Refusal.NO_LEASE.value, Refusal.HELD.value):
+                raise
 
     async def stop_all(self, why: str) -> list[str]:
         """Tell every module to stop at once; return the serials that did not confirm."""

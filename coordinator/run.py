@@ -26,6 +26,7 @@ from coordinator.urdf import write_urdf
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from coordinator.viewer_feed import Screen, ViewerFeed
+from module_agent.catalogue import module_type
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Transport
@@ -170,6 +171,7 @@ def write_outputs(out: Path, found: Identified) -> None:
     """Write everything that follows from a recording into a folder, each file whole or not at all."""
     write_result(out / RESULT, found.result)
     phi = found.inertia.phi if found.inertia is not None else None
-    write_urdf(out / URDF, found.kinematics.fit.chain, phi)
+    types = [module_type(found.result.types[s]) for s in found.result.serials]
+    write_urdf(out / URDF, found.kinematics.fit.chain, phi, found.result.robot, types)
     if found.held_out is not None:
         write_held_out(out / HELD_OUT, found.held_out)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 from coordinator.recording import Recording
 from coordinator.session_file import read_session
-
 from module_agent.wire.refusal import WireError
 
 SESSION, VIEW, RESULT, URDF, HELD_OUT = (

@@ -32,4 +32,3 @@ class ScaledLoop(asyncio.SelectorEventLoop):
     def clock_ns(self) -> int:
         """Return session time as integer nanoseconds since 1970 (at the start)."""
         return self._origin_ns + int((time.monotonic_ns() - self._start_ns) * self._speed)
-

@@ -17,6 +17,9 @@ from coordinator.recording import Recording
 from coordinator.robot_link import MotionInterrupted, RobotLink
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
+# Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
+ESTIMATE_WAIT_S = 0.6
+
 
 class Reporter(Protocol):
     """Hears how the session goes; screen and viewer implement it."""
@@ -243,7 +246,7 @@ class Session:
     async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> None:
         record = await self._move(f"explore/{serial}", serial, pattern, purpose)
         for observer in self.link.serials:
-            found = await self.link.estimate(observer, serial, record.motion_id, 3.0)
+            found = await self.link.estimate(observer, serial, record.motion_id, ESTIMATE_WAIT_S)
             if found is None:
                 self._reporter.note(f"{observer} has no estimate of the {purpose} motion of {serial}")
             elif found.note:

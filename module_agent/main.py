@@ -30,6 +30,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 EXIT_USAGE, EXIT_LOST = 2, 3
+CONNECT_ATTEMPT_S = 1.0
 
 
 class Stopped(SystemExit):
@@ -61,10 +62,20 @@ def _config(
 
 
 def _transport(connect: list[str], listen: list[str], network: str, seed: int) -> Transport:
+    """Open the session, waiting for the hub as long as it takes; a signal ends the waiting."""
     found = profile(network)
-    transport: Transport = open_zenoh(
-        ZenohConfig(mode="client", connect=tuple(connect), listen=tuple(listen))
+    config = ZenohConfig(
+        mode="client", connect=tuple(connect), listen=tuple(listen), connect_timeout_s=CONNECT_ATTEMPT_S
     )
+    transport: Transport | None = None
+    said = ""
+    while transport is None:
+        try:
+            transport = open_zenoh(config)
+        except TransportError as error:
+            if str(error) != said:
+                said = str(error)
+                typer.echo(f"x5-agent: waiting for the network: {error}", err=True)
     if network == "none":
         return transport
     return ImpairedTransport(transport, found, np.random.default_rng(seed), TimerThread())
@@ -76,7 +87,8 @@ def main(
     bus: Annotated[str, typer.Option(help="Path of the physics bus of the world.")],
     robot: Annotated[str, typer.Option(help="Name of the robot, part of every key.")] = "robot",
     connect: Annotated[
-        list[str] | None, typer.Option(help=f"Zenoh endpoint of the coordinator or a router [{DEFAULT_ENDPOINT}].")
+        list[str] | None,
+        typer.Option(help=f"Zenoh endpoint of the coordinator or a router [{DEFAULT_ENDPOINT}]."),
     ] = None,
     listen: Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on.")] = None,
     network: Annotated[str, typer.Option(help="Injected network: none, lan, wifi, bad.")] = "none",
@@ -100,9 +112,10 @@ def main(
         if expiry not in ("motor_off", "hold", "damping"):
             raise ValueError(f"--expiry {expiry}: it must be motor_off, hold or damping")
         action: ExpiryAction = expiry  # type: ignore[assignment]
+        transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], network, seed)
+        # The world waits for whoever is on its bus, so the bus comes last.
         hardware = BusClient(bus, serial)
         configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in hardware.modules]
-        transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], network, seed)
     except (ValueError, KeyError, OSError, TransportError) as error:
         text = error.args[0] if isinstance(error, KeyError) else error
         typer.echo(f"x5-agent: {text}", err=True)

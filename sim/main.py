@@ -17,10 +17,11 @@ from module_agent.wire.network_profile import PROFILES
 from sim.bus_server import BusServer
 from sim.drawing import draw
 from sim.launcher import LaunchConfig, Launcher, LaunchError
+from sim.logged_world import LoggedWorld
 from sim.noise_profile import NOISE_PROFILES
 from sim.robot_file import Robot, RobotFileError, load_robot, shipped_robots
 from sim.score import ScoreError, score, table, write_score
-from sim.truth import TruthLog, write_truth
+from sim.truth import write_truth
 from sim.virtual_run import VirtualConfig, run_virtual
 from sim.world import World
 
@@ -97,7 +98,9 @@ def world(
     seed: Seed = 0,
     noise: Noise = None,
     speed: Speed = 1.0,
-    truth: Annotated[Path | None, typer.Option(help="Folder for truth.json and truth.npz at the end.")] = None,
+    truth: Annotated[
+        Path | None, typer.Option(help="Folder for truth.json and truth.npz at the end.")
+    ] = None,
 ) -> None:
     """Run the world of one robot until a signal comes; agents attach to its bus."""
     found = _load(robot)
@@ -110,25 +113,27 @@ def world(
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     plant = World(found, seed, noise)
-    record = TruthLog(plant)
+    logged = LoggedWorld(plant)
     try:
-        server = BusServer(bus, plant)
+        server = BusServer(bus, logged)
     except OSError as error:
         _fail(error, EXIT_USAGE)
     typer.echo(f"{found.name}: {len(plant.modules)} modules on {bus}", err=True)
-    achieved = server.run(speed, lambda: bool(stopping), after_tick=record.record)
-    typer.echo(f"ran at {achieved:.2f} of real time", err=True)
+    report = server.run(speed, lambda: bool(stopping))
+    typer.echo(f"{report.simulated_s:.1f} s at {report.achieved_speed:.2f} times real time", err=True)
     if truth is not None:
         truth.mkdir(parents=True, exist_ok=True)
         write_truth(truth / "truth.json", found)
-        record.save(truth / "truth.npz")
+        logged.log.save(truth / "truth.npz")
     plant.close()
 
 
 @app.command()
 def run(
     robot: RobotArgument,
-    virtual: Annotated[bool, typer.Option("--virtual", help="In one process, faster than real time.")] = False,
+    virtual: Annotated[
+        bool, typer.Option("--virtual", help="In one process, faster than real time.")
+    ] = False,
     seed: Seed = 0,
     network: Network = None,
     noise: Noise = None,
@@ -144,7 +149,7 @@ def run(
     if virtual:
         _run_virtual(found, folder, seed, network, noise, Plan(dynamics=dynamics), quiet)
     else:
-        options = ("--quiet",) if quiet else ()
+        options: tuple[str, ...] = ("--quiet",) if quiet else ()
         options += () if dynamics else ("--no-dynamics",)
         _run_processes(found, robot, folder, seed, network, noise, speed, options)
     _score(folder)
@@ -164,7 +169,9 @@ def _run_virtual(
         _fail(f"interrupted; recorded up to here: {out}", 130)
     wall_s = time.monotonic() - started_s
     typer.echo(f"trace hash {result.trace_hash}")
-    typer.echo(f"{result.robot_time_s:.1f} s of robot time in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x")
+    typer.echo(
+        f"{result.robot_time_s:.1f} s of robot time in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x"
+    )
 
 
 def _run_processes(

@@ -107,7 +107,9 @@ def _firmware(module: HardwareModule, boot: int, rate_hz: float) -> FirmwareConf
     )
 
 
-def run_virtual(config: VirtualConfig, screen: Screen, between: Callable[[VirtualRobot], None] | None = None) -> Result:
+def run_virtual(
+    config: VirtualConfig, screen: Screen, between: Callable[[VirtualRobot], None] | None = None
+) -> Result:
     """Run one identification in virtual time and write the run's folder, truth included.
 
     `between` is handed the robot before the run begins, to schedule faults on its loop.

@@ -17,6 +17,7 @@ class RowLog:
     def __init__(self, boot: int):
         self.boot = boot
         self._base: int | None = None
+        self._end = 0
         self._rows = np.zeros(0, dtype=ROW)
         self._have = np.zeros(0, dtype=bool)
 
@@ -28,11 +29,7 @@ class RowLog:
     @property
     def end_row(self) -> int:
         """One past the newest row, 0 before any."""
-        if self._base is None:
-            return 0
-        held = np.flatnonzero(self._have[-_GROWTH:])
-        tail = len(self._have) - min(len(self._have), _GROWTH)
-        return self._base + tail + int(held[-1]) + 1 if len(held) else self._base
+        return self._end
 
     def add(self, feedback: Feedback) -> Rows:
         """Keep the rows of a message; return them.
@@ -48,6 +45,7 @@ class RowLog:
         at = feedback.first_row - self._base
         self._rows[at : at + len(rows)] = rows
         self._have[at : at + len(rows)] = True
+        self._end = max(self._end, feedback.first_row + len(rows))
         return rows
 
     def _reserve(self, first: int, end: int) -> None:

@@ -37,3 +37,11 @@ def test_forgetting_keeps_what_is_newer() -> None:
     log.forget_before(60)
     assert log.rows(0, 100)["t_ns"].tolist() == list(range(60, 100))
     assert log.end_row == 100
+
+
+def test_the_end_is_known_however_far_the_log_has_grown() -> None:
+    log = RowLog(1)
+    for first in range(0, 40_000, 50):
+        log.add(block(first, 50))
+        assert log.end_row == first + 50
+    assert len(log.rows(0, 40_000)) == 40_000

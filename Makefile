@@ -1,0 +1,42 @@
+# Everything runs in .venv, made from Python 3.11 (pybullet has wheels up to 3.11 only).
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: help demo test check bench clean
+
+help:
+	@echo "make demo    a simulated arm identifies itself over Zenoh, one process per module, and is scored"
+	@echo "make test    all tests"
+	@echo "make check   format, lint, types and import floors"
+	@echo "make bench   benchmarks"
+	@echo "make clean   remove .venv and caches; runs/ stays"
+
+$(STAMP): pyproject.toml
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; v == (3, 11) or sys.exit("Python 3.11 is needed, this is %d.%d: pybullet has no wheels beyond it. Try: make PYTHON=/path/to/python3.11" % v)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+demo: $(STAMP)
+	@rm -rf runs/demo
+	$(BIN)/x5-sim run a2085_04 --network lan --out runs/demo
+	@echo "Look at it: $(BIN)/rerun runs/demo/session.rrd"
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+check: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(STAMP)
+	$(BIN)/python -m pytest -m benchmark -s tests/benchmarks
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache
