@@ -16,6 +16,8 @@ import zenoh
 from module_agent.wire.transport import Event, Liveness, Reply, Sample, TransportError
 from module_agent.wire.zenoh_transport import ZenohConfig, ZenohTransport, open_zenoh
 
+pytestmark = pytest.mark.integration
+
 ROOT = Path(__file__).parents[3]
 LIMIT_S = 20.0
 
@@ -33,7 +35,8 @@ import sys, threading
 from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
 endpoint, name = sys.argv[1:]
 transport = open_zenoh(ZenohConfig.spoke(endpoint))
-transport.serve(f"x5/r/{name}/info", lambda request: request.reply(name.encode() + b" hears " + request.payload))
+hears = name.encode() + b" hears "
+transport.serve(f"x5/r/{name}/info", lambda request: request.reply(hears + request.payload))
 transport.declare_alive(f"x5/r/{name}/alive")
 ended = threading.Event()
 def publish():
