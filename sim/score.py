@@ -137,7 +137,8 @@ def write_score(path: Path, found: Score) -> None:
 
 def table(found: Score) -> Table:
     """Return the score as a table to print."""
-    shown = Table(title="Result against truth")
+    excused = "\n".join(f"Not identifiable: {words}" for words in found.unidentifiable)
+    shown = Table(title="Result against truth", caption=excused or None, caption_justify="left")
     for name in ("", "truth", "error", "claimed sigma", "axis error"):
         shown.add_column(name, justify="left" if not name else "right")
     shown.add_row("topology", "", "correct" if found.topology_correct else "WRONG", "", "")
@@ -156,14 +157,14 @@ def table(found: Score) -> Table:
     shown.add_row("tip orientation, rms", "", _shown(found.tip_orientation_rms_deg, ".3f", " deg"), "", "")
     shown.add_row("held-out torque against the true", "", _shown(found.torque_relative_error, ".2%"), "", "")
     for serial, error in (found.torque_relative_error_per_joint or {}).items():
-        shown.add_row(f"  of {serial}", "", _shown(error, ".2%"), "", "")
+        # A bare output turns against next to nothing: there any error is many times the torque.
+        remark = "  (more than the torque)" if error is not None and error > 1.0 else ""
+        shown.add_row(f"  of {serial}{remark}", "", _shown(error, ".2%"), "", "")
     measured = _shown(found.torque_relative_error_measured, ".2%")
     shown.add_row("held-out torque against the measured", "", measured, "", "")
     shown.add_section()
     shown.add_row("robot time", _shown(found.robot_time_s, ".1f", " s"), "", "", "")
     shown.add_row("wall time", _shown(found.wall_time_s, ".1f", " s"), "", "", "")
-    for words in found.unidentifiable:
-        shown.add_row(f"not identifiable: {words}", "", "", "", "")
     return shown
 
 

@@ -176,10 +176,9 @@ def _transform(turn: Array, offset: Array, angular: Array, linear: Array) -> tup
 def _torque_rows(motion: _BodyMotion) -> Array:
     """Return the regressor rows (k, 10, m) of one body for the k joints that carry it.
 
-    With the wrench (f, n) of thesis eq. 25 on the body and a joint's screw (w, v): tau = w . n + v . f. The
-    terms
-    are grouped by parameter: for `mc` by a x w + B^T v with B = [alpha x] + [omega x]^2, for the inertia by
-    w . (I alpha) + (w x omega) . (I omega).
+    With the wrench (f, n) of thesis eq. 25 on the body and a joint's screw (w, v): tau = w . n + v . f.
+    Grouped by parameter that is a x w + B^T v for `mc`, with B = [alpha x] + [omega x]^2, and
+    w . (I alpha) + (w x omega) . (I omega) for the inertia.
     """
     w, v = motion.screws
     omega, alpha, a = motion.omega, motion.alpha, motion.acceleration

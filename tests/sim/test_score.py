@@ -228,7 +228,7 @@ def test_the_table_shows_every_figure(tmp_path: Path) -> None:
     console = Console(width=200, record=True, file=(tmp_path / "out.txt").open("w"))
     console.print(table(score(make_run(tmp_path, TRUTH, predicted=1.05))))
     text = console.export_text()
-    for words in ("correct", "link root - left-1", "5.00%", "61.5 s", "not identifiable: yaw beyond root"):
+    for words in ("correct", "link root - left-1", "5.00%", "61.5 s", "Not identifiable: yaw beyond root"):
         assert words in text
 
 
