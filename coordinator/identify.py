@@ -191,24 +191,28 @@ def _type(recording: Recording, serial: str) -> ModuleType:
     return module_type(info.module_type)
 
 
-def _latest(recording: Recording, joint: str, observer: str) -> Estimate | None:
-    """Return the estimate of the latest motion, the windowed sine's."""
-    sine = [e for e in _motions(recording, "windowed_sine") if e.serial == joint]
-    number = sine[-1].motion.motion_id if sine and sine[-1].motion is not None else -1
+def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose) -> Estimate | None:
+    """Return what `observer` made of the latest motion of this purpose of `joint`."""
+    found = [e for e in _motions(recording, purpose) if e.serial == joint]
+    number = found[-1].motion.motion_id if found and found[-1].motion is not None else -1
     for ids, estimate in recording.estimates.get((joint, observer), {}).items():
-        if number in ids:
+        if ids[-1] == number:
             return estimate
     return None
 
 
 def _seen(recording: Recording, serials: Sequence[str]) -> dict[tuple[str, str], MotionSeen]:
+    """Return who moved with whom, by the slow motion where it was seen (see `estimate.observer`)."""
     seen: dict[tuple[str, str], MotionSeen] = {}
     for joint in serials:
         for observer in serials:
-            estimate = _latest(recording, joint, observer)
+            slow = _estimate(recording, joint, observer, "constant")
+            fast = _estimate(recording, joint, observer, "windowed_sine")
+            estimate = slow if slow is not None else fast
             if estimate is None:
                 continue
-            axis = np.array(estimate.circle.axis) if estimate.circle is not None else None
+            circle = fast.circle if fast is not None else None
+            axis = np.array(circle.axis) if circle is not None else None
             seen[joint, observer] = MotionSeen(estimate.moved, estimate.rate_ratio, axis)
     return seen
 
@@ -222,7 +226,7 @@ def _pairs(recording: Recording, serials: Sequence[str], windows: Sequence[Windo
     for joint in serials:
         q_mean = windows[sines[joint]].q_rad.mean(axis=0)
         for observer in serials:
-            estimate = _latest(recording, joint, observer)
+            estimate = _estimate(recording, joint, observer, "windowed_sine")
             if estimate is None or estimate.circle is None or joint == observer:
                 continue
             circle, excess = estimate.circle, abs(estimate.rate_ratio - 1.0)

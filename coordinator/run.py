@@ -64,7 +64,7 @@ class Run:
         targets = ViewerTargets(
             config.out / VIEW, config.spawn_viewer, config.connect_viewer, config.serve_viewer
         )
-        self._viewer = Viewer(config.robot, config.out.name, targets)
+        self._viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
         self._feed = ViewerFeed(self._viewer, self.recording)
         if crashed is not None:
             self._take_over(crashed)
@@ -93,8 +93,10 @@ class Run:
         entry = Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode())
         self._writer.write(entry)
         self.recording.add(entry)
-        if event.what in ("begin", "failed"):
-            self._viewer.phase(event.t_ns, event.text or event.step)
+        if event.what == "session":
+            self._feed.since_start(event.t_ns)
+        if event.what == "failed":
+            self._feed.step(event.t_ns, event.text)
 
     # ------------------------------------------------------------------ reporter of the session
 
@@ -102,6 +104,7 @@ class Run:
         """Pass on that a step begins."""
         self._screen.step(index, total, text)
         self._feed.met({s: self._link.kind(s).name for s in self._link.serials})
+        self._feed.step(self._clock(), f"{index} of {total}: {text}")
 
     def note(self, text: str) -> None:
         """Pass on a line."""
@@ -114,7 +117,7 @@ class Run:
     async def explored(self) -> None:
         """Assemble topology and chain as soon as all joints are explored, and show them."""
         found = await self._compute(lambda: identify_kinematics(self.recording))
-        self._feed.chain(self._clock(), found.fit.chain, list(found.fit.link_length_sigma_m))
+        self._feed.chain(self._clock(), found.fit)
         for line in found.words():
             self._screen.note(line)
 
@@ -158,13 +161,8 @@ class Run:
         out = self._config.out
         write_outputs(out, found)
         if found.held_out is not None:
-            for index, serial in enumerate(found.held_out.serials):
-                self._viewer.residuals(
-                    serial,
-                    found.held_out.session_ns,
-                    found.held_out.tau_measured_nm[:, index],
-                    found.held_out.tau_predicted_nm[:, index],
-                )
+            self._feed.held_out(found.held_out)
+        self._feed.step(self._clock(), "done")
 
 
 def write_outputs(out: Path, found: Identified) -> None:

@@ -1,11 +1,13 @@
 """What the viewer is shown of a session as it runs, from the messages as they are recorded."""
 
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from coordinator.chain import Array, Chain
 from coordinator.clock_map import ClockMap, map_clock
+from coordinator.identify import HeldOutMotion
+from coordinator.kinematics.assembly import ChainFit
 from coordinator.recording import Entry, Recording
 from coordinator.viewer.viewer import Viewer
 from module_agent.wire.feedback_rows import unpack
@@ -15,6 +17,8 @@ MAP_PERIOD_NS = 1_000_000_000
 POSE_PERIOD_NS = 33_000_000
 NETWORK_PERIOD_NS = 500_000_000
 RECENT_TRIPS = 100
+# Of a joint's motion, what so many of the modules next to it found is drawn.
+NEAREST = 2
 
 
 class Screen(Protocol):
@@ -29,8 +33,17 @@ class Screen(Protocol):
         ...
 
 
+class _Shown(NamedTuple):
+    """An estimate on the screen, which stays as it is until there is a newer one."""
+
+    name: str
+    serial: str
+    value_mm: float
+    sigma_mm: float
+
+
 class ViewerFeed:
-    """Feeds one viewer from one recording."""
+    """Feeds one viewer from one recording; the viewer's time counts from the beginning of the session."""
 
     def __init__(self, viewer: Viewer, recording: Recording):
         self._viewer = viewer
@@ -40,6 +53,8 @@ class ViewerFeed:
         self._pose_ns = 0
         self._network_ns: dict[str, int] = {}
         self._known: tuple[str, ...] = ()
+        self._origin_ns: int | None = None
+        self._shown: dict[tuple[str, str], _Shown] = {}
 
     def on_message(self, entry: Entry, message: Message) -> None:
         """Show one recorded message, if it is one that is shown."""
@@ -49,6 +64,12 @@ class ViewerFeed:
             self._on_feedback(entry, message)
         elif isinstance(message, Status):
             self._on_status(entry, message)
+
+    def since_start(self, session_ns: int) -> int:
+        """Return the time that the viewer shows for a session time."""
+        if self._origin_ns is None:
+            self._origin_ns = session_ns
+        return session_ns - self._origin_ns
 
     def _map(self, serial: str, now_ns: int) -> ClockMap | None:
         made_ns, found = self._maps.get(serial, (-MAP_PERIOD_NS, None))
@@ -63,10 +84,12 @@ class ViewerFeed:
         if clock is None or not feedback.count:
             return
         rows = unpack(feedback)
-        self._viewer.rows(feedback.serial, clock.to_session(rows["t_ns"].astype(np.int64)), rows)
+        now_ns = self.since_start(entry.t_ns)
+        session = clock.to_session(rows["t_ns"].astype(np.int64))
+        self._viewer.rows(feedback.serial, session - (entry.t_ns - now_ns), rows)
         if self._chain is not None and entry.t_ns - self._pose_ns >= POSE_PERIOD_NS:
             self._pose_ns = entry.t_ns
-            self._viewer.pose(entry.t_ns, self._positions(self._chain))
+            self._viewer.pose(now_ns, self._positions(self._chain))
 
     def _positions(self, chain: Chain) -> Array:
         q = np.zeros(len(chain.serials))
@@ -85,8 +108,9 @@ class ViewerFeed:
         trip = record.round_trips[-1]
         age_ns = entry.t_ns - record.arrivals[-1][0] if record.arrivals else 0
         refused = sum(status.refusals.values())
+        round_trip_ms = (trip.received_ns - trip.sent_ns) / 1e6
         self._viewer.network(
-            status.serial, entry.t_ns, (trip.received_ns - trip.sent_ns) / 1e6, age_ns / 1e6, refused
+            status.serial, self.since_start(entry.t_ns), round_trip_ms, age_ns / 1e6, refused
         )
 
     def met(self, types: dict[str, str]) -> None:
@@ -95,24 +119,49 @@ class ViewerFeed:
             self._known = tuple(types)
             self._viewer.modules(self._known, types)
 
-    def estimates(self, joint: str, now_ns: int) -> None:
-        """Show what every module made of a joint's motion."""
-        for (moved, observer), found in self._recording.estimates.items():
-            if moved != joint or not found:
-                continue
-            circle = list(found.values())[-1].circle
-            if circle is not None:
-                self._viewer.estimate(
-                    "distance_to_joint",
-                    f"{joint}-{observer}",
-                    now_ns,
-                    1e3 * circle.distance_m,
-                    1e3 * circle.sigma_distance_m,
-                    "mm",
-                )
+    def step(self, session_ns: int, text: str) -> None:
+        """Show that a step begins; what is known by now is shown once more, so that it draws a line."""
+        now_ns = self.since_start(session_ns)
+        self._viewer.phase(now_ns, text)
+        for shown in self._shown.values():
+            self._show(now_ns, shown)
 
-    def chain(self, now_ns: int, chain: Chain, sigma_m: list[float]) -> None:
+    def _show(self, now_ns: int, shown: _Shown) -> None:
+        self._shown[shown.name, shown.serial] = shown
+        self._viewer.estimate(shown.name, shown.serial, now_ns, shown.value_mm, shown.sigma_mm, "mm")
+
+    def estimates(self, joint: str, session_ns: int) -> None:
+        """Show what the modules nearest to a joint made of its motion."""
+        circles = [
+            (estimate.circle, observer)
+            for (moved, observer), found in self._recording.estimates.items()
+            for estimate in list(found.values())[-1:]
+            if moved == joint and observer != joint and estimate.circle is not None
+        ]
+        for circle, observer in sorted(circles, key=lambda pair: pair[0].distance_m)[:NEAREST]:
+            name = f"{observer} from {joint}"
+            shown = _Shown("local_estimate", name, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
+            self._show(self.since_start(session_ns), shown)
+
+    def chain(self, session_ns: int, fit: ChainFit) -> None:
         """Show the identified robot; it then turns as the robot turns."""
+        chain, now_ns = fit.chain, self.since_start(session_ns)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
-        self._viewer.chain(now_ns, chain, sigma_m)
+        sigma = [s if np.isfinite(s) else 0.0 for s in fit.link_length_sigma_m.tolist()]
+        self._viewer.chain(now_ns, chain, sigma)
         self._chain = chain
+        for k, parent in enumerate(chain.parent):
+            if parent >= 0:
+                length, spread = 1e3 * float(fit.link_length_m[k]), 1e3 * float(fit.link_length_sigma_m[k])
+                self._show(now_ns, _Shown("link_length", chain.serials[k], length, spread))
+
+    def held_out(self, found: HeldOutMotion) -> None:
+        """Show measured and predicted torques of the held-out motions."""
+        origin_ns = self._origin_ns or 0
+        for index, serial in enumerate(found.serials):
+            self._viewer.residuals(
+                serial,
+                found.session_ns - origin_ns,
+                found.tau_measured_nm[:, index],
+                found.tau_predicted_nm[:, index],
+            )

@@ -70,8 +70,9 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
     if contents.reach_m is not None:
         size = max(contents.reach_m, 0.2)
         eye = rrb.EyeControls3D(
-            position=[0.6 * size, -0.95 * size, 0.65 * size],
-            look_target=[0.0, 0.0, 0.25 * size],
+            # Far enough for all that the robot can reach, not only for where it stands now.
+            position=[1.0 * size, -1.6 * size, 0.9 * size],
+            look_target=[0.0, 0.0, 0.1 * size],
             eye_up=[0.0, 0.0, 1.0],
         )
     return rrb.Spatial3DView(
@@ -85,7 +86,11 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
 
 
 def _identification(contents: Contents) -> rrb.Vertical:
-    geometric = [parameter for parameter in contents.estimated if not is_dynamic(parameter)]
+    # The links of the identified robot come before what single modules made of single joints.
+    geometric = sorted(
+        (parameter for parameter in contents.estimated if not is_dynamic(parameter)),
+        key=lambda parameter: parameter.name != LINK_LENGTH,
+    )
     log = rrb.TextLogView(
         origin=layout.PHASE_LOG, name="Log", columns=rrb.TextLogColumns(text_log_columns=["Body"])
     )

@@ -20,9 +20,18 @@ class LoggingThread:
     """Runs jobs in the order they come; drops and counts them when there are too many."""
 
     def __init__(
-        self, on_idle: Job, on_end: Job, length: int = QUEUE_LENGTH, reserved: int = RESERVED
+        self,
+        on_idle: Job,
+        on_end: Job,
+        length: int = QUEUE_LENGTH,
+        reserved: int = RESERVED,
+        waits: bool = False,
     ) -> None:
-        """Start the thread; `on_idle` runs in it whenever nothing came for a while, `on_end` last of all."""
+        """Start the thread; `on_idle` runs in it whenever nothing came for a while, `on_end` last of all.
+
+        With `waits`, `submit` waits for a place instead of dropping: for virtual time, where nobody hurries.
+        """
+        self._waits = waits
         self._jobs: queue.Queue[Job | None] = queue.Queue(length + reserved)
         self._length = length
         self._on_idle = on_idle
@@ -47,11 +56,16 @@ class LoggingThread:
     def submit(self, job: Job, *, essential: bool = False) -> bool:
         """Queue a job and return at once; False if it was dropped. Data keeps out of the reserved places.
 
+        A thread that was told to wait drops nothing.
+
         Raises:
             RuntimeError: the thread is closed.
         """
         if self._closed:
             raise RuntimeError("the viewer is closed; nothing can be logged any more")
+        if self._waits:
+            self._jobs.put(job)
+            return True
         if not essential and self._jobs.qsize() >= self._length:
             self._dropped += 1
             return False

@@ -32,13 +32,14 @@ class Viewer:
     The methods are to be called from one thread.
     """
 
-    def __init__(self, robot: str, run_id: str, targets: ViewerTargets) -> None:
+    def __init__(self, robot: str, run_id: str, targets: ViewerTargets, waits: bool = False) -> None:
         """Open the targets; the only part that may take seconds, where a viewer has to be started.
 
         Args:
             robot: the robot's name, shown above it.
             run_id: the recording's identity; the same one in two processes makes one recording.
             targets: where to; with none at all, nothing is recorded and all calls do nothing.
+            waits: let calls wait when there is too much, instead of dropping it: for virtual time.
 
         Raises:
             OSError: the file cannot be written. A live viewer that is not there is only reported.
@@ -48,7 +49,7 @@ class Viewer:
         self._opened = open_targets(self._stream, targets, first)
         self._recorder = Recorder(self._stream, robot)
         self._thread = (
-            LoggingThread(on_idle=self._recorder.drain, on_end=self._recorder.finish)
+            LoggingThread(on_idle=self._recorder.drain, on_end=self._recorder.finish, waits=waits)
             if self._opened.records
             else None
         )

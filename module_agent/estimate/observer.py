@@ -36,10 +36,13 @@ class Finding(NamedTuple):
     note: str
 
 
-class _Aligned(NamedTuple):
+class _Constant(NamedTuple):
+    """The constant motion of a joint as this module saw it, and whether it moved with it."""
+
     boot: int
     motion_id: int
     motion: AlignedMotion
+    moved: bool
 
 
 class Observer:
@@ -49,7 +52,7 @@ class Observer:
         self.serial = serial
         self.boot = boot
         self.findings: dict[str, Finding] = {}
-        self._constant: dict[str, _Aligned] = {}
+        self._constant: dict[str, _Constant] = {}
         self._rest: tuple[int, Rows] | None = None
 
     def job(self, motion: JointMotion, history: History, rest: MotionRecord | None) -> Callable[[], Finding]:
@@ -82,19 +85,24 @@ class Observer:
             seen = detect_motion([aligned], still.gyro_offset_rad_s)
             moved, ratio = seen.moved, seen.rate_ratio
             if motion.record.pattern.kind == "constant":
-                self._constant[motion.serial] = _Aligned(motion.boot, motion.record.motion_id, aligned)
-            elif moved:
+                self._constant[motion.serial] = _Constant(
+                    motion.boot, motion.record.motion_id, aligned, moved
+                )
+            else:
+                # Slow motion decides: near a resonance of the held joints the windowed sine shakes modules
+                # that it does not carry, and holds others still that it does.
                 constant = self._constant_of(motion)
-                numbers = (constant.motion_id, *numbers)
-                fit = circle_point_analysis(rest, constant.motion, aligned)
-                circle = circle_estimate(fit, delay.delay_s)
+                numbers, moved = (constant.motion_id, *numbers), constant.moved
+                if moved:
+                    fit = circle_point_analysis(rest, constant.motion, aligned)
+                    circle = circle_estimate(fit, delay.delay_s)
             note = ""
         except ValueError as error:
             # Said to whoever listens: an estimate that cannot be had is a finding too.
             note = str(error)
         return Finding(motion.serial, numbers, moved, ratio, gravity, circle, note[:512])
 
-    def _constant_of(self, motion: JointMotion) -> _Aligned:
+    def _constant_of(self, motion: JointMotion) -> _Constant:
         constant = self._constant.get(motion.serial)
         if constant is None or constant.boot != motion.boot:
             raise ValueError(f"no constant motion of {motion.serial} was seen: its axis is not known")
