@@ -16,7 +16,8 @@ from sim.robot_file import load_robot
 from sim.world import InProcessHardware, World
 
 LIMIT_S = 20.0
-ROBOT = "tree_y"
+# Two modules whose gears hold them still without current: when an agent attaches matters to no test.
+ROBOT = "thesis_171_vertical"
 
 
 @pytest.fixture(params=["bus", "in process"])
@@ -73,19 +74,18 @@ def test_samples_are_finite_and_in_the_field_s_order(hardware: Hardware) -> None
 def test_an_imu_at_rest_reads_specific_force(hardware: Hardware) -> None:
     for sample in hardware.exchange([0.0] * len(hardware.modules)):
         force = math.hypot(sample.accel_x_m_s2, sample.accel_y_m_s2, sample.accel_z_m_s2)
-        # Within the acceleration of a robot that begins to sag.
-        assert force == pytest.approx(9.81, abs=3.0)
+        assert force == pytest.approx(9.81, abs=0.01)
 
 
 def test_the_pwm_reaches_the_module_in_its_place(hardware: Hardware) -> None:
-    """Only the last module is driven: its winding carries amperes, the others' at most what sagging drives."""
+    """Only the last module is driven, so only its winding carries current."""
     pwm = [0.0] * len(hardware.modules)
     pwm[-1] = 1.0
     currents_a = np.zeros(len(pwm))
     for _ in range(5):
         currents_a = np.array([sample.motor_current_a for sample in hardware.exchange(pwm)])
     assert currents_a[-1] > 1.0
-    assert np.all(np.abs(currents_a[:-1]) < 0.5)
+    assert np.all(np.abs(currents_a[:-1]) < 0.1)
 
 
 def test_after_close_there_is_no_further_tick(hardware: Hardware) -> None:
