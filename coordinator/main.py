@@ -10,11 +10,12 @@ from typing import Annotated, NoReturn
 
 import numpy as np
 import typer
+from pydantic import ValidationError
 from rich.table import Table
 
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import listed, stop_robot
-from coordinator.plan import Plan
+from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.radio import NoAnswer, Refused
 from coordinator.recording import Recording
 from coordinator.result import Result
@@ -27,7 +28,7 @@ from coordinator.session_file import SessionFileError
 from coordinator.terminal import Terminal
 from module_agent.wire.impaired_transport import ImpairedTransport
 from module_agent.wire.keys import check_chunk
-from module_agent.wire.network_profile import profile
+from module_agent.wire.network_profile import PROFILES, profile
 from module_agent.wire.timer_thread import TimerThread
 from module_agent.wire.transport import Transport, TransportError
 from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
@@ -49,7 +50,7 @@ Connect = Annotated[
     list[str] | None,
     typer.Option(help="Zenoh router to connect to, instead of listening; repeat for several."),
 ]
-Network = Annotated[str, typer.Option(help="Injected network: none, lan, wifi, bad.")]
+Network = Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}.")]
 
 
 def _fail(text: object, code: int) -> NoReturn:
@@ -88,11 +89,17 @@ def run(
     network: Network = "none",
     seed: Annotated[int, typer.Option(help="Seed of the injected network.")] = 0,
     expect: Annotated[int | None, typer.Option(help="Wait for this many modules.")] = None,
-    dynamics: Annotated[bool, typer.Option(help="Identify inertial parameters too.")] = True,
+    plan: Annotated[
+        Path | None,
+        typer.Option(help="TOML file with settings of the motions; the options below go before it."),
+    ] = None,
+    dynamics: Annotated[
+        bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
+    ] = None,
     amplitude: Annotated[
         float | None, typer.Option(help="Amplitude of the windowed sine [rad]; by module type if not given.")
     ] = None,
-    home: Annotated[float, typer.Option(help="Home position of all joints [rad].")] = 0.0,
+    home: Annotated[float | None, typer.Option(help="Home position of all joints [rad] [0].")] = None,
     viewer: Annotated[
         str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
     ] = "none",
@@ -102,7 +109,6 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Discover a robot, move it joint by joint, and identify topology, chain and inertia."""
-    plan = Plan(dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home)
     if viewer not in ("none", "spawn", "serve") and "://" not in viewer:
         _fail(
             f"--viewer {viewer}: it must be none, spawn, serve or an address like rerun+http://...",
@@ -112,7 +118,7 @@ def run(
         robot=robot,
         out=out,
         sender=_sender(),
-        plan=plan,
+        plan=_plan(plan, dynamics, amplitude, home),
         expect=expect,
         resume=resume,
         spawn_viewer=viewer == "spawn",
@@ -123,6 +129,19 @@ def run(
         result = _run(config, listen, connect, network, seed, speed, terminal)
     _print(result, terminal)
     terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
+
+
+def _plan(path: Path | None, dynamics: bool | None, amplitude: float | None, home: float | None) -> Plan:
+    given = {"dynamics": dynamics, "sine_amplitude_rad": amplitude, "home_rad": home}
+    try:
+        base = load_plan(path) if path is not None else Plan()
+        # Validated again: an option can be out of range as well.
+        return Plan.model_validate({**base.model_dump(), **{k: v for k, v in given.items() if v is not None}})
+    except PlanFileError as error:
+        _fail(error, EXIT_USAGE)
+    except ValidationError as error:
+        first = error.errors()[0]
+        _fail(f"{first['loc'][0]} = {first['input']}: {first['msg']}", EXIT_USAGE)
 
 
 def _run(

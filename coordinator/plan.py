@@ -1,13 +1,19 @@
 """What a session does with a robot: which motions, how large, how long."""
 
+import tomllib
+from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from module_agent.catalogue import ModuleType
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
+
+
+class PlanFileError(ValueError):
+    """The file is no plan; the message names the file, the setting and what would be right."""
 
 
 class Plan(BaseModel):
@@ -82,3 +88,27 @@ class Plan(BaseModel):
 def _amplitude(kind: ModuleType, frequency_hz: float, most_rad: float) -> float:
     """Return an amplitude whose peak speed is 70 % of the type's, where its back-EMF leaves torque to spare."""
     return min(most_rad, 0.7 * kind.max_speed_rad_s / (6.2832 * frequency_hz))
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan from a TOML file; what the file does not set keeps its default.
+
+    Raises:
+        PlanFileError: the file cannot be read, is not TOML, or sets something unknown or out of range.
+    """
+    try:
+        return Plan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise PlanFileError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise PlanFileError(f"{path} is not TOML: {error}") from error
+    except ValidationError as error:
+        raise PlanFileError(f"{path}: {_first_fault(error)}") from error
+
+
+def _first_fault(error: ValidationError) -> str:
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown setting {name}; known are {', '.join(Plan.model_fields)}"
+    return f"{name} = {first['input']!r}: {first['msg']}"

@@ -19,7 +19,7 @@ from module_agent.host import AgentHost
 from module_agent.wire.impaired_transport import ImpairedTransport
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.messages import ExpiryAction
-from module_agent.wire.network_profile import profile
+from module_agent.wire.network_profile import PROFILES, profile
 from module_agent.wire.timer_thread import TimerThread
 from module_agent.wire.transport import Transport, TransportError
 from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
@@ -91,7 +91,7 @@ def main(
         typer.Option(help=f"Zenoh endpoint of the coordinator or a router [{DEFAULT_ENDPOINT}]."),
     ] = None,
     listen: Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on.")] = None,
-    network: Annotated[str, typer.Option(help="Injected network: none, lan, wifi, bad.")] = "none",
+    network: Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}.")] = "none",
     seed: Annotated[int, typer.Option(help="Seed of the injected network.")] = 0,
     feedback_rate: Annotated[float, typer.Option(help="Feedback rows per second, up to 1000.")] = 250.0,
     lifetime_ms: Annotated[float, typer.Option(help="Command lifetime, at most 1000 ms.")] = 250.0,

@@ -10,7 +10,7 @@ from typing import Annotated, NoReturn
 import typer
 from rich.table import Table
 
-from coordinator.plan import Plan
+from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.run_folder import RunFolderError
 from coordinator.terminal import Terminal
 from module_agent.wire.network_profile import PROFILES
@@ -40,6 +40,7 @@ Seed = Annotated[int, typer.Option(help="Seed of all noise.")]
 Noise = Annotated[str | None, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)} [the robot's].")]
 Network = Annotated[str | None, typer.Option(help=f"Network profile: {', '.join(PROFILES)} [the robot's].")]
 Speed = Annotated[float, typer.Option(help="Times real time; slower helps a busy machine.")]
+PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
 Out = Annotated[Path | None, typer.Option(help="Folder of the run [runs/ROBOT].")]
 
 
@@ -60,6 +61,14 @@ def _check(network: str | None, noise: str | None) -> None:
         _fail(f"--network {network}: known are {', '.join(PROFILES)}", EXIT_USAGE)
     if noise is not None and noise not in NOISE_PROFILES:
         _fail(f"--noise {noise}: known are {', '.join(NOISE_PROFILES)}", EXIT_USAGE)
+
+
+def _plan(path: Path | None, dynamics: bool | None = None) -> Plan:
+    try:
+        found = load_plan(path) if path is not None else Plan()
+    except PlanFileError as error:
+        _fail(error, EXIT_USAGE)
+    return found if dynamics is None else found.model_copy(update={"dynamics": dynamics})
 
 
 @app.command()
@@ -138,19 +147,24 @@ def run(
     network: Network = None,
     noise: Noise = None,
     out: Out = None,
-    dynamics: Annotated[bool, typer.Option(help="Identify inertial parameters too.")] = True,
+    plan: PlanFile = None,
+    dynamics: Annotated[
+        bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
+    ] = None,
     speed: Speed = 1.0,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Identify a simulated robot and score the result against the truth."""
     found = _load(robot)
     _check(network, noise)
+    motions = _plan(plan, dynamics)
     folder = out if out is not None else Path("runs") / found.name
     if virtual:
-        _run_virtual(found, folder, seed, network, noise, Plan(dynamics=dynamics), quiet)
+        _run_virtual(found, folder, seed, network, noise, motions, quiet)
     else:
         options: tuple[str, ...] = ("--quiet",) if quiet else ()
-        options += () if dynamics else ("--no-dynamics",)
+        options += ("--dynamics",) if motions.dynamics else ("--no-dynamics",)
+        options += ("--plan", str(plan)) if plan is not None else ()
         _run_processes(found, robot, folder, seed, network, noise, speed, options)
     _score(folder)
 
@@ -222,6 +236,7 @@ def launch(
     network: Network = None,
     noise: Noise = None,
     out: Out = None,
+    plan: PlanFile = None,
     speed: Speed = 1.0,
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")] = "tcp/127.0.0.1:7447",
@@ -229,6 +244,8 @@ def launch(
     """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
     found = _load(robot)
     _check(network, noise)
+    _plan(plan)
+    options = ("--viewer", viewer) + (() if plan is None else ("--plan", str(plan)))
     folder = out if out is not None else Path("runs") / found.name
     config = LaunchConfig(
         robot_file=robot,
@@ -240,7 +257,7 @@ def launch(
         noise=noise,
         speed=speed,
         endpoint=endpoint,
-        coordinator_options=("--viewer", viewer),
+        coordinator_options=options,
     )
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-ProfileName = Literal["none", "lan", "wifi", "bad"]
+ProfileName = Literal["none", "lan", "lossy", "wifi", "bad"]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Milliseconds = Annotated[float, Field(ge=0.0, le=10_000.0)]
 
@@ -35,6 +35,8 @@ PROFILES: dict[str, NetworkProfile] = {
         NetworkProfile(name="none"),
         # A switched 100 Mbps segment: the real module's round trip is 0.70 ms in the median, 1.6 ms at most.
         NetworkProfile(name="lan", delay_ms=0.25, jitter_ms=0.1, jitter_shape=2.0),
+        # The same segment with a bad plug: nothing is late, one message in twenty is lost.
+        NetworkProfile(name="lossy", delay_ms=0.25, jitter_ms=0.1, jitter_shape=2.0, loss=0.05),
         NetworkProfile(
             name="wifi",
             delay_ms=1.5,
