@@ -1,8 +1,8 @@
 """How a module's clock maps to session time, from round trips.
 
-A module answers at a time that lies between sending and receiving; the middle is wrong by at most half the round
-trip, so the quickest trips say most. Offset and drift are fitted by least squares with weights that fall with the
-excess of a trip over the quickest one.
+A module answers at a time that lies between sending and receiving; the middle is wrong by at most half the
+round trip, so the quickest trips say most. Offset and drift are fitted by least squares with weights that fall
+with the excess of a trip over the quickest one.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,10 @@ SHORTEST_FIT_NS = 10_000_000_000
 
 
 class ClockMap(NamedTuple):
-    """session = module + offset_ns + drift * (module - origin_ns); `uncertainty_ns` is half the quickest trip."""
+    """session = module + offset_ns + drift * (module - origin_ns).
+
+    `uncertainty_ns` is half the quickest trip.
+    """
 
     origin_ns: int
     offset_ns: float
@@ -31,18 +34,22 @@ class ClockMap(NamedTuple):
 
     def to_session(self, module_ns: Times) -> Times:
         """Map module times (n,) to session times (n,), both integer nanoseconds."""
+        # The offset can be years of uptime, which a float does not tell to the nanosecond.
+        whole, rest = self._split()
         since = module_ns - self.origin_ns
-        correction = np.rint(self.offset_ns + self.drift * since).astype(np.int64)
-        mapped: Times = module_ns + correction
+        mapped: Times = module_ns + whole + np.rint(rest + self.drift * since).astype(np.int64)
         return mapped
 
     def to_module(self, session_ns: Times) -> Times:
-        """Map session times (n,) to module times (n,), both integer nanoseconds."""
-        guess = session_ns - round(self.offset_ns)
-        # The drift is below 1e-3, so one step leaves less than a nanosecond in a microsecond of correction.
-        correction = np.rint(self.offset_ns + self.drift * (guess - self.origin_ns)).astype(np.int64)
-        mapped: Times = session_ns - correction
+        """Undo `to_session`, to 1 ns: session times (n,) to module times (n,), integer nanoseconds."""
+        whole, rest = self._split()
+        since = (session_ns - whole - self.origin_ns - rest) / (1.0 + self.drift)
+        mapped: Times = session_ns - whole - np.rint(rest + self.drift * since).astype(np.int64)
         return mapped
+
+    def _split(self) -> tuple[int, float]:
+        whole = round(self.offset_ns)
+        return whole, self.offset_ns - whole
 
 
 def map_clock(trips: Sequence[RoundTrip]) -> ClockMap:

@@ -114,8 +114,8 @@ class Recording:
         """Return the record of one boot of a module, new if it was not known."""
         found = self.past.get((serial, boot))
         if found is None:
-            found = self.past[serial, boot] = ModuleRecord(serial, boot)
-        self.modules[serial] = found
+            # A straggler of an earlier boot, known already, does not make that boot the latest again.
+            found = self.past[serial, boot] = self.modules[serial] = ModuleRecord(serial, boot)
         return found
 
     def add(self, entry: Entry) -> Message | JournalEvent:

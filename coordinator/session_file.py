@@ -21,6 +21,7 @@ from module_agent.wire.messages import Ack, Message
 
 CHUNK_BYTES = 16 * 1024
 FLUSH_NS = 200_000_000
+MCAP0_MAGIC = b"\x89MCAP0\r\n"
 KINDS: tuple[Kind, ...] = ("publication", "request", "reply", "journal")
 
 
@@ -95,7 +96,9 @@ def read_session(path: Path) -> Iterator[Entry]:
     except OSError as error:
         raise SessionFileError(f"{path}: {error.strerror or error}") from error
     with file:
-        if not file.read(8).startswith(b"\x89MCAP"):
+        # Cut within its first bytes it is an empty recording, that of a run that died as it began.
+        head = file.read(len(MCAP0_MAGIC))
+        if not MCAP0_MAGIC.startswith(head):
             raise SessionFileError(f"{path}: not an MCAP file; give the session.mcap of a run")
         file.seek(0)
         reader = NonSeekingReader(file)

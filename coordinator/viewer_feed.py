@@ -17,8 +17,8 @@ MAP_PERIOD_NS = 1_000_000_000
 POSE_PERIOD_NS = 33_000_000
 NETWORK_PERIOD_NS = 500_000_000
 RECENT_TRIPS = 100
-# Of a joint's motion, what so many of the modules next to it found is drawn.
-NEAREST = 2
+# Name of the plot of what a module itself finds: its distance from the nearest joint that moves it.
+LOCAL = "distance_from_joint"
 
 
 class Screen(Protocol):
@@ -131,17 +131,15 @@ class ViewerFeed:
         self._viewer.estimate(shown.name, shown.serial, now_ns, shown.value_mm, shown.sigma_mm, "mm")
 
     def estimates(self, joint: str, session_ns: int) -> None:
-        """Show what the modules nearest to a joint made of its motion."""
-        circles = [
-            (estimate.circle, observer)
-            for (moved, observer), found in self._recording.estimates.items()
-            for estimate in list(found.values())[-1:]
-            if moved == joint and observer != joint and estimate.circle is not None
-        ]
-        for circle, observer in sorted(circles, key=lambda pair: pair[0].distance_m)[:NEAREST]:
-            name = f"{observer} from {joint}"
-            shown = _Shown("local_estimate", name, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
-            self._show(self.since_start(session_ns), shown)
+        """Show the distances from a joint that the modules found, where no nearer joint is known yet."""
+        for (moved, observer), found in self._recording.estimates.items():
+            circle = list(found.values())[-1].circle if moved == joint and observer != joint else None
+            if circle is None:
+                continue
+            known = self._shown.get((LOCAL, observer))
+            if known is None or 1e3 * circle.distance_m <= known.value_mm:
+                shown = _Shown(LOCAL, observer, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
+                self._show(self.since_start(session_ns), shown)
 
     def chain(self, session_ns: int, fit: ChainFit) -> None:
         """Show the identified robot; it then turns as the robot turns."""

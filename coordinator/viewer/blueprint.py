@@ -129,10 +129,8 @@ def _parameters(parameters: Sequence[Parameter], name: str) -> rrb.Container:
 
 
 def _parameter_page(parameters: Sequence[Parameter], serials: Sequence[str], name: str) -> rrb.Container:
-    rows = [
-        rrb.Horizontal(*(_estimate(p, serial) for serial in serials if serial in p.ranges_by_serial()))
-        for p in parameters
-    ]
+    shown = [[(p, serial) for serial in serials if serial in p.ranges_by_serial()] for p in parameters]
+    rows = [rrb.Horizontal(*(_estimate(p, serial) for p, serial in row)) for row in shown if row]
     return rrb.Vertical(*rows, name=name)
 
 
