@@ -1,8 +1,8 @@
 """`session.mcap`: every message as it was sent or received, crash-safe, readable by any MCAP tool.
 
 Topics are the keys; the kind (publication, request, reply) is in the channel's metadata. Message encoding is
-msgpack with a JSON schema for each message type; the journal is JSON. Chunks are small and handed over five times
-a second, because a chunk is what a crash loses: the library's default of 1 MiB lost 11.8 s.
+msgpack with a JSON schema for each message type; the journal is JSON. Chunks are small and handed over five
+times a second, because a chunk is what a crash loses: the library's default of 1 MiB lost 11.8 s.
 """
 
 import json
