@@ -1,8 +1,8 @@
 """How a module's clock maps to session time, from round trips.
 
 A module answers at a time that lies between sending and receiving; the middle is wrong by at most half the
-round trip, so the quickest trips say most. Offset and drift are fitted by least squares with weights that fall
-with the excess of a trip over the quickest one.
+round trip, so the quickest trips say most. Offset and drift are fitted by least squares with weights that
+fall with the excess of a trip over the quickest one.
 """
 
 from collections.abc import Sequence
