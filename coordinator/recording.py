@@ -1,7 +1,7 @@
 """Everything that a session received and sent, in order, and what follows from it without looking further.
 
-The live session and a replay feed the same entries through the same `Recording`, so that both compute the same
-results. The recording's hash is the trace hash of the run.
+The live session and a replay feed the same entries through the same `Recording`, so that both compute the
+same results. The recording's hash is the trace hash of the run.
 """
 
 import hashlib
