@@ -39,7 +39,8 @@ from module_agent.wire.messages import Estimate
 KINEMATIC_CUTOFF_HZ = 15.0
 # Half the time constant of that low-pass: about as many independent samples as there are.
 KINEMATIC_KEEP_EVERY = 5
-MOST_KINEMATIC_SAMPLES = 4000
+# IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
+MOST_IMU_SAMPLES = 40_000
 DYNAMIC_CUTOFF_HZ = 12.0
 
 
@@ -133,8 +134,9 @@ def identify_kinematics(recording: Recording) -> Kinematics:
             _pairs(recording, topology.serials, windows),
             [_rest(recording, topology.serials)],
         )
-        samples = sum(len(w.t_ns) for w in windows) // MOST_KINEMATIC_SAMPLES
-        data = sensor_data(windows, KINEMATIC_CUTOFF_HZ, max(KINEMATIC_KEEP_EVERY, samples))
+        samples = sum(len(w.t_ns) for w in windows) * len(serials)
+        keep_every = max(KINEMATIC_KEEP_EVERY, -(-samples // MOST_IMU_SAMPLES))
+        data = sensor_data(windows, KINEMATIC_CUTOFF_HZ, keep_every)
         refined = refine_chain(first.chain, data)
     except (TopologyError, AssemblyError, ValueError) as error:
         raise IdentificationError(str(error)) from error

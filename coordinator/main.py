@@ -19,7 +19,7 @@ from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.radio import NoAnswer, Refused
 from coordinator.recording import Recording
 from coordinator.result import Result
-from coordinator.robot_link import ModuleLost, MotionInterrupted
+from coordinator.robot_link import ModuleLost, MotionInterrupted, RobotStopped
 from coordinator.run import Run, RunConfig, write_outputs
 from coordinator.run_folder import load_recording
 from coordinator.scaled_loop import ScaledLoop
@@ -171,7 +171,15 @@ def _run(
         _fail(f"interrupted, the robot is stopped; {kept}", EXIT_INTERRUPTED)
     except ModuleLost as error:
         _fail(f"{error}; {kept}", EXIT_LOST)
-    except (NobodyThere, UnfitLink, NoAnswer, Refused, MotionInterrupted, IdentificationError) as error:
+    except (
+        NobodyThere,
+        UnfitLink,
+        NoAnswer,
+        Refused,
+        MotionInterrupted,
+        RobotStopped,
+        IdentificationError,
+    ) as error:
         _fail(f"{error}; {kept}", EXIT_FAILED)
     finally:
         loop.run_until_complete(loop.shutdown_default_executor())

@@ -49,6 +49,14 @@ class ModuleLost(RuntimeError):
         self.serial = serial
 
 
+class RobotStopped(RuntimeError):
+    """Somebody said stop in the middle of the session; a program does not overrule that."""
+
+    def __init__(self, serial: str, note: str):
+        super().__init__(f"module {serial} was {note}")
+        self.serial = serial
+
+
 class MotionInterrupted(RuntimeError):
     """A motion ended before its end; it can be tried again after re-arming."""
 
@@ -68,7 +76,9 @@ class RobotLink:
         self._clock = clock
         self._tokens: dict[str, int] = {}
         self._boots: dict[str, int] = {}
+        self._armed_ns: dict[str, int] = {}
         self._complete_row: dict[str, int] = {}
+        self._met_row: dict[str, int] = {}
         self._last_id = 0
         self._renewals: set[asyncio.Task[None]] = set()
         self._taken_by: dict[str, str] = {}
@@ -101,6 +111,7 @@ class RobotLink:
             if not isinstance(info, Info):
                 raise NoAnswer(serial, Leaf.INFO, f"its answer is {type(info).__name__}")
             self._boots[serial] = info.boot
+            self._met_row[serial] = self.module(serial).rows.end_row
         self.serials = tuple(serials)
 
     async def _ask_info(self, serial: str) -> object:
@@ -138,6 +149,7 @@ class RobotLink:
 
         Raises:
             ModuleLost: a module's token is gone, it is silent, it booted anew, or somebody took its lease.
+            RobotStopped: somebody has stopped a module that this sender holds.
         """
         now = self._clock()
         for serial in self.serials:
@@ -151,6 +163,17 @@ class RobotLink:
                 raise ModuleLost(serial, f"no feedback for {(now - heard) / 1e9:.1f} s")
             if serial in self._taken_by:
                 raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
+            status = record.status
+            # A status from before the lease was taken tells of an earlier stop.
+            fresh = status is not None and serial in self._tokens and status.t_ns > self._armed_ns[serial]
+            if fresh and status is not None and status.state == "stopped":
+                raise RobotStopped(serial, status.note)
+
+    async def check_now(self) -> None:
+        """Ask every module how it is, then `check`; a status may not have arrived yet."""
+        for serial in self.serials:
+            await self.ask_status(serial)
+        self.check()
 
     async def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
         """Wait until a condition holds; False when the time is up.
@@ -179,7 +202,7 @@ class RobotLink:
             return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "acquire"))
 
         ack = await self._persist(serial, attempt)
-        self._tokens[serial] = ack.token
+        self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
 
     def _lease(self, serial: str, action: str) -> LeaseRequest:
         return LeaseRequest.model_validate({**self._head(serial), "action": action, "duration_ns": LEASE_NS})
@@ -231,11 +254,12 @@ class RobotLink:
                 raise
 
     async def stop_all(self, why: str) -> list[str]:
-        """Tell every module to stop at once; return the serials that did not confirm."""
+        """Tell every module that this sender holds to stop; return the serials that did not confirm."""
+        # A module that another coordinator holds is its business.
+        held = [serial for serial in self._tokens if serial not in self._taken_by]
         self._tokens.clear()
-        stops = [self._stop(serial, why) for serial in self.serials]
-        done = await asyncio.gather(*stops, return_exceptions=True)
-        return [s for s, r in zip(self.serials, done, strict=True) if isinstance(r, BaseException)]
+        done = await asyncio.gather(*(self._stop(serial, why) for serial in held), return_exceptions=True)
+        return [s for s, r in zip(held, done, strict=True) if isinstance(r, BaseException)]
 
     async def _stop(self, serial: str, why: str) -> None:
         for left in reversed(range(3)):
@@ -322,6 +346,19 @@ class RobotLink:
             status = await self.ask_status(serial)
             await self._complete(serial, status.next_row)
 
+    async def close_gaps(self) -> None:
+        """Fetch what is missing before the newest row of every module that has arrived.
+
+        Nothing is missing on return, and while the caller does not give way to the event loop.
+        """
+        for _ in range(ATTEMPTS):
+            ends = {serial: self.module(serial).rows.end_row for serial in self.serials}
+            gaps = [s for s, end in ends.items() if self.module(s).rows.missing(self._complete_row[s], end)]
+            if not gaps:
+                return
+            for serial in gaps:
+                await self._complete(serial, ends[serial])
+
     async def _complete(self, serial: str, end: int) -> None:
         rows = self.module(serial).rows
         first = self._complete_row.get(serial, rows.first_row)
@@ -329,7 +366,14 @@ class RobotLink:
             missing = rows.missing(first, end)
             if not missing:
                 break
-            await self._fetch(serial, *missing[0])
+            try:
+                await self._fetch(serial, *missing[0])
+            except Refused as refused:
+                # What passed while nobody listened, between a crash and its resumption, may be forgotten by
+                # now; steps that are done had all their rows before.
+                if refused.ack.reason != Refusal.GONE.value or missing[0][0] >= self._met_row[serial]:
+                    raise
+                first = missing[0][1]
         self._complete_row[serial] = end
 
     async def _fetch(self, serial: str, first: int, end: int) -> None:

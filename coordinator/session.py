@@ -185,6 +185,7 @@ class Session:
                 await work(*arguments)
                 break
             except MotionInterrupted as error:
+                await self.link.check_now()
                 if not left:
                     raise
                 self._reporter.note(f"{error}; re-arming and trying again")
@@ -204,6 +205,7 @@ class Session:
         await self.link.complete_rows()
         await self._stop_keeping()
         await self.link.release_all()
+        await self.link.close_gaps()
 
     async def _stop_keeping(self) -> None:
         if self._keeper is not None:

@@ -239,6 +239,7 @@ def launch(
     plan: PlanFile = None,
     speed: Speed = 1.0,
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
+    dynamics: Annotated[bool, typer.Option(help="Identify inertial parameters too.")] = True,
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")] = "tcp/127.0.0.1:7447",
 ) -> None:
     """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
