@@ -96,14 +96,14 @@ class Launcher:
             arguments += ["--serial", serial]
         return self._start(f"agent {','.join(serials)}", arguments)
 
-    def start_coordinator(self, options: Sequence[str] = ()) -> Child:
-        """Start the coordinator; its output goes to this terminal."""
+    def start_coordinator(self, options: Sequence[str] = (), quiet: bool = False) -> Child:
+        """Start the coordinator; its output goes to this terminal, or to its log when `quiet`."""
         config = self.config
         arguments = ["coordinator.main", "run", "--out", str(config.out), "--robot", config.robot_name]
         arguments += ["--listen", config.endpoint, "--network", config.network]
         arguments += ["--seed", str(1000 * config.seed), "--expect", str(len(config.serials))]
         arguments += ["--speed", str(config.speed), *config.coordinator_options, *options]
-        return self._start("coordinator", arguments, quiet=False)
+        return self._start("coordinator", arguments, quiet)
 
     def _start(self, name: str, arguments: Sequence[str], quiet: bool = True) -> Child:
         log = Path(self._folder.name) / f"{len(self.children)}.log" if quiet else None

@@ -34,6 +34,7 @@ app = typer.Typer(
 )
 
 EXIT_FAILED, EXIT_USAGE = 1, 2
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
 Seed = Annotated[int, typer.Option(help="Seed of all noise.")]
@@ -41,6 +42,10 @@ Noise = Annotated[str | None, typer.Option(help=f"Noise profile: {', '.join(NOIS
 Network = Annotated[str | None, typer.Option(help=f"Network profile: {', '.join(PROFILES)} [the robot's].")]
 Speed = Annotated[float, typer.Option(help="Times real time; slower helps a busy machine.")]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
+Dynamics = Annotated[
+    bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
+]
+Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
 Out = Annotated[Path | None, typer.Option(help="Folder of the run [runs/ROBOT].")]
 
 
@@ -69,6 +74,11 @@ def _plan(path: Path | None, dynamics: bool | None = None) -> Plan:
     except PlanFileError as error:
         _fail(error, EXIT_USAGE)
     return found if dynamics is None else found.model_copy(update={"dynamics": dynamics})
+
+
+def _motion_options(path: Path | None, plan: Plan) -> tuple[str, ...]:
+    dynamics = "--dynamics" if plan.dynamics else "--no-dynamics"
+    return (dynamics,) if path is None else ("--plan", str(path), dynamics)
 
 
 @app.command()
@@ -148,10 +158,9 @@ def run(
     noise: Noise = None,
     out: Out = None,
     plan: PlanFile = None,
-    dynamics: Annotated[
-        bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
-    ] = None,
+    dynamics: Dynamics = None,
     speed: Speed = 1.0,
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Identify a simulated robot and score the result against the truth."""
@@ -162,10 +171,21 @@ def run(
     if virtual:
         _run_virtual(found, folder, seed, network, noise, motions, quiet)
     else:
-        options: tuple[str, ...] = ("--quiet",) if quiet else ()
-        options += ("--dynamics",) if motions.dynamics else ("--no-dynamics",)
-        options += ("--plan", str(plan)) if plan is not None else ()
-        _run_processes(found, robot, folder, seed, network, noise, speed, options)
+        options = (*_motion_options(plan, motions), *(("--quiet",) if quiet else ()))
+        _run_processes(
+            LaunchConfig(
+                robot_file=robot,
+                robot_name=found.name,
+                serials=tuple(module.serial for module in found.modules),
+                out=folder,
+                seed=seed,
+                network=network or found.network,
+                noise=noise,
+                speed=speed,
+                endpoint=endpoint,
+                coordinator_options=options,
+            )
+        )
     _score(folder)
 
 
@@ -188,27 +208,7 @@ def _run_virtual(
     )
 
 
-def _run_processes(
-    robot: Robot,
-    robot_file: str,
-    out: Path,
-    seed: int,
-    network: str | None,
-    noise: str | None,
-    speed: float,
-    options: tuple[str, ...],
-) -> None:
-    config = LaunchConfig(
-        robot_file=robot_file,
-        robot_name=robot.name,
-        serials=tuple(module.serial for module in robot.modules),
-        out=out,
-        seed=seed,
-        network=network or robot.network,
-        noise=noise,
-        speed=speed,
-        coordinator_options=options,
-    )
+def _run_processes(config: LaunchConfig) -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         with Launcher(config, lambda text: typer.echo(text, err=True)) as launcher:
@@ -216,7 +216,7 @@ def _run_processes(
     except LaunchError as error:
         _fail(error, EXIT_FAILED)
     except KeyboardInterrupt:
-        _fail(f"interrupted, everything is stopped; recorded up to here: {out}", 130)
+        _fail(f"interrupted, everything is stopped; recorded up to here: {config.out}", 130)
 
 
 def _drive(launcher: Launcher) -> None:
@@ -239,35 +239,28 @@ def launch(
     plan: PlanFile = None,
     speed: Speed = 1.0,
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
-    dynamics: Annotated[bool, typer.Option(help="Identify inertial parameters too.")] = True,
-    endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")] = "tcp/127.0.0.1:7447",
+    dynamics: Dynamics = None,
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
 ) -> None:
     """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
     found = _load(robot)
     _check(network, noise)
-    _plan(plan)
-    options = ("--viewer", viewer) + (() if plan is None else ("--plan", str(plan)))
+    options = ("--viewer", viewer, *_motion_options(plan, _plan(plan, dynamics)))
     folder = out if out is not None else Path("runs") / found.name
-    config = LaunchConfig(
-        robot_file=robot,
-        robot_name=found.name,
-        serials=tuple(module.serial for module in found.modules),
-        out=folder,
-        seed=seed,
-        network=network or found.network,
-        noise=noise,
-        speed=speed,
-        endpoint=endpoint,
-        coordinator_options=options,
+    _run_processes(
+        LaunchConfig(
+            robot_file=robot,
+            robot_name=found.name,
+            serials=tuple(module.serial for module in found.modules),
+            out=folder,
+            seed=seed,
+            network=network or found.network,
+            noise=noise,
+            speed=speed,
+            endpoint=endpoint,
+            coordinator_options=options,
+        )
     )
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-    try:
-        with Launcher(config, lambda text: typer.echo(text, err=True)) as launcher:
-            _drive(launcher)
-    except LaunchError as error:
-        _fail(error, EXIT_FAILED)
-    except KeyboardInterrupt:
-        _fail(f"interrupted, everything is stopped; recorded up to here: {folder}", 130)
     _score(folder)
 
 
