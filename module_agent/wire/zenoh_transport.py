@@ -103,8 +103,9 @@ class _Pending:
 class _Answer:
     """Holds a Zenoh query until it is answered, from any thread; Zenoh ends it when it is dropped."""
 
-    def __init__(self, query: zenoh.Query):
+    def __init__(self, query: zenoh.Query, key: str):
         self._query: zenoh.Query | None = query
+        self._key = key
         self._lock = threading.Lock()
 
     def __call__(self, payload: bytes) -> None:
@@ -113,7 +114,7 @@ class _Answer:
         if query is None:
             return
         try:
-            query.reply(query.key_expr, payload)
+            query.reply(self._key, payload)
         except zenoh.ZError as error:
             # A session that closed meanwhile has already ended the query at the asker.
             if "closed" not in str(error):
@@ -168,11 +169,17 @@ class ZenohTransport:
             raise self._error(f"publish on {key}", error) from error
 
     def subscribe(self, key_expr: str, sink: Sink) -> Undeclare:
-        """Deliver a `Sample` for everything published on a matching key from now on."""
+        """Deliver a `Sample` for everything published on a matching key from now on.
+
+        A foreign client may publish on an expression such as `x5/**`: that is heard by whoever subscribed to
+        one key, and by nobody who subscribed to many, as it names none of them.
+        """
         declaration = _Declaration(sink, self._forget_declaration)
 
         def on_sample(sample: zenoh.Sample) -> None:
-            declaration.deliver(Sample(str(sample.key_expr), sample.payload.to_bytes()))
+            key = _one_key(str(sample.key_expr), key_expr)
+            if key is not None:
+                declaration.deliver(Sample(key, sample.payload.to_bytes()))
 
         return self._declare(
             declaration,
@@ -181,12 +188,17 @@ class ZenohTransport:
         )
 
     def serve(self, key_expr: str, sink: Sink) -> Undeclare:
-        """Deliver a `Request` for every query on a matching key; an unanswered one times out at its asker."""
+        """Deliver a `Request` for every query on a matching key; an unanswered one times out at its asker.
+
+        Queries on an expression are taken as samples on one are (see `subscribe`).
+        """
         declaration = _Declaration(sink, self._forget_declaration)
 
         def on_query(query: zenoh.Query) -> None:
             payload = b"" if query.payload is None else query.payload.to_bytes()
-            declaration.deliver(Request(str(query.key_expr), payload, _Answer(query)))
+            key = _one_key(str(query.key_expr), key_expr)
+            if key is not None:
+                declaration.deliver(Request(key, payload, _Answer(query, key)))
 
         return self._declare(
             declaration, f"serve {key_expr}", lambda: self._session.declare_queryable(key_expr, on_query)
@@ -293,6 +305,13 @@ class ZenohTransport:
     def _forget_pending(self, pending: _Pending) -> None:
         with self._lock:
             self._pending.pop(pending, None)
+
+
+def _one_key(said: str, declared: str) -> str | None:
+    """Return the key that a message on `said` means to whoever declared `declared`, None if it means many."""
+    if "*" not in said:
+        return said
+    return None if "*" in declared else declared
 
 
 def open_zenoh(config: ZenohConfig) -> ZenohTransport:
