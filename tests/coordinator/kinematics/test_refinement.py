@@ -1,0 +1,218 @@
+"""The batch refinement recovers known robots, says honestly how well, and names what it cannot know."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.linalg import orth
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from coordinator.chain import Array, Chain
+from coordinator.kinematics import refinement
+from coordinator.kinematics.increments import apply_increment
+from coordinator.kinematics.inertial_prediction import imu_readings
+from coordinator.kinematics.null_space import name_null_space
+from coordinator.kinematics.refinement import SensorData, refine_chain
+
+GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03
+
+
+def _motion(joints: int, samples: int = 300, seed: int = 0) -> tuple[Array, Array, Array]:
+    """All joints at once at 1 to 2 Hz: positions, velocities and accelerations, (m, n) each."""
+    rng = np.random.default_rng(1000 + seed)
+    rate, phase = rng.uniform(6, 12, joints), rng.uniform(0, 6, joints)
+    t = np.linspace(0, 4.0, samples)[:, None]
+    swing = 0.3 * np.sin(0.9 * t + phase) + 0.1 * np.sin(rate * t + phase)
+    velocity = 0.27 * np.cos(0.9 * t + phase) + 0.1 * rate * np.cos(rate * t + phase)
+    acceleration = -0.243 * np.sin(0.9 * t + phase) - 0.1 * rate**2 * np.sin(rate * t + phase)
+    return swing, velocity, acceleration
+
+
+def _sensed(
+    chain: Chain, seed: int = 0, noise: float = 0.0, bias: float = 0.0, samples: int = 300
+) -> SensorData:
+    """What the sensors of a chain read; `bias` in standard deviations of the data sheet's."""
+    q, qd, qdd = _motion(len(chain.serials), samples)
+    ideal = imu_readings(chain, q, qd, qdd)
+    rng = np.random.default_rng(seed)
+    shape, each = ideal.gyro_rad_s.shape, (len(chain.serials), 3)
+    gyro_bias = bias * rng.normal(0, refinement.GYRO_BIAS_RAD_S, each)
+    accel_bias = bias * rng.normal(0, refinement.ACCEL_BIAS_M_S2, each)
+    gyro = ideal.gyro_rad_s + gyro_bias + noise * rng.normal(0, GYRO_NOISE, shape)
+    accel = ideal.accel_m_s2 + accel_bias + noise * rng.normal(0, ACCEL_NOISE, shape)
+    return SensorData(q, qd, qdd, gyro, accel)
+
+
+def _perturbed(chain: Chain, seed: int, angle: float, offset: float) -> Chain:
+    """Every module but the root displaced; gravity tilted by as much."""
+    rng = np.random.default_rng(500 + seed)
+    count = len(chain.serials)
+    delta = np.concatenate([rng.normal(0, angle, (count, 3)), rng.normal(0, offset, (count, 3))], axis=1)
+    # Turning about the root would carry distal modules far off: every module turns about itself.
+    delta[:, 3:] += np.cross(chain.imu_home[:, :3, 3], delta[:, :3])
+    delta[0] = 0.0
+    tilt = Rotation.from_rotvec(rng.normal(0, angle, 3))
+    return apply_increment(chain, delta.ravel())._replace(gravity=tilt.apply(chain.gravity))
+
+
+def _increment(found: Chain, truth: Chain) -> Array:
+    """The increment (6 n,) that leads from `truth` to `found`."""
+    moved = found.imu_home @ np.linalg.inv(truth.imu_home)
+    return np.asarray(RigidTransform.from_matrix(moved).as_exp_coords().ravel())
+
+
+def _upright(robots: Any, seed: int, joints: int, tilt_rad: float = 0.0) -> Chain:
+    """A serial robot whose first axis is vertical, or tilted by an angle."""
+    chain, types = robots.random(seed, joints, serial=True)
+    up = Rotation.from_rotvec([tilt_rad, 0.0, 0.0]).apply([0.0, 0.0, 1.0])
+    return robots.build(list(chain.parent), [False] * joints, np.array(chain.imu_home), types, np.asarray(up))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_robot_that_is_roughly_known_is_recovered_from_ideal_data(robots: Any, seed: int) -> None:
+    truth, _ = robots.random(seed, joints=2 + seed % 4)
+    found = refine_chain(_perturbed(truth, seed, 0.05, 0.02), _sensed(truth))
+    # What cannot be known may differ, but not what the sensors read in any other motion.
+    q, qd, qdd = _motion(len(truth.serials), seed=9)
+    for mine, theirs in zip(
+        imu_readings(found.chain, q, qd, qdd), imu_readings(truth, q, qd, qdd), strict=True
+    ):
+        # 1e-7 rad of convergence on readings of up to 20 m/s^2.
+        np.testing.assert_allclose(mine, theirs, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_parameters_are_exact_but_for_the_null_space(robots: Any, seed: int) -> None:
+    truth, _ = robots.random(seed, joints=2 + seed % 4)
+    # What hides is a finite twist; small starts keep its second order, 0.5 * (7e-4)^2, below the bound.
+    found = refine_chain(_perturbed(truth, seed, 2e-4, 2e-4), _sensed(truth))
+    error = _increment(found.chain, truth)
+    known = error - found.null_basis @ (found.null_basis.T @ error)
+    assert np.abs(known).max() < 1e-6
+    assert found.rank + found.null_basis.shape[1] == 6 * (len(truth.serials) - 1)
+
+
+def test_biases_do_not_bend_the_robot(robots: Any) -> None:
+    truth, _ = robots.random(3, joints=4, serial=True)
+    data = _sensed(truth, seed=7, bias=1.0)
+    found = refine_chain(_perturbed(truth, 1, 0.02, 0.01), data)
+    q, qd, qdd = data.q_rad, data.qd_rad_s, data.qdd_rad_s2
+    again = imu_readings(found.chain, q, qd, qdd)
+    gyro = data.gyro_rad_s - found.gyro_bias_rad_s - again.gyro_rad_s
+    assert np.abs(gyro).max() < 1e-6
+    true_rates = imu_readings(truth, q, qd, qdd).gyro_rad_s
+    np.testing.assert_allclose(again.gyro_rad_s, true_rates, atol=1e-5)
+
+
+def test_the_covariance_is_honest_over_many_noisy_runs(robots: Any) -> None:
+    truth, _ = robots.random(4, joints=3, serial=True)
+    squares, freedom = 0.0, 0
+    for seed in range(25):
+        found = refine_chain(truth, _sensed(truth, seed, noise=1.0, bias=1.0))
+        values, vectors = np.linalg.eigh(found.covariance)
+        kept = values > values.max() * 1e-12
+        along = vectors[:, kept].T @ _increment(found.chain, truth)
+        squares += float(np.sum(along**2 / values[kept]))
+        freedom += int(np.count_nonzero(kept))
+    assert freedom == 25 * found.rank
+    # Chi-square with some 275 degrees of freedom: one sigma is 0.085; four sigma for what the seeds share.
+    assert 0.66 < squares / freedom < 1.34
+
+
+def test_residuals_tell_the_noise_of_the_sensors(robots: Any) -> None:
+    truth, _ = robots.random(4, joints=4)
+    found = refine_chain(truth, _sensed(truth, 1, noise=1.0))
+    # 900 values for each, 2 % of scatter, and the few degrees of freedom that the fit takes.
+    np.testing.assert_allclose(found.residual_gyro_rad_s, GYRO_NOISE, rtol=0.1)
+    np.testing.assert_allclose(found.residual_accel_m_s2, ACCEL_NOISE, rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("tilt_rad", "kinds"),
+    [(0.0, ["offset_along_axis", "rotation_about_axis"]), (0.5, ["offset_along_axis"])],
+)
+@pytest.mark.parametrize("joints", [2, 3])
+def test_a_vertical_first_axis_hides_offset_and_heading_and_a_tilted_one_the_offset(
+    robots: Any, tilt_rad: float, kinds: list[str], joints: int
+) -> None:
+    truth = _upright(robots, 11, joints, tilt_rad)
+    found = refine_chain(truth, _sensed(truth, 0, noise=1.0))
+    named = name_null_space(found.chain, found.null_basis)
+    assert [u.kind for u in named] == kinds
+    assert {u.joint for u in named} == {truth.serials[0]}
+    assert found.null_basis.shape[1] == len(kinds)
+    np.testing.assert_allclose(found.null_basis.T @ found.null_basis, np.eye(len(kinds)), atol=1e-9)
+    # The covariance claims nothing along what is unknown.
+    np.testing.assert_allclose(found.covariance @ found.null_basis, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_step_brings_the_model_nearer_to_the_data(
+    robots: Any, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    truth, _ = robots.random(seed, joints=3)
+    start, data = _perturbed(truth, seed, 0.05, 0.02), _sensed(truth, seed, noise=1.0)
+    costs = []
+    for iterations in (1, 2, 3, 8):
+        monkeypatch.setattr(refinement, "ITERATIONS", iterations)
+        found = refine_chain(start, data)
+        costs.append(
+            float(np.sum((found.residual_gyro_rad_s / GYRO_NOISE) ** 2))
+            + float(np.sum((found.residual_accel_m_s2 / ACCEL_NOISE) ** 2))
+        )
+    before = imu_readings(start, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+    first = float(np.sum(np.mean((data.gyro_rad_s - before.gyro_rad_s) ** 2, axis=(0, 2)) / GYRO_NOISE**2))
+    assert costs[0] < first
+    # Down to the noise, where each sensor's share is one.
+    assert all(later < 1.001 * earlier for earlier, later in itertools.pairwise(costs))
+    assert costs[-1] == pytest.approx(6.0, rel=0.1)
+
+
+def test_scipy_finds_the_same_minimum(robots: Any) -> None:
+    truth, _ = robots.random(2, joints=3)
+    data = _sensed(truth, 3, noise=1.0)
+    found = refine_chain(truth, data)
+    q, qd, qdd = data.q_rad, data.qd_rad_s, data.qdd_rad_s2
+    w_gyro, w_accel = 1 / found.residual_gyro_rad_s[:, None], 1 / found.residual_accel_m_s2[:, None]
+    # Scipy's solver stalls along directions that change nothing: it moves in the others only.
+    poses = orth(np.eye(12) - found.null_basis[6:] @ found.null_basis[6:].T)
+
+    def misfit(x: Array) -> Array:
+        moved = apply_increment(truth, np.concatenate([np.zeros(6), poses @ x[: found.rank]]))
+        tilt, biases = x[found.rank : found.rank + 3], x[found.rank + 3 :].reshape(2, 3, 3)
+        read = imu_readings(moved._replace(gravity=truth.gravity + tilt), q, qd, qdd)
+        return np.concatenate(
+            [
+                ((data.gyro_rad_s - read.gyro_rad_s - biases[0]) * w_gyro).ravel(),
+                ((data.accel_m_s2 - read.accel_m_s2 - biases[1]) * w_accel).ravel(),
+                biases[0].ravel() / refinement.GYRO_BIAS_RAD_S,
+                biases[1].ravel() / refinement.ACCEL_BIAS_M_S2,
+            ]
+        )
+
+    theirs = least_squares(
+        misfit, np.zeros(found.rank + 21), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
+    their = np.concatenate([np.zeros(6), poses @ theirs.x[: found.rank]])
+    apart = _increment(found.chain, truth) - their
+    sigma = np.sqrt(np.einsum("ij,jk,ik->i", poses.T, found.covariance[6:, 6:], poses.T))
+    # The same point on the scale of what the noise leaves open: a hundredth of a standard deviation.
+    assert np.abs((poses.T @ apart[6:]) / sigma).max() < 0.01
+
+
+def test_too_few_samples_are_refused(robots: Any) -> None:
+    truth, _ = robots.random(0, joints=4)
+    few = SensorData(*(signal[:5] for signal in _sensed(truth)))
+    with pytest.raises(ValueError, match="5 samples are too few to refine a chain of 4 modules"):
+        refine_chain(truth, few)
+
+
+def test_results_cannot_be_written_to(robots: Any) -> None:
+    truth, _ = robots.random(0, joints=2)
+    found = refine_chain(truth, _sensed(truth, 0, noise=1.0))
+    for name in ("covariance", "null_basis", "residual_gyro_rad_s", "accel_bias_m_s2"):
+        assert not getattr(found, name).flags.writeable
+    for array in (found.chain.axis, found.chain.point, found.chain.imu_home, found.chain.gravity):
+        assert not array.flags.writeable
