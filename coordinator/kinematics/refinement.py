@@ -1,10 +1,10 @@
 """One batch refinement of a chain over all motions at once, from all IMUs and all encoders.
 
-The circle point analysis takes it that only one joint moves. In a real arm the springs of the held joints give, so
-that distal IMUs turn by more than the moving joint does (up to 50 % more near a resonance), and the circles come
-out wrong. Here every IMU sample is predicted from the measured motion of all joints (`inertial_prediction`), so
-what the held joints do is part of the model. Solved by Gauss-Newton on the normal equations; gravity and the
-biases are estimated along.
+The circle point analysis takes it that only one joint moves. In a real arm the springs of the held joints
+give, so that distal IMUs turn by more than the moving joint does (up to 50 % more near a resonance), and
+the circles come out wrong. Here every IMU sample is predicted from the measured motion of all joints
+(`inertial_prediction`), so what the held joints do is part of the model. Solved by Gauss-Newton on the
+normal equations; gravity and the biases are estimated along.
 """
 
 from collections.abc import Callable
@@ -25,6 +25,8 @@ UNKNOWN_ABOVE = 0.1
 # motions cannot: an accelerometer's bias and gravity where the IMU never turns.
 GYRO_BIAS_RAD_S = 0.05
 ACCEL_BIAS_M_S2 = 0.2
+# Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
+FINEST = 1e-6
 
 
 class SensorData(NamedTuple):
@@ -44,9 +46,8 @@ class SensorData(NamedTuple):
 class Refinement(NamedTuple):
     """A refined chain; increments are as in `increments`, of all n modules (the first one's are zero).
 
-    covariance: (6 n, 6 n), zero along what is unknown. null_basis: (6 n, k) orthonormal directions that the data
-    does not know. sigmas: of all directions, smallest first, infinite for those that the gauge fixes.
-    residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis.
+    covariance: (6 n, 6 n), zero along what is unknown. null_basis: (6 n, k) orthonormal directions that the
+    data does not know. residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis. Biases: (n, 3).
     """
 
     chain: Chain
@@ -68,7 +69,7 @@ class _State(NamedTuple):
 
 
 class _Normal(NamedTuple):
-    """Normal equations: pose block, nuisance block (gravity, biases), their coupling, and right-hand sides."""
+    """Normal equations: pose block, nuisance block (gravity, biases), their coupling, right-hand sides."""
 
     pose: Array
     cross: Array
@@ -115,8 +116,8 @@ def _residuals(state: _State, data: SensorData) -> tuple[Array, Array]:
 
 
 def _spread(residual: Array) -> Array:
-    """Return the rms (n,) per axis of residuals (m, n, 3), never quite zero."""
-    return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), 1e-9))
+    """Return the rms (n,) per axis of residuals (m, n, 3), no smaller than any sensor's resolution."""
+    return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), FINEST))
 
 
 def _slopes(state: _State, data: SensorData, move: Callable[[float], Chain]) -> ImuReadings:
@@ -184,7 +185,7 @@ def _normal_equations(
 
 
 class _Spectrum(NamedTuple):
-    """Eigenvectors (columns) of the pose information with the nuisance taken out, and the sigmas along them."""
+    """Eigenvectors (columns) of the pose information with the nuisance taken out; the sigmas along them."""
 
     vectors: Array
     sigmas: Array
@@ -195,7 +196,7 @@ class _Spectrum(NamedTuple):
 
 
 def _solve(normal: _Normal, count: int) -> tuple[Array, Array, _Spectrum]:
-    """Return the step of all modules (6 n,), that of the nuisance, and the spectrum; unknown directions stay."""
+    """Return the step of all modules (6 n,), that of the nuisance, the spectrum; unknown directions stay."""
     through = np.linalg.solve(normal.nuisance, np.column_stack([normal.cross.T, normal.nuisance_rhs]))
     information = normal.pose - normal.cross @ through[:, :-1]
     rhs = normal.pose_rhs - normal.cross @ through[:, -1]
