@@ -45,7 +45,7 @@ def window(
     The window is cut to what all modules have recorded.
 
     Raises:
-        ValueError: a hole in the recording, with the module's column.
+        ValueError: a hole in the recording, with the module or its column.
     """
     start_ns, end_ns = _span(recording, clocks, event, margin_s)
     times: list[NDArray[np.int64]] = []
@@ -56,6 +56,8 @@ def window(
         rows = log.rows(log.first_row, log.end_row)
         session = clocks[serial].to_session(rows["t_ns"].astype(np.int64))
         near = (session >= start_ns - 10 * STEP_NS) & (session <= end_ns + 10 * STEP_NS)
+        if not near.any():
+            raise ValueError(_no_row(serial, event))
         picked.append(rows[near])
         times.append(session[near])
         imu_times.append(clocks[serial].to_session(rows["imu_t_ns"][near].astype(np.int64)))
@@ -99,9 +101,16 @@ def _span(
     assert event.motion.end_row is not None
     log = recording.modules[event.serial].rows
     rows = log.rows(event.motion.start_row, event.motion.end_row)
+    if not len(rows):
+        raise ValueError(_no_row(event.serial, event))
     session = clocks[event.serial].to_session(rows["t_ns"][[0, -1]].astype(np.int64))
     margin_ns = round(margin_s * 1e9)
     return int(session[0]) - margin_ns, int(session[1]) + margin_ns
+
+
+def _no_row(serial: str, event: JournalEvent) -> str:
+    motion = f"{event.purpose} motion of {event.serial}"
+    return f"module {serial} has no row in the {motion}: its recording has a hole"
 
 
 def sensor_data(windows: Sequence[Window], cutoff_hz: float, keep_every: int) -> SensorData:
