@@ -15,13 +15,15 @@ from coordinator.viewer.time_series import Batch, IntArray
 class Recorder:
     """Everything that one run has logged so far; used by one thread only."""
 
-    def __init__(self, stream: rr.RecordingStream, robot: str) -> None:
+    def __init__(
+        self, stream: rr.RecordingStream, robot: str, batch_ns: int = time_series.LIVE_BATCH_NS
+    ) -> None:
         self._stream = stream
         self._palette = layout.Palette()
         self._types: dict[str, str] = {}
         self._contents = blueprint.Contents(robot)
         self._shown: blueprint.Contents | None = None
-        self._batcher = time_series.RowBatcher()
+        self._batcher = time_series.RowBatcher(batch_ns)
         self._states = time_series.StateChanges()
         self._scenes: dict[str, robot_scene.Scene] = {}
         self._q_rad: dict[str, float] = {}

@@ -16,9 +16,11 @@ from module_agent.wire.feedback_rows import STATE_NAMES, Rows
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
-BATCH_NS = 100_000_000
-# A batch whose module fell silent is logged once another module is this much further.
-STALE_NS = 400_000_000
+# A call costs the same whatever it carries: 100 ms are soon enough for the eye, and a file read later takes more.
+LIVE_BATCH_NS = 100_000_000
+FILE_BATCH_NS = 1_000_000_000
+# A batch whose module fell silent is logged once another module is this many batches further.
+STALE_BATCHES = 4
 
 
 class Batch(NamedTuple):
@@ -60,9 +62,10 @@ _COMMANDS = (
 
 
 class RowBatcher:
-    """Gathers the rows of every module until there are about 100 ms of them."""
+    """Gathers the rows of every module until there are about `batch_ns` of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, batch_ns: int = LIVE_BATCH_NS) -> None:
+        self._batch_ns = batch_ns
         self._pending: dict[str, list[Batch]] = {}
 
     def add(self, batch: Batch) -> list[Batch]:
@@ -71,10 +74,11 @@ class RowBatcher:
             return []
         self._pending.setdefault(batch.serial, []).append(batch)
         newest = int(batch.t_ns[-1])
+        stale_ns = STALE_BATCHES * self._batch_ns
         complete = [
             serial
             for serial, parts in self._pending.items()
-            if newest - int(parts[0].t_ns[0]) >= (BATCH_NS if serial == batch.serial else STALE_NS)
+            if newest - int(parts[0].t_ns[0]) >= (self._batch_ns if serial == batch.serial else stale_ns)
         ]
         return [self._take(serial) for serial in complete]
 

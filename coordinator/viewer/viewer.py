@@ -14,7 +14,7 @@ from coordinator.viewer.logging_thread import Job, LoggingThread
 from coordinator.viewer.parameter import Estimate
 from coordinator.viewer.recorder import Recorder
 from coordinator.viewer.targets import ViewerTargets, open_targets
-from coordinator.viewer.time_series import Batch, IntArray
+from coordinator.viewer.time_series import FILE_BATCH_NS, LIVE_BATCH_NS, Batch, IntArray
 from coordinator.viewer.topology_graph import as_topology
 from module_agent.wire.feedback_rows import Rows
 
@@ -39,7 +39,8 @@ class Viewer:
             robot: the robot's name, shown above it.
             run_id: the recording's identity; the same one in two processes makes one recording.
             targets: where to; with none at all, nothing is recorded and all calls do nothing.
-            waits: let calls wait when there is too much, instead of dropping it: for virtual time.
+            waits: let calls wait when there is too much, instead of dropping it, and log in larger batches:
+                for virtual time.
 
         Raises:
             OSError: the file cannot be written. A live viewer that is not there is only reported.
@@ -47,7 +48,7 @@ class Viewer:
         self._stream = rr.RecordingStream(layout.APPLICATION_ID, recording_id=run_id)
         first = blueprint.build(blueprint.Contents(robot))
         self._opened = open_targets(self._stream, targets, first)
-        self._recorder = Recorder(self._stream, robot)
+        self._recorder = Recorder(self._stream, robot, FILE_BATCH_NS if waits else LIVE_BATCH_NS)
         self._thread = (
             LoggingThread(on_idle=self._recorder.drain, on_end=self._recorder.finish, waits=waits)
             if self._opened.records
