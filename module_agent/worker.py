@@ -1,7 +1,7 @@
 """Runs local estimates beside the ticks, on one background thread."""
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 from module_agent.estimate.observer import Finding
 
@@ -15,18 +15,16 @@ class ThreadWorker:
 
     def submit(self, job: Callable[[], Finding], done: Callable[[Finding], None]) -> None:
         """Queue a job; `done` is called on the worker's thread."""
+        self._pool.submit(self._run, job, done)
 
-        def finish(future: Future[Finding]) -> None:
-            error = future.exception()
-            if error is not None:
-                self._failure = error
-            else:
-                done(future.result())
-
-        self._pool.submit(job).add_done_callback(finish)
+    def _run(self, job: Callable[[], Finding], done: Callable[[Finding], None]) -> None:
+        try:
+            done(job())
+        except BaseException as error:  # kept for `check`: the pool would only log it
+            self._failure = error
 
     def check(self) -> None:
-        """Raise what a job raised: an estimate that crashes is a defect, not a finding."""
+        """Raise what a job or its receiver raised: an estimate that crashes is a defect, not a finding."""
         if self._failure is not None:
             raise self._failure
 
