@@ -1,7 +1,7 @@
 """From a recording to what it says of the robot: pure, so that a replay computes the same.
 
-Topology from who moved, a first chain from the agents' circle point analyses, one batch refinement of it over all
-exploration motions, then the inertial parameters, checked on motions that nothing was fitted to.
+Topology from who moved, a first chain from the agents' circle point analyses, one batch refinement of it
+over all exploration motions, then the inertial parameters, checked on motions that nothing was fitted to.
 """
 
 import os

@@ -86,7 +86,7 @@ class Plan(BaseModel):
 
 
 def _amplitude(kind: ModuleType, frequency_hz: float, most_rad: float) -> float:
-    """Return an amplitude whose peak speed is 70 % of the type's, where its back-EMF leaves torque to spare."""
+    """Return an amplitude whose peak speed is 70 % of the type's: back-EMF then leaves torque to spare."""
     return min(most_rad, 0.7 * kind.max_speed_rad_s / (6.2832 * frequency_hz))
 
 

@@ -1,4 +1,4 @@
-"""The coordinator's asyncio face of a transport: everything heard and said passes through one `record` function."""
+"""The coordinator's asyncio face of a transport; all that is heard and said passes through `record`."""
 
 import asyncio
 from collections.abc import Callable

@@ -138,7 +138,7 @@ class Run:
                     t_ns=self._clock(), what="finished", wall_time_s=time.monotonic() - self._started_s
                 )
             )
-            # From here on nothing more is recorded, so that a replay sees exactly what this result is made of.
+            # Nothing more is recorded from here on: a replay must see exactly what this result is made of.
             self._radio.close()
             self._writer.close()
             self._screen.note("estimating")

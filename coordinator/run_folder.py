@@ -25,7 +25,8 @@ def open_run_folder(path: Path, resume: bool) -> Path | None:
     The crashed run's recording is set aside under another name and kept until the resumed run is complete.
 
     Raises:
-        RunFolderError: the folder holds a run already and is not to be resumed, or there is nothing to resume.
+        RunFolderError: the folder holds a run already and is not to be resumed, or there is nothing to
+        resume.
     """
     path.mkdir(parents=True, exist_ok=True)
     session = path / SESSION
@@ -48,7 +49,7 @@ def open_run_folder(path: Path, resume: bool) -> Path | None:
 
 
 def load_recording(path: Path) -> Recording:
-    """Read a recording; entries that could not be understood when they came are left out as they were then."""
+    """Read a recording; what could not be understood when it came is left out as it was then."""
     recording = Recording()
     for entry in read_session(path):
         try:

@@ -125,7 +125,7 @@ class Session:
         self._reporter.note(f"found {len(known)}: {', '.join(self.link.serials)}")
 
     async def _check_link(self) -> None:
-        """Measure rate, loss and round trip for a second, and refuse a link that cannot keep a motion alive."""
+        """Measure rate and round trip for a second; refuse a link that cannot keep a motion alive."""
         self._report("checking the link")
         before = {s: self.link.module(s).rows.end_row for s in self.link.serials}
         start = self._clock()
@@ -140,7 +140,8 @@ class Session:
             trips = [(t.received_ns - t.sent_ns) / 1e6 for t in record.round_trips]
             median, worst = float(np.median(trips)), float(np.percentile(trips, 95))
             self._reporter.note(
-                f"{serial} ({info.module_type}): {rate:.0f} rows/s, round trip {median:.2f} ms, 95 % {worst:.2f} ms"
+                f"{serial} ({info.module_type}): {rate:.0f} rows/s, "
+                f"round trip {median:.2f} ms, 95 % {worst:.2f} ms"
             )
             if rate < 0.5 * info.feedback_rate_hz:
                 raise UnfitLink(

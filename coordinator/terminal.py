@@ -1,4 +1,4 @@
-"""What a person sees of a run in the terminal: one line of progress, notes above it; plain lines in a pipe."""
+"""What a person sees of a run in the terminal: a line of progress, notes above; plain lines in a pipe."""
 
 import time
 

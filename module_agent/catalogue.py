@@ -1,7 +1,7 @@
 """The catalogue of module types: what a module knows of its own make.
 
-Figures are the manufacturer's published ones where they exist. A housing frame has its origin at the centre of
-the mounting face and z along the output axis; the output turns about that z axis.
+Figures are the manufacturer's published ones where they exist. A housing frame has its origin at the centre
+of the mounting face and z along the output axis; the output turns about that z axis.
 """
 
 from typing import Literal, NamedTuple
@@ -23,9 +23,9 @@ class MotorConstants(NamedTuple):
 
 
 class ModuleType(NamedTuple):
-    """One type of module; lengths [m], masses [kg], inertia about the centre of mass in housing axes [kg m^2].
+    """One type of module; lengths [m], masses [kg].
 
-    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz). `imu_xyz` and `output_xyz` are positions in the housing; the
+    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) about the centre of mass in housing axes [kg m^2]. `imu_xyz` and `output_xyz` are positions in the housing; the
     IMU's axes and the output's axes (at q = 0) are parallel to the housing's.
     """
 
@@ -49,8 +49,8 @@ _X5_INERTIA = (1.5e-4, 2.55e-4, 3.5e-4, 3.41e-5, 1.18e-5, 2.29e-6)
 
 
 def _motor(coulomb_nm: float, viscous_nm_s_rad: float) -> MotorConstants:
-    # Resistance and back-EMF: middle of the ranges read from a real X5-1 log. Rotor inertia: the same log's first
-    # step turns about 1.5 A (9.4 mNm) into 1.9e5 rad/s^2.
+    # Resistance and back-EMF: middle of the ranges read from a real X5-1 log. Rotor inertia: the same log's
+    # first step turns about 1.5 A (9.4 mNm) into 1.9e5 rad/s^2.
     return MotorConstants(9.5, 0.00626, 0.00575, 1530.0, 4.0e-8, coulomb_nm, viscous_nm_s_rad, 0.65)
 
 
@@ -63,8 +63,9 @@ def _x5(
     velocity_clamp_rad_s: float,
     spring_nm_rad: float,
 ) -> ModuleType:
-    # Friction at the output of the X5-1 is 0.076 Nm + 0.017 Nm s/rad (real log). The same gear train drives the
-    # other types through further stages, so it is scaled with the gear ratio, viscous friction with its square.
+    # Friction at the output of the X5-1 is 0.076 Nm + 0.017 Nm s/rad (real log). The same gear train drives
+    # the other types through further stages, so it is scaled with the gear ratio, viscous friction with its
+    # square.
     scale = gear_ratio / 272.22
     return ModuleType(
         name=name,

@@ -11,9 +11,10 @@ from typing import NamedTuple, Protocol
 class SensorSample(NamedTuple):
     """One tick of one module, in the module's own clock and frames.
 
-    The accelerometer reads specific force (+g on the axis that points up at rest). Gyro and accelerometer are
-    in the IMU frame. Effort is the torque that the output exerts on what it is mounted to, read from the
-    spring. Position, velocity and effort are those of the output relative to the housing about the module's +z.
+    The accelerometer reads specific force (+g on the axis that points up at rest). Gyro and accelerometer
+    are in the IMU frame. Effort is the torque that the output exerts on what it is mounted to, read from
+    the spring. Position, velocity and effort are those of the output relative to the housing about the
+    module's +z.
     """
 
     t_ns: int

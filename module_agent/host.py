@@ -1,7 +1,7 @@
 """One agent process: the modules that it hosts, between their hardware and the transport.
 
-`cycle` runs one tick of all of them. The same host runs in real time on the physics bus and Zenoh, and in virtual
-time inside the simulator; only hardware, transport and worker differ.
+`cycle` runs one tick of all of them. The same host runs in real time on the physics bus and Zenoh, and in
+virtual time inside the simulator; only hardware, transport and worker differ.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,8 +1,8 @@
 """What the modules of one agent process hear of whichever joint moves, so that each can estimate from it.
 
-A joint that moves is noticed by its status; its feedback is then listened to, and whatever the network dropped is
-asked for from its history. When the motion is complete it is handed to every module of the process. Pure: what is
-to be sent or subscribed comes back as wishes.
+A joint that moves is noticed by its status; its feedback is then listened to, and whatever the network
+dropped is asked for from its history. When the motion is complete it is handed to every module of the
+process. Pure: what is to be sent or subscribed comes back as wishes.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,8 @@ Wish = Listen | AskHistory
 class JointMotion(NamedTuple):
     """A complete motion of one joint: its record and all its rows, and a rough mapping of its clock.
 
-    `rough_offset_ns` per own module: own clock minus the joint's clock, too large by the delay of the network.
+    `rough_offset_ns` per own module: own clock minus the joint's clock, too large by the delay of the
+    network.
     """
 
     serial: str
@@ -70,7 +71,7 @@ class _Track:
 
 
 class Neighbours:
-    """Collects exploration motions of all joints of the robot. `own_ns` maps own serials to their clocks now."""
+    """Collects exploration motions of all joints; `own_ns` maps own serials to their clocks now."""
 
     def __init__(self) -> None:
         self._tracks: dict[str, _Track] = {}

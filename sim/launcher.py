@@ -1,4 +1,4 @@
-"""World, agents and coordinator as processes: started in order, watched, stopped in order, nothing left behind."""
+"""World, agents and coordinator as processes: started and stopped in order, nothing left behind."""
 
 import ctypes
 import os
@@ -21,7 +21,7 @@ class LaunchError(RuntimeError):
 
 
 class LaunchConfig(NamedTuple):
-    """What is started. `processes` is how many agent processes the modules are shared among (None: one each)."""
+    """What is started; `processes` is how many agent processes share the modules (None: one each)."""
 
     robot_file: str
     robot_name: str

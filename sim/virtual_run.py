@@ -1,4 +1,4 @@
-"""A whole run in virtual time: the same agents, coordinator and world in one process, faster than real time."""
+"""A whole run in virtual time: the same agents, coordinator and world in one process."""
 
 import asyncio
 from collections.abc import Callable

@@ -16,7 +16,7 @@ from module_agent.wire.feedback_rows import STATE_NAMES, Rows
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
-# A call costs the same whatever it carries: 100 ms are soon enough for the eye, and a file read later takes more.
+# A call costs the same whatever it carries. 100 ms are soon enough for the eye; a file has time.
 LIVE_BATCH_NS = 100_000_000
 FILE_BATCH_NS = 1_000_000_000
 # A batch whose module fell silent is logged once another module is this many batches further.

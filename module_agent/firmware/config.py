@@ -44,7 +44,8 @@ def check_config(config: FirmwareConfig) -> FirmwareConfig:
     """Return the configuration if it can be run.
 
     Raises:
-        ValueError: a lifetime that is infinite or over 1 s, or a rate that the tick or a message cannot carry.
+        ValueError: a lifetime that is infinite or over 1 s, or a rate that the tick or a message cannot
+        carry.
     """
     if not 0 < config.lifetime_ns <= MAX_LIFETIME_NS:
         raise ValueError(f"lifetime {config.lifetime_ns / 1e6:.0f} ms: it must be over 0 and at most 1000 ms")

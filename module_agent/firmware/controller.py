@@ -6,9 +6,9 @@
     3            pwm = clip(P + V + T(effort command))
     4            pwm = clip(V + T(effort command + P))
 
-P outputs Nm under 2 and 4 and PWM under 3; V outputs Nm only under 2. An unset command disables its loop. Feed-
-forward turns a target into the PWM that holds it in steady state: v N 30 / (pi Kv 48) for a velocity, verified on
-a real log, and tau R / (48 Kt N efficiency) for an effort.
+P outputs Nm under 2 and 4 and PWM under 3; V outputs Nm only under 2. An unset command disables its loop.
+Feed-forward turns a target into the PWM that holds it in steady state: v N 30 / (pi Kv 48) for a velocity,
+verified on a real log, and tau R / (48 Kt N efficiency) for an effort.
 """
 
 import math

@@ -1,7 +1,7 @@
 """The firmware of one module: `step` is called once a tick, with the time, a sample and what has arrived.
 
-It is pure: no clock, no socket, no file, no randomness. Each step expires what is stale, reads the inbox, runs
-the control law, and publishes feedback rows and status.
+It is pure: no clock, no socket, no file, no randomness. Each step expires what is stale, reads the inbox,
+runs the control law, and publishes feedback rows and status.
 """
 
 from collections.abc import Sequence
@@ -257,7 +257,8 @@ class Firmware:
         if self.state == "fault" and self._sample.winding_temperature_c > WINDING_REARM_C:
             raise WireError(
                 Refusal.NOT_ARMED,
-                f"winding at {self._sample.winding_temperature_c:.0f} C, re-arms below {WINDING_REARM_C:.0f} C",
+                f"winding at {self._sample.winding_temperature_c:.0f} C, "
+                f"re-arms below {WINDING_REARM_C:.0f} C",
             )
         self.lease.acquire(request, self._now_ns)
         self._finish_motion("superseded")
@@ -306,7 +307,8 @@ class Firmware:
         ):
             raise WireError(
                 Refusal.LIMIT,
-                f"position {position:.3f} rad is outside {limits.min_position_rad} .. {limits.max_position_rad}",
+                f"position {position:.3f} rad is outside "
+                f"{limits.min_position_rad} .. {limits.max_position_rad} rad",
             )
         if self.state != "streaming":
             self._enter("setpoint")

@@ -1,7 +1,7 @@
 """One PID loop with the manufacturer's parameters, in the manufacturer's order of operations.
 
-Target clamp, target low-pass, error, dead zone, P + I + D + punch + feed-forward, output clamp, output low-pass.
-A low-pass is x = a x + (1 - a) x_prev, so 1 means none; `i_clamp` limits the integral's output.
+Target clamp, target low-pass, error, dead zone, P + I + D + punch + feed-forward, output clamp, output
+low-pass. A low-pass is x = a x + (1 - a) x_prev, so 1 means none; `i_clamp` limits the integral's output.
 """
 
 from module_agent.wire.messages import PidGains
@@ -28,7 +28,7 @@ class Pid:
         self._output: float | None = None
 
     def update(self, target: float, measured: float) -> float:
-        """Return the output for this tick; the first tick after a reset has no derivative and no filter past."""
+        """Return this tick's output; the first one after a reset has no derivative and no filter past."""
         g = self._g
         target = min(max(target, g.min_target), g.max_target)
         if g.target_lowpass < 1.0 and self._target is not None:

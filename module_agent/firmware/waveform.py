@@ -20,8 +20,9 @@ from module_agent.wire.messages import (
 
 Array = NDArray[np.float64]
 
-# The window is cut at +-Tm, where the Gaussian is not yet zero (2 % at Tm = 2.8 s, Ts = 1 s). This share of the
-# duration at either end carries it to exactly zero: a step there would put a spike into the acceleration.
+# The window is cut at +-Tm, where the Gaussian is not yet zero (2 % at Tm = 2.8 s, Ts = 1 s). This share of
+# the duration at either end carries it to exactly zero: a step there would put a spike into the
+# acceleration.
 TAPER_SHARE = 0.15
 SHORTEST_GOTO_S = 0.2
 

@@ -1,4 +1,4 @@
-"""The block of samples inside a `Feedback` message: little-endian records of `ROW`, packed, 101 bytes each."""
+"""The samples inside a `Feedback` message: little-endian records of `ROW`, packed, 101 bytes each."""
 
 from typing import Any
 

@@ -82,8 +82,9 @@ class WindowedSine(Part):
 class DynamicPattern(Part):
     """The thesis' dynamic pattern (table 6, figure 44): the steep part of a WSM, cut out and repeated.
 
-    One period is q = A exp(-s^2 / (2 Ts^2)) sin(2 pi f s) for s in +-`half_width_s`, which begins and ends at
-    rest but for the taper; it is repeated `repeats` times, every second time mirrored when `alternate` is set.
+    One period is q = A exp(-s^2 / (2 Ts^2)) sin(2 pi f s) for s in +-`half_width_s`, which begins and ends
+    at rest but for the taper; it is repeated `repeats` times, every second time mirrored when `alternate`
+    is set.
     """
 
     kind: Literal["dynamic"] = "dynamic"
@@ -204,8 +205,8 @@ class Status(Message):
 class CircleEstimate(Part):
     """A circle point analysis of one joint in one IMU's frame, with its quality figures.
 
-    `axis` is the direction about which the IMU's body turns when the joint's position grows; `radial_m` points
-    from the joint's axis to the IMU; `sigma_*` are one standard deviation.
+    `axis` is the direction about which the IMU's body turns when the joint's position grows; `radial_m`
+    points from the joint's axis to the IMU; `sigma_*` are one standard deviation.
     """
 
     axis: Vector3

@@ -1,6 +1,7 @@
 """A module obeys one holder, refuses what is late or wrong and says so, and never moves on its own."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -229,9 +230,7 @@ def test_a_command_that_echoes_the_future_is_refused() -> None:
 def test_a_replayed_command_is_refused_by_its_sequence() -> None:
     bench = Bench()
     bench.acquire()
-    old = encode(
-        Setpoint(**bench.head(position_rad=0.3, velocity_rad_s=None, effort_nm=None))
-    )
+    old = encode(Setpoint(**bench.head(position_rad=0.3, velocity_rad_s=None, effort_nm=None)))
     assert bench.ask(Leaf.SETPOINT, old).accepted
     assert refused(bench.ask(Leaf.SETPOINT, old), Refusal.SEQUENCE)
 
@@ -323,15 +322,11 @@ def test_the_duty_stays_below_the_winding_s_ceiling() -> None:
 def test_gains_are_refused_during_a_motion_and_reported_after_a_change() -> None:
     bench = Bench()
     bench.acquire()
-    (answer,) = bench.tick(
-        Incoming(Leaf.INFO, encode(Ask(serial="A", boot=0, seq=1, sender="me")), 1)
-    )
+    (answer,) = bench.tick(Incoming(Leaf.INFO, encode(Ask(serial="A", boot=0, seq=1, sender="me")), 1))
     gains = decode(Info, answer).gains
     stiff = gains.model_copy(update={"position": gains.position.model_copy(update={"kp": 6.0})})
     assert bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=stiff))).accepted
-    (answer,) = bench.tick(
-        Incoming(Leaf.INFO, encode(Ask(serial="A", boot=0, seq=1, sender="me")), 1)
-    )
+    (answer,) = bench.tick(Incoming(Leaf.INFO, encode(Ask(serial="A", boot=0, seq=1, sender="me")), 1))
     assert decode(Info, answer).gains == stiff
     bench.move()
     assert refused(bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=gains))), Refusal.BUSY)
@@ -344,11 +339,13 @@ def test_feedback_comes_at_its_rate_without_gaps_and_history_serves_every_row_ag
     first = bench.firmware.history.next_row
     bench.ticks(1000)
     blocks = [
-        unpack(decode(Feedback, p.payload, MAX_MESSAGE_BYTES)) for p in bench.published if p.leaf is Leaf.FEEDBACK
+        unpack(decode(Feedback, p.payload, MAX_MESSAGE_BYTES))
+        for p in bench.published
+        if p.leaf is Leaf.FEEDBACK
     ]
     times = [int(t) for block in blocks for t in block["t_ns"]]
     assert len(times) == pytest.approx(250, abs=5)
-    assert {b - a for a, b in zip(times, times[1:], strict=False)} == {4 * MS}
+    assert {b - a for a, b in pairwise(times)} == {4 * MS}
     request = HistoryRequest(serial="A", boot=BOOT, seq=1, sender="me", first_row=first, end_row=first + 200)
     (answer,) = bench.tick(Incoming(Leaf.HISTORY, encode(request), 1))
     rows = unpack(decode(Feedback, answer, MAX_MESSAGE_BYTES))
@@ -377,9 +374,7 @@ def test_rows_that_are_gone_are_refused_with_what_is_kept() -> None:
 SEND: dict[Leaf, Callable[[Bench], Message]] = {
     Leaf.LEASE: lambda b: LeaseRequest(**b.head(action="renew")),
     Leaf.MOTION: lambda b: MotionCommand(**b.head(motion_id=9, pattern=Rest(duration_s=1.0))),
-    Leaf.SETPOINT: lambda b: Setpoint(
-        **b.head(position_rad=1.0, velocity_rad_s=None, effort_nm=None)
-    ),
+    Leaf.SETPOINT: lambda b: Setpoint(**b.head(position_rad=1.0, velocity_rad_s=None, effort_nm=None)),
     Leaf.GAINS: lambda b: GainsCommand(**b.head(gains=b.firmware._controller.gains)),
     Leaf.STOP: lambda b: Stop(serial="A", boot=0, seq=1, sender="me"),
 }
@@ -403,8 +398,11 @@ def test_garbage_is_counted_and_changes_nothing(leaf: Leaf, noise: bytes, data: 
         assert bench.firmware.state == "armed"
 
 
+ACTIONS = ["acquire", "renew", "move", "setpoint", "stop", "wait", "hot"]
+
+
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.sampled_from(["acquire", "renew", "move", "setpoint", "stop", "wait", "hot"]), max_size=40))
+@given(st.lists(st.sampled_from(ACTIONS), max_size=40))
 def test_no_sequence_of_commands_drives_a_motor_that_is_not_commanded(actions: list[str]) -> None:
     bench = Bench()
     for number, action in enumerate(actions, start=1):
@@ -435,7 +433,8 @@ def test_every_transition_leads_to_a_state_that_can_be_left_again() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"lifetime_ns": 0}, {"lifetime_ns": 2_000 * MS}, {"feedback_rate_hz": 2000.0}, {"batch_rows": 0}]
+    "settings",
+    [{"lifetime_ns": 0}, {"lifetime_ns": 2_000 * MS}, {"feedback_rate_hz": 2000.0}, {"batch_rows": 0}],
 )
 def test_a_configuration_that_cannot_be_run_is_refused(settings: dict[str, Any]) -> None:
     kind = CATALOGUE["X5-1"]

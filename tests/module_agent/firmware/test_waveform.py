@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.firmware.waveform import Waveform, duration_s, waveform
+from module_agent.firmware.waveform import Array, Waveform, duration_s, waveform
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GoTo, Pattern, Rest, WindowedSine
 
 PATTERNS: list[Pattern] = [
@@ -21,7 +21,7 @@ PATTERNS: list[Pattern] = [
 ]
 
 
-def sampled(pattern: Pattern, step_s: float = 1e-4) -> tuple["np.ndarray[tuple[int], np.dtype[np.float64]]", Waveform]:
+def sampled(pattern: Pattern, step_s: float = 1e-4) -> tuple[Array, Waveform]:
     t = np.arange(0.0, duration_s(pattern, 0.5), step_s)
     return t, waveform(pattern, 0.5, t)
 
@@ -35,7 +35,10 @@ def test_velocity_is_the_derivative_of_position(pattern: Pattern) -> None:
     assert np.abs(numeric[inner] - found.velocity_rad_s[inner]).max() < 2e-3
 
 
-@pytest.mark.parametrize("pattern", [p for p in PATTERNS if getattr(p, "ramp_s", 1.0) > 0], ids=lambda p: p.kind)
+SMOOTH = [p for p in PATTERNS if getattr(p, "ramp_s", 1.0) > 0]
+
+
+@pytest.mark.parametrize("pattern", SMOOTH, ids=lambda p: p.kind)
 def test_a_motion_begins_and_ends_at_rest(pattern: Pattern) -> None:
     total = duration_s(pattern, 0.5)
     ends = waveform(pattern, 0.5, np.array([0.0, total]))

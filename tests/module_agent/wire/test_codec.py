@@ -1,4 +1,4 @@
-"""Bytes on the wire: what goes in comes out, plain msgpack reads it, and what is wrong is refused by its reason."""
+"""Bytes on the wire: what goes in comes out, plain msgpack reads it, what is wrong is refused by reason."""
 
 import json
 import math
@@ -121,7 +121,17 @@ EXAMPLES: list[Message] = [
         gravity_m_s2=(0.0, 0.0, 9.81),
         circle=CIRCLE,
     ),
-    Ack(**HEAD, re=6, accepted=False, reason="held", detail="d", t_ns=5, holder=None, lease_left_ns=0, token=3),
+    Ack(
+        **HEAD,
+        re=6,
+        accepted=False,
+        reason="held",
+        detail="d",
+        t_ns=5,
+        holder=None,
+        lease_left_ns=0,
+        token=3,
+    ),
 ]
 
 
