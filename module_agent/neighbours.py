@@ -77,9 +77,22 @@ class Neighbours:
         self._tracks: dict[str, _Track] = {}
         self._finished: dict[str, tuple[int, int]] = {}
         self._wishes: list[Wish] = []
+        self._boot: dict[str, int] = {}
+        self._newest: dict[tuple[str, int], int] = {}
+
+    def _late(self, status: Status) -> bool:
+        """Return whether something newer of this module was heard: a later status, or a later boot."""
+        newest = self._newest.get((status.serial, status.boot))
+        if newest is not None and (self._boot[status.serial] != status.boot or status.seq <= newest):
+            return True
+        self._boot[status.serial] = status.boot
+        self._newest[status.serial, status.boot] = status.seq
+        return False
 
     def on_status(self, status: Status, now_ns: int, own_ns: Mapping[str, int]) -> None:
         """Take notice of a status; `now_ns` is any one steady clock of this process."""
+        if self._late(status):
+            return
         record = status.motion
         if record is None or record.pattern.kind not in EXPLORATION_KINDS:
             self._drop(status.serial)
@@ -96,8 +109,10 @@ class Neighbours:
         if record.outcome not in ("running", "done"):
             self._drop(status.serial)
             return
+        if track.record.end_row is None:
+            # Counted from when the end is known: rows that are gone are not to be asked for for ever.
+            track.give_up_ns = now_ns + GIVE_UP_NS
         track.record = record
-        track.give_up_ns = now_ns + GIVE_UP_NS
         track.note_arrival(status.t_ns, own_ns)
 
     def on_feedback(self, feedback: Feedback, own_ns: Mapping[str, int], live: bool = True) -> None:
