@@ -42,6 +42,7 @@ app = typer.Typer(
 )
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+JOIN_TIMEOUT_S = 5.0
 EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 Robot = Annotated[str, typer.Option(help="Name of the robot, part of every key.")]
@@ -60,12 +61,14 @@ def _fail(text: object, code: int) -> NoReturn:
 
 def _open(listen: str, connect: list[str] | None, terminal: Terminal) -> Transport:
     if connect:
-        return open_zenoh(ZenohConfig(mode="client", connect=tuple(connect)))
+        routers = ZenohConfig(mode="client", connect=tuple(connect), connect_timeout_s=JOIN_TIMEOUT_S)
+        return open_zenoh(routers)
     try:
         return open_zenoh(ZenohConfig(mode="router", listen=(listen,)))
     except TransportError:
         # Somebody listens there already: another coordinator, or a router. Join it as a client.
-        transport = open_zenoh(ZenohConfig(mode="client", connect=(listen,)))
+        joining = ZenohConfig(mode="client", connect=(listen,), connect_timeout_s=JOIN_TIMEOUT_S)
+        transport = open_zenoh(joining)
         terminal.note(f"{listen} is in use: joined the hub there")
         return transport
 

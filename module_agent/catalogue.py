@@ -25,8 +25,9 @@ class MotorConstants(NamedTuple):
 class ModuleType(NamedTuple):
     """One type of module; lengths [m], masses [kg].
 
-    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) about the centre of mass in housing axes [kg m^2]. `imu_xyz` and `output_xyz` are positions in the housing; the
-    IMU's axes and the output's axes (at q = 0) are parallel to the housing's.
+    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) about the centre of mass in housing axes [kg m^2]. `imu_xyz`
+    and `output_xyz` are positions in the housing; the IMU's axes and the output's axes (at q = 0) are parallel
+    to the housing's.
     """
 
     name: ModuleTypeName

@@ -69,6 +69,7 @@ class HostedModule:
         self.now_ns = 0
         self.requests: dict[int, Request] = {}
         self._request_id = 0
+        self._arrived: list[Event] = []
         self._estimate_seq = 0
         self._keys = {leaf: key(robot, config.serial, leaf) for leaf in Leaf}
         self._leaves = {text: leaf for leaf, text in self._keys.items()}
@@ -77,12 +78,17 @@ class HostedModule:
         """Return the key of one of this module's leaves."""
         return self._keys[leaf]
 
+    def collect(self) -> None:
+        """Take what has arrived by now, to be judged by the next sample."""
+        if len(self.inbox):
+            self._arrived = self.inbox.drain()
+
     def step(self, sample: SensorSample) -> tuple[float, list[Outgoing]]:
-        """Run one tick on what has arrived."""
+        """Run one tick on what was collected before the sample was taken."""
         self.now_ns = sample.t_ns
         firmware = self.firmware
         firmware.dropped_events = self.inbox.dropped
-        events = self.inbox.drain() if len(self.inbox) else ()
+        events, self._arrived = self._arrived, []
         incoming: list[Incoming] = []
         answers: list[Outgoing] = []
         for event in events:
@@ -195,6 +201,10 @@ class AgentHost:
         Raises:
             HardwareLost: no further tick will come.
         """
+        # Before the exchange: a process that freezes in it finds the sample of long ago when it thaws, and by
+        # that sample's time all that was sent to it meanwhile would be fresh.
+        for module in self.modules:
+            module.collect()
         samples = self._hardware.exchange(self._pwm)
         if len(self._heard):
             self._hear()
