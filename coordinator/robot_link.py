@@ -394,7 +394,7 @@ class RobotLink:
         return answer
 
     async def estimate(self, observer: str, joint: str, motion_id: int, timeout_s: float) -> Estimate | None:
-        """Wait for what `observer` makes of a motion of `joint`, ask if it was lost; None if there is none."""
+        """Wait for what `observer` makes of a motion, and ask if it was lost; None if there is none."""
 
         def found() -> Estimate | None:
             for ids, estimate in self._recording.estimates.get((joint, observer), {}).items():

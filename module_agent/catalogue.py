@@ -26,8 +26,7 @@ class ModuleType(NamedTuple):
     """One type of module; lengths [m], masses [kg].
 
     `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) about the centre of mass in housing axes [kg m^2]. `imu_xyz`
-    and `output_xyz` are positions in the housing; the IMU's axes and the output's axes (at q = 0) are parallel
-    to the housing's.
+    and `output_xyz` are positions in the housing; the axes of IMU and output (at q = 0) are parallel to its own.
     """
 
     name: ModuleTypeName
