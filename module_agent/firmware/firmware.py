@@ -260,7 +260,8 @@ class Firmware:
                 f"winding at {self._sample.winding_temperature_c:.0f} C, "
                 f"re-arms below {WINDING_REARM_C:.0f} C",
             )
-        self.lease.acquire(request, self._now_ns)
+        if not self.lease.acquire(request, self._now_ns):
+            return
         self._finish_motion("superseded")
         if self.state not in COMMANDED:
             self._hold()

@@ -7,12 +7,13 @@ from module_agent.wire.refusal import Refusal, WireError
 class Lease:
     """The lease of one joint; times are the module's own nanoseconds."""
 
-    __slots__ = ("_until_ns", "holder", "token")
+    __slots__ = ("_granted", "_until_ns", "holder", "token")
 
     def __init__(self) -> None:
         self.holder: str | None = None
         self.token = 0
         self._until_ns = 0
+        self._granted: tuple[str, int, int] | None = None
 
     def left_ns(self, now_ns: int) -> int:
         """Return the time until the lease lapses, 0 when nobody holds it."""
@@ -22,18 +23,28 @@ class Lease:
         """Return whether a holder has let its lease run out."""
         return self.holder is not None and now_ns >= self._until_ns
 
-    def acquire(self, request: LeaseRequest, now_ns: int) -> None:
-        """Grant the lease to the sender under a new token.
+    def acquire(self, request: LeaseRequest, now_ns: int) -> bool:
+        """Grant the lease under a new token; False for a copy of the request that was granted it.
+
+        A network may deliver a request twice: a copy must neither take the token from the one who was granted
+        it nor bring back a lease that was released.
 
         Raises:
-            WireError: HELD, naming the holder and the time left.
+            WireError: HELD, naming the holder and the time left; SEQUENCE for a copy that comes after release.
         """
+        asked = (request.sender, request.seq, request.echo_ns)
+        if asked == self._granted:
+            if self.holder == request.sender:
+                return False
+            raise WireError(Refusal.SEQUENCE, f"a copy of what {request.sender} was granted before")
         if self.holder not in (None, request.sender):
             left_s = self.left_ns(now_ns) / 1e9
             raise WireError(Refusal.HELD, f"held by {self.holder} for another {left_s:.2f} s")
         self.holder = request.sender
         self.token += 1
         self._until_ns = now_ns + request.duration_ns
+        self._granted = asked
+        return True
 
     def extend(self, duration_ns: int, now_ns: int) -> None:
         """Let the present holder's lease run for `duration_ns` from now."""
