@@ -26,7 +26,7 @@ class ModuleType(NamedTuple):
     """One type of module; lengths [m], masses [kg].
 
     `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) about the centre of mass in housing axes [kg m^2]. `imu_xyz`
-    and `output_xyz` are positions in the housing, to whose axes those of IMU and output (at q = 0) are parallel.
+    and `output_xyz` are positions in the housing; the axes of IMU and output are parallel to its own.
     """
 
     name: ModuleTypeName

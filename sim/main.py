@@ -46,6 +46,9 @@ Dynamics = Annotated[
     bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
 ]
 Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
+Processes = Annotated[
+    int | None, typer.Option(min=1, help="Agent processes that share the modules [one for each module].")
+]
 Out = Annotated[Path | None, typer.Option(help="Folder of the run [runs/ROBOT].")]
 
 
@@ -160,6 +163,7 @@ def run(
     plan: PlanFile = None,
     dynamics: Dynamics = None,
     speed: Speed = 1.0,
+    processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
@@ -240,6 +244,7 @@ def launch(
     speed: Speed = 1.0,
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
     dynamics: Dynamics = None,
+    processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
 ) -> None:
     """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
@@ -257,6 +262,7 @@ def launch(
             network=network or found.network,
             noise=noise,
             speed=speed,
+            processes=processes,
             endpoint=endpoint,
             coordinator_options=options,
         )

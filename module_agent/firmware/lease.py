@@ -30,7 +30,7 @@ class Lease:
         it nor bring back a lease that was released.
 
         Raises:
-            WireError: HELD, naming the holder and the time left; SEQUENCE for a copy that comes after release.
+            WireError: HELD, naming the holder and the time left; SEQUENCE for a copy after release.
         """
         asked = (request.sender, request.seq, request.echo_ns)
         if asked == self._granted:
