@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pybullet
 
+from sim.physics.bullet import pybullet
 from sim.physics.urdf import urdf_text
 from sim.pose import Array
 from sim.robot_tree import GRAVITY_M_S2, RobotTree
