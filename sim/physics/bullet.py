@@ -3,6 +3,7 @@
 Standard output belongs to results, some of them machine-readable.
 """
 
+import ctypes
 import importlib
 import os
 import sys
@@ -16,6 +17,8 @@ def _imported_quietly() -> Any:
         os.dup2(nowhere, 1)
         return importlib.import_module("pybullet")
     finally:
+        # The greeting waits in the C library's buffer.
+        ctypes.CDLL(None).fflush(None)
         os.dup2(kept, 1)
         os.close(kept)
         os.close(nowhere)
