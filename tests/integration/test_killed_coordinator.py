@@ -1,0 +1,106 @@
+"""A coordinator that dies in the middle of a motion: the robot stops by itself, and the run is resumed."""
+
+import numpy as np
+
+from coordinator.recording import Recording
+from coordinator.robot_link import LEASE_NS
+from coordinator.run_folder import load_recording
+from module_agent.wire.feedback_rows import STATE_NAMES
+from sim.score import score
+
+EXPIRED = STATE_NAMES.index("expired")
+
+
+def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(launcher, client) -> None:
+    """The hub outlives the coordinator here, so that the instant of the last accepted command is heard."""
+    robot = launcher()
+    config = robot.config
+    ear = client(config.robot_name, hub=True)
+    robot.start_world()
+    agents = robot.start_agents()
+    coordinator = robot.start_coordinator(quiet=True)
+    mover = config.serials[0]
+    motion = ear.motion(mover, "windowed_sine", 150, coordinator)
+    coordinator.process.kill()
+    coordinator.process.wait()
+    for serial in config.serials:
+        info = ear.info(serial)
+        expired = ear.until(
+            lambda serial=serial: next((s for s in ear.statuses[serial] if s.state == "expired"), None),
+            f"{serial} expired",
+            *agents,
+        )
+        # A keep-alive lets the lease run for this long from the instant at which it is accepted.
+        accepted_ns = expired.t_ns + expired.lease_left_ns - LEASE_NS
+        late_ns = accepted_ns + info.lifetime_ns + 2 * info.tick_ns
+        now = ear.status(serial)
+        assert now.expiries == 1
+        rows = ear.history(serial, motion.start_row if serial == mover else 0, now.next_row)
+        past = rows[rows["t_ns"] > late_ns]
+        assert len(past)
+        assert (past["state"] == EXPIRED).all()
+        assert (past["pwm"] == 0.0).all()
+        # Not before its time either: commands are good for the whole lifetime.
+        early = rows[(rows["t_ns"] >= accepted_ns) & (rows["t_ns"] <= accepted_ns + info.lifetime_ns)]
+        assert not (early["state"] == EXPIRED).any()
+    moving = ear.history(mover, motion.start_row, motion.start_row + 150)
+    assert np.abs(moving["pwm"]).max() > 0.0
+    assert ear.status(mover).motion.outcome == "expired"
+
+
+def done_steps(recording: Recording) -> list[str]:
+    return [event.step for event in recording.journal if event.what == "done"]
+
+
+def test_a_killed_coordinator_s_run_is_resumed_where_it_was(launcher, client, programs) -> None:
+    robot = launcher()
+    config = robot.config
+    first, second = config.serials
+    robot.start_world()
+    coordinator = robot.start_coordinator(quiet=True)
+    agents = robot.start_agents()
+    ear = client(config.robot_name)
+    motion = ear.motion(second, "windowed_sine", 150, coordinator)
+    coordinator.process.kill()
+    coordinator.process.wait()
+    ear.close()
+
+    # The hub died with the coordinator; somebody else's lets the modules say what they did alone.
+    witness = client(config.robot_name, hub=True)
+    witness.meet(config.serials, *agents)
+    status = witness.status(second)
+    assert status.state == "expired"
+    assert status.expiries == 1
+    assert status.motion.motion_id == motion.motion_id
+    assert status.motion.outcome == "expired"
+    rows = witness.history(second, motion.start_row, status.next_row)
+    off = rows[rows["t_ns"] >= rows["t_ns"][rows["state"] == EXPIRED][0]]
+    assert (off["state"] == EXPIRED).all()
+    assert (off["pwm"] == 0.0).all()
+    witness.close()
+
+    crashed = load_recording(config.out / "session.mcap")
+    assert f"explore/{first}" in done_steps(crashed)
+    assert f"explore/{second}" not in done_steps(crashed)
+    resumed = robot.start_coordinator(["--resume"], quiet=True)
+    code, said = programs.ended(resumed)
+    assert code == 0, said
+    robot.stop()
+
+    whole = load_recording(config.out / "session.mcap")
+    assert [event.what for event in whole.journal].count("session") == 2
+    assert [event.what for event in whole.journal].count("finished") == 1
+    begun = [event.step for event in whole.journal if event.what == "begin"]
+    assert begun.count(f"explore/{first}") == begun.count("rest") == 1
+    assert begun.count(f"explore/{second}") == 2
+    assert done_steps(whole).count(f"explore/{second}") == 1
+    for serial in config.serials:
+        old, log = crashed.modules[serial].rows, whole.modules[serial].rows
+        assert log.first_row == old.first_row
+        assert log.end_row > old.end_row
+        # The modules remember a minute, so not even the rows between the two coordinators are missing.
+        assert log.missing(log.first_row, log.end_row) == []
+    assert not (config.out / "session.crashed.mcap").exists()
+    found = score(config.out)
+    assert found.topology_correct
+    assert abs(found.links[0].link_length_error_mm) <= 0.05 * found.links[0].link_length_true_mm

@@ -1,0 +1,41 @@
+"""One message in twenty is lost, and the recording is complete all the same."""
+
+from coordinator.run_folder import load_recording
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
+from module_agent.wire.keys import Leaf, parse
+from module_agent.wire.messages import Feedback
+from module_agent.wire.row_log import RowLog
+from sim.score import score
+
+
+def test_no_row_is_missing_when_the_network_drops_feedback(launcher, programs) -> None:
+    robot = launcher(network="lossy")
+    config = robot.config
+    robot.start_world()
+    coordinator = robot.start_coordinator(quiet=True)
+    robot.start_agents()
+    code, said = programs.ended(coordinator)
+    assert code == 0, said
+    robot.stop()
+
+    recording = load_recording(config.out / "session.mcap")
+    live: dict[str, RowLog] = {}
+    questions = 0
+    for entry in programs.entries(config.out / "session.mcap"):
+        if entry.kind == "journal":
+            continue
+        leaf = parse(entry.topic).leaf
+        questions += entry.kind == "request" and leaf is Leaf.HISTORY
+        if entry.kind == "publication" and leaf is Leaf.FEEDBACK:
+            feedback = decode(Feedback, entry.payload, MAX_MESSAGE_BYTES)
+            live.setdefault(feedback.serial, RowLog(feedback.boot)).add(feedback)
+    assert questions > 0
+    for serial in config.serials:
+        log = recording.modules[serial].rows
+        lost = live[serial].missing(live[serial].first_row, live[serial].end_row)
+        # 13 s at 50 messages a second: some 30 are lost.
+        assert len(lost) >= 5
+        assert log.missing(log.first_row, log.end_row) == []
+    found = score(config.out)
+    assert found.topology_correct
+    assert abs(found.links[0].link_length_error_mm) <= 0.05 * found.links[0].link_length_true_mm

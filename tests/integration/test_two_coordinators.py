@@ -1,0 +1,35 @@
+"""A second coordinator comes to a robot that is taken."""
+
+from coordinator.run_folder import load_recording
+from sim.score import score
+
+
+def test_the_second_coordinator_is_told_who_holds_the_robot_and_disturbs_nothing(
+    launcher, client, programs, plan, tmp_path
+) -> None:
+    robot = launcher()
+    config = robot.config
+    robot.start_world()
+    first = robot.start_coordinator(quiet=True)
+    robot.start_agents()
+    ear = client(config.robot_name)
+    ear.motion(config.serials[0], "constant", 1, first)
+    second = programs.run(
+        "coordinator.main",
+        *("run", "--out", str(tmp_path / "second"), "--robot", config.robot_name),
+        *("--listen", config.endpoint, "--plan", str(plan), "--no-dynamics"),
+    )
+    assert first.process.poll() is None, "the second one must come while the first one works"
+    assert second.returncode == 1
+    assert f"held by coordinator-{first.process.pid}@" in second.stderr
+    assert "Traceback" not in second.stderr
+
+    code, said = programs.ended(first)
+    assert code == 0, said
+    robot.stop()
+    journal = load_recording(config.out / "session.mcap").journal
+    assert [event for event in journal if event.what in ("note", "failed")] == []
+    assert score(config.out).topology_correct
+    ear.pump()
+    for serial in config.serials:
+        assert {s.state for s in ear.statuses[serial]} <= {"idle", "armed", "moving"}
