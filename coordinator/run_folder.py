@@ -13,10 +13,21 @@ SESSION, VIEW, RESULT, URDF, HELD_OUT = (
     "robot.urdf",
     "held_out.npz",
 )
+ASIDE = "session.crashed.mcap"
 
 
 class RunFolderError(ValueError):
     """The folder cannot be used; the message says why and what to do."""
+
+
+def check_free(path: Path) -> None:
+    """Check that a new run may use the folder, without making it.
+
+    Raises:
+        RunFolderError: it holds a run already.
+    """
+    if (path / SESSION).exists() or (path / ASIDE).exists():
+        raise RunFolderError(f"{path} holds a run already: choose another --out, or --resume it")
 
 
 def open_run_folder(path: Path, resume: bool) -> Path | None:
@@ -28,12 +39,12 @@ def open_run_folder(path: Path, resume: bool) -> Path | None:
         RunFolderError: the folder holds a run already and is not to be resumed, or there is nothing to
         resume.
     """
+    if not resume:
+        check_free(path)
     path.mkdir(parents=True, exist_ok=True)
     session = path / SESSION
-    aside = path / "session.crashed.mcap"
+    aside = path / ASIDE
     if not resume:
-        if session.exists() or aside.exists():
-            raise RunFolderError(f"{path} holds a run already: choose another --out, or --resume it")
         return None
     if (path / RESULT).exists():
         raise RunFolderError(f"{path} holds a complete run: there is nothing to resume")

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from coordinator.plan import Plan, PlanFileError, load_plan
-from coordinator.run_folder import RunFolderError
+from coordinator.run_folder import RunFolderError, check_free
 from coordinator.terminal import Terminal
 from module_agent.wire.network_profile import PROFILES
 from sim.bus_server import BusServer
@@ -213,6 +213,11 @@ def _run_virtual(
 
 
 def _run_processes(config: LaunchConfig) -> None:
+    try:
+        # Here, before the world starts: at its end it writes the truth into this folder.
+        check_free(config.out)
+    except RunFolderError as error:
+        _fail(error, EXIT_USAGE)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         with Launcher(config, lambda text: typer.echo(text, err=True)) as launcher:
