@@ -161,7 +161,8 @@ class Session:
             if event.serial and (record is None or record.boot != event.boot):
                 del self._done[step]
                 self._reporter.note(f"{step} is done again: module {event.serial} has booted since")
-        self._done.pop("home", None)
+        for journey in ("home", "back"):
+            self._done.pop(journey, None)
         if self._done:
             self._reporter.note(f"resuming: {len(self._done)} steps are done already")
 
@@ -181,29 +182,35 @@ class Session:
         if name in self._done:
             return
         self._journal(JournalEvent(t_ns=self._clock(), what="begin", step=name))
-        for left in reversed(range(self._plan.retries + 1)):
+        for attempt in range(self._plan.retries + 1):
             try:
+                if attempt:
+                    await self._rearm()
                 await work(*arguments)
                 break
             except MotionInterrupted as error:
                 await self.link.check_now()
-                if not left:
+                if attempt == self._plan.retries:
                     raise
                 self._reporter.note(f"{error}; re-arming and trying again")
                 self._journal(JournalEvent(t_ns=self._clock(), what="note", step=name, text=str(error)))
-                for serial in self.link.serials:
-                    await self.link.acquire(serial)
-                await self._home()
         await self.link.complete_rows()
         serial = arguments[0] if arguments else ""
         boot = self.link.module(serial).boot if serial else 0
         self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
 
+    async def _rearm(self) -> None:
+        for serial in self.link.serials:
+            await self.link.acquire(serial)
+        await self._home()
+
     async def _finish(self, starts: dict[str, float]) -> None:
-        self._report("back to where it stood")
         speed = self._plan.travel_speed_rad_s
-        await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in starts.items()})
-        await self.link.complete_rows()
+
+        async def back() -> None:
+            await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in starts.items()})
+
+        await self._step("back", "back to where it stood", back)
         await self._stop_keeping()
         await self.link.release_all()
         await self.link.close_gaps()
