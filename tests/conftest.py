@@ -246,9 +246,13 @@ class Rig:
     def end_tasks(self) -> None:
         """End what a killed coordinator has left behind, as the end of its process would."""
         left = sorted(asyncio.all_tasks(self.loop), key=lambda task: task.get_name())
-        for task in left:
-            task.cancel()
-        self.loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
+
+        async def end() -> None:
+            for task in left:
+                task.cancel()
+            await asyncio.gather(*left, return_exceptions=True)
+
+        self.loop.run_until_complete(end())
 
     def close(self) -> None:
         self._ticking = False
