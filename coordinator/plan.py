@@ -7,6 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from module_agent.catalogue import ModuleType
+from module_agent.firmware.gains import default_gains
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
@@ -79,10 +80,11 @@ class Plan(BaseModel):
             alternate=False,
         )
 
-    def exploring_gains(self, default: GainSet) -> GainSet:
-        """Return gains that hold a joint stiffly, so that only the moving joint moves."""
-        position = default.position.model_copy(update={"kp": default.position.kp * self.hold_stiffness})
-        return default.model_copy(update={"position": position})
+    def exploring_gains(self, kind: ModuleType, strategy: int) -> GainSet:
+        """Return the factory gains, the position loop `hold_stiffness` times as stiff."""
+        factory = default_gains(kind, strategy)
+        position = factory.position.model_copy(update={"kp": factory.position.kp * self.hold_stiffness})
+        return factory.model_copy(update={"position": position})
 
 
 def _amplitude(kind: ModuleType, frequency_hz: float, most_rad: float) -> float:

@@ -238,9 +238,7 @@ class RobotLink:
 
     async def release_all(self) -> None:
         """Let go of all modules; their motors are off then."""
-        for serial in list(self._tokens):
-            await self._release(serial)
-            self._tokens.pop(serial)
+        await asyncio.gather(*(self._release(serial) for serial in list(self._tokens)))
 
     async def _release(self, serial: str) -> None:
         async def attempt() -> Ack:
@@ -252,6 +250,7 @@ class RobotLink:
             # The first answer may have been lost: then there is nothing left to release.
             if refused.ack.reason not in (Refusal.NO_LEASE.value, Refusal.HELD.value):
                 raise
+        self._tokens.pop(serial, None)
 
     async def stop_all(self, why: str) -> list[str]:
         """Tell every module that this sender holds to stop; return the serials that did not confirm."""

@@ -167,12 +167,17 @@ class Session:
             self._reporter.note(f"resuming: {len(self._done)} steps are done already")
 
     async def _take(self) -> None:
+        # The keeper first: what is taken already must not expire while the next one is slow to answer.
+        self._keeper = asyncio.create_task(self.link.keep_alive())
+        await self._arm()
+
+    async def _arm(self) -> None:
+        """Acquire every module, and set gains where the plan wants others than the factory's."""
         for serial in self.link.serials:
             await self.link.acquire(serial)
-        self._keeper = asyncio.create_task(self.link.keep_alive())
-        for serial in self.link.serials:
-            gains = self._plan.exploring_gains(self.link.info(serial).gains)
-            if self.link.info(serial).gains != gains:
+            if self._plan.hold_stiffness != 1.0:
+                strategy = self.link.info(serial).gains.strategy
+                gains = self._plan.exploring_gains(self.link.kind(serial), strategy)
                 await self.link.set_gains(serial, gains)
 
     async def _step(
@@ -200,8 +205,7 @@ class Session:
         self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
 
     async def _rearm(self) -> None:
-        for serial in self.link.serials:
-            await self.link.acquire(serial)
+        await self._arm()
         await self._home()
 
     async def _finish(self, starts: dict[str, float]) -> None:
@@ -211,8 +215,8 @@ class Session:
             await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in starts.items()})
 
         await self._step("back", "back to where it stood", back)
-        await self._stop_keeping()
         await self.link.release_all()
+        await self._stop_keeping()
         await self.link.close_gaps()
 
     async def _stop_keeping(self) -> None:

@@ -24,7 +24,7 @@ from module_agent.wire.messages import (
     Status,
 )
 from module_agent.wire.refusal import Refusal, WireError
-from module_agent.wire.transport import Event, Liveness, Reply, Request, Sample, Transport, Undeclare
+from module_agent.wire.transport import Event, Liveness, Reply, Request, Sample, Sink, Transport, Undeclare
 
 SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.STOP, Leaf.GAINS, Leaf.ESTIMATE)
 HEARD = (Leaf.SETPOINT, Leaf.STOP)
@@ -66,6 +66,8 @@ class HostedModule:
         self.firmware = Firmware(config)
         self.observer = Observer(config.serial, config.boot)
         self.inbox = Inbox()
+        # Apart from all else, so that no flood can keep a stop out.
+        self.stops = Inbox(capacity=16)
         self.now_ns = 0
         self.requests: dict[int, Request] = {}
         self._request_id = 0
@@ -78,10 +80,14 @@ class HostedModule:
         """Return the key of one of this module's leaves."""
         return self._keys[leaf]
 
+    def sink(self, leaf: Leaf) -> Sink:
+        """Return where what arrives on a leaf is put."""
+        return self.stops.put if leaf is Leaf.STOP else self.inbox.put
+
     def collect(self) -> None:
         """Take what has arrived by now, to be judged by the next sample."""
-        if len(self.inbox):
-            self._arrived = self.inbox.drain()
+        if len(self.stops) or len(self.inbox):
+            self._arrived = self.stops.drain() + self.inbox.drain()
 
     def step(self, sample: SensorSample) -> tuple[float, list[Outgoing]]:
         """Run one tick on what was collected before the sample was taken."""
@@ -187,9 +193,9 @@ class AgentHost:
         transport = self._transport
         for module in self.modules:
             for leaf in SERVED:
-                self._declared.append(transport.serve(module.key(leaf), module.inbox.put))
+                self._declared.append(transport.serve(module.key(leaf), module.sink(leaf)))
             for leaf in HEARD:
-                self._declared.append(transport.subscribe(module.key(leaf), module.inbox.put))
+                self._declared.append(transport.subscribe(module.key(leaf), module.sink(leaf)))
         self._declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._heard.put))
         # Last, so that whoever sees the token finds everything else in place.
         for module in self.modules:

@@ -6,7 +6,7 @@ from module_agent.wire.transport import Event
 
 
 class Inbox:
-    """Events in order of arrival. When full, what arrives is dropped and counted: old commands go first."""
+    """Events in order of arrival. When it is full, what arrives is dropped and counted."""
 
     def __init__(self, capacity: int = 256):
         self._events: deque[Event] = deque()

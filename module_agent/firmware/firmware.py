@@ -13,7 +13,7 @@ from module_agent.firmware.controller import NOMINAL_VOLTAGE_V, UNSET, Command, 
 from module_agent.firmware.gains import default_gains
 from module_agent.firmware.history import MAX_ROWS_PER_ANSWER, History
 from module_agent.firmware.lease import Lease
-from module_agent.firmware.motion import Motion, check_motion
+from module_agent.firmware.motion import Motion, check_duration, check_motion, check_speed
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
 from module_agent.hardware import SensorSample
 from module_agent.wire.codec import encode
@@ -79,9 +79,7 @@ class Firmware:
         self.admission = Admission(config.serial, config.boot, config.lifetime_ns)
         self.state: State = "idle"
         self.dropped_events = 0
-        self._controller = Controller(
-            config.kind, default_gains(config.kind, config.strategy), config.tick_ns / 1e9
-        )
+        self._controller = self._own_controller()
         self._period_ns = round(1e9 / config.feedback_rate_hz)
         self._motion: Motion | None = None
         self._record: MotionRecord | None = None
@@ -89,6 +87,7 @@ class Firmware:
         self._command: Command = UNSET
         self._setpoint: Command = UNSET
         self._fresh_ns = 0
+        self._stopped_ns = 0
         self._expiries = 0
         self._seq = 0
         self._now_ns = 0
@@ -112,11 +111,11 @@ class Firmware:
         if self.state in COMMANDED and now_ns - self._fresh_ns > self.config.lifetime_ns:
             self._expire()
         if self.lease.lapsed(now_ns):
-            self.lease.release()
-            self._status_due = True
+            self._end_lease()
         for incoming in inbox:
             self._receive(incoming, out)
         if sample.winding_temperature_c >= WINDING_LIMIT_C and self.state != "fault":
+            self._finish_motion("fault")
             self._enter("fault", f"winding at {sample.winding_temperature_c:.0f} C")
         pwm = self._drive(sample)
         self._append_row(sample, pwm, out)
@@ -160,7 +159,12 @@ class Firmware:
         return min(max(pwm, -DAMPING_LIMIT_PWM), DAMPING_LIMIT_PWM)
 
     def _limit(self, pwm: float, sample: SensorSample) -> float:
-        """Keep the duty below the winding's ceiling 1 - 1/(155 - T)."""
+        """Keep the duty below the winding's ceiling 1 - 1/(155 - T), and never drive out of the range."""
+        low, high = self.config.limits.min_position_rad, self.config.limits.max_position_rad
+        if (high is not None and sample.position_rad > high and pwm > 0.0) or (
+            low is not None and sample.position_rad < low and pwm < 0.0
+        ):
+            return 0.0
         ceiling = max(0.0, 1.0 - 1.0 / max(155.0 - sample.winding_temperature_c, 1.0))
         most = ceiling * sample.voltage_v / NOMINAL_VOLTAGE_V
         return min(max(pwm, -most), most)
@@ -176,6 +180,16 @@ class Firmware:
         self.state = target
         self._status_due = True
         self._note = note
+
+    def _own_controller(self) -> Controller:
+        gains = default_gains(self.config.kind, self.config.strategy)
+        return Controller(self.config.kind, gains, self.config.tick_ns / 1e9)
+
+    def _end_lease(self) -> None:
+        """Let go of the holder, and of the gains that it has set: the next one shall not inherit them."""
+        self.lease.release()
+        self._controller = self._own_controller()
+        self._status_due = True
 
     def _expire(self) -> None:
         self._expiries += 1
@@ -193,7 +207,9 @@ class Firmware:
         self._record = self._record.model_copy(update={"outcome": outcome, "end_row": self.history.next_row})
         if outcome == "done" and self._record.pattern.kind == "rest":
             self.last_rest = self._record
-        self._command = Command(self._motion.last_position_rad, 0.0, None)
+        # A motion that is broken off holds where it was then, not where it would have ended.
+        end = self._motion.last_position_rad if outcome == "done" else self._command.position_rad
+        self._command = Command(end, 0.0, None)
         self._motion = None
         self._status_due = True
 
@@ -221,6 +237,7 @@ class Firmware:
                 stop = read(Stop, payload, any_boot=True)
                 self._finish_motion("stopped")
                 self._enter("stop", f"stopped by {stop.sender}: {stop.why}"[:512])
+                self._stopped_ns = self._now_ns
                 return encode(self._ack(True, stop.seq))
             case Leaf.LEASE:
                 request = read(LeaseRequest, payload, any_boot=False)
@@ -248,12 +265,11 @@ class Firmware:
     def _act_lease(self, request: LeaseRequest) -> None:
         if request.action == "renew":
             self.lease.extend(request.duration_ns, self._now_ns)
-            if self.state in COMMANDED:
-                self._fresh_ns = self._now_ns
+            self._refresh(request.echo_ns)
             return
         if request.action == "release":
             self._finish_motion("superseded")
-            self.lease.release()
+            self._end_lease()
             self._enter("release")
             return
         assert self._sample is not None
@@ -263,13 +279,21 @@ class Firmware:
                 f"winding at {self._sample.winding_temperature_c:.0f} C, "
                 f"re-arms below {WINDING_REARM_C:.0f} C",
             )
+        if self.state == "stopped" and request.echo_ns <= self._stopped_ns:
+            raise WireError(Refusal.STALE, "sent before the stop: its sender cannot have known of it")
         if not self.lease.acquire(request, self._now_ns):
             return
         self._finish_motion("superseded")
-        if self.state not in COMMANDED:
+        if self.state not in ("armed", "moving"):
             self._hold()
-        self._fresh_ns = self._now_ns
         self._enter("acquire")
+        self._refresh(request.echo_ns)
+
+    def _refresh(self, echo_ns: int) -> None:
+        """Count the lifetime from what the sender had seen of this module, not from when its command came:
+        a command that was long on the way must not let a motor outlive its commander.
+        """
+        self._fresh_ns = max(self._fresh_ns, echo_ns)
 
     def _start_motion(self, command: MotionCommand) -> None:
         record = self._record
@@ -278,18 +302,19 @@ class Firmware:
                 raise WireError(
                     Refusal.SEQUENCE, f"motion {command.motion_id} was {record.outcome}: use a new number"
                 )
-            self._fresh_ns = self._now_ns
+            self._refresh(command.echo_ns)
             return
         if self.state == "moving":
             raise WireError(Refusal.BUSY, f"motion {record.motion_id if record else '?'} is running")
         assert self._sample is not None
         held = self._command.position_rad
         origin = held if held is not None else self._sample.position_rad
+        check_duration(command.pattern, origin)
         motion = Motion(command.pattern, origin, self._now_ns, self.config.tick_ns)
         check_motion(motion, self.config.limits)
         self._enter("motion")
         self._motion = motion
-        self._fresh_ns = self._now_ns
+        self._refresh(command.echo_ns)
         self._record = MotionRecord(
             motion_id=command.motion_id,
             pattern=command.pattern,
@@ -304,6 +329,7 @@ class Firmware:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "a motion is running; setpoints are taken when it has ended")
         limits = self.config.limits
+        check_speed(abs(setpoint.velocity_rad_s or 0.0), limits)
         position = setpoint.position_rad
         if position is not None and (
             (limits.min_position_rad is not None and position < limits.min_position_rad)
@@ -317,13 +343,13 @@ class Firmware:
         if self.state != "streaming":
             self._enter("setpoint")
         self._setpoint = Command(position, setpoint.velocity_rad_s, setpoint.effort_nm)
-        self._fresh_ns = self._now_ns
+        self._refresh(setpoint.echo_ns)
 
     def _set_gains(self, command: GainsCommand) -> None:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "gains are taken when no motion is running")
         self._controller = Controller(self.config.kind, command.gains, self.config.tick_ns / 1e9)
-        self._fresh_ns = self._now_ns
+        self._refresh(command.echo_ns)
 
     def _answer_history(self, request: HistoryRequest) -> bytes:
         end = min(request.end_row, request.first_row + MAX_ROWS_PER_ANSWER)

@@ -3,6 +3,9 @@
 from module_agent.wire.messages import LeaseRequest
 from module_agent.wire.refusal import Refusal, WireError
 
+# A copy is as old as the network can hold it, so a few past senders are enough.
+SENDERS_REMEMBERED = 32
+
 
 class Lease:
     """The lease of one joint; times are the module's own nanoseconds."""
@@ -13,7 +16,7 @@ class Lease:
         self.holder: str | None = None
         self.token = 0
         self._until_ns = 0
-        self._granted: tuple[str, int, int] | None = None
+        self._granted: dict[str, tuple[int, int]] = {}
 
     def left_ns(self, now_ns: int) -> int:
         """Return the time until the lease lapses, 0 when nobody holds it."""
@@ -32,18 +35,23 @@ class Lease:
         Raises:
             WireError: HELD, naming the holder and the time left; SEQUENCE for a copy after release.
         """
-        asked = (request.sender, request.seq, request.echo_ns)
-        if asked == self._granted:
-            if self.holder == request.sender:
+        granted = self._granted.get(request.sender)
+        if granted is not None and request.seq <= granted[0]:
+            if granted == (request.seq, self.token) and self.holder == request.sender:
                 return False
-            raise WireError(Refusal.SEQUENCE, f"a copy of what {request.sender} was granted before")
+            raise WireError(
+                Refusal.SEQUENCE, f"{request.sender} was granted {granted[0]} before it asked {request.seq}"
+            )
         if self.holder not in (None, request.sender):
             left_s = self.left_ns(now_ns) / 1e9
             raise WireError(Refusal.HELD, f"held by {self.holder} for another {left_s:.2f} s")
         self.holder = request.sender
         self.token += 1
         self._until_ns = now_ns + request.duration_ns
-        self._granted = asked
+        self._granted.pop(request.sender, None)
+        self._granted[request.sender] = (request.seq, self.token)
+        if len(self._granted) > SENDERS_REMEMBERED:
+            del self._granted[next(iter(self._granted))]
         return True
 
     def extend(self, duration_ns: int, now_ns: int) -> None:

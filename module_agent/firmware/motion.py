@@ -7,6 +7,11 @@ from module_agent.firmware.waveform import duration_s, waveform
 from module_agent.wire.messages import Limits, Pattern
 from module_agent.wire.refusal import Refusal, WireError
 
+# A motion is sampled when it starts; a minute takes 3 ms.
+LONGEST_S = 60.0
+# The thesis asks for up to 9 times what the module can do, to show how it saturates.
+ABSURD_SPEED = 10.0
+
 
 class Motion:
     """A pattern sampled once at its start (0.3 ms for 6 s), so that a tick only looks it up."""
@@ -26,6 +31,11 @@ class Motion:
         self.last_position_rad = self._position[-1]
 
     @property
+    def top_speed_rad_s(self) -> float:
+        """The highest commanded speed of the motion."""
+        return max(max(self._velocity), -min(self._velocity))
+
+    @property
     def range_rad(self) -> tuple[float, float]:
         """The lowest and the highest position of the motion."""
         return min(self._position), max(self._position)
@@ -38,12 +48,40 @@ class Motion:
         return Command(self._position[index], self._velocity[index], None)
 
 
-def check_motion(motion: Motion, limits: Limits) -> None:
-    """Check that a motion stays within the position limits; the loops clamp speed and effort.
+def check_duration(pattern: Pattern, origin_rad: float) -> None:
+    """Check that a motion is short enough to be sampled within a tick or so.
 
     Raises:
-        WireError: LIMIT, with the range that the motion needs and the one that is allowed.
+        WireError: LIMIT, with the duration.
     """
+    total_s = duration_s(pattern, origin_rad)
+    if total_s > LONGEST_S:
+        raise WireError(
+            Refusal.LIMIT, f"the motion would take {total_s:.0f} s, at most {LONGEST_S:.0f} s are taken"
+        )
+
+
+def check_speed(speed_rad_s: float, limits: Limits) -> None:
+    """Check that a speed is one that somebody may mean. The loops clamp what the motor cannot follow.
+
+    Raises:
+        WireError: LIMIT, with the speed.
+    """
+    if speed_rad_s > ABSURD_SPEED * limits.max_speed_rad_s:
+        raise WireError(
+            Refusal.LIMIT,
+            f"{speed_rad_s:.1f} rad/s is over {ABSURD_SPEED:.0f} times what this module can do, "
+            f"{limits.max_speed_rad_s:.2f} rad/s",
+        )
+
+
+def check_motion(motion: Motion, limits: Limits) -> None:
+    """Check that a motion stays within the position limits and is not absurdly fast.
+
+    Raises:
+        WireError: LIMIT, with the range that the motion needs and the one that is allowed, or its speed.
+    """
+    check_speed(motion.top_speed_rad_s, limits)
     low, high = motion.range_rad
     if (limits.min_position_rad is not None and low < limits.min_position_rad) or (
         limits.max_position_rad is not None and high > limits.max_position_rad

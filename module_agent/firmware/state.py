@@ -15,9 +15,7 @@ from typing import Literal
 
 from module_agent.wire.messages import State
 
-Trigger = Literal[
-    "acquire", "release", "lapse", "motion", "motion_done", "setpoint", "expire", "stop", "fault"
-]
+Trigger = Literal["acquire", "release", "motion", "motion_done", "setpoint", "expire", "stop", "fault"]
 
 TRANSITIONS: dict[tuple[State, Trigger], State] = {
     ("idle", "acquire"): "armed",

@@ -138,7 +138,7 @@ class MotionRecord(Part):
 
     motion_id: Counter
     pattern: Pattern
-    outcome: Literal["running", "done", "superseded", "stopped", "expired"]
+    outcome: Literal["running", "done", "superseded", "stopped", "expired", "fault"]
     start_ns: Nanoseconds
     start_row: Counter
     end_row: Counter | None
@@ -146,7 +146,7 @@ class MotionRecord(Part):
 
 
 class Limits(Part):
-    """What the module refuses to exceed."""
+    """What the module does not exceed: positions are refused, speed and effort clamped by the loops."""
 
     max_speed_rad_s: Positive
     max_effort_nm: Positive

@@ -7,8 +7,11 @@ import numpy as np
 
 from module_agent.wire.feedback_rows import ROW, Rows, unpack
 from module_agent.wire.messages import Feedback
+from module_agent.wire.refusal import Refusal, WireError
 
 _GROWTH = 4096
+# Four hours at 250 Hz, or one at 1 kHz: what is farther off is no row of this session.
+LONGEST_ROWS = 4_000_000
 
 
 class RowLog:
@@ -35,7 +38,7 @@ class RowLog:
         """Keep the rows of a message; return them.
 
         Raises:
-            WireError: the block does not hold what the message announces.
+            WireError: the block does not hold what the message announces, or is far from all others.
         """
         rows = unpack(feedback)
         if not len(rows):
@@ -51,6 +54,11 @@ class RowLog:
     def _reserve(self, first: int, end: int) -> None:
         if self._base is None:
             self._base = first
+        if max(end, self._end) - min(first, self._base) > LONGEST_ROWS:
+            raise WireError(
+                Refusal.RANGE,
+                f"row {first} is too far from rows {self._base} to {self._end} to be of this boot",
+            )
         before = max(0, self._base - first)
         after = max(0, end - self._base - len(self._have))
         if before or after:

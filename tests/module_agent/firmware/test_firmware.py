@@ -19,6 +19,7 @@ from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
     Ack,
     Ask,
+    ConstantMotion,
     Feedback,
     GainsCommand,
     GoTo,
@@ -160,7 +161,8 @@ def test_without_commands_the_expiry_action_runs_one_tick_after_the_lifetime(
     bench.acquire()
     bench.move(pattern=Rest(duration_s=10.0))
     bench.position = 0.1  # pushed aside, so that holding needs PWM
-    bench.ticks(250)
+    # The command echoed the tick before it came: that is what its sender knew.
+    bench.ticks(249)
     assert bench.firmware.state == "moving"
     bench.tick()
     assert bench.firmware.state == "expired"
@@ -369,6 +371,107 @@ def test_rows_that_are_gone_are_refused_with_what_is_kept() -> None:
     )
     assert refused(answer, Refusal.GONE)
     assert str(bench.firmware.history.first_row) in answer.detail
+
+
+def test_acquiring_again_in_the_middle_of_a_motion_holds_where_it_is() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move(pattern=GoTo(target_rad=3.0, max_speed_rad_s=0.5))
+    bench.ticks(50)
+    assert bench.acquire().accepted
+    bench.tick()
+    motion = bench.status().motion
+    assert motion is not None
+    assert motion.outcome == "superseded"
+    # 50 ms into a motion of 11 s nothing has moved yet: there is nothing to drive the motor for.
+    assert abs(bench.pwm) < 0.01
+
+
+def test_a_keep_alive_that_was_long_on_the_way_does_not_prolong_the_life_of_a_motion() -> None:
+    """The motor may outlive what its commander last knew of it by one lifetime, not by two."""
+    bench = Bench()
+    bench.acquire()
+    bench.move(pattern=Rest(duration_s=10.0))
+    sent_ns = bench.now
+    bench.ticks(240)
+    assert bench.renew(echo_ns=sent_ns).accepted
+    bench.ticks(20)
+    assert bench.firmware.state == "expired"
+
+
+def test_a_copy_of_any_acquire_that_was_granted_before_is_refused() -> None:
+    bench = Bench()
+    first = encode(LeaseRequest(**bench.head(action="acquire")))
+    assert bench.ask(Leaf.LEASE, first).accepted
+    assert bench.acquire().accepted
+    bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="anybody"))
+    assert refused(bench.ask(Leaf.LEASE, first), Refusal.STALE)
+    bench.ticks(5)
+    assert refused(bench.ask(Leaf.LEASE, first), Refusal.STALE)
+    assert bench.firmware.state == "stopped"
+
+
+def test_an_acquire_that_was_sent_before_a_stop_does_not_undo_it() -> None:
+    bench = Bench()
+    bench.acquire()
+    early = encode(LeaseRequest(**bench.head(action="acquire")))
+    bench.ask(Leaf.STOP, Stop(serial="A", boot=0, seq=1, sender="anybody"))
+    assert refused(bench.ask(Leaf.LEASE, early), Refusal.STALE)
+    bench.ticks(2)
+    assert bench.acquire().accepted
+
+
+@pytest.mark.parametrize(
+    ("pattern", "said"),
+    [
+        (GoTo(target_rad=1e6, max_speed_rad_s=1e-6), "would take"),
+        (GoTo(target_rad=6.0, max_speed_rad_s=0.01), "would take"),
+        (ConstantMotion(velocity_rad_s=1e5, duration_s=1.0), "times"),
+    ],
+)
+def test_an_absurd_motion_is_refused_before_it_is_sampled(pattern: Any, said: str) -> None:
+    bench = Bench()
+    bench.acquire()
+    answer = bench.move(pattern=pattern)
+    assert refused(answer, Refusal.LIMIT)
+    assert said in answer.detail
+
+
+def test_a_joint_beyond_its_range_is_not_driven_further_out() -> None:
+    bench = Bench(kind="SEA-snake")
+    bench.acquire()
+    outward = Setpoint(**bench.head(position_rad=None, velocity_rad_s=3.0, effort_nm=None))
+    bench.position = 1.60
+    assert bench.ask(Leaf.SETPOINT, outward).accepted
+    bench.tick()
+    assert bench.pwm == 0.0
+    inward = Setpoint(**bench.head(position_rad=None, velocity_rad_s=-1.0, effort_nm=None))
+    assert bench.ask(Leaf.SETPOINT, inward).accepted
+    bench.tick()
+    assert bench.pwm < 0.0
+
+
+def test_a_fault_ends_the_motion_that_it_interrupts() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move(5)
+    bench.winding_c = 154.5
+    bench.tick()
+    motion = bench.status().motion
+    assert motion is not None
+    assert (motion.outcome, motion.end_row is not None) == ("fault", True)
+    assert not bench.move(5).accepted
+
+
+def test_gains_end_with_the_lease_of_who_set_them() -> None:
+    bench = Bench()
+    bench.acquire()
+    factory = bench.firmware._controller.gains
+    stiff = factory.model_copy(update={"position": factory.position.model_copy(update={"kp": 6.0})})
+    assert bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=stiff))).accepted
+    assert bench.firmware._controller.gains == stiff
+    assert bench.ask(Leaf.LEASE, LeaseRequest(**bench.head(action="release"))).accepted
+    assert bench.firmware._controller.gains == factory
 
 
 SEND: dict[Leaf, Callable[[Bench], Message]] = {

@@ -3,11 +3,13 @@
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.messages import Feedback
+from module_agent.wire.refusal import WireError
 from module_agent.wire.row_log import RowLog
 
 
@@ -45,3 +47,11 @@ def test_the_end_is_known_however_far_the_log_has_grown() -> None:
         log.add(block(first, 50))
         assert log.end_row == first + 50
     assert len(log.rows(0, 40_000)) == 40_000
+
+
+def test_a_row_that_is_impossibly_far_off_is_refused_before_memory_is_taken_for_it() -> None:
+    log = RowLog(1)
+    log.add(block(0, 5))
+    with pytest.raises(WireError, match="too far"):
+        log.add(block(10_000_000_000, 5))
+    assert log.end_row == 5

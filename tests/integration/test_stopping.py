@@ -1,0 +1,74 @@
+"""People who stop things: Ctrl-C at the launcher, and the stop command."""
+
+import json
+import signal
+import subprocess
+import sys
+
+from coordinator.run_folder import load_recording
+
+ROBOT = "thesis_171_horizontal"
+
+
+def test_ctrl_c_stops_everything_and_keeps_what_was_recorded(
+    client, programs, endpoint, plan, tmp_path
+) -> None:
+    out, log = tmp_path / "run", tmp_path / "log"
+    command = [sys.executable, "-m", "sim.main", "launch", ROBOT, "--viewer", "none", "--no-dynamics"]
+    with log.open("wb") as output:
+        launch = subprocess.Popen(
+            [*command, "--out", str(out), "--plan", str(plan), "--endpoint", endpoint],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+    ear = client(ROBOT)
+    motion = ear.motion("X-00009", "windowed_sine", 100)
+    launch.send_signal(signal.SIGINT)
+    assert launch.wait(programs.limit_s) == 130
+    said = log.read_text()
+    assert f"interrupted, everything is stopped; recorded up to here: {out}" in said
+    assert "Traceback" not in said
+    recording = load_recording(out / "session.mcap")
+    rows = recording.modules["X-00009"].rows.rows(motion.start_row, motion.start_row + 100)
+    assert len(rows) == 100
+    assert (rows["motion_id"] == motion.motion_id).all()
+    assert recording.journal[-1].what == "failed"
+    # The truth up to the end too, for whoever examines the recording.
+    assert (out / "truth.npz").is_file()
+
+
+def test_whoever_says_stop_is_obeyed_by_the_modules_and_by_the_coordinator(
+    launcher, client, programs
+) -> None:
+    robot = launcher()
+    config = robot.config
+    robot.start_world()
+    coordinator = robot.start_coordinator(quiet=True)
+    agents = robot.start_agents()
+    ear = client(config.robot_name)
+    ear.motion(config.serials[0], "windowed_sine", 50, coordinator)
+    where = ("--robot", config.robot_name, "--listen", config.endpoint)
+
+    listed = programs.run("coordinator.main", "list", "--json", *where)
+    assert listed.returncode == 0, listed.stderr
+    modules = json.loads(listed.stdout)
+    assert [m["serial"] for m in modules] == sorted(config.serials)
+    assert all(m["holder"].startswith(f"coordinator-{coordinator.process.pid}@") for m in modules)
+    assert {m["state"] for m in modules} <= {"armed", "moving"}
+
+    stopped = programs.run("coordinator.main", "stop", *where)
+    assert stopped.returncode == 0, stopped.stderr
+    code, said = programs.ended(coordinator)
+    assert code == 1
+    assert "was stopped by" in said
+    assert "Traceback" not in said
+    ear.close()
+
+    witness = client(config.robot_name, hub=True)
+    witness.meet(config.serials, *agents)
+    for serial in config.serials:
+        assert witness.status(serial).state == "stopped"
+    # Nobody has armed it again in between.
+    journal = load_recording(config.out / "session.mcap").journal
+    assert journal[-1].what == "failed"
+    assert [event for event in journal if "stop" in event.text and event.what == "note"] == []
