@@ -186,8 +186,12 @@ class AgentHost:
         self._declared: list[Undeclare] = []
         self._tag = 0
         self._seq = 0
-        self._boots = {m.serial: m.firmware.config.boot for m in self.modules}
         self._declare()
+
+    @property
+    def pwm(self) -> Sequence[float]:
+        """The PWM of every module as of the last cycle, that the next exchange hands over."""
+        return self._pwm
 
     def _declare(self) -> None:
         transport = self._transport

@@ -177,7 +177,7 @@ class Rig:
         for serial, host in list(self.hosts.items()):
             host.cycle()
             # On the bus this PWM goes into the next exchange, and so into the very next step of the world.
-            self.pwm[self.serials.index(serial)] = host._pwm[0]
+            self.pwm[self.serials.index(serial)] = host.pwm[0]
         self.truth.record()
         for watcher in self.watchers:
             watcher()

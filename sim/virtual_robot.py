@@ -1,0 +1,129 @@
+"""One robot in virtual time: world, network, and one agent for every module, on one event loop."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.catalogue import module_type
+from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.hardware import HardwareModule, SensorSample
+from module_agent.host import AgentHost, InlineWorker
+from module_agent.wire.impaired_transport import ImpairedTransport
+from module_agent.wire.network_profile import NetworkProfile
+from module_agent.wire.transport import Transport
+from sim.robot_file import Robot
+from sim.truth import TruthLog
+from sim.virtual_loop import LoopScheduler, VirtualLoop
+from sim.virtual_network import VirtualNetwork
+from sim.world import World
+
+TICK_S = 0.001
+
+
+class VirtualSettings(NamedTuple):
+    """What a virtual robot is told; every seed in it follows from `seed`."""
+
+    robot: Robot
+    profile: NetworkProfile
+    seed: int = 0
+    noise: str | None = None
+    feedback_rate_hz: float = 250.0
+
+
+class _Wires:
+    """The wires inside one module: the world's tick has passed already when the agent asks for it."""
+
+    def __init__(self, robot: "VirtualRobot", index: int):
+        self._robot = robot
+        self._index = index
+
+    @property
+    def modules(self) -> Sequence[HardwareModule]:
+        return (self._robot.world.modules[self._index],)
+
+    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        return (self._robot.samples[self._index],)
+
+    def close(self) -> None:
+        self._robot.pwm[self._index] = 0.0
+
+
+class VirtualRobot:
+    """Ticks the world and all agents once a virtual millisecond.
+
+    Every agent has its own endpoint on the network, impaired by its own draws, as a process of its own has.
+    """
+
+    def __init__(self, settings: VirtualSettings, loop: VirtualLoop):
+        seeds = np.random.SeedSequence(settings.seed).spawn(2)
+        self.loop = loop
+        self.world = World(settings.robot, settings.seed, settings.noise)
+        self.network = VirtualNetwork(loop)
+        self.truth = TruthLog(self.world)
+        self.pwm = [0.0] * len(self.world.modules)
+        self.samples: Sequence[SensorSample] = ()
+        self._profile = settings.profile
+        self._network_seeds = seeds[0]
+        boots = np.random.default_rng(seeds[1]).integers(1, 2**63, size=len(self.world.modules))
+        self.hosts: dict[str, AgentHost] = {}
+        for index, (module, boot) in enumerate(zip(self.world.modules, boots, strict=True)):
+            self.hosts[module.serial] = AgentHost(
+                settings.robot.name,
+                _Wires(self, index),
+                self.endpoint(module.serial),
+                [_firmware(module, int(boot), settings.feedback_rate_hz)],
+                InlineWorker(),
+            )
+        self._index = {module.serial: index for index, module in enumerate(self.world.modules)}
+        self._running = False
+
+    def endpoint(self, name: str) -> Transport:
+        """Return a transport of the virtual network, impaired as the profile says."""
+        rng = np.random.default_rng(self._network_seeds.spawn(1)[0])
+        return ImpairedTransport(self.network.endpoint(name), self._profile, rng, LoopScheduler(self.loop))
+
+    def start(self) -> None:
+        """Begin to tick."""
+        self._running = True
+        self.loop.call_soon(self._tick, self.loop.time() + TICK_S)
+
+    def _tick(self, next_s: float) -> None:
+        if not self._running:
+            return
+        self.samples = self.world.step(self.pwm)
+        self.truth.record()
+        for serial, host in self.hosts.items():
+            host.cycle()
+            self.pwm[self._index[serial]] = host.pwm[0]
+        self.loop.call_at(next_s, self._tick, next_s + TICK_S)
+
+    def kill(self, serial: str) -> None:
+        """End an agent as SIGKILL does: its motor gets zero PWM, its network endpoint is gone."""
+        del self.hosts[serial]
+        self.network.kill(serial)
+        self.pwm[self._index[serial]] = 0.0
+
+    def stop(self) -> None:
+        """Tick no more."""
+        self._running = False
+
+    def close(self) -> None:
+        """End agents and world."""
+        self.stop()
+        for host in self.hosts.values():
+            host.close()
+        self.world.close()
+
+
+def _firmware(module: HardwareModule, boot: int, rate_hz: float) -> FirmwareConfig:
+    kind = module_type(module.module_type)
+    return FirmwareConfig(
+        serial=module.serial,
+        kind=kind,
+        boot=boot,
+        limits=catalogue_limits(kind),
+        tick_ns=module.tick_ns,
+        imu_period_ns=module.imu_period_ns,
+        feedback_rate_hz=rate_hz,
+    )
