@@ -10,9 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from module_agent.wire.messages import MotionRecord
 
 Purpose = Literal["rest", "constant", "windowed_sine", "dynamic", "held_out", "other"]
-StepName = Literal[
-    "discover", "link", "prepare", "home", "rest", "explore", "topology", "excite", "held_out", "finish"
-]
 
 
 class JournalEvent(BaseModel):

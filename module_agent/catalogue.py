@@ -112,13 +112,21 @@ CATALOGUE: dict[ModuleTypeName, ModuleType] = {
 }
 
 
+class UnknownModuleType(KeyError):
+    """The catalogue has no such type; the message lists those that it has."""
+
+    def __str__(self) -> str:
+        # A KeyError would show its message in quotes.
+        return str(self.args[0])
+
+
 def module_type(name: str) -> ModuleType:
     """Look up a type by name.
 
     Raises:
-        KeyError: unknown type; the message lists the known ones.
+        UnknownModuleType: a KeyError; the message lists the known ones.
     """
     for known, found in CATALOGUE.items():
         if known == name:
             return found
-    raise KeyError(f"unknown module type {name!r}; the catalogue knows {', '.join(CATALOGUE)}")
+    raise UnknownModuleType(f"unknown module type {name!r}; the catalogue knows {', '.join(CATALOGUE)}")

@@ -48,6 +48,14 @@ class TransportError(ConnectionError):
     """The transport could not be opened or is closed; the message says what to check."""
 
 
+class NoHub(TransportError):
+    """Nobody answers where the hub should be; there may be one later."""
+
+
+class EndpointInUse(TransportError):
+    """Somebody else listens on the endpoint."""
+
+
 class Undeclare(Protocol):
     """What a declaration returns; keep it as long as the declaration shall hold."""
 

@@ -1,7 +1,8 @@
 """The transport over Zenoh: one session, scouting off, every endpoint named by configuration.
 
-Topology: one hub listens, every other session is a spoke that connects to it; all of them in `router` mode.
-Measured with eclipse-zenoh 1.10.2 on loopback, agents started before the hub:
+Topology: one hub listens, in `router` mode; every other session connects to it. The programs do so in `client`
+mode with a bounded wait, tried again and again: so an agent can say that it waits for a hub, and hears signals
+meanwhile. A `router` spoke opens at once, which suits a program that has something to do without a hub. Measured with eclipse-zenoh 1.10.2 on loopback, agents started before the hub:
 
 ========  ==============  =====================================  ==============================
 spokes    opens           hear each other through the hub        back after SIGKILL of the hub
@@ -12,7 +13,6 @@ peer      at once         no (peers are not relayed since 1.9)   0.3 s after the
 ========  ==============  =====================================  ==============================
 
 32 router spokes cost the same as 32 clients (8 against 6 % of a core at the hub, at 1600 messages a second).
-A client would hold an agent in `zenoh.open`, deaf to signals, until somebody starts a coordinator.
 """
 
 import json
@@ -23,10 +23,13 @@ from typing import Literal, Protocol, Self
 import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
+from module_agent.wire.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from module_agent.wire.query_errors import CLOSED, NO_ANSWER
 from module_agent.wire.transport import (
+    EndpointInUse,
     Event,
     Liveness,
+    NoHub,
     Reply,
     Request,
     Sample,
@@ -35,7 +38,6 @@ from module_agent.wire.transport import (
     Undeclare,
 )
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _MAX_MESSAGE_BYTES = 1 << 20
 
 
@@ -318,13 +320,19 @@ def open_zenoh(config: ZenohConfig) -> ZenohTransport:
     """Open a session. A `client` waits for its hub; the other modes connect in the background, for ever.
 
     Raises:
-        TransportError: an endpoint cannot be listened on (most often another coordinator has the port), is
-            malformed, or a client found no hub within `connect_timeout_s`.
+        NoHub: a client found no hub within `connect_timeout_s`.
+        EndpointInUse: somebody else listens there, most often another coordinator.
+        TransportError: an endpoint is malformed or cannot be listened on.
     """
+    try:
+        for endpoint in (*config.listen, *config.connect):
+            check_endpoint(endpoint)
+    except ValueError as error:
+        raise TransportError(str(error)) from error
     try:
         return ZenohTransport(zenoh.open(_session_config(config)))
     except zenoh.ZError as error:
-        raise TransportError(_why_not_open(config, error)) from error
+        raise _why_not_open(config, error) from error
 
 
 def _session_config(config: ZenohConfig) -> zenoh.Config:
@@ -356,19 +364,19 @@ def _session_config(config: ZenohConfig) -> zenoh.Config:
     return made
 
 
-def _why_not_open(config: ZenohConfig, error: zenoh.ZError) -> str:
+def _why_not_open(config: ZenohConfig, error: zenoh.ZError) -> TransportError:
     text = _first_line(error)
     if "Address already in use" in text:
-        return (
+        return EndpointInUse(
             f"cannot listen on {', '.join(config.listen)}: the address is in use, most likely by another "
             "coordinator; connect to that one as a spoke, or listen on another port"
         )
     if config.mode == "client" and "Unable to connect" in text:
-        return (
+        return NoHub(
             f"no hub answers on {', '.join(config.connect)} within {config.connect_timeout_s} s; is the "
             "coordinator running, and do both sides agree on address, TLS and password?"
         )
-    return (
+    return TransportError(
         f"cannot open a Zenoh session (listen {list(config.listen)}, connect {list(config.connect)}): {text}"
     )
 

@@ -1,0 +1,31 @@
+"""Endpoints of the network: where one listens and the others connect to."""
+
+import re
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_WITH_PORT = ("tcp", "tls", "quic", "udp", "ws")
+_OTHERS = ("serial", "unixpipe", "unixsock-stream", "vsock")
+_FORM = re.compile(r"(?P<protocol>[a-z-]+)/(?P<address>[^?#]+)([?#].*)?\Z")
+
+
+def check_endpoint(text: str) -> str:
+    """Return an endpoint that can be listened on or connected to, such as `tcp/127.0.0.1:7447`.
+
+    Zenoh itself takes an unknown protocol or a missing port for a hub that does not answer yet.
+
+    Raises:
+        ValueError: it cannot, whatever the network does; the message says what would be right.
+    """
+    found = _FORM.match(text)
+    if found is None:
+        raise ValueError(f"endpoint {text!r}: it must look like {DEFAULT_ENDPOINT}")
+    protocol = found["protocol"]
+    if protocol in _OTHERS:
+        return text
+    if protocol not in _WITH_PORT:
+        known = ", ".join((*_WITH_PORT, *_OTHERS))
+        raise ValueError(f"endpoint {text!r}: unknown protocol {protocol!r}, known are {known}")
+    host, _, port = found["address"].rpartition(":")
+    if not host or not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
+        raise ValueError(f"endpoint {text!r}: an address of {protocol} is HOST:PORT, with a port of 1 to 65535")
+    return text
