@@ -1,8 +1,20 @@
 """An asyncio loop whose clock runs faster or slower than real time, for a simulation run at another speed."""
 
 import asyncio
+import math
 import selectors
 import time
+
+
+def check_speed(speed: float) -> float:
+    """Return a speed that a clock can run at.
+
+    Raises:
+        ValueError: not positive, or not finite.
+    """
+    if not (math.isfinite(speed) and speed > 0.0):
+        raise ValueError(f"speed {speed}: it must be a positive number, 1 for real time")
+    return speed
 
 
 class _ScaledSelector(selectors.DefaultSelector):
@@ -16,10 +28,14 @@ class _ScaledSelector(selectors.DefaultSelector):
 
 
 class ScaledLoop(asyncio.SelectorEventLoop):
-    """Sleeps and time-outs are in session seconds: `speed` of them pass in a real second."""
+    """Sleeps and time-outs are in session seconds: `speed` of them pass in a real second.
+
+    Raises:
+        ValueError: see `check_speed`.
+    """
 
     def __init__(self, speed: float = 1.0):
-        super().__init__(_ScaledSelector(speed))
+        super().__init__(_ScaledSelector(check_speed(speed)))
         self._speed = speed
         # Wall time at the start, so that the recordings of a resumed session do not overlap.
         self._origin_ns = time.time_ns()

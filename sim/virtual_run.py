@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from coordinator.interruption import Interruption, run_to_end
 from coordinator.plan import Plan
 from coordinator.result import Result
 from coordinator.run import Run, RunConfig
@@ -32,11 +33,15 @@ class VirtualConfig(NamedTuple):
 
 
 def run_virtual(
-    config: VirtualConfig, screen: Screen, between: Callable[[VirtualRobot], None] | None = None
+    config: VirtualConfig,
+    screen: Screen,
+    between: Callable[[VirtualRobot], None] | None = None,
+    on_signal: Callable[[Interruption], None] = lambda interruption: None,
 ) -> Result:
     """Run one identification in virtual time and write the run's folder, truth included.
 
-    `between` is handed the robot before the run begins, to schedule faults on its loop.
+    `between` is handed the robot before the run begins, to schedule faults on its loop; `on_signal` is handed
+    what a signal handler is to call, and the run then ends with `asyncio.CancelledError` after its clean-up.
     """
     loop = VirtualLoop()
     settings = VirtualSettings(
