@@ -9,6 +9,7 @@ from module_agent.inbox import Inbox
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Message
+from module_agent.wire.query_errors import CLOSED
 from module_agent.wire.transport import Event, Liveness, Reply, Sample, Transport, Undeclare
 
 Post = Callable[[Callable[[], None]], object]
@@ -47,6 +48,7 @@ class Radio:
         self._record = record
         self._inbox = Inbox(capacity=100_000)
         self._draining = False
+        self._closed = False
         self._pending: dict[int, asyncio.Future[Reply]] = {}
         self._declared: list[Undeclare] = []
         self._tag = 0
@@ -83,15 +85,22 @@ class Radio:
             self._post(self._drain)
 
     def _hear(self, event: Event) -> None:
-        if isinstance(event, Sample):
+        if self._closed:
+            # A recording that is closed must not change any more; whoever still waits is let go.
+            if isinstance(event, Reply):
+                self._answer(event._replace(payload=None, error=CLOSED))
+        elif isinstance(event, Sample):
             self._record(Entry("publication", event.key, self._clock(), event.payload))
         elif isinstance(event, Liveness):
             serial = parse(event.key).serial
             (self.alive.add if event.alive else self.alive.discard)(serial)
         elif isinstance(event, Reply):
-            future = self._pending.pop(event.tag, None)
-            if future is not None and not future.done():
-                future.set_result(event)
+            self._answer(event)
+
+    def _answer(self, reply: Reply) -> None:
+        future = self._pending.pop(reply.tag, None)
+        if future is not None and not future.done():
+            future.set_result(reply)
 
     def publish(self, serial: str, leaf: Leaf, message: Message) -> None:
         """Publish on a module's key."""
@@ -136,7 +145,8 @@ class Radio:
         return answer
 
     def close(self) -> None:
-        """Stop listening and leave the network."""
+        """Stop listening and leave the network; what has arrived and is not recorded yet never will be."""
+        self._closed = True
         for declared in reversed(self._declared):
             declared.undeclare()
         self._declared.clear()
