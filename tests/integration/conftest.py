@@ -1,4 +1,4 @@
-"""Real processes over Zenoh on loopback: what starts them, what watches them, and proof that nothing is left."""
+"""Real processes over Zenoh on loopback: starting them, watching them, and proof that nothing is left."""
 
 import os
 import queue
@@ -203,7 +203,7 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
 
 
 class Client:
-    """A program of somebody else on the robot's network: it hears everything, asks, and commands if it may."""
+    """Somebody else's program on the robot's network: it hears everything, asks, and commands if it may."""
 
     Ack = Ack
 

@@ -45,7 +45,7 @@ def test_processes_over_zenoh_find_what_virtual_time_finds_and_a_replay_finds_it
     (real_mm, real_sigma_mm), (virtual_mm, virtual_sigma_mm) = link(real), link(virtual)
     assert abs(real_mm - virtual_mm) <= 3.0 * np.hypot(real_sigma_mm, virtual_sigma_mm)
     # The claimed sigma is mostly the accelerometer's unknown scale. World and noise are of one seed here, so
-    # that is the same in both, and what remains is the timing of two processes against one: 0.5 mm was measured.
+    # that is the same in both, and what remains is the timing of processes: 0.5 mm was measured.
     assert abs(real_mm - virtual_mm) <= 2.0
 
 

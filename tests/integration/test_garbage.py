@@ -25,8 +25,8 @@ def without_values() -> dict[str, bytes]:
     }
 
 
-def not_finite(head: dict[str, Any]) -> dict[Leaf, dict[str, Any]]:
-    """Return commands that nothing is wrong with but one number: lease, boot, echo and order are the holder's."""
+def not_finite() -> dict[Leaf, dict[str, Any]]:
+    """Return what makes a command of the lease's holder wrong in a number, and in nothing else."""
     gain = {"kp": NAN}
     return {
         Leaf.SETPOINT: {"position_rad": NAN, "velocity_rad_s": None, "effort_nm": INFINITY},
@@ -83,9 +83,9 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
 
     so_far = {s: Counter(commander.status(s).refusals) for s in serials}
     for serial in serials:
-        for leaf, fields in not_finite({}).items():
-            throw(key(name, serial, leaf), msgpack.packb({**commander.head(serial), **fields}))
-    settled({s: Counter(not_finite=len(not_finite({}))) for s in serials}, so_far)
+        for leaf, fields in not_finite().items():
+            throw(key(name, serial, leaf), msgpack.packb({"v": 1, **commander.head(serial), **fields}))
+    settled({s: Counter(not_finite=len(not_finite())) for s in serials}, so_far)
 
     # Wildcards reach all of a module's keys at once; larger than any message, or than Zenoh itself takes.
     so_far = {s: Counter(commander.status(s).refusals) for s in serials}
