@@ -67,7 +67,9 @@ def run_virtual(
         if between is not None:
             between(robot)
         robot.start()
-        result: Result = loop.run_until_complete(_to_end(run, robot))
+        task = loop.create_task(_to_end(run, robot))
+        on_signal(Interruption(loop, task))
+        result = run_to_end(loop, task)
         write_truth(config.out / "truth.json", config.robot, robot.world)
         robot.truth.save(config.out / "truth.npz")
         return result
