@@ -1,36 +1,36 @@
 """`x5-coordinator`: identify a robot, replay a recording, list, stop, picture."""
 
-import asyncio
 import os
 import secrets
+import shlex
 import signal
 import socket
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, NamedTuple, NoReturn
 
-import numpy as np
 import typer
 from pydantic import ValidationError
 from rich.table import Table
 
+from coordinator.failure import EXIT_FAILED, EXIT_USAGE, explain
 from coordinator.identify import IdentificationError, identify
-from coordinator.inspect import listed, stop_robot
+from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
+from coordinator.interruption import Interruption, run_to_end
 from coordinator.plan import Plan, PlanFileError, load_plan
-from coordinator.radio import NoAnswer, Refused
 from coordinator.recording import Recording
 from coordinator.result import Result
-from coordinator.robot_link import ModuleLost, MotionInterrupted, RobotStopped
 from coordinator.run import Run, RunConfig, write_outputs
 from coordinator.run_folder import load_recording
-from coordinator.scaled_loop import ScaledLoop
-from coordinator.session import NobodyThere, UnfitLink
+from coordinator.scaled_loop import ScaledLoop, check_speed
 from coordinator.session_file import SessionFileError
 from coordinator.terminal import Terminal
-from module_agent.wire.impaired_transport import ImpairedTransport
+from coordinator.viewer_choice import viewer_choice
+from module_agent.catalogue import UnknownModuleType
+from module_agent.wire.endpoint import DEFAULT_ENDPOINT
+from module_agent.wire.injected_network import inject
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.network_profile import PROFILES, profile
-from module_agent.wire.timer_thread import TimerThread
-from module_agent.wire.transport import Transport, TransportError
+from module_agent.wire.transport import EndpointInUse, Transport, TransportError
 from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
 
 app = typer.Typer(
@@ -41,9 +41,7 @@ app = typer.Typer(
     help="Let a robot measure its own body.",
 )
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 JOIN_TIMEOUT_S = 5.0
-EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 Robot = Annotated[str, typer.Option(help="Name of the robot, part of every key.")]
 Listen = Annotated[str, typer.Option(help="Zenoh endpoint to listen on, the hub of the agents.")]
@@ -52,6 +50,21 @@ Connect = Annotated[
     typer.Option(help="Zenoh router to connect to, instead of listening; repeat for several."),
 ]
 Network = Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}.")]
+Expect = Annotated[int | None, typer.Option(min=1, help="Wait for this many modules, no more and no fewer.")]
+
+
+class _Place(NamedTuple):
+    """Where the robot is to be met: a hub to be, or routers to connect to; and through which network."""
+
+    listen: str
+    connect: tuple[str, ...]
+    network: str = "none"
+    seed: int = 0
+
+
+class _Joined(NamedTuple):
+    transport: Transport
+    is_hub: bool
 
 
 def _fail(text: object, code: int) -> NoReturn:
@@ -59,24 +72,24 @@ def _fail(text: object, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
-def _open(listen: str, connect: list[str] | None, terminal: Terminal) -> Transport:
-    if connect:
-        routers = ZenohConfig(mode="client", connect=tuple(connect), connect_timeout_s=JOIN_TIMEOUT_S)
-        return open_zenoh(routers)
+def _words(error: Exception) -> object:
+    # A KeyError shows its message in quotes.
+    return error.args[0] if isinstance(error, KeyError) and error.args else error
+
+
+def _join(place: _Place, terminal: Terminal) -> _Joined:
+    if place.connect:
+        routers = ZenohConfig(mode="client", connect=place.connect, connect_timeout_s=JOIN_TIMEOUT_S)
+        return _Joined(inject(open_zenoh(routers), place.network, place.seed), False)
     try:
-        return open_zenoh(ZenohConfig(mode="router", listen=(listen,)))
-    except TransportError:
-        # Somebody listens there already: another coordinator, or a router. Join it as a client.
-        joining = ZenohConfig(mode="client", connect=(listen,), connect_timeout_s=JOIN_TIMEOUT_S)
+        hub = open_zenoh(ZenohConfig.hub(place.listen))
+        return _Joined(inject(hub, place.network, place.seed), True)
+    except EndpointInUse:
+        # By another coordinator, or a router: join it as a client.
+        joining = ZenohConfig(mode="client", connect=(place.listen,), connect_timeout_s=JOIN_TIMEOUT_S)
         transport = open_zenoh(joining)
-        terminal.note(f"{listen} is in use: joined the hub there")
-        return transport
-
-
-def _impaired(transport: Transport, network: str, seed: int) -> Transport:
-    if network == "none":
-        return transport
-    return ImpairedTransport(transport, profile(network), np.random.default_rng(seed), TimerThread())
+        terminal.note(f"{place.listen} is in use: joined the hub there")
+        return _Joined(inject(transport, place.network, place.seed), False)
 
 
 def _sender() -> str:
@@ -85,13 +98,14 @@ def _sender() -> str:
 
 @app.command()
 def run(
+    context: typer.Context,
     out: Annotated[Path, typer.Option(help="Folder of the run, made new.")],
     robot: Robot = "robot",
     listen: Listen = DEFAULT_ENDPOINT,
     connect: Connect = None,
     network: Network = "none",
-    seed: Annotated[int, typer.Option(help="Seed of the injected network.")] = 0,
-    expect: Annotated[int | None, typer.Option(help="Wait for this many modules.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0,
+    expect: Expect = None,
     plan: Annotated[
         Path | None,
         typer.Option(help="TOML file with settings of the motions; the options below go before it."),
@@ -106,17 +120,24 @@ def run(
     viewer: Annotated[
         str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
     ] = "none",
-    serve_port: Annotated[int, typer.Option(help="Port of the viewer served to a browser.")] = 9090,
+    serve_port: Annotated[
+        int, typer.Option(min=1, max=65534, help="Port of the viewer served to a browser.")
+    ] = 9090,
     resume: Annotated[bool, typer.Option(help="Go on with the crashed run in --out.")] = False,
     speed: Annotated[float, typer.Option(help="Speed of a simulated world.")] = 1.0,
+    advise: Annotated[
+        bool, typer.Option("--advise/--no-advise", hidden=True, help="Say how a run that ended is resumed.")
+    ] = True,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Discover a robot, move it joint by joint, and identify topology, chain and inertia."""
-    if viewer not in ("none", "spawn", "serve") and "://" not in viewer:
-        _fail(
-            f"--viewer {viewer}: it must be none, spawn, serve or an address like rerun+http://...",
-            EXIT_USAGE,
-        )
+    try:
+        shown = viewer_choice(viewer)
+        check_chunk("robot", robot)
+        check_speed(speed)
+        profile(network)
+    except (ValueError, KeyError) as error:
+        _fail(_words(error), EXIT_USAGE)
     config = RunConfig(
         robot=robot,
         out=out,
@@ -124,14 +145,32 @@ def run(
         plan=_plan(plan, dynamics, amplitude, home),
         expect=expect,
         resume=resume,
-        spawn_viewer=viewer == "spawn",
-        connect_viewer=viewer if "://" in viewer else None,
-        serve_viewer=serve_port if viewer == "serve" else None,
+        spawn_viewer=shown.spawn,
+        connect_viewer=shown.connect,
+        serve_viewer=serve_port if shown.serve else None,
     )
+    advice = f"to go on: {resuming(context)}" if advise else ""
     with Terminal(quiet) as terminal:
-        result = _run(config, listen, connect, network, seed, speed, terminal)
+        result = _run(config, _Place(listen, tuple(connect or ()), network, seed), speed, terminal, advice)
     _print(result, terminal)
     terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
+
+
+def resuming(context: typer.Context) -> str:
+    """Return the command that goes on with a run: what was given, with `--resume`."""
+    words = ["x5-coordinator", "run"]
+    for option in context.command.params:
+        name = option.name or ""
+        source = context.get_parameter_source(name)
+        if source is None or source.name != "COMMANDLINE" or name == "resume":
+            continue
+        value = context.params[name]
+        if isinstance(value, bool):
+            words.append((option.opts if value else option.secondary_opts)[0])
+        else:
+            for one in value if isinstance(value, list | tuple) else [value]:
+                words += [option.opts[0], str(one)]
+    return shlex.join([*words, "--resume"])
 
 
 def _plan(path: Path | None, dynamics: bool | None, amplitude: float | None, home: float | None) -> Plan:
@@ -147,46 +186,40 @@ def _plan(path: Path | None, dynamics: bool | None, amplitude: float | None, hom
         _fail(f"{first['loc'][0]} = {first['input']}: {first['msg']}", EXIT_USAGE)
 
 
-def _run(
-    config: RunConfig,
-    listen: str,
-    connect: list[str] | None,
-    network: str,
-    seed: int,
-    speed: float,
-    terminal: Terminal,
-) -> Result:
+def _run(config: RunConfig, place: _Place, speed: float, terminal: Terminal, advice: str) -> Result:
     loop = ScaledLoop(speed)
     try:
-        check_chunk("robot", config.robot)
-        transport = _impaired(_open(listen, connect, terminal), network, seed)
-        work = Run(config, transport, loop.clock_ns, loop.call_soon_threadsafe, terminal)
-    except (ValueError, KeyError, OSError, TransportError) as error:
-        loop.close()
-        _fail(error.args[0] if isinstance(error, KeyError) else error, EXIT_USAGE)
-    kept = f"recorded up to here: {config.out}; `x5-coordinator run --resume --out {config.out}` goes on"
-    task = loop.create_task(work.run())
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, task.cancel)
-    try:
-        return loop.run_until_complete(task)
-    except asyncio.CancelledError:
-        _fail(f"interrupted, the robot is stopped; {kept}", EXIT_INTERRUPTED)
-    except ModuleLost as error:
-        _fail(f"{error}; {kept}", EXIT_LOST)
-    except (
-        NobodyThere,
-        UnfitLink,
-        NoAnswer,
-        Refused,
-        MotionInterrupted,
-        RobotStopped,
-        IdentificationError,
-    ) as error:
-        _fail(f"{error}; {kept}", EXIT_FAILED)
+        work = _prepared(config, place, loop, terminal)
+        task = loop.create_task(work.run())
+        interruption = Interruption(loop, task)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, interruption)
+        try:
+            return run_to_end(loop, task)
+        except BaseException as error:
+            failure = explain(error)
+            if failure is None:
+                raise
+            kept = f"{failure.text}; {work.standstill}; recorded up to here: {config.out}"
+            _fail("\n".join((kept, advice)).rstrip(), failure.exit_code)
     finally:
         loop.run_until_complete(loop.shutdown_default_executor())
         loop.close()
+
+
+def _prepared(config: RunConfig, place: _Place, loop: ScaledLoop, terminal: Terminal) -> Run:
+    """Open everything, or nothing."""
+    try:
+        transport = _join(place, terminal).transport
+    except (OSError, TransportError) as error:
+        _fail(error, EXIT_USAGE)
+    try:
+        return Run(config, transport, loop.clock_ns, loop.call_soon_threadsafe, terminal)
+    except BaseException as error:
+        transport.close()
+        if isinstance(error, ValueError | OSError):
+            _fail(error, EXIT_USAGE)
+        raise
 
 
 def _print(result: Result, terminal: Terminal) -> None:
@@ -216,11 +249,30 @@ def replay(
     try:
         recording: Recording = load_recording(session)
         found = identify(recording)
-    except (SessionFileError, IdentificationError) as error:
+    except (SessionFileError, IdentificationError, UnknownModuleType) as error:
         _fail(error, EXIT_FAILED)
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, found)
     _print(found.result, Terminal())
+
+
+def _search(
+    robot: str, listen: str, connect: list[str] | None, expect: int | None
+) -> tuple[Transport, Search]:
+    """Join a robot's network to look at it; whoever is its hub now waits for the agents to come."""
+    try:
+        check_chunk("robot", robot)
+        joined = _join(_Place(listen, tuple(connect or ())), Terminal())
+    except (ValueError, OSError, TransportError) as error:
+        _fail(error, EXIT_USAGE)
+    return joined.transport, Search(least_s=AS_HUB_S if joined.is_hub else 0.0, expect=expect)
+
+
+def _check_all(robot: str, found: int, expect: int | None) -> None:
+    if not found:
+        _fail(f"no module of robot {robot!r} answers", EXIT_FAILED)
+    if expect is not None and found != expect:
+        _fail(f"{found} modules of robot {robot!r} answer, {expect} are expected", EXIT_FAILED)
 
 
 @app.command("list")
@@ -228,15 +280,12 @@ def list_modules(
     robot: Robot = "robot",
     listen: Listen = DEFAULT_ENDPOINT,
     connect: Connect = None,
+    expect: Expect = None,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
 ) -> None:
     """List the modules on the network: state, holder, refusals."""
-    terminal = Terminal()
-    try:
-        transport = _open(listen, connect, terminal)
-    except TransportError as error:
-        _fail(error, EXIT_USAGE)
-    statuses = listed(transport, robot)
+    transport, search = _search(robot, listen, connect, expect)
+    statuses, deaf = listed(transport, robot, search)
     if as_json:
         typer.echo("[" + ",\n ".join(status.model_dump_json() for status in statuses) + "]")
     else:
@@ -249,23 +298,23 @@ def list_modules(
                 str(status.expiries),
                 ", ".join(f"{k} {v}" for k, v in status.refusals.items()) or "-",
             )
-        terminal.console.print(table)
-    if not statuses:
-        _fail(f"no module of robot {robot!r} answers", EXIT_FAILED)
+        Terminal().console.print(table)
+    if deaf:
+        _fail(f"no status from {', '.join(deaf)}", EXIT_FAILED)
+    _check_all(robot, len(statuses), expect)
 
 
 @app.command()
-def stop(robot: Robot = "robot", listen: Listen = DEFAULT_ENDPOINT, connect: Connect = None) -> None:
+def stop(
+    robot: Robot = "robot", listen: Listen = DEFAULT_ENDPOINT, connect: Connect = None, expect: Expect = None
+) -> None:
     """Stop every module of a robot at once, whoever holds it."""
-    terminal = Terminal()
-    try:
-        transport = _open(listen, connect, terminal)
-    except TransportError as error:
-        _fail(error, EXIT_USAGE)
-    stopped, deaf = stop_robot(transport, robot, _sender())
-    terminal.note(f"stopped: {', '.join(stopped) or 'none'}")
-    if deaf or not stopped:
-        _fail(f"no confirmation from {', '.join(deaf) or 'any module'}", EXIT_FAILED)
+    transport, search = _search(robot, listen, connect, expect)
+    stopped, deaf = stop_robot(transport, robot, _sender(), search)
+    Terminal().note(f"stopped: {', '.join(stopped) or 'none'}")
+    if deaf:
+        _fail(f"no confirmation from {', '.join(deaf)}", EXIT_FAILED)
+    _check_all(robot, len(stopped), expect)
 
 
 @app.command()

@@ -53,7 +53,7 @@ class Run:
     """One run in one folder."""
 
     def __init__(self, config: RunConfig, transport: Transport, clock: Clock, post: Post, screen: Screen):
-        crashed = open_run_folder(config.out, config.resume)
+        crashed = open_run_folder(config.out, config.resume, config.robot)
         self._config = config
         self._clock = clock
         self._screen = screen
@@ -72,9 +72,14 @@ class Run:
         self._link = RobotLink(self._radio, self.recording, clock, config.sender)
 
     def _take_over(self, crashed: Path) -> None:
-        for entry in read_session(crashed):
-            self._record(entry)
-        self._writer.flush()
+        try:
+            for entry in read_session(crashed):
+                self._record(entry)
+            self._writer.flush()
+        except BaseException:
+            self._writer.close()
+            self._viewer.close()
+            raise
 
     # ------------------------------------------------------------------ recording
 
@@ -151,6 +156,22 @@ class Run:
             self._radio.close()
             self._writer.close()
             self._viewer.close()
+            if self._radio.dropped:
+                self._screen.note(
+                    f"{self._radio.dropped} messages were dropped unread: this machine is too slow"
+                )
+
+    @property
+    def standstill(self) -> str:
+        """What is known of the robot after a run that ended before its end, in words."""
+        last = self.recording.journal[-1] if self.recording.journal else None
+        if last is None or last.what != "failed":
+            return "the robot was not moving"
+        # As the session words it; every module that it holds is asked to stop.
+        deaf = last.text.partition("; no confirmation from ")[2]
+        if deaf:
+            return f"{deaf} did not confirm to have stopped: see that the robot stands still"
+        return "the robot is stopped"
 
     async def _compute(self, work: Callable[[], T]) -> T:
         if self._config.inline:

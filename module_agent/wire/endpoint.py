@@ -27,5 +27,7 @@ def check_endpoint(text: str) -> str:
         raise ValueError(f"endpoint {text!r}: unknown protocol {protocol!r}, known are {known}")
     host, _, port = found["address"].rpartition(":")
     if not host or not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
-        raise ValueError(f"endpoint {text!r}: an address of {protocol} is HOST:PORT, with a port of 1 to 65535")
+        raise ValueError(
+            f"endpoint {text!r}: an address of {protocol} is HOST:PORT, with a port of 1 to 65535"
+        )
     return text

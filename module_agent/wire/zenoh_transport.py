@@ -1,8 +1,9 @@
 """The transport over Zenoh: one session, scouting off, every endpoint named by configuration.
 
-Topology: one hub listens, in `router` mode; every other session connects to it. The programs do so in `client`
-mode with a bounded wait, tried again and again: so an agent can say that it waits for a hub, and hears signals
-meanwhile. A `router` spoke opens at once, which suits a program that has something to do without a hub. Measured with eclipse-zenoh 1.10.2 on loopback, agents started before the hub:
+Topology: one hub listens, in `router` mode; every other session connects to it. The programs do so in
+`client` mode with a bounded wait, tried again and again: so an agent can say that it waits for a hub, and
+hears signals meanwhile. A `router` spoke opens at once, for a program that has something to do without a hub.
+Measured with eclipse-zenoh 1.10.2 on loopback, spokes started before the hub:
 
 ========  ==============  =====================================  ==============================
 spokes    opens           hear each other through the hub        back after SIGKILL of the hub
