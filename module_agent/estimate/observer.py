@@ -110,7 +110,9 @@ class Observer:
 
 
 def _own_rows(history: History, motion: JointMotion, offset_ns: int) -> Rows:
-    """Return the own rows within the motion's time and a margin."""
+    """Return the own rows within the motion's time and a margin; none for a motion shorter than a row."""
+    if not len(motion.rows):
+        return history.rows(history.next_row, history.next_row)
     start = int(motion.rows["t_ns"][0]) + offset_ns - MARGIN_NS
     end = int(motion.rows["t_ns"][-1]) + offset_ns + MARGIN_NS
     rows = history.rows(history.first_row, history.next_row)
