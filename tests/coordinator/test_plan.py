@@ -54,11 +54,12 @@ def test_a_set_amplitude_is_taken_as_it_is() -> None:
 
 
 def test_exploring_gains_stiffen_the_position_loop_alone() -> None:
-    default = default_gains(CATALOGUE["X5-9"], 3)
-    stiff = Plan(hold_stiffness=4.0).exploring_gains(default)
+    kind = CATALOGUE["X5-9"]
+    default = default_gains(kind, 3)
+    stiff = Plan(hold_stiffness=4.0).exploring_gains(kind, 3)
     assert stiff.position.kp == 4.0 * default.position.kp
     assert stiff.model_copy(update={"position": default.position}) == default
-    assert Plan().exploring_gains(default) == default
+    assert Plan().exploring_gains(kind, 3) == default
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,8 @@ from module_agent.wire.network_profile import NetworkProfile
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
+# With 30 ms a way in the mean and long tails, the default of 250 ms expires every few seconds.
+PATIENT_NS = 500_000_000
 SLOW = GoTo(target_rad=1.0, max_speed_rad_s=0.6)
 
 
@@ -58,7 +60,7 @@ def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Cal
 def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
     rigs: Callable[..., Any], seed: int
 ) -> None:
-    rig = rigs(ARM, "bad", seed)
+    rig = rigs(ARM, "bad", seed, lifetime_ns=PATIENT_NS)
     _, recording, link = rig.link()
     interrupted = 0
 
@@ -84,8 +86,7 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
         rows = recording.modules[serial].rows
         assert rows.missing(rows.first_row, end) == []
         assert (np.diff(rows.rows(rows.first_row, end)["t_ns"]) > 0).all()
-    # Four keep-alives fit into a lifetime, 5 % of each are lost either way: expiry is a rarity.
-    assert interrupted <= 1
+    assert interrupted == 0
     assert abs(rig.world.plant.q_rad[0]) < 0.05
 
 
@@ -271,7 +272,7 @@ def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Ca
 
 
 def test_what_the_network_drops_of_feedback_and_estimates_is_fetched(rigs: Callable[..., Any]) -> None:
-    rig = rigs(ARM, "bad", 3)
+    rig = rigs(ARM, "bad", 3, lifetime_ns=PATIENT_NS)
     _, recording, link = rig.link()
 
     async def work() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from coordinator.plan import Plan
-from coordinator.robot_link import ModuleLost
+from coordinator.robot_link import ModuleLost, MotionInterrupted
 from coordinator.run_folder import load_recording
 from coordinator.session import NobodyThere, UnfitLink
 from module_agent.wire.network_profile import NetworkProfile
@@ -31,9 +31,24 @@ def _right(out: Path) -> None:
 def test_on_a_bad_network_the_robot_is_recognised_all_the_same(
     rigs: Rigs, quick_plan: Plan, tmp_path: Path, seed: int
 ) -> None:
-    rig = rigs(ARM, "bad", seed)
+    # Its round trips of up to 300 ms need modules that are told to be patient; at most a second is allowed.
+    rig = rigs(ARM, "bad", seed, lifetime_ns=500_000_000)
     rig.session(tmp_path / "run", quick_plan)
     _right(tmp_path / "run")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_with_impatient_modules_a_bad_network_ends_right_or_with_a_reason_and_all_stopped(
+    rigs: Rigs, quick_plan: Plan, tmp_path: Path, seed: int
+) -> None:
+    rig = rigs(ARM, "bad", seed)
+    try:
+        rig.session(tmp_path / "run", quick_plan)
+    except (UnfitLink, MotionInterrupted):
+        assert not (tmp_path / "run" / "result.json").exists()
+        assert {rig.state(s) for s in rig.serials} <= {"idle", "stopped", "expired"}
+    else:
+        _right(tmp_path / "run")
 
 
 @pytest.mark.parametrize("seed", range(4))
