@@ -1,14 +1,13 @@
 """`x5-agent`: the process that runs one or several modules on a physics bus and the network."""
 
-import logging
 import os
 import secrets
 import signal
 import sys
+from contextlib import ExitStack
 from types import FrameType
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from module_agent.bus_client import BusClient
@@ -16,21 +15,21 @@ from module_agent.catalogue import module_type
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits
 from module_agent.hardware import HardwareLost, HardwareModule
 from module_agent.host import AgentHost
-from module_agent.wire.impaired_transport import ImpairedTransport
+from module_agent.wire.endpoint import DEFAULT_ENDPOINT
+from module_agent.wire.injected_network import inject
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.messages import ExpiryAction
 from module_agent.wire.network_profile import PROFILES, profile
-from module_agent.wire.timer_thread import TimerThread
-from module_agent.wire.transport import Transport, TransportError
+from module_agent.wire.transport import NoHub, Transport, TransportError
 from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.worker import ThreadWorker
 
-log = logging.getLogger("x5-agent")
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 EXIT_USAGE, EXIT_LOST = 2, 3
 CONNECT_ATTEMPT_S = 1.0
+# What an agent says when it is up; the launcher waits for it.
+ATTACHED = "attached to the bus and the network"
 
 
 class Stopped(SystemExit):
@@ -62,23 +61,24 @@ def _config(
 
 
 def _transport(connect: list[str], listen: list[str], network: str, seed: int) -> Transport:
-    """Open the session, waiting for the hub as long as it takes; a signal ends the waiting."""
-    found = profile(network)
+    """Open the session, waiting for the hub as long as it takes; a signal ends the waiting.
+
+    Raises:
+        TransportError: an endpoint is wrong, or taken; waiting would not help.
+    """
     config = ZenohConfig(
         mode="client", connect=tuple(connect), listen=tuple(listen), connect_timeout_s=CONNECT_ATTEMPT_S
     )
     transport: Transport | None = None
-    said = ""
+    said = False
     while transport is None:
         try:
             transport = open_zenoh(config)
-        except TransportError as error:
-            if str(error) != said:
-                said = str(error)
+        except NoHub as error:
+            if not said:
+                said = True
                 typer.echo(f"x5-agent: waiting for the network: {error}", err=True)
-    if network == "none":
-        return transport
-    return ImpairedTransport(transport, found, np.random.default_rng(seed), TimerThread())
+    return inject(transport, network, seed)
 
 
 @app.command()
@@ -92,40 +92,45 @@ def main(
     ] = None,
     listen: Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on.")] = None,
     network: Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}.")] = "none",
-    seed: Annotated[int, typer.Option(help="Seed of the injected network.")] = 0,
-    feedback_rate: Annotated[float, typer.Option(help="Feedback rows per second, up to 1000.")] = 250.0,
-    lifetime_ms: Annotated[float, typer.Option(help="Command lifetime, at most 1000 ms.")] = 250.0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0,
+    feedback_rate: Annotated[
+        float, typer.Option(min=1.0, max=1000.0, help="Feedback rows per second.")
+    ] = 250.0,
+    lifetime_ms: Annotated[float, typer.Option(min=1.0, max=1000.0, help="Command lifetime [ms].")] = 250.0,
     expiry: Annotated[str, typer.Option(help="On expiry: motor_off, hold or damping.")] = "motor_off",
     strategy: Annotated[int, typer.Option(min=0, max=4, help="Control strategy at start.")] = 3,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log more.")] = False,
 ) -> None:
     """Run the agent of one or several modules until the world ends or a signal comes."""
-    logging.basicConfig(
-        level=logging.INFO if verbose else logging.WARNING, format="%(name)s %(levelname)s %(message)s"
-    )
     signal.signal(signal.SIGTERM, _stop)
     signal.signal(signal.SIGINT, _stop)
     # Estimates run on a second thread; a tick must not wait for it the default 5 ms.
     sys.setswitchinterval(0.0005)
-    try:
-        check_chunk("robot", robot)
-        if expiry not in ("motor_off", "hold", "damping"):
-            raise ValueError(f"--expiry {expiry}: it must be motor_off, hold or damping")
-        action: ExpiryAction = expiry  # type: ignore[assignment]
-        transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], network, seed)
-        # The world waits for whoever is on its bus, so the bus comes last.
-        hardware = BusClient(bus, serial)
-        configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in hardware.modules]
-    except (ValueError, KeyError, OSError, TransportError) as error:
-        text = error.args[0] if isinstance(error, KeyError) else error
-        typer.echo(f"x5-agent: {text}", err=True)
-        raise typer.Exit(EXIT_USAGE) from error
-    _serve(AgentHost(robot, hardware, transport, configs, worker := ThreadWorker()), worker)
+    with ExitStack() as opened:
+        try:
+            check_chunk("robot", robot)
+            profile(network)
+            if expiry not in ("motor_off", "hold", "damping"):
+                raise ValueError(f"--expiry {expiry}: it must be motor_off, hold or damping")
+            action: ExpiryAction = expiry  # type: ignore[assignment]
+            transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], network, seed)
+            opened.callback(transport.close)
+            # The world waits for whoever is on its bus, so the bus comes last.
+            hardware = BusClient(bus, serial)
+            opened.callback(hardware.close)
+            configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in hardware.modules]
+            host = AgentHost(robot, hardware, transport, configs, worker := ThreadWorker())
+        except (ValueError, KeyError, OSError, TransportError) as error:
+            # A KeyError shows its message in quotes.
+            text = error.args[0] if isinstance(error, KeyError) else error
+            typer.echo(f"x5-agent: {text}", err=True)
+            raise typer.Exit(EXIT_USAGE) from error
+        opened.pop_all()
+    _serve(host, worker)
 
 
 def _serve(host: AgentHost, worker: ThreadWorker) -> None:
     names = ", ".join(module.serial for module in host.modules)
-    log.info("%s up, process %d", names, os.getpid())
+    typer.echo(f"x5-agent: {names}: {ATTACHED}, process {os.getpid()}", err=True)
     try:
         while True:
             host.cycle()

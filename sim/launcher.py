@@ -11,8 +11,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from module_agent.main import ATTACHED
+from module_agent.wire.endpoint import DEFAULT_ENDPOINT
+
 START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 5.0
+WATCH_S = 0.1
+LOGS = "logs"
+# The file systems' limit is 255 bytes.
+_LONGEST_NAME = 100
 _PR_SET_PDEATHSIG = 1
 
 
@@ -31,18 +38,19 @@ class LaunchConfig(NamedTuple):
     network: str = "lan"
     noise: str | None = None
     speed: float = 1.0
-    endpoint: str = "tcp/127.0.0.1:7447"
+    endpoint: str = DEFAULT_ENDPOINT
     processes: int | None = None
     coordinator_options: tuple[str, ...] = ()
     agent_options: tuple[str, ...] = ()
 
 
 class Child(NamedTuple):
-    """A started process and where its output goes."""
+    """A started process, where its output goes, and what it prints there when it is up."""
 
     name: str
     process: "subprocess.Popen[bytes]"
     log: Path | None
+    up: str = ""
 
 
 def _die_with_parent() -> None:
@@ -51,7 +59,10 @@ def _die_with_parent() -> None:
 
 
 class Launcher:
-    """Starts and stops the processes of one robot. Use as a context manager."""
+    """Starts, watches and stops the processes of one robot. Use as a context manager.
+
+    What a process prints is kept in `logs/` of the run's folder; `say` is told who is up and who has ended.
+    """
 
     def __init__(self, config: LaunchConfig, say: Callable[[str], None]):
         self.config = config
@@ -59,6 +70,8 @@ class Launcher:
         self._folder = tempfile.TemporaryDirectory(prefix="x5-")
         self.bus = str(Path(self._folder.name) / "bus")
         self.children: list[Child] = []
+        self._waited_for: list[Child] = []
+        self._ended: list[Child] = []
 
     def __enter__(self) -> "Launcher":
         return self
@@ -77,6 +90,7 @@ class Launcher:
             arguments += ["--noise", config.noise]
         world = self._start("world", arguments)
         self._wait(lambda: os.path.exists(self.bus), world, "its bus")
+        self._say("world: bus open")
         return world
 
     def start_agents(self) -> list[Child]:
@@ -94,7 +108,9 @@ class Launcher:
         arguments += ["--seed", str(1000 * config.seed + index + 1), *config.agent_options]
         for serial in serials:
             arguments += ["--serial", serial]
-        return self._start(f"agent {','.join(serials)}", arguments)
+        agent = self._start(f"agent {','.join(serials)}", arguments, up=ATTACHED)
+        self._waited_for.append(agent)
+        return agent
 
     def start_coordinator(self, options: Sequence[str] = (), quiet: bool = False) -> Child:
         """Start the coordinator; its output goes to this terminal, or to its log when `quiet`."""
@@ -105,8 +121,16 @@ class Launcher:
         arguments += ["--speed", str(config.speed), *config.coordinator_options, *options]
         return self._start("coordinator", arguments, quiet)
 
-    def _start(self, name: str, arguments: Sequence[str], quiet: bool = True) -> Child:
-        log = Path(self._folder.name) / f"{len(self.children)}.log" if quiet else None
+    def _log(self, name: str) -> Path:
+        folder = self.config.out / LOGS
+        folder.mkdir(parents=True, exist_ok=True)
+        stem = name.replace(" ", "-").replace("/", "-")[:_LONGEST_NAME]
+        taken = [child.log for child in self.children]
+        paths = [folder / f"{stem}.log", *(folder / f"{stem}-{k}.log" for k in range(2, len(taken) + 3))]
+        return next(path for path in paths if path not in taken)
+
+    def _start(self, name: str, arguments: Sequence[str], quiet: bool = True, up: str = "") -> Child:
+        log = self._log(name) if quiet else None
         with open(log if log is not None else os.devnull, "wb") as output:
             # Its own session: Ctrl-C reaches the launcher alone, which then stops the others in order.
             process = subprocess.Popen(
@@ -118,7 +142,7 @@ class Launcher:
                 preexec_fn=_die_with_parent,
                 env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             )
-        child = Child(name, process, log)
+        child = Child(name, process, log, up)
         self.children.append(child)
         self._say(f"{name}: process {process.pid}")
         return child
@@ -127,7 +151,7 @@ class Launcher:
         end = time.monotonic() + START_TIMEOUT_S
         while not ready():
             if child.process.poll() is not None:
-                raise LaunchError(f"{child.name} ended with {child.process.returncode}: {last_words(child)}")
+                raise LaunchError(_obituary(child))
             if time.monotonic() > end:
                 raise LaunchError(f"{child.name} did not open {what} within {START_TIMEOUT_S:.0f} s")
             time.sleep(0.02)
@@ -137,6 +161,31 @@ class Launcher:
     def dead(self) -> list[Child]:
         """Return the processes that have ended."""
         return [child for child in self.children if child.process.poll() is not None]
+
+    def watch(self, coordinator: Child) -> int:
+        """Watch until the coordinator ends, and return its exit code (128 + n if signal n ended it).
+
+        An agent that ends early is named with its last words, and how the run ends is the coordinator's to
+        say.
+
+        Raises:
+            LaunchError: the world ended early, so that there is no robot any more.
+        """
+        while (code := coordinator.process.poll()) is None:
+            self.look(coordinator)
+            time.sleep(WATCH_S)
+        return code if code >= 0 else 128 - code
+
+    def look(self, coordinator: Child) -> None:
+        """Say once of every process that it has come up, and that it has ended; see `watch`."""
+        for child in [each for each in self._waited_for if each.up in whole_log(each)]:
+            self._waited_for.remove(child)
+            self._say(f"{child.name}: {child.up}")
+        for child in [each for each in self.dead() if each not in self._ended and each != coordinator]:
+            self._ended.append(child)
+            if child.name == "world":
+                raise LaunchError(_obituary(child))
+            self._say(_obituary(child))
 
     def stop(self) -> None:
         """Stop everything, coordinator first and world last, and remove the bus. May be called twice."""
@@ -158,8 +207,17 @@ def stop_child(child: Child) -> None:
     child.process.wait()
 
 
-def last_words(child: Child) -> str:
-    """Return the last lines that a process printed."""
+def whole_log(child: Child) -> str:
+    """Return all that a process has printed."""
     if child.log is None or not child.log.exists():
         return ""
-    return " / ".join(child.log.read_text(errors="replace").strip().splitlines()[-3:])
+    return child.log.read_text(errors="replace")
+
+
+def last_words(child: Child) -> str:
+    """Return the last lines that a process printed."""
+    return " / ".join(whole_log(child).strip().splitlines()[-3:])
+
+
+def _obituary(child: Child) -> str:
+    return f"{child.name} ended with {child.process.returncode}: {last_words(child) or 'without a word'}"

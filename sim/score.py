@@ -23,6 +23,9 @@ from sim.gauge import align_gauge, move_root, reorder, reorder_basis, tip_error
 from sim.truth import Motion, read_motion, read_truth
 
 POSES = 1000
+# A torque below what the sensor resolves is no scale to measure errors by: a bare output turns against next
+# to nothing.
+LEAST_TORQUE_NM = 0.02
 _SEED = 1
 
 
@@ -52,7 +55,8 @@ class Score(BaseModel):
     """What `score.json` holds; None where nothing could be compared.
 
     Tip errors are root mean squares over 1000 random poses of all leaf IMUs in the root frame. Torque errors
-    are |e| / |tau| on the held-out motion, against the true torque and against the measured one.
+    are |e| / |tau| on the held-out motion, against the true torque and against the measured one; None for a
+    joint whose true torque is below `LEAST_TORQUE_NM` (rms), whose error in Nm is there all the same.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -65,6 +69,7 @@ class Score(BaseModel):
     unidentifiable: list[str]
     torque_relative_error: float | None
     torque_relative_error_per_joint: dict[str, float | None] | None
+    torque_rms_error_nm_per_joint: dict[str, float] | None
     torque_relative_error_measured: float | None
     robot_time_s: float
     wall_time_s: float | None
@@ -97,6 +102,7 @@ class _HeldOut(NamedTuple):
 class _TorqueScore(NamedTuple):
     overall: float | None
     per_joint: dict[str, float | None] | None
+    rms_error_nm: dict[str, float] | None
     measured: float | None
 
 
@@ -122,6 +128,7 @@ def score(run: Path) -> Score:
         unidentifiable=[item.words for item in result.unresolved],
         torque_relative_error=torque.overall,
         torque_relative_error_per_joint=torque.per_joint,
+        torque_rms_error_nm_per_joint=torque.rms_error_nm,
         torque_relative_error_measured=torque.measured,
         robot_time_s=result.robot_time_s,
         wall_time_s=result.wall_time_s,
@@ -157,9 +164,9 @@ def table(found: Score) -> Table:
     shown.add_row("tip orientation, rms", "", _shown(found.tip_orientation_rms_deg, ".3f", " deg"), "", "")
     shown.add_row("held-out torque against the true", "", _shown(found.torque_relative_error, ".2%"), "", "")
     for serial, error in (found.torque_relative_error_per_joint or {}).items():
-        # A bare output turns against next to nothing: there any error is many times the torque.
-        remark = "  (more than the torque)" if error is not None and error > 1.0 else ""
-        shown.add_row(f"  of {serial}{remark}", "", _shown(error, ".2%"), "", "")
+        absolute = (found.torque_rms_error_nm_per_joint or {}).get(serial)
+        words = _shown(absolute, ".3f", " Nm") if error is None else _shown(error, ".2%")
+        shown.add_row(f"  of {serial}", "", words, "", "")
     measured = _shown(found.torque_relative_error_measured, ".2%")
     shown.add_row("held-out torque against the measured", "", measured, "", "")
     shown.add_section()
@@ -261,19 +268,23 @@ def _link_errors(estimated: Chain, truth: Chain, child: int) -> tuple[float | No
 
 def _torque(run: Path, result: _ResultFile) -> _TorqueScore:
     if result.dynamics is None or result.dynamics.get("held_out") is None:
-        return _TorqueScore(None, None, None)
+        return _TorqueScore(None, None, None, None)
     held_out = _read_held_out(run / "held_out.npz", len(result.serials))
     motion = _read_motion(run / "truth.npz")
     known = [column for column, serial in enumerate(result.serials) if serial in motion.serials]
     if not known:
-        return _TorqueScore(None, None, _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm))
+        return _TorqueScore(None, None, None, _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm))
     true = np.column_stack(
         [_true_torque(motion, result.serials[c], held_out.t_ns[:, c], run / "truth.npz") for c in known]
     )
     predicted = held_out.tau_predicted_nm[:, known]
+    serials = [result.serials[c] for c in known]
+    size, error = _rms(true), _rms(predicted - true)
+    relative = [e / s if s >= LEAST_TORQUE_NM else None for e, s in zip(error, size, strict=True)]
     return _TorqueScore(
         _ratio(predicted, true),
-        {result.serials[c]: _ratio(predicted[:, k], true[:, k]) for k, c in enumerate(known)},
+        dict(zip(serials, relative, strict=True)),
+        dict(zip(serials, error, strict=True)),
         _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm),
     )
 
@@ -291,6 +302,10 @@ def _true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], path: Pat
 def _ratio(predicted: Array, true: Array) -> float | None:
     size = float(np.linalg.norm(true))
     return float(np.linalg.norm(predicted - true)) / size if size > 0.0 else None
+
+
+def _rms(columns: Array) -> list[float]:
+    return [float(value) for value in np.sqrt((columns**2).mean(axis=0))]
 
 
 def _shown(value: float | None, form: str, unit: str = "") -> str:
