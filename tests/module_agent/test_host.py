@@ -1,0 +1,204 @@
+"""A process of modules: what it serves, what it hears, and what it makes of its neighbours' motions."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from module_agent.wire.codec import decode, encode
+from module_agent.wire.feedback_rows import unpack
+from module_agent.wire.keys import Leaf, key
+from module_agent.wire.messages import (
+    Ack,
+    Ask,
+    ConstantMotion,
+    Estimate,
+    EstimateRequest,
+    Feedback,
+    GoTo,
+    HistoryRequest,
+    Info,
+    Rest,
+    Status,
+    WindowedSine,
+)
+from module_agent.wire.transport import Liveness, Reply, Sample
+from sim.robot_tree import true_chain
+
+ARM = "thesis_171_horizontal"
+BASE, TIP = "X-00009", "X-00010"
+
+
+async def _explore(link: Any, joint: str) -> None:
+    """The motions of an exploration, without all else that a session does."""
+    await asyncio.sleep(0.2)
+    await link.meet([BASE, TIP])
+    for serial in link.serials:
+        await link.acquire(serial)
+    keeper = asyncio.create_task(link.keep_alive())
+    await link.run(dict.fromkeys(link.serials, Rest(duration_s=1.0)))
+    for pattern in (
+        GoTo(target_rad=-0.45, max_speed_rad_s=1.2),
+        ConstantMotion(velocity_rad_s=1.0, duration_s=0.75),
+        GoTo(target_rad=0.0, max_speed_rad_s=1.2),
+        WindowedSine(amplitude=0.08, centre_s=1.2, sigma_s=0.5),
+    ):
+        record = (await link.run({joint: pattern}))[joint]
+        await asyncio.sleep(0.3)
+        if not isinstance(pattern, GoTo):
+            # As a session does: the next motion waits until everybody has understood this one.
+            for observer in link.serials:
+                assert await link.estimate(observer, joint, record.motion_id, 0.6) is not None
+    keeper.cancel()
+
+
+@pytest.mark.parametrize(("network", "seed"), [("none", 0), ("wifi", 1), ("bad", 2), ("bad", 3)])
+def test_a_module_finds_the_circle_of_another_joint_through_a_network_that_loses(
+    rigs: Callable[..., Any], network: str, seed: int
+) -> None:
+    rig = rigs(ARM, network, seed, lifetime_ns=500_000_000)
+    heard: dict[str, list[Estimate]] = {BASE: [], TIP: []}
+    listener = rig.network.endpoint("listener")
+
+    def on_estimate(event: Any) -> None:
+        found = decode(Estimate, event.payload)
+        heard[found.serial].append(found)
+
+    listener.subscribe(key(rig.robot.name, TIP, Leaf.ESTIMATE), on_estimate)
+    listener.subscribe(key(rig.robot.name, BASE, Leaf.ESTIMATE), on_estimate)
+    rig.run(_explore(rig.link()[2], BASE))
+    # Each module says once what it makes of each of the two motions.
+    assert [len(found) for found in heard.values()] == [2, 2]
+    constant, sine = heard[TIP]
+    assert (constant.moved, sine.moved) == (True, True)
+    assert len(sine.motion_ids) == 2
+    assert sine.circle is not None
+    chain = true_chain(rig.robot)
+    turn = chain.imu_home[1, :3, :3]
+    # Friction makes the arm ring on its spring at 25 Hz; the thesis' analysis smooths that out of alpha alone
+    # and so finds d up to 15 % long here. It is a first guess; the refinement comes to 0.3 mm.
+    assert 0.95 * 0.171 < sine.circle.distance_m < 1.15 * 0.171
+    assert np.degrees(np.arccos(min(1.0, sine.circle.axis @ (turn.T @ chain.axis[0])))) < 0.5
+    # The housing of the module that moves stands on the base: it was not carried, and says so too.
+    assert [found.moved for found in heard[BASE]] == [False, False]
+    assert heard[BASE][1].circle is None
+
+
+def test_a_motion_of_a_single_tick_does_not_end_the_agents(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    _, recording, link = rig.link()
+
+    async def work() -> None:
+        await asyncio.sleep(0.1)
+        await link.meet([BASE, TIP])
+        await link.acquire(BASE)
+        blink = ConstantMotion(velocity_rad_s=0.1, duration_s=1e-3, ramp_s=0.0)
+        for _ in range(4):
+            assert (await link.run({BASE: blink}))[BASE].outcome == "done"
+        await asyncio.sleep(0.5)
+
+    rig.run(work())
+    notes = [e.note for found in recording.estimates.values() for e in found.values()]
+    # Whether a row fell into it or not, nothing can be told from it, and that is said.
+    assert notes
+    assert all(notes)
+
+
+def _answers(rig: Any, leaf: Leaf, payload: bytes, serial: str = BASE) -> bytes:
+    """Ask a module from an endpoint of its own."""
+    replies: list[Reply] = []
+    asker = rig.network.endpoint(f"asker-{rig.loop.now_ns}")
+    rig.loop.call_soon(
+        lambda: asker.query(key(rig.robot.name, serial, leaf), payload, 1.0, replies.append, 1)
+    )
+    rig.run(asyncio.sleep(0.02))
+    (reply,) = replies
+    assert reply.payload is not None
+    return reply.payload
+
+
+def test_every_question_is_answered_within_a_few_ticks(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    rig.run(asyncio.sleep(0.2))
+    ask = encode(Ask(serial=BASE, boot=0, seq=7, sender="tester"))
+    assert decode(Info, _answers(rig, Leaf.INFO, ask)).module_type == "X5-9"
+    assert decode(Status, _answers(rig, Leaf.STATUS, ask)).re == 7
+    boot = rig.hosts[BASE].modules[0].firmware.config.boot
+    history = HistoryRequest(serial=BASE, boot=boot, seq=8, sender="tester", first_row=3, end_row=9)
+    rows = unpack(decode(Feedback, _answers(rig, Leaf.HISTORY, encode(history))))
+    assert len(rows) == 6
+    assert (np.diff(rows["t_ns"]) == 4_000_000).all() or np.abs(np.diff(rows["t_ns"]) - 4e6).max() < 1e3
+
+
+def test_an_estimate_that_there_is_not_and_noise_are_refused_and_counted(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    rig.run(asyncio.sleep(0.2))
+    request = EstimateRequest(serial=BASE, boot=0, seq=1, sender="tester", joint=TIP)
+    refusal = decode(Ack, _answers(rig, Leaf.ESTIMATE, encode(request)))
+    assert (refusal.accepted, refusal.reason) == (False, "gone")
+    assert "has no estimate of joint X-00010" in refusal.detail
+    for leaf in (Leaf.ESTIMATE, Leaf.LEASE, Leaf.HISTORY):
+        assert decode(Ack, _answers(rig, leaf, b"\xc1noise")).reason == "malformed"
+    assert rig.hosts[BASE].modules[0].firmware.admission.refusals == {"gone": 1, "malformed": 3}
+
+
+def test_noise_on_a_neighbours_keys_is_counted_and_does_no_harm(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    noise = rig.network.endpoint("noise")
+    status = Status(
+        serial="X-66666",
+        boot=1,
+        seq=1,
+        t_ns=0,
+        state="moving",
+        holder=None,
+        lease_left_ns=0,
+        token=0,
+        next_row=0,
+        motion=None,
+        refusals={},
+        expiries=0,
+        dropped_events=0,
+    )
+    for payload in (b"", b"\xc1", b"\x81" * 5000, encode(status)):
+        noise.publish(key(rig.robot.name, "X-12345", Leaf.STATUS), payload)
+    rig.run(asyncio.sleep(0.1))
+    refused = rig.hosts[TIP].modules[0].firmware.admission.refusals
+    assert sum(refused.values()) == 4
+    assert refused["wrong_serial"] == 1
+
+
+def test_a_token_stands_for_a_module_that_serves_and_falls_with_it(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    watcher, seen = rig.network.endpoint("watcher"), list[Liveness]()
+    watcher.watch_alive(key(rig.robot.name, TIP, Leaf.ALIVE), seen.append)
+    rig.run(asyncio.sleep(0.01))
+    rig.hosts.pop(TIP).close()
+    rig.run(asyncio.sleep(0.01))
+    assert [event.alive for event in seen] == [True, False]
+    assert rig.pwm[1] == 0.0
+
+
+def test_modules_that_share_a_process_share_nothing_else(rigs: Callable[..., Any]) -> None:
+    """Feedback of each module on its own key, in its own clock, numbered from its own first row."""
+    rig = rigs("a2085_04")
+    got: dict[str, list[Feedback]] = {serial: [] for serial in rig.serials}
+    listener = rig.network.endpoint("listener")
+
+    def on_feedback(event: Any) -> None:
+        assert isinstance(event, Sample)
+        found = decode(Feedback, event.payload, 1 << 16)
+        got[found.serial].append(found)
+
+    for serial in rig.serials:
+        listener.subscribe(key(rig.robot.name, serial, Leaf.FEEDBACK), on_feedback)
+    rig.run(asyncio.sleep(0.3))
+    starts = []
+    for found in got.values():
+        firsts = [f.first_row for f in found]
+        assert firsts == list(range(0, 5 * len(firsts), 5))
+        assert len(firsts) >= 14
+        starts.append(int(unpack(found[0])["t_ns"][0]))
+    assert len(set(starts)) == 4
