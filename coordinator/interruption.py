@@ -1,9 +1,19 @@
 """A task that a signal may end, with all that it does in its `finally`."""
 
 import asyncio
+import signal
 from typing import TypeVar
 
 T = TypeVar("T")
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def ignore_signals() -> None:
+    """Ignore what has been obeyed, up to the end of the process: it would end with another exit code."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 class Interruption:
@@ -12,14 +22,14 @@ class Interruption:
     def __init__(self, loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]"):
         self._loop = loop
         self._task = task
-        self._asked = False
+        self.asked = False
 
     def __call__(self, *_: object) -> None:
         """Cancel the task, once; to be called from the loop's thread."""
-        if not self._asked:
-            self._asked = True
+        if not self.asked:
+            self.asked = True
             # By the loop, so that a task that has not begun yet runs as far as its `try` first.
-            self._loop.call_soon(self._task.cancel)
+            self._loop.call_soon(self._task.cancel, "interrupted")
 
 
 def run_to_end(loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]") -> T:

@@ -3,7 +3,6 @@
 import os
 import secrets
 import shlex
-import signal
 import socket
 from pathlib import Path
 from typing import Annotated, NamedTuple, NoReturn
@@ -15,7 +14,7 @@ from rich.table import Table
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE, explain
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
-from coordinator.interruption import Interruption, run_to_end
+from coordinator.interruption import SIGNALS, Interruption, ignore_signals, run_to_end
 from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.recording import Recording
 from coordinator.result import Result
@@ -188,11 +187,12 @@ def _plan(path: Path | None, dynamics: bool | None, amplitude: float | None, hom
 
 def _run(config: RunConfig, place: _Place, speed: float, terminal: Terminal, advice: str) -> Result:
     loop = ScaledLoop(speed)
+    interruption: Interruption | None = None
     try:
         work = _prepared(config, place, loop, terminal)
         task = loop.create_task(work.run())
         interruption = Interruption(loop, task)
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in SIGNALS:
             loop.add_signal_handler(number, interruption)
         try:
             return run_to_end(loop, task)
@@ -204,7 +204,10 @@ def _run(config: RunConfig, place: _Place, speed: float, terminal: Terminal, adv
             _fail("\n".join((kept, advice)).rstrip(), failure.exit_code)
     finally:
         loop.run_until_complete(loop.shutdown_default_executor())
+        # Closing hands the signals back to Python.
         loop.close()
+        if interruption is not None and interruption.asked:
+            ignore_signals()
 
 
 def _prepared(config: RunConfig, place: _Place, loop: ScaledLoop, terminal: Terminal) -> Run:

@@ -1,22 +1,26 @@
 """`x5-sim`: the simulated world, and everything that needs it or its truth."""
 
 import signal
-import sys
 import time
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NoReturn
+from typing import Annotated, NamedTuple, NoReturn
 
 import typer
 from rich.table import Table
 
+from coordinator.failure import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, explain
+from coordinator.interruption import SIGNALS, Interruption, ignore_signals
 from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.run_folder import RunFolderError, check_free
+from coordinator.scaled_loop import check_speed
 from coordinator.terminal import Terminal
+from coordinator.viewer_choice import viewer_choice
+from module_agent.wire.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from module_agent.wire.network_profile import PROFILES
 from sim.bus_server import BusServer
 from sim.drawing import draw
-from sim.launcher import LaunchConfig, Launcher, LaunchError
+from sim.launcher import LOGS, LaunchConfig, Launcher, LaunchError
 from sim.logged_world import LoggedWorld
 from sim.noise_profile import NOISE_PROFILES
 from sim.robot_file import Robot, RobotFileError, load_robot, shipped_robots
@@ -33,11 +37,8 @@ app = typer.Typer(
     help="Simulate modular robots, run the whole system on them, and score it.",
 )
 
-EXIT_FAILED, EXIT_USAGE = 1, 2
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-
 RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
-Seed = Annotated[int, typer.Option(help="Seed of all noise.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all noise.")]
 Noise = Annotated[str | None, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)} [the robot's].")]
 Network = Annotated[str | None, typer.Option(help=f"Network profile: {', '.join(PROFILES)} [the robot's].")]
 Speed = Annotated[float, typer.Option(help="Times real time; slower helps a busy machine.")]
@@ -64,11 +65,30 @@ def _load(name: str) -> Robot:
         _fail(error, EXIT_USAGE)
 
 
-def _check(network: str | None, noise: str | None) -> None:
+def _check(
+    network: str | None = None, noise: str | None = None, speed: float = 1.0, endpoint: str = DEFAULT_ENDPOINT
+) -> None:
+    """Refuse what cannot work before anything is started."""
     if network is not None and network not in PROFILES:
         _fail(f"--network {network}: known are {', '.join(PROFILES)}", EXIT_USAGE)
     if noise is not None and noise not in NOISE_PROFILES:
         _fail(f"--noise {noise}: known are {', '.join(NOISE_PROFILES)}", EXIT_USAGE)
+    try:
+        check_speed(speed)
+        check_endpoint(endpoint)
+    except ValueError as error:
+        _fail(error, EXIT_USAGE)
+
+
+def _folder(out: Path | None, robot: Robot) -> Path:
+    """Return the folder of a run, which must not hold one: at its end the truth is written there as well."""
+    folder = out if out is not None else Path("runs") / robot.name
+    try:
+        check_free(folder)
+    except RunFolderError as error:
+        # Another world's modules have booted since: there is nothing to go on from.
+        _fail(f"{error} with `x5-coordinator run`, if its modules are still up", EXIT_USAGE)
+    return folder
 
 
 def _plan(path: Path | None, dynamics: bool | None = None) -> Plan:
@@ -109,7 +129,10 @@ def show(
     """Draw a robot at its zero position."""
     found = _load(robot)
     path = out if out is not None else Path(f"{found.name}.png")
-    draw(found, path)
+    try:
+        draw(found, path)
+    except (ValueError, OSError) as error:
+        _fail(f"cannot draw {path}: {error}", EXIT_USAGE)
     typer.echo(str(path))
 
 
@@ -126,7 +149,7 @@ def world(
 ) -> None:
     """Run the world of one robot until a signal comes; agents attach to its bus."""
     found = _load(robot)
-    _check(None, noise)
+    _check(noise=noise, speed=speed)
     stopping: list[int] = []
 
     def stop(number: int, _frame: FrameType | None) -> None:
@@ -137,15 +160,16 @@ def world(
     plant = World(found, seed, noise)
     logged = LoggedWorld(plant)
     try:
-        server = BusServer(bus, logged)
+        server = BusServer(bus, logged, report=lambda line: typer.echo(line, err=True))
     except OSError as error:
         _fail(error, EXIT_USAGE)
     typer.echo(f"{found.name}: {len(plant.modules)} modules on {bus}", err=True)
-    report = server.run(speed, lambda: bool(stopping))
+    with server:
+        report = server.run(speed, lambda: bool(stopping))
     typer.echo(f"{report.simulated_s:.1f} s at {report.achieved_speed:.2f} times real time", err=True)
     if truth is not None:
         truth.mkdir(parents=True, exist_ok=True)
-        write_truth(truth / "truth.json", found)
+        write_truth(truth / "truth.json", found, plant)
         logged.log.save(truth / "truth.npz")
     plant.close()
 
@@ -169,42 +193,70 @@ def run(
 ) -> None:
     """Identify a simulated robot and score the result against the truth."""
     found = _load(robot)
-    _check(network, noise)
+    _check(network, noise, speed, endpoint)
     motions = _plan(plan, dynamics)
-    folder = out if out is not None else Path("runs") / found.name
+    folder = _folder(out, found)
     if virtual:
-        _run_virtual(found, folder, seed, network, noise, motions, quiet)
+        _run_virtual(VirtualConfig(found, folder, seed, network or found.network, noise, motions), quiet)
     else:
         options = (*_motion_options(plan, motions), *(("--quiet",) if quiet else ()))
-        _run_processes(
-            LaunchConfig(
-                robot_file=robot,
-                robot_name=found.name,
-                serials=tuple(module.serial for module in found.modules),
-                out=folder,
-                seed=seed,
-                network=network or found.network,
-                noise=noise,
-                speed=speed,
-                endpoint=endpoint,
-                coordinator_options=options,
-            )
-        )
+        place = _Place(folder, network or found.network, endpoint, processes)
+        _run_processes(_launch(robot, found, place, seed, noise, speed, options))
     _score(folder)
 
 
-def _run_virtual(
-    robot: Robot, out: Path, seed: int, network: str | None, noise: str | None, plan: Plan, quiet: bool
-) -> None:
-    config = VirtualConfig(robot, out, seed, network or robot.network, noise, plan)
+class _Place(NamedTuple):
+    """Where the processes of a run meet, and where they write."""
+
+    out: Path
+    network: str
+    endpoint: str
+    processes: int | None
+
+
+def _launch(
+    robot_file: str,
+    robot: Robot,
+    place: _Place,
+    seed: int,
+    noise: str | None,
+    speed: float,
+    options: tuple[str, ...],
+) -> LaunchConfig:
+    return LaunchConfig(
+        robot_file=robot_file,
+        robot_name=robot.name,
+        serials=robot.serials,
+        out=place.out,
+        seed=seed,
+        network=place.network,
+        noise=noise,
+        speed=speed,
+        endpoint=place.endpoint,
+        processes=place.processes,
+        # The robot ends with this run, so that nothing is left to go on with.
+        coordinator_options=("--no-advise", *options),
+    )
+
+
+def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
+    def on_signal(interruption: Interruption) -> None:
+        def stop(_number: int, _frame: FrameType | None) -> None:
+            ignore_signals()
+            interruption()
+
+        for number in SIGNALS:
+            signal.signal(number, stop)
+
     started_s = time.monotonic()
     try:
         with Terminal(quiet) as terminal:
-            result = run_virtual(config, terminal)
-    except RunFolderError as error:
-        _fail(error, EXIT_USAGE)
-    except KeyboardInterrupt:
-        _fail(f"interrupted; recorded up to here: {out}", 130)
+            result = run_virtual(config, terminal, on_signal=on_signal)
+    except BaseException as error:
+        failure = explain(error)
+        if failure is None:
+            raise
+        _fail(f"{failure.text}; recorded up to here: {config.out}", failure.exit_code)
     wall_s = time.monotonic() - started_s
     typer.echo(f"trace hash {result.trace_hash}")
     typer.echo(
@@ -212,30 +264,35 @@ def _run_virtual(
     )
 
 
+class _Stopped(Exception):
+    """SIGINT or SIGTERM came; `number` says which."""
+
+    def __init__(self, number: int):
+        super().__init__(signal.strsignal(number))
+        self.number = number
+
+
+def _stop(number: int, _frame: FrameType | None) -> None:
+    # Once: everything is then stopped in order, and a second signal would leave some of it behind.
+    ignore_signals()
+    raise _Stopped(number)
+
+
 def _run_processes(config: LaunchConfig) -> None:
-    try:
-        # Here, before the world starts: at its end it writes the truth into this folder.
-        check_free(config.out)
-    except RunFolderError as error:
-        _fail(error, EXIT_USAGE)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    for number in SIGNALS:
+        signal.signal(number, _stop)
     try:
         with Launcher(config, lambda text: typer.echo(text, err=True)) as launcher:
-            _drive(launcher)
+            launcher.start_world()
+            launcher.start_agents()
+            code = launcher.watch(launcher.start_coordinator())
     except LaunchError as error:
-        _fail(error, EXIT_FAILED)
-    except KeyboardInterrupt:
-        _fail(f"interrupted, everything is stopped; recorded up to here: {config.out}", 130)
-
-
-def _drive(launcher: Launcher) -> None:
-    launcher.start_world()
-    launcher.start_agents()
-    coordinator = launcher.start_coordinator()
-    while coordinator.process.poll() is None:
-        time.sleep(0.1)
-    if coordinator.process.returncode:
-        raise LaunchError(f"the coordinator ended with {coordinator.process.returncode}")
+        _fail(f"{error}; logs: {config.out / LOGS}", EXIT_FAILED)
+    except _Stopped as stopped:
+        code = EXIT_INTERRUPTED if stopped.number == signal.SIGINT else 128 + stopped.number
+        _fail(f"interrupted, everything is stopped; recorded up to here: {config.out}", code)
+    if code:
+        _fail(f"the coordinator ended with {code}; logs of the others: {config.out / LOGS}", code)
 
 
 @app.command()
@@ -254,25 +311,15 @@ def launch(
 ) -> None:
     """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
     found = _load(robot)
-    _check(network, noise)
+    _check(network, noise, speed, endpoint)
+    try:
+        viewer_choice(viewer)
+    except ValueError as error:
+        _fail(error, EXIT_USAGE)
     options = ("--viewer", viewer, *_motion_options(plan, _plan(plan, dynamics)))
-    folder = out if out is not None else Path("runs") / found.name
-    _run_processes(
-        LaunchConfig(
-            robot_file=robot,
-            robot_name=found.name,
-            serials=tuple(module.serial for module in found.modules),
-            out=folder,
-            seed=seed,
-            network=network or found.network,
-            noise=noise,
-            speed=speed,
-            processes=processes,
-            endpoint=endpoint,
-            coordinator_options=options,
-        )
-    )
-    _score(folder)
+    place = _Place(_folder(out, found), network or found.network, endpoint, processes)
+    _run_processes(_launch(robot, found, place, seed, noise, speed, options))
+    _score(place.out)
 
 
 @app.command("score")
