@@ -78,7 +78,8 @@ class Radio:
 
     def _drain(self) -> None:
         self._draining = False
-        for event in self._inbox.drain(limit=4096):
+        # A few at a time: after a stall the keep-alives that are due must not wait for all that has piled up.
+        for event in self._inbox.drain(limit=32):
             self._hear(event)
         if len(self._inbox) and not self._draining:
             self._draining = True
