@@ -178,10 +178,14 @@ def plan(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -> Iterator[Any]:
-    """Make the launcher of one robot; whatever it started is stopped at the end."""
+    """Make the launcher of one robot; whatever it started is stopped at the end.
+
+    Commands live longer than by default, for a machine that has other things to do; the tests that are about
+    their lifetime set it.
+    """
     made: list[Launcher] = []
 
-    def make(robot: str = "thesis_171_horizontal", network: str = "lan") -> Launcher:
+    def make(robot: str = "thesis_171_horizontal", network: str = "lan", lifetime_ms: int = 800) -> Launcher:
         config = LaunchConfig(
             robot_file=robot,
             robot_name=robot,
@@ -189,6 +193,7 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
             out=tmp_path / "run",
             network=network,
             endpoint=endpoint,
+            agent_options=("--lifetime-ms", str(lifetime_ms)),
             coordinator_options=("--plan", str(plan), "--no-dynamics"),
         )
         made.append(Launcher(config, lambda text: None))
