@@ -1,0 +1,138 @@
+"""How fast things are: figures to read (`pytest -m benchmark -s`), no assertion on any of them."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from coordinator.chain import Chain
+from coordinator.dynamics.regressor import torque_regressor
+from coordinator.kinematics.inertial_prediction import imu_readings
+from coordinator.plan import Plan
+from coordinator.terminal import Terminal
+from module_agent.catalogue import CATALOGUE
+from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.firmware.firmware import Firmware
+from module_agent.hardware import SensorSample
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.feedback_rows import ROW, unpack
+from module_agent.wire.messages import Feedback, LeaseRequest
+from sim.robot_file import load_robot
+from sim.robot_tree import true_chain
+from sim.virtual_run import VirtualConfig, run_virtual
+from sim.world import World
+
+pytestmark = pytest.mark.benchmark
+
+
+def _seconds(work: Callable[[], object], count: int) -> float:
+    """The best mean of three rounds, per call."""
+    best = float("inf")
+    for _ in range(3):
+        start = time.perf_counter()
+        for _ in range(count):
+            work()
+        best = min(best, (time.perf_counter() - start) / count)
+    return best
+
+
+def _report(what: str, figure: str) -> None:
+    print(f"\n{what:.<60} {figure}")
+
+
+@pytest.mark.parametrize("dynamics", [False, True])
+def test_virtual_time_over_real_time(tmp_path: Path, dynamics: bool) -> None:
+    config = VirtualConfig(
+        load_robot("a2085_04"), tmp_path / "run", network="lan", plan=Plan(dynamics=dynamics)
+    )
+    start = time.perf_counter()
+    result = run_virtual(config, Terminal(quiet=True))
+    wall_s = time.perf_counter() - start
+    assert result.robot_time_s > 0.0
+    what = f"a2085_04, whole run{' with dynamics' if dynamics else ''}"
+    _report(
+        what, f"{result.robot_time_s:.1f} s in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x real time"
+    )
+
+
+def test_firmware_step() -> None:
+    kind = CATALOGUE["X5-9"]
+    firmware = Firmware(FirmwareConfig("A", kind, 1, catalogue_limits(kind)))
+    now = 0
+
+    def tick() -> None:
+        nonlocal now
+        now += 1_000_000
+        sample = SensorSample(now, now // 4_000_000 * 4_000_000, *([0.0] * 6), 40.0, 24.0, *([0.0] * 6))
+        firmware.step(now, sample, ())
+
+    _report("firmware step, one module, idle, 250 rows/s", f"{1e6 * _seconds(tick, 5000):.1f} us")
+
+
+@pytest.mark.parametrize("name", ["thesis_171_horizontal", "a2085_04", "snake16"])
+def test_world_tick(name: str) -> None:
+    world = World(load_robot(name), seed=0)
+    pwm = [0.01] * len(world.modules)
+    _report(
+        f"world tick, {name}, {len(pwm)} modules", f"{1e6 * _seconds(lambda: world.step(pwm), 500):.0f} us"
+    )
+    world.close()
+
+
+def test_codec() -> None:
+    rows = np.zeros(5, dtype=ROW)
+    feedback = Feedback(serial="A", boot=1, seq=1, first_row=0, count=5, rows=rows.tobytes())
+    request = LeaseRequest(serial="A", boot=1, seq=1, sender="C", token=1, echo_ns=1, action="renew")
+    for name, message in (("feedback of 5 rows", feedback), ("lease request", request)):
+        payload = encode(message)
+        kind = type(message)
+        there = _seconds(lambda message=message: encode(message), 5000)
+        back = _seconds(lambda kind=kind, payload=payload: decode(kind, payload, MAX_MESSAGE_BYTES), 5000)
+        _report(f"codec, {name}, {len(payload)} bytes", f"{1e6 * there:.1f} us out, {1e6 * back:.1f} us in")
+    _report("codec, rows unpacked and checked", f"{1e6 * _seconds(lambda: unpack(feedback), 5000):.1f} us")
+
+
+def _chain(joints: int) -> Chain:
+    rng = np.random.default_rng(0)
+    axis = rng.normal(size=(joints, 3))
+    home = np.tile(np.eye(4), (joints, 1, 1))
+    return Chain(
+        tuple(f"M{i}" for i in range(joints)),
+        tuple(range(-1, joints - 1)),
+        (False,) * joints,
+        axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        rng.uniform(-1, 1, (joints, 3)),
+        home,
+        np.array([0.0, 0.0, 9.81]),
+    )
+
+
+def test_regressor_against_pinocchios_loop() -> None:
+    chain, samples = _chain(7), 2000
+    q, qd, qdd = np.random.default_rng(1).uniform(-1, 1, (3, samples, 7))
+    model = pin.Model()
+    for i, point in enumerate(chain.point):
+        below = chain.point[i - 1] if i else np.zeros(3)
+        joint = pin.JointModelRevoluteUnaligned(chain.axis[i])
+        model.addJoint(i, joint, pin.SE3(np.eye(3), point - below), chain.serials[i])
+    data = model.createData()
+
+    def loop() -> None:
+        for a, b, c in zip(q, qd, qdd, strict=True):
+            pin.computeJointTorqueRegressor(model, data, a, b, c)
+
+    ours = _seconds(lambda: torque_regressor(chain, q, qd, qdd), 3) / samples
+    theirs = _seconds(loop, 3) / samples
+    _report(
+        "torque regressor, 7 joints, a sample", f"{1e6 * ours:.2f} us, pinocchio's loop {1e6 * theirs:.2f} us"
+    )
+
+
+def test_imu_prediction() -> None:
+    chain = true_chain(load_robot("a2085_04"))
+    q, qd, qdd = np.random.default_rng(1).uniform(-1, 1, (3, 4000, 4))
+    each = _seconds(lambda: imu_readings(chain, q, qd, qdd), 5) / 4000
+    _report("IMU prediction, 4 modules, a sample", f"{1e6 * each:.2f} us")
