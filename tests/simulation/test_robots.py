@@ -105,8 +105,8 @@ def test_what_a_fixed_base_hides_is_named(runs: Runs, quick_plan: Plan, name: st
     assert len(found.null_basis[0]) == len(kinds)
 
 
-def test_the_kit_arm_is_identified_with_its_inertia(runs: Runs) -> None:
-    found = runs("a2085_04", "lan", Plan()).score
+def test_the_kit_arm_is_identified_with_its_inertia(runs: Runs, quick_plan: Plan) -> None:
+    found = runs("a2085_04", "lan", quick_plan.model_copy(update={"dynamics": True})).score
     assert found.topology_correct
     assert found.tip_position_rms_mm is not None
     assert found.torque_relative_error is not None
