@@ -16,6 +16,8 @@ from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
 
 BASE, TIP = "X-00009", "X-00010"
+# One process makes the recording that all tests here work on.
+pytestmark = pytest.mark.xdist_group("identify")
 
 
 @pytest.fixture(scope="module")
