@@ -25,17 +25,19 @@ OTHER_ORDER = ("root", "right-1", "left-1", "left-2", "right-2", "left-3")
 EPOCH_NS = 1_700_000_000_000_000_000
 
 
-def true_torque(t_s: Array, column: int) -> Array:
+def true_torque(t_s: Array, column: int, faint: int | None = None) -> Array:
+    if column == faint:
+        return 0.01 * np.sin(2.0 * t_s)
     return (1.0 + column) * np.sin(2.0 * t_s + column)
 
 
-def write_truth_files(folder: Path) -> None:
+def write_truth_files(folder: Path, faint: int | None = None) -> None:
     write_truth(folder / "truth.json", ROBOT)
     t_ns = 4_000_000 * np.arange(1500, dtype=np.int64)
     n = len(SERIALS)
     # Every module's clock has its own epoch and drift.
     clock = np.stack([EPOCH_NS + 10**9 * k + t_ns + t_ns // 50_000 * k for k in range(n)], axis=1)
-    torque = np.stack([true_torque(t_ns / 1e9, k) for k in range(n)], axis=1)
+    torque = np.stack([true_torque(t_ns / 1e9, k, faint) for k in range(n)], axis=1)
     np.savez(
         folder / "truth.npz",
         serials=np.array(SERIALS),
@@ -183,6 +185,29 @@ def test_torque_errors_are_relative_to_the_true_and_to_the_measured_torque(tmp_p
     found = score(make_run(tmp_path, TRUTH, predicted=0.9, measured=1.2))
     assert found.torque_relative_error == pytest.approx(0.1, abs=1e-8)
     assert found.torque_relative_error_measured == pytest.approx(0.25)
+
+
+def test_a_torque_too_small_to_measure_by_is_scored_in_newton_metres(tmp_path: Path) -> None:
+    run = make_run(tmp_path, TRUTH)
+    # The module at the end of the first arm turns a bare output; all are predicted to do what the others do.
+    faint = SERIALS.index("left-3")
+    write_truth_files(tmp_path, faint)
+    found = score(run)
+    relative, absolute = found.torque_relative_error_per_joint, found.torque_rms_error_nm_per_joint
+    assert relative is not None
+    assert absolute is not None
+    relative = dict(relative)
+    assert relative.pop("left-3") is None
+    assert list(relative.values()) == pytest.approx([0.0] * 5, abs=1e-8)
+    t_s = 1.0 + 4.001003e-3 * np.arange(900)
+    error = true_torque(t_s, faint) - true_torque(t_s, faint, faint)
+    rms_nm = float(np.sqrt((error**2).mean()))
+    assert absolute["left-3"] == pytest.approx(rms_nm, rel=1e-6)
+    assert found.torque_relative_error is not None
+    assert found.torque_relative_error > 0.1
+    console = Console(width=200, record=True, file=(tmp_path / "out.txt").open("w"))
+    console.print(table(found))
+    assert f"{rms_nm:.3f} Nm" in console.export_text()
 
 
 def test_without_dynamics_there_are_no_torque_errors(tmp_path: Path) -> None:

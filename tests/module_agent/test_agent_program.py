@@ -1,0 +1,93 @@
+"""What `x5-agent` says when it cannot work; only a hub that is not there yet is waited for."""
+
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from module_agent.main import app
+from module_agent.wire.endpoint import check_endpoint
+from module_agent.wire.impaired_transport import ImpairedTransport
+from module_agent.wire.injected_network import inject
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--network", "pigeons"), "known are none, lan, lossy, wifi, bad"),
+        (("--robot", "a/b"), "robot 'a/b' cannot be part of a key"),
+        (("--expiry", "later"), "it must be motor_off, hold or damping"),
+        (("--seed", "-1"), "greater than or equal to 0"),
+        (("--lifetime-ms", "5000"), "less than or equal to 1000"),
+        (("--feedback-rate", "0"), "greater than or equal to 1"),
+        (("--connect", "nonsense"), "endpoint 'nonsense': it must look like tcp/127.0.0.1:7447"),
+        (("--connect", "tcp/127.0.0.1"), "an address of tcp is HOST:PORT"),
+        (("--connect", "carrier/pigeon:1"), "unknown protocol 'carrier'"),
+        (("--listen", "tcp/127.0.0.1:99999"), "with a port of 1 to 65535"),
+    ],
+)
+def test_wrong_usage_is_answered_at_once_with_what_is_right(arguments: tuple[str, ...], words: str) -> None:
+    done = CliRunner().invoke(app, ["--serial", "A-1", "--bus", "no-bus", *arguments])
+    assert done.exit_code == 2, done.output
+    assert words in done.output
+
+
+def test_a_port_that_somebody_else_has_is_named_and_not_waited_for() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        done = CliRunner().invoke(app, ["--serial", "A-1", "--bus", "no-bus", "--listen", endpoint])
+    assert done.exit_code == 2
+    assert f"cannot listen on {endpoint}: the address is in use" in done.output
+
+
+def test_an_agent_waits_for_its_hub_until_it_is_told_to_stop(tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        nobody = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    command = [sys.executable, "-m", "module_agent.main", "--serial", "A-1", "--bus", str(tmp_path / "bus")]
+    with subprocess.Popen([*command, "--connect", nobody], stderr=subprocess.PIPE, text=True) as agent:
+        assert agent.stderr is not None
+        assert f"waiting for the network: no hub answers on {nobody}" in agent.stderr.readline()
+        agent.send_signal(signal.SIGTERM)
+        assert agent.wait(30.0) == 0
+        assert agent.stderr.read() == ""
+
+
+@pytest.mark.parametrize(
+    "good",
+    [
+        "tcp/127.0.0.1:7447",
+        "tcp/[::1]:7447",
+        "tls/robot.example:443#root_ca=a.pem",
+        "udp/0.0.0.0:1?rel=0",
+        "unixsock-stream/tmp/robot.sock",
+    ],
+)
+def test_what_zenoh_can_listen_on_is_an_endpoint(good: str) -> None:
+    assert check_endpoint(good) == good
+
+
+@pytest.mark.parametrize(
+    "bad",
+    ["", "tcp", "tcp/", "tcp/:7447", "tcp/host:", "tcp/host:0", "tcp/host:65536", "tcp/host:x", "a/b:1"],
+)
+def test_what_no_network_can_mend_is_no_endpoint(bad: str) -> None:
+    with pytest.raises(ValueError, match="endpoint"):
+        check_endpoint(bad)
+
+
+def test_no_network_is_injected_where_none_is_asked_for() -> None:
+    class Nothing:
+        """A transport that is not used."""
+
+    transport = Nothing()
+    assert inject(transport, "none", 0) is transport  # type: ignore[arg-type]
+    assert isinstance(inject(transport, "wifi", 0), ImpairedTransport)  # type: ignore[arg-type]
+    with pytest.raises(KeyError, match="unknown network profile 'pigeons'"):
+        inject(transport, "pigeons", 0)  # type: ignore[arg-type]
