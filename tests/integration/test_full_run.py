@@ -47,15 +47,3 @@ def test_processes_over_zenoh_find_what_virtual_time_finds_and_a_replay_finds_it
     # The claimed sigma is mostly the accelerometer's unknown scale. World and noise are of one seed here, so
     # that is the same in both, and what remains is the timing of processes: 0.5 mm was measured.
     assert abs(real_mm - virtual_mm) <= 2.0
-
-
-def test_the_files_of_a_virtual_run_follow_from_its_recording(programs, plan: Path, tmp_path: Path) -> None:
-    run, again = tmp_path / "run", tmp_path / "again"
-    done = programs.run(
-        "sim.main", "run", ROBOT, "--virtual", "--no-dynamics", "--plan", str(plan), "--out", str(run), "-q"
-    )
-    assert done.returncode == 0, done.stderr
-    done = programs.run("coordinator.main", "replay", str(run / "session.mcap"), "--out", str(again))
-    assert done.returncode == 0, done.stderr
-    for name in ("result.json", "robot.urdf"):
-        assert (again / name).read_bytes() == (run / name).read_bytes()
