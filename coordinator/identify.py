@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.chain import Array
-from coordinator.clock_map import ClockMap, map_clock
+from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
 from coordinator.dynamics.identification import InertialFit, solve_pseudo_inverse
 from coordinator.dynamics.prediction import TorqueError, torque_error
@@ -42,9 +42,6 @@ KINEMATIC_KEEP_EVERY = 5
 # IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
 MOST_IMU_SAMPLES = 40_000
 DYNAMIC_CUTOFF_HZ = 12.0
-# Crystals are within 1e-4 of each other. Accelerations follow from session time, and lengths from them, so that
-# a clock which runs differently by a share makes lengths wrong by that share.
-LARGEST_DRIFT = 0.01
 
 
 class IdentificationError(ValueError):
@@ -128,7 +125,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     serials = _explored(recording)
     try:
         topology = find_topology(_seen(recording, serials))
-        clocks = {s: _clock(recording, s) for s in serials}
+        clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
         types = [_type(recording, s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
         first = assemble(
@@ -150,17 +147,6 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         if estimate.note
     )
     return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
-
-
-def _clock(recording: Recording, serial: str) -> ClockMap:
-    clock = map_clock(recording.modules[serial].round_trips)
-    if abs(clock.drift) > LARGEST_DRIFT:
-        pace = 1.0 / (1.0 + clock.drift)
-        raise IdentificationError(
-            f"the clock of module {serial} ran at {pace:.2f} times the session's, no crystal is off by more "
-            "than 0.0001: a simulated world that its machine cannot run so fast? Give it a smaller --speed"
-        )
-    return clock
 
 
 def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
