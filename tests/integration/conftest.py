@@ -2,6 +2,7 @@
 
 import os
 import queue
+import shutil
 import signal
 import socket
 import subprocess
@@ -99,10 +100,10 @@ def nothing_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator
     processes = marked_processes(mark)
     for line in processes:
         os.kill(int(line.split(":")[0]), signal.SIGKILL)
-    assert not processes, "processes are left"
     left = [str(path) for path in place.rglob("*")]
+    shutil.rmtree(place)
+    assert not processes, "processes are left"
     assert not left, "files are left beside the bus"
-    place.rmdir()
 
 
 # --------------------------------------------------------------------------- programs

@@ -43,7 +43,8 @@ def test_whoever_says_stop_is_obeyed_by_the_modules_and_by_the_coordinator(
     robot = launcher()
     config = robot.config
     robot.start_world()
-    coordinator = robot.start_coordinator(quiet=True)
+    # A long session: it must not come to its end by itself before it is stopped.
+    coordinator = robot.start_coordinator(["--dynamics"], quiet=True)
     agents = robot.start_agents()
     ear = client(config.robot_name)
     ear.motion(config.serials[0], "windowed_sine", 50, coordinator)
