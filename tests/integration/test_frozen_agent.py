@@ -25,7 +25,7 @@ def test_nothing_that_was_sent_to_a_frozen_agent_is_executed_when_it_thaws(
     launcher, client, frozen_s: float, arrives: bool
 ) -> None:
     """On the horizontal robot gravity moves nothing, so whatever moves after the thaw was commanded."""
-    robot = launcher(lifetime_ms=250)
+    robot = launcher(lifetime_ms=400)
     serial, other = robot.config.serials
     commander = client(robot.config.robot_name, hub=True)
     robot.start_world()

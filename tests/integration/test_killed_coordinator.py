@@ -13,7 +13,7 @@ EXPIRED = STATE_NAMES.index("expired")
 
 def test_the_motors_are_off_within_the_lifetime_of_the_last_accepted_command(launcher, client) -> None:
     """The hub outlives the coordinator here, so that the instant of the last accepted command is heard."""
-    robot = launcher(lifetime_ms=250)
+    robot = launcher(lifetime_ms=500)
     config = robot.config
     ear = client(config.robot_name, hub=True)
     robot.start_world()
@@ -61,6 +61,8 @@ def test_a_killed_coordinator_s_run_is_resumed_where_it_was(launcher, client, pr
     agents = robot.start_agents()
     ear = client(config.robot_name)
     motion = ear.motion(second, "windowed_sine", 150, coordinator)
+    # A busy machine may have held up the keep-alives before: the session re-arms then and tries again.
+    before = ear.status(second).expiries
     coordinator.process.kill()
     coordinator.process.wait()
     ear.close()
@@ -70,7 +72,7 @@ def test_a_killed_coordinator_s_run_is_resumed_where_it_was(launcher, client, pr
     witness.meet(config.serials, *agents)
     witness.until(lambda: witness.status(second).state == "expired", "the expiry", *agents)
     status = witness.status(second)
-    assert status.expiries == 1
+    assert status.expiries == before + 1
     assert status.motion.motion_id == motion.motion_id
     assert status.motion.outcome == "expired"
     rows = witness.history(second, motion.start_row, status.next_row)
