@@ -37,6 +37,11 @@ app = typer.Typer(
     help="Simulate modular robots, run the whole system on them, and score it.",
 )
 
+# How long the world waits for an agent that a busy machine does not let run, before it goes on without it:
+# the world's time is its own to stretch, while a motor that is let go in a motion spoils it. Agents that die
+# are noticed at once all the same.
+PATIENCE_S = 0.2
+
 RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all noise.")]
 Noise = Annotated[str | None, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)} [the robot's].")]
@@ -160,7 +165,7 @@ def world(
     plant = World(found, seed, noise)
     logged = LoggedWorld(plant)
     try:
-        server = BusServer(bus, logged, report=lambda line: typer.echo(line, err=True))
+        server = BusServer(bus, logged, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
     except OSError as error:
         _fail(error, EXIT_USAGE)
     typer.echo(f"{found.name}: {len(plant.modules)} modules on {bus}", err=True)
