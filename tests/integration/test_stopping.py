@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 from coordinator.run_folder import load_recording
+from sim.launcher import Child
 
 ROBOT = "thesis_171_horizontal"
 
@@ -22,7 +23,7 @@ def test_ctrl_c_stops_everything_and_keeps_what_was_recorded(
             stderr=subprocess.STDOUT,
         )
     ear = client(ROBOT)
-    motion = ear.motion("X-00009", "windowed_sine", 100)
+    motion = ear.motion("X-00009", "windowed_sine", 100, Child("launch", launch, log))
     launch.send_signal(signal.SIGINT)
     assert launch.wait(programs.limit_s) == 130
     said = log.read_text()
