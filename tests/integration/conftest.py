@@ -61,11 +61,10 @@ retries = 5
 """
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if Path(__file__).parent in item.path.parents:
-            item.add_marker(pytest.mark.integration)
-            item.add_marker(pytest.mark.xdist_group("integration"))
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark every test of this folder, early enough for xdist to keep all of them on one worker."""
+    item.add_marker(pytest.mark.integration)
+    item.add_marker(pytest.mark.xdist_group("integration"))
 
 
 # --------------------------------------------------------------------------- nothing is left behind
