@@ -32,13 +32,6 @@ def commands(block: str) -> list[str]:
 SHELL_BLOCKS = [b for b in blocks("sh") if not b.startswith("make ")]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("readme")
-    (path / "runs").mkdir()
-    return path
-
-
 @pytest.fixture
 def background() -> Iterator[list["subprocess.Popen[bytes]"]]:
     started: list[subprocess.Popen[bytes]] = []
@@ -55,11 +48,12 @@ def environment() -> dict[str, str]:
 
 @pytest.mark.integration
 @pytest.mark.xdist_group("integration")
-@pytest.mark.parametrize("block", SHELL_BLOCKS, ids=lambda block: block.split()[1])
-def test_the_commands_of_a_block_succeed_one_after_the_other(
-    block: str, folder: Path, background: "list[subprocess.Popen[bytes]]"
+def test_all_commands_succeed_one_after_the_other_and_leave_the_promised_files(
+    tmp_path: Path, background: "list[subprocess.Popen[bytes]]"
 ) -> None:
-    for line in commands(block):
+    folder = tmp_path
+    (folder / "runs").mkdir()
+    for line in (line for block in SHELL_BLOCKS for line in commands(block)):
         words = shlex.split(line)
         if words[-1] == "&":
             process = subprocess.Popen(words[:-1], cwd=folder, env=environment())
@@ -69,6 +63,13 @@ def test_the_commands_of_a_block_succeed_one_after_the_other(
             words, cwd=folder, env=environment(), capture_output=True, text=True, timeout=PATIENCE_S
         )
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    run = folder / "runs" / "virtual"
+    promised = re.findall(r"^\| (`[a-z_.]+`(?:, `[a-z_.]+`)*) \|", README, flags=re.MULTILINE)
+    names = [name for cell in promised for name in re.findall(r"`([a-z_]+\.[a-z]+)`", cell)]
+    assert len(names) >= 8
+    for name in names:
+        assert (run / name).stat().st_size > 0, f"{name} is missing"
+    assert json.loads((run / "score.json").read_text())["topology_correct"] is True
 
 
 def test_the_make_commands_are_those_that_ci_runs() -> None:
@@ -100,15 +101,3 @@ def test_the_robot_file_of_the_readme_is_a_robot(tmp_path: Path) -> None:
     path.write_text(text)
     robot = load_robot(path)
     assert [module.serial for module in robot.modules] == ["shoulder", "elbow"]
-
-
-def test_the_files_that_the_readme_promises_are_left_by_a_run(folder: Path) -> None:
-    run = folder / "runs" / "virtual"
-    if not run.exists():
-        pytest.skip("the run of the README's own block is not there: it runs in the integration group")
-    promised = re.findall(r"^\| (`[a-z_.]+`(?:, `[a-z_.]+`)*) \|", README, flags=re.MULTILINE)
-    names = [name for cell in promised for name in re.findall(r"`([a-z_]+\.[a-z]+)`", cell)]
-    assert len(names) >= 8
-    for name in names:
-        assert (run / name).stat().st_size > 0, f"{name} is missing"
-    assert json.loads((run / "score.json").read_text())["topology_correct"] is True
