@@ -1,55 +1,127 @@
-"""How imperfect the sensors and clocks are: named profiles."""
+"""How imperfect a simulated robot is: every imperfection's size, and the named profiles.
 
-from math import pi
+A size of zero switches an imperfection off. Which sizes belong together, where they come from and how the
+switches on the command line are called is the table of `sim.effects`.
+"""
+
+from math import pi, radians
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Amount = Annotated[float, Field(ge=0.0, le=1e3)]
+from sim.effects import EFFECTS, Effect
+
+Amount = Annotated[float, Field(ge=0.0, le=1e4)]
+STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 class NoiseProfile(BaseModel):
-    """Errors of one module's sensors as standard deviations; biases and clocks are drawn once per module.
+    """The sizes of all imperfections; standard deviations unless said otherwise, constants drawn per module.
 
-    The IMU's white noise is that of an output rate of 250 Hz and grows with the square root of the rate. The
-    effort's is a fraction of the type's largest effort.
+    Sensors: the IMU's white noise is that of an output rate of 250 Hz and grows with the square root of the
+    rate. Biases wander around their drawn value as a Gauss-Markov process of the given sigma and correlation
+    time. Vibration is the accelerometer's extra noise at the type's full speed. The effort's errors are
+    fractions of the type's largest effort, its scale error is relative.
+
+    Actuators: friction, gear_loss and heat multiply the catalogue's figures (1 = as catalogued, 0 = none).
+    The spreads are relative differences between modules of a type. spring_stiffening is the share of the
+    spring that is of the stiffening kind (0 = linear, 1 = as in modules made since 2019).
+
+    Structure: base_shake and link_flex multiply the compliance of the robot's base and links (1 = as
+    described by the robot file, 0 = rigid).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
+    # IMU
     accel_white_m_s2: Amount = 0.0
     gyro_white_rad_s: Amount = 0.0
     accel_bias_m_s2: Amount = 0.0
     gyro_bias_rad_s: Amount = 0.0
+    accel_drift_m_s2: Amount = 0.0
+    gyro_drift_rad_s: Amount = 0.0
+    drift_time_s: Amount = 0.0
+    accel_scale: Amount = 0.0
+    gyro_scale: Amount = 0.0
+    imu_misalignment_rad: Amount = 0.0
+    gyro_g_sensitivity_s_m: Amount = 0.0
+    imu_bandwidth_hz: Amount = 0.0
+    accel_range_m_s2: Amount = 0.0
+    gyro_range_rad_s: Amount = 0.0
+    accel_step_m_s2: Amount = 0.0
+    gyro_step_rad_s: Amount = 0.0
+    vibration_m_s2: Amount = 0.0
+    # encoder and torque sensor
     position_step_rad: Amount = 0.0
     velocity_white_rad_s: Amount = 0.0
+    velocity_bandwidth_hz: Amount = 0.0
     effort_white_fraction: Amount = 0.0
+    effort_offset_fraction: Amount = 0.0
+    effort_scale: Amount = 0.0
+    effort_hysteresis_fraction: Amount = 0.0
+    # clock
     clock_offset_min_s: Amount = 0.0
     clock_offset_max_s: Amount = 0.0
     clock_drift_ppm: Amount = 0.0
+    sampling_jitter_s: Amount = 0.0
+    # actuator
+    friction: Amount = 0.0
+    gear_loss: Amount = 0.0
+    heat: Amount = 0.0
+    friction_spread: Amount = 0.0
+    motor_spread: Amount = 0.0
+    spring_spread: Amount = 0.0
+    backlash_rad: Amount = 0.0
+    spring_stiffening: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    # structure
+    base_shake: Amount = 0.0
+    link_flex: Amount = 0.0
+
+
+_BODY = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
+_X5 = (
+    *_BODY,
+    *("variation", "imu-white", "imu-bias", "imu-drift", "g-sensitivity", "imu-bandwidth", "imu-range"),
+    *("imu-steps", "vibration", "encoder", "velocity-estimate", "torque-noise", "clock", "sampling-jitter"),
+)
+_UNCALIBRATED = (*_X5, "imu-scale", "imu-misalignment", "torque-calibration", "torque-hysteresis")
+
+
+def _profile(name: str, effects: tuple[str, ...], **sizes: float) -> NoiseProfile:
+    typical = {field: size for effect in effects for field, size in EFFECTS[effect].sizes.items()}
+    return NoiseProfile(name=name, **(typical | sizes))
 
 
 NOISE_PROFILES: dict[str, NoiseProfile] = {
     p.name: p
     for p in (
-        NoiseProfile(name="ideal"),
-        # White noise and biases as read from a real X5-1's log; the encoder counts 16 bit per turn.
-        NoiseProfile(
-            name="x5",
-            accel_white_m_s2=0.023,
-            gyro_white_rad_s=1.2e-3,
-            accel_bias_m_s2=0.020,
-            gyro_bias_rad_s=0.020,
-            position_step_rad=2.0 * pi / 2**16,
-            velocity_white_rad_s=5e-3,
-            effort_white_fraction=0.002,
-            clock_offset_min_s=1.0,
-            clock_offset_max_s=100.0,
-            clock_drift_ppm=20.0,
+        # Perfect sensors on a rigid robot; its motors still have friction and get warm.
+        _profile("ideal", ("friction", "gear-loss", "heat")),
+        # A calibrated IMU: noise, biases and resolution as in a real X5-1's log and in data sheets.
+        _profile("x5", _X5),
+        # As delivered.
+        _profile("x5-uncalibrated", _UNCALIBRATED, accel_bias_m_s2=0.020 * STANDARD_GRAVITY_M_S2),
+        # Everything at once, and about three times as large.
+        _profile(
+            "poor",
+            tuple(EFFECTS),
+            accel_white_m_s2=0.07,
+            gyro_white_rad_s=4e-3,
+            accel_bias_m_s2=0.050 * STANDARD_GRAVITY_M_S2,
+            gyro_bias_rad_s=0.050,
+            accel_scale=0.03,
+            gyro_scale=0.03,
+            imu_misalignment_rad=radians(2.0),
+            position_step_rad=2.0 * pi / 2**14,
+            velocity_white_rad_s=0.015,
+            effort_white_fraction=0.006,
+            effort_scale=0.05,
+            clock_drift_ppm=100.0,
         ),
     )
 }
+DEFAULT_PROFILE = "x5-uncalibrated"
 
 
 def noise_profile(name: str) -> NoiseProfile:
@@ -61,3 +133,29 @@ def noise_profile(name: str) -> NoiseProfile:
     if name not in NOISE_PROFILES:
         raise KeyError(f"unknown noise profile {name!r}; known are {', '.join(NOISE_PROFILES)}")
     return NOISE_PROFILES[name]
+
+
+def switched(profile: NoiseProfile, on: tuple[str, ...] = (), off: tuple[str, ...] = ()) -> NoiseProfile:
+    """Return a profile with some effects switched on at their typical size, and others off.
+
+    An effect that the profile has already keeps its size there.
+
+    Raises:
+        KeyError: unknown effect; the message lists the known ones.
+        ValueError: an effect is switched both on and off.
+    """
+    if both := [name for name in on if name in off]:
+        raise ValueError(f"effect {both[0]!r} is switched both on and off")
+    sizes: dict[str, float] = {}
+    for effect in map(_effect, on):
+        if not any(getattr(profile, field) for field in effect.sizes):
+            sizes |= effect.sizes
+    for effect in map(_effect, off):
+        sizes |= dict.fromkeys(effect.sizes, 0.0)
+    return profile.model_copy(update=sizes)
+
+
+def _effect(name: str) -> Effect:
+    if name not in EFFECTS:
+        raise KeyError(f"unknown effect {name!r}; known are {', '.join(EFFECTS)}")
+    return EFFECTS[name]

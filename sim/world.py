@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.hardware import HardwareLost, HardwareModule, SensorSample
-from sim.module_clock import draw_clock, module_time
-from sim.noise_profile import noise_profile
+from sim.module_clock import ModuleClock
+from sim.noise_profile import NoiseProfile, noise_profile
 from sim.physics.actuator import Actuators
 from sim.physics.imu import ImuKinematics
 from sim.physics.multibody import Multibody
-from sim.physics.sensor_noise import SensorNoise, generator
+from sim.physics.sensors import Instant, Sensors
 from sim.physics.thermal import Windings
 from sim.pose import Array, read_only
 from sim.robot_file import Robot
@@ -53,18 +53,17 @@ class World:
         KeyError: unknown noise profile.
     """
 
-    def __init__(self, robot: Robot, seed: int, noise: str | None = None, imu_rate_hz: float = 250.0):
+    def __init__(
+        self, robot: Robot, seed: int, noise: str | NoiseProfile | None = None, imu_rate_hz: float = 250.0
+    ):
         self.robot = robot
-        profile = noise_profile(robot.noise if noise is None else noise)
+        wanted = robot.noise if noise is None else noise
+        self.profile = noise_profile(wanted) if isinstance(wanted, str) else wanted
         tree = build_tree(robot)
-        self._imu_ticks = _whole_ticks(imu_rate_hz)
-        self.clocks = tuple(draw_clock(generator(seed, s, "clock"), profile) for s in robot.serials)
-        self._effort_limit = np.array([t.max_effort_nm for t in tree.types])
-        self._position_step = profile.position_step_rad
-        self._noise = SensorNoise(seed, robot.serials, profile, imu_rate_hz)
+        imu_ticks = _whole_ticks(imu_rate_hz)
+        self._sensors = Sensors(seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S)
         self._imu = ImuKinematics(tree)
-        self._imu_values = np.zeros((len(tree.serials), 6))
-        self._imu_ns = [0] * len(tree.serials)
+        self._felt = (np.zeros((len(tree.serials), 3)), np.zeros((len(tree.serials), 3)))
         self._windings = Windings(tree.types, TICK_S)
         self._actuators = Actuators(tree.types, TICK_S)
         self._body = Multibody(robot.name, tree, TICK_S)
@@ -77,7 +76,7 @@ class World:
         motor = self._actuators.motor_rad
         self._plant = (0, zero, zero, self._q, zero, zero, motor, zero, self._actuators.torque_nm)
         self.modules = tuple(
-            HardwareModule(m.serial, m.type, TICK_NS, self._imu_ticks * TICK_NS) for m in robot.modules
+            HardwareModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
         )
 
     @property
@@ -92,9 +91,14 @@ class World:
         return Plant(t_ns, *(read_only(a.copy()) for a in arrays))
 
     @property
+    def clocks(self) -> tuple[ModuleClock, ...]:
+        """The modules' clocks."""
+        return self._sensors.clocks
+
+    @property
     def imu_bias(self) -> Array:
         """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
-        return self._noise.imu_bias
+        return self._sensors.imu_bias
 
     def step(self, pwm: Sequence[float]) -> list[SensorSample]:
         """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.
@@ -137,25 +141,23 @@ class World:
         return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
 
     def _samples(self, q: Array, rate: Array, change: Array, motor_rate: Array) -> list[SensorSample]:
-        now = [module_time(clock, self.t_ns) for clock in self.clocks]
-        if self._tick % self._imu_ticks == 0:
-            self._imu_values = np.hstack(self._imu.feel(q, rate, change)) + self._noise.imu()
-            self._imu_ns = now
-        actuators, error = self._actuators, self._noise.joint()
-        step = self._position_step
-        effort = error[:, 1] * self._effort_limit - actuators.spring_nm_rad * actuators.deflection_rad
-        values = np.empty((len(q), 14))
-        values[:, 0] = np.rint(q / step) * step if step else q
-        values[:, 1] = rate + error[:, 0]
-        values[:, 2] = effort
-        values[:, 3] = effort / -actuators.spring_nm_rad
-        values[:, 4] = actuators.gear * motor_rate
-        values[:, 5] = actuators.current_a
-        values[:, 6] = self._windings.winding_c
-        values[:, 7] = actuators.voltage_v
-        values[:, 8:] = self._imu_values
-        rows = values.tolist()
-        return [SensorSample(t, imu, *row) for t, imu, row in zip(now, self._imu_ns, rows, strict=True)]
+        if self._sensors.imu_due(self._tick):
+            self._felt = self._imu.feel(q, rate, change)
+        actuators = self._actuators
+        instant = Instant(
+            t_ns=self.t_ns,
+            q_rad=q,
+            qd_rad_s=rate,
+            motor_rad_s=motor_rate,
+            deflection_rad=actuators.deflection_rad,
+            elastic_nm=-actuators.spring_nm_rad * actuators.deflection_rad,
+            current_a=actuators.current_a,
+            winding_c=self._windings.winding_c,
+            voltage_v=actuators.voltage_v,
+            gyro_rad_s=self._felt[0],
+            specific_force_m_s2=self._felt[1],
+        )
+        return self._sensors.read(self._tick, instant)
 
 
 class InProcessHardware:

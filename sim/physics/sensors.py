@@ -1,0 +1,93 @@
+"""What the modules' sensors make of the truth: one `SensorSample` per module and tick."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.catalogue import ModuleType
+from module_agent.hardware import SensorSample
+from sim.module_clock import ModuleClock, draw_clock, module_time
+from sim.noise_profile import NoiseProfile
+from sim.physics.sensor_noise import SensorNoise, generator
+from sim.pose import Array
+
+
+class Instant(NamedTuple):
+    """The truth at one instant, arrays (n,) or (n, 3); read only.
+
+    motor_rad_s is seen at the output, as motor positions are. deflection_rad is output
+    minus motor, elastic_nm what the spring's elasticity exerts on the output. gyro_rad_s and
+    specific_force_m_s2 are in IMU axes; they are those of an earlier instant where the IMU is not due.
+    """
+
+    t_ns: int
+    q_rad: Array
+    qd_rad_s: Array
+    motor_rad_s: Array
+    deflection_rad: Array
+    elastic_nm: Array
+    current_a: Array
+    winding_c: Array
+    voltage_v: float
+    gyro_rad_s: Array
+    specific_force_m_s2: Array
+
+
+class Sensors:
+    """The sensors and clocks of n modules under one profile.
+
+    The IMU is read every `imu_ticks` ticks; in between its last values are repeated with their own time.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        serials: Sequence[str],
+        types: Sequence[ModuleType],
+        profile: NoiseProfile,
+        imu_ticks: int,
+        tick_s: float,
+    ):
+        self.clocks: tuple[ModuleClock, ...] = tuple(
+            draw_clock(generator(seed, s, "clock"), profile) for s in serials
+        )
+        self._imu_ticks = imu_ticks
+        self._gear = np.array([t.gear_ratio for t in types])
+        self._effort_limit = np.array([t.max_effort_nm for t in types])
+        self._spring = np.array([t.spring_nm_rad for t in types])
+        self._position_step = profile.position_step_rad
+        self._noise = SensorNoise(seed, serials, profile, 1.0 / (imu_ticks * tick_s))
+        self._imu_values = np.zeros((len(types), 6))
+        self._imu_ns = [0] * len(types)
+
+    @property
+    def imu_bias(self) -> Array:
+        """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
+        return self._noise.imu_bias
+
+    def imu_due(self, tick: int) -> bool:
+        """Whether `read` at this tick needs the IMU's truth of this instant."""
+        return tick % self._imu_ticks == 0
+
+    def read(self, tick: int, truth: Instant) -> list[SensorSample]:
+        """Return one sample per module. To be called once a tick, in order."""
+        now = [module_time(clock, truth.t_ns) for clock in self.clocks]
+        if self.imu_due(tick):
+            felt = np.hstack((truth.gyro_rad_s, truth.specific_force_m_s2))
+            self._imu_values = felt + self._noise.imu()
+            self._imu_ns = now
+        error, step = self._noise.joint(), self._position_step
+        effort = error[:, 1] * self._effort_limit + truth.elastic_nm
+        values = np.empty((len(effort), 14))
+        values[:, 0] = np.rint(truth.q_rad / step) * step if step else truth.q_rad
+        values[:, 1] = truth.qd_rad_s + error[:, 0]
+        values[:, 2] = effort
+        values[:, 3] = effort / -self._spring
+        values[:, 4] = self._gear * truth.motor_rad_s
+        values[:, 5] = truth.current_a
+        values[:, 6] = truth.winding_c
+        values[:, 7] = truth.voltage_v
+        values[:, 8:] = self._imu_values
+        rows = values.tolist()
+        return [SensorSample(t, imu, *row) for t, imu, row in zip(now, self._imu_ns, rows, strict=True)]
