@@ -4,6 +4,17 @@ import time
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+_PIPE_WIDTH = 140
+
+
+def print_table(table: Table) -> None:
+    """Print a command's result on standard output, with colours where it is a terminal."""
+    console = Console(highlight=False)
+    # A pipe has no width; cells cut short in it would be lost for whoever searches them.
+    console.width = console.width if console.is_terminal else _PIPE_WIDTH
+    console.print(table)
 
 
 class Terminal:

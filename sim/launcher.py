@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from module_agent.main import ATTACHED
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
+from sim.noise_choice import NoiseChoice
 
 START_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 5.0
@@ -36,7 +37,7 @@ class LaunchConfig(NamedTuple):
     out: Path
     seed: int = 0
     network: str = "lan"
-    noise: str | None = None
+    noise: NoiseChoice = NoiseChoice()
     speed: float = 1.0
     endpoint: str = DEFAULT_ENDPOINT
     processes: int | None = None
@@ -86,8 +87,7 @@ class Launcher:
         config = self.config
         arguments = ["sim.main", "world", config.robot_file, "--bus", self.bus, "--seed", str(config.seed)]
         arguments += ["--speed", str(config.speed), "--truth", str(config.out)]
-        if config.noise is not None:
-            arguments += ["--noise", config.noise]
+        arguments += config.noise.arguments
         world = self._start("world", arguments)
         self._wait(lambda: os.path.exists(self.bus), world, "its bus")
         self._say("world: bus open")

@@ -12,6 +12,7 @@ from module_agent.host import AgentHost, InlineWorker
 from module_agent.wire.impaired_transport import ImpairedTransport
 from module_agent.wire.network_profile import NetworkProfile
 from module_agent.wire.transport import Transport
+from sim.noise_profile import NoiseProfile
 from sim.robot_file import Robot
 from sim.truth import TruthLog
 from sim.virtual_loop import LoopScheduler, VirtualLoop
@@ -27,7 +28,7 @@ class VirtualSettings(NamedTuple):
     robot: Robot
     profile: NetworkProfile
     seed: int = 0
-    noise: str | None = None
+    noise: str | NoiseProfile | None = None
     feedback_rate_hz: float = 250.0
 
 

@@ -11,6 +11,7 @@ from coordinator.result import Result
 from coordinator.run import Run, RunConfig
 from coordinator.viewer_feed import Screen
 from module_agent.wire.network_profile import profile
+from sim.noise_profile import NoiseProfile
 from sim.robot_file import Robot
 from sim.truth import write_truth
 from sim.virtual_loop import VirtualLoop
@@ -26,7 +27,7 @@ class VirtualConfig(NamedTuple):
     out: Path
     seed: int = 0
     network: str = "lan"
-    noise: str | None = None
+    noise: str | NoiseProfile | None = None
     plan: Plan = Plan()
     connect_viewer: str | None = None
     feedback_rate_hz: float = 250.0

@@ -37,7 +37,9 @@ ROBOT = "thesis_171_horizontal"
     [
         (("run", ROBOT, "--seed", "-1"), "greater than or equal to 0"),
         (("run", ROBOT, "--speed", "0"), "speed 0.0: it must be a positive number"),
-        (("run", ROBOT, "--virtual", "--noise", "loud"), "--noise loud: known are"),
+        (("run", ROBOT, "--virtual", "--noise", "loud"), "unknown noise profile 'loud'; known are ideal"),
+        (("run", ROBOT, "--virtual", "--with", "wind"), "unknown effect 'wind'; known are friction"),
+        (("launch", ROBOT, "--with", "heat", "--without", "heat"), "'heat' is switched both on and off"),
         (("launch", ROBOT, "--endpoint", "nonsense"), "endpoint 'nonsense': it must look like tcp/"),
         (("launch", ROBOT, "--viewer", "foo"), "--viewer foo: it must be none, spawn, serve or an address"),
         (("launch", ROBOT, "--processes", "0"), "greater than or equal to 1"),

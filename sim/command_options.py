@@ -1,0 +1,96 @@
+"""What the simulator's commands have in common: their options, and refusing what cannot work."""
+
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+
+from coordinator.failure import EXIT_USAGE
+from coordinator.plan import Plan, PlanFileError, load_plan
+from coordinator.run_folder import RunFolderError, check_free
+from coordinator.scaled_loop import check_speed
+from module_agent.wire.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from module_agent.wire.network_profile import PROFILES
+from sim.noise_choice import NoiseChoice
+from sim.noise_profile import NOISE_PROFILES
+from sim.robot_file import Robot, RobotFileError, load_robot
+
+RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all noise.")]
+Noise = Annotated[str | None, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)} [the robot's].")]
+With = Annotated[
+    list[str] | None, typer.Option("--with", help="Switch an effect on; repeat. `x5-sim effects` lists them.")
+]
+Without = Annotated[list[str] | None, typer.Option("--without", help="Switch an effect off; repeat.")]
+Network = Annotated[str | None, typer.Option(help=f"Network profile: {', '.join(PROFILES)} [the robot's].")]
+Speed = Annotated[float, typer.Option(help="Times real time; slower helps a busy machine.")]
+PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
+Dynamics = Annotated[
+    bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
+]
+Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
+Processes = Annotated[
+    int | None, typer.Option(min=1, help="Agent processes that share the modules [one for each module].")
+]
+Out = Annotated[Path | None, typer.Option(help="Folder of the run [runs/ROBOT].")]
+
+
+def fail(text: object, code: int) -> NoReturn:
+    """Say on standard error what is wrong, and end the command with an exit code."""
+    typer.echo(f"x5-sim: {text}", err=True)
+    raise typer.Exit(code)
+
+
+def load(name: str) -> Robot:
+    """Load a robot, or end the command."""
+    try:
+        return load_robot(name)
+    except (RobotFileError, OSError) as error:
+        fail(error, EXIT_USAGE)
+
+
+def check(network: str | None = None, speed: float = 1.0, endpoint: str = DEFAULT_ENDPOINT) -> None:
+    """Refuse what cannot work before anything is started."""
+    if network is not None and network not in PROFILES:
+        fail(f"--network {network}: known are {', '.join(PROFILES)}", EXIT_USAGE)
+    try:
+        check_speed(speed)
+        check_endpoint(endpoint)
+    except ValueError as error:
+        fail(error, EXIT_USAGE)
+
+
+def noise_choice(robot: Robot, noise: str | None, on: list[str] | None, off: list[str] | None) -> NoiseChoice:
+    """Return the noise asked for, or end the command if there is no such profile or effect."""
+    choice = NoiseChoice(noise, tuple(on or ()), tuple(off or ()))
+    try:
+        choice.of(robot)
+    except (KeyError, ValueError) as error:
+        fail(error.args[0], EXIT_USAGE)
+    return choice
+
+
+def free_folder(out: Path | None, robot: Robot) -> Path:
+    """Return the folder of a run, which must not hold one: at its end the truth is written there as well."""
+    folder = out if out is not None else Path("runs") / robot.name
+    try:
+        check_free(folder)
+    except RunFolderError as error:
+        # Another world's modules have booted since: there is nothing to go on from.
+        fail(f"{error} with `x5-coordinator run`, if its modules are still up", EXIT_USAGE)
+    return folder
+
+
+def motions(path: Path | None, dynamics: bool | None = None) -> Plan:
+    """Return the plan of a file, or end the command."""
+    try:
+        found = load_plan(path) if path is not None else Plan()
+    except PlanFileError as error:
+        fail(error, EXIT_USAGE)
+    return found if dynamics is None else found.model_copy(update={"dynamics": dynamics})
+
+
+def motion_arguments(path: Path | None, plan: Plan) -> tuple[str, ...]:
+    """Return a plan as arguments for the coordinator."""
+    dynamics = "--dynamics" if plan.dynamics else "--no-dynamics"
+    return (dynamics,) if path is None else ("--plan", str(path), dynamics)
