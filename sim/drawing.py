@@ -21,6 +21,9 @@ COLOURS: dict[ModuleTypeName, str] = {
     "X5-1": "#4c9ed9",
     "X5-4": "#3aa66a",
     "X5-9": "#e0883a",
+    "X5-1-old": "#2f6288",
+    "X5-4-old": "#246a43",
+    "X5-9-old": "#8f5724",
     "SEA-snake": "#9a6fc0",
 }
 _AXIS, _IMU, _LINK, _GRAVITY = "#c0264b", "#101010", "#6b6b6b", "#2050b0"

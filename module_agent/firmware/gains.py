@@ -9,7 +9,9 @@ _KP: dict[str, dict[int, tuple[float, float, float]]] = {
     "X5-4": {2: (10.0, 0.2, 0.25), 3: (1.0, 0.05, 0.25), 4: (10.0, 0.05, 0.25)},
     "X5-9": {2: (15.0, 0.5, 0.25), 3: (1.5, 0.05, 0.25), 4: (15.0, 0.05, 0.25)},
 }
-# The snake module has the gear train of the X5-4 and no published file.
+# The older generation has the same gear trains, and the snake module that of the X5-4 and no published file.
+for _name in ("X5-1", "X5-4", "X5-9"):
+    _KP[f"{_name}-old"] = _KP[_name]
 _KP["SEA-snake"] = _KP["X5-4"]
 
 
@@ -23,7 +25,7 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
     effort = kind.max_effort_nm
     position_limit = effort if strategy in (2, 4) else 1.0
     velocity_limit = effort if strategy == 2 else 1.0
-    effort_target = 4.0 if kind.name == "X5-1" else 1.6 * effort
+    effort_target = 4.0 if kind.name in ("X5-1", "X5-1-old") else 1.6 * effort
     return GainSet(
         strategy=strategy,
         position=PidGains(kp=kp[0], min_output=-position_limit, max_output=position_limit),
