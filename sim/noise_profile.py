@@ -20,8 +20,11 @@ class NoiseProfile(BaseModel):
 
     Sensors: the IMU's white noise is that of an output rate of 250 Hz and grows with the square root of the
     rate. Biases wander around their drawn value as a Gauss-Markov process of the given sigma and correlation
-    time. Vibration is the accelerometer's extra noise at the type's full speed. The effort's errors are
-    fractions of the type's largest effort, its scale error is relative.
+    time. imu_bandwidth_hz is the corner of a low-pass that runs at the world's 1 kHz. Vibration is the extra
+    noise of accelerometer and gyro at the type's full speed. The effort's errors are fractions of the type's
+    largest effort, its scale error is relative; effort_hysteresis_fraction is the whole width of the loop.
+    sampling_jitter_s is first order, and so at most a fifth of a tick. Both bandwidths of speeds belong to
+    first-order low-passes.
 
     Actuators: friction, gear_loss and heat multiply the catalogue's figures (1 = as catalogued, 0 = none).
     The spreads are relative differences between modules of a type. spring_stiffening is the share of the
@@ -45,26 +48,29 @@ class NoiseProfile(BaseModel):
     accel_scale: Amount = 0.0
     gyro_scale: Amount = 0.0
     imu_misalignment_rad: Amount = 0.0
+    imu_skew_rad: Amount = 0.0
     gyro_g_sensitivity_s_m: Amount = 0.0
-    imu_bandwidth_hz: Amount = 0.0
+    imu_bandwidth_hz: Annotated[float, Field(ge=0.0, le=450.0)] = 0.0
     accel_range_m_s2: Amount = 0.0
     gyro_range_rad_s: Amount = 0.0
     accel_step_m_s2: Amount = 0.0
     gyro_step_rad_s: Amount = 0.0
     vibration_m_s2: Amount = 0.0
+    vibration_rad_s: Amount = 0.0
     # encoder and torque sensor
     position_step_rad: Amount = 0.0
     velocity_white_rad_s: Amount = 0.0
     velocity_bandwidth_hz: Amount = 0.0
+    motor_velocity_bandwidth_hz: Amount = 0.0
     effort_white_fraction: Amount = 0.0
     effort_offset_fraction: Amount = 0.0
     effort_scale: Amount = 0.0
-    effort_hysteresis_fraction: Amount = 0.0
+    effort_hysteresis_fraction: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0
     # clock
     clock_offset_min_s: Amount = 0.0
     clock_offset_max_s: Amount = 0.0
     clock_drift_ppm: Amount = 0.0
-    sampling_jitter_s: Amount = 0.0
+    sampling_jitter_s: Annotated[float, Field(ge=0.0, le=2e-4)] = 0.0
     # actuator
     friction: Amount = 0.0
     gear_loss: Amount = 0.0
@@ -83,7 +89,8 @@ _BODY = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
 _X5 = (
     *_BODY,
     *("variation", "imu-white", "imu-bias", "imu-drift", "g-sensitivity", "imu-bandwidth", "imu-range"),
-    *("imu-steps", "vibration", "encoder", "velocity-estimate", "torque-noise", "clock", "sampling-jitter"),
+    *("imu-steps", "vibration", "encoder", "velocity-estimate", "motor-speed-estimate", "torque-noise"),
+    *("clock", "sampling-jitter"),
 )
 _UNCALIBRATED = (*_X5, "imu-scale", "imu-misalignment", "torque-calibration", "torque-hysteresis")
 
@@ -106,17 +113,21 @@ NOISE_PROFILES: dict[str, NoiseProfile] = {
         _profile(
             "poor",
             tuple(EFFECTS),
-            accel_white_m_s2=0.07,
-            gyro_white_rad_s=4e-3,
+            accel_white_m_s2=0.035,
+            gyro_white_rad_s=2e-3,
             accel_bias_m_s2=0.050 * STANDARD_GRAVITY_M_S2,
-            gyro_bias_rad_s=0.050,
+            gyro_bias_rad_s=0.080,
             accel_scale=0.03,
             gyro_scale=0.03,
             imu_misalignment_rad=radians(2.0),
+            imu_skew_rad=0.01,
+            vibration_m_s2=0.14,
+            vibration_rad_s=6e-3,
             position_step_rad=2.0 * pi / 2**14,
             velocity_white_rad_s=0.015,
             effort_white_fraction=0.006,
             effort_scale=0.05,
+            effort_hysteresis_fraction=0.015,
             clock_drift_ppm=100.0,
         ),
     )

@@ -14,6 +14,7 @@ import numpy as np
 
 from coordinator.chain import Chain
 from sim.module_clock import ModuleClock, module_time
+from sim.physics.sensor_errors import SensorErrors
 from sim.pose import Array, read_only
 from sim.robot_file import Robot
 from sim.robot_tree import true_chain, true_inertia
@@ -26,7 +27,7 @@ class Truth(NamedTuple):
     """A robot's constants; frames and order as in `chain`.
 
     inertia: (n, 10) every body's parameters in the root frame at q = 0 (see `sim.robot_tree.true_inertia`).
-    clocks and imu_bias (n, 6; gyro, accelerometer) are those of one world, or None.
+    clocks, imu_bias (n, 6; gyro, accelerometer) and sensor_errors are those of one world, or None.
     """
 
     robot: str
@@ -35,6 +36,7 @@ class Truth(NamedTuple):
     inertia: Array
     clocks: tuple[ModuleClock, ...] | None
     imu_bias: Array | None
+    sensor_errors: SensorErrors | None = None
 
 
 class Motion(NamedTuple):
@@ -60,12 +62,14 @@ def truth_of(robot: Robot, world: World | None = None) -> Truth:
         inertia=true_inertia(robot),
         clocks=None if world is None else world.clocks,
         imu_bias=None if world is None else world.imu_bias,
+        sensor_errors=None if world is None else world.sensor_errors,
     )
 
 
 def write_truth(path: Path, robot: Robot, world: World | None = None) -> None:
     """Write `truth_of` as JSON, atomically."""
     truth = truth_of(robot, world)
+    errors = truth.sensor_errors
     chain = {
         k: v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in truth.chain._asdict().items()
     }
@@ -77,6 +81,7 @@ def write_truth(path: Path, robot: Robot, world: World | None = None) -> None:
         "inertia": truth.inertia.tolist(),
         "clocks": None if truth.clocks is None else [clock._asdict() for clock in truth.clocks],
         "imu_bias": None if truth.imu_bias is None else truth.imu_bias.tolist(),
+        "sensor_errors": None if errors is None else {k: v.tolist() for k, v in errors._asdict().items()},
     }
     _replace(path, json.dumps(document, indent=1).encode())
 
@@ -90,7 +95,8 @@ def read_truth(path: Path) -> Truth:
     document = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(document, dict) or document.get("version") != VERSION:
         raise ValueError(f"{path}: not a truth file of version {VERSION}")
-    clocks, bias = document["clocks"], document["imu_bias"]
+    # Files of runs before sensors had more than biases lack the rest of their errors.
+    clocks, bias, errors = document["clocks"], document["imu_bias"], document.get("sensor_errors")
     return Truth(
         robot=document["robot"],
         module_types=tuple(document["module_types"]),
@@ -98,6 +104,9 @@ def read_truth(path: Path) -> Truth:
         inertia=read_only(np.array(document["inertia"])),
         clocks=None if clocks is None else tuple(ModuleClock(**clock) for clock in clocks),
         imu_bias=None if bias is None else read_only(np.array(bias)),
+        sensor_errors=None
+        if errors is None
+        else SensorErrors(**{k: read_only(np.array(v)) for k, v in errors.items()}),
     )
 
 

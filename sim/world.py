@@ -12,6 +12,7 @@ from sim.noise_profile import NoiseProfile, noise_profile
 from sim.physics.actuator import Actuators
 from sim.physics.imu import ImuKinematics
 from sim.physics.multibody import Multibody
+from sim.physics.sensor_errors import SensorErrors
 from sim.physics.sensors import Instant, Sensors
 from sim.physics.thermal import Windings
 from sim.pose import Array, read_only
@@ -99,6 +100,11 @@ class World:
     def imu_bias(self) -> Array:
         """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
         return self._sensors.imu_bias
+
+    @property
+    def sensor_errors(self) -> SensorErrors:
+        """The constant errors of all sensors, read-only."""
+        return self._sensors.errors
 
     def step(self, pwm: Sequence[float]) -> list[SensorSample]:
         """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.

@@ -9,7 +9,10 @@ from module_agent.catalogue import ModuleType
 from module_agent.hardware import SensorSample
 from sim.module_clock import ModuleClock, draw_clock, module_time
 from sim.noise_profile import NoiseProfile
-from sim.physics.sensor_noise import SensorNoise, generator
+from sim.physics.imu_sensor import Imus
+from sim.physics.joint_sensor import JointSensors
+from sim.physics.sensor_errors import SensorErrors, draw_sensor_errors
+from sim.physics.sensor_noise import generator
 from sim.pose import Array
 
 
@@ -38,6 +41,8 @@ class Sensors:
     """The sensors and clocks of n modules under one profile.
 
     The IMU is read every `imu_ticks` ticks; in between its last values are repeated with their own time.
+    Sampling jitter moves a reading off its stamp, to first order and never the stamp itself, so the stamps of
+    successive ticks stay a tick of the module's clock apart.
     """
 
     def __init__(
@@ -52,39 +57,35 @@ class Sensors:
         self.clocks: tuple[ModuleClock, ...] = tuple(
             draw_clock(generator(seed, s, "clock"), profile) for s in serials
         )
+        self.errors: SensorErrors = draw_sensor_errors(seed, serials, types, profile)
         self._imu_ticks = imu_ticks
         self._gear = np.array([t.gear_ratio for t in types])
-        self._effort_limit = np.array([t.max_effort_nm for t in types])
-        self._spring = np.array([t.spring_nm_rad for t in types])
-        self._position_step = profile.position_step_rad
-        self._noise = SensorNoise(seed, serials, profile, 1.0 / (imu_ticks * tick_s))
+        self._joints = JointSensors(seed, serials, types, profile, self.errors, tick_s)
+        self._imus = Imus(seed, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
         self._imu_values = np.zeros((len(types), 6))
         self._imu_ns = [0] * len(types)
 
     @property
     def imu_bias(self) -> Array:
         """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
-        return self._noise.imu_bias
+        return self.errors.imu_bias
 
     def imu_due(self, tick: int) -> bool:
         """Whether `read` at this tick needs the IMU's truth of this instant."""
-        return tick % self._imu_ticks == 0
+        return self._imus.every_tick or tick % self._imu_ticks == 0
 
     def read(self, tick: int, truth: Instant) -> list[SensorSample]:
         """Return one sample per module. To be called once a tick, in order."""
         now = [module_time(clock, truth.t_ns) for clock in self.clocks]
         if self.imu_due(tick):
-            felt = np.hstack((truth.gyro_rad_s, truth.specific_force_m_s2))
-            self._imu_values = felt + self._noise.imu()
+            self._imus.feel(truth.gyro_rad_s, truth.specific_force_m_s2)
+        if tick % self._imu_ticks == 0:
+            self._imu_values = self._imus.read(truth.motor_rad_s)
             self._imu_ns = now
-        error, step = self._noise.joint(), self._position_step
-        effort = error[:, 1] * self._effort_limit + truth.elastic_nm
-        values = np.empty((len(effort), 14))
-        values[:, 0] = np.rint(truth.q_rad / step) * step if step else truth.q_rad
-        values[:, 1] = truth.qd_rad_s + error[:, 0]
-        values[:, 2] = effort
-        values[:, 3] = effort / -self._spring
-        values[:, 4] = self._gear * truth.motor_rad_s
+        joint = self._joints.read(truth.q_rad, truth.qd_rad_s, truth.motor_rad_s, truth.elastic_nm)
+        values = np.empty((len(joint), 14))
+        values[:, :5] = joint
+        values[:, 4] *= self._gear
         values[:, 5] = truth.current_a
         values[:, 6] = truth.winding_c
         values[:, 7] = truth.voltage_v

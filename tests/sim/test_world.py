@@ -6,8 +6,6 @@ import pytest
 
 from module_agent.hardware import Hardware, HardwareLost, SensorSample
 from sim.module_clock import module_time
-from sim.noise_profile import noise_profile
-from sim.physics.sensor_noise import SensorNoise, generator
 from sim.robot_file import Robot, load_robot, parse_robot
 from sim.robot_tree import true_chain
 from sim.world import InProcessHardware, World
@@ -47,15 +45,6 @@ def test_two_worlds_side_by_side_do_not_feel_each_other() -> None:
         two.step([0.5] * 6)
     two.close()
     assert mixed == alone
-
-
-def test_an_added_module_does_not_change_the_draws_of_the_others() -> None:
-    profile = noise_profile("x5")
-    few, many = (SensorNoise(3, s, profile, 250.0) for s in (("a", "b"), ("new", "a", "b")))
-    for _ in range(600):
-        np.testing.assert_array_equal(few.imu(), many.imu()[1:])
-        np.testing.assert_array_equal(few.joint(), many.joint()[1:])
-    assert generator(3, "a", "clock").random() != generator(3, "b", "clock").random()
 
 
 def test_the_imu_is_read_every_fourth_tick_at_the_instant_of_the_position() -> None:
@@ -150,53 +139,6 @@ def test_ideal_sensors_read_the_true_state() -> None:
     # The spring's own loss (1 ms of its rate) is transmitted but not read: below 0.1 Nm here.
     np.testing.assert_allclose([s.effort_nm for s in samples], plant.spring_torque_nm, atol=0.1)
     np.testing.assert_allclose([s.deflection_rad for s in samples], plant.q_rad - plant.motor_rad, atol=1e-12)
-
-
-@pytest.fixture(scope="module")
-def rest() -> tuple[World, np.ndarray]:
-    """Four seconds of samples of an arm without gravity torque, motors off; and its world."""
-    world = World(load_robot("thesis_484_horizontal"), seed=11)
-    return world, np.array([world.step([0.0, 0.0]) for _ in range(4000)])
-
-
-def test_noise_at_rest_has_the_size_of_the_profile(rest: tuple[World, np.ndarray]) -> None:
-    world, samples = rest
-    profile = noise_profile("x5")
-    imu = samples[::4, :, -6:]
-    # 1000 IMU readings: one sigma of a sample deviation is 2.2 %, so 10 % is more than four.
-    np.testing.assert_allclose(imu[..., :3].std(axis=0), profile.gyro_white_rad_s, rtol=0.10)
-    np.testing.assert_allclose(imu[..., 3:].std(axis=0), profile.accel_white_m_s2, rtol=0.10)
-    expected = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.81], (2, 1)) + world.imu_bias
-    np.testing.assert_allclose(imu.mean(axis=0), expected, atol=5 * 0.023 / math.sqrt(1000))
-    fields = SensorSample._fields
-    velocity = samples[..., fields.index("velocity_rad_s")]
-    np.testing.assert_allclose(velocity.std(axis=0), profile.velocity_white_rad_s, rtol=0.06)
-    effort = samples[..., fields.index("effort_nm")]
-    np.testing.assert_allclose(effort.std(axis=0), 0.002 * 13.0, rtol=0.06)
-
-
-def test_biases_are_drawn_with_the_size_of_the_profile() -> None:
-    serials = [f"m{i}" for i in range(400)]
-    bias = SensorNoise(1, serials, noise_profile("x5"), 250.0).imu_bias
-    # 1200 draws each: one sigma of the deviation is 2 %.
-    assert bias[:, :3].std() == pytest.approx(0.020, rel=0.08)
-    assert bias[:, 3:].std() == pytest.approx(0.020, rel=0.08)
-
-
-def test_positions_are_whole_encoder_counts() -> None:
-    world = World(load_robot(IDEAL_ARM), seed=1)
-    counts = np.array([s.position_rad for samples in _waving(world, 100) for s in samples]) / (
-        2 * math.pi / 65536
-    )
-    np.testing.assert_allclose(counts, np.rint(counts), atol=1e-9)
-    assert abs(counts[-1]) > 10
-
-
-def test_deflection_is_the_reading_of_the_effort_over_the_stiffness() -> None:
-    world = World(load_robot(IDEAL_ARM), seed=1)
-    for samples in _waving(world, 20):
-        for sample, stiffness in zip(samples, (100.0, 150.0, 100.0), strict=True):
-            assert sample.effort_nm == pytest.approx(-stiffness * sample.deflection_rad, rel=1e-12)
 
 
 def test_a_positive_effort_pushes_the_load_towards_positive_positions() -> None:
