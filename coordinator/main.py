@@ -28,7 +28,8 @@ from module_agent.catalogue import UnknownModuleType
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.injected_network import inject
 from module_agent.wire.keys import check_chunk
-from module_agent.wire.network_profile import PROFILES, profile
+from module_agent.wire.network_file import network as network_named
+from module_agent.wire.network_profile import PROFILES, NetworkProfile
 from module_agent.wire.transport import EndpointInUse, Transport, TransportError
 from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
 
@@ -48,7 +49,7 @@ Connect = Annotated[
     list[str] | None,
     typer.Option(help="Zenoh router to connect to, instead of listening; repeat for several."),
 ]
-Network = Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}.")]
+Network = Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}, or a TOML file.")]
 Expect = Annotated[int | None, typer.Option(min=1, help="Wait for this many modules, no more and no fewer.")]
 
 Enough = Annotated[
@@ -61,7 +62,7 @@ class _Place(NamedTuple):
 
     listen: str
     connect: tuple[str, ...]
-    network: str = "none"
+    network: NetworkProfile = PROFILES["none"]
     seed: int = 0
 
 
@@ -75,24 +76,19 @@ def _fail(text: object, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
-def _words(error: Exception) -> object:
-    # A KeyError shows its message in quotes.
-    return error.args[0] if isinstance(error, KeyError) and error.args else error
-
-
 def _join(place: _Place, terminal: Terminal) -> _Joined:
     if place.connect:
         routers = ZenohConfig(mode="client", connect=place.connect, connect_timeout_s=JOIN_TIMEOUT_S)
-        return _Joined(inject(open_zenoh(routers), place.network, place.seed), False)
+        return _Joined(inject(open_zenoh(routers), place.network, place.seed, "coordinator"), False)
     try:
         hub = open_zenoh(ZenohConfig.hub(place.listen))
-        return _Joined(inject(hub, place.network, place.seed), True)
+        return _Joined(inject(hub, place.network, place.seed, "coordinator"), True)
     except EndpointInUse:
         # By another coordinator, or a router: join it as a client.
         joining = ZenohConfig(mode="client", connect=(place.listen,), connect_timeout_s=JOIN_TIMEOUT_S)
         transport = open_zenoh(joining)
         terminal.note(f"{place.listen} is in use: joined the hub there")
-        return _Joined(inject(transport, place.network, place.seed), False)
+        return _Joined(inject(transport, place.network, place.seed, "coordinator"), False)
 
 
 def _sender() -> str:
@@ -138,9 +134,9 @@ def run(
         shown = viewer_choice(viewer)
         check_chunk("robot", robot)
         check_speed(speed)
-        profile(network)
-    except (ValueError, KeyError) as error:
-        _fail(_words(error), EXIT_USAGE)
+        injected = network_named(network)
+    except ValueError as error:
+        _fail(error, EXIT_USAGE)
     config = RunConfig(
         robot=robot,
         out=out,
@@ -154,7 +150,7 @@ def run(
     )
     advice = f"to go on: {resuming(context)}" if advise else ""
     with Terminal(quiet) as terminal:
-        result = _run(config, _Place(listen, tuple(connect or ()), network, seed), speed, terminal, advice)
+        result = _run(config, _Place(listen, tuple(connect or ()), injected, seed), speed, terminal, advice)
     _print(result, terminal)
     terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
 

@@ -19,7 +19,8 @@ from module_agent.wire.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.injected_network import inject
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.messages import ExpiryAction
-from module_agent.wire.network_profile import PROFILES, profile
+from module_agent.wire.network_file import network as network_named
+from module_agent.wire.network_profile import PROFILES, NetworkProfile
 from module_agent.wire.transport import NoHub, Transport, TransportError
 from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.worker import ThreadWorker
@@ -60,7 +61,7 @@ def _config(
     )
 
 
-def _transport(connect: list[str], listen: list[str], network: str, seed: int) -> Transport:
+def _transport(connect: list[str], listen: list[str], network: NetworkProfile, seed: int) -> Transport:
     """Open the session, waiting for the hub as long as it takes; a signal ends the waiting.
 
     Raises:
@@ -78,7 +79,7 @@ def _transport(connect: list[str], listen: list[str], network: str, seed: int) -
             if not said:
                 said = True
                 typer.echo(f"x5-agent: waiting for the network: {error}", err=True)
-    return inject(transport, network, seed)
+    return inject(transport, network, seed, "module")
 
 
 @app.command()
@@ -91,7 +92,9 @@ def main(
         typer.Option(help=f"Zenoh endpoint of the coordinator or a router [{DEFAULT_ENDPOINT}]."),
     ] = None,
     listen: Annotated[list[str] | None, typer.Option(help="Zenoh endpoint to listen on.")] = None,
-    network: Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}.")] = "none",
+    network: Annotated[
+        str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}, or a TOML file.")
+    ] = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0,
     feedback_rate: Annotated[
         float, typer.Option(min=1.0, max=1000.0, help="Feedback rows per second.")
@@ -108,11 +111,11 @@ def main(
     with ExitStack() as opened:
         try:
             check_chunk("robot", robot)
-            profile(network)
+            injected = network_named(network)
             if expiry not in ("motor_off", "hold", "damping"):
                 raise ValueError(f"--expiry {expiry}: it must be motor_off, hold or damping")
             action: ExpiryAction = expiry  # type: ignore[assignment]
-            transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], network, seed)
+            transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], injected, seed)
             opened.callback(transport.close)
             # The world waits for whoever is on its bus, so the bus comes last.
             hardware = BusClient(bus, serial)

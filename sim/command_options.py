@@ -10,6 +10,7 @@ from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.run_folder import RunFolderError, check_free
 from coordinator.scaled_loop import check_speed
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from module_agent.wire.network_file import network as network_named
 from module_agent.wire.network_profile import PROFILES
 from sim.noise_choice import NoiseChoice
 from sim.noise_profile import NOISE_PROFILES
@@ -22,7 +23,9 @@ With = Annotated[
     list[str] | None, typer.Option("--with", help="Switch an effect on; repeat. `x5-sim effects` lists them.")
 ]
 Without = Annotated[list[str] | None, typer.Option("--without", help="Switch an effect off; repeat.")]
-Network = Annotated[str | None, typer.Option(help=f"Network profile: {', '.join(PROFILES)} [the robot's].")]
+Network = Annotated[
+    str | None, typer.Option(help=f"Network: {', '.join(PROFILES)}, or a TOML file [the robot's].")
+]
 Speed = Annotated[float, typer.Option(help="Times real time; slower helps a busy machine.")]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
 Dynamics = Annotated[
@@ -51,9 +54,9 @@ def load(name: str) -> Robot:
 
 def check(network: str | None = None, speed: float = 1.0, endpoint: str = DEFAULT_ENDPOINT) -> None:
     """Refuse what cannot work before anything is started."""
-    if network is not None and network not in PROFILES:
-        fail(f"--network {network}: known are {', '.join(PROFILES)}", EXIT_USAGE)
     try:
+        if network is not None:
+            network_named(network)
         check_speed(speed)
         check_endpoint(endpoint)
     except ValueError as error:

@@ -16,17 +16,18 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
 
 from module_agent.catalogue import module_type
+from module_agent.toml_lines import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
-from module_agent.wire.network_profile import profile
+from module_agent.wire.network_file import network, network_beside
 from sim.noise_profile import noise_profile
 from sim.parts import Angle, Part
 from sim.pose import Array, pose
-from sim.toml_lines import Location, line_of, syntax_error_line
 
 ROBOTS = Path(__file__).parent / "robots"
 BASE = "base"
@@ -103,7 +104,10 @@ class Module(_Strict):
 
 
 class Robot(_Strict):
-    """A robot as its file describes it; `modules` is ordered depth first, so parents precede children."""
+    """A robot as its file describes it; `modules` is ordered depth first, so parents precede children.
+
+    `network` is a profile's name, or the path of a network file, in the robot's file from its own folder.
+    """
 
     name: str
     network: str = "none"
@@ -118,8 +122,10 @@ class Robot(_Strict):
 
     @field_validator("network")
     @classmethod
-    def _known_network(cls, name: str) -> str:
-        return _known(name, profile)
+    def _known_network(cls, name: str, info: ValidationInfo) -> str:
+        found = network_beside(name, (info.context or {}).get("folder", Path()))
+        network(found)
+        return found
 
     @field_validator("noise")
     @classmethod
@@ -181,7 +187,7 @@ def parse_robot(text: str, name: str) -> Robot:
         line, reason = syntax_error_line(error, text)
         raise RobotFileError(f"{name}:{line}: not TOML: {reason}") from error
     try:
-        robot = Robot.model_validate(data)
+        robot = Robot.model_validate(data, context={"folder": Path(name).parent})
     except ValidationError as error:
         faults = [_Fault(tuple(e["loc"]), _reason(dict(e))) for e in error.errors(include_url=False)]
         raise _error(name, text, faults) from error

@@ -174,6 +174,11 @@ class LoopScheduler:
     def __init__(self, loop: asyncio.AbstractEventLoop):
         self._loop = loop
 
+    @property
+    def now_s(self) -> float:
+        """The loop's time [s]."""
+        return self._loop.time()
+
     def call_later(self, delay_s: float, call: Callable[[], None]) -> None:
         """Call `call` after `delay_s` on the loop."""
         if isinstance(self._loop, VirtualLoop):

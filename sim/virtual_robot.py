@@ -82,7 +82,13 @@ class VirtualRobot:
     def endpoint(self, name: str) -> Transport:
         """Return a transport of the virtual network, impaired as the profile says."""
         rng = np.random.default_rng(self._network_seeds.spawn(1)[0])
-        return ImpairedTransport(self.network.endpoint(name), self._profile, rng, LoopScheduler(self.loop))
+        return ImpairedTransport(
+            self.network.endpoint(name),
+            self._profile,
+            rng,
+            LoopScheduler(self.loop),
+            receiver="module" if any(name == m.serial for m in self.world.modules) else "coordinator",
+        )
 
     def start(self) -> None:
         """Begin to tick."""

@@ -10,7 +10,7 @@ from coordinator.plan import Plan
 from coordinator.result import Result
 from coordinator.run import Run, RunConfig
 from coordinator.viewer_feed import Screen
-from module_agent.wire.network_profile import profile
+from module_agent.wire.network_file import network
 from sim.noise_profile import NoiseProfile
 from sim.robot_file import Robot
 from sim.truth import write_truth
@@ -46,7 +46,7 @@ def run_virtual(
     """
     loop = VirtualLoop()
     settings = VirtualSettings(
-        config.robot, profile(config.network), config.seed, config.noise, config.feedback_rate_hz
+        config.robot, network(config.network), config.seed, config.noise, config.feedback_rate_hz
     )
     robot = VirtualRobot(settings, loop)
     try:

@@ -168,7 +168,13 @@ class Rig:
 
     def endpoint(self, name: str) -> Transport:
         rng = np.random.default_rng(self._seeds.spawn(1)[0])
-        return ImpairedTransport(self.network.endpoint(name), self._profile, rng, LoopScheduler(self.loop))
+        return ImpairedTransport(
+            self.network.endpoint(name),
+            self._profile,
+            rng,
+            LoopScheduler(self.loop),
+            receiver="module" if name.startswith("agent-") else "coordinator",
+        )
 
     def _tick(self, next_s: float) -> None:
         if not self._ticking:

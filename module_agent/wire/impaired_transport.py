@@ -1,20 +1,23 @@
-"""A transport whose network misbehaves: latency, jitter, loss, reordering and duplication around any other.
+"""A transport whose network misbehaves, around any other: late, lost, stalled, cut off, out of order, twice.
 
 Every message crosses exactly one wrapper, that of the endpoint that receives it: samples, requests, and the
-replies to this endpoint's queries. What this endpoint sends goes out untouched.
+replies to this endpoint's queries. What this endpoint sends goes out untouched, unless it is cut off.
 """
 
 import threading
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.wire.network_profile import NetworkProfile
+from module_agent.wire.channel import Channel
+from module_agent.wire.network_profile import NetworkProfile, Receiver
+from module_agent.wire.ordered_flow import OrderedFlow
+from module_agent.wire.parted_tokens import OwnToken, WatchedTokens
 from module_agent.wire.query_errors import CLOSED, TIMEOUT
 from module_agent.wire.scheduler import Scheduler
 from module_agent.wire.transport import (
+    LEASE_S,
     Event,
     Liveness,
     Reply,
@@ -29,56 +32,23 @@ from module_agent.wire.transport import (
 # A lost request stays referenced this long: a transport may tell the asker at once that nobody answers when
 # the request is garbage collected, and the loss would not look like one. Longer than any time-out in use.
 _LOST_REQUEST_S = 30.0
-_BLOCK = 256
 
 
 class DropCounts(NamedTuple):
-    """What an endpoint lost so far, by kind."""
+    """What an endpoint lost so far, by kind; `sent` is what it tried to send while it was cut off."""
 
     samples: int
     requests: int
     replies: int
-
-
-class _Fate(NamedTuple):
-    """What happens to one message; `copy_delay_s` is that of its duplicate, None without one."""
-
-    lost: bool
-    reordered: bool
-    delay_s: float
-    copy_delay_s: float | None
-
-
-class _Flow:
-    """Messages of one key in order: each waits for its own time and for those before it, as on a TCP link."""
-
-    def __init__(self) -> None:
-        self._queue: deque[list[object]] = deque()
-
-    def enter(self) -> list[object]:
-        entry: list[object] = [None]
-        self._queue.append(entry)
-        return entry
-
-    def ripen(self, entry: list[object], deliver: Callable[[], None]) -> list[Callable[[], None]]:
-        """Mark an entry's time as come; return what may be delivered now, in order."""
-        entry[0] = deliver
-        ready: list[Callable[[], None]] = []
-        while self._queue and callable(first := self._queue[0][0]):
-            self._queue.popleft()
-            ready.append(first)
-        return ready
-
-    @property
-    def empty(self) -> bool:
-        return not self._queue
+    sent: int
 
 
 class _Declaration:
     """A declaration of the inner transport; events still on their way end with it."""
 
-    def __init__(self, sink: Sink):
+    def __init__(self, sink: Sink, forget: Callable[["_Declaration"], None] = lambda declaration: None):
         self._sink: Sink | None = sink
+        self._forget = forget
         self._inner: Undeclare | None = None
 
     def hold(self, inner: Undeclare) -> "_Declaration":
@@ -92,6 +62,7 @@ class _Declaration:
 
     def undeclare(self) -> None:
         self._sink = None
+        self._forget(self)
         inner, self._inner = self._inner, None
         if inner is not None:
             inner.undeclare()
@@ -120,57 +91,79 @@ class _Question:
 class _Once:
     """The reply function of a request that may arrive twice: only the first answer goes out."""
 
-    def __init__(self, reply: Callable[[bytes], None]):
+    def __init__(
+        self, reply: Callable[[bytes], None], send: Callable[[Callable[[bytes], None], bytes], None]
+    ):
         self._reply: Callable[[bytes], None] | None = reply
+        self._send = send
         self._lock = threading.Lock()
 
     def __call__(self, payload: bytes) -> None:
         with self._lock:
             reply, self._reply = self._reply, None
         if reply is not None:
-            reply(payload)
+            self._send(reply, payload)
 
 
 class ImpairedTransport:
-    """Wraps a transport and impairs what its endpoint receives, as `profile` says.
+    """Wraps a transport and impairs what its endpoint receives, as the profile's way to it says.
 
-    Order is kept per key and kind of message but for the fraction `reorder`. Lost requests and replies end as
-    a `Reply` with error "Timeout" when the query's time is up. A reply is never duplicated, and a duplicated
-    request is answered once. Liveliness is delayed, in order, never lost; so are errors of queries, which no
-    message carries, delivered as they come. The profile `none`, or any without delay, loss and duplicates,
-    passes everything straight through.
+    Order is kept per key and kind of message but for the fraction `reorder`. A stall holds up all messages of
+    the endpoint together. Lost requests and replies end as a `Reply` with error "Timeout" when the query's
+    time is up. A reply is never duplicated, and a duplicated request is answered once. Liveliness is delayed,
+    in order, never lost; so are errors of queries, which no message carries, delivered as they come. A
+    perfect way delivers from inside the call of the inner transport.
+
+    Partition: at the profile's times, or from `partition` to `heal`, the endpoint is cut off: what it sends
+    and what comes for it is lost, but what is under way to it already arrives. Liveliness then goes as with
+    a session of which nothing is heard: changes are told at the end; if the partition lasts longer than the
+    lease (`LEASE_S`), both sides see the other's tokens vanish after it, and appear again at the end.
 
     Thread-safe; the scheduler must run its calls one at a time.
     """
 
     def __init__(
-        self, inner: Transport, profile: NetworkProfile, rng: np.random.Generator, scheduler: Scheduler
+        self,
+        inner: Transport,
+        profile: NetworkProfile,
+        rng: np.random.Generator,
+        scheduler: Scheduler,
+        *,
+        receiver: Receiver,
     ):
+        path = profile.path(receiver)
         self._inner = inner
-        self._profile = profile
         self._scheduler = scheduler
-        self._fates = _fates(profile, rng)
-        self._passes = not (profile.delay_ms or profile.jitter_ms or profile.loss or profile.duplicate)
+        self._start_s = scheduler.now_s
+        self._channel = None if path.is_perfect else Channel(path, rng)
         self._lock = threading.Lock()
         self._closed = False
-        self._flows: dict[tuple[str, str], _Flow] = {}
+        self._flows: dict[tuple[str, str], OrderedFlow] = {}
         self._questions: dict[_Question, None] = {}
-        self._dropped = {"sample": 0, "request": 0, "reply": 0}
+        self._dropped = {"sample": 0, "request": 0, "reply": 0, "sent": 0}
+        # Guards what follows; taken before the other, never after it.
+        self._parting = threading.Lock()
+        self._parted = False
+        self._partition = 0
+        self._own_tokens: dict[OwnToken, None] = {}
+        self._watched: dict[_Declaration, WatchedTokens] = {}
+        for start_s, end_s in profile.partitions:
+            scheduler.call_later(start_s, self.partition)
+            scheduler.call_later(end_s, self.heal)
 
     @property
     def drops(self) -> DropCounts:
         """What was lost so far at this endpoint."""
         with self._lock:
-            return DropCounts(self._dropped["sample"], self._dropped["request"], self._dropped["reply"])
+            return DropCounts(*self._dropped.values())
 
     def publish(self, key: str, payload: bytes) -> None:
-        """Send to all subscribers, untouched."""
-        self._inner.publish(key, payload)
+        """Send to all subscribers; untouched, unless cut off."""
+        if not self._is_cut_off():
+            self._inner.publish(key, payload)
 
     def subscribe(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver samples late, not at all, out of order or twice."""
-        if self._passes:
-            return self._inner.subscribe(key_expr, sink)
         declaration = _Declaration(sink)
 
         def on_sample(event: Event) -> None:
@@ -180,32 +173,28 @@ class ImpairedTransport:
         return declaration.hold(self._inner.subscribe(key_expr, on_sample))
 
     def serve(self, key_expr: str, sink: Sink) -> Undeclare:
-        """Deliver requests late, not at all, out of order or twice; the answers go out untouched."""
-        if self._passes:
-            return self._inner.serve(key_expr, sink)
+        """Deliver requests late, not at all, out of order or twice; answers go out unless cut off."""
         declaration = _Declaration(sink)
 
         def on_request(event: Event) -> None:
             assert isinstance(event, Request)
-            request = event._replace(reply=_Once(event.reply))
+            request = event._replace(reply=_Once(event.reply, self._answer))
             arrives = self._impair("request", event.key, lambda: declaration.deliver(request))
             if not arrives:
-                self._scheduler.call_later(_LOST_REQUEST_S, lambda: _let_go(event))
+                self._scheduler.call_later(_LOST_REQUEST_S, lambda: _let_go(event.reply))
 
         return declaration.hold(self._inner.serve(key_expr, on_request))
 
     def query(self, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
         """Ask; the answer comes late or, if it is lost or too late, as the error "Timeout"."""
-        if self._passes:
-            self._inner.query(key, payload, timeout_s, sink, tag)
-            return
         question = _Question(tag, key, sink)
         with self._lock:
             if self._closed:
                 raise TransportError(f"cannot query {key}: {CLOSED}")
             self._questions[question] = None
         try:
-            self._inner.query(key, payload, timeout_s, lambda event: self._on_reply(question, event), tag)
+            if not self._is_cut_off():
+                self._inner.query(key, payload, timeout_s, lambda event: self._on_reply(question, event), tag)
         except TransportError:
             self._forget(question)
             # Closing meanwhile has answered it.
@@ -214,19 +203,31 @@ class ImpairedTransport:
         self._scheduler.call_later(timeout_s, lambda: self._finish(question, Reply(tag, key, None, TIMEOUT)))
 
     def declare_alive(self, key: str) -> Undeclare:
-        """Hold a liveliness token while this session lives."""
-        return self._inner.declare_alive(key)
+        """Hold a liveliness token while this session lives; the others see it unless cut off for long."""
+        with self._parting:
+            token = OwnToken(lambda: self._inner.declare_alive(key), self._forget_token)
+            self._own_tokens[token] = None
+            visible = not self._parted or self._closed
+        if visible:
+            token.show()
+        return token
 
     def watch_alive(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver changes of matching tokens late, in order, never lost."""
-        if self._passes:
-            return self._inner.watch_alive(key_expr, sink)
-        declaration = _Declaration(sink)
+        declaration = _Declaration(sink, self._forget_watch)
+
+        def tell(event: Liveness) -> None:
+            self._delay("liveness", event.key, lambda: declaration.deliver(event))
+
+        watched = WatchedTokens(tell)
 
         def on_liveness(event: Event) -> None:
             assert isinstance(event, Liveness)
-            self._delay("liveness", event.key, lambda: declaration.deliver(event))
+            with self._parting:
+                watched.hear(event, self._parted)
 
+        with self._parting:
+            self._watched[declaration] = watched
         return declaration.hold(self._inner.watch_alive(key_expr, on_liveness))
 
     def close(self) -> None:
@@ -240,6 +241,66 @@ class ImpairedTransport:
         self._inner.close()
         for question in questions:
             question.finish(Reply(question.tag, question.key, None, CLOSED))
+
+    # ------------------------------------------------------------------ partition
+
+    def partition(self) -> None:
+        """Cut this endpoint off until `heal`; nothing happens if it is cut off already."""
+        with self._parting:
+            if self._parted:
+                return
+            self._parted = True
+            self._partition += 1
+            number = self._partition
+        self._scheduler.call_later(LEASE_S, lambda: self._lapse(number))
+
+    def heal(self) -> None:
+        """End the partition, whoever began it."""
+        with self._parting:
+            if not self._parted:
+                return
+            self._parted = False
+            for watched in self._watched.values():
+                watched.heal()
+            tokens = list(self._own_tokens)
+        if self._closed:
+            return
+        for token in tokens:
+            token.show()
+
+    def _lapse(self, number: int) -> None:
+        with self._parting:
+            if not self._parted or self._partition != number or self._closed:
+                return
+            for watched in self._watched.values():
+                watched.lapse()
+            tokens = list(self._own_tokens)
+        for token in tokens:
+            token.hide()
+
+    def _is_cut_off(self) -> bool:
+        """Return whether what is to be sent is lost, and count it."""
+        if not self._parted or self._closed:
+            return False
+        with self._lock:
+            self._dropped["sent"] += 1
+        return True
+
+    def _answer(self, reply: Callable[[bytes], None], payload: bytes) -> None:
+        if self._is_cut_off():
+            self._scheduler.call_later(_LOST_REQUEST_S, lambda: _let_go(reply))
+        else:
+            reply(payload)
+
+    def _forget_token(self, token: OwnToken) -> None:
+        with self._parting:
+            self._own_tokens.pop(token, None)
+
+    def _forget_watch(self, declaration: _Declaration) -> None:
+        with self._parting:
+            self._watched.pop(declaration, None)
+
+    # ------------------------------------------------------------------ what comes in
 
     def _on_reply(self, question: _Question, event: Event) -> None:
         assert isinstance(event, Reply)
@@ -260,27 +321,47 @@ class ImpairedTransport:
         with self._lock:
             if self._closed:
                 return
-            delay_s = next(self._fates).delay_s
-            call = self._enter(kind, key, deliver)
-        self._scheduler.call_later(delay_s, call)
+            channel = self._channel
+            if channel is not None:
+                delay_s = channel.fate(self._scheduler.now_s - self._start_s).delay_s
+                deliver = self._enter(kind, key, deliver)
+        if channel is None:
+            deliver()
+        else:
+            self._scheduler.call_later(delay_s, deliver)
 
     def _impair(self, kind: str, key: str, deliver: Callable[[], None]) -> bool:
         """Deliver as fate has it; return False when the message is lost."""
         with self._lock:
             if self._closed:
                 return False
-            fate = next(self._fates)
-            if fate.lost:
+            if self._parted:
                 self._dropped[kind] += 1
                 return False
-            # The copy has its place in the queue right behind the original, as order goes but for `reorder`.
-            route = self._past_queue if fate.reordered else self._enter
-            calls = [(fate.delay_s, route(kind, key, deliver))]
-            if fate.copy_delay_s is not None and kind != "reply":
-                calls.append((fate.copy_delay_s, route(kind, key, deliver)))
+            calls = self._calls(kind, key, deliver)
+        if calls is None:
+            deliver()
+            return True
         for delay_s, call in calls:
             self._scheduler.call_later(delay_s, call)
-        return True
+        return bool(calls)
+
+    def _calls(
+        self, kind: str, key: str, deliver: Callable[[], None]
+    ) -> list[tuple[float, Callable[[], None]]] | None:
+        """Return what to call when for a message; nothing if it is lost, None if the way is perfect."""
+        if self._channel is None:
+            return None
+        fate = self._channel.fate(self._scheduler.now_s - self._start_s)
+        if fate.lost:
+            self._dropped[kind] += 1
+            return []
+        # The copy has its place in the queue right behind the original, as order goes but for `reorder`.
+        route = self._past_queue if fate.reordered else self._enter
+        calls = [(fate.delay_s, route(kind, key, deliver))]
+        if fate.copy_delay_s is not None and kind != "reply":
+            calls.append((fate.copy_delay_s, route(kind, key, deliver)))
+        return calls
 
     def _past_queue(self, kind: str, key: str, deliver: Callable[[], None]) -> Callable[[], None]:
         def call() -> None:
@@ -291,7 +372,7 @@ class ImpairedTransport:
 
     def _enter(self, kind: str, key: str, deliver: Callable[[], None]) -> Callable[[], None]:
         """Queue behind the earlier messages of this key; return what is to be called at its own time."""
-        flow = self._flows.setdefault((kind, key), _Flow())
+        flow = self._flows.setdefault((kind, key), OrderedFlow())
         entry = flow.enter()
 
         def call() -> None:
@@ -299,7 +380,7 @@ class ImpairedTransport:
                 if self._closed:
                     return
                 ready = flow.ripen(entry, deliver)
-                if flow.empty and self._flows.get((kind, key)) is flow:
+                if flow.is_empty and self._flows.get((kind, key)) is flow:
                     del self._flows[kind, key]
             for each in ready:
                 each()
@@ -307,21 +388,5 @@ class ImpairedTransport:
         return call
 
 
-def _let_go(request: Request) -> None:
-    """Hold the last reference to a lost request until here."""
-
-
-def _fates(profile: NetworkProfile, rng: np.random.Generator) -> Iterator[_Fate]:
-    """Yield one fate per message. Drawn in blocks, as scalar draws cost several times more."""
-    scale_s = 1e-3 * profile.jitter_ms / profile.jitter_shape
-    while True:
-        chances = rng.random((_BLOCK, 3)).tolist()
-        jitter_s = scale_s * rng.standard_gamma(profile.jitter_shape, (_BLOCK, 2))
-        delays_s = (1e-3 * profile.delay_ms + jitter_s).tolist()
-        for (loss, reorder, duplicate), (delay_s, copy_delay_s) in zip(chances, delays_s, strict=True):
-            yield _Fate(
-                loss < profile.loss,
-                reorder < profile.reorder,
-                delay_s,
-                copy_delay_s if duplicate < profile.duplicate else None,
-            )
+def _let_go(reply: Callable[[bytes], None]) -> None:
+    """Hold the last reference to what would have answered a lost request until here."""

@@ -22,13 +22,18 @@ class TimerThread:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
+    @property
+    def now_s(self) -> float:
+        """The monotonic time [s]."""
+        return time.monotonic()
+
     def call_later(self, delay_s: float, call: Callable[[], None]) -> None:
         """Call `call` after `delay_s` on the timer's thread; nothing is called after `close`.
 
         Raises:
             RuntimeError: the thread has died of an exception in an earlier call.
         """
-        due_s = time.monotonic() + max(delay_s, 0.0)
+        due_s = self.now_s + max(delay_s, 0.0)
         with self._wake:
             if self._closed:
                 return
@@ -58,7 +63,7 @@ class TimerThread:
                 if not self._heap:
                     self._wake.wait()
                     continue
-                left_s = self._heap[0][0] - time.monotonic()
+                left_s = self._heap[0][0] - self.now_s
                 if left_s <= 0.0:
                     return heapq.heappop(self._heap)[2]
                 self._wake.wait(left_s)

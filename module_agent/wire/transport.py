@@ -8,6 +8,9 @@ never blocks for long and may drop; a query is answered by exactly one `Reply`. 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+# A session of which nothing is heard for so long is gone, for the others: its liveliness tokens vanish.
+LEASE_S = 1.0
+
 
 class Sample(NamedTuple):
     """Something published on a key."""

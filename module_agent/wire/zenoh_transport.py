@@ -27,6 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from module_agent.wire.query_errors import CLOSED, NO_ANSWER
 from module_agent.wire.transport import (
+    LEASE_S,
     EndpointInUse,
     Event,
     Liveness,
@@ -351,7 +352,7 @@ def _session_config(config: ZenohConfig) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "scouting/delay": 0,
-        "transport/link/tx/lease": 1000,
+        "transport/link/tx/lease": round(1000 * LEASE_S),
         "transport/link/tx/keep_alive": 4,
         # Closing waits for a handshake under way, such as one with a frozen hub: not for the default 10 s.
         "transport/unicast/open_timeout": 1000,

@@ -13,12 +13,13 @@ from module_agent.main import app
 from module_agent.wire.endpoint import check_endpoint
 from module_agent.wire.impaired_transport import ImpairedTransport
 from module_agent.wire.injected_network import inject
+from module_agent.wire.network_profile import NetworkProfile, PathProfile, profile
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--network", "pigeons"), "known are none, lan, lossy, wifi, bad"),
+        (("--network", "pigeons"), "known are none, lan, lossy, wifi, bad, asymmetric"),
         (("--robot", "a/b"), "robot 'a/b' cannot be part of a key"),
         (("--expiry", "later"), "it must be motor_off, hold or damping"),
         (("--seed", "-1"), "greater than or equal to 0"),
@@ -87,7 +88,13 @@ def test_no_network_is_injected_where_none_is_asked_for() -> None:
         """A transport that is not used."""
 
     transport = Nothing()
-    assert inject(transport, "none", 0) is transport  # type: ignore[arg-type]
-    assert isinstance(inject(transport, "wifi", 0), ImpairedTransport)  # type: ignore[arg-type]
-    with pytest.raises(KeyError, match="unknown network profile 'pigeons'"):
-        inject(transport, "pigeons", 0)  # type: ignore[arg-type]
+    assert inject(transport, profile("none"), 0, "module") is transport  # type: ignore[arg-type]
+    injected = inject(transport, profile("wifi"), 0, "module")  # type: ignore[arg-type]
+    assert isinstance(injected, ImpairedTransport)
+    only_parted = NetworkProfile(name="parted", partitions=((1.0, 2.0),))
+    injected = inject(transport, only_parted, 0, "module")  # type: ignore[arg-type]
+    assert isinstance(injected, ImpairedTransport)
+    one_way = NetworkProfile(name="one way", to_coordinator=PathProfile(delay_ms=1.0))
+    assert inject(transport, one_way, 0, "module") is transport  # type: ignore[arg-type]
+    injected = inject(transport, one_way, 0, "coordinator")  # type: ignore[arg-type]
+    assert isinstance(injected, ImpairedTransport)

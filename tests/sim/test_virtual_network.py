@@ -199,7 +199,13 @@ def trace_hash(seed: int) -> str:
     network = VirtualNetwork(loop, tap)
     rng = np.random.default_rng(seed)
     ends = {
-        name: ImpairedTransport(network.endpoint(name), profile("bad"), rng.spawn(1)[0], LoopScheduler(loop))
+        name: ImpairedTransport(
+            network.endpoint(name),
+            profile("bad"),
+            rng.spawn(1)[0],
+            LoopScheduler(loop),
+            receiver="module",
+        )
         for name in ("a", "b", "c")
     }
 

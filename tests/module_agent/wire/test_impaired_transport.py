@@ -78,7 +78,11 @@ class Bare:
 
 def make(found: NetworkProfile, seed: int = 0) -> tuple[ImpairedTransport, Bare, ManualTime]:
     inner, clock = Bare(), ManualTime()
-    return ImpairedTransport(inner, found, np.random.default_rng(seed), clock), inner, clock
+    return (
+        ImpairedTransport(inner, found, np.random.default_rng(seed), clock, receiver="module"),
+        inner,
+        clock,
+    )
 
 
 PROBABILITY = st.floats(0.0, 1.0)
@@ -274,13 +278,20 @@ def test_reordering_overtakes() -> None:
     assert numbers != sorted(numbers)
 
 
-def test_the_profile_none_touches_nothing() -> None:
+def test_over_a_perfect_network_everything_arrives_at_once() -> None:
     transport, inner, _ = make(profile("none"))
     got: list[Event] = []
     transport.subscribe("**", got.append)
-    assert inner.sinks["sample"] == got.append
+    transport.watch_alive("**", got.append)
+    transport.serve("**", lambda event: event.reply(b"yes"))
+    sample, liveness, answers = Sample("k", b"x"), Liveness("k", True), list[bytes]()
+    inner.sinks["sample"](sample)
+    inner.sinks["liveness"](liveness)
+    inner.sinks["request"](Request("k", b"", answers.append))
     transport.query("k", b"", 1.0, got.append, 3)
-    assert inner.asked == [(3, got.append)]
+    inner.asked[0][1](Reply(3, "k", b"there"))
+    assert got == [sample, liveness, Reply(3, "k", b"there")]
+    assert answers == [b"yes"]
 
 
 def test_what_the_endpoint_sends_goes_out_untouched() -> None:
@@ -317,7 +328,7 @@ def test_closing_answers_queries_once_and_later_ones_are_refused() -> None:
 def test_many_threads_lose_nothing_and_keep_their_order() -> None:
     timer = TimerThread()
     inner = Bare()
-    transport = ImpairedTransport(inner, profile("lan"), np.random.default_rng(0), timer)
+    transport = ImpairedTransport(inner, profile("lan"), np.random.default_rng(0), timer, receiver="module")
     got: list[Event] = []
     all_there = threading.Event()
 

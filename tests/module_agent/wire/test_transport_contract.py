@@ -89,7 +89,7 @@ def free_endpoint() -> str:
 
 
 def impaired(inner: Transport, scheduler: Scheduler, seed: int) -> Transport:
-    return ImpairedTransport(inner, profile("lan"), np.random.default_rng(seed), scheduler)
+    return ImpairedTransport(inner, profile("lan"), np.random.default_rng(seed), scheduler, receiver="module")
 
 
 @pytest.fixture(params=["zenoh", "zenoh-lan", "virtual", "virtual-lan"])
