@@ -26,7 +26,7 @@ from module_agent.toml_lines import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.network_file import network, network_beside
 from sim.noise_profile import noise_profile
-from sim.parts import Angle, Part
+from sim.parts import Angle, Moment, Part, Xyz, check_inertia
 from sim.pose import Array, pose
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -61,11 +61,77 @@ class _Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+Stiffness = Annotated[float, Field(ge=0.0, le=1e9)]
+Damping = Annotated[float, Field(ge=0.0, le=1e6)]
+Stiffnesses = tuple[Stiffness, Stiffness, Stiffness]
+Dampings = tuple[Damping, Damping, Damping]
+_RIGID = (0.0, 0.0, 0.0)
+_AXES = "xyz"
+
+
+def _check_springs(kind: str, stiffness: Stiffnesses, damping: Dampings) -> None:
+    for axis, k, c in zip(_AXES, stiffness, damping, strict=True):
+        if c > 0.0 and k == 0.0:
+            raise ValueError(
+                f"the {kind} {axis} has a damping of {c} but a stiffness of 0, which stands for rigid; "
+                "give it a stiffness or leave the damping out"
+            )
+
+
+class BaseCompliance(_Strict):
+    """How the base gives: springs and dampers in base axes, in up to six directions.
+
+    A stiffness of 0, or none, stands for a rigid direction. The rotations are about `pivot_m`, a point of the
+    base frame. `mass_kg`, `com_xyz_m` (base frame) and `inertia` (ixx, iyy, izz, ixy, ixz, iyz about that
+    centre, base axes) describe what shakes with the base beside the modules' own parts.
+    """
+
+    mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    com_xyz_m: Xyz = (0.0, 0.0, 0.0)
+    inertia: tuple[Moment, Moment, Moment, Moment, Moment, Moment] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    pivot_m: Xyz = (0.0, 0.0, 0.0)
+    stiffness_n_m: Stiffnesses = _RIGID
+    damping_n_s_m: Dampings = _RIGID
+    stiffness_nm_rad: Stiffnesses = _RIGID
+    damping_nm_s_rad: Dampings = _RIGID
+
+    @model_validator(mode="after")
+    def _springs_somewhere(self) -> "BaseCompliance":
+        if not any((*self.stiffness_n_m, *self.stiffness_nm_rad)):
+            raise ValueError(
+                "every direction is rigid; give a stiffness_n_m or stiffness_nm_rad, or leave compliance out"
+            )
+        _check_springs("translation along", self.stiffness_n_m, self.damping_n_s_m)
+        _check_springs("rotation about", self.stiffness_nm_rad, self.damping_nm_s_rad)
+        return self
+
+    @model_validator(mode="after")
+    def _possible_inertia(self) -> "BaseCompliance":
+        check_inertia(self.mass_kg, self.inertia)
+        return self
+
+
+class Flex(_Strict):
+    """How a link gives about its held end: springs and dampers about x, y, z of the parent's distal frame.
+
+    A stiffness of 0 stands for a rigid direction; with all three the link is rigid, tubes included.
+    """
+
+    stiffness_nm_rad: Stiffnesses
+    damping_nm_s_rad: Dampings = _RIGID
+
+    @model_validator(mode="after")
+    def _springs_damped(self) -> "Flex":
+        _check_springs("rotation about", self.stiffness_nm_rad, self.damping_nm_s_rad)
+        return self
+
+
 class Base(_Strict):
     """How the base frame stands in gravity: a named mount, or roll, pitch, yaw in a world with z up."""
 
     mount: MountName | None = None
     rpy_deg: tuple[Angle, Angle, Angle] | None = None
+    compliance: BaseCompliance | None = None
 
     @model_validator(mode="after")
     def _one_or_the_other(self) -> "Base":
@@ -81,7 +147,10 @@ class Base(_Strict):
 
 
 class Module(_Strict):
-    """One module and the link that holds it: a list of parts, from the parent on."""
+    """One module and the link that holds it: a list of parts, from the parent on.
+
+    Without `flex` tubes give by beam theory, and all else is rigid.
+    """
 
     serial: str
     type: str
@@ -89,6 +158,7 @@ class Module(_Strict):
     mounted: Literal["forward", "reversed"] = "forward"
     start_rad: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
     link: Annotated[tuple[Part, ...], BeforeValidator(_in_a_list)] = ()
+    flex: Flex | None = None
 
     @field_validator("serial")
     @classmethod

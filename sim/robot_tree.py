@@ -10,18 +10,30 @@ import numpy as np
 
 from coordinator.chain import Chain
 from module_agent.catalogue import ModuleType, module_type
-from sim.parts import placed
+from sim.parts import Hinge, placed
 from sim.pose import Array, inverse, pose, read_only
 from sim.rigid_body import RigidBody, joined, moved, negative, parameters, tensor
-from sim.robot_file import Robot
+from sim.robot_file import Module, Robot
 
 GRAVITY_M_S2 = 9.81
 
 _FLANGE_KG, _FLANGE_RADIUS_M, _FLANGE_HEIGHT_M = 0.030, 0.018, 0.006
 
 
+class Segment(NamedTuple):
+    """A stretch of a link that is rigid in itself, in the world at q = 0: its mass, and what it hangs on.
+
+    Without a hinge it is one with what holds it: the segment before it, or the parent's body.
+    """
+
+    body: RigidBody
+    hinge: Hinge | None
+
+
 class RobotTree(NamedTuple):
     """A tree of n bodies, parents before children; poses are in the world at q = 0.
+
+    The bodies, and all that refers to them, are those of the rigid robot; its links' segments tell the rest.
 
     types: the modules' catalogue entries.
     parent: index of the parent body, -1 for the fixed base.
@@ -31,6 +43,8 @@ class RobotTree(NamedTuple):
     housing: (n, 4, 4) the modules' housing frames. output: (n, 4, 4) their output frames.
     imu_body: the body that carries module i's IMU, -1 for the base. imu_pose: (n, 4, 4) its pose therein.
     way: for every module the corners of its link, (k, 3), from the parent's distal frame to its own.
+    moved: for every module what its joint alone turns (flange, or housing if reversed), in the world.
+    segments: for every module the segments of its link, its own held part in the last of them.
     """
 
     serials: tuple[str, ...]
@@ -46,6 +60,8 @@ class RobotTree(NamedTuple):
     imu_body: tuple[int, ...]
     imu_pose: Array
     way: tuple[Array, ...]
+    moved: tuple[RigidBody, ...]
+    segments: tuple[tuple[Segment, ...], ...]
 
 
 def flange(kind: ModuleType) -> RigidBody:
@@ -64,42 +80,76 @@ def housing(kind: ModuleType) -> RigidBody:
 
 def build_tree(robot: Robot) -> RobotTree:
     """Put a robot together at q = 0."""
-    parent = robot.parents
     housings: list[Array] = []
     outputs: list[Array] = []
-    ways: list[Array] = []
-    pieces: list[list[RigidBody]] = [[] for _ in robot.modules]
-    for i, module in enumerate(robot.modules):
-        p = parent[i]
+    links: list[_Link] = []
+    own: list[RigidBody] = []
+    for module, p in zip(robot.modules, robot.parents, strict=True):
         here = robot.base.world_pose
         if p >= 0:
             here = housings[p] if robot.modules[p].mounted == "reversed" else outputs[p]
-        way = [here[:3, 3]]
-        held = pieces[p] if p >= 0 else []
-        for part in map(placed, module.link):
-            held.append(moved(part.body, here))
-            here = here @ part.output
-            way.append(here[:3, 3])
+        link = _Link(here, module)
+        here = link.end
         kind = module_type(module.type)
         backwards = module.mounted == "reversed"
         across = pose(kind.output_xyz)
         housings.append(here @ inverse(across) if backwards else here)
         outputs.append(here if backwards else here @ across)
-        own = moved(housing(kind), housings[i]), moved(flange(kind), outputs[i])
-        held.append(own[1] if backwards else own[0])
-        pieces[i].append(own[0] if backwards else own[1])
-        ways.append(read_only(np.array(way)))
-    return _tree(robot, np.array(housings), np.array(outputs), pieces, tuple(ways))
+        both = moved(housing(kind), housings[-1]), moved(flange(kind), outputs[-1])
+        link.add(both[1] if backwards else both[0])
+        own.append(both[0] if backwards else both[1])
+        links.append(link)
+    return _tree(robot, np.array(housings), np.array(outputs), own, links)
+
+
+class _Link:
+    """A link in the making: where it ends so far, its corners, and its segments."""
+
+    def __init__(self, start: Array, module: Module):
+        self.end = start
+        self._way = [start[:3, 3]]
+        self._hinges: list[Hinge | None] = [None]
+        self._pieces: list[list[RigidBody]] = [[]]
+        if module.flex is not None:
+            stiffness, damping = module.flex.stiffness_nm_rad, module.flex.damping_nm_s_rad
+            self._hang(Hinge(start, np.array(stiffness), np.array(damping)))
+        for part in map(placed, module.link):
+            if module.flex is None and part.hinge is not None:
+                self._hang(part.hinge._replace(pose=self.end @ part.hinge.pose))
+            self.add(moved(part.body, self.end))
+            self.end = self.end @ part.output
+            self._way.append(self.end[:3, 3])
+
+    def _hang(self, hinge: Hinge) -> None:
+        if hinge.stiffness_nm_rad.any():
+            self._hinges.append(hinge)
+            self._pieces.append([])
+
+    def add(self, body: RigidBody) -> None:
+        self._pieces[-1].append(body)
+
+    @property
+    def way(self) -> Array:
+        return read_only(np.array(self._way))
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        return tuple(Segment(joined(p), h) for p, h in zip(self._pieces, self._hinges, strict=True))
 
 
 def _tree(
-    robot: Robot, housings: Array, outputs: Array, pieces: list[list[RigidBody]], ways: tuple[Array, ...]
+    robot: Robot, housings: Array, outputs: Array, own: list[RigidBody], links: list[_Link]
 ) -> RobotTree:
     parent = robot.parents
     backwards = tuple(m.mounted == "reversed" for m in robot.modules)
     types = tuple(module_type(m.type) for m in robot.modules)
     imu_body = tuple(i if back else p for i, (back, p) in enumerate(zip(backwards, parent, strict=True)))
     imu_home = np.array([h @ pose(kind.imu_xyz) for h, kind in zip(housings, types, strict=True)])
+    segments = tuple(link.segments for link in links)
+    pieces = [[body] for body in own]
+    for p, link in zip(parent, segments, strict=True):
+        if p >= 0:
+            pieces[p] += [segment.body for segment in link]
 
     def seen_from(body: int, transform: Array) -> Array:
         return transform if body < 0 else inverse(outputs[body]) @ transform
@@ -117,7 +167,9 @@ def _tree(
         output=read_only(outputs),
         imu_body=imu_body,
         imu_pose=read_only(np.array([seen_from(b, imu_home[i]) for i, b in enumerate(imu_body)])),
-        way=ways,
+        way=tuple(link.way for link in links),
+        moved=tuple(own),
+        segments=segments,
     )
 
 

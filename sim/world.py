@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,14 @@ from module_agent.hardware import HardwareLost, HardwareModule, SensorSample
 from sim.module_clock import ModuleClock
 from sim.noise_profile import NoiseProfile, noise_profile
 from sim.physics.actuator import Actuators
-from sim.physics.imu import ImuKinematics
+from sim.physics.equilibrium import equilibrium
 from sim.physics.multibody import Multibody
+from sim.physics.rigid_tree import RigidTree
 from sim.physics.sensor_errors import SensorErrors
 from sim.physics.sensors import Instant, Sensors
+from sim.physics.skeleton import build_skeleton
 from sim.physics.thermal import Windings
+from sim.physics.variation import draw_variation
 from sim.pose import Array, read_only
 from sim.robot_file import Robot
 from sim.robot_tree import build_tree
@@ -24,11 +28,12 @@ TICK_S = 1e-3
 
 
 class Plant(NamedTuple):
-    """The true state at the instant of the last samples, (n,) each, read-only.
+    """The true state of the modules' joints at the instant of the last samples, (n,) each, read-only.
 
     duty is what the bridges apply for `pwm`; motor positions and rates are seen at the output;
     spring_torque_nm is what the springs exert on the outputs. With q, qd and qdd it fulfils the equations of
     motion but for the integrator's error: velocity forces are half a tick old, 1e-3 Nm in brisk motion.
+    structure (p,) is how far the base and the links give: the positions [m, rad] of the passive joints.
     """
 
     t_ns: int
@@ -40,6 +45,7 @@ class Plant(NamedTuple):
     motor_rad: Array
     motor_rad_s: Array
     spring_torque_nm: Array
+    structure: Array
 
 
 class World:
@@ -49,8 +55,12 @@ class World:
     that instant on the module's clock, and so is `imu_t_ns` in the ticks in which the IMU is read. In between
     the last IMU values are repeated with their own time.
 
+    The world begins at rest, the modules' joints where the robot file has them and everything that gives
+    sagged under its weight.
+
     Raises:
-        ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number.
+        ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number, or the robot's base or links are
+            too soft to carry it.
         KeyError: unknown noise profile.
     """
 
@@ -63,19 +73,23 @@ class World:
         tree = build_tree(robot)
         imu_ticks = _whole_ticks(imu_rate_hz)
         self._sensors = Sensors(seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S)
-        self._imu = ImuKinematics(tree)
-        self._felt = (np.zeros((len(tree.serials), 3)), np.zeros((len(tree.serials), 3)))
-        self._windings = Windings(tree.types, TICK_S)
-        self._actuators = Actuators(tree.types, TICK_S)
-        self._body = Multibody(robot.name, tree, TICK_S)
+        self._skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
+        self._joints = np.array(self._skeleton.module)
+        self._passive = np.array(self._skeleton.passive, dtype=np.int64)
+        self._tree = RigidTree(self._skeleton)
+        self._windings = Windings(len(tree.types), TICK_S, self.profile.heat)
+        variation = draw_variation(seed, robot.serials, self.profile)
+        self._actuators = Actuators(tree.types, TICK_S, self.profile, variation, self._skeleton)
         self._tick = 0
-        self._q = robot.start_rad
+        self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
         self._qd = np.zeros_like(self._q)
+        self._actuators.reset(robot.start_rad, load)
+        self._compile()
+        self._body = Multibody(robot.name, self._skeleton, TICK_S)
         self._body.place(self._q)
-        self._actuators.reset(self._q, self._body.bias(self._q.tolist(), self._qd.tolist()))
-        zero = np.zeros_like(self._q)
-        motor = self._actuators.motor_rad
-        self._plant = (0, zero, zero, self._q, zero, zero, motor, zero, self._actuators.torque_nm)
+        zero = np.zeros_like(robot.start_rad)
+        q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.motor_rad
+        self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.torque_nm, structure)
         self.modules = tuple(
             HardwareModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
         )
@@ -115,20 +129,21 @@ class World:
         """
         u = self._checked(pwm)
         actuators, q, qd = self._actuators, self._q, self._qd
-        q_list = q.tolist()
-        motor, speed = actuators.motor_rad, actuators.motor_rad_s
-        torque = actuators.step(
-            u, q, qd, self._body.mass_matrix(q_list), self._body.bias(q_list, qd.tolist())
-        )
-        self._q, self._qd = self._body.step(torque.tolist())
+        motor = actuators.motor_rad
+        mass, bias = self._tree.mass_and_bias(q, qd)
+        force = actuators.step(u, q, qd, mass, bias, self._windings.resistance_factor)
+        self._q, self._qd = self._body.step(force.tolist())
         # The integrator is a leapfrog: its velocities live half a tick before its positions, so the velocity
         # at this instant is the mean of the two around it, and the acceleration is their difference.
         rate = (qd + self._qd) * 0.5
         change = (self._qd - qd) * (1.0 / TICK_S)
-        motor_rate = (speed + actuators.motor_rad_s) * 0.5
-        self._plant = (self.t_ns, u, actuators.duty, q, rate, change, motor, motor_rate, torque)
-        samples = self._samples(q, rate, change, motor_rate)
-        self._windings.step(actuators.current_a)
+        own = self._joints
+        self._plant = (
+            *(self.t_ns, u, actuators.duty, q[own], rate[own], change[own], motor),
+            *(actuators.motor_rate_rad_s, actuators.torque_nm, q[self._passive]),
+        )
+        samples = self._samples(q, rate, change)
+        self._windings.step(actuators.copper_w)
         self._tick += 1
         return samples
 
@@ -146,17 +161,27 @@ class World:
                 raise ValueError(f"PWM of module {module.serial} is {value}; it must be a number in [-1, 1]")
         return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
 
-    def _samples(self, q: Array, rate: Array, change: Array, motor_rate: Array) -> list[SensorSample]:
+    def _compile(self) -> None:
+        """Call what is compiled at its first call, which would take seconds out of a world in real time."""
+        still = np.zeros_like(self._q)
+        self._felt = self._tree.feel(self._q, still, still)
+        rehearsal = copy(self._actuators)
+        mass, bias = self._tree.mass_and_bias(self._q, still)
+        idle = np.zeros(len(self._joints))
+        rehearsal.step(idle, self._q, still, mass, bias, self._windings.resistance_factor)
+        copy(self._windings).step(rehearsal.copper_w)
+
+    def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:
         if self._sensors.imu_due(self._tick):
-            self._felt = self._imu.feel(q, rate, change)
+            self._felt = self._tree.feel(q, rate, change)
         actuators = self._actuators
         instant = Instant(
             t_ns=self.t_ns,
-            q_rad=q,
-            qd_rad_s=rate,
-            motor_rad_s=motor_rate,
+            q_rad=q[self._joints],
+            qd_rad_s=rate[self._joints],
+            motor_rad_s=actuators.motor_rate_rad_s,
             deflection_rad=actuators.deflection_rad,
-            elastic_nm=-actuators.spring_nm_rad * actuators.deflection_rad,
+            elastic_nm=actuators.elastic_nm,
             current_a=actuators.current_a,
             winding_c=self._windings.winding_c,
             voltage_v=actuators.voltage_v,

@@ -1,100 +1,205 @@
-"""Series elastic actuators: DC motor, lossy gear with friction, spring; vectorised over the modules.
+"""Series elastic actuators: DC motor, lossy gear with friction, gap and spring; and the structure's springs.
 
 Motor side quantities are seen at the output: a rotor inertia Jr behind a gear N is N^2 Jr. One step goes as
 
-    i    = (V - Ke N thd) / R
-    J thdd = a N Kt i - b thd - f - ts          |f| <= Tc + (1 - eff)/2 N Kt |i|
-    ts   = k (th - q) + c (thd - qd) + g (thdd - qdd),   g = k h^2/4 + c h/2
+    i    = (V - K N w) / R                      w: the mean of the motor's speeds before and after the step
+    J thdd = a K N i - b w - f - ts             |f| <= Tc + (1 - eff)/2 K N |i|
+    ts   = T(y) + c yd + k h^2/4 ydd            y: th - q less the gap, k = dT/dy, c = k times its loss
 
-with a = (1 + eff)/2. The gear's loss is a friction that grows with the torque it transmits: driving, the
-output gets eff times the motor's torque; driven backwards, all of it; and in between it sticks. The last line
-is the average-acceleration rule. It needs qdd = M^-1 (ts - bias), so spring and bodies are solved together,
-which is stable for any stiffness and any inertia. Back-EMF and viscous friction are implicit, as the added
-inertia h b.
+with a = (1 + eff)/2. One constant K stands for torque per ampere and volts per speed, as it does in any motor
+that turns all of its back-EMF's power into mechanical power. The gear's loss is a friction growing with the
+torque it transmits: driving, the output gets eff times the motor's torque; driven backwards, all of it; and
+in between it sticks. The last line is the average-acceleration rule (Newmark, 1959, beta = 1/4), linearised
+at the step's beginning. It needs qdd = M^-1 (ts - bias), so springs and bodies are solved together, which is
+stable for any stiffness and any inertia. A passive joint of stiffness k and damping c exerts, by the same
+rule, -k q - c qd - (k h^2/4 + c h/2) qdd. All losses are taken at the mean speeds, at which the discrete
+equations conserve energy.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from module_agent.catalogue import ModuleType
-from sim.pose import Array
+from sim.noise_profile import NoiseProfile, noise_profile
+from sim.physics import actuator_kernel as kernel
+from sim.physics.skeleton import Skeleton
+from sim.physics.spring import build_springs
+from sim.physics.variation import Variation, alike
+from sim.pose import Array, read_only
 
 BUS_VOLTAGE_V = 24.0
 # Gains are normalised to 48 V: the duty applied is the firmware's PWM times 48 V / bus voltage.
 GAIN_VOLTAGE_V = 48.0
 # The spring's loss: damping over stiffness. Below 40 rad/s it is under 2 % of critical.
 SPRING_LOSS_S = 1e-3
+# A gear that loses nearly all still has to turn.
+_LEAST_EFFICIENCY = 0.05
+
+
+class Power(NamedTuple):
+    """Where the electrical power went in the last step, (n,) each [W], read-only.
+
+    What is left of it is in the motion of the rotors and in the springs: see `Actuators.stored_j`.
+    """
+
+    electrical_w: Array
+    output_w: Array
+    copper_w: Array
+    friction_w: Array
+    gear_w: Array
+    spring_w: Array
 
 
 class Actuators:
-    """The motors and springs of n modules; arrays are (n,). Positions and speeds as seen at the output."""
+    """The motors and springs of n modules, arrays (n,), on m joints; speeds and angles seen at the output.
 
-    def __init__(self, types: Sequence[ModuleType], dt_s: float, voltage_v: float = BUS_VOLTAGE_V):
-        motors = [t.motor for t in types]
-        self.gear = np.array([t.gear_ratio for t in types])
-        self.spring_nm_rad = np.array([t.spring_nm_rad for t in types])
-        self.damping_nm_s_rad = self.spring_nm_rad * SPRING_LOSS_S
-        self.rotor_kg_m2 = self.gear**2 * np.array([m.rotor_inertia_kg_m2 for m in motors])
-        resistance = np.array([m.resistance_ohm for m in motors])
-        efficiency = np.array([m.efficiency for m in motors])
-        torque_per_a = self.gear * np.array([m.torque_constant_nm_a for m in motors])
-        viscous = np.array([m.viscous_nm_s_rad for m in motors])
+    Without a skeleton the joints are the modules'. `profile` says which effects act (all modules as
+    catalogued by default), `variation` how the modules differ from their types.
+    """
+
+    def __init__(
+        self,
+        types: Sequence[ModuleType],
+        dt_s: float,
+        profile: NoiseProfile | None = None,
+        variation: Variation | None = None,
+        skeleton: Skeleton | None = None,
+        voltage_v: float = BUS_VOLTAGE_V,
+    ):
+        n = len(types)
+        profile = noise_profile("ideal") if profile is None else profile
+        variation = alike(n) if variation is None else variation
+        self.springs = build_springs(types, profile, variation.spring)
+        self._modules = _module_records(types, profile, variation)
+        self._modules["linear_nm_rad"] = self.springs.linear_nm_rad
+        self._modules["cubic_nm_rad3"] = self.springs.cubic_nm_rad3
+        self._modules["half_gap_rad"] = self.springs.gap_rad / 2.0
+        self._modules["joint"] = range(n) if skeleton is None else skeleton.module
+        self._passives = np.zeros(0 if skeleton is None else len(skeleton.passive), kernel.PASSIVE)
+        if skeleton is not None:
+            self._passives["joint"] = skeleton.passive
+            self._passives["stiffness"], self._passives["damping"] = skeleton.stiffness, skeleton.damping
         self._dt = dt_s
-        self._amps_per_u = voltage_v / resistance
-        self._u_to_duty = GAIN_VOLTAGE_V / voltage_v
-        self._amps_per_speed = self.gear * np.array([m.back_emf_v_s_rad for m in motors]) / resistance
-        self._mean_torque_per_a = (1.0 + efficiency) / 2.0 * torque_per_a
-        self._loss_per_a = (1.0 - efficiency) / 2.0 * torque_per_a
-        self._viscous = viscous
-        self._coulomb = np.array([m.coulomb_nm for m in motors])
-        inertia = self.rotor_kg_m2 + dt_s * (viscous + self._mean_torque_per_a * self._amps_per_speed)
-        self._momentum_per_speed = inertia / dt_s
-        g = self.spring_nm_rad * dt_s**2 / 4.0 + self.damping_nm_s_rad * dt_s / 2.0
-        self._g_per_inertia = g / inertia
-        self._shrink = 1.0 / (1.0 + self._g_per_inertia)
-        self._added = g * self._shrink
         self.voltage_v = voltage_v
-        self.reset(np.zeros(len(types)), np.zeros(len(types)))
+        self._cold = np.ones(n)
+        self.reset(np.zeros(n), np.zeros(n))
 
     def reset(self, q_rad: Array, load_nm: Array) -> None:
         """Put the motors to rest where their springs carry the load at the given joint positions."""
-        self.motor_rad = q_rad + load_nm / self.spring_nm_rad
-        self.motor_rad_s = np.zeros_like(q_rad)
-        self.torque_nm = np.array(load_nm)
-        self.duty = np.zeros_like(q_rad)
-        self.current_a = np.zeros_like(q_rad)
-        self.deflection_rad = q_rad - self.motor_rad
+        stretch = self.springs.stretch(load_nm)
+        self._state = np.zeros((kernel.ROWS, len(q_rad)))
+        self._state[kernel.MOTOR_RAD] = q_rad + stretch
+        self._state[kernel.TORQUE_NM] = load_nm
+        self._state[kernel.DEFLECTION_RAD] = -self.springs.deflection(stretch)
+        self._state[kernel.ELASTIC_NM] = load_nm
 
-    def step(self, pwm: Array, q: Array, qd: Array, mass: Array, bias: Array) -> Array:
-        """Advance the motors by one step; return the springs' torques on the outputs (n,) [Nm] for that step.
+    def step(
+        self,
+        pwm: Array,
+        q: Array,
+        qd: Array,
+        mass: Array,
+        bias: Array,
+        resistance_factor: Array | None = None,
+    ) -> Array:
+        """Advance the motors by one step; return the forces on the joints (m,) [Nm, N] for that step.
 
-        `mass` (n, n) and `bias` (n,) are the multibody's at (q, qd). The current, deflection and torque kept
-        in `self` belong to the beginning of the step, as does the acceleration that the torque brings about.
+        `mass` (m, m) and `bias` (m,) are the multibody's at (q, qd); `resistance_factor` (n,) is what warm
+        windings have over cold ones. The current, deflection, torque and power kept in `self` belong to the
+        instant of q, as does the acceleration that the forces bring about.
         """
-        duty = np.minimum(np.maximum(pwm * self._u_to_duty, -1.0), 1.0)
-        speed = self.motor_rad_s
-        current = duty * self._amps_per_u - self._amps_per_speed * speed
-        drive = self._mean_torque_per_a * current - self._viscous * speed
-        limit = self._coulomb + self._loss_per_a * np.abs(current)
-        momentum = self._momentum_per_speed * speed + drive
-        # Friction as the last step's torque predicts it; only the spring's second-order term depends on it.
-        friction = _clamp(momentum - self.torque_nm, limit)
-        stretch = self.motor_rad - q
-        pull = self.spring_nm_rad * stretch + self.damping_nm_s_rad * (speed - qd)
-        pull += self._g_per_inertia * (drive - friction)
-        pull *= self._shrink
-        # (M + diag(added)) qdd = pull - bias follows from the module's docstring by eliminating thdd and ts.
-        stiffened = mass.copy()
-        stiffened.flat[:: len(pull) + 1] += self._added
-        torque: Array = pull - self._added * np.linalg.solve(stiffened, pull - bias)
-        momentum -= torque
-        self.motor_rad_s = (momentum - _clamp(momentum, limit)) / self._momentum_per_speed
-        self.motor_rad = self.motor_rad + self._dt * self.motor_rad_s
-        self.duty, self.current_a, self.deflection_rad, self.torque_nm = duty, current, -stretch, torque
-        return torque
+        force, self._state = kernel.advance(
+            self._modules,
+            self._passives,
+            self._state,
+            pwm,
+            self._cold if resistance_factor is None else resistance_factor,
+            self.voltage_v,
+            GAIN_VOLTAGE_V / self.voltage_v,
+            self._dt,
+            mass,
+            bias,
+            q,
+            qd,
+        )
+        return force
+
+    @property
+    def motor_rad(self) -> Array:
+        """The motors' positions after the last step."""
+        return self._row(kernel.MOTOR_RAD)
+
+    @property
+    def motor_rad_s(self) -> Array:
+        """The motors' speeds after the last step, half a step before the positions."""
+        return self._row(kernel.MOTOR_RAD_S)
+
+    @property
+    def motor_rate_rad_s(self) -> Array:
+        """The motors' speeds at the instant of the last step's beginning."""
+        return self._row(kernel.RATE_RAD_S)
+
+    @property
+    def torque_nm(self) -> Array:
+        """What the springs exert on the outputs."""
+        return self._row(kernel.TORQUE_NM)
+
+    @property
+    def elastic_nm(self) -> Array:
+        """The elastic part of `torque_nm`, the springs' own loss left out."""
+        return self._row(kernel.ELASTIC_NM)
+
+    @property
+    def deflection_rad(self) -> Array:
+        """The springs' own deflections, output minus motor; the gear's gap is not in them."""
+        return self._row(kernel.DEFLECTION_RAD)
+
+    @property
+    def duty(self) -> Array:
+        """What the bridges apply."""
+        return self._row(kernel.DUTY)
+
+    @property
+    def current_a(self) -> Array:
+        """The motors' currents."""
+        return self._row(kernel.CURRENT_A)
+
+    @property
+    def copper_w(self) -> Array:
+        """The heat in the windings."""
+        return self._row(kernel.COPPER_W)
+
+    def power(self) -> Power:
+        """Return the powers of the last step."""
+        rows = kernel.ELECTRICAL_W, kernel.OUTPUT_W, kernel.COPPER_W, kernel.FRICTION_W
+        return Power(*(read_only(self._row(r)) for r in (*rows, kernel.GEAR_W, kernel.SPRING_W)))
+
+    def stored_j(self, q_rad: Array) -> Array:
+        """Return the energies of rotors and springs (n,) [J] after the last step, outputs at `q_rad` (n,)."""
+        own = self.springs.deflection(self.motor_rad - q_rad)
+        kinetic: Array = 0.5 * self._modules["rotor_kg_m2"] * self.motor_rad_s**2
+        return read_only(kinetic + self.springs.energy_j(own))
+
+    def _row(self, row: int) -> Array:
+        values: Array = self._state[row]
+        return values
 
 
-def _clamp(value: Array, limit: Array) -> Array:
-    clamped: Array = np.minimum(np.maximum(value, -limit), limit)
-    return clamped
+def _module_records(
+    types: Sequence[ModuleType], profile: NoiseProfile, variation: Variation
+) -> kernel.Records:
+    motors = [t.motor for t in types]
+    gear = np.array([t.gear_ratio for t in types])
+    efficiency = 1.0 - profile.gear_loss * (1.0 - np.array([m.efficiency for m in motors]))
+    friction = profile.friction * variation.friction
+    records: kernel.Records = np.zeros(len(types), kernel.MODULE)
+    records["resistance_ohm"] = variation.resistance * [m.resistance_ohm for m in motors]
+    records["per_amp_nm"] = variation.motor * gear * [m.back_emf_v_s_rad for m in motors]
+    records["loss"] = 1.0 - np.maximum(efficiency, _LEAST_EFFICIENCY)
+    records["coulomb_nm"] = friction * [m.coulomb_nm for m in motors]
+    records["viscous_nm_s_rad"] = friction * [m.viscous_nm_s_rad for m in motors]
+    records["rotor_kg_m2"] = gear**2 * [m.rotor_inertia_kg_m2 for m in motors]
+    records["spring_loss_s"] = SPRING_LOSS_S
+    return records

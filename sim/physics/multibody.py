@@ -7,41 +7,42 @@ from pathlib import Path
 import numpy as np
 
 from sim.physics.bullet import pybullet
-from sim.physics.urdf import urdf_text
+from sim.physics.skeleton import Skeleton
+from sim.physics.urdf import joint_name, urdf_text
 from sim.pose import Array
-from sim.robot_tree import GRAVITY_M_S2, RobotTree
+from sim.robot_tree import GRAVITY_M_S2
 
 
 class Multibody:
-    """A robot's joints in one private physics client; joint order is that of the tree."""
+    """A robot's joints in one private physics client; joint order is that of the skeleton."""
 
-    def __init__(self, name: str, tree: RobotTree, dt_s: float):
-        self._n = len(tree.serials)
-        self._indices = list(range(self._n))
-        self._zeros = [0.0] * self._n
+    def __init__(self, name: str, skeleton: Skeleton, dt_s: float):
+        n = len(skeleton.names)
+        self._indices = list(range(n))
+        self._zeros = [0.0] * n
         self.closed = False
         self._client: int = pybullet.connect(pybullet.DIRECT)
-        self._body = _load(self._client, urdf_text(name, tree))
-        _configure(self._client, self._body, self._n, dt_s)
-        _check(self._client, self._body, tree)
+        self._body = _load(self._client, urdf_text(name, skeleton))
+        _configure(self._client, self._body, n, dt_s)
+        _check(self._client, self._body, skeleton)
 
     def place(self, q_rad: Array) -> None:
-        """Put the joints, at rest, to the given positions (n,)."""
+        """Put the joints, at rest, to the given positions (m,)."""
         for i in self._indices:
             pybullet.resetJointState(self._body, i, float(q_rad[i]), 0.0, physicsClientId=self._client)
 
     def mass_matrix(self, q: list[float]) -> Array:
-        """Return the joint-space mass matrix (n, n) [kg m^2]."""
+        """Return the joint-space mass matrix (m, m) [kg m^2 for turning joints]."""
         return np.array(pybullet.calculateMassMatrix(self._body, q, physicsClientId=self._client))
 
     def bias(self, q: list[float], qd: list[float]) -> Array:
-        """Return the torques (n,) [Nm] that hold gravity and velocity forces at zero acceleration."""
+        """Return the torques (m,) [Nm] that hold gravity and velocity forces at zero acceleration."""
         return np.array(
             pybullet.calculateInverseDynamics(self._body, q, qd, self._zeros, physicsClientId=self._client)
         )
 
     def step(self, torque_nm: Sequence[float]) -> tuple[Array, Array]:
-        """Apply joint torques (n,) for one step; return the new positions and velocities (n,)."""
+        """Apply joint torques (m,) for one step; return the new positions and velocities (m,)."""
         pybullet.setJointMotorControlArray(
             self._body,
             self._indices,
@@ -86,19 +87,19 @@ def _configure(client: int, body: int, n: int, dt_s: float) -> None:
     )
 
 
-def _check(client: int, body: int, tree: RobotTree) -> None:
+def _check(client: int, body: int, skeleton: Skeleton) -> None:
     """Make sure that the engine took over every joint in our order and every inertia unchanged.
 
     Raises:
         RuntimeError: it did not (it zeroes an impossible inertia tensor with no more than a warning).
     """
-    for i, serial in enumerate(tree.serials):
+    for i, (body_name, wanted) in enumerate(zip(skeleton.names, skeleton.bodies, strict=True)):
         name = pybullet.getJointInfo(body, i, physicsClientId=client)[1].decode()
         info = pybullet.getDynamicsInfo(body, i, physicsClientId=client)
-        wanted = np.linalg.eigvalsh(tree.bodies[i].inertia_kg_m2)
-        same = np.allclose(np.sort(info[2]), wanted, rtol=1e-9, atol=0.0)
-        if name != f"joint-{serial}" or not same or not np.isclose(info[0], tree.bodies[i].mass_kg):
+        moments = np.linalg.eigvalsh(wanted.inertia_kg_m2)
+        same = np.allclose(np.sort(info[2]), moments, rtol=1e-9, atol=0.0)
+        if name != joint_name(body_name) or not same or not np.isclose(info[0], wanted.mass_kg):
             raise RuntimeError(
                 f"the physics engine's joint {i} is {name} with {info[0]} kg and moments {info[2]}; "
-                f"expected joint-{serial} with {tree.bodies[i].mass_kg} kg and moments {wanted}"
+                f"expected {joint_name(body_name)} with {wanted.mass_kg} kg and moments {moments}"
             )

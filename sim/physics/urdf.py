@@ -1,28 +1,37 @@
-"""A robot's rigid bodies as URDF text, for physics engines: joints and inertia, no shapes."""
+"""A skeleton as URDF text, for physics engines: joints and inertia, no shapes."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sim.physics.skeleton import Skeleton
 from sim.pose import Array
 from sim.rigid_body import RigidBody
-from sim.robot_tree import RobotTree
+
+# Physics engines take lower > upper for "no limits", which a sliding joint cannot leave out.
+_NO_LIMIT = '<limit lower="1" upper="-1" effort="1e9" velocity="1e9"/>'
 
 
-def urdf_text(name: str, tree: RobotTree) -> str:
-    """Return the robot at q = 0 as URDF; joint and link i are called after serial i, the fixed base `world`.
+def urdf_text(name: str, skeleton: Skeleton) -> str:
+    """Return the robot with all joints at 0 as URDF; link i is called after body i, the fixed base `world`.
 
-    Floats are written by `repr`, so nothing is lost, and a joint's coordinate is the module's position.
+    Floats are written by `repr`, so nothing is lost, and a joint's coordinate is the skeleton's.
     """
     rows = [f'<robot name="{name}">', '<link name="world"/>']
-    for i, serial in enumerate(tree.serials):
-        parent = "world" if tree.parent[i] < 0 else tree.serials[tree.parent[i]]
+    for i, body in enumerate(skeleton.names):
+        parent = "world" if skeleton.parent[i] < 0 else skeleton.names[skeleton.parent[i]]
+        kind, limit = ("prismatic", _NO_LIMIT) if skeleton.prismatic[i] else ("continuous", "")
         rows += [
-            f'<link name="{serial}">{_inertial(tree.bodies[i])}</link>',
-            f'<joint name="joint-{serial}" type="continuous">',
-            f'<parent link="{parent}"/><child link="{serial}"/>{_origin(tree.origin[i])}',
-            f'<axis xyz="0 0 {float(tree.axis_sign[i])!r}"/></joint>',
+            f'<link name="{body}">{_inertial(skeleton.bodies[i])}</link>',
+            f'<joint name="{joint_name(body)}" type="{kind}">',
+            f'<parent link="{parent}"/><child link="{body}"/>{_origin(skeleton.origin[i])}{limit}',
+            f'<axis xyz="0 0 {float(skeleton.axis_sign[i])!r}"/></joint>',
         ]
     return "\n".join([*rows, "</robot>"])
+
+
+def joint_name(body: str) -> str:
+    """Return the name of the joint that moves a body."""
+    return f"joint-{body}"
 
 
 def _numbers(values: Array) -> str:

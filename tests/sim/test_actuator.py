@@ -35,7 +35,7 @@ class Bench:
 def test_a_blocked_output_feels_the_published_stall_torque(name: str, published_nm: float) -> None:
     # Slowly, or the rotor's swing would wind the spring up further and friction would keep it there.
     bench = Bench(module_type(name), inertia=1e9)
-    for pwm in np.linspace(0.0, 0.5, 1000):
+    for pwm in np.append(np.linspace(0.0, 0.5, 1000), np.full(1000, 0.5)):
         bench.run(pwm, DT)
     assert bench.actuator.torque_nm[0] == pytest.approx(published_nm, rel=0.10)
 
@@ -47,7 +47,7 @@ def test_the_free_speed_balances_back_emf_and_friction(name: str) -> None:
     bench = Bench(kind, inertia=1e-4)
     bench.run(1.0, 0.5)
     # eff Kt N (V - Ke N w)/R = Tc + b w
-    torque = m.efficiency * m.torque_constant_nm_a * gear / m.resistance_ohm
+    torque = m.efficiency * m.back_emf_v_s_rad * gear / m.resistance_ohm
     expected = (24.0 * torque - m.coulomb_nm) / (m.viscous_nm_s_rad + torque * m.back_emf_v_s_rad * gear)
     assert bench.qd[0] == pytest.approx(expected, rel=1e-6)
     assert expected > kind.max_speed_rad_s
@@ -67,7 +67,7 @@ def test_a_motor_sticks_until_its_torque_beats_friction(name: str) -> None:
     motor = kind.motor
     # Duty at which eff Kt N V / R equals the Coulomb friction.
     breakaway = motor.coulomb_nm / (
-        motor.efficiency * motor.torque_constant_nm_a * kind.gear_ratio * 24.0 / motor.resistance_ohm
+        motor.efficiency * motor.back_emf_v_s_rad * kind.gear_ratio * 24.0 / motor.resistance_ohm
     )
     for share, moves in ((0.97, False), (1.03, True)):
         bench = Bench(kind, inertia=0.01)
@@ -79,7 +79,7 @@ def test_a_gear_at_rest_holds_a_load_between_driving_and_being_driven_back() -> 
     # The motor's torque i Kt N drives loads up to eff times it and yields to loads above all of it.
     kind = module_type("X5-1")
     pwm = 0.3
-    ideal = 2.0 * pwm * 24.0 / kind.motor.resistance_ohm * kind.motor.torque_constant_nm_a * kind.gear_ratio
+    ideal = 2.0 * pwm * 24.0 / kind.motor.resistance_ohm * kind.motor.back_emf_v_s_rad * kind.gear_ratio
     ends = []
     for share in (0.55, 0.85, 1.10):
         bench = Bench(kind, inertia=0.02, load=share * ideal)
@@ -97,7 +97,7 @@ def test_a_gear_at_rest_holds_a_load_between_driving_and_being_driven_back() -> 
 def test_a_driven_joint_follows_the_continuous_equations(name: str, inertia: float) -> None:
     kind = module_type(name)
     m, gear, k = kind.motor, kind.gear_ratio, kind.spring_nm_rad
-    per_amp = m.efficiency * m.torque_constant_nm_a * gear
+    per_amp = m.efficiency * m.back_emf_v_s_rad * gear
     rotor = gear**2 * m.rotor_inertia_kg_m2
 
     def flow(_: float, y: np.ndarray) -> list[float]:
@@ -167,13 +167,11 @@ def test_the_three_temperatures_follow_the_continuous_heat_equation() -> None:
 
 
 def test_a_constant_current_heats_the_winding_by_power_times_all_resistances_in_the_end() -> None:
-    windings = Windings([module_type("X5-1")], DT)
-    amps = 0.5
-    heat = windings._kelvin_per_a2[0] * amps**2
-    settled = np.linalg.solve(np.eye(3) - heat_flow(DT), [heat, 0.0, 0.0])
-    power = module_type("X5-1").motor.resistance_ohm * amps**2
+    windings = Windings(1, DT)
+    power = 9.5 * 0.5**2
+    settled = np.linalg.solve(np.eye(3) - heat_flow(DT), [DT * power / CAPACITIES_J_K[0], 0.0, 0.0])
     assert settled[0] == pytest.approx(power * sum(RESISTANCES_K_W), rel=1e-6)
     for _ in range(100):
-        windings.step(np.array([amps]))
+        windings.step(np.array([power]))
     # Early on, nothing has left the winding yet: P t / C.
     assert windings.winding_c[0] - 25.0 == pytest.approx(power * 0.1 / CAPACITIES_J_K[0], rel=0.04)

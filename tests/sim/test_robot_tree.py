@@ -5,6 +5,7 @@ from coordinator.kinematics.forward import imu_poses
 from module_agent.catalogue import CATALOGUE, module_type
 from sim.parts import BRACKETS, Part, Tube, placed
 from sim.physics.multibody import Multibody
+from sim.physics.skeleton import build_skeleton
 from sim.pose import pose
 from sim.rigid_body import about_origin, joined, moved, parameters, tensor
 from sim.robot_file import load_robot, parse_robot, shipped_robots
@@ -115,7 +116,7 @@ def _largest_load(name: str, together: bool) -> float:
     tree = build_tree(robot)
     limit = np.array([t.max_effort_nm for t in tree.types])
     n = len(limit)
-    body = Multibody(robot.name, tree, 1e-3)
+    body = Multibody(robot.name, build_skeleton(robot), 1e-3)
     rng = np.random.default_rng(3)
     poses = [d * row for row in np.eye(n) for d in np.linspace(-0.5, 0.5, 9)]
     if together:

@@ -1,0 +1,22 @@
+"""Kernels: functions on plain arrays, compiled to machine code.
+
+The code is kept on disk and reused until the kernel's own file changes. That check knows nothing of other
+files, so kernels call each other within one file only.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(function: Function) -> Function:
+    """Compile a function when it is first called; IEEE arithmetic in the order written, as in Python."""
+    try:
+        kernel = numba.njit(cache=True)(function)
+    except RuntimeError:
+        # No folder to keep the code in (a read-only installation without a home): compiled in each process.
+        kernel = numba.njit(function)
+    return cast(Function, kernel)

@@ -1,0 +1,47 @@
+"""Where a robot that gives comes to rest: its passive joints deflected until they carry the weight."""
+
+import numpy as np
+
+from sim.physics.rigid_tree import RigidTree
+from sim.physics.skeleton import Skeleton
+from sim.pose import Array
+
+_STEP = 1e-6
+_ROUNDS = 30
+# The rest position's force error, relative to the largest load: far below what a tick can show.
+_TOLERANCE = 1e-12
+
+
+def equilibrium(name: str, tree: RigidTree, skeleton: Skeleton, module_rad: Array) -> tuple[Array, Array]:
+    """Return all joints' positions at rest (m,), the modules' held at `module_rad`, and these' loads (n,).
+
+    Newton's method on k q + bias(q) = 0 over the passive joints.
+
+    Raises:
+        ValueError: the springs are too soft to carry the weight: the robot falls over.
+    """
+    q = np.zeros(len(skeleton.names))
+    q[list(skeleton.module)] = module_rad
+    passive = list(skeleton.passive)
+    still = np.zeros_like(q)
+
+    def unbalanced(at: Array) -> Array:
+        return skeleton.stiffness * at[passive] + tree.mass_and_bias(at, still)[1][passive]
+
+    for _ in range(_ROUNDS if passive else 0):
+        residual = unbalanced(q)
+        slope = np.empty((len(passive), len(passive)))
+        for column, joint in enumerate(passive):
+            nudged = q.copy()
+            nudged[joint] += _STEP
+            slope[:, column] = (unbalanced(nudged) - residual) / _STEP
+        if np.linalg.eigvalsh((slope + slope.T) / 2.0)[0] <= 0.0:
+            raise ValueError(
+                f"robot {name!r} falls over: its base or links are too soft to carry its weight; "
+                "raise the stiffness in the robot file or lower base_shake and link_flex in the profile"
+            )
+        q[passive] -= np.linalg.solve(slope, residual)
+        load = tree.mass_and_bias(q, still)[1]
+        if np.abs(unbalanced(q)).max() <= _TOLERANCE * max(1.0, float(np.abs(load).max())):
+            break
+    return q, tree.mass_and_bias(q, still)[1][list(skeleton.module)]

@@ -1,0 +1,267 @@
+"""Newton and Euler's equations of a tree of joints, compiled: motion, mass matrix, bias.
+
+All vectors are in world axes, and wrenches and inertia are about the world's origin, so that those of several
+bodies simply add up (Featherstone, Rigid Body Dynamics Algorithms, 2008, sections 5.3 and 6.2). Joints turn
+about, or slide along, z of their frame.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sim.physics.compiled import compiled
+from sim.pose import Array
+
+Indices = np.ndarray[Any, np.dtype[np.int64]]
+
+
+@compiled
+def _into(a: Array, x: Array, out: Array) -> None:
+    for r in range(3):
+        out[r] = a[r, 0] * x[0] + a[r, 1] * x[1] + a[r, 2] * x[2]
+
+
+@compiled
+def _cross(a: Array, b: Array, out: Array) -> None:
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def _add_swing(alpha: Array, omega: Array, r: Array, work: Array, out: Array) -> None:
+    """Add alpha x r + omega x (omega x r), the acceleration of a point of a body against its origin."""
+    _cross(omega, r, work[0])
+    _cross(omega, work[0], work[1])
+    _cross(alpha, r, work[0])
+    for k in range(3):
+        out[k] += work[0, k] + work[1, k]
+
+
+@compiled
+def _turned(a: Array, b: Array, out: Array) -> None:
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = a[r, 0] * b[0, c] + a[r, 1] * b[1, c] + a[r, 2] * b[2, c]
+
+
+@compiled
+def _place(
+    parent: Indices, prismatic: Indices, sign: Array, rotation: Array, offset: Array, q: Array
+) -> tuple[Array, Array]:
+    """Return every body's orientation (m, 3, 3) and its offset from its parent in world axes (m, 3)."""
+    m = len(parent)
+    where, arm = np.empty((m, 3, 3)), np.empty((m, 3))
+    world, fixed = np.eye(3), np.empty((3, 3))
+    for i in range(m):
+        held = where[parent[i]] if parent[i] >= 0 else world
+        _into(held, offset[i], arm[i])
+        _turned(held, rotation[i], fixed)
+        slide = sign[i] * q[i] if prismatic[i] else 0.0
+        turn = 0.0 if prismatic[i] else sign[i] * q[i]
+        co, si = np.cos(turn), np.sin(turn)
+        for r in range(3):
+            where[i, r, 0] = co * fixed[r, 0] + si * fixed[r, 1]
+            where[i, r, 1] = co * fixed[r, 1] - si * fixed[r, 0]
+            where[i, r, 2] = fixed[r, 2]
+            arm[i, r] += slide * fixed[r, 2]
+    return where, arm
+
+
+@compiled
+def _move(
+    parent: Indices,
+    prismatic: Indices,
+    sign: Array,
+    where: Array,
+    arm: Array,
+    qd: Array,
+    qdd: Array,
+    up_m_s2: float,
+) -> tuple[Array, Array, Array]:
+    """Return every body's angular rate and acceleration, and its origin's specific force, (m, 3) each."""
+    m = len(parent)
+    omega, alpha, accel = np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3))
+    still, work, own = np.zeros(3), np.empty((2, 3)), np.empty(3)
+    for i in range(m):
+        p = parent[i]
+        held = omega[p] if p >= 0 else still
+        for k in range(3):
+            omega[i, k] = held[k]
+            alpha[i, k] = alpha[p, k] if p >= 0 else 0.0
+            accel[i, k] = accel[p, k] if p >= 0 else (up_m_s2 if k == 2 else 0.0)
+            own[k] = where[i, k, 2] * sign[i] * qd[i]
+        if p >= 0:
+            _add_swing(alpha[p], held, arm[i], work, accel[i])
+        _cross(held, own, work[0])
+        for k in range(3):
+            change = where[i, k, 2] * sign[i] * qdd[i]
+            if prismatic[i]:
+                accel[i, k] += 2.0 * work[0, k] + change
+            else:
+                omega[i, k] += own[k]
+                alpha[i, k] += work[0, k] + change
+    return omega, alpha, accel
+
+
+@compiled
+def feel(
+    parent: Indices,
+    prismatic: Indices,
+    sign: Array,
+    rotation: Array,
+    offset: Array,
+    q: Array,
+    qd: Array,
+    qdd: Array,
+    up_m_s2: float,
+    body: Indices,
+    imu_offset: Array,
+    imu_rotation: Array,
+) -> tuple[Array, Array]:
+    """Return angular rate and specific force (n, 3) in the axes of n IMUs; body -1 is the world."""
+    n = len(body)
+    where, arm = _place(parent, prismatic, sign, rotation, offset, q)
+    omega, alpha, accel = _move(parent, prismatic, sign, where, arm, qd, qdd, up_m_s2)
+    gyro, force = np.zeros((n, 3)), np.zeros((n, 3))
+    work, r, total, axes = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty((3, 3))
+    for i in range(n):
+        b = body[i]
+        if b < 0:
+            for k in range(3):
+                force[i, k] = imu_rotation[i, 2, k] * up_m_s2
+            continue
+        _into(where[b], imu_offset[i], r)
+        for k in range(3):
+            total[k] = accel[b, k]
+        _add_swing(alpha[b], omega[b], r, work, total)
+        _turned(where[b], imu_rotation[i], axes)
+        for k in range(3):
+            for row in range(3):
+                gyro[i, k] += axes[row, k] * omega[b, row]
+                force[i, k] += axes[row, k] * total[row]
+    return gyro, force
+
+
+@compiled
+def mass_and_bias(
+    parent: Indices,
+    prismatic: Indices,
+    sign: Array,
+    rotation: Array,
+    offset: Array,
+    mass: Array,
+    com: Array,
+    inertia: Array,
+    q: Array,
+    qd: Array,
+    up_m_s2: float,
+) -> tuple[Array, Array]:
+    """Return the mass matrix (m, m) and the forces (m,) that gravity and velocities ask for at qdd = 0.
+
+    Composite rigid bodies for the one, recursive Newton-Euler for the other.
+    """
+    where, arm = _place(parent, prismatic, sign, rotation, offset, q)
+    omega, alpha, accel = _move(parent, prismatic, sign, where, arm, qd, np.zeros(len(q)), up_m_s2)
+    spin, travel, place = _twists(parent, prismatic, sign, where, arm)
+    first, whole, force, moment = _loads(mass, com, inertia, where, place, omega, alpha, accel)
+    return _projected(parent, spin, travel, mass.copy(), first, whole, force, moment)
+
+
+@compiled
+def _twists(
+    parent: Indices, prismatic: Indices, sign: Array, where: Array, arm: Array
+) -> tuple[Array, Array, Array]:
+    """Return the joints' unit twists, angular and linear at the world's origin, and the bodies' places."""
+    m = len(parent)
+    spin, travel, place = np.zeros((m, 3)), np.empty((m, 3)), np.empty((m, 3))
+    for i in range(m):
+        for k in range(3):
+            place[i, k] = arm[i, k] + (place[parent[i], k] if parent[i] >= 0 else 0.0)
+            travel[i, k] = sign[i] * where[i, k, 2]
+        if not prismatic[i]:
+            spin[i] = travel[i]
+            _cross(place[i], spin[i], travel[i])
+    return spin, travel, place
+
+
+@compiled
+def _loads(
+    mass: Array,
+    com: Array,
+    inertia: Array,
+    where: Array,
+    place: Array,
+    omega: Array,
+    alpha: Array,
+    accel: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Return every body's first moment, inertia, force and moment: m c, I, m a, I alpha + omega x I omega."""
+    m = len(mass)
+    first, whole = np.empty((m, 3)), np.empty((m, 3, 3))
+    force, moment = np.empty((m, 3)), np.empty((m, 3))
+    work, turned = np.empty((2, 3)), np.empty((3, 3))
+    lever, centre, change, swirl = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(m):
+        _into(where[i], com[i], lever)
+        force[i] = accel[i]
+        _add_swing(alpha[i], omega[i], lever, work, force[i])
+        for k in range(3):
+            force[i, k] *= mass[i]
+            centre[k] = place[i, k] + lever[k]
+            first[i, k] = mass[i] * centre[k]
+        # R I R^T about the centre; Euler's equation; then both about the origin.
+        _turned(where[i], inertia[i], turned)
+        _turned(turned, where[i].T, whole[i])
+        _into(whole[i], omega[i], change)
+        _cross(omega[i], change, swirl)
+        _into(whole[i], alpha[i], change)
+        _cross(centre, force[i], moment[i])
+        square = centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2
+        for a in range(3):
+            moment[i, a] += change[a] + swirl[a]
+            for b in range(3):
+                whole[i, a, b] += mass[i] * ((square if a == b else 0.0) - centre[a] * centre[b])
+    return first, whole, force, moment
+
+
+@compiled
+def _projected(
+    parent: Indices,
+    spin: Array,
+    travel: Array,
+    mass: Array,
+    first: Array,
+    whole: Array,
+    force: Array,
+    moment: Array,
+) -> tuple[Array, Array]:
+    """Add up from the leaves what every joint carries, projected on the joints; changes its arguments."""
+    m = len(parent)
+    matrix, bias = np.zeros((m, m)), np.zeros(m)
+    linear, angular, part = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(m - 1, -1, -1):
+        # Momentum, linear and about the origin, of all that joint i carries at its unit rate.
+        _cross(spin[i], first[i], linear)
+        _cross(first[i], travel[i], angular)
+        _into(whole[i], spin[i], part)
+        for k in range(3):
+            linear[k] += mass[i] * travel[i, k]
+            angular[k] += part[k]
+            bias[i] += spin[i, k] * moment[i, k] + travel[i, k] * force[i, k]
+        j = i
+        while j >= 0:
+            for k in range(3):
+                matrix[i, j] += spin[j, k] * angular[k] + travel[j, k] * linear[k]
+            matrix[j, i] = matrix[i, j]
+            j = parent[j]
+        p = parent[i]
+        if p >= 0:
+            mass[p] += mass[i]
+            for a in range(3):
+                first[p, a] += first[i, a]
+                force[p, a] += force[i, a]
+                moment[p, a] += moment[i, a]
+                for b in range(3):
+                    whole[p, a, b] += whole[i, a, b]
+    return matrix, bias
