@@ -120,6 +120,10 @@ class World:
         """The constant errors of all sensors, read-only."""
         return self._sensors.errors
 
+    def warm(self, above_ambient_k: Array) -> None:
+        """Set the modules' temperatures above the ambient: rows winding, housing, body, (3, n) [K]."""
+        self._windings.above_k[:] = above_ambient_k
+
     def step(self, pwm: Sequence[float]) -> list[SensorSample]:
         """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.
 
