@@ -120,7 +120,11 @@ def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
 
 
 def circle_point_analysis(
-    rest: ImuWindow, constant: AlignedMotion, sine: AlignedMotion, quiet_s: float = QUIET_S
+    rest: ImuWindow,
+    constant: AlignedMotion,
+    sine: AlignedMotion,
+    quiet_s: float = QUIET_S,
+    taps: int = TAPS,
 ) -> CircleFit:
     """Run eqs. 12 to 24 and 30: axis from the constant motion, radial vector from the windowed sine motion.
 
@@ -132,6 +136,8 @@ def circle_point_analysis(
         constant: the CM, on one time axis (`windows.align`).
         sine: the WSM, likewise, beginning with at least `quiet_s` of near rest.
         quiet_s: length of that near rest [s].
+        taps: of the filter of alpha; 1 is none, as in the thesis' comparison (6.2.1.2), and gives d too
+            short.
 
     Returns:
         The fit. An IMU on the axis comes out with a distance near zero and a sigma no smaller than its noise
@@ -143,7 +149,7 @@ def circle_point_analysis(
     _enough(sine.t_s.size, "windowed sine motion")
     at_rest = rest_reading(rest)
     found = joint_axis(constant, at_rest)
-    alpha = angular_acceleration(sine)
+    alpha = angular_acceleration(sine, taps)
     quiet = sine.t_s <= quiet_s
     turns = _turns(found.axis, sine, quiet)
     dynamic = _dynamic_acceleration(sine, turns, quiet)
@@ -172,13 +178,13 @@ def circle_point_analysis(
     )
 
 
-def angular_acceleration(motion: AlignedMotion) -> Array:
+def angular_acceleration(motion: AlignedMotion, taps: int = TAPS) -> Array:
     """Differentiate the joint's rate and smooth it by the Gaussian of 11 taps (thesis 6.2.1.2): (n,) rad/s^2.
 
     Raises:
-        ValueError: the joint hardly accelerated.
+        ValueError: the joint hardly accelerated, or `taps` is not odd and positive.
     """
-    alpha = gaussian_filter(np.gradient(motion.velocity_rad_s, motion.t_s))
+    alpha = gaussian_filter(np.gradient(motion.velocity_rad_s, motion.t_s), taps)
     rms = float(np.sqrt(np.mean(alpha**2)))
     if rms < LEAST_ACCELERATION_RAD_S2:
         raise ValueError(

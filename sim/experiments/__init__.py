@@ -1,0 +1,1 @@
+"""Experiments on the simulator: what others have measured on real modules, done again on simulated ones."""

@@ -1,0 +1,126 @@
+"""The amplitude experiment as a picture: amplitude against estimated length, as figures 23-26 and 29-32."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from sim.experiments.amplitude_sweep import Trial
+from sim.experiments.thesis_lengths import ALIGNMENTS, Alignment, thesis_length
+
+_FILTERED, _UNFILTERED, _THESIS, _TRUTH, _SATURATED = "#1f5fa8", "#d07a1f", "#b0204a", "#404040", "#e9e4da"
+# The same relative range in every panel, so that they can be compared; what is beyond is drawn at its edge.
+_LEAST_RANGE, _MOST_RANGE = 0.10, 0.30
+
+
+def plot(trials: Sequence[Trial], path: Path, title: str) -> None:
+    """Draw the sweep and save it (PNG, SVG or PDF by suffix): one row per alignment, one column per length.
+
+    Raises:
+        ValueError: no trial of a sweep, or a suffix that matplotlib cannot write.
+    """
+    sweep = [trial for trial in trials if trial.purpose == "sweep"]
+    if not sweep:
+        raise ValueError("no trial of a sweep over amplitudes: nothing to draw")
+    lengths = list(dict.fromkeys(trial.length_mm for trial in sweep))
+    width = max(3.1 * len(lengths) + 0.9, 6.0)
+    figure = Figure(figsize=(width, 7.0), dpi=150)
+    FigureCanvasAgg(figure)
+    grid: Any = figure.subplots(2, len(lengths), squeeze=False)
+    half = _half_range(sweep)
+    for row, alignment in enumerate(ALIGNMENTS):
+        for column, length in enumerate(lengths):
+            own = [t for t in sweep if (t.alignment, t.length_mm) == (alignment, length)]
+            axes = grid[row][column]
+            _panel(axes, own, half)
+            axes.set_title(f"{length} mm, {alignment}", fontsize=10)
+            _thesis_mark(axes, alignment, length, half)
+            if row == len(ALIGNMENTS) - 1:
+                axes.set_xlabel("amplitude [rad]")
+            if column == 0:
+                axes.set_ylabel("estimated length [mm]")
+            if column == len(lengths) - 1:
+                axes.error_axis.set_ylabel("error [%]")
+    figure.suptitle(title, fontsize=12, y=0.985)
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncol=3, fontsize=9, frameon=False)
+    figure.subplots_adjust(left=0.75 / width, right=1 - 0.75 / width, top=0.90, bottom=0.17, wspace=0.48)
+    figure.savefig(path)
+
+
+def _half_range(sweep: Sequence[Trial]) -> float:
+    errors = [error for t in sweep for filtered in (True, False) if (error := t.error(filtered)) is not None]
+    return float(np.clip(1.1 * max(map(abs, errors), default=0.0), _LEAST_RANGE, _MOST_RANGE))
+
+
+def _panel(axes: Any, own: Sequence[Trial], half: float) -> None:
+    """Draw one arm: the mean over rigs as a line, every rig as a point, and where the velocity saturates."""
+    axes.grid(True, linewidth=0.4, color="#d5d5d5")
+    axes.set_axisbelow(True)
+    if not own:
+        axes.error_axis = axes.twinx()
+        return
+    true = own[0].true_mm
+    axes.axhline(true, color=_TRUTH, linewidth=1.0, label="true length")
+    _shade(axes, own)
+    _series(axes, own, True, _FILTERED, "o", "thesis' analysis", half)
+    _series(axes, own, False, _UNFILTERED, "s", "without its filter", half)
+    axes.set_xlim(0.0, max(t.amplitude_rad for t in own) + 0.02)
+    axes.set_ylim(true * (1 - half), true * (1 + half))
+    axes.error_axis = axes.twinx()
+    axes.error_axis.set_ylim(-100 * half, 100 * half)
+    for each in (axes, axes.error_axis):
+        each.tick_params(labelsize=8)
+
+
+def _shade(axes: Any, own: Sequence[Trial]) -> None:
+    amplitudes = sorted({t.amplitude_rad for t in own})
+    saturated = [t.amplitude_rad for t in own if t.saturated]
+    if saturated:
+        first = amplitudes.index(min(saturated))
+        start = amplitudes[0] / 2 if first == 0 else (amplitudes[first - 1] + amplitudes[first]) / 2
+        axes.axvspan(
+            start, amplitudes[-1] + 0.02, color=_SATURATED, zorder=0, label="commanded speed is cut off"
+        )
+
+
+def _series(
+    axes: Any, own: Sequence[Trial], filtered: bool, colour: str, marker: str, label: str, half: float
+) -> None:
+    true = own[0].true_mm
+    low, high = true * (1 - half), true * (1 + half)
+    points = [(t.amplitude_rad, true * (1 + e)) for t in own if (e := t.error(filtered)) is not None]
+    inside = [(a, y) for a, y in points if low < y < high]
+    outside = [(a, y) for a, y in points if not low < y < high]
+    amplitudes = sorted({a for a, _ in points})
+    means = [np.mean([y for a, y in points if a == amplitude]) for amplitude in amplitudes]
+    face = colour if filtered else "white"
+    style = {"color": colour, "markersize": 4.0, "markerfacecolor": face, "linestyle": "none"}
+    axes.plot(amplitudes, means, color=colour, linewidth=1.3, linestyle="-" if filtered else "--")
+    axes.plot(*_columns(inside), marker=marker, label=label, **style)
+    for amplitude, y in outside:
+        edge, arrow = (high, "^") if y >= high else (low, "v")
+        axes.plot([amplitude], [edge], marker=arrow, clip_on=False, **style)
+
+
+def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    return [a for a, _ in points], [y for _, y in points]
+
+
+def _thesis_mark(axes: Any, alignment: Alignment, length_mm: int, half: float) -> None:
+    found = thesis_length(alignment, length_mm)
+    axes.plot(
+        [found.amplitude_rad],
+        [found.mean_mm],
+        marker="*",
+        markersize=10.0,
+        linestyle="none",
+        color=_THESIS,
+        markeredgecolor="white",
+        markeredgewidth=0.6,
+        zorder=5,
+        label="thesis: mean of 13 trials on real modules",
+    )
