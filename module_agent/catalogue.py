@@ -58,9 +58,10 @@ _OLD_VIBRATION = 3.0
 
 
 def _motor(coulomb_nm: float, viscous_nm_s_rad: float) -> MotorConstants:
-    # Resistance and back-EMF: middle of the ranges read from a real X5-1 log. Rotor inertia: the same log's
-    # first step turns about 1.5 A (9.4 mNm) into 1.9e5 rad/s^2.
-    return MotorConstants(9.5, 0.00626, 0.00575, 1530.0, 4.0e-8, coulomb_nm, viscous_nm_s_rad, 0.65)
+    # Resistance at 25 C: published, and in a real X5-1's log 14.2 ohm at the 128 C that it reports, which is
+    # copper's growth to 1.3 %. Back-EMF: the same log. Rotor inertia: the log's motion comes out best with
+    # 1.6e-8 to 3.2e-8, depending on when within its 10 ms a command was received, which is not recorded.
+    return MotorConstants(9.99, 0.00626, 0.00575, 1530.0, 2.6e-8, coulomb_nm, viscous_nm_s_rad, 0.65)
 
 
 def _x5(
@@ -72,9 +73,10 @@ def _x5(
     velocity_clamp_rad_s: float,
     spring_nm_rad: float,
 ) -> ModuleType:
-    # Friction at the output of the X5-1 is 0.076 Nm + 0.017 Nm s/rad (real log). The same gear train drives
-    # the other types through further stages, so it is scaled with the gear ratio, viscous friction with its
-    # square.
+    # A real X5-1 that drives nothing draws the current of 0.076 Nm + 0.017 Nm s/rad by the torque constant
+    # alone; behind a gear that passes 0.65 of it the friction is 0.049 Nm + 0.011 Nm s/rad at the output. The
+    # same gear train drives the other types through further stages, so it is scaled with the gear ratio,
+    # viscous friction with its square.
     scale = gear_ratio / 272.22
     return ModuleType(
         name=name,
@@ -88,7 +90,7 @@ def _x5(
         gear_ratio=gear_ratio,
         velocity_clamp_rad_s=velocity_clamp_rad_s,
         spring_nm_rad=spring_nm_rad,
-        motor=_motor(0.076 * scale, 0.017 * scale**2),
+        motor=_motor(0.049 * scale, 0.011 * scale**2),
         range_rad=None,
     )
 
@@ -125,7 +127,7 @@ CATALOGUE: dict[ModuleTypeName, ModuleType] = {
             gear_ratio=762.22,
             velocity_clamp_rad_s=3.434687,
             spring_nm_rad=100.0,
-            motor=_motor(0.213, 0.133),
+            motor=_motor(0.137, 0.086),
             range_rad=(-1.5708, 1.5708),
         ),
     )
