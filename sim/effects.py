@@ -25,14 +25,14 @@ _TABLE = (
     Effect(
         "friction",
         "actuator",
-        "Coulomb and viscous friction at the motor, sticking when at rest",
+        "Coulomb and viscous friction of motor and gear, sticking when at rest",
         {"friction": 1.0},
         "real X5-1 log: 0.076 Nm + 0.017 Nm s/rad at the output; other types scaled by gear ratio",
     ),
     Effect(
         "gear-loss",
         "actuator",
-        "a friction that grows with the torque transmitted",
+        "a friction that grows with the torque transmitted: driving loses 35 %, being driven back nothing",
         {"gear_loss": 1.0},
         "published efficiency 0.65",
     ),
@@ -46,23 +46,23 @@ _TABLE = (
     Effect(
         "variation",
         "actuator",
-        "every module's friction, motor and spring differ from its type's",
+        "every module's friction, motor constant, winding and spring differ from its type's by factors",
         {"friction_spread": 0.15, "motor_spread": 0.03, "spring_spread": 0.05},
         "thesis 6.1; resistance 8.9-10.1 ohm in a real X5-1 log",
     ),
     Effect(
         "backlash",
         "actuator",
-        "a gap between motor and spring",
+        "a gap between gear and spring; flanks push and do not pull",
         {"backlash_rad": radians(0.1)},
         "an assumption: the X5's backlash is not published",
     ),
     Effect(
         "stiffening-spring",
         "actuator",
-        "stiffness grows from a third near zero to several times at full load",
+        "a cubic spring: 30-70 Nm/rad near zero, 300-1000 at full load, by the type's strength",
         {"spring_stiffening": 1.0},
-        "published for modules since 2019: 30-70 Nm/rad rising to 300-1000",
+        "published for modules since 2019",
     ),
     Effect(
         "imu-white",
@@ -200,16 +200,16 @@ _TABLE = (
     Effect(
         "base-shake",
         "structure",
-        "the base gives as the robot file says: stiffness and damping in six directions",
+        "the base gives as the robot file says: stiffness, damping, up to six directions",
         {"base_shake": 1.0},
         "thesis 6.1, figures 17 and 18",
     ),
     Effect(
         "link-flex",
         "structure",
-        "links bend and twist about where they are held",
+        "links bend and twist on hinges: tubes by a pseudo-rigid beam, others as the robot file says",
         {"link_flex": 1.0},
-        "beam theory, tubes as drawn",
+        "beam theory (Howell 2001) with the tube's published mass and radius; 2 % damping at 40 Hz",
     ),
 )
 

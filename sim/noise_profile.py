@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from sim.effects import EFFECTS, Effect
 
 Amount = Annotated[float, Field(ge=0.0, le=1e4)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 STANDARD_GRAVITY_M_S2 = 9.80665
 
 
@@ -75,11 +76,11 @@ class NoiseProfile(BaseModel):
     friction: Amount = 0.0
     gear_loss: Amount = 0.0
     heat: Amount = 0.0
-    friction_spread: Amount = 0.0
-    motor_spread: Amount = 0.0
-    spring_spread: Amount = 0.0
+    friction_spread: Share = 0.0
+    motor_spread: Share = 0.0
+    spring_spread: Share = 0.0
     backlash_rad: Amount = 0.0
-    spring_stiffening: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    spring_stiffening: Share = 0.0
     # structure
     base_shake: Amount = 0.0
     link_flex: Amount = 0.0
