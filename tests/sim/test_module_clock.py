@@ -19,6 +19,14 @@ def test_a_clock_never_stands_still(clock: ModuleClock, t_ns: int, later_ns: int
     assert module_time(clock, t_ns + later_ns) > module_time(clock, t_ns)
 
 
+@given(clock=clocks, tick=st.integers(0, 30 * 86_400 * 1000))
+def test_stamps_of_successive_ticks_are_a_tick_apart_to_the_drift_and_a_nanosecond(
+    clock: ModuleClock, tick: int
+) -> None:
+    apart = module_time(clock, (tick + 1) * 1_000_000) - module_time(clock, tick * 1_000_000)
+    assert abs(apart - 1_000_000 - clock.drift_ppb / 1000) <= 1
+
+
 def test_a_clock_of_twenty_ppm_gains_seventy_two_milliseconds_in_an_hour() -> None:
     clock = ModuleClock(offset_ns=5, drift_ppb=20_000)
     assert module_time(clock, 3600 * 10**9) - 5 - 3600 * 10**9 == 72_000_000

@@ -29,6 +29,11 @@ def test_truth_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
     _assert_same(found, truth_of(robot, world))
     assert found.imu_bias is not None
     np.testing.assert_array_equal(found.imu_bias, world.imu_bias)
+    assert found.sensor_errors is not None
+    for read, drawn in zip(found.sensor_errors, world.sensor_errors, strict=True):
+        np.testing.assert_array_equal(read, drawn)
+        assert not read.flags.writeable
+    assert found.sensor_errors.misalignment.shape == (6, 2, 3, 3)
     assert not found.inertia.flags.writeable
 
 
@@ -38,7 +43,18 @@ def test_truth_of_a_robot_alone_has_no_clocks(tmp_path: Path) -> None:
     found = read_truth(tmp_path / "truth.json")
     _assert_same(found, truth_of(robot))
     assert found.clocks is None
+    assert found.sensor_errors is None
     assert found.chain.reversed == (False, False, True, False, False, False)
+
+
+def test_truth_written_before_sensors_had_more_errors_than_biases_is_read(tmp_path: Path) -> None:
+    robot = load_robot("tree_y")
+    path = tmp_path / "truth.json"
+    write_truth(path, robot, World(robot, seed=3))
+    document = json.loads(path.read_text())
+    del document["sensor_errors"]
+    path.write_text(json.dumps(document))
+    assert read_truth(path).sensor_errors is None
 
 
 def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
