@@ -13,7 +13,7 @@ Receiver = Literal["module", "coordinator"]
 # gamma: Internet delays are a least delay and a gamma (Corlett, Pullin, Sargood: "Statistics of One-Way
 #   Internet Packet Delays", 53rd IETF, 2002: shape 2.5, scale 1 ms); shape 1 is the wait in an M/M/1 queue.
 # lognormal: the product of many independent slowings; the usual fit where a gamma's tail is too light.
-# pareto: the heaviest tail, as tc-netem(8) offers for the same purpose; second moment finite here (Lomax).
+# pareto: the heaviest tail far out, offered by tc-netem(8) for the same purpose; here Lomax, with a variance.
 Jitter = Literal["gamma", "lognormal", "pareto"]
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -1,4 +1,4 @@
-"""Recorded traces of a network: delay and loss over time, replayed in a circle.
+r"""Recorded traces of a network: delay and loss over time, replayed in a circle.
 
 A trace is a CSV file with the header `time_s,delay_ms,lost` and one row for each probe: when it was sent or
 came back [s, from any origin, never decreasing], how long it took one way [ms, may be empty if it was lost],
