@@ -27,7 +27,7 @@ _TABLE = (
         "actuator",
         "Coulomb and viscous friction of motor and gear, sticking when at rest",
         {"friction": 1.0},
-        "real X5-1 log: 0.076 Nm + 0.017 Nm s/rad at the output; other types scaled by gear ratio",
+        "real X5-1 log: 0.049 Nm + 0.011 Nm s/rad at the output; other types scaled by gear ratio",
     ),
     Effect(
         "gear-loss",
