@@ -86,21 +86,22 @@ class HostedModule:
 
     def collect(self) -> None:
         """Take what has arrived by now, to be judged by the next sample."""
-        if len(self.stops) or len(self.inbox):
+        if self.stops.waiting or self.inbox.waiting:
             self._arrived = self.stops.drain() + self.inbox.drain()
+            self.firmware.dropped_events = self.inbox.dropped
 
     def step(self, sample: SensorSample) -> tuple[float, list[Outgoing]]:
         """Run one tick on what was collected before the sample was taken."""
         self.now_ns = sample.t_ns
-        firmware = self.firmware
-        firmware.dropped_events = self.inbox.dropped
-        events, self._arrived = self._arrived, []
+        if not self._arrived:
+            return self.firmware.step(sample.t_ns, sample, ())
         incoming: list[Incoming] = []
         answers: list[Outgoing] = []
-        for event in events:
+        for event in self._arrived:
             self._sort(event, incoming, answers)
-        pwm, out = firmware.step(sample.t_ns, sample, incoming)
-        return pwm, answers + out if answers else out
+        self._arrived = []
+        pwm, out = self.firmware.step(sample.t_ns, sample, incoming)
+        return pwm, answers + out
 
     def _sort(self, event: Event, incoming: list[Incoming], answers: list[Outgoing]) -> None:
         if not isinstance(event, Request | Sample):
@@ -216,13 +217,20 @@ class AgentHost:
         for module in self.modules:
             module.collect()
         samples = self._hardware.exchange(self._pwm)
-        if len(self._heard):
+        if self._heard.waiting:
             self._hear()
-        for index, (module, sample) in enumerate(zip(self.modules, samples, strict=True)):
-            self._pwm[index], out = module.step(sample)
-            for outgoing in out:
-                self._send(module, outgoing)
-        self._estimate()
+        self._pwm = list(map(self._step, self.modules, samples))
+        if self._neighbours.restless:
+            self._attend_to_motions()
+        self._worker.check()
+        if self._found:
+            self._publish_findings()
+
+    def _step(self, module: HostedModule, sample: SensorSample) -> float:
+        pwm, out = module.step(sample)
+        for outgoing in out:
+            self._send(module, outgoing)
+        return pwm
 
     def _send(self, module: HostedModule, outgoing: Outgoing) -> None:
         if isinstance(outgoing, Answer):
@@ -268,7 +276,7 @@ class AgentHost:
             return
         self._neighbours.on_feedback(feedback, clocks, live=False)
 
-    def _estimate(self) -> None:
+    def _attend_to_motions(self) -> None:
         now_ns = self.modules[0].now_ns
         wishes, motions = self._neighbours.poll(now_ns)
         for wish in wishes:
@@ -279,7 +287,8 @@ class AgentHost:
         for motion in motions:
             for module in self.modules:
                 self._submit(module, motion)
-        self._worker.check()
+
+    def _publish_findings(self) -> None:
         while self._found:
             module, finding = self._found.pop(0)
             module.observer.findings[finding.joint] = finding

@@ -6,26 +6,31 @@ from module_agent.wire.transport import Event
 
 
 class Inbox:
-    """Events in order of arrival. When it is full, what arrives is dropped and counted."""
+    """Events in order of arrival. When it is full, what arrives is dropped and counted.
+
+    `waiting` is true while there are events: the queue itself, as asking it costs a tick the least.
+    """
+
+    __slots__ = ("_capacity", "dropped", "waiting")
 
     def __init__(self, capacity: int = 256):
-        self._events: deque[Event] = deque()
+        self.waiting: deque[Event] = deque()
         self._capacity = capacity
         self.dropped = 0
 
     def put(self, event: Event) -> None:
         """Enqueue from any thread; never blocks."""
-        if len(self._events) >= self._capacity:
+        if len(self.waiting) >= self._capacity:
             self.dropped += 1
         else:
-            self._events.append(event)
+            self.waiting.append(event)
 
     def drain(self, limit: int = 64) -> list[Event]:
         """Take up to `limit` events, oldest first."""
         events: list[Event] = []
-        while self._events and len(events) < limit:
-            events.append(self._events.popleft())
+        while self.waiting and len(events) < limit:
+            events.append(self.waiting.popleft())
         return events
 
     def __len__(self) -> int:
-        return len(self._events)
+        return len(self.waiting)

@@ -71,9 +71,13 @@ class _Track:
 
 
 class Neighbours:
-    """Collects exploration motions of all joints; `own_ns` maps own serials to their clocks now."""
+    """Collects exploration motions of all joints; `own_ns` maps own serials to their clocks now.
+
+    `restless` says whether `poll` may have anything to say: something was heard since, or rows are missing.
+    """
 
     def __init__(self) -> None:
+        self.restless = False
         self._tracks: dict[str, _Track] = {}
         self._finished: dict[str, tuple[int, int]] = {}
         self._wishes: list[Wish] = []
@@ -93,6 +97,7 @@ class Neighbours:
         """Take notice of a status; `now_ns` is any one steady clock of this process."""
         if self._late(status):
             return
+        self.restless = True
         record = status.motion
         if record is None or record.pattern.kind not in EXPLORATION_KINDS:
             self._drop(status.serial)
@@ -120,6 +125,7 @@ class Neighbours:
         track = self._tracks.get(feedback.serial)
         if track is None or track.boot != feedback.boot:
             return
+        self.restless = True
         rows = track.log.add(feedback)
         if live and len(rows):
             track.note_arrival(int(rows["t_ns"][-1]), own_ns)
@@ -154,5 +160,6 @@ class Neighbours:
                 self._wishes.append(
                     AskHistory(track.serial, track.boot, first, min(stop, first + ROWS_PER_QUESTION))
                 )
+        self.restless = any(track.record.end_row is not None for track in self._tracks.values())
         wishes, self._wishes = self._wishes, []
         return wishes, complete

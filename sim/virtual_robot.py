@@ -17,9 +17,7 @@ from sim.robot_file import Robot
 from sim.truth import TruthLog
 from sim.virtual_loop import LoopScheduler, VirtualLoop
 from sim.virtual_network import VirtualNetwork
-from sim.world import World
-
-TICK_S = 0.001
+from sim.world import TICK_NS, World
 
 
 class VirtualSettings(NamedTuple):
@@ -93,9 +91,9 @@ class VirtualRobot:
     def start(self) -> None:
         """Begin to tick."""
         self._running = True
-        self.loop.call_soon(self._tick, self.loop.time() + TICK_S)
+        self.loop.call_soon(self._tick)
 
-    def _tick(self, next_s: float) -> None:
+    def _tick(self) -> None:
         if not self._running:
             return
         self.samples = self.world.step(self.pwm)
@@ -103,7 +101,7 @@ class VirtualRobot:
         for serial, host in self.hosts.items():
             host.cycle()
             self.pwm[self._index[serial]] = host.pwm[0]
-        self.loop.call_at(next_s, self._tick, next_s + TICK_S)
+        self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)
 
     def kill(self, serial: str) -> None:
         """End an agent as SIGKILL does: its motor gets zero PWM, its network endpoint is gone."""

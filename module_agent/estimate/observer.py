@@ -115,5 +115,4 @@ def _own_rows(history: History, motion: JointMotion, offset_ns: int) -> Rows:
         return history.rows(history.next_row, history.next_row)
     start = int(motion.rows["t_ns"][0]) + offset_ns - MARGIN_NS
     end = int(motion.rows["t_ns"][-1]) + offset_ns + MARGIN_NS
-    rows = history.rows(history.first_row, history.next_row)
-    return rows[(rows["t_ns"] >= start) & (rows["t_ns"] <= end)]
+    return history.between(start, end)

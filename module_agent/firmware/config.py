@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from module_agent.catalogue import ModuleType, module_type
-from module_agent.wire.messages import ExpiryAction, Limits
+from module_agent.wire.messages import ExpiryAction, GainSet, Info, Limits
 
 FIRMWARE_NAME = "x5-agent 0.1"
 
@@ -23,6 +23,11 @@ class FirmwareConfig(NamedTuple):
     lifetime_ns: int = 250_000_000
     expiry_action: ExpiryAction = "motor_off"
     strategy: int = 3
+
+    @property
+    def history_rows(self) -> int:
+        """How many feedback rows are kept."""
+        return int(self.history_s * self.feedback_rate_hz)
 
 
 def catalogue_limits(kind: ModuleType) -> Limits:
@@ -55,3 +60,24 @@ def check_config(config: FirmwareConfig) -> FirmwareConfig:
         raise ValueError(f"{config.batch_rows} rows a batch: it must be 1 to 64")
     module_type(config.kind.name)
     return config
+
+
+def describe(config: FirmwareConfig, gains: GainSet, seq: int, t_ns: int) -> Info:
+    """Return what a module with these settings says of itself, with the gains in force, at a module time."""
+    return Info(
+        serial=config.serial,
+        boot=config.boot,
+        seq=seq,
+        module_type=config.kind.name,
+        firmware=FIRMWARE_NAME,
+        feedback_rate_hz=config.feedback_rate_hz,
+        batch_rows=config.batch_rows,
+        history_rows=config.history_rows,
+        tick_ns=config.tick_ns,
+        imu_period_ns=config.imu_period_ns,
+        lifetime_ns=config.lifetime_ns,
+        expiry_action=config.expiry_action,
+        limits=config.limits,
+        gains=gains,
+        t_ns=t_ns,
+    )

@@ -12,6 +12,7 @@ verified on a real log, and tau R / (48 Kt N efficiency) for an effort.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 from module_agent.catalogue import ModuleType
@@ -32,8 +33,14 @@ class Command(NamedTuple):
 UNSET = Command(None, None, None)
 
 
+Law = Callable[[Command, float, float, float], float]
+
+
 class Controller:
-    """The three loops of one module."""
+    """The three loops of one module under its control strategy.
+
+    `update(command, position_rad, velocity_rad_s, effort_nm)` returns the PWM of this tick.
+    """
 
     def __init__(self, kind: ModuleType, gains: GainSet, dt_s: float):
         motor = kind.motor
@@ -46,46 +53,77 @@ class Controller:
             * motor.efficiency
         )
         self.gains = gains
-        self._strategy = gains.strategy
-        self._position = Pid(gains.position, dt_s)
-        self._velocity = Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s)
-        self._effort = Pid(gains.effort, dt_s, 1.0 / torque_at_full_pwm)
+        self._loops = (
+            Pid(gains.position, dt_s),
+            Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s),
+            Pid(gains.effort, dt_s, 1.0 / torque_at_full_pwm),
+        )
+        self.update: Law = _LAWS[gains.strategy](*self._loops)
 
     def reset(self) -> None:
         """Forget all loops' past."""
-        self._position.reset()
-        self._velocity.reset()
-        self._effort.reset()
-
-    def update(self, command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
-        """Return the PWM of this tick."""
-        strategy = self._strategy
-        if strategy == 0:
-            return 0.0
-        if strategy == 1:
-            return _clip(command.effort_nm) if command.effort_nm is not None else 0.0
-        p = self._loop(self._position, command.position_rad, position_rad)
-        v = self._loop(self._velocity, command.velocity_rad_s, velocity_rad_s)
-        if strategy == 3:
-            return _clip(_sum(p, v, self._loop(self._effort, command.effort_nm, effort_nm)))
-        if strategy == 4:
-            target = None if p is None and command.effort_nm is None else _sum(p, command.effort_nm)
-            return _clip(_sum(v, self._loop(self._effort, target, effort_nm)))
-        unset = p is None and v is None and command.effort_nm is None
-        target = None if unset else _sum(p, v, command.effort_nm)
-        return _clip(_sum(self._loop(self._effort, target, effort_nm)))
-
-    @staticmethod
-    def _loop(loop: Pid, target: float | None, measured: float) -> float | None:
-        if target is None:
+        for loop in self._loops:
             loop.reset()
-            return None
-        return loop.update(target, measured)
+
+
+def _off(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    return lambda command, position_rad, velocity_rad_s, effort_nm: 0.0
+
+
+def _direct_pwm(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    return lambda command, position_rad, velocity_rad_s, effort_nm: _clip(_sum(command.effort_nm))
+
+
+def _all_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
+        p_target, v_target, feed_nm = command
+        p = position.follow(p_target, position_rad)
+        v = velocity.follow(v_target, velocity_rad_s)
+        unset = p is None and v is None and feed_nm is None
+        return _clip(_sum(effort.follow(None if unset else _sum(p, v, feed_nm), effort_nm)))
+
+    return law
+
+
+def _side_by_side(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
+        p_target, v_target, e_target = command
+        p = position.follow(p_target, position_rad)
+        v = velocity.follow(v_target, velocity_rad_s)
+        return _clip(_sum(p, v, effort.follow(e_target, effort_nm)))
+
+    return law
+
+
+def _position_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
+        p_target, v_target, feed_nm = command
+        p = position.follow(p_target, position_rad)
+        v = velocity.follow(v_target, velocity_rad_s)
+        unset = p is None and feed_nm is None
+        return _clip(_sum(v, effort.follow(None if unset else _sum(p, feed_nm), effort_nm)))
+
+    return law
+
+
+_LAWS: dict[int, Callable[[Pid, Pid, Pid], Law]] = {
+    0: _off,
+    1: _direct_pwm,
+    2: _all_through_effort,
+    3: _side_by_side,
+    4: _position_through_effort,
+}
 
 
 def _sum(*terms: float | None) -> float:
-    return sum(term for term in terms if term is not None)
+    total = 0.0
+    for term in terms:
+        if term is not None:
+            total += term
+    return total
 
 
 def _clip(pwm: float) -> float:
-    return min(max(pwm, -1.0), 1.0)
+    if pwm < -1.0:
+        return -1.0
+    return 1.0 if pwm > 1.0 else pwm

@@ -4,20 +4,21 @@ It is pure: no clock, no socket, no file, no randomness. Each step expires what 
 runs the control law, and publishes feedback rows and status.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from module_agent.firmware.admission import Admission
-from module_agent.firmware.config import FIRMWARE_NAME, FirmwareConfig, check_config
-from module_agent.firmware.controller import NOMINAL_VOLTAGE_V, UNSET, Command, Controller
+from module_agent.firmware.config import FirmwareConfig, check_config, describe
+from module_agent.firmware.controller import UNSET, Command, Controller
+from module_agent.firmware.feedback_stream import Batch, FeedbackStream
 from module_agent.firmware.gains import default_gains
-from module_agent.firmware.history import MAX_ROWS_PER_ANSWER, History
+from module_agent.firmware.history import MAX_ROWS_PER_ANSWER
 from module_agent.firmware.lease import Lease
-from module_agent.firmware.motion import Motion, check_duration, check_motion, check_speed
+from module_agent.firmware.motion import Motion, check_duration, check_motion, check_setpoint
+from module_agent.firmware.motor_guard import WINDING_LIMIT_C, WINDING_REARM_C, MotorGuard
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
 from module_agent.hardware import SensorSample
 from module_agent.wire.codec import encode
-from module_agent.wire.feedback_rows import STATE_NAMES
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
     Ack,
@@ -37,11 +38,6 @@ from module_agent.wire.messages import (
 from module_agent.wire.refusal import Refusal, WireError
 
 STATUS_PERIOD_NS = 400_000_000
-# Above this the manufacturer's PWM ceiling 1 - 1/(155 - T) has fallen to zero.
-WINDING_LIMIT_C = 154.0
-WINDING_REARM_C = 140.0
-DAMPING_LIMIT_PWM = 0.25
-_NAN = float("nan")
 
 
 class Incoming(NamedTuple):
@@ -75,12 +71,14 @@ class Firmware:
     def __init__(self, config: FirmwareConfig):
         self.config = check_config(config)
         self.lease = Lease()
-        self.history = History(int(config.history_s * config.feedback_rate_hz))
+        self._rows = FeedbackStream(config)
+        self.history = self._rows.history
         self.admission = Admission(config.serial, config.boot, config.lifetime_ns)
         self.state: State = "idle"
         self.dropped_events = 0
         self._controller = self._own_controller()
-        self._period_ns = round(1e9 / config.feedback_rate_hz)
+        self._guard = MotorGuard(config)
+        self._drives = self._drive_of_state()
         self._motion: Motion | None = None
         self._record: MotionRecord | None = None
         self.last_rest: MotionRecord | None = None
@@ -92,11 +90,7 @@ class Firmware:
         self._seq = 0
         self._now_ns = 0
         self._sample: SensorSample | None = None
-        self._row_due_ns = 0
-        self._last_imu_ns = -1
-        self._sent_row = 0
-        self._status_ns = -STATUS_PERIOD_NS
-        self._status_due = True
+        self._status_due_ns = 0
         self._note = ""
 
     # ------------------------------------------------------------------ the tick
@@ -117,57 +111,51 @@ class Firmware:
         if sample.winding_temperature_c >= WINDING_LIMIT_C and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", f"winding at {sample.winding_temperature_c:.0f} C")
-        pwm = self._drive(sample)
-        self._append_row(sample, pwm, out)
-        if self._status_due or now_ns - self._status_ns >= STATUS_PERIOD_NS:
-            self._status_due, self._status_ns = False, now_ns
+        pwm = self._drives[self.state](sample)
+        if self._rows.due(now_ns, sample.imu_t_ns):
+            self._append_row(sample, pwm, out)
+        if now_ns >= self._status_due_ns:
+            self._status_due_ns = now_ns + STATUS_PERIOD_NS
             out.append(Publication(Leaf.STATUS, encode(self._status(re=0))))
         return pwm, out
 
-    def _drive(self, sample: SensorSample) -> float:
-        state = self.state
-        action = self.config.expiry_action if state == "expired" else None
-        if state == "stopped" or action == "damping":
-            return self._limit(self._damping(sample), sample)
-        if state == "idle" or state == "fault" or action == "motor_off":
-            self._command = UNSET
-            return 0.0
-        if state == "moving":
-            self._command = self._follow_motion()
-        elif state == "streaming":
-            self._command = self._setpoint
+    # ------------------------------------------------------------------ what drives the motor
+
+    def _drive_of_state(self) -> dict[State, Callable[[SensorSample], float]]:
+        on_expiry = {"motor_off": self._rest, "hold": self._follow, "damping": self._guard.damping}
+        return {
+            "idle": self._rest,
+            "armed": self._follow,
+            "moving": self._follow_motion,
+            "streaming": self._follow_setpoint,
+            "expired": on_expiry[self.config.expiry_action],
+            "stopped": self._guard.damping,
+            "fault": self._rest,
+        }
+
+    def _rest(self, sample: SensorSample) -> float:
+        self._command = UNSET
+        return 0.0
+
+    def _follow(self, sample: SensorSample) -> float:
         pwm = self._controller.update(
             self._command, sample.position_rad, sample.velocity_rad_s, sample.effort_nm
         )
-        return self._limit(pwm, sample)
+        return self._guard.limit(pwm, sample)
 
-    def _follow_motion(self) -> Command:
-        motion = self._motion
-        assert motion is not None
-        command = motion.command(self._now_ns)
+    def _follow_setpoint(self, sample: SensorSample) -> float:
+        self._command = self._setpoint
+        return self._follow(sample)
+
+    def _follow_motion(self, sample: SensorSample) -> float:
+        assert self._motion is not None
+        command = self._motion.command(self._now_ns)
         if command is None:
             self._finish_motion("done")
             self._enter("motion_done")
-            return self._command
-        return command
-
-    def _damping(self, sample: SensorSample) -> float:
-        # By the motor's speed and not the output's, which follows through a spring: fed back, that is driven
-        # into an oscillation (25 Hz and 2.6 rad/s on an X5-9 with an arm of 0.5 kg).
-        kind = self.config.kind
-        pwm = -sample.motor_velocity_rad_s / (kind.gear_ratio * kind.max_speed_rad_s)
-        return min(max(pwm, -DAMPING_LIMIT_PWM), DAMPING_LIMIT_PWM)
-
-    def _limit(self, pwm: float, sample: SensorSample) -> float:
-        """Keep the duty below the winding's ceiling 1 - 1/(155 - T), and never drive out of the range."""
-        low, high = self.config.limits.min_position_rad, self.config.limits.max_position_rad
-        if (high is not None and sample.position_rad > high and pwm > 0.0) or (
-            low is not None and sample.position_rad < low and pwm < 0.0
-        ):
-            return 0.0
-        ceiling = max(0.0, 1.0 - 1.0 / max(155.0 - sample.winding_temperature_c, 1.0))
-        most = ceiling * sample.voltage_v / NOMINAL_VOLTAGE_V
-        return min(max(pwm, -most), most)
+        else:
+            self._command = command
+        return self._follow(sample)
 
     # ------------------------------------------------------------------ states
 
@@ -178,7 +166,7 @@ class Firmware:
         if target != self.state and target not in COMMANDED:
             self._controller.reset()
         self.state = target
-        self._status_due = True
+        self._status_due_ns = 0
         self._note = note
 
     def _own_controller(self) -> Controller:
@@ -189,7 +177,7 @@ class Firmware:
         """Let go of the holder, and of the gains that it has set: the next one shall not inherit them."""
         self.lease.release()
         self._controller = self._own_controller()
-        self._status_due = True
+        self._status_due_ns = 0
 
     def _expire(self) -> None:
         self._expiries += 1
@@ -211,7 +199,7 @@ class Firmware:
         end = self._motion.last_position_rad if outcome == "done" else self._command.position_rad
         self._command = Command(end, 0.0, None)
         self._motion = None
-        self._status_due = True
+        self._status_due_ns = 0
 
     # ------------------------------------------------------------------ inbox
 
@@ -228,7 +216,8 @@ class Firmware:
         leaf, payload, read = incoming.leaf, incoming.payload, self.admission.read
         match leaf:
             case Leaf.INFO:
-                return encode(self._info(read(Ask, payload, any_boot=True)))
+                read(Ask, payload, any_boot=True)
+                return encode(self._info())
             case Leaf.STATUS:
                 return encode(self._status(read(Ask, payload, any_boot=True).seq))
             case Leaf.HISTORY:
@@ -328,21 +317,10 @@ class Firmware:
     def _stream(self, setpoint: Setpoint) -> None:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "a motion is running; setpoints are taken when it has ended")
-        limits = self.config.limits
-        check_speed(abs(setpoint.velocity_rad_s or 0.0), limits)
-        position = setpoint.position_rad
-        if position is not None and (
-            (limits.min_position_rad is not None and position < limits.min_position_rad)
-            or (limits.max_position_rad is not None and position > limits.max_position_rad)
-        ):
-            raise WireError(
-                Refusal.LIMIT,
-                f"position {position:.3f} rad is outside "
-                f"{limits.min_position_rad} .. {limits.max_position_rad} rad",
-            )
+        check_setpoint(setpoint, self.config.limits)
         if self.state != "streaming":
             self._enter("setpoint")
-        self._setpoint = Command(position, setpoint.velocity_rad_s, setpoint.effort_nm)
+        self._setpoint = Command(setpoint.position_rad, setpoint.velocity_rad_s, setpoint.effort_nm)
         self._refresh(setpoint.echo_ns)
 
     def _set_gains(self, command: GainsCommand) -> None:
@@ -353,74 +331,33 @@ class Firmware:
 
     def _answer_history(self, request: HistoryRequest) -> bytes:
         end = min(request.end_row, request.first_row + MAX_ROWS_PER_ANSWER)
-        rows = self.history.rows(request.first_row, end)
-        return encode(self._feedback(request.first_row, len(rows), rows.tobytes()))
+        block = self.history.block(request.first_row, end)
+        return encode(self._feedback(Batch(request.first_row, end, block)))
 
     # ------------------------------------------------------------------ what it publishes
 
     def _append_row(self, sample: SensorSample, pwm: float, out: list[Outgoing]) -> None:
-        now_ns, half_tick = self._now_ns, self.config.tick_ns // 2
-        new_imu = sample.imu_t_ns != self._last_imu_ns
-        self._last_imu_ns = sample.imu_t_ns
-        if now_ns < self._row_due_ns - half_tick:
-            return
-        # Rows no faster than the IMU wait for its next sample, so that every row holds a new one.
-        slow = self._period_ns >= self.config.imu_period_ns
-        if slow and not new_imu and now_ns < self._row_due_ns + self.config.imu_period_ns:
-            return
-        self._row_due_ns = max(self._row_due_ns, now_ns - half_tick) + self._period_ns
-        if slow and new_imu:
-            self._row_due_ns = now_ns + self._period_ns
-        self.history.append(self._row(sample, pwm))
-        if self.history.next_row - self._sent_row >= self.config.batch_rows:
-            first, end = self._sent_row, self.history.next_row
-            self._sent_row = end
-            block = self.history.rows(first, end).tobytes()
-            out.append(Publication(Leaf.FEEDBACK, encode(self._feedback(first, end - first, block))))
-
-    def _row(self, sample: SensorSample, pwm: float) -> tuple[object, ...]:
-        position, velocity, effort = self._command
         motion = self._record.motion_id if self._motion is not None and self._record is not None else 0
-        return (
-            sample.t_ns,
-            sample.imu_t_ns,
-            motion,
-            STATE_NAMES.index(self.state),
-            sample.position_rad,
-            sample.velocity_rad_s,
-            sample.effort_nm,
-            _NAN if position is None else position,
-            _NAN if velocity is None else velocity,
-            _NAN if effort is None else effort,
-            min(max(pwm * NOMINAL_VOLTAGE_V / sample.voltage_v, -1.0), 1.0) if sample.voltage_v else 0.0,
-            sample.deflection_rad,
-            sample.motor_velocity_rad_s,
-            sample.motor_current_a,
-            sample.winding_temperature_c,
-            sample.voltage_v,
-            sample[10:13],
-            sample[13:16],
-        )
+        batch = self._rows.append(sample, motion, self.state, self._command, pwm)
+        if batch is not None:
+            out.append(Publication(Leaf.FEEDBACK, encode(self._feedback(batch))))
 
     def _next_seq(self) -> int:
         self._seq += 1
         return self._seq
 
-    def _feedback(self, first: int, count: int, rows: bytes) -> Feedback:
-        # Built from trusted values: validation would only cost time here.
-        return Feedback.model_construct(
-            v=1,
+    def _feedback(self, batch: Batch) -> Feedback:
+        return Feedback(
             serial=self.config.serial,
             boot=self.config.boot,
             seq=self._next_seq(),
-            first_row=first,
-            count=count,
-            rows=rows,
+            first_row=batch.first_row,
+            count=batch.end_row - batch.first_row,
+            rows=batch.block,
         )
 
     def _ack(self, accepted: bool, re: int, reason: str = "", detail: str = "") -> Ack:
-        return Ack.model_construct(
-            v=1,
+        return Ack(
             serial=self.config.serial,
             boot=self.config.boot,
             seq=self._next_seq(),
@@ -453,22 +390,5 @@ class Firmware:
             note=self._note[:512],
         )
 
-    def _info(self, ask: Ask) -> Info:
-        config = self.config
-        return Info(
-            serial=config.serial,
-            boot=config.boot,
-            seq=self._next_seq(),
-            module_type=config.kind.name,
-            firmware=FIRMWARE_NAME,
-            feedback_rate_hz=config.feedback_rate_hz,
-            batch_rows=config.batch_rows,
-            history_rows=self.history.capacity,
-            tick_ns=config.tick_ns,
-            imu_period_ns=config.imu_period_ns,
-            lifetime_ns=config.lifetime_ns,
-            expiry_action=config.expiry_action,
-            limits=config.limits,
-            gains=self._controller.gains,
-            t_ns=self._now_ns,
-        )
+    def _info(self) -> Info:
+        return describe(self.config, self._controller.gains, self._next_seq(), self._now_ns)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from module_agent.wire.feedback_rows import ROW, Rows
+from module_agent.wire.feedback_rows import ROW, Rows, pack_row
 from module_agent.wire.refusal import Refusal, WireError
 
 MAX_ROWS_PER_ANSWER = 256
@@ -12,7 +12,9 @@ class History:
     """A ring of feedback rows, numbered from 0 since boot."""
 
     def __init__(self, capacity: int):
-        self._ring = np.zeros(capacity, dtype=ROW)
+        self._bytes = bytearray(capacity * ROW.itemsize)
+        # The same memory: rows are written one by one as bytes and read in bulk as records.
+        self._ring: Rows = np.frombuffer(self._bytes, dtype=ROW)
         self.capacity = capacity
         self.next_row = 0
 
@@ -21,13 +23,21 @@ class History:
         """The oldest row still kept."""
         return max(0, self.next_row - self.capacity)
 
-    def append(self, row: tuple[object, ...]) -> None:
-        """Add one row, in the field order of `feedback_rows.ROW`."""
-        self._ring[self.next_row % self.capacity] = row
+    def append(self, values: tuple[float, ...]) -> None:
+        """Add one row: its values in the order of `feedback_rows.ROW`, vectors element by element."""
+        pack_row(self._bytes, self.next_row % self.capacity, values)
         self.next_row += 1
 
     def rows(self, first: int, end: int) -> Rows:
         """Return a copy of rows `first` up to and without `end`, shape (end - first,).
+
+        Raises:
+            WireError: GONE (overwritten or not yet there), saying which rows are kept.
+        """
+        return np.frombuffer(self.block(first, end), dtype=ROW)
+
+    def block(self, first: int, end: int) -> bytes:
+        """Return the bytes of rows `first` up to and without `end`.
 
         Raises:
             WireError: GONE (overwritten or not yet there), saying which rows are kept.
@@ -37,7 +47,26 @@ class History:
                 Refusal.GONE,
                 f"rows {first} to {end} are not kept; kept are {self.first_row} to {self.next_row}",
             )
-        start, stop = first % self.capacity, first % self.capacity + (end - first)
-        if stop <= self.capacity:
-            return self._ring[start:stop].copy()
-        return np.concatenate((self._ring[start:], self._ring[: stop - self.capacity]))
+        start = first % self.capacity * ROW.itemsize
+        stop = start + (end - first) * ROW.itemsize
+        ring = memoryview(self._bytes)
+        if stop <= len(ring):
+            return bytes(ring[start:stop])
+        return bytes(ring[start:]) + bytes(ring[: stop - len(ring)])
+
+    def between(self, start_ns: int, end_ns: int) -> Rows:
+        """Return a copy of the rows kept whose module time is within a span, both ends included."""
+        first, end = self._row_from(start_ns), self._row_from(end_ns + 1)
+        return self.rows(first, max(first, end))
+
+    def _row_from(self, t_ns: int) -> int:
+        """Return the first row kept at or after a module time; rows are in the order of their time."""
+        low, high = self.first_row, self.next_row
+        stamps = self._ring["t_ns"]
+        while low < high:
+            middle = (low + high) // 2
+            if stamps[middle % self.capacity] < t_ns:
+                low = middle + 1
+            else:
+                high = middle
+        return low

@@ -4,7 +4,7 @@ import numpy as np
 
 from module_agent.firmware.controller import Command
 from module_agent.firmware.waveform import duration_s, waveform
-from module_agent.wire.messages import Limits, Pattern
+from module_agent.wire.messages import Limits, Pattern, Setpoint
 from module_agent.wire.refusal import Refusal, WireError
 
 # A motion is sampled when it starts; a minute takes 3 ms.
@@ -73,6 +73,20 @@ def check_speed(speed_rad_s: float, limits: Limits) -> None:
             f"{speed_rad_s:.1f} rad/s is over {ABSURD_SPEED:.0f} times what this module can do, "
             f"{limits.max_speed_rad_s:.2f} rad/s",
         )
+
+
+def check_setpoint(setpoint: Setpoint, limits: Limits) -> None:
+    """Check that a setpoint is within the position limits and is not absurdly fast.
+
+    Raises:
+        WireError: LIMIT, with the position and the range that is allowed, or the speed.
+    """
+    check_speed(abs(setpoint.velocity_rad_s or 0.0), limits)
+    position, low, high = setpoint.position_rad, limits.min_position_rad, limits.max_position_rad
+    if position is not None and (
+        (low is not None and position < low) or (high is not None and position > high)
+    ):
+        raise WireError(Refusal.LIMIT, f"position {position:.3f} rad is outside {low} .. {high} rad")
 
 
 def check_motion(motion: Motion, limits: Limits) -> None:

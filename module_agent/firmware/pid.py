@@ -10,13 +10,37 @@ from module_agent.wire.messages import PidGains
 class Pid:
     """The state of one loop; `update` advances it by one tick of `dt_s`."""
 
-    __slots__ = ("_dt", "_error", "_ff_scale", "_g", "_integral", "_measured", "_output", "_target")
+    __slots__ = (
+        "_dt",
+        "_error",
+        "_ff",
+        "_g",
+        "_integral",
+        "_kp",
+        "_lowpass",
+        "_max_output",
+        "_max_target",
+        "_measured",
+        "_min_output",
+        "_min_target",
+        "_output",
+        "_plain",
+        "_target",
+    )
 
     def __init__(self, gains: PidGains, dt_s: float, feed_forward_scale: float = 1.0):
         """`feed_forward_scale` turns the target's unit into the output's (PWM per rad/s, or per Nm)."""
         self._g = gains
         self._dt = dt_s
-        self._ff_scale = feed_forward_scale * gains.feed_forward
+        # What every tick needs is resolved once: a model's fields are dictionary lookups.
+        self._kp = gains.kp
+        self._ff = feed_forward_scale * gains.feed_forward
+        self._min_target, self._max_target = gains.min_target, gains.max_target
+        self._min_output, self._max_output = gains.min_output, gains.max_output
+        self._lowpass = gains.output_lowpass
+        self._plain = not (gains.ki or gains.kd or gains.punch or gains.dead_zone) and (
+            gains.target_lowpass == 1.0
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -27,17 +51,43 @@ class Pid:
         self._integral = 0.0
         self._output: float | None = None
 
+    def follow(self, target: float | None, measured: float) -> float | None:
+        """Return this tick's output; None, and the past is forgotten, while the target is unset."""
+        if target is not None:
+            return self.update(target, measured)
+        if self._output is not None:
+            self.reset()
+        return None
+
     def update(self, target: float, measured: float) -> float:
         """Return this tick's output; the first one after a reset has no derivative and no filter past."""
+        if target < self._min_target:
+            target = self._min_target
+        if target > self._max_target:
+            target = self._max_target
+        if self._plain:
+            output = self._kp * (target - measured) + self._ff * target
+        else:
+            output = self._every_term(target, measured)
+        if output < self._min_output:
+            output = self._min_output
+        if output > self._max_output:
+            output = self._max_output
+        if self._lowpass < 1.0 and self._output is not None:
+            output = self._lowpass * output + (1.0 - self._lowpass) * self._output
+        self._output = output
+        return output
+
+    def _every_term(self, target: float, measured: float) -> float:
+        """Return the output before its clamp, for a target within its own."""
         g = self._g
-        target = min(max(target, g.min_target), g.max_target)
         if g.target_lowpass < 1.0 and self._target is not None:
             target = g.target_lowpass * target + (1.0 - g.target_lowpass) * self._target
         self._target = target
         error = target - measured
         if -g.dead_zone < error < g.dead_zone:
             error = 0.0
-        output = g.kp * error + self._ff_scale * target
+        output = self._kp * error + self._ff * target
         if g.ki:
             limit = g.i_clamp
             self._integral = min(max(self._integral + g.ki * error * self._dt, -limit), limit)
@@ -46,10 +96,6 @@ class Pid:
             output += g.kd * self._derivative(error, measured)
         if g.punch and error:
             output += g.punch if error > 0.0 else -g.punch
-        output = min(max(output, g.min_output), g.max_output)
-        if g.output_lowpass < 1.0 and self._output is not None:
-            output = g.output_lowpass * output + (1.0 - g.output_lowpass) * self._output
-        self._output = output
         return output
 
     def _derivative(self, error: float, measured: float) -> float:

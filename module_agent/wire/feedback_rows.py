@@ -1,5 +1,8 @@
 """The samples inside a `Feedback` message: little-endian records of `ROW`, packed, 101 bytes each."""
 
+import math
+import struct
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +37,31 @@ STATE_NAMES = ("idle", "armed", "moving", "streaming", "expired", "stopped", "fa
 
 Rows = NDArray[Any]
 
+_CODES = {"<i8": "q", "<u4": "I", "|u1": "B", "<f8": "d", "<f4": "f"}
+_PACKING = struct.Struct(
+    "<" + "".join(math.prod(f.shape) * _CODES[f.base.str] for f, *_ in (ROW.fields or {}).values())
+)
+_MAX_F4 = float(np.finfo(np.float32).max)
+
+# What a module measures must be finite; commands may be unset. Row by row, as numpy takes 1.4 us a field for
+# a message of 5 rows, and this 0.2 us a row.
+_MEASURED = ("position_rad", "velocity_rad_s", "effort_nm", "gyro_rad_s", "accel_m_s2")
+_MEASURED_PACKING = struct.Struct("<21x d 2f 40x 6f")
+
+
+def pack_row(ring: bytearray, slot: int, values: Sequence[float]) -> None:
+    """Write one record into its slot: the values in the order of `ROW`, vectors element by element.
+
+    A value too large for its field is kept as infinite, which whoever reads the row refuses.
+    """
+    offset = slot * ROW.itemsize
+    try:
+        _PACKING.pack_into(ring, offset, *values)
+    except OverflowError:
+        _PACKING.pack_into(
+            ring, offset, *(math.copysign(math.inf, v) if abs(v) > _MAX_F4 else v for v in values)
+        )
+
 
 def unpack(feedback: Feedback) -> Rows:
     """Return the records of a feedback message, shape (count,), read-only.
@@ -47,7 +75,8 @@ def unpack(feedback: Feedback) -> Rows:
             f"{len(feedback.rows)} bytes of rows, {feedback.count} rows of {ROW.itemsize} bytes announced",
         )
     rows = np.frombuffer(feedback.rows, dtype=ROW)
-    for field in ("position_rad", "velocity_rad_s", "effort_nm", "gyro_rad_s", "accel_m_s2"):
-        if not np.isfinite(rows[field]).all():
-            raise WireError(Refusal.NOT_FINITE, f"{field} of serial {feedback.serial} is not finite")
+    # A sum is finite if all its terms are: eight f4 are too little to make one f8 overflow.
+    if not all(map(math.isfinite, map(sum, _MEASURED_PACKING.iter_unpack(feedback.rows)))):
+        field = next(name for name in _MEASURED if not np.isfinite(rows[name]).all())
+        raise WireError(Refusal.NOT_FINITE, f"{field} of serial {feedback.serial} is not finite")
     return rows

@@ -5,6 +5,7 @@ Keys are `x5/{robot}/{serial}/{leaf}`. A serial and a robot name are one key chu
 
 import re
 from enum import StrEnum
+from functools import lru_cache
 from typing import NamedTuple
 
 ROOT = "x5"
@@ -59,6 +60,7 @@ def every(robot: str, leaf: Leaf) -> str:
     return f"{ROOT}/{check_chunk('robot', robot)}/*/{leaf.value}"
 
 
+@lru_cache(maxsize=4096)
 def parse(text: str) -> KeyParts:
     """Take a key apart.
 

@@ -43,29 +43,29 @@ class RowLog:
         rows = unpack(feedback)
         if not len(rows):
             return rows
-        self._reserve(feedback.first_row, feedback.first_row + len(rows))
-        assert self._base is not None
-        at = feedback.first_row - self._base
-        self._rows[at : at + len(rows)] = rows
-        self._have[at : at + len(rows)] = True
-        self._end = max(self._end, feedback.first_row + len(rows))
-        return rows
-
-    def _reserve(self, first: int, end: int) -> None:
+        first, end = feedback.first_row, feedback.first_row + feedback.count
         if self._base is None:
             self._base = first
-        if max(end, self._end) - min(first, self._base) > LONGEST_ROWS:
+        if first < self._base or end > self._base + len(self._have):
+            self._reserve(first, end, self._base)
+        span = slice(first - self._base, end - self._base)
+        self._rows[span] = rows
+        self._have[span] = True
+        self._end = max(self._end, end)
+        return rows
+
+    def _reserve(self, first: int, end: int, base: int) -> None:
+        if max(end, self._end) - min(first, base) > LONGEST_ROWS:
             raise WireError(
                 Refusal.RANGE,
-                f"row {first} is too far from rows {self._base} to {self._end} to be of this boot",
+                f"row {first} is too far from rows {base} to {self._end} to be of this boot",
             )
-        before = max(0, self._base - first)
-        after = max(0, end - self._base - len(self._have))
-        if before or after:
-            after = max(after, _GROWTH, len(self._have) // 2) if after else 0
-            self._rows = np.concatenate((np.zeros(before, ROW), self._rows, np.zeros(after, ROW)))
-            self._have = np.concatenate((np.zeros(before, bool), self._have, np.zeros(after, bool)))
-            self._base -= before
+        before = max(0, base - first)
+        after = max(0, end - base - len(self._have))
+        after = max(after, _GROWTH, len(self._have) // 2) if after else 0
+        self._rows = np.concatenate((np.zeros(before, ROW), self._rows, np.zeros(after, ROW)))
+        self._have = np.concatenate((np.zeros(before, bool), self._have, np.zeros(after, bool)))
+        self._base = base - before
 
     def missing(self, first: int, end: int) -> list[tuple[int, int]]:
         """Return the ranges within rows `first` up to and without `end` that have not arrived."""

@@ -76,6 +76,16 @@ def _feedback(first: int, count: int = BATCH, boot: int = 1, serial: str = "J") 
     return Feedback(serial=serial, boot=boot, seq=first, first_row=first, count=count, rows=rows.tobytes())
 
 
+class Checked(Neighbours):
+    """Neighbours that have nothing to say unless they are restless."""
+
+    def poll(self, now_ns: int) -> tuple[list[Wish], list[JointMotion]]:
+        restless = self.restless
+        said = super().poll(now_ns)
+        assert restless or said == ([], [])
+        return said
+
+
 def _questions(wishes: list[Wish]) -> list[AskHistory]:
     return [w for w in wishes if isinstance(w, AskHistory)]
 
@@ -89,7 +99,7 @@ def _whole(motion: JointMotion, record: MotionRecord) -> bool:
 
 
 def test_a_joint_that_moves_is_listened_to_until_its_motion_is_complete() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     neighbours.on_status(_status(_running()), 0, OWN)
     assert neighbours.poll(0) == ([Listen("J", True)], [])
     for first in range(100, 400, BATCH):
@@ -103,7 +113,7 @@ def test_a_joint_that_moves_is_listened_to_until_its_motion_is_complete() -> Non
 
 
 def test_rows_that_were_dropped_are_asked_for_in_pieces_that_a_message_can_carry() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     record = _record(end=100 + 600)
     neighbours.on_status(_status(record), 0, OWN)
     now, asked = 0, []
@@ -116,8 +126,22 @@ def test_rows_that_were_dropped_are_asked_for_in_pieces_that_a_message_can_carry
     assert [_whole(m, record) for m in motions] == [True]
 
 
+def test_who_only_listens_rests_until_something_is_heard_and_who_misses_rows_does_not() -> None:
+    neighbours = Checked()
+    assert not neighbours.restless
+    neighbours.on_status(_status(_running()), 0, OWN)
+    assert neighbours.restless
+    neighbours.poll(0)
+    assert not neighbours.restless
+    neighbours.on_feedback(_feedback(100), OWN)
+    assert neighbours.restless
+    neighbours.on_status(_status(_record(), 2), 0, OWN)
+    neighbours.poll(0)
+    assert neighbours.restless
+
+
 def test_an_unanswered_question_is_asked_again_but_not_at_every_tick() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     neighbours.on_status(_status(_record()), 0, OWN)
     questions = [q for now in range(0, 1000 * MS, MS) for q in _questions(neighbours.poll(now)[0])]
     assert len(questions) == 1000 * MS // ANSWER_TIMEOUT_NS + 1
@@ -125,7 +149,7 @@ def test_an_unanswered_question_is_asked_again_but_not_at_every_tick() -> None:
 
 
 def test_rows_that_never_come_are_given_up_though_the_module_goes_on_telling_of_its_last_motion() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     last_question = 0
     for number, now in enumerate(range(0, 4 * GIVE_UP_NS, 100 * MS)):
         neighbours.on_status(_status(_record(), 1 + number), now, OWN)
@@ -137,7 +161,7 @@ def test_rows_that_never_come_are_given_up_though_the_module_goes_on_telling_of_
 
 
 def test_a_long_motion_is_not_given_up_while_it_runs() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     for number, now in enumerate(range(0, 3 * GIVE_UP_NS, 400 * MS)):
         neighbours.on_status(_status(_running(), 1 + number), now, OWN)
         neighbours.poll(now)
@@ -147,7 +171,7 @@ def test_a_long_motion_is_not_given_up_while_it_runs() -> None:
 
 def test_a_motion_that_was_stopped_is_dropped() -> None:
     for outcome in ("stopped", "expired", "superseded"):
-        neighbours = Neighbours()
+        neighbours = Checked()
         neighbours.on_status(_status(_running()), 0, OWN)
         neighbours.on_status(_status(_record(outcome=outcome), 2), 0, OWN)
         assert neighbours.poll(0) == ([Listen("J", True), Listen("J", False)], [])
@@ -157,7 +181,7 @@ def test_a_motion_that_was_stopped_is_dropped() -> None:
 
 
 def test_journeys_are_no_exploration() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     journey = GoTo(target_rad=1.0, max_speed_rad_s=1.0)
     neighbours.on_status(_status(_record(pattern=journey)), 0, OWN)
     neighbours.on_status(_status(None, 2), 0, OWN)
@@ -165,7 +189,7 @@ def test_journeys_are_no_exploration() -> None:
 
 
 def test_a_joint_that_boots_anew_in_mid_motion_does_not_mix_its_rows() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     neighbours.on_status(_status(_running(), 50), 0, OWN)
     neighbours.on_feedback(_feedback(100, 250), OWN)
     neighbours.on_status(_status(_record(start=0, end=100), 1, boot=2), 0, OWN)
@@ -179,7 +203,7 @@ def test_a_joint_that_boots_anew_in_mid_motion_does_not_mix_its_rows() -> None:
 
 
 def test_joints_that_move_at_once_are_kept_apart() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     for serial in ("J", "K"):
         neighbours.on_status(_status(_record(), serial=serial), 0, OWN)
         neighbours.on_feedback(_feedback(100, 300, serial=serial), OWN)
@@ -187,7 +211,7 @@ def test_joints_that_move_at_once_are_kept_apart() -> None:
 
 
 def test_the_clock_is_mapped_by_the_message_that_was_least_delayed() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     neighbours.on_status(_status(_record(), t_ns=0), 0, {"ME": 10_000 * MS, "YOU": 20 * MS})
     for first, delay in ((100, 9), (200, 2), (300, 30)):
         sent = (first + 99) * 4 * MS
@@ -199,7 +223,7 @@ def test_the_clock_is_mapped_by_the_message_that_was_least_delayed() -> None:
 
 
 def test_rows_from_history_tell_nothing_of_the_clock() -> None:
-    neighbours = Neighbours()
+    neighbours = Checked()
     neighbours.on_status(_status(_record(), t_ns=0), 0, {"ME": 50 * MS})
     neighbours.on_feedback(_feedback(100, 300), {"ME": 0}, live=False)
     (motion,) = neighbours.poll(0)[1]
@@ -253,7 +277,7 @@ def test_whatever_the_network_does_a_motion_is_handed_over_whole_and_once_or_not
     seed: int, loss: float, silent: bool, holes: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    neighbours, net = Neighbours(), _Net(rng, loss)
+    neighbours, net = Checked(), _Net(rng, loss)
     found: list[JointMotion] = []
     listening = False
     lost_rows = rng.integers(0, 1400 // 50, holes).tolist()

@@ -29,6 +29,10 @@ def _record(motion_id: int, pattern: Pattern, start: int, end: int | None) -> Mo
     )
 
 
+def _values(row: Any) -> tuple[float, ...]:
+    return tuple(value for field in row.item() for value in np.ravel(field).tolist())
+
+
 class Scene:
     """A module that rests and then is carried by the joint `J` through both exploration motions."""
 
@@ -53,7 +57,7 @@ class Scene:
         rows["t_ns"] = rows["imu_t_ns"] = imu.t_ns + shift_ns
         rows["gyro_rad_s"], rows["accel_m_s2"] = imu.gyro_rad_s, imu.accel_m_s2
         for row in rows:
-            self.history.append(tuple(row))
+            self.history.append(_values(row))
 
     @staticmethod
     def _joint_rows(joint: Any, shift_ns: int) -> Rows:
@@ -137,7 +141,7 @@ def test_the_rest_is_kept_when_the_history_has_long_forgotten_it(
     short = History(1700)
     short.next_row = scene.history.next_row - 1700
     for row in rows:
-        short.append(tuple(row))
+        short.append(_values(row))
     assert short.first_row > scene.rest.end_row  # type: ignore[operator]
     found = observer.job(scene.motions["sine"], short, scene.rest)()
     assert found.note == ""
@@ -167,7 +171,7 @@ def test_the_work_holds_copies_so_that_ticks_may_go_on_meanwhile(
     scene.observe(observer, "constant")
     job = observer.job(scene.motions["sine"], scene.history, scene.rest)
     before = job()
-    blank = tuple(np.zeros(1, dtype=ROW)[0])
+    blank = _values(np.zeros(1, dtype=ROW)[0])
     for _ in range(3000):
         scene.history.append(blank)
     assert job() == before

@@ -1,5 +1,6 @@
 """A module obeys one holder, refuses what is late or wrong and says so, and never moves on its own."""
 
+import math
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -14,7 +15,7 @@ from module_agent.firmware.firmware import Answer, Firmware, Incoming, Publicati
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
 from module_agent.hardware import SensorSample
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
-from module_agent.wire.feedback_rows import unpack
+from module_agent.wire.feedback_rows import STATE_NAMES, unpack
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
     Ack,
@@ -353,6 +354,32 @@ def test_feedback_comes_at_its_rate_without_gaps_and_history_serves_every_row_ag
     rows = unpack(decode(Feedback, answer, MAX_MESSAGE_BYTES))
     assert len(rows) == 200
     assert set(times[10:150]) <= {int(t) for t in rows["t_ns"]}
+
+
+def test_a_row_holds_the_sample_and_the_command_field_by_field() -> None:
+    kind = CATALOGUE["X5-9"]
+    config = FirmwareConfig("A", kind, BOOT, catalogue_limits(kind), feedback_rate_hz=1000.0, batch_rows=1)
+    firmware = Firmware(config)
+    now = 5_000 * MS
+    # Every value another one, and all of them exact in four bytes.
+    sample = SensorSample(now, now - MS, *(0.25 + 0.5 * n for n in range(6)), 40.0, 24.0, *range(1, 7))
+    head = {"serial": "A", "boot": BOOT, "seq": 1, "sender": "me", "echo_ns": now}
+    values = {"position_rad": 0.75, "velocity_rad_s": None, "effort_nm": -0.5}
+    acquire, setpoint = LeaseRequest(**head, token=0, action="acquire"), Setpoint(**head, token=1, **values)
+    inbox = [Incoming(Leaf.LEASE, encode(acquire), None), Incoming(Leaf.SETPOINT, encode(setpoint), None)]
+    pwm, out = firmware.step(now, sample, inbox)
+    (block,) = [o.payload for o in out if isinstance(o, Publication) and o.leaf is Leaf.FEEDBACK]
+    (row,) = unpack(decode(Feedback, block, MAX_MESSAGE_BYTES))
+    for name in set(SensorSample._fields) & set(row.dtype.names):
+        assert row[name] == getattr(sample, name), name
+    assert row["gyro_rad_s"].tolist() == [1.0, 2.0, 3.0]
+    assert row["accel_m_s2"].tolist() == [4.0, 5.0, 6.0]
+    assert (row["position_command_rad"], row["effort_command_nm"]) == (0.75, -0.5)
+    assert math.isnan(row["velocity_command_rad_s"])
+    assert row["motion_id"] == 0
+    assert STATE_NAMES[row["state"]] == "streaming"
+    assert pwm != 0.0
+    assert row["pwm"] == pytest.approx(pwm * 48.0 / 24.0)
 
 
 def test_rows_are_taken_when_the_imu_has_a_new_sample() -> None:
