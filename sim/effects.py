@@ -158,7 +158,7 @@ _TABLE = (
     Effect(
         "motor-speed-estimate",
         "encoder and torque",
-        "a first-order low-pass of the motor's speed",
+        "a first-order low-pass of the motor's speed, as in feedback; whether control sees it is not known",
         {"motor_velocity_bandwidth_hz": 15.0},
         "real X5-1 log: the motor's speed is 10.7 ms late",
     ),

@@ -90,8 +90,7 @@ _BODY = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
 _X5 = (
     *_BODY,
     *("variation", "imu-white", "imu-bias", "imu-drift", "g-sensitivity", "imu-bandwidth", "imu-range"),
-    *("imu-steps", "vibration", "encoder", "velocity-estimate", "motor-speed-estimate", "torque-noise"),
-    *("clock", "sampling-jitter"),
+    *("imu-steps", "vibration", "encoder", "velocity-estimate", "torque-noise", "clock", "sampling-jitter"),
 )
 _UNCALIBRATED = (*_X5, "imu-scale", "imu-misalignment", "torque-calibration", "torque-hysteresis")
 

@@ -18,10 +18,10 @@ from collections.abc import Sequence
 from math import exp, pi, sqrt, tan
 
 import numpy as np
-from numba import njit
 
 from module_agent.catalogue import ModuleType
 from sim.noise_profile import NoiseProfile
+from sim.physics.compiled import compiled
 from sim.physics.sensor_errors import SensorErrors
 from sim.physics.sensor_noise import StandardNormals
 from sim.pose import Array
@@ -128,8 +128,8 @@ def _axes(gyro: float, accel: float) -> Array:
     return np.array([gyro] * 3 + [accel] * 3)
 
 
-@njit(cache=True)
-def _feel(taps, gyro, force, felt):  # type: ignore[no-untyped-def]
+@compiled
+def _feel(taps: tuple[float, float, float, float, float], gyro: Array, force: Array, felt: Array) -> None:
     """Transposed direct form II; `felt` holds output, last output and the two memories, (4, n, 6)."""
     b0, b1, b2, a1, a2 = taps
     for i in range(gyro.shape[0]):
@@ -142,10 +142,21 @@ def _feel(taps, gyro, force, felt):  # type: ignore[no-untyped-def]
             felt[0, i, axis] = y
 
 
-@njit(cache=True)
-def _read(  # type: ignore[no-untyped-def]
-    felt, jitter, axes, scale, g_sensitivity, bias, drift, white, vibration, per_speed, speed, sizes
-):
+@compiled
+def _read(
+    felt: Array,
+    jitter: Array,
+    axes: Array,
+    scale: Array,
+    g_sensitivity: Array,
+    bias: Array,
+    drift: Array,
+    white: Array,
+    vibration: Array,
+    per_speed: Array,
+    speed: Array,
+    sizes: Array,
+) -> Array:
     """Return `Imus.read`; jitter (n,) is in ticks, white, vibration and drift in standard deviations."""
     values = np.empty(scale.shape)
     now = np.empty(6)
@@ -167,8 +178,8 @@ def _read(  # type: ignore[no-untyped-def]
     return values
 
 
-@njit(cache=True)
-def _converted(value, limit, step):  # type: ignore[no-untyped-def]
+@compiled
+def _converted(value: float, limit: float, step: float) -> float:
     """Return what a converter makes of a value: no more than its range, in whole steps; 0 means without."""
     if limit > 0.0:
         value = min(max(value, -limit), limit)

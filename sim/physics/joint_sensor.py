@@ -3,7 +3,7 @@
 Encoder: whole counts. Velocity: the module's own estimate, a first-order low-pass of the encoder readings'
 differences over the nominal tick, so that counts and sampling jitter show in it; the real X5-1's lags its
 encoder by 1.3 to 1.7 ms. The motor's speed comes from its commutation and is smoothed far more: in the same
-log it lags by 11 ms.
+log it lags by 11 ms. That log is feedback: whether the module's control loops see it as late is not known.
 
 Torque: the sensor reads the deflection and multiplies it by a constant stiffness, but part of what rubber
 transmits is inner friction, which it cannot see. That part is a Dahl element driven by the torque,
@@ -21,10 +21,10 @@ from collections.abc import Sequence
 from math import exp, pi
 
 import numpy as np
-from numba import njit
 
 from module_agent.catalogue import ModuleType
 from sim.noise_profile import NoiseProfile
+from sim.physics.compiled import compiled
 from sim.physics.sensor_errors import SensorErrors
 from sim.physics.sensor_noise import StandardNormals
 from sim.pose import Array
@@ -33,8 +33,8 @@ from sim.pose import Array
 # up to this width the reading still grows with the torque.
 HYSTERESIS_ROUNDING = 0.05
 
-# Columns of a joint's memory: encoder reading, velocity, motor speed, torque, inner friction.
-_MEMORY = 5
+# Tick, encoder step, shares of the low-passes of velocity and motor speed, velocity's white noise, jitter.
+_Settings = tuple[float, float, float, float, float, float]
 
 
 class JointSensors:
@@ -62,7 +62,7 @@ class JointSensors:
                 HYSTERESIS_ROUNDING * effort,
             )
         )
-        self._settings = (
+        self._settings: _Settings = (
             tick_s,
             profile.position_step_rad,
             _share(profile.velocity_bandwidth_hz, tick_s),
@@ -72,7 +72,8 @@ class JointSensors:
         )
         self._noise = StandardNormals(seed, serials, "joint", 2)
         self._jitter = StandardNormals(seed, serials, "joint jitter", 1)
-        self._memory = np.empty((len(types), _MEMORY))
+        # Columns: encoder reading, velocity, motor speed, torque, inner friction.
+        self._memory = np.empty((len(types), 5))
         self._started = False
 
     def read(self, q_rad: Array, qd_rad_s: Array, motor_rad_s: Array, elastic_nm: Array) -> Array:
@@ -82,7 +83,7 @@ class JointSensors:
         """
         if not self._started:
             self._start(q_rad, qd_rad_s, motor_rad_s, elastic_nm)
-        values: Array = _read(
+        return _read(
             self._settings,
             self._fixed,
             self._noise.draw(),
@@ -93,7 +94,6 @@ class JointSensors:
             elastic_nm,
             self._memory,
         )
-        return values
 
     def _start(self, q_rad: Array, qd_rad_s: Array, motor_rad_s: Array, elastic_nm: Array) -> None:
         """Remember as much as if the joint had always moved at this speed under this torque."""
@@ -109,17 +109,28 @@ def _share(bandwidth_hz: float, tick_s: float) -> float:
     return 1.0 - exp(-2.0 * pi * bandwidth_hz * tick_s) if bandwidth_hz else 1.0
 
 
-@njit(cache=True)
-def dahl(friction_nm, change_nm, limit_nm, rounding_nm):  # type: ignore[no-untyped-def]
+@compiled
+def _dahl(friction_nm: float, change_nm: float, limit_nm: float, rounding_nm: float) -> float:
     """Return a Dahl element's force after a monotone change of its drive, in closed form."""
     if change_nm == 0.0 or limit_nm == 0.0:
         return friction_nm
     end = limit_nm if change_nm > 0.0 else -limit_nm
-    return end + (friction_nm - end) * np.exp(-abs(change_nm) / rounding_nm)
+    return end + (friction_nm - end) * exp(-abs(change_nm) / rounding_nm)
 
 
-@njit(cache=True)
-def _read(settings, fixed, noise, jitter, q, qd, motor, elastic, memory):  # type: ignore[no-untyped-def]
+@compiled
+def _read(
+    settings: _Settings,
+    fixed: Array,
+    noise: Array,
+    jitter: Array,
+    q: Array,
+    qd: Array,
+    motor: Array,
+    elastic: Array,
+    memory: Array,
+) -> Array:
+    """Return `JointSensors.read`; noise and jitter are in standard deviations, `memory` is carried on."""
     tick_s, step, velocity_share, motor_share, velocity_white, jitter_s = settings
     values = np.empty((q.shape[0], 5))
     for i in range(q.shape[0]):
@@ -140,7 +151,7 @@ def _read(settings, fixed, noise, jitter, q, qd, motor, elastic, memory):  # typ
             memory[i, 2] = motor[i]
         change = elastic[i] - memory[i, 3]
         memory[i, 3] = elastic[i]
-        memory[i, 4] = dahl(memory[i, 4], change, fixed[i, 4], fixed[i, 5])
+        memory[i, 4] = _dahl(memory[i, 4], change, fixed[i, 4], fixed[i, 5])
         torque = elastic[i] + change * (off_s / tick_s) - memory[i, 4]
         effort = fixed[i, 1] * torque + fixed[i, 2] + fixed[i, 3] * noise[i, 1]
         values[i, 0] = angle
