@@ -167,4 +167,4 @@ def test_a_world_begins_with_its_springs_carrying_the_weight(name: str) -> None:
         [s.effort_nm for s in samples], reference.torque(robot.start_rad, zero, zero), atol=1e-12
     )
     # Unpowered motors begin to give way; with slack springs the arms would fall at 10 rad/s^2 and more.
-    assert np.abs(world.plant.qdd_rad_s2).max() < 0.5
+    assert np.abs(world.plant.qdd_rad_s2).max() < 1.0
