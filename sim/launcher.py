@@ -28,8 +28,16 @@ class LaunchError(RuntimeError):
     """A process did not come up or died; the message says which and what it printed last."""
 
 
+def _nowhere_else(process: str) -> tuple[str, ...]:
+    return ()
+
+
 class LaunchConfig(NamedTuple):
-    """What is started; `processes` is how many agent processes share the modules (None: one each)."""
+    """What is started; `processes` is how many agent processes share the modules (None: one each).
+
+    `within` is told the name of a process ("world", "coordinator", or "agent" and its serials) and returns
+    the words that go before its command, such as `nsenter` and a network namespace.
+    """
 
     robot_file: str
     robot_name: str
@@ -43,6 +51,7 @@ class LaunchConfig(NamedTuple):
     processes: int | None = None
     coordinator_options: tuple[str, ...] = ()
     agent_options: tuple[str, ...] = ()
+    within: Callable[[str], tuple[str, ...]] = _nowhere_else
 
 
 class Child(NamedTuple):
@@ -134,7 +143,7 @@ class Launcher:
         with open(log if log is not None else os.devnull, "wb") as output:
             # Its own session: Ctrl-C reaches the launcher alone, which then stops the others in order.
             process = subprocess.Popen(
-                [sys.executable, "-m", *arguments],
+                [*self.config.within(name), sys.executable, "-m", *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=output if quiet else None,
                 stderr=subprocess.STDOUT if quiet else None,
