@@ -9,6 +9,7 @@ import struct
 import subprocess
 import threading
 import time
+from contextlib import suppress
 from ipaddress import IPv4Interface
 from pathlib import Path
 
@@ -81,9 +82,10 @@ class NetworkNamespace:
         own = os.readlink("/proc/self/ns/net")
         end_s = time.monotonic() + OPEN_TIMEOUT_S
         while self._holder.poll() is None and time.monotonic() < end_s:
-            # Its namespace is another as soon as `unshare` has done its work.
-            if os.readlink(self.path) != own:
-                return
+            # Its namespace is another as soon as `unshare` has done its work; a dying process has none.
+            with suppress(FileNotFoundError):
+                if os.readlink(self.path) != own:
+                    return
             time.sleep(0.005)
         if self._holder.poll() is None:
             self._holder.kill()
