@@ -194,6 +194,18 @@ def test_jitter_is_the_rate_times_a_time_of_the_size_of_the_profile(bench: Any) 
     assert abs(np.corrcoef(gyro_off_s.ravel(), off_s.ravel())[0, 1]) < 0.045
 
 
+def test_jitter_has_nothing_to_do_with_noise(bench: Any) -> None:
+    profile = NOTHING.model_copy(
+        update={"sampling_jitter_s": 2e-5, "velocity_white_rad_s": 5e-3, "effort_white_fraction": 0.002}
+    )
+    q = np.arange(8000)[:, None] * 3e-3
+    samples = bench(profile, ("a",)).read(8000, q_rad=q, qd_rad_s=3.0)
+    errors = [column(samples, name)[:, 0] for name in ("position_rad", "velocity_rad_s", "effort_nm")]
+    errors[0] -= q[:, 0]
+    # 8000 pairs: a correlation is within 0.045 (4 sigma).
+    assert np.abs(np.corrcoef(errors) - np.eye(3)).max() < 0.045
+
+
 def test_a_joint_at_rest_knows_no_jitter(bench: Any) -> None:
     samples = bench(switched(NOTHING, on=("sampling-jitter",))).read(100, q_rad=0.3, elastic_nm=1.0)
     assert np.all(column(samples, "position_rad") == 0.3)
