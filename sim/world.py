@@ -31,8 +31,8 @@ class Plant(NamedTuple):
     """The true state of the modules' joints at the instant of the last samples, (n,) each, read-only.
 
     duty is what the bridges apply for `pwm`; motor positions and rates are seen at the output;
-    spring_torque_nm is what the springs exert on the outputs. With q, qd and qdd it fulfils the equations of
-    motion but for the integrator's error: velocity forces are half a tick old, 1e-3 Nm in brisk motion.
+    spring_torque_nm is what the springs exert on the outputs; with q, qd and qdd it fulfils the equations of
+    motion.
     structure (p,) is how far the base and the links give: the positions [m, rad] of the passive joints.
     """
 
@@ -82,7 +82,8 @@ class World:
         self._actuators = Actuators(tree.types, TICK_S, self.profile, variation, self._skeleton)
         self._tick = 0
         self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
-        self._qd = np.zeros_like(self._q)
+        self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
+        self._rates = np.zeros((2, len(self._q)))
         self._actuators.reset(robot.start_rad, load)
         self._compile()
         self._body = Multibody(robot.name, self._skeleton, TICK_S)
@@ -134,12 +135,16 @@ class World:
         u = self._checked(pwm)
         actuators, q, qd = self._actuators, self._q, self._qd
         motor = actuators.motor_rad
-        mass, bias = self._tree.mass_and_bias(q, qd)
-        force = actuators.step(u, q, qd, mass, bias, self._windings.resistance_factor)
-        self._q, self._qd = self._body.step(force.tolist())
-        # The integrator is a leapfrog: its velocities live half a tick before its positions, so the velocity
-        # at this instant is the mean of the two around it, and the acceleration is their difference.
+        # The integrator is a leapfrog: its velocities live half a tick before its positions, but it takes
+        # velocity forces as if they were of the same instant. So it is handed what they lack of those at the
+        # velocity that the last acceleration predicts for this instant.
+        self._rates[0], self._rates[1] = qd + self._ahead, qd
+        mass, biases = self._tree.mass_and_biases(q, self._rates)
+        force = actuators.step(u, q, qd, mass, biases[0], self._windings.resistance_factor)
+        self._q, self._qd = self._body.step((force - biases[0] + biases[1]).tolist())
+        # The velocity at this instant is the mean of the two around it, the acceleration their difference.
         rate = (qd + self._qd) * 0.5
+        self._ahead = rate - qd
         change = (self._qd - qd) * (1.0 / TICK_S)
         own = self._joints
         self._plant = (
@@ -170,9 +175,9 @@ class World:
         still = np.zeros_like(self._q)
         self._felt = self._tree.feel(self._q, still, still)
         rehearsal = copy(self._actuators)
-        mass, bias = self._tree.mass_and_bias(self._q, still)
+        mass, biases = self._tree.mass_and_biases(self._q, self._rates)
         idle = np.zeros(len(self._joints))
-        rehearsal.step(idle, self._q, still, mass, bias, self._windings.resistance_factor)
+        rehearsal.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
         copy(self._windings).step(rehearsal.copper_w)
 
     def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:

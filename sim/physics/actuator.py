@@ -32,10 +32,10 @@ from sim.pose import Array, read_only
 BUS_VOLTAGE_V = 24.0
 # Gains are normalised to 48 V: the duty applied is the firmware's PWM times 48 V / bus voltage.
 GAIN_VOLTAGE_V = 48.0
-# The spring's loss: damping over stiffness. Springs of this kind are rubber bonded between plates (Rollinson et
-# al. 2013), whose loss factor is taken as 0.1: an assumption, met at 5 Hz, where an arm of half a metre rings on
-# its spring. With a third of it light arms ring on after every reversal of the gear's friction, and circle point
-# analysis of them on a solid table comes out 10 to 30 % long, where the thesis saw under 5 %.
+# The spring's loss: damping over stiffness. Springs of this kind are rubber bonded between plates (Rollinson
+# et al. 2013), whose loss factor is taken as 0.1: an assumption, met at 5 Hz, where an arm of half a metre
+# rings on its spring. With a third of it light arms ring on after every reversal of the gear's friction, and
+# circle point analysis of them on a solid table comes out 10 to 30 % long, where the thesis saw under 5 %.
 SPRING_LOSS_S = 3e-3
 # A gear that loses nearly all still has to turn.
 _LEAST_EFFICIENCY = 0.05

@@ -150,7 +150,7 @@ def _pull(
     drag = own.viscous_nm_s_rad + mean * own.per_amp_nm / ohm
     inertia = own.rotor_kg_m2 + dt_s / 2.0 * drag
     drive = mean * drive_v / ohm
-    # The current of this instant, half a step ahead of the speed, as the last step's change of speed predicts.
+    # The current of this instant, half a step ahead of the speed, as the last change of speed predicts.
     amps = (drive_v - own.per_amp_nm * (2.0 * speed - state[RATE_RAD_S])) / ohm
     momentum = drive + (own.rotor_kg_m2 / dt_s - drag / 2.0) * speed
     # Friction as the last step's torque predicts it; only the spring's second-order term depends on it.

@@ -144,7 +144,7 @@ def feel(
 
 
 @compiled
-def mass_and_bias(
+def mass_and_biases(
     parent: Indices,
     prismatic: Indices,
     sign: Array,
@@ -154,18 +154,22 @@ def mass_and_bias(
     com: Array,
     inertia: Array,
     q: Array,
-    qd: Array,
+    rates: Array,
     up_m_s2: float,
 ) -> tuple[Array, Array]:
-    """Return the mass matrix (m, m) and the forces (m,) that gravity and velocities ask for at qdd = 0.
+    """Return the mass matrix (m, m), and for R velocities (R, m) the forces that they and gravity ask for.
 
-    Composite rigid bodies for the one, recursive Newton-Euler for the other.
+    Composite rigid bodies for the one, recursive Newton-Euler for the others.
     """
     where, arm = _place(parent, prismatic, sign, rotation, offset, q)
-    omega, alpha, accel = _move(parent, prismatic, sign, where, arm, qd, np.zeros(len(q)), up_m_s2)
     spin, travel, place = _twists(parent, prismatic, sign, where, arm)
-    first, whole, force, moment = _loads(mass, com, inertia, where, place, omega, alpha, accel)
-    return _projected(parent, spin, travel, mass.copy(), first, whole, force, moment)
+    lever, central = _bodies(com, inertia, where)
+    matrix = _composite(parent, spin, travel, mass, place + lever, central)
+    biases, still = np.empty(rates.shape), np.zeros(len(q))
+    for k in range(len(rates)):
+        motion = _move(parent, prismatic, sign, where, arm, rates[k], still, up_m_s2)
+        biases[k] = _loads(parent, spin, travel, mass, place, lever, central, motion)
+    return matrix, biases
 
 
 @compiled
@@ -186,69 +190,41 @@ def _twists(
 
 
 @compiled
-def _loads(
-    mass: Array,
-    com: Array,
-    inertia: Array,
-    where: Array,
-    place: Array,
-    omega: Array,
-    alpha: Array,
-    accel: Array,
-) -> tuple[Array, Array, Array, Array]:
-    """Return every body's first moment, inertia, force and moment: m c, I, m a, I alpha + omega x I omega."""
-    m = len(mass)
-    first, whole = np.empty((m, 3)), np.empty((m, 3, 3))
-    force, moment = np.empty((m, 3)), np.empty((m, 3))
-    work, turned = np.empty((2, 3)), np.empty((3, 3))
-    lever, centre, change, swirl = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+def _bodies(com: Array, inertia: Array, where: Array) -> tuple[Array, Array]:
+    """Return the centres' arms (m, 3) and the inertia about the centres, R I R^T, in world axes (m, 3, 3)."""
+    m = len(com)
+    lever, central, turned = np.empty((m, 3)), np.empty((m, 3, 3)), np.empty((3, 3))
     for i in range(m):
-        _into(where[i], com[i], lever)
-        force[i] = accel[i]
-        _add_swing(alpha[i], omega[i], lever, work, force[i])
-        for k in range(3):
-            force[i, k] *= mass[i]
-            centre[k] = place[i, k] + lever[k]
-            first[i, k] = mass[i] * centre[k]
-        # R I R^T about the centre; Euler's equation; then both about the origin.
+        _into(where[i], com[i], lever[i])
         _turned(where[i], inertia[i], turned)
-        _turned(turned, where[i].T, whole[i])
-        _into(whole[i], omega[i], change)
-        _cross(omega[i], change, swirl)
-        _into(whole[i], alpha[i], change)
-        _cross(centre, force[i], moment[i])
-        square = centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2
-        for a in range(3):
-            moment[i, a] += change[a] + swirl[a]
-            for b in range(3):
-                whole[i, a, b] += mass[i] * ((square if a == b else 0.0) - centre[a] * centre[b])
-    return first, whole, force, moment
+        _turned(turned, where[i].T, central[i])
+    return lever, central
 
 
 @compiled
-def _projected(
-    parent: Indices,
-    spin: Array,
-    travel: Array,
-    mass: Array,
-    first: Array,
-    whole: Array,
-    force: Array,
-    moment: Array,
-) -> tuple[Array, Array]:
-    """Add up from the leaves what every joint carries, projected on the joints; changes its arguments."""
+def _composite(
+    parent: Indices, spin: Array, travel: Array, mass: Array, centre: Array, central: Array
+) -> Array:
+    """Return the mass matrix: what every joint carries, added up from the leaves, projected on the joints."""
     m = len(parent)
-    matrix, bias = np.zeros((m, m)), np.zeros(m)
+    matrix, total = np.zeros((m, m)), mass.copy()
+    first, whole = np.empty((m, 3)), central.copy()
     linear, angular, part = np.empty(3), np.empty(3), np.empty(3)
+    for i in range(m):
+        square = centre[i, 0] ** 2 + centre[i, 1] ** 2 + centre[i, 2] ** 2
+        for a in range(3):
+            first[i, a] = mass[i] * centre[i, a]
+            whole[i, a, a] += mass[i] * square
+            for b in range(3):
+                whole[i, a, b] -= mass[i] * centre[i, a] * centre[i, b]
     for i in range(m - 1, -1, -1):
         # Momentum, linear and about the origin, of all that joint i carries at its unit rate.
         _cross(spin[i], first[i], linear)
         _cross(first[i], travel[i], angular)
         _into(whole[i], spin[i], part)
         for k in range(3):
-            linear[k] += mass[i] * travel[i, k]
+            linear[k] += total[i] * travel[i, k]
             angular[k] += part[k]
-            bias[i] += spin[i, k] * moment[i, k] + travel[i, k] * force[i, k]
         j = i
         while j >= 0:
             for k in range(3):
@@ -257,11 +233,45 @@ def _projected(
             j = parent[j]
         p = parent[i]
         if p >= 0:
-            mass[p] += mass[i]
+            total[p] += total[i]
             for a in range(3):
                 first[p, a] += first[i, a]
-                force[p, a] += force[i, a]
-                moment[p, a] += moment[i, a]
                 for b in range(3):
                     whole[p, a, b] += whole[i, a, b]
-    return matrix, bias
+    return matrix
+
+
+@compiled
+def _loads(
+    parent: Indices,
+    spin: Array,
+    travel: Array,
+    mass: Array,
+    place: Array,
+    lever: Array,
+    central: Array,
+    motion: tuple[Array, Array, Array],
+) -> Array:
+    """Return the joints' loads (m,): m a and I alpha + omega x I omega of all that each of them carries."""
+    omega, alpha, accel = motion
+    m = len(parent)
+    loads, force, moment = np.zeros(m), accel.copy(), np.empty((m, 3))
+    work, change, swirl = np.empty((2, 3)), np.empty(3), np.empty(3)
+    for i in range(m):
+        _add_swing(alpha[i], omega[i], lever[i], work, force[i])
+        for k in range(3):
+            force[i, k] *= mass[i]
+            work[0, k] = place[i, k] + lever[i, k]
+        _cross(work[0], force[i], moment[i])
+        _into(central[i], omega[i], change)
+        _cross(omega[i], change, swirl)
+        _into(central[i], alpha[i], change)
+        for k in range(3):
+            moment[i, k] += change[k] + swirl[k]
+    for i in range(m - 1, -1, -1):
+        for k in range(3):
+            loads[i] += spin[i, k] * moment[i, k] + travel[i, k] * force[i, k]
+            if parent[i] >= 0:
+                force[parent[i], k] += force[i, k]
+                moment[parent[i], k] += moment[i, k]
+    return loads

@@ -7,7 +7,7 @@ specific force is wrong by 3e-2 m/s^2 on a 2 Hz motion, paired so by less than 1
 
 import numpy as np
 
-from sim.physics.rigid_kernels import feel, mass_and_bias
+from sim.physics.rigid_kernels import feel, mass_and_biases
 from sim.physics.skeleton import Skeleton
 from sim.pose import Array
 from sim.robot_tree import GRAVITY_M_S2
@@ -41,7 +41,12 @@ class RigidTree:
 
         With both, M qdd + bias is what the joints' forces or torques add up to.
         """
-        return mass_and_bias(*self._joints, *self._bodies, q, qd, GRAVITY_M_S2)
+        mass, biases = self.mass_and_biases(q, qd[None])
+        return mass, biases[0]
+
+    def mass_and_biases(self, q: Array, rates: Array) -> tuple[Array, Array]:
+        """Return the same, with one row of biases (R, m) for each of several velocities (R, m)."""
+        return mass_and_biases(*self._joints, *self._bodies, q, rates, GRAVITY_M_S2)
 
     def feel(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         """Return the angular rates and specific forces (n, 3) in the IMUs' frames [rad/s, m/s^2]."""
