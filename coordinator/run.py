@@ -25,7 +25,7 @@ from coordinator.session_file import SessionWriter, read_session
 from coordinator.urdf import write_urdf
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
-from coordinator.viewer_feed import Screen, ViewerFeed
+from coordinator.viewer_feed import FILE, LIVE, Screen, ViewerFeed
 from module_agent.catalogue import module_type
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
@@ -64,8 +64,8 @@ class Run:
         targets = ViewerTargets(
             config.out / VIEW, config.spawn_viewer, config.connect_viewer, config.serve_viewer
         )
-        self._viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
-        self._feed = ViewerFeed(self._viewer, self.recording)
+        viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
+        self._feed = ViewerFeed(viewer, self.recording, FILE if config.inline else LIVE)
         if crashed is not None:
             self._take_over(crashed)
         self._radio = Radio(transport, config.robot, clock, post, self._record)
@@ -78,7 +78,7 @@ class Run:
             self._writer.flush()
         except BaseException:
             self._writer.close()
-            self._viewer.close()
+            self._feed.close()
             raise
 
     # ------------------------------------------------------------------ recording
@@ -155,7 +155,7 @@ class Run:
         finally:
             self._radio.close()
             self._writer.close()
-            self._viewer.close()
+            self._feed.close()
             if self._radio.dropped:
                 self._screen.note(
                     f"{self._radio.dropped} messages were dropped unread: this machine is too slow"

@@ -8,9 +8,8 @@ from coordinator.chain import Array, Chain
 from coordinator.clock_map import ClockMap, map_clock
 from coordinator.identify import HeldOutMotion
 from coordinator.kinematics.assembly import ChainFit
-from coordinator.recording import Entry, Recording
+from coordinator.recording import Entry, ModuleRecord, Recording
 from coordinator.viewer.viewer import Viewer
-from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.messages import Feedback, Message, Status
 
 MAP_PERIOD_NS = 1_000_000_000
@@ -33,6 +32,18 @@ class Screen(Protocol):
         ...
 
 
+class Pace(NamedTuple):
+    """How long rows and poses are gathered before they are shown: a call costs the same for one as for many."""
+
+    rows_ns: int
+    poses_ns: int
+
+
+# 100 ms are soon enough for curves, a robot has to turn smoothly. A file has time.
+LIVE = Pace(rows_ns=100_000_000, poses_ns=0)
+FILE = Pace(rows_ns=4_000_000_000, poses_ns=4_000_000_000)
+
+
 class _Shown(NamedTuple):
     """An estimate on the screen, which stays as it is until there is a newer one."""
 
@@ -43,14 +54,21 @@ class _Shown(NamedTuple):
 
 
 class ViewerFeed:
-    """Feeds one viewer from one recording; the viewer's time counts from the beginning of the session."""
+    """Feeds one viewer from one recording; the viewer's time counts from the beginning of the session.
 
-    def __init__(self, viewer: Viewer, recording: Recording):
+    Rows and poses are gathered for as long as `pace` says; `close` shows what is left.
+    """
+
+    def __init__(self, viewer: Viewer, recording: Recording, pace: Pace = LIVE):
         self._viewer = viewer
         self._recording = recording
-        self._maps: dict[str, tuple[int, ClockMap]] = {}
+        self.pace = pace
+        self._maps: dict[tuple[str, int], tuple[int, ClockMap]] = {}
+        self._pending: dict[tuple[str, int], list[tuple[int, int]]] = {}
+        self._rows_ns = 0
         self._chain: Chain | None = None
         self._pose_ns = 0
+        self._poses: list[tuple[int, Array]] = []
         self._network_ns: dict[str, int] = {}
         self._known: tuple[str, ...] = ()
         self._origin_ns: int | None = None
@@ -61,35 +79,71 @@ class ViewerFeed:
         if message.serial not in self._known:
             return
         if isinstance(message, Feedback) and entry.kind == "publication":
-            self._on_feedback(entry, message)
+            self._gather(message)
+            self._pose(entry.t_ns)
         elif isinstance(message, Status):
             self._on_status(entry, message)
+        if entry.t_ns - self._rows_ns >= self.pace.rows_ns:
+            self._show_rows(entry.t_ns)
 
     def since_start(self, session_ns: int) -> int:
         """Return the time that the viewer shows for a session time."""
+        return session_ns - self._start_ns(session_ns)
+
+    def _start_ns(self, session_ns: int) -> int:
+        """Return the beginning of the session; the first one to ask says when that was."""
         if self._origin_ns is None:
             self._origin_ns = session_ns
-        return session_ns - self._origin_ns
+        return self._origin_ns
 
-    def _map(self, serial: str, now_ns: int) -> ClockMap | None:
-        made_ns, found = self._maps.get(serial, (-MAP_PERIOD_NS, None))
-        trips = self._recording.modules[serial].round_trips
-        if trips and now_ns - made_ns >= MAP_PERIOD_NS:
-            found = map_clock(trips[-RECENT_TRIPS:])
-            self._maps[serial] = (now_ns, found)
+    def _gather(self, feedback: Feedback) -> None:
+        """Note which rows have come; they are in the recording."""
+        spans = self._pending.setdefault((feedback.serial, feedback.boot), [])
+        first, end = feedback.first_row, feedback.first_row + feedback.count
+        if spans and spans[-1][1] == first:
+            spans[-1] = (spans[-1][0], end)
+        else:
+            spans.append((first, end))
+
+    def _show_rows(self, now_ns: int) -> None:
+        """Show the rows that have come since the last time, where a clock map says when they were taken."""
+        self._rows_ns = now_ns
+        for (serial, boot), spans in self._pending.items():
+            record = self._recording.module(serial, boot)
+            clock = self._map(record, now_ns)
+            if clock is not None:
+                rows = np.concatenate([record.rows.rows(first, end) for first, end in spans])
+                session_ns = clock.to_session(rows["t_ns"].astype(np.int64))
+                self._viewer.rows(serial, session_ns - self._start_ns(now_ns), rows)
+        self._pending.clear()
+
+    def _map(self, record: ModuleRecord, now_ns: int) -> ClockMap | None:
+        key = record.serial, record.boot
+        made_ns, found = self._maps.get(key, (-MAP_PERIOD_NS, None))
+        if record.round_trips and now_ns - made_ns >= MAP_PERIOD_NS:
+            found = map_clock(record.round_trips[-RECENT_TRIPS:])
+            self._maps[key] = (now_ns, found)
         return found
 
-    def _on_feedback(self, entry: Entry, feedback: Feedback) -> None:
-        clock = self._map(feedback.serial, entry.t_ns)
-        if clock is None or not feedback.count:
+    def _pose(self, now_ns: int) -> None:
+        if self._chain is None or now_ns - self._pose_ns < POSE_PERIOD_NS:
             return
-        rows = unpack(feedback)
-        now_ns = self.since_start(entry.t_ns)
-        session = clock.to_session(rows["t_ns"].astype(np.int64))
-        self._viewer.rows(feedback.serial, session - (entry.t_ns - now_ns), rows)
-        if self._chain is not None and entry.t_ns - self._pose_ns >= POSE_PERIOD_NS:
-            self._pose_ns = entry.t_ns
-            self._viewer.pose(now_ns, self._positions(self._chain))
+        self._pose_ns = now_ns
+        self._poses.append((self.since_start(now_ns), self._positions(self._chain)))
+        if self._poses[-1][0] - self._poses[0][0] >= self.pace.poses_ns:
+            self._show_poses()
+
+    def _show_poses(self) -> None:
+        if self._poses:
+            times, positions = zip(*self._poses, strict=True)
+            self._viewer.poses(times, positions)
+            self._poses.clear()
+
+    def close(self) -> None:
+        """Show what has been gathered, and close the viewer. May be called twice."""
+        self._show_rows(self._rows_ns)
+        self._show_poses()
+        self._viewer.close()
 
     def _positions(self, chain: Chain) -> Array:
         q = np.zeros(len(chain.serials))
@@ -143,6 +197,7 @@ class ViewerFeed:
 
     def chain(self, session_ns: int, fit: ChainFit) -> None:
         """Show the identified robot; it then turns as the robot turns."""
+        self._show_poses()  # of the chain before
         chain, now_ns = fit.chain, self.since_start(session_ns)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
         sigma = [s if np.isfinite(s) else 0.0 for s in fit.link_length_sigma_m.tolist()]

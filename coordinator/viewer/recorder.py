@@ -15,15 +15,12 @@ from coordinator.viewer.time_series import Batch, IntArray
 class Recorder:
     """Everything that one run has logged so far; used by one thread only."""
 
-    def __init__(
-        self, stream: rr.RecordingStream, robot: str, batch_ns: int = time_series.LIVE_BATCH_NS
-    ) -> None:
+    def __init__(self, stream: rr.RecordingStream, robot: str) -> None:
         self._stream = stream
         self._palette = layout.Palette()
         self._types: dict[str, str] = {}
         self._contents = blueprint.Contents(robot)
         self._shown: blueprint.Contents | None = None
-        self._batcher = time_series.RowBatcher(batch_ns)
         self._states = time_series.StateChanges()
         self._scenes: dict[str, robot_scene.Scene] = {}
         self._q_rad: dict[str, float] = {}
@@ -35,24 +32,16 @@ class Recorder:
         self._know(serials)
 
     def rows(self, batch: Batch) -> None:
-        """Gather rows, and log the batches that are complete."""
+        """Log rows."""
         self._know([batch.serial])
-        complete = self._batcher.add(batch)
-        for each in complete:
-            self._send(each)
-        if complete:
-            # Estimates of many modules come in bursts: one layout shows them all.
-            self._show_if_new()
-
-    def drain(self) -> None:
-        """Log the rows gathered so far."""
-        for batch in self._batcher.drain():
-            self._send(batch)
-        self._show_if_new()
+        if batch.t_ns.size:
+            time_series.send_rows(self._stream, batch)
+            time_series.send_states(self._stream, batch.serial, *self._states.of(batch))
+        # Estimates of many modules come in bursts: one layout shows them all.
+        self.show_if_new()
 
     def finish(self) -> None:
-        """Log the rows gathered so far, and the layout that the file opens with."""
-        self.drain()
+        """Log the layout that the file opens with."""
         self._show()
 
     def phase(self, t_ns: int, text: str) -> None:
@@ -97,28 +86,26 @@ class Recorder:
         self._scenes[look.world] = scene
         self._frame(chain)
 
-    def pose(self, t_ns: int, q_rad: Array) -> None:
-        """Turn the robots that are drawn; `q_rad` (n,) is in the order of the identified chain."""
-        progress.set_time(self._stream, t_ns)
+    def poses(self, t_ns: IntArray, q_rad: Array) -> None:
+        """Turn the robots that are drawn at `t_ns` (k,); `q_rad` (k, n) in the identified chain's order."""
         first = self._scenes.get(layout.ESTIMATED_WORLD, self._scenes.get(layout.TRUE_WORLD))
         if first is None:
             return  # before there is a robot there is nothing to turn
-        if q_rad.shape != (len(first.chain.serials),):
-            raise ValueError(
-                f"a pose of shape {q_rad.shape} for a robot of {len(first.chain.serials)} joints"
-            )
-        self._q_rad.update(zip(first.chain.serials, q_rad.tolist(), strict=True))
+        serials = first.chain.serials
+        if q_rad.shape != (t_ns.size, len(serials)):
+            raise ValueError(f"{t_ns.size} poses of shape {q_rad.shape} for a robot of {len(serials)} joints")
+        self._q_rad.update(zip(serials, q_rad[-1].tolist(), strict=True))
         for scene in self._scenes.values():
-            robot_scene.log_pose(self._stream, scene, self._posture(scene.chain))
+            postures = np.tile(self._posture(scene.chain), (t_ns.size, 1))
+            for column, serial in enumerate(scene.chain.serials):
+                if serial in serials:
+                    postures[:, column] = q_rad[:, serials.index(serial)]
+            robot_scene.send_poses(self._stream, scene, t_ns, postures)
 
     def residuals(self, serial: str, t_ns: IntArray, measured_nm: Array, predicted_nm: Array) -> None:
         """Log held-out torque."""
         self._know([serial])
         progress.send_residuals(self._stream, serial, t_ns, measured_nm, predicted_nm)
-
-    def _send(self, batch: Batch) -> None:
-        time_series.send_rows(self._stream, batch)
-        time_series.send_states(self._stream, batch.serial, *self._states.of(batch))
 
     def _know(self, serials: Sequence[str]) -> None:
         new = [serial for serial in dict.fromkeys(serials) if serial not in self._contents.serials]
@@ -144,7 +131,8 @@ class Recorder:
     def _colours(self, serials: Sequence[str]) -> dict[str, layout.Colour]:
         return {serial: self._palette.colour(serial) for serial in serials}
 
-    def _show_if_new(self) -> None:
+    def show_if_new(self) -> None:
+        """Log the layout if it has other views than the one that stands."""
         # A new layout puts the first tab in front again. Ranges of plots alone are not worth that in the
         # middle of a step; they come with the next one.
         if self._shown is None or blueprint.views(self._contents) != blueprint.views(self._shown):

@@ -11,6 +11,7 @@ from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE, body_displacements
 from coordinator.viewer import layout
 from coordinator.viewer.robot_geometry import Link, Module, from_z, links, modules, upright
+from coordinator.viewer.time_series import IntArray, time_column
 
 LINK_RADIUS_M = 0.009
 OUTPUT_RADIUS_M = 0.024
@@ -91,15 +92,24 @@ def log_scene(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
     for path, archetypes in scene.drawn:
         for archetype in archetypes:
             stream.log(path, archetype)
-    log_pose(stream, scene, q_rad)
+    _log_pose(stream, scene, q_rad)
 
 
-def log_pose(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
-    """Turn the robot to `q_rad` (n,): one transform per body.
+def send_poses(stream: rr.RecordingStream, scene: Scene, t_ns: IntArray, q_rad: Array) -> None:
+    """Turn the robot to `q_rad` (k, n) at `t_ns` (k,): one column of transforms per body.
 
     Raises:
         ValueError: `q_rad` has not one position per joint.
     """
+    displaced = body_displacements(scene.chain, q_rad)
+    for body, serial in enumerate(scene.chain.serials):
+        moved = rr.Transform3D.columns(
+            translation=displaced[:, body, :3, 3], mat3x3=displaced[:, body, :3, :3]
+        )
+        stream.send_columns(layout.body_path(scene.look.world, serial), [time_column(t_ns)], moved)
+
+
+def _log_pose(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
     displaced = body_displacements(scene.chain, q_rad[None, :])[0]
     for serial, motion in zip(scene.chain.serials, displaced, strict=True):
         path = layout.body_path(scene.look.world, serial)

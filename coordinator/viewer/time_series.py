@@ -1,6 +1,6 @@
-"""Feedback rows into columns of time series: batches of about 100 ms, one vector entity per group of sensors.
+"""Feedback rows into columns of time series, one vector entity per group of sensors.
 
-A call of `send_columns` costs the same for 25 rows as for 250, so rows are gathered before they are logged.
+A call of `send_columns` costs the same for 25 rows as for 250, so rows should come in large batches.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,12 +15,6 @@ from module_agent.wire.feedback_rows import STATE_NAMES, Rows
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
-
-# A call costs the same whatever it carries. 100 ms are soon enough for the eye; a file has time.
-LIVE_BATCH_NS = 100_000_000
-FILE_BATCH_NS = 1_000_000_000
-# A batch whose module fell silent is logged once another module is this many batches further.
-STALE_BATCHES = 4
 
 
 class Batch(NamedTuple):
@@ -59,36 +53,6 @@ _COMMANDS = (
     (layout.VELOCITY_COMMAND, "velocity_command_rad_s"),
     (layout.EFFORT_COMMAND, "effort_command_nm"),
 )
-
-
-class RowBatcher:
-    """Gathers the rows of every module until there are about `batch_ns` of them."""
-
-    def __init__(self, batch_ns: int = LIVE_BATCH_NS) -> None:
-        self._batch_ns = batch_ns
-        self._pending: dict[str, list[Batch]] = {}
-
-    def add(self, batch: Batch) -> list[Batch]:
-        """Take rows in; return the batches that are now complete, this module's or those gone stale."""
-        if not batch.t_ns.size:
-            return []
-        self._pending.setdefault(batch.serial, []).append(batch)
-        newest = int(batch.t_ns[-1])
-        stale_ns = STALE_BATCHES * self._batch_ns
-        complete = [
-            serial
-            for serial, parts in self._pending.items()
-            if newest - int(parts[0].t_ns[0]) >= (self._batch_ns if serial == batch.serial else stale_ns)
-        ]
-        return [self._take(serial) for serial in complete]
-
-    def drain(self) -> list[Batch]:
-        """Return whatever is left."""
-        return [self._take(serial) for serial in tuple(self._pending)]
-
-    def _take(self, serial: str) -> Batch:
-        parts = self._pending.pop(serial)
-        return Batch(serial, np.concatenate([p.t_ns for p in parts]), np.concatenate([p.rows for p in parts]))
 
 
 def groups(rows: Rows) -> Iterator[tuple[str, FloatArray]]:

@@ -14,7 +14,7 @@ from coordinator.viewer.logging_thread import Job, LoggingThread
 from coordinator.viewer.parameter import Estimate
 from coordinator.viewer.recorder import Recorder
 from coordinator.viewer.targets import ViewerTargets, open_targets
-from coordinator.viewer.time_series import FILE_BATCH_NS, LIVE_BATCH_NS, Batch, IntArray
+from coordinator.viewer.time_series import Batch, IntArray
 from coordinator.viewer.topology_graph import as_topology
 from module_agent.wire.feedback_rows import Rows
 
@@ -39,8 +39,7 @@ class Viewer:
             robot: the robot's name, shown above it.
             run_id: the recording's identity; the same one in two processes makes one recording.
             targets: where to; with none at all, nothing is recorded and all calls do nothing.
-            waits: let calls wait when there is too much, instead of dropping it, and log in larger batches:
-                for virtual time.
+            waits: let calls wait when there is too much, instead of dropping it: for virtual time.
 
         Raises:
             OSError: the file cannot be written. A live viewer that is not there is only reported.
@@ -48,9 +47,9 @@ class Viewer:
         self._stream = rr.RecordingStream(layout.APPLICATION_ID, recording_id=run_id)
         first = blueprint.build(blueprint.Contents(robot))
         self._opened = open_targets(self._stream, targets, first)
-        self._recorder = Recorder(self._stream, robot, FILE_BATCH_NS if waits else LIVE_BATCH_NS)
+        self._recorder = Recorder(self._stream, robot)
         self._thread = (
-            LoggingThread(on_idle=self._recorder.drain, on_end=self._recorder.finish, waits=waits)
+            LoggingThread(on_idle=self._recorder.show_if_new, on_end=self._recorder.finish, waits=waits)
             if self._opened.records
             else None
         )
@@ -119,7 +118,18 @@ class Viewer:
         if self._next_pose_ns is not None and 0 < self._next_pose_ns - t_ns <= POSE_PERIOD_NS:
             return
         self._next_pose_ns = t_ns + POSE_PERIOD_NS
-        self._submit(partial(self._recorder.pose, t_ns, np.array(q_rad, dtype=float)))
+        self.poses([t_ns], np.array(q_rad, dtype=float)[None])
+
+    def poses(self, t_ns: ArrayLike, q_rad: ArrayLike) -> None:
+        """Turn the robot to `q_rad` (k, n) at `t_ns` (k,), all of which are shown.
+
+        Raises:
+            ValueError: there is not one time per pose.
+        """
+        times, postures = np.array(t_ns, dtype=np.int64), np.array(q_rad, dtype=float)
+        if times.shape != postures.shape[:1]:
+            raise ValueError(f"times of shape {times.shape} for poses of shape {postures.shape}")
+        self._submit(partial(self._recorder.poses, times, postures))
 
     def residuals(self, serial: str, t_ns: IntArray, measured_nm: ArrayLike, predicted_nm: ArrayLike) -> None:
         """Show held-out torque at `t_ns` (m,): measured (m,) and predicted (m,).

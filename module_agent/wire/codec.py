@@ -19,21 +19,27 @@ MAX_DEPTH = 6
 
 M = TypeVar("M", bound=Message)
 
+# What `unpackb` makes of maps and arrays.
+_CONTAINERS = (dict, tuple)
 _RANGE_ERRORS = frozenset({"greater_than", "greater_than_equal", "less_than", "less_than_equal"})
 
 
 def encode(message: Message) -> bytes:
     """Return the bytes of a message: one msgpack map, its fields by name."""
-    packed: bytes = msgpack.packb(message.model_dump(), use_bin_type=True)
+    # A model's own dictionary holds its fields in their order: `model_dump` without its copies. msgpack hands
+    # the parts that are models themselves to `default`.
+    packed: bytes = msgpack.packb(vars(message), use_bin_type=True, default=vars)
     return packed
 
 
-def _depth(value: Any) -> int:
-    if isinstance(value, dict):
-        return 1 + max((_depth(v) for v in value.values()), default=0)
-    if isinstance(value, (list, tuple)):
-        return 1 + max((_depth(v) for v in value), default=0)
-    return 0
+def _is_nested_deeper(value: dict[str, Any] | tuple[Any, ...], levels: int) -> bool:
+    """Return whether there are more than `levels` of containers in each other, `value` the first."""
+    if not levels:
+        return True
+    for part in value.values() if isinstance(value, dict) else value:
+        if isinstance(part, _CONTAINERS) and _is_nested_deeper(part, levels - 1):
+            return True
+    return False
 
 
 def _unpack(data: bytes, max_bytes: int) -> dict[str, Any]:
@@ -55,7 +61,7 @@ def _unpack(data: bytes, max_bytes: int) -> dict[str, Any]:
         raise WireError(Refusal.MALFORMED, f"not a msgpack map: {error or type(error).__name__}") from error
     if not isinstance(value, dict):
         raise WireError(Refusal.MALFORMED, f"a msgpack map is expected, this is {type(value).__name__}")
-    if _depth(value) > MAX_DEPTH:
+    if _is_nested_deeper(value, MAX_DEPTH):
         raise WireError(Refusal.MALFORMED, f"nested deeper than {MAX_DEPTH}")
     return value
 

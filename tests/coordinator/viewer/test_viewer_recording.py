@@ -153,6 +153,24 @@ def test_the_bodies_turn_so_that_the_imus_are_where_the_kinematics_says(
     assert times_ns(table) == [10, 20]
 
 
+def test_poses_that_come_together_are_logged_each_at_its_time(
+    viewer: Viewer, file: Path, read: Read, arm: Chain, types: dict[str, str]
+) -> None:
+    t_ns, q = [20, 21, 40], np.array([[0.7, -1.1], [0.8, 0.3], [-2.0, 1.4]])
+    viewer.modules(arm.serials, types)
+    viewer.chain(10, arm)
+    viewer.poses(t_ns, q)
+    viewer.chain(50, arm)
+    done(viewer)
+    body = "/world/est/body/b\\/1"
+    table = read(file, "/world/est/**")
+    assert times_ns(table) == [10, *t_ns, 50]
+    imu = _transform(table.iloc[0], f"{body}/imu/b\\/1")
+    moved = np.array([_transform(table.iloc[k], body) for k in range(1, 5)])
+    # Single precision in the recording; the last posture is that of the robot drawn anew.
+    np.testing.assert_allclose(moved @ imu, imu_poses(arm, q[[0, 1, 2, 2]])[:, 1], atol=1e-6)
+
+
 def _transform(row: pd.Series, path: str) -> np.ndarray:
     pose = np.eye(4)
     # Rerun keeps matrices column by column.
@@ -228,6 +246,8 @@ def test_a_module_without_a_type_is_reported_and_the_run_goes_on(
 def test_mistakes_of_the_caller_are_raised_at_the_call(viewer: Viewer, make_rows: MakeRows) -> None:
     with pytest.raises(ValueError, match="times of shape"):
         viewer.rows("a", np.arange(4), make_rows(0, 5))
+    with pytest.raises(ValueError, match="for poses of shape"):
+        viewer.poses([1, 2], [[0.1, 0.2]])
     with pytest.raises(ValueError, match="have shapes"):
         viewer.residuals("a", np.arange(2), [1.0], [1.0, 2.0])
     with pytest.raises(ValueError, match=r"'b'.*parent index 1"):

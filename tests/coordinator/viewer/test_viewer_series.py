@@ -1,4 +1,4 @@
-"""Gathering rows into batches, and the rest of what happens before anything is logged."""
+"""States, colours and ranges of plots: what is worked out before anything is logged."""
 
 import numpy as np
 from hypothesis import given
@@ -6,49 +6,8 @@ from hypothesis import strategies as st
 
 from coordinator.viewer.layout import Palette, axis_shades, nth_colour
 from coordinator.viewer.parameter import Estimate, Parameter, fitting, with_estimate
-from coordinator.viewer.time_series import LIVE_BATCH_NS, Batch, RowBatcher, StateChanges
+from coordinator.viewer.time_series import Batch, StateChanges
 from module_agent.wire.feedback_rows import ROW
-
-lengths = st.lists(st.tuples(st.sampled_from(["a", "b", "c"]), st.integers(0, 40)), max_size=60)
-
-
-def numbered(first: int, count: int) -> np.ndarray:
-    rows = np.zeros(count, ROW)
-    rows["t_ns"] = np.arange(first, first + count)
-    return rows
-
-
-@given(lengths)
-def test_no_row_is_lost_doubled_or_moved_whatever_the_pieces(pieces: list[tuple[str, int]]) -> None:
-    batcher, logged, sent = RowBatcher(), dict[str, list[int]](), dict[str, list[int]]()
-    for serial, count in pieces:
-        first = len(sent.setdefault(serial, []))
-        sent[serial] += range(first, first + count)
-        t_ns = 4_000_000 * np.arange(first, first + count)
-        for batch in batcher.add(Batch(serial, t_ns, numbered(first, count))):
-            assert batch.t_ns.tolist() == (4_000_000 * batch.rows["t_ns"]).tolist()
-            logged.setdefault(batch.serial, []).extend(batch.rows["t_ns"].tolist())
-    for batch in batcher.drain():
-        logged.setdefault(batch.serial, []).extend(batch.rows["t_ns"].tolist())
-    assert logged == {serial: rows for serial, rows in sent.items() if rows}
-
-
-def test_a_batch_spans_a_tenth_of_a_second() -> None:
-    batcher = RowBatcher()
-    for i in range(0, 250, 5):
-        for batch in batcher.add(Batch("a", 4_000_000 * np.arange(i, i + 5), numbered(i, 5))):
-            assert LIVE_BATCH_NS <= batch.t_ns[-1] - batch.t_ns[0] < LIVE_BATCH_NS + 20_000_000
-
-
-def test_the_last_rows_of_a_module_that_fell_silent_are_not_held_back() -> None:
-    batcher = RowBatcher()
-    batcher.add(Batch("silent", np.array([0]), numbered(0, 1)))
-    logged = [
-        batch.serial
-        for i in range(0, 150, 5)
-        for batch in batcher.add(Batch("b", 4_000_000 * np.arange(i, i + 5), numbered(i, 5)))
-    ]
-    assert "silent" in logged
 
 
 def test_states_change_across_batches_and_an_unknown_state_is_shown_by_number() -> None:
