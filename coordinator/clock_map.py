@@ -24,6 +24,9 @@ SAME_MOMENT_NS = 5_000_000
 FEWEST_PAIRS = 5
 
 
+_Columns = tuple[Times, Times, Times]
+
+
 class ClockMap(NamedTuple):
     """session = module + offset_ns + drift * (module - origin_ns).
 
@@ -61,9 +64,11 @@ def map_clock(trips: Sequence[RoundTrip]) -> ClockMap:
     Raises:
         ValueError: no round trip.
     """
-    if not trips:
-        raise ValueError("no round trip with this module: its clock cannot be mapped")
-    sent, received, module = _columns(trips)
+    return _map(_columns(trips))
+
+
+def _map(trips: _Columns) -> ClockMap:
+    sent, received, module = trips
     origin = int(module[0])
     base = int(sent[0]) - origin
     trip = (received - sent).astype(np.float64)
@@ -82,28 +87,26 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
     Raises:
         ValueError: a module has no round trip.
     """
-    names = sorted(trips)
-    reference, *others = names
-    whole = map_clock(trips[reference])
+    columns = {name: _columns(trips[name]) for name in sorted(trips)}
+    reference, *others = columns
+    whole = _map(columns[reference])
     base = ClockMap(whole.origin_ns, whole.offset_ns, 0.0, whole.uncertainty_ns)
-    return {reference: base, **{name: _beside(base, trips[reference], trips[name]) for name in others}}
+    return {reference: base, **{name: _beside(base, columns[reference], columns[name]) for name in others}}
 
 
-def _beside(base: ClockMap, reference: Sequence[RoundTrip], trips: Sequence[RoundTrip]) -> ClockMap:
+def _beside(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
     """Return the map of a module whose trips went out beside those of the reference, whose map is `base`."""
-    if not trips:
-        raise ValueError("no round trip with this module: its clock cannot be mapped")
-    sent_r, received_r, module_r = _columns(reference)
-    sent, received, module = _columns(trips)
+    sent_r, received_r, module_r = reference
+    sent, received, module = trips
     order = np.argsort(sent_r, kind="stable")
     at = np.clip(np.searchsorted(sent_r[order], sent), 1, len(order) - 1) if len(order) > 1 else None
     if at is None:
-        return map_clock(trips)
+        return _map(trips)
     before, after = order[at - 1], order[at]
     near = np.where(np.abs(sent_r[after] - sent) < np.abs(sent_r[before] - sent), after, before)
     same = np.abs(sent_r[near] - sent) <= SAME_MOMENT_NS
     if np.count_nonzero(same) < FEWEST_PAIRS:
-        return map_clock(trips)
+        return _map(trips)
     near, sent, received, module = near[same], sent[same], received[same], module[same]
     apart = 0.5 * ((sent - sent_r[near]) + (received - received_r[near])).astype(np.float64)
     origin = int(module[0])
@@ -114,7 +117,9 @@ def _beside(base: ClockMap, reference: Sequence[RoundTrip], trips: Sequence[Roun
     return ClockMap(origin, base.offset_ns + shift + constant, drift, 0.5 * float(trip.min()))
 
 
-def _columns(trips: Sequence[RoundTrip]) -> tuple[Times, Times, Times]:
+def _columns(trips: Sequence[RoundTrip]) -> _Columns:
+    if not trips:
+        raise ValueError("no round trip with this module: its clock cannot be mapped")
     sent, received, module = (np.array(column, dtype=np.int64) for column in zip(*trips, strict=True))
     return sent, received, module
 

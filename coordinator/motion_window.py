@@ -48,50 +48,40 @@ def window(
         ValueError: a hole in the recording, with the module or its column.
     """
     start_ns, end_ns = _span(recording, clocks, event, margin_s)
-    times: list[NDArray[np.int64]] = []
-    imu_times: list[NDArray[np.int64]] = []
-    picked = []
-    for serial in serials:
-        log = recording.modules[serial].rows
-        rows = log.rows(log.first_row, log.end_row)
-        session = clocks[serial].to_session(rows["t_ns"].astype(np.int64))
-        near = (session >= start_ns - 10 * STEP_NS) & (session <= end_ns + 10 * STEP_NS)
-        if not near.any():
-            raise ValueError(_no_row(serial, event))
-        picked.append(rows[near])
-        times.append(session[near])
-        imu_times.append(clocks[serial].to_session(rows["imu_t_ns"][near].astype(np.int64)))
-    start_ns = max(start_ns, *(int(t[0]) for t in (*times, *imu_times)))
-    end_ns = min(end_ns, *(int(t[-1]) for t in (*times, *imu_times)))
+    tracks = [_track(recording, clocks[s], s, event, start_ns, end_ns) for s in serials]
+    start_ns = max(start_ns, *(int(t[0]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
+    end_ns = min(end_ns, *(int(t[-1]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
     common = np.arange(start_ns, end_ns, STEP_NS, dtype=np.int64)
+    joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common)
+    imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common)
+    return Window(common, joint[..., 0], joint[..., 1], joint[..., 2], imu[..., :3], imu[..., 3:])
 
-    def joint(field: str) -> Array:
-        return resample(times, [rows[field] for rows in picked], common)
 
-    def imu(field: str) -> Array:
-        axes = [_imu_axis(imu_times, picked, field, axis, common) for axis in range(3)]
-        return np.stack(axes, axis=2)
+class _Track(NamedTuple):
+    """One module in session time: position, velocity, effort (m, 3); gyro and accelerometer (k, 6)."""
 
-    return Window(
-        common,
-        joint("position_rad"),
-        joint("velocity_rad_s"),
-        joint("effort_nm"),
-        imu("gyro_rad_s"),
-        imu("accel_m_s2"),
+    t_ns: NDArray[np.int64]
+    imu_t_ns: NDArray[np.int64]
+    joint: Array
+    imu: Array
+
+
+def _track(
+    recording: Recording, clock: ClockMap, serial: str, event: JournalEvent, start_ns: int, end_ns: int
+) -> _Track:
+    around = np.array([start_ns - 10 * STEP_NS, end_ns + 10 * STEP_NS])
+    first_ns, last_ns = (int(t) for t in clock.to_module(around))
+    rows = recording.modules[serial].rows.between(first_ns, last_ns)
+    if not len(rows):
+        raise ValueError(_no_row(serial, event))
+    # An IMU that is slower than the rows repeats its samples.
+    imu_t_ns, fresh = np.unique(rows["imu_t_ns"], return_index=True)
+    return _Track(
+        clock.to_session(rows["t_ns"].astype(np.int64)),
+        clock.to_session(imu_t_ns.astype(np.int64)),
+        np.column_stack([rows[field] for field in ("position_rad", "velocity_rad_s", "effort_nm")]),
+        np.column_stack([rows["gyro_rad_s"], rows["accel_m_s2"]])[fresh],
     )
-
-
-def _imu_axis(
-    times: Sequence[NDArray[np.int64]],
-    picked: Sequence[NDArray[np.void]],
-    field: str,
-    axis: int,
-    common: NDArray[np.int64],
-) -> Array:
-    unique = [np.unique(t, return_index=True) for t in times]
-    values = [rows[field][index, axis] for rows, (_, index) in zip(picked, unique, strict=True)]
-    return resample([t for t, _ in unique], values, common)
 
 
 def _span(

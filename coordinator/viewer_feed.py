@@ -33,7 +33,7 @@ class Screen(Protocol):
 
 
 class Pace(NamedTuple):
-    """How long rows and poses are gathered before they are shown: a call costs the same for one as for many."""
+    """How long rows and poses are gathered until they are shown; a call costs as much for one as for many."""
 
     rows_ns: int
     poses_ns: int

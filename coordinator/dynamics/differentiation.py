@@ -45,13 +45,13 @@ def resample(
 
     Args:
         t_ns: per module the times (m_i,) of its samples, increasing, already mapped into one clock.
-        signals: per module the values (m_i,).
+        signals: per module the values (m_i,), or (m_i, k) of k signals that were sampled together.
         t_common_ns: (m,) times to interpolate to.
         kind: order of the spline through the samples.
         max_gap_ns: the longest hole between samples that is bridged (10 samples at 250 Hz by default).
 
     Returns:
-        (m, n), read-only.
+        (m, n), or (m, n, k), read-only.
 
     Raises:
         ValueError: times out of order, a hole that is too long, or a common time outside a module's samples;
@@ -62,7 +62,7 @@ def resample(
         raise ValueError(
             f"{len(t_ns)} time bases for {len(signals)} signals; one of each per module is needed"
         )
-    found = np.empty((common.size, len(signals)))
+    found = np.empty((common.size, len(signals), *np.shape(signals[0])[1:]))
     for column, (times, values) in enumerate(zip(t_ns, signals, strict=True)):
         known = np.asarray(times, dtype=np.int64)
         _check_times(column, known, common, max_gap_ns)

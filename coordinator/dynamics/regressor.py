@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.chain import Array, Chain
+from coordinator.cross_product import cross
 from coordinator.kinematics.forward import BASE, ancestors
 
 BODY_PARAMETERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
@@ -143,18 +144,18 @@ def _carry(below: _BodyMotion, axis: Array, point: Array, q: Array, qd: Array, q
     acceleration kept is the classical one, A_linear + omega x v.
     """
     turn, offset = _inverse_displacement(axis, point, q)
-    moment = -_cross(axis[:, None], point[:, None])
+    moment = -cross(axis[:, None], point[:, None])
     stacked = np.stack([below.omega, below.alpha])
-    linear = np.stack([below.velocity, below.acceleration - _cross(below.omega, below.velocity)])
+    linear = np.stack([below.velocity, below.acceleration - cross(below.omega, below.velocity)])
     (omega, alpha), (velocity, spatial) = _transform(turn, offset, stacked, linear)
     omega = omega + axis[:, None] * qd
     velocity = velocity + moment * qd
-    alpha = alpha + _cross(omega, axis[:, None] * qd) + axis[:, None] * qdd
-    spatial = spatial + _cross(velocity, axis[:, None] * qd) + _cross(omega, moment * qd) + moment * qdd
+    alpha = alpha + cross(omega, axis[:, None] * qd) + axis[:, None] * qdd
+    spatial = spatial + cross(velocity, axis[:, None] * qd) + cross(omega, moment * qd) + moment * qdd
     carried = np.stack(_transform(turn, offset, below.screws[0], below.screws[1]))
     own = np.broadcast_to(np.stack([axis, moment[:, 0]])[:, None, :, None], (2, 1, 3, q.size))
     screws = np.concatenate([carried, own], axis=1)
-    return _BodyMotion(omega, velocity, alpha, spatial + _cross(omega, velocity), screws)
+    return _BodyMotion(omega, velocity, alpha, spatial + cross(omega, velocity), screws)
 
 
 def _inverse_displacement(axis: Array, point: Array, q: Array) -> tuple[Array, Array]:
@@ -169,7 +170,7 @@ def _inverse_displacement(axis: Array, point: Array, q: Array) -> tuple[Array, A
 
 def _transform(turn: Array, offset: Array, angular: Array, linear: Array) -> tuple[Array, Array]:
     """Bring twists (k, 3, m) into the displaced frame: w' = R^T w, v' = R^T (v + w x p)."""
-    moved = linear + _cross(angular, offset)
+    moved = linear + cross(angular, offset)
     return np.einsum("ijm,kjm->kim", turn, angular), np.einsum("ijm,kjm->kim", turn, moved)
 
 
@@ -184,22 +185,10 @@ def _torque_rows(motion: _BodyMotion) -> Array:
     omega, alpha, a = motion.omega, motion.alpha, motion.acceleration
     rows = np.empty((w.shape[0], PER_BODY, w.shape[2]))
     rows[:, 0] = np.einsum("kim,im->km", v, a)
-    rows[:, 1:4] = _cross(a, w) + _cross(v, alpha) + _cross(omega, _cross(omega, v))
-    u = _cross(w, omega)
+    rows[:, 1:4] = cross(a, w) + cross(v, alpha) + cross(omega, cross(omega, v))
+    u = cross(w, omega)
     for column, (r, c) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), start=4):
         rows[:, column] = w[:, r] * alpha[c] + u[:, r] * omega[c]
         if r != c:
             rows[:, column] += w[:, c] * alpha[r] + u[:, c] * omega[r]
     return rows
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product along the last axis but one, broadcasting; several times faster than `np.cross` here."""
-    ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
-    bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
-    first = ay * bz
-    found = np.empty((*first.shape[:-1], 3, first.shape[-1]))
-    np.subtract(first, az * by, out=found[..., 0, :])
-    np.subtract(az * bx, ax * bz, out=found[..., 1, :])
-    np.subtract(ax * by, ay * bx, out=found[..., 2, :])
-    return found

@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.chain import Array, Chain
+from coordinator.cross_product import cross
 from coordinator.kinematics.forward import BASE, carrier
+from coordinator.kinematics.increments import skew
 
 
 class ImuReadings(NamedTuple):
@@ -16,8 +18,8 @@ class ImuReadings(NamedTuple):
     accel_m_s2: Array
 
 
-class _Twist(NamedTuple):
-    """Motion of one body in its own frame (which is the root frame at q = 0), (m, 3) each.
+class BodyMotion(NamedTuple):
+    """Motion of one body in its own frame (which is the root frame at q = 0), (3, m) each.
 
     `acceleration` is that of the frame's origin against free fall: at rest it is the specific force of rest.
     """
@@ -37,49 +39,58 @@ def imu_readings(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2
     Returns:
         Readings in the IMU frames, (m, n, 3).
     """
-    q, qd, qdd = (np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2))
-    samples, joints = q.shape
-    rest = np.zeros((samples, 3))
-    base = _Twist(rest, rest, np.broadcast_to(chain.gravity, (samples, 3)))
-    bodies: list[_Twist] = []
-    for i, parent in enumerate(chain.parent):
-        below = base if parent == BASE else bodies[parent]
-        bodies.append(_carry(below, chain.axis[i], chain.point[i], q[:, i], qd[:, i], qdd[:, i]))
+    bodies = body_motions(chain, q_rad, qd_rad_s, qdd_rad_s2)
+    joints = len(chain.serials)
+    samples = bodies[BASE].omega.shape[1]
     gyro, accel = np.empty((samples, joints, 3)), np.empty((samples, joints, 3))
     for k in range(joints):
-        body = carrier(chain, k)
-        motion = base if body == BASE else bodies[body]
-        turn, place = chain.imu_home[k, :3, :3], chain.imu_home[k, :3, 3]
-        force = (
-            motion.acceleration
-            + np.cross(motion.alpha, place)
-            + np.cross(motion.omega, np.cross(motion.omega, place))
-        )
-        gyro[:, k] = motion.omega @ turn
-        accel[:, k] = force @ turn
+        motion = bodies[carrier(chain, k)]
+        turn, place = chain.imu_home[k, :3, :3], chain.imu_home[k, :3, 3, None]
+        gyro[:, k] = motion.omega.T @ turn
+        accel[:, k] = acceleration_at(motion, place).T @ turn
     return ImuReadings(gyro, accel)
 
 
-def _carry(below: _Twist, axis: Array, point: Array, q: Array, qd: Array, qdd: Array) -> _Twist:
+def body_motions(
+    chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2: ArrayLike
+) -> list[BodyMotion]:
+    """Return the motion of every body, the base in the last place, where the index -1 finds it.
+
+    Args as in `imu_readings`.
+    """
+    q, qd, qdd = (np.asarray(signal, dtype=float).T for signal in (q_rad, qd_rad_s, qdd_rad_s2))
+    rest = np.zeros((3, q.shape[1]))
+    base = BodyMotion(rest, rest, np.broadcast_to(chain.gravity[:, None], rest.shape))
+    bodies: list[BodyMotion] = []
+    for i, parent in enumerate(chain.parent):
+        below = base if parent == BASE else bodies[parent]
+        bodies.append(_carry(below, chain.axis[i], chain.point[i][:, None], q[i], qd[i], qdd[i]))
+    return [*bodies, base]
+
+
+def acceleration_at(body: BodyMotion, place: Array) -> Array:
+    """Return the acceleration (3, m) against free fall of points (3, m) that are fixed to a body."""
+    return np.asarray(
+        body.acceleration + cross(body.alpha, place) + cross(body.omega, cross(body.omega, place))
+    )
+
+
+def turned(axis: Array, angle_rad: Array, vectors: Array) -> Array:
+    """Return R(axis, angle) v of vectors (3, ..., m) for angles (m,), Rodrigues' formula (thesis 2.2)."""
+    flat = vectors.reshape(3, -1)
+    across = (skew(axis) @ flat).reshape(vectors.shape)
+    along = (np.outer(axis, axis) @ flat).reshape(vectors.shape)
+    return np.asarray(along + np.cos(angle_rad) * (vectors - along) + np.sin(angle_rad) * across)
+
+
+def _carry(below: BodyMotion, axis: Array, point: Array, q: Array, qd: Array, qdd: Array) -> BodyMotion:
     """Return the motion beyond a joint, in the frame that turns with it, from the motion below it.
 
     At a point of the axis both bodies accelerate alike (Craig, Introduction to Robotics, eqs 6.45-6.48).
     """
-    at_axis = (
-        below.acceleration
-        + np.cross(below.alpha, point)
-        + np.cross(below.omega, np.cross(below.omega, point))
-    )
-    spin = axis * qd[:, None]
-    turned_omega = _unturn(axis, q, below.omega)
+    moved = np.stack([below.omega, below.alpha, acceleration_at(below, point)], axis=1)
+    turned_omega, turned_alpha, at_axis = np.swapaxes(turned(axis, -q, moved), 0, 1)
+    spin = axis[:, None] * qd
     omega = turned_omega + spin
-    alpha = _unturn(axis, q, below.alpha) + np.cross(turned_omega, spin) + axis * qdd[:, None]
-    origin = _unturn(axis, q, at_axis) - np.cross(alpha, point) - np.cross(omega, np.cross(omega, point))
-    return _Twist(omega, alpha, origin)
-
-
-def _unturn(axis: Array, q: Array, vectors: Array) -> Array:
-    """Return R(axis, -q) v for every sample, Rodrigues' formula (thesis 2.2)."""
-    cosine, sine = np.cos(q)[:, None], np.sin(q)[:, None]
-    along = (vectors @ axis)[:, None] * axis
-    return np.asarray(cosine * vectors - sine * np.cross(axis, vectors) + (1.0 - cosine) * along)
+    alpha = turned_alpha + cross(turned_omega, spin) + axis[:, None] * qdd
+    return BodyMotion(omega, alpha, acceleration_at(BodyMotion(omega, alpha, at_axis), -point))

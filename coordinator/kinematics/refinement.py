@@ -7,17 +7,18 @@ the circles come out wrong. Here every IMU sample is predicted from the measured
 normal equations; gravity and the biases are estimated along.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coordinator.chain import Array, Chain
 from coordinator.kinematics.increments import apply_increment, frozen
-from coordinator.kinematics.inertial_prediction import ImuReadings, imu_readings
+from coordinator.kinematics.inertial_prediction import body_motions, imu_readings
+from coordinator.kinematics.inertial_slopes import imu_slopes
 
 ITERATIONS = 12
-STEP = 1e-6
 CONVERGED = 1e-7
 # What the data knows worse than this (in rad, or in m) it does not know: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
@@ -27,6 +28,8 @@ GYRO_BIAS_RAD_S = 0.05
 ACCEL_BIAS_M_S2 = 0.2
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
+
+Index = NDArray[np.int64]
 
 
 class SensorData(NamedTuple):
@@ -120,68 +123,56 @@ def _spread(residual: Array) -> Array:
     return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), FINEST))
 
 
-def _slopes(state: _State, data: SensorData, move: Callable[[float], Chain]) -> ImuReadings:
-    """Return the derivative of all readings along one change of the chain, by central differences."""
-    ahead, behind = (
-        imu_readings(move(step), data.q_rad, data.qd_rad_s, data.qdd_rad_s2) for step in (STEP, -STEP)
-    )
-    scale = 0.5 / STEP
-    return ImuReadings(
-        (ahead.gyro_rad_s - behind.gyro_rad_s) * scale, (ahead.accel_m_s2 - behind.accel_m_s2) * scale
-    )
-
-
-def _columns(state: _State, data: SensorData) -> list[ImuReadings]:
-    """Return the slopes of the 6 (n - 1) increments (the root stays) and of the three of gravity."""
-    chain, size = state.chain, 6 * len(state.chain.serials)
-
-    def turned(index: int) -> Callable[[float], Chain]:
-        return lambda step: apply_increment(chain, step * np.eye(1, size, index)[0])
-
-    def tilted(axis: int) -> Callable[[float], Chain]:
-        return lambda step: chain._replace(gravity=chain.gravity + step * np.eye(3)[axis])
-
-    moves = [turned(index) for index in range(6, size)] + [tilted(axis) for axis in range(3)]
-    return [_slopes(state, data, move) for move in moves]
-
-
 def _normal_equations(
     state: _State, data: SensorData, gyro: Array, accel: Array, sigma_gyro: Array, sigma_accel: Array
 ) -> _Normal:
-    """Build the weighted normal equations; the biases' own columns are constants and never stored."""
-    columns = _columns(state, data)
-    samples, count = data.q_rad.shape
-    poses = 6 * (count - 1)
-    w_gyro, w_accel = (1.0 / sigma_gyro)[None, :, None], (1.0 / sigma_accel)[None, :, None]
-    stacked = np.stack(
-        [np.concatenate([(c.gyro_rad_s * w_gyro).ravel(), (c.accel_m_s2 * w_accel).ravel()]) for c in columns]
-    )
-    target = np.concatenate([(gyro * w_gyro).ravel(), (accel * w_accel).ravel()])
-    shared, shared_rhs = stacked @ stacked.T, stacked @ target
-    half = gyro.size
-    to_gyro = (stacked[:, :half].reshape(-1, samples, count, 3).sum(axis=1) * w_gyro).reshape(
-        len(columns), -1
-    )
-    to_accel = (stacked[:, half:].reshape(-1, samples, count, 3).sum(axis=1) * w_accel).reshape(
-        len(columns), -1
-    )
-    to_bias = np.concatenate([to_gyro, to_accel], axis=1)
-    weight = np.concatenate([np.repeat(sigma_gyro**-2.0, 3), np.repeat(sigma_accel**-2.0, 3)]) * samples
-    prior = np.repeat([GYRO_BIAS_RAD_S**-2.0, ACCEL_BIAS_M_S2**-2.0], 3 * count)
-    held = np.concatenate([state.gyro_bias.ravel(), state.accel_bias.ravel()])
-    bias_rhs = np.concatenate(
-        [(gyro.sum(axis=0) * w_gyro[0] ** 2).ravel(), (accel.sum(axis=0) * w_accel[0] ** 2).ravel()]
-    )
-    nuisance = np.block(
-        [[shared[poses:, poses:], to_bias[poses:]], [to_bias[poses:].T, np.diag(weight + prior)]]
-    )
+    """Build the weighted normal equations, IMU by IMU; the root stays."""
+    count = len(state.chain.serials)
+    poses = 6 * count
+    information, rhs = _prior(state)
+    bodies = body_motions(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+    for k in range(count):
+        slopes = imu_slopes(state.chain, bodies, data.q_rad, data.qd_rad_s, k)
+        weight = 1.0 / np.repeat([sigma_gyro[k], sigma_accel[k]], 3)[:, None]
+        rows = (np.concatenate([slopes.poses, slopes.gravity, _biases(len(gyro))]) * weight).reshape(
+            -1, weight.size * len(gyro)
+        )
+        target = (np.concatenate([gyro[:, k], accel[:, k]], axis=1).T * weight).ravel()
+        at = _places(slopes.modules, k, count)
+        information[np.ix_(at, at)] += rows @ rows.T
+        rhs[at] += rows @ target
     return _Normal(
-        shared[:poses, :poses],
-        np.concatenate([shared[:poses, poses:], to_bias[:poses]], axis=1),
-        nuisance,
-        shared_rhs[:poses],
-        np.concatenate([shared_rhs[poses:], bias_rhs - prior * held]),
+        information[6:poses, 6:poses],
+        information[6:poses, poses:],
+        information[poses:, poses:],
+        rhs[6:poses],
+        rhs[poses:],
     )
+
+
+def _prior(state: _State) -> tuple[Array, Array]:
+    """Return the information on [increments (6 n), gravity (3), gyro and accelerometer biases (6 n)].
+
+    Before any sample only the biases are known: they are small. With it the right-hand side that this makes.
+    """
+    count = len(state.chain.serials)
+    known = np.zeros(12 * count + 3)
+    known[6 * count + 3 :] = np.repeat([GYRO_BIAS_RAD_S**-2.0, ACCEL_BIAS_M_S2**-2.0], 3 * count)
+    held = np.zeros_like(known)
+    held[6 * count + 3 :] = np.concatenate([state.gyro_bias.ravel(), state.accel_bias.ravel()])
+    return np.diag(known), -known * held
+
+
+def _biases(samples: int) -> Array:
+    """Return the slopes (6, 6, m) of an IMU's readings by its own biases."""
+    return np.broadcast_to(np.eye(6)[:, :, None], (6, 6, samples))
+
+
+def _places(modules: Sequence[int], imu: int, count: int) -> Index:
+    """Return where the parameters that one IMU feels stand among all of them, in the order of its slopes."""
+    increments = [6 * module + np.arange(6) for module in modules]
+    gravity, biases = 6 * count + np.arange(3), 6 * count + 3 + 3 * imu + np.arange(3)
+    return np.concatenate([*increments, gravity, biases, biases + 3 * count])
 
 
 class _Spectrum(NamedTuple):

@@ -88,6 +88,12 @@ class RowLog:
         span = slice(low - self._base, high - self._base)
         return self._rows[span][self._have[span]]
 
+    def between(self, start_ns: int, end_ns: int) -> Rows:
+        """Return the rows that have arrived of a span of module time, both ends included, as a copy."""
+        arrived = np.flatnonzero(self._have)
+        t_ns = self._rows["t_ns"][arrived]
+        return self._rows[arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]]
+
     def forget_before(self, row: int) -> None:
         """Drop rows below `row`, for listeners with little memory."""
         if self._base is None or row <= self._base:
