@@ -4,8 +4,8 @@ import asyncio
 from typing import NamedTuple
 
 from coordinator.identify import IdentificationError
+from coordinator.link_errors import ModuleLost, MotionInterrupted, RobotStopped
 from coordinator.radio import NoAnswer, Refused
-from coordinator.robot_link import ModuleLost, MotionInterrupted, RobotStopped
 from coordinator.run_folder import RunFolderError
 from coordinator.session import NobodyThere, UnfitLink
 from coordinator.session_file import SessionFileError

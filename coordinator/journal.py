@@ -3,6 +3,7 @@
 A crashed run resumes from it, and a replay knows from it which motion served which purpose.
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -13,7 +14,11 @@ Purpose = Literal["rest", "constant", "windowed_sine", "dynamic", "held_out", "o
 
 
 class JournalEvent(BaseModel):
-    """One line of the journal; `what` says which of the other fields are set."""
+    """One line of the journal; `what` says which of the other fields are set.
+
+    `deaf` are the modules that did not confirm to have stopped, of a session that failed; None in an older
+    journal, which names them in its text.
+    """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -25,9 +30,22 @@ class JournalEvent(BaseModel):
     purpose: Purpose = "other"
     motion: MotionRecord | None = None
     text: str = ""
+    deaf: tuple[str, ...] | None = None
     robot: str = ""
     wall_time_s: float | None = None
 
     def encode(self) -> bytes:
         """Return the event as JSON."""
         return self.model_dump_json(exclude_none=True).encode()
+
+
+def standstill(journal: Sequence[JournalEvent]) -> str:
+    """Return in words what is known of the robot after a session that ended before its end."""
+    if not journal or journal[-1].what != "failed":
+        return "the robot was not moving"
+    last = journal[-1]
+    if last.deaf is None:
+        return f"{last.text}: see that the robot stands still"
+    if last.deaf:
+        return f"{', '.join(last.deaf)} did not confirm to have stopped: see that the robot stands still"
+    return "the robot is stopped"

@@ -5,6 +5,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import TypeVar
 
 from coordinator.clock import Clock
+from coordinator.link_errors import ModuleLost, MotionInterrupted, RobotStopped
 from coordinator.radio import NoAnswer, Radio, Refused
 from coordinator.recording import ModuleRecord, Recording
 from module_agent.catalogue import ModuleType, module_type
@@ -39,30 +40,6 @@ TOKEN_GONE_NS = 300_000_000
 PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
 
 T = TypeVar("T")
-
-
-class ModuleLost(RuntimeError):
-    """A module left in the middle of the session; `serial` says which."""
-
-    def __init__(self, serial: str, why: str):
-        super().__init__(f"module {serial} is lost: {why}")
-        self.serial = serial
-
-
-class RobotStopped(RuntimeError):
-    """Somebody said stop in the middle of the session; a program does not overrule that."""
-
-    def __init__(self, serial: str, note: str):
-        super().__init__(f"module {serial} was {note}")
-        self.serial = serial
-
-
-class MotionInterrupted(RuntimeError):
-    """A motion ended before its end; it can be tried again after re-arming."""
-
-    def __init__(self, serial: str, outcome: str):
-        super().__init__(f"the motion of module {serial} was {outcome}")
-        self.serial = serial
 
 
 class RobotLink:

@@ -13,7 +13,7 @@ from coordinator.identify import (
     identify_kinematics,
     write_held_out,
 )
-from coordinator.journal import JournalEvent
+from coordinator.journal import JournalEvent, standstill
 from coordinator.plan import Plan
 from coordinator.radio import Post, Radio
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
@@ -164,14 +164,7 @@ class Run:
     @property
     def standstill(self) -> str:
         """What is known of the robot after a run that ended before its end, in words."""
-        last = self.recording.journal[-1] if self.recording.journal else None
-        if last is None or last.what != "failed":
-            return "the robot was not moving"
-        # As the session words it; every module that it holds is asked to stop.
-        deaf = last.text.partition("; no confirmation from ")[2]
-        if deaf:
-            return f"{deaf} did not confirm to have stopped: see that the robot stands still"
-        return "the robot is stopped"
+        return standstill(self.recording.journal)
 
     async def _compute(self, work: Callable[[], T]) -> T:
         if self._config.inline:

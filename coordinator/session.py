@@ -11,10 +11,11 @@ import numpy as np
 
 from coordinator.clock import Clock
 from coordinator.journal import JournalEvent, Purpose
+from coordinator.link_errors import MotionInterrupted
 from coordinator.plan import Plan
 from coordinator.radio import Radio
 from coordinator.recording import Recording
-from coordinator.robot_link import MotionInterrupted, RobotLink
+from coordinator.robot_link import RobotLink
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
 # Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
@@ -230,7 +231,7 @@ class Session:
         why = str(error) or type(error).__name__
         deaf = await self.link.stop_all(why[:200])
         text = f"stopped: {why}" + (f"; no confirmation from {', '.join(deaf)}" if deaf else "")
-        self._journal(JournalEvent(t_ns=self._clock(), what="failed", text=text))
+        self._journal(JournalEvent(t_ns=self._clock(), what="failed", text=text, deaf=tuple(deaf)))
         self._reporter.note(text)
 
     # ------------------------------------------------------------------ the steps

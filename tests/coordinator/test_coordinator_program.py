@@ -16,10 +16,10 @@ from coordinator.failure import explain
 from coordinator.inspect import Search, listed, stop_robot
 from coordinator.interruption import Interruption, run_to_end
 from coordinator.journal import JournalEvent
+from coordinator.link_errors import ModuleLost
 from coordinator.main import app, resuming
 from coordinator.radio import NoAnswer
 from coordinator.recording import JOURNAL_TOPIC, Entry
-from coordinator.robot_link import ModuleLost
 from coordinator.run_folder import SESSION, RunFolderError, check_free, open_run_folder
 from coordinator.session_file import SessionWriter
 from coordinator.viewer_choice import ViewerChoice, viewer_choice

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.link_errors import ModuleLost, MotionInterrupted
 from coordinator.radio import NoAnswer, Refused
-from coordinator.robot_link import ModuleLost, MotionInterrupted, RobotLink
+from coordinator.robot_link import RobotLink
 from module_agent.wire.messages import ConstantMotion, GoTo, Rest
 from module_agent.wire.network_profile import NetworkProfile
 

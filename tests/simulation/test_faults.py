@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from coordinator.link_errors import ModuleLost, MotionInterrupted
 from coordinator.plan import Plan
-from coordinator.robot_link import ModuleLost, MotionInterrupted
 from coordinator.run_folder import load_recording
 from coordinator.session import NobodyThere, UnfitLink
 from module_agent.wire.network_profile import NetworkProfile
@@ -77,6 +77,7 @@ def test_an_agent_that_is_killed_ends_the_run_by_name_and_the_others_are_stopped
     failed = [e for e in load_recording(tmp_path / "run" / "session.mcap").journal if e.what == "failed"]
     assert len(failed) == 1
     assert f"no confirmation from {victim}" in failed[0].text
+    assert failed[0].deaf == (victim,)
 
 
 def test_an_agent_that_freezes_in_mid_motion_ends_the_run_by_name(
