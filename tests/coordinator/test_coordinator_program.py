@@ -23,7 +23,7 @@ from coordinator.recording import JOURNAL_TOPIC, Entry
 from coordinator.run_folder import SESSION, RunFolderError, check_free, open_run_folder
 from coordinator.session_file import SessionWriter
 from coordinator.viewer_choice import ViewerChoice, viewer_choice
-from module_agent.catalogue import module_type
+from module_agent.catalogue import CATALOGUE, module_type
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ask, Status, Stop
@@ -153,7 +153,7 @@ def test_every_end_of_a_run_has_a_sentence_and_a_code_and_a_defect_has_none() ->
         module_type("X5-7")
     failure = explain(unknown.value)
     assert failure is not None
-    assert failure.text == "unknown module type 'X5-7'; the catalogue knows X5-1, X5-4, X5-9, SEA-snake"
+    assert failure.text == f"unknown module type 'X5-7'; the catalogue knows {', '.join(CATALOGUE)}"
     assert explain(KeyError("a bug")) is None
     assert explain(ZeroDivisionError()) is None
 
