@@ -12,6 +12,7 @@ from coordinator.terminal import print_table
 from sim.command_options import RobotArgument, fail, load
 from sim.drawing import draw
 from sim.effects import EFFECTS
+from sim.experiments.program import amplitudes
 from sim.log_program import compare_log
 from sim.noise_profile import NOISE_PROFILES
 from sim.robot_file import load_robot, shipped_robots
@@ -83,6 +84,7 @@ app.command()(world)
 app.command()(run)
 app.command()(launch)
 app.command("score")(score_run)
+app.command()(amplitudes)
 app.command()(compare_log)
 
 if __name__ == "__main__":
