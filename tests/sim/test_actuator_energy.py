@@ -67,7 +67,7 @@ def test_a_minutes_electrical_energy_is_found_again_in_motion_springs_and_losses
     stored = float(pendulum.actuator.stored_j(pendulum.q)[0])
     # The pendulum got what the springs gave: two reckonings of one work.
     assert output == pytest.approx(pendulum.mechanical_j(), rel=5e-3)
-    # Measured 6e-6: the discrete equations conserve energy but for the nonlinear springs. Each of the large terms
+    # Measured 6e-6: the discrete equations conserve energy but for the springs. Each of the large terms
     # is many times the bound, so none can be left out or wrong.
     found = pendulum.mechanical_j() + stored + copper + friction + gear + spring
     assert found == pytest.approx(electrical, rel=1e-3)

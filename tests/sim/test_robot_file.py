@@ -38,7 +38,7 @@ def test_a_shipped_robot_is_called_as_its_file_and_lists_parents_first(name: str
 
 def test_the_shipped_robots_are_the_announced_ones() -> None:
     arms = {f"thesis_{mm}_{way}" for mm in (484, 350, 245, 171) for way in ("horizontal", "vertical")}
-    assert arms | {"a2085_03", "a2085_04", "arm6", "snake16", "tree_y"} <= set(shipped_robots())
+    assert arms | {"a2085_03", "a2085_04", "arm6", "arm7", "snake16", "tree_y"} <= set(shipped_robots())
 
 
 @pytest.mark.parametrize("millimetres", [484, 350, 245, 171])
@@ -117,6 +117,38 @@ def test_an_unknown_robot_is_answered_with_the_shipped_ones() -> None:
             "no solid",
         ),
         ('parent = "one"', 'parent = "one"\nmounted = "sideways"', 16, "module[1].mounted"),
+        ('mount = "wall"', 'mount = "wall"\n[base.compliance]\nmass_kg = 1.0', 6, "every direction is rigid"),
+        (
+            'mount = "wall"',
+            'mount = "wall"\n[base.compliance]\nstiffness_n_m = [9.0, 0, 0]\ndamping_n_s_m = [1.0, 2.0, 0.0]',
+            6,
+            "translation along y has a damping of 2.0 but a stiffness of 0",
+        ),
+        (
+            'mount = "wall"',
+            'mount = "wall"\n[base.compliance]\nstiffness_nm_rad = [1e4, -1.0, 0.0]',
+            7,
+            "base.compliance.stiffness_nm_rad[1]: ",
+        ),
+        (
+            'mount = "wall"',
+            'mount = "wall"\n[base.compliance]\nstifness_nm_rad = [1e4, 1.0, 0.0]',
+            7,
+            "base.compliance.stifness_nm_rad: unknown key",
+        ),
+        (
+            'mount = "wall"',
+            'mount = "wall"\n[base.compliance]\nstiffness_nm_rad = [9.0, 0, 0]\ninertia = [1, 1, 1, 0, 0, 0]',
+            6,
+            "an inertia needs a mass_kg",
+        ),
+        (
+            'parent = "one"',
+            'parent = "one"\nflex = { stiffness_nm_rad = [1.0, 0, 1.0], damping_nm_s_rad = [0, 3.0, 0] }',
+            16,
+            "rotation about y has a damping of 3.0",
+        ),
+        ('parent = "one"', 'parent = "one"\nflex = { stiffness_nm_rad = [1.0, inf, 1.0] }', 16, "finite"),
     ],
 )
 def test_a_wrong_file_is_refused_with_its_line_and_key(old: str, new: str, line: int, says: str) -> None:
