@@ -27,7 +27,8 @@ from module_agent.hardware import HardwareModule, SensorSample
 
 BUS_VERSION = 1
 MAX_HANDSHAKE_BYTES = 64 * 1024
-_FIELDS = len(SensorSample._fields)
+_TICK = struct.Struct("<Q")
+_SAMPLE = struct.Struct("<qq14d")
 
 
 class FrameError(ValueError):
@@ -57,9 +58,9 @@ class TickFrames(NamedTuple):
         """
         if len(frame) != self.samples.size:
             raise FrameError(f"a samples frame has {self.samples.size} bytes, this one {len(frame)}")
-        values = self.samples.unpack(frame)
+        (tick,) = _TICK.unpack_from(frame)
         make = SensorSample._make
-        return values[0], [make(values[i : i + _FIELDS]) for i in range(1, len(values), _FIELDS)]
+        return tick, [make(values) for values in _SAMPLE.iter_unpack(frame[_TICK.size :])]
 
     def pack_pwm(self, tick: int, pwm: Sequence[float]) -> bytes:
         """Return the pwm frame that answers a tick."""

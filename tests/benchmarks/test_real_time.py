@@ -1,0 +1,160 @@
+"""What real time costs with one process per module: figures to read, no assertion on any of them.
+
+Speeds are only worth something on a machine that is otherwise idle; CPU time per tick is robust. A tick can
+be no shorter than the CPU time of all processes over the number of cores.
+"""
+
+import os
+import socket
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
+from module_agent.wire.feedback_rows import unpack
+from module_agent.wire.keys import Leaf, every
+from module_agent.wire.messages import Feedback
+from module_agent.wire.transport import Event, Sample
+from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
+from sim.launcher import Child, LaunchConfig, Launcher, last_words, stop_child
+from sim.robot_file import load_robot
+
+pytestmark = pytest.mark.benchmark
+
+WINDOW_S = 20.0
+STARTUP_S = 60.0
+_HERTZ = os.sysconf("SC_CLK_TCK")
+
+
+class Cpu(NamedTuple):
+    """CPU time of a process so far [s]: of its main thread, of its other threads, and within the kernel."""
+
+    main_s: float
+    others_s: float
+    kernel_s: float
+
+
+def cpu(pid: int) -> Cpu:
+    user, kernel = _ticks(Path(f"/proc/{pid}/stat"))
+    main = sum(_ticks(Path(f"/proc/{pid}/task/{pid}/stat")))
+    return Cpu(main / _HERTZ, (user + kernel - main) / _HERTZ, kernel / _HERTZ)
+
+
+def _ticks(stat: Path) -> tuple[int, int]:
+    # The name of the program, in brackets, may hold blanks.
+    fields = stat.read_text().rsplit(")", 1)[1].split()
+    return int(fields[11]), int(fields[12])
+
+
+class Ear:
+    """Hears the feedback of all modules: how many rows, and the newest module time of each."""
+
+    def __init__(self, robot: str, config: ZenohConfig):
+        self.rows = 0
+        self.newest_ns: dict[str, int] = {}
+        self._transport = open_zenoh(config)
+        self._transport.subscribe(every(robot, Leaf.FEEDBACK), self._hear)
+
+    def _hear(self, event: Event) -> None:
+        assert isinstance(event, Sample)
+        feedback = decode(Feedback, event.payload, MAX_MESSAGE_BYTES)
+        self.rows += feedback.count
+        self.newest_ns[feedback.serial] = int(unpack(feedback)["t_ns"][-1])
+
+    def wait_for(self, serials: tuple[str, ...], world: Child) -> None:
+        end = time.monotonic() + STARTUP_S
+        while set(serials) - set(self.newest_ns):
+            assert world.process.poll() is None, last_words(world)
+            assert time.monotonic() < end, f"only {sorted(self.newest_ns)} were heard"
+            time.sleep(0.1)
+
+    def close(self) -> None:
+        self._transport.close()
+
+
+@pytest.fixture
+def endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def _measure(ear: Ear, children: dict[str, list[int]], serials: tuple[str, ...]) -> None:
+    """Print what a window of real time costs each kind of process, per tick."""
+    pids = [pid for group in children.values() for pid in group]
+    before, t_ns, rows, start = {p: cpu(p) for p in pids}, dict(ear.newest_ns), ear.rows, time.monotonic()
+    time.sleep(WINDOW_S)
+    after, wall_s = {p: cpu(p) for p in pids}, time.monotonic() - start
+    passed_s = min((ear.newest_ns[s] - t_ns[s]) * 1e-9 for s in serials)
+    ticks = passed_s * 1e3
+    print(f"  {passed_s:.1f} s in {wall_s:.1f} s: {passed_s / wall_s:.2f} x real time; ", end="")
+    print(f"{(ear.rows - rows) / passed_s / len(serials):.0f} rows/s heard of each module")
+    total = 0.0
+    for name, group in children.items():
+        spent = [[1e6 * (b - a) / ticks for a, b in zip(before[p], after[p], strict=True)] for p in group]
+        main, others, kernel = (sum(column) / len(group) for column in zip(*spent, strict=True))
+        total += len(group) * (main + others)
+        print(
+            f"  {len(group):2d} x {name:12s} {main + others:6.1f} us a tick each: main thread {main:.1f}, "
+            f"others {others:.1f}; {kernel:.1f} of it in the kernel"
+        )
+    print(f"  all: {total:.0f} us CPU a tick; on 2 cores at most {2e3 / total:.2f} x real time")
+
+
+@pytest.mark.parametrize("processes", [16, 4])
+@pytest.mark.parametrize("speed", [1.0, 20.0])
+def test_sixteen_modules_in_real_time(tmp_path: Path, endpoint: str, processes: int, speed: float) -> None:
+    """Idle modules that publish 250 rows/s each, and somebody who listens to all of them."""
+    robot = load_robot("snake16")
+    config = LaunchConfig(
+        "snake16",
+        robot.name,
+        robot.serials,
+        tmp_path,
+        speed=speed,
+        endpoint=endpoint,
+        processes=processes,
+        network="none",
+    )
+    print(f"\nsnake16, {processes} agent processes, world asked for {speed:g} x real time, modules idle")
+    ear = Ear(robot.name, ZenohConfig.hub(endpoint))
+    with Launcher(config, lambda text: None) as launcher:
+        world = launcher.start_world()
+        agents = launcher.start_agents()
+        ear.wait_for(robot.serials, world)
+        children = {"world": [world.process.pid], "agent": [a.process.pid for a in agents]}
+        _measure(ear, {**children, "listener": [os.getpid()]}, robot.serials)
+        for child in (world, *agents):
+            stop_child(child)
+        print(f"  the world, start included: {last_words(world)}")
+    ear.close()
+
+
+def test_sixteen_modules_in_real_time_while_they_move(tmp_path: Path, endpoint: str) -> None:
+    """A coordinator identifies the robot meanwhile: one joint moves, 16 agents listen to it, all hold."""
+    robot = load_robot("snake16")
+    config = LaunchConfig(
+        "snake16",
+        robot.name,
+        robot.serials,
+        tmp_path,
+        endpoint=endpoint,
+        network="none",
+        coordinator_options=("--no-advise",),
+    )
+    print("\nsnake16, 16 agent processes, 1 x real time asked for, a coordinator runs its motions")
+    with Launcher(config, lambda text: None) as launcher:
+        world = launcher.start_world()
+        agents = launcher.start_agents()
+        coordinator = launcher.start_coordinator(quiet=True)
+        ear = Ear(robot.name, ZenohConfig(mode="client", connect=(endpoint,), connect_timeout_s=STARTUP_S))
+        ear.wait_for(robot.serials, world)
+        # The first motions come after discovery, the check of the link and a rest.
+        time.sleep(20.0)
+        children = {"world": [world.process.pid], "agent": [a.process.pid for a in agents]}
+        children |= {"coordinator": [coordinator.process.pid], "listener": [os.getpid()]}
+        _measure(ear, children, robot.serials)
+        print(f"  the world: {last_words(world)}")
+        ear.close()
