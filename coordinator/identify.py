@@ -21,10 +21,10 @@ from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
 from coordinator.kinematics.chain_observations import (
     DISTANCE_FLOOR_M,
-    DISTANCE_FLOOR_RELATIVE,
     PairObservation,
     RestObservation,
 )
+from coordinator.kinematics.imu_intrinsics import UNCALIBRATED
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.kinematics.topology import MotionSeen, Topology, TopologyError, find_topology
@@ -137,7 +137,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         samples = sum(len(w.t_ns) for w in windows) * len(serials)
         keep_every = max(KINEMATIC_KEEP_EVERY, -(-samples // MOST_IMU_SAMPLES))
         data = sensor_data(windows, KINEMATIC_CUTOFF_HZ, keep_every)
-        refined = refine_chain(first.chain, data)
+        refined = refine_chain(first.chain, data, UNCALIBRATED)
     except (TopologyError, AssemblyError, ValueError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
@@ -151,8 +151,8 @@ def identify_kinematics(recording: Recording) -> Kinematics:
 
 def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
     length, sigma = link_lengths(refined.chain, refined.covariance)
-    # What no motion can tell: the accelerometer's scale, and its place in the housing.
-    believed = np.sqrt(sigma**2 + DISTANCE_FLOOR_M**2 + (DISTANCE_FLOOR_RELATIVE * length) ** 2)
+    # What no motion can tell: the IMU's place in the housing.
+    believed = np.sqrt(sigma**2 + DISTANCE_FLOOR_M**2)
     believed.flags.writeable = False
     return first._replace(
         chain=refined.chain,

@@ -117,4 +117,5 @@ def _filtered(one: Window, cutoff_hz: float, keep_every: int) -> SensorData:
         for signal in (one.q_rad, one.qd_rad_s, one.gyro_rad_s, one.accel_m_s2)
     )
     qdd = differentiate(qd, RATE_HZ)
-    return SensorData(q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept])
+    rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
+    return SensorData(q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept])

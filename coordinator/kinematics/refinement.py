@@ -4,7 +4,7 @@ The circle point analysis takes it that only one joint moves. In a real arm the 
 give, so that distal IMUs turn by more than the moving joint does (up to 50 % more near a resonance), and
 the circles come out wrong. Here every IMU sample is predicted from the measured motion of all joints
 (`inertial_prediction`), so what the held joints do is part of the model. Solved by Gauss-Newton on the
-normal equations; gravity and the biases are estimated along.
+normal equations; gravity and the IMUs' own errors (`imu_intrinsics`) are estimated along.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.chain import Array, Chain
+from coordinator.kinematics.imu_intrinsics import (
+    BIASES_ONLY,
+    ImuIntrinsics,
+    ImuPrior,
+    mixing,
+    perfect,
+    read,
+    slopes,
+)
 from coordinator.kinematics.increments import apply_increment, frozen
 from coordinator.kinematics.inertial_prediction import body_motions, imu_readings
 from coordinator.kinematics.inertial_slopes import imu_slopes
@@ -22,10 +31,6 @@ ITERATIONS = 12
 CONVERGED = 1e-7
 # What the data knows worse than this (in rad, or in m) it does not know: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
-# What the data sheets of this class of IMU allow as a bias, one standard deviation; it keeps apart what the
-# motions cannot: an accelerometer's bias and gravity where the IMU never turns.
-GYRO_BIAS_RAD_S = 0.05
-ACCEL_BIAS_M_S2 = 0.2
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
 
@@ -35,8 +40,9 @@ Index = NDArray[np.int64]
 class SensorData(NamedTuple):
     """Samples of all joints and IMUs on one time base and through one low-pass, m samples of n modules.
 
-    q_rad, qd_rad_s, qdd_rad_s2: (m, n). gyro_rad_s, accel_m_s2: (m, n, 3) in the IMU frames. The samples are
-    far enough apart for their errors to be independent.
+    q_rad, qd_rad_s, qdd_rad_s2: (m, n). gyro_rad_s, accel_m_s2: (m, n, 3) in the IMU frames. imu_rates:
+    (m, n, 6) how fast these two change [rad/s^2, m/s^3]; None if no IMU is late. The samples are far enough
+    apart for their errors to be independent.
     """
 
     q_rad: Array
@@ -44,13 +50,15 @@ class SensorData(NamedTuple):
     qdd_rad_s2: Array
     gyro_rad_s: Array
     accel_m_s2: Array
+    imu_rates: Array | None = None
 
 
 class Refinement(NamedTuple):
     """A refined chain; increments are as in `increments`, of all n modules (the first one's are zero).
 
     covariance: (6 n, 6 n), zero along what is unknown. null_basis: (6 n, k) orthonormal directions that the
-    data does not know. residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis. Biases: (n, 3).
+    data does not know. residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis. intrinsics: the IMUs' own
+    errors; where nothing tells them, they are those expected.
     """
 
     chain: Chain
@@ -60,19 +68,17 @@ class Refinement(NamedTuple):
     condition: float
     residual_gyro_rad_s: Array
     residual_accel_m_s2: Array
-    gyro_bias_rad_s: Array
-    accel_bias_m_s2: Array
+    intrinsics: ImuIntrinsics
     iterations: int
 
 
 class _State(NamedTuple):
     chain: Chain
-    gyro_bias: Array
-    accel_bias: Array
+    imus: ImuIntrinsics
 
 
 class _Normal(NamedTuple):
-    """Normal equations: pose block, nuisance block (gravity, biases), their coupling, right-hand sides."""
+    """Normal equations: pose block, nuisance block (gravity, IMU errors), coupling, right-hand sides."""
 
     pose: Array
     cross: Array
@@ -81,41 +87,45 @@ class _Normal(NamedTuple):
     nuisance_rhs: Array
 
 
-def refine_chain(chain: Chain, data: SensorData) -> Refinement:
+def refine_chain(chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY) -> Refinement:
     """Refine a chain that is roughly right (within about 0.2 rad and 0.1 m).
 
+    Args:
+        chain: where to start.
+        data: what the sensors read.
+        prior: how well the IMUs are known beforehand.
+
     Raises:
-        ValueError: fewer samples than parameters.
+        ValueError: fewer samples than parameters; delays wanted without the readings' rates.
     """
+    if prior.delay_s > 0.0 and data.imu_rates is None:
+        raise ValueError("the IMUs' delays cannot be refined without the rates of their readings (imu_rates)")
     count = len(chain.serials)
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise ValueError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
-    bias = np.zeros((count, 3))
-    state = _State(chain, bias, bias)
+    state = _State(chain, perfect(count))
     sigma_gyro, sigma_accel = np.full(count, 0.01), np.full(count, 0.1)
     used = 0
     for used in range(1, ITERATIONS + 1):
         gyro, accel = _residuals(state, data)
         if used > 1:
             sigma_gyro, sigma_accel = _spread(gyro), _spread(accel)
-        normal = _normal_equations(state, data, gyro, accel, sigma_gyro, sigma_accel)
+        normal = _normal_equations(state, data, prior, (gyro, accel), (sigma_gyro, sigma_accel))
         step, nuisance, _ = _solve(normal, count)
-        state = _moved(state, step, nuisance)
+        state = _moved(state, step, nuisance, prior)
         if used > 2 and float(np.abs(step).max()) < CONVERGED:
             break
     gyro, accel = _residuals(state, data)
     sigma_gyro, sigma_accel = _spread(gyro), _spread(accel)
-    normal = _normal_equations(state, data, gyro, accel, sigma_gyro, sigma_accel)
+    normal = _normal_equations(state, data, prior, (gyro, accel), (sigma_gyro, sigma_accel))
     _, _, spectrum = _solve(normal, count)
     return _report(state, spectrum, sigma_gyro, sigma_accel, used)
 
 
 def _residuals(state: _State, data: SensorData) -> tuple[Array, Array]:
-    found = imu_readings(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
-    return (
-        data.gyro_rad_s - found.gyro_rad_s - state.gyro_bias,
-        data.accel_m_s2 - found.accel_m_s2 - state.accel_bias,
-    )
+    ideal = imu_readings(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+    gyro, accel = read(state.imus, ideal.gyro_rad_s, ideal.accel_m_s2, data.imu_rates)
+    return data.gyro_rad_s - gyro, data.accel_m_s2 - accel
 
 
 def _spread(residual: Array) -> Array:
@@ -124,21 +134,27 @@ def _spread(residual: Array) -> Array:
 
 
 def _normal_equations(
-    state: _State, data: SensorData, gyro: Array, accel: Array, sigma_gyro: Array, sigma_accel: Array
+    state: _State,
+    data: SensorData,
+    prior: ImuPrior,
+    residuals: tuple[Array, Array],
+    sigmas: tuple[Array, Array],
 ) -> _Normal:
     """Build the weighted normal equations, IMU by IMU; the root stays."""
-    count = len(state.chain.serials)
-    poses = 6 * count
-    information, rhs = _prior(state)
+    count, samples = len(state.chain.serials), len(data.q_rad)
+    poses, free = 6 * count, prior.sigmas > 0.0
+    information, rhs = _before(state, prior)
     bodies = body_motions(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+    ideal = imu_readings(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
     for k in range(count):
-        slopes = imu_slopes(state.chain, bodies, data.q_rad, data.qd_rad_s, k)
-        weight = 1.0 / np.repeat([sigma_gyro[k], sigma_accel[k]], 3)[:, None]
-        rows = (np.concatenate([slopes.poses, slopes.gravity, _biases(len(gyro))]) * weight).reshape(
-            -1, weight.size * len(gyro)
-        )
-        target = (np.concatenate([gyro[:, k], accel[:, k]], axis=1).T * weight).ravel()
-        at = _places(slopes.modules, k, count)
+        found = imu_slopes(state.chain, bodies, data.q_rad, data.qd_rad_s, k)
+        true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity])
+        rates = None if data.imu_rates is None else data.imu_rates[:, k]
+        own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
+        weight = 1.0 / np.repeat([sigma[k] for sigma in sigmas], 3)[:, None]
+        rows = (np.concatenate([true, own]) * weight).reshape(-1, 6 * samples)
+        target = (np.concatenate([part[:, k] for part in residuals], axis=1).T * weight).ravel()
+        at = _places(found.modules, k, count, int(free.sum()))
         information[np.ix_(at, at)] += rows @ rows.T
         rhs[at] += rows @ target
     return _Normal(
@@ -150,29 +166,23 @@ def _normal_equations(
     )
 
 
-def _prior(state: _State) -> tuple[Array, Array]:
-    """Return the information on [increments (6 n), gravity (3), gyro and accelerometer biases (6 n)].
+def _before(state: _State, prior: ImuPrior) -> tuple[Array, Array]:
+    """Return the information on [increments (6 n), gravity (3), free IMU errors], and its right-hand side.
 
-    Before any sample only the biases are known: they are small. With it the right-hand side that this makes.
+    Before any sample only the IMUs' errors are known: they are small.
     """
-    count = len(state.chain.serials)
-    known = np.zeros(12 * count + 3)
-    known[6 * count + 3 :] = np.repeat([GYRO_BIAS_RAD_S**-2.0, ACCEL_BIAS_M_S2**-2.0], 3 * count)
-    held = np.zeros_like(known)
-    held[6 * count + 3 :] = np.concatenate([state.gyro_bias.ravel(), state.accel_bias.ravel()])
+    count, free = len(state.chain.serials), prior.sigmas > 0.0
+    nothing = np.zeros(6 * count + 3)
+    known = np.concatenate([nothing, np.tile(prior.sigmas[free] ** -2.0, count)])
+    held = np.concatenate([nothing, state.imus.errors[:, free].ravel()])
     return np.diag(known), -known * held
 
 
-def _biases(samples: int) -> Array:
-    """Return the slopes (6, 6, m) of an IMU's readings by its own biases."""
-    return np.broadcast_to(np.eye(6)[:, :, None], (6, 6, samples))
-
-
-def _places(modules: Sequence[int], imu: int, count: int) -> Index:
+def _places(modules: Sequence[int], imu: int, count: int, size: int) -> Index:
     """Return where the parameters that one IMU feels stand among all of them, in the order of its slopes."""
     increments = [6 * module + np.arange(6) for module in modules]
-    gravity, biases = 6 * count + np.arange(3), 6 * count + 3 + 3 * imu + np.arange(3)
-    return np.concatenate([*increments, gravity, biases, biases + 3 * count])
+    gravity, own = 6 * count + np.arange(3), 6 * count + 3 + size * imu + np.arange(size)
+    return np.concatenate([*increments, gravity, own])
 
 
 class _Spectrum(NamedTuple):
@@ -201,15 +211,11 @@ def _solve(normal: _Normal, count: int) -> tuple[Array, Array, _Spectrum]:
     return np.concatenate([np.zeros(6), step]), nuisance, spectrum
 
 
-def _moved(state: _State, step: Array, nuisance: Array) -> _State:
-    count = len(state.chain.serials)
-    chain = apply_increment(state.chain, step)
-    biases = nuisance[3:].reshape(2, count, 3)
-    return _State(
-        chain._replace(gravity=frozen(chain.gravity + nuisance[:3])),
-        state.gyro_bias + biases[0],
-        state.accel_bias + biases[1],
-    )
+def _moved(state: _State, step: Array, nuisance: Array, prior: ImuPrior) -> _State:
+    chain, free = apply_increment(state.chain, step), prior.sigmas > 0.0
+    change = np.zeros_like(state.imus.errors)
+    change[:, free] = nuisance[3:].reshape(len(change), -1)
+    return _State(chain._replace(gravity=frozen(chain.gravity + nuisance[:3])), state.imus.moved(change))
 
 
 def _report(
@@ -231,7 +237,6 @@ def _report(
         condition=float(sigmas.max() / sigmas.min()) if sigmas.size else float("inf"),
         residual_gyro_rad_s=frozen(sigma_gyro),
         residual_accel_m_s2=frozen(sigma_accel),
-        gyro_bias_rad_s=frozen(state.gyro_bias),
-        accel_bias_m_s2=frozen(state.accel_bias),
+        intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
         iterations=iterations,
     )

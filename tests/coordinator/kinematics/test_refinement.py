@@ -11,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from coordinator.chain import Array, Chain
 from coordinator.kinematics import refinement
+from coordinator.kinematics.imu_intrinsics import BIASES_ONLY, SIZE, UNCALIBRATED, ImuIntrinsics, read, slopes
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import imu_readings
 from coordinator.kinematics.null_space import name_null_space
@@ -38,8 +39,8 @@ def _sensed(
     ideal = imu_readings(chain, q, qd, qdd)
     rng = np.random.default_rng(seed)
     shape, each = ideal.gyro_rad_s.shape, (len(chain.serials), 3)
-    gyro_bias = bias * rng.normal(0, refinement.GYRO_BIAS_RAD_S, each)
-    accel_bias = bias * rng.normal(0, refinement.ACCEL_BIAS_M_S2, each)
+    gyro_bias = bias * rng.normal(0, BIASES_ONLY.gyro_bias_rad_s, each)
+    accel_bias = bias * rng.normal(0, BIASES_ONLY.accel_bias_m_s2, each)
     gyro = ideal.gyro_rad_s + gyro_bias + noise * rng.normal(0, GYRO_NOISE, shape)
     accel = ideal.accel_m_s2 + accel_bias + noise * rng.normal(0, ACCEL_NOISE, shape)
     return SensorData(q, qd, qdd, gyro, accel)
@@ -100,7 +101,7 @@ def test_biases_do_not_bend_the_robot(robots: Any) -> None:
     found = refine_chain(_perturbed(truth, 1, 0.02, 0.01), data)
     q, qd, qdd = data.q_rad, data.qd_rad_s, data.qdd_rad_s2
     again = imu_readings(found.chain, q, qd, qdd)
-    gyro = data.gyro_rad_s - found.gyro_bias_rad_s - again.gyro_rad_s
+    gyro = data.gyro_rad_s - found.intrinsics.gyro_bias_rad_s - again.gyro_rad_s
     assert np.abs(gyro).max() < 1e-6
     true_rates = imu_readings(truth, q, qd, qdd).gyro_rad_s
     np.testing.assert_allclose(again.gyro_rad_s, true_rates, atol=1e-5)
@@ -187,8 +188,8 @@ def test_scipy_finds_the_same_minimum(robots: Any) -> None:
             [
                 ((data.gyro_rad_s - read.gyro_rad_s - biases[0]) * w_gyro).ravel(),
                 ((data.accel_m_s2 - read.accel_m_s2 - biases[1]) * w_accel).ravel(),
-                biases[0].ravel() / refinement.GYRO_BIAS_RAD_S,
-                biases[1].ravel() / refinement.ACCEL_BIAS_M_S2,
+                biases[0].ravel() / BIASES_ONLY.gyro_bias_rad_s,
+                biases[1].ravel() / BIASES_ONLY.accel_bias_m_s2,
             ]
         )
 
@@ -202,9 +203,84 @@ def test_scipy_finds_the_same_minimum(robots: Any) -> None:
     assert np.abs((poses.T @ apart[6:]) / sigma).max() < 0.01
 
 
+def _uncalibrated(data: SensorData, seed: int) -> tuple[SensorData, ImuIntrinsics]:
+    """The same motion as read by IMUs whose errors are drawn from what is allowed beforehand."""
+    rates = np.concatenate(
+        [np.gradient(part, 4.0 / 299, axis=0) for part in (data.gyro_rad_s, data.accel_m_s2)], axis=2
+    )
+    count = data.q_rad.shape[1]
+    errors = np.random.default_rng(seed).normal(size=(count, SIZE)) * UNCALIBRATED.sigmas
+    imus = ImuIntrinsics(errors)
+    gyro, accel = read(imus, data.gyro_rad_s, data.accel_m_s2, rates)
+    return data._replace(gyro_rad_s=gyro, accel_m_s2=accel, imu_rates=rates), imus
+
+
+def _with_noise(data: SensorData, seed: int) -> SensorData:
+    rng = np.random.default_rng(seed)
+    return data._replace(
+        gyro_rad_s=data.gyro_rad_s + rng.normal(0, GYRO_NOISE, data.gyro_rad_s.shape),
+        accel_m_s2=data.accel_m_s2 + rng.normal(0, ACCEL_NOISE, data.accel_m_s2.shape),
+    )
+
+
+def test_the_intervals_hold_with_imus_as_delivered(robots: Any) -> None:
+    truth, _ = robots.random(4, joints=3, serial=True)
+    squares, freedom = 0.0, 0
+    for seed in range(25):
+        data, _ = _uncalibrated(_sensed(truth), seed)
+        found = refine_chain(truth, _with_noise(data, 100 + seed), UNCALIBRATED)
+        values, vectors = np.linalg.eigh(found.covariance)
+        kept = values > values.max() * 1e-12
+        along = vectors[:, kept].T @ _increment(found.chain, truth)
+        squares += float(np.sum(along**2 / values[kept]))
+        freedom += int(np.count_nonzero(kept))
+    # Chi-square with some 275 degrees of freedom: one sigma is 0.085; four sigma for what the seeds share.
+    assert 0.66 < squares / freedom < 1.34
+
+
+def test_scale_and_axes_of_an_imu_are_found_where_distal_joints_turn_it(robots: Any) -> None:
+    truth, _ = robots.random(4, joints=4, serial=True)
+    data, imus = _uncalibrated(_sensed(truth), 3)
+    calibrated = refine_chain(truth, _with_noise(data, 1), UNCALIBRATED)
+    trusted = refine_chain(truth, _with_noise(data, 1), BIASES_ONLY)
+    error = calibrated.intrinsics.errors - imus.errors
+    # Module 2 is turned by two joints and seen against a third; its gyro is told by their encoders.
+    before = np.abs(imus.errors[2, :9]).max()
+    assert np.abs(error[2, :9]).max() < 0.5 * before
+    # And what is trusted blindly bends the robot.
+    assert np.abs(_increment(calibrated.chain, truth)).max() < np.abs(_increment(trusted.chain, truth)).max()
+
+
+def test_a_late_imu_is_told_by_how_late_it_is(robots: Any) -> None:
+    truth, _ = robots.random(4, joints=3, serial=True)
+    data, imus = _uncalibrated(_sensed(truth), 5)
+    found = refine_chain(truth, _with_noise(data, 2), UNCALIBRATED)
+    # 900 gyro samples of 2 mrad/s on changes of some 5 rad/s^2: 0.02 ms, with room for what is shared.
+    np.testing.assert_allclose(found.intrinsics.errors[1:, -1], imus.errors[1:, -1], atol=2e-4)
+
+
+def test_the_slopes_by_an_imus_own_errors_are_those_of_differences() -> None:
+    rng = np.random.default_rng(0)
+    gyro, accel, rates = (rng.normal(size=(7, 1, k)) for k in (3, 3, 6))
+    found = slopes(gyro[:, 0], accel[:, 0], rates[:, 0], np.ones(SIZE, dtype=bool))
+    for k in range(SIZE):
+        ahead, behind = (
+            np.concatenate(read(ImuIntrinsics(h * np.eye(1, SIZE, k)), gyro, accel, rates), axis=2)[:, 0]
+            for h in (0.5, -0.5)
+        )
+        # The readings are linear in the errors.
+        np.testing.assert_allclose(found[k], (ahead - behind).T, atol=1e-14)
+
+
+def test_delays_need_the_rates_of_the_readings(robots: Any) -> None:
+    truth, _ = robots.random(0, joints=2)
+    with pytest.raises(ValueError, match="imu_rates"):
+        refine_chain(truth, _sensed(truth), UNCALIBRATED)
+
+
 def test_too_few_samples_are_refused(robots: Any) -> None:
     truth, _ = robots.random(0, joints=4)
-    few = SensorData(*(signal[:5] for signal in _sensed(truth)))
+    few = SensorData(*(signal[:5] for signal in _sensed(truth)[:5]))
     with pytest.raises(ValueError, match="5 samples are too few to refine a chain of 4 modules"):
         refine_chain(truth, few)
 
@@ -212,7 +288,8 @@ def test_too_few_samples_are_refused(robots: Any) -> None:
 def test_results_cannot_be_written_to(robots: Any) -> None:
     truth, _ = robots.random(0, joints=2)
     found = refine_chain(truth, _sensed(truth, 0, noise=1.0))
-    for name in ("covariance", "null_basis", "residual_gyro_rad_s", "accel_bias_m_s2"):
+    for name in ("covariance", "null_basis", "residual_gyro_rad_s"):
         assert not getattr(found, name).flags.writeable
+    assert not found.intrinsics.errors.flags.writeable
     for array in (found.chain.axis, found.chain.point, found.chain.imu_home, found.chain.gravity):
         assert not array.flags.writeable
