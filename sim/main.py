@@ -12,6 +12,7 @@ from coordinator.terminal import print_table
 from sim.command_options import RobotArgument, fail, load
 from sim.drawing import draw
 from sim.effects import EFFECTS
+from sim.effects_page import OFF, default_size, page, sizes
 from sim.experiments.program import amplitudes
 from sim.log_program import compare_log
 from sim.noise_profile import NOISE_PROFILES
@@ -63,20 +64,23 @@ def show(
 @app.command()
 def effects(
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="As a page of Markdown.")] = False,
 ) -> None:
     """List what a simulated module does as a real one: what `--with` and `--without` switch."""
+    if markdown:
+        typer.echo(page(), nl=False)
+        return
     having = {
-        name: [p.name for p in NOISE_PROFILES.values() if any(getattr(p, field) for field in effect.sizes)]
+        name: [p.name for p in NOISE_PROFILES.values() if sizes(effect, p) != OFF]
         for name, effect in EFFECTS.items()
     }
     if as_json:
         rows = [effect._asdict() | {"profiles": having[name]} for name, effect in EFFECTS.items()]
         typer.echo(json.dumps(rows, indent=2))
         return
-    shown = Table("effect", "part", "model", "typical size", "in the profiles", show_lines=True)
+    shown = Table("effect", "part", "model", "size", "in the profiles", show_lines=True)
     for name, effect in EFFECTS.items():
-        sizes = "\n".join(f"{field} {size:.3g}" for field, size in effect.sizes.items())
-        shown.add_row(name, effect.part, effect.model, sizes, ", ".join(having[name]))
+        shown.add_row(name, effect.part, effect.model, default_size(effect), ", ".join(having[name]))
     print_table(shown)
 
 

@@ -1,0 +1,85 @@
+"""The table of effects as a page of Markdown: what `sim/EFFECTS.md` holds."""
+
+from sim.effects import EFFECTS, Effect
+from sim.noise_profile import DEFAULT_PROFILE, NOISE_PROFILES, NoiseProfile
+
+# How a field's name ends, the unit of its number, and whether small numbers are shown in thousandths of it.
+_UNITS = (
+    ("_s_m", "rad/s per m/s²", True),
+    ("_m_s2", "m/s²", True),
+    ("_rad_s", "rad/s", True),
+    ("_rad", "rad", True),
+    ("_hz", "Hz", False),
+    ("_ppm", "ppm", False),
+    ("_s", "s", True),
+)
+OFF = "off"
+_PERCENT = ("_fraction", "_spread", "_scale")
+
+_HEAD = f"""# What the simulated module does as a real one does
+
+Every effect can be switched on its own: `--with NAME` and `--without NAME` of `x5-sim run`, `launch` and
+`world`. A noise profile (`--noise`) is a set of them: `ideal` has perfect sensors on a rigid robot, `x5` is a
+module with a calibrated IMU, `{DEFAULT_PROFILE}` (the default) one as delivered, `poor` has everything, and
+larger. Sizes are one standard deviation where they differ between modules or samples, unless the model says
+otherwise; they are drawn once per module from the seed. `x5-sim effects` prints the same table.
+
+"""
+
+
+def page() -> str:
+    """Return the whole page, one table per part of a module, rows in the order of `EFFECTS`."""
+    parts = dict.fromkeys(effect.part for effect in EFFECTS.values())
+    return _HEAD + "\n".join(_table(part) for part in parts)
+
+
+def sizes(effect: Effect, profile: NoiseProfile) -> str:
+    """Return an effect's sizes in a profile with their units, or "off"."""
+    shown = {field: getattr(profile, field) for field in effect.sizes}
+    return ", ".join(_size(field, value) for field, value in shown.items()) if any(shown.values()) else OFF
+
+
+def default_size(effect: Effect) -> str:
+    """Return an effect's sizes in the default profile; where it is off there, those that the switch gives."""
+    profile = NOISE_PROFILES[DEFAULT_PROFILE]
+    size = sizes(effect, profile)
+    if size != OFF:
+        return size
+    return f"{OFF}; switched on: {sizes(effect, profile.model_copy(update=dict(effect.sizes)))}"
+
+
+def _table(part: str) -> str:
+    rows = [
+        f"## {part[0].upper()}{part[1:]}",
+        "",
+        "| effect | model | default size | source | switch |",
+        "|---|---|---|---|---|",
+    ]
+    for name, effect in EFFECTS.items():
+        if effect.part != part:
+            continue
+        rows.append(
+            f"| {_title(name)} | {effect.model} | {default_size(effect)} | {effect.source} | `{name}` |"
+        )
+    return "\n".join([*rows, ""])
+
+
+def _title(name: str) -> str:
+    return name.replace("-", " ").replace("imu", "IMU")
+
+
+def _size(field: str, value: float) -> str:
+    for ending in _PERCENT:
+        if field.endswith(ending):
+            of_what = " of the largest" if ending == "_fraction" else ""
+            return f"{_words(field, ending)} {100.0 * value:.3g} %{of_what}"
+    for ending, unit, small in _UNITS:
+        if field.endswith(ending):
+            thousandths = small and value < 0.1
+            shown = f"{1e3 * value:.3g} m" if thousandths else f"{value:.3g} "
+            return f"{_words(field, ending)} {shown}{unit}"
+    return "as described" if value == 1.0 else f"{value:.3g} times as described"
+
+
+def _words(field: str, ending: str) -> str:
+    return field.removesuffix(ending).replace("_", " ")
