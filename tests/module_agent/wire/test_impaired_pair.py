@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from module_agent.wire.impaired_transport import ImpairedTransport
 from module_agent.wire.network_profile import NetworkProfile, PathProfile, Receiver, Stall, profile
@@ -259,6 +261,17 @@ def test_a_partition_shorter_than_the_lease_is_not_seen_in_liveliness(pairs, end
     assert alive(pair) == [(0.001, True)]
 
 
+def test_short_partitions_that_follow_one_another_do_not_add_up(pairs) -> None:
+    pair = pairs(NetworkProfile(name="t", delay_ms=1.0))
+    pair.coordinator.watch_alive("m", pair.note("seen"))
+    pair.module.declare_alive("m")
+    for start in (1.0, 1.0 + 0.7 * LEASE_S):
+        pair.at(start, pair.coordinator.partition)
+        pair.at(start + 0.6 * LEASE_S, pair.coordinator.heal)
+    pair.run(5.0)
+    assert alive(pair) == [(0.001, True)]
+
+
 @pytest.mark.parametrize("ends", [("module",), ("coordinator",), ("module", "coordinator")])
 def test_after_the_lease_a_partition_takes_tokens_away_and_its_end_gives_them_back(pairs, ends) -> None:
     pair = pairs(NetworkProfile(name="t", delay_ms=1.0))
@@ -318,3 +331,56 @@ def test_the_same_seed_gives_the_same_arrivals_and_another_seed_others(pairs) ->
 
     assert arrivals(1) == arrivals(1)
     assert arrivals(1) != arrivals(2)
+
+
+OPERATIONS = st.lists(
+    st.tuples(
+        st.floats(0.001, 1.5),
+        st.sampled_from(["part module", "heal module", "part coordinator", "heal coordinator"])
+        | st.sampled_from(["declare", "undeclare", "ask"]),
+    ),
+    max_size=25,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(OPERATIONS, st.integers(0, 2**32), st.sampled_from([0.0, 5.0]))
+def test_whatever_is_cut_and_healed_each_question_has_one_end_and_who_is_there_is_known_in_the_end(
+    operations: list[tuple[float, str]], seed: int, delay_ms: float
+) -> None:
+    pair = Pair(NetworkProfile(name="t", delay_ms=delay_ms, jitter_ms=delay_ms, loss=0.1), seed)
+    pair.coordinator.watch_alive("m/*", pair.note("seen"))
+    pair.module.serve("q", lambda event: event.reply(b"yes"))
+    pair.note("reply")
+    tokens: dict[str, Any] = {}
+    at_s, asked = 0.0, 0
+
+    def undeclare() -> None:
+        if tokens:
+            tokens.pop(next(iter(tokens))).undeclare()
+
+    for number, (gap_s, what) in enumerate(operations):
+        at_s += gap_s
+        verb, _, end = what.partition(" ")
+        if verb in ("part", "heal"):
+            endpoint = getattr(pair, end)
+            pair.at(at_s, endpoint.partition if verb == "part" else endpoint.heal)
+        elif verb == "declare":
+            key = f"m/{number}"
+            pair.at(at_s, lambda key=key: tokens.update({key: pair.module.declare_alive(key)}))
+        elif verb == "undeclare":
+            pair.at(at_s, undeclare)
+        else:
+            pair.at(at_s, lambda tag=asked: ask(pair, "reply", timeout_s=0.5, tag=tag))
+            asked += 1
+    pair.at(at_s + 1.0, pair.module.heal)
+    pair.at(at_s + 1.0, pair.coordinator.heal)
+    pair.run(at_s + 5.0)
+    pair.close()
+    assert sorted(e.tag for e in pair.events("reply")) == list(range(asked))
+    view: dict[str, bool] = {}
+    for event in pair.events("seen"):
+        # Nobody is told twice of the same: appearing and vanishing alternate.
+        assert view.get(event.key, False) is not event.alive
+        view[event.key] = event.alive
+    assert {key for key, there in view.items() if there} == set(tokens)

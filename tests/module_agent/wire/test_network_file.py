@@ -4,11 +4,16 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from typer import Typer
+from typer.testing import CliRunner
 
+from coordinator.main import app as coordinator
+from module_agent.main import app as agent
 from module_agent.wire import network_trace
 from module_agent.wire.network_file import NetworkError, load_network, network, network_beside
 from module_agent.wire.network_profile import PROFILES, LossBurst, NetworkProfile, PathProfile, Stall
 from module_agent.wire.network_trace import NetworkTrace, TraceError, TraceRow, parse_trace
+from sim.main import app as simulator
 from sim.robot_file import RobotFileError, load_robot, shipped_robots
 
 GOOD = """
@@ -154,7 +159,23 @@ rtt min/avg/max/mdev = 1.000/85.013/250.000/116.0 ms
     ]
 
 
-# --------------------------------------------------------------------------- named by robot files
+# --------------------------------------------------------------------------- named by programs and robots
+
+
+@pytest.mark.parametrize(
+    ("app", "arguments"),
+    [
+        (agent, ("--serial", "A-1", "--bus", "no-bus")),
+        (coordinator, ("run", "--out", "no-run")),
+        (simulator, ("run", shipped_robots()[0], "--out", "no-run")),
+        (simulator, ("launch", shipped_robots()[0], "--out", "no-run")),
+    ],
+)
+def test_every_program_refuses_a_wrong_network_file_with_its_line(file: Path, app: Typer, arguments) -> None:
+    file.write_text(GOOD.replace("delay_ms = 1.0", "delay_ms = -1.0", 1))
+    done = CliRunner().invoke(app, [*arguments, "--network", str(file)])
+    assert done.exit_code == 2, done.output
+    assert f"{file}:2: delay_ms: Input should be greater than or equal to 0" in done.output
 
 
 def robot_text(network_value: str) -> str:
