@@ -72,7 +72,8 @@ class World:
         self.profile = noise_profile(wanted) if isinstance(wanted, str) else wanted
         tree = build_tree(robot)
         imu_ticks = _whole_ticks(imu_rate_hz)
-        self._sensors = Sensors(seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S)
+        drawn = seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S
+        self._sensors = Sensors(*drawn)
         self._skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
         self._joints = np.array(self._skeleton.module)
         self._passive = np.array(self._skeleton.passive, dtype=np.int64)
@@ -85,7 +86,7 @@ class World:
         self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
         self._rates = np.zeros((2, len(self._q)))
         self._actuators.reset(robot.start_rad, load)
-        self._compile()
+        self._rehearse(Sensors(*drawn))
         self._body = Multibody(robot.name, self._skeleton, TICK_S)
         self._body.place(self._q)
         zero = np.zeros_like(robot.start_rad)
@@ -170,21 +171,24 @@ class World:
                 raise ValueError(f"PWM of module {module.serial} is {value}; it must be a number in [-1, 1]")
         return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
 
-    def _compile(self) -> None:
-        """Call what is compiled at its first call, which would take seconds out of a world in real time."""
-        still = np.zeros_like(self._q)
+    def _rehearse(self, sensors: Sensors) -> None:
+        """Call all that is compiled at its first call, which would take seconds out of a world in real time."""
+        still, idle = np.zeros_like(self._q), np.zeros(len(self._joints))
         self._felt = self._tree.feel(self._q, still, still)
-        rehearsal = copy(self._actuators)
         mass, biases = self._tree.mass_and_biases(self._q, self._rates)
-        idle = np.zeros(len(self._joints))
-        rehearsal.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
-        copy(self._windings).step(rehearsal.copper_w)
+        actuators = copy(self._actuators)
+        actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
+        copy(self._windings).step(actuators.copper_w)
+        sensors.read(0, self._instant(self._q, still))
 
     def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:
         if self._sensors.imu_due(self._tick):
             self._felt = self._tree.feel(q, rate, change)
+        return self._sensors.read(self._tick, self._instant(q, rate))
+
+    def _instant(self, q: Array, rate: Array) -> Instant:
         actuators = self._actuators
-        instant = Instant(
+        return Instant(
             t_ns=self.t_ns,
             q_rad=q[self._joints],
             qd_rad_s=rate[self._joints],
@@ -197,7 +201,6 @@ class World:
             gyro_rad_s=self._felt[0],
             specific_force_m_s2=self._felt[1],
         )
-        return self._sensors.read(self._tick, instant)
 
 
 class InProcessHardware:
