@@ -172,7 +172,7 @@ class World:
         return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
 
     def _rehearse(self, sensors: Sensors) -> None:
-        """Call all that is compiled at its first call, which would take seconds out of a world in real time."""
+        """Call all that is compiled at its first call, which would take seconds out of real time."""
         still, idle = np.zeros_like(self._q), np.zeros(len(self._joints))
         self._felt = self._tree.feel(self._q, still, still)
         mass, biases = self._tree.mass_and_biases(self._q, self._rates)
