@@ -38,6 +38,9 @@ SILENT_NS = 1_000_000_000
 TOKEN_GONE_NS = 300_000_000
 # Refusals that the next attempt can mend: it carries a newer echo and a newer sequence number.
 PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
+# Refusals of a motion that arming again mends. SEQUENCE that does not pass says that the motion has ended
+# already: it had begun, the answer was lost, and so were the keep-alives.
+UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.value)
 
 T = TypeVar("T")
 
@@ -310,7 +313,7 @@ class RobotLink:
         try:
             await self._persist(serial, attempt)
         except Refused as refused:
-            if refused.ack.reason in (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value):
+            if refused.ack.reason in UNSTARTED:
                 raise MotionInterrupted(serial, f"refused: {refused.ack.detail}") from refused
             raise
 

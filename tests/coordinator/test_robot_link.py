@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from coordinator.link_errors import ModuleLost, MotionInterrupted
-from coordinator.radio import NoAnswer, Refused
+from coordinator.radio import NoAnswer, Radio, Refused
 from coordinator.robot_link import RobotLink
-from module_agent.wire.messages import ConstantMotion, GoTo, Rest
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, Rest
 from module_agent.wire.network_profile import NetworkProfile
 
 ARM = "thesis_171_horizontal"
@@ -257,6 +258,40 @@ def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callab
 
     rig.run(work())
     assert rig.world.plant.q_rad[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_again(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM, "lan")
+    radio, recording, link = rig.link()
+    lost: list[Ack] = []
+
+    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+        ack = await Radio.command(radio, serial, leaf, message, timeout_s)
+        if leaf is Leaf.MOTION and not lost:
+            lost.append(ack)
+            # The answer is lost, and for longer than a command lives so are the keep-alives.
+            rig.cut = True
+            await asyncio.sleep(0.4)
+            rig.cut = False
+            raise NoAnswer(serial, leaf, "Timeout")
+        return ack
+
+    monkeypatch.setattr(radio, "command", command)
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        with pytest.raises(MotionInterrupted, match="was expired: use a new number"):
+            await link.run({BASE: SLOW})
+        for serial in link.serials:
+            await link.acquire(serial)
+        assert (await link.run({BASE: SLOW}))[BASE].outcome == "done"
+        keeper.cancel()
+
+    rig.run(work())
+    assert [ack.accepted for ack in lost] == [True]
+    assert recording.modules[BASE].status.expiries == 1
 
 
 def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Callable[..., Any]) -> None:
