@@ -25,7 +25,7 @@ from module_agent.catalogue import module_type
 from module_agent.toml_lines import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.network_file import network, network_beside
-from sim.noise_profile import noise_profile
+from sim.noise_profile import DEFAULT_PROFILE, noise_profile
 from sim.parts import Angle, Moment, Part, Xyz, check_inertia
 from sim.pose import Array, pose
 
@@ -181,7 +181,7 @@ class Robot(_Strict):
 
     name: str
     network: str = "none"
-    noise: str = "x5"
+    noise: str = DEFAULT_PROFILE
     base: Base = Base()
     modules: Annotated[tuple[Module, ...], Field(alias="module", min_length=1, max_length=64)]
 

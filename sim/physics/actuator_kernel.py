@@ -25,6 +25,10 @@ MODULE = np.dtype(
         ("cubic_nm_rad3", np.float64),
         ("spring_loss_s", np.float64),
         ("half_gap_rad", np.float64),
+        ("least_rad", np.float64),  # the end stops; infinite without
+        ("most_rad", np.float64),
+        ("stop_nm_rad", np.float64),
+        ("stop_loss_s", np.float64),
     ]
 )
 PASSIVE = np.dtype([("joint", np.int64), ("stiffness", np.float64), ("damping", np.float64)])
@@ -38,6 +42,11 @@ ROWS = 14
 @compiled
 def _clamp(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
+
+
+@compiled
+def _clamp_between(value: float, least: float, most: float) -> float:
+    return min(max(value, least), most)
 
 
 @compiled
@@ -95,6 +104,7 @@ def advance(
     m, n = len(q), len(modules)
     pull, added, after = np.empty(m), np.empty(m), np.zeros((ROWS, n))
     momentum, inertia = np.empty(n), np.empty(n)
+    stopped, stiffened = np.zeros(n), np.zeros(n)
     for i in range(len(passives)):
         one = passives[i]
         pull[one.joint] = -(one.stiffness * q[one.joint] + one.damping * qd[one.joint])
@@ -106,16 +116,23 @@ def advance(
         pull[j], added[j], momentum[i], inertia[i], after[CURRENT_A, i] = _pull(
             modules[i], state[:, i], drive, resistance_factor[i], dt_s, q[j], qd[j]
         )
+        stopped[i], stiffened[i] = _stop(modules[i], q[j], qd[j], dt_s)
     # (M + diag(added)) qdd = pull - bias follows by eliminating the motors' accelerations and the torques.
     matrix, qdd = mass.copy(), np.empty(m)
     for j in range(m):
         matrix[j, j] += added[j]
         qdd[j] = pull[j] - bias[j]
+    for i in range(n):
+        j = modules[i].joint
+        matrix[j, j] += stiffened[i]
+        qdd[j] += stopped[i]
     _solve(matrix, qdd)
     force = pull - added * qdd
+    whole = force.copy()
     for i in range(n):
         own = modules[i]
         j = own.joint
+        whole[j] += stopped[i] - stiffened[i] * qdd[j]
         limit = _friction_limit(own, after[CURRENT_A, i])
         free = momentum[i] - force[j]
         friction = _clamp(free, limit)
@@ -127,7 +144,20 @@ def advance(
         ohm = own.resistance_ohm * resistance_factor[i]
         stretch, rate = state[MOTOR_RAD, i] - q[j], qd[j] + dt_s / 2.0 * qdd[j]
         _account(own, ohm, voltage_v, friction, share, stretch, rate, after[:, i])
-    return force, after
+    return whole, after
+
+
+@compiled
+def _stop(own: Any, q: float, qd: float, dt_s: float) -> tuple[float, float]:
+    """Return what an end stop exerts on the output at qdd = 0, and by how much less per qdd."""
+    beyond = q - _clamp_between(q, own.least_rad, own.most_rad)
+    # Implicit Euler, as the blow of a bare output is over within a step: a rule that keeps its energy would
+    # throw it back and forth for ever.
+    push = own.stop_nm_rad * (beyond + (dt_s + own.stop_loss_s) * qd)
+    # A stop does not hold back what leaves it.
+    if beyond == 0.0 or push * beyond <= 0.0:
+        return 0.0, 0.0
+    return -push, own.stop_nm_rad * (dt_s + own.stop_loss_s) * dt_s
 
 
 @compiled

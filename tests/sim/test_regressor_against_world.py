@@ -14,7 +14,7 @@ from sim.world import World
 @pytest.mark.parametrize("name", ["thesis_484_vertical", "tree_y"])
 def test_true_parameters_give_the_true_torque(name: str) -> None:
     robot = load_robot(name)
-    world = World(robot, seed=1)
+    world = World(robot, seed=1, noise="ideal")
     log = TruthLog(world, every=1)
     joints = len(world.modules)
     rng = np.random.default_rng(0)
