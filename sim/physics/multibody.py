@@ -19,7 +19,6 @@ class Multibody:
     def __init__(self, name: str, skeleton: Skeleton, dt_s: float):
         n = len(skeleton.names)
         self._indices = list(range(n))
-        self._zeros = [0.0] * n
         self.closed = False
         self._client: int = pybullet.connect(pybullet.DIRECT)
         self._body = _load(self._client, urdf_text(name, skeleton))
@@ -30,16 +29,6 @@ class Multibody:
         """Put the joints, at rest, to the given positions (m,)."""
         for i in self._indices:
             pybullet.resetJointState(self._body, i, float(q_rad[i]), 0.0, physicsClientId=self._client)
-
-    def mass_matrix(self, q: list[float]) -> Array:
-        """Return the joint-space mass matrix (m, m) [kg m^2 for turning joints]."""
-        return np.array(pybullet.calculateMassMatrix(self._body, q, physicsClientId=self._client))
-
-    def bias(self, q: list[float], qd: list[float]) -> Array:
-        """Return the torques (m,) [Nm] that hold gravity and velocity forces at zero acceleration."""
-        return np.array(
-            pybullet.calculateInverseDynamics(self._body, q, qd, self._zeros, physicsClientId=self._client)
-        )
 
     def step(self, torque_nm: Sequence[float]) -> tuple[Array, Array]:
         """Apply joint torques (m,) for one step; return the new positions and velocities (m,)."""

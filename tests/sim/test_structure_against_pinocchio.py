@@ -298,6 +298,21 @@ def test_a_struck_robot_rings_at_its_natural_frequencies_and_dies_away_as_damped
         assert damping == pytest.approx(zeta[i], rel=0.03 + zeta[i])
 
 
+@pytest.mark.parametrize("millimetres", [484, 350, 245, 171])
+def test_the_thesis_vertical_arm_rocks_at_some_hertz_and_the_horizontal_one_stands_firm(
+    millimetres: int,
+) -> None:
+    lowest = {}
+    for way in ("vertical", "horizontal"):
+        bell = Bell(load_robot(f"thesis_{millimetres}_{way}"))
+        skeleton, passive = bell.skeleton, list(bell.skeleton.passive)
+        # Joints held at the start, the vertical arm hanging; the weight's own stiffness is 1 % here.
+        mass = Reference(skeleton).mass(bell.q)[np.ix_(passive, passive)]
+        lowest[way] = math.sqrt(eigh(np.diag(skeleton.stiffness), mass)[0][0]) / (2 * math.pi)
+    assert 6.0 < lowest["vertical"] < 9.0
+    assert lowest["horizontal"] > 25.0
+
+
 @pytest.mark.parametrize("name", ["thesis_484_vertical", "arm7", "arm6"])
 def test_a_giving_robot_begins_sagged_under_its_weight_and_stays_there(name: str) -> None:
     robot = load_robot(name)
