@@ -37,8 +37,8 @@ GAIN_VOLTAGE_V = 48.0
 # rings on its spring. With a third of it light arms ring on after every reversal of the gear's friction, and
 # circle point analysis of them on a solid table comes out 10 to 30 % long, where the thesis saw under 5 %.
 SPRING_LOSS_S = 3e-3
-# End stops, where a type has them: 0.2 deg deep under the type's largest torque, and a blow is over at once. An
-# assumption: what they are made of is not published.
+# End stops, where a type has them: 0.2 deg deep under the type's largest torque, and a blow is over at once.
+# An assumption: what they are made of is not published.
 STOP_NM_RAD = 2000.0
 STOP_LOSS_S = 2e-3
 # A gear that loses nearly all still has to turn.
