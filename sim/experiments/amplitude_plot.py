@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from sim.experiments.amplitude_sweep import Trial
 from sim.experiments.thesis_lengths import ALIGNMENTS, Alignment, thesis_length
@@ -30,7 +31,7 @@ def plot(trials: Sequence[Trial], path: Path, title: str) -> None:
     figure = Figure(figsize=(width, 7.0), dpi=150)
     FigureCanvasAgg(figure)
     grid: Any = figure.subplots(2, len(lengths), squeeze=False)
-    half = _half_range(sweep)
+    half = float(np.clip(1.1 * _largest_error(sweep), _LEAST_RANGE, _MOST_RANGE))
     for row, alignment in enumerate(ALIGNMENTS):
         for column, length in enumerate(lengths):
             own = [t for t in sweep if (t.alignment, t.length_mm) == (alignment, length)]
@@ -45,15 +46,24 @@ def plot(trials: Sequence[Trial], path: Path, title: str) -> None:
             if column == len(lengths) - 1:
                 axes.error_axis.set_ylabel("error [%]")
     figure.suptitle(title, fontsize=12, y=0.985)
-    handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncol=3, fontsize=9, frameon=False)
-    figure.subplots_adjust(left=0.75 / width, right=1 - 0.75 / width, top=0.90, bottom=0.17, wspace=0.48)
+    handles, _ = grid[0][0].get_legend_handles_labels()
+    if _largest_error(sweep) >= half:
+        beyond = Line2D([], [], marker="v", linestyle="none", color="#808080", markersize=4.0)
+        beyond.set_label("beyond the scale")
+        handles.append(beyond)
+    figure.legend(
+        handles=handles, loc="lower center", ncol=min(3, len(lengths) + 1), fontsize=9, frameon=False
+    )
+    figure.subplots_adjust(
+        left=0.75 / width, right=1 - 0.75 / width, top=0.90, bottom=0.17, wspace=0.48, hspace=0.27
+    )
     figure.savefig(path)
 
 
-def _half_range(sweep: Sequence[Trial]) -> float:
-    errors = [error for t in sweep for filtered in (True, False) if (error := t.error(filtered)) is not None]
-    return float(np.clip(1.1 * max(map(abs, errors), default=0.0), _LEAST_RANGE, _MOST_RANGE))
+def _largest_error(sweep: Sequence[Trial]) -> float:
+    """Return the size of the largest relative error, with the filter or without."""
+    errors = [abs(e) for t in sweep for filtered in (True, False) if (e := t.error(filtered)) is not None]
+    return max(errors, default=0.0)
 
 
 def _panel(axes: Any, own: Sequence[Trial], half: float) -> None:
@@ -122,5 +132,5 @@ def _thesis_mark(axes: Any, alignment: Alignment, length_mm: int, half: float) -
         markeredgecolor="white",
         markeredgewidth=0.6,
         zorder=5,
-        label="thesis: mean of 13 trials on real modules",
+        label="thesis: 13 trials on real modules",
     )
