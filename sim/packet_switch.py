@@ -11,6 +11,7 @@ import numpy as np
 from module_agent.wire.channel import Channel
 from module_agent.wire.network_profile import NetworkProfile, Receiver
 
+_COORDINATOR = 0
 _IPV4 = 4
 _DESTINATION = slice(16, 20)
 _LEAST_HEADER_BYTES = 20
@@ -40,7 +41,8 @@ class PacketSwitch:
 
     The first host is the coordinator's, the others are modules'. Every direction between two hosts is a link
     of its own, with the profile's path to its receiver and draws of its own: a radio of every module. Packets
-    of a link keep their order but for the fraction `reorder`. In the profile's partitions nothing passes.
+    of a link keep their order but for the fraction `reorder`. In the profile's partitions nothing passes to
+    or from the coordinator.
     Packets for nobody here are dropped without a count, as are those that are not IPv4.
     """
 
@@ -76,7 +78,7 @@ class PacketSwitch:
         link = self._links[source, destination]
         fate = link.channel.fate(t_s)
         counts = link.counts._replace(taken=link.counts.taken + 1)
-        if fate.lost or any(start_s <= t_s < end_s for start_s, end_s in self._partitions):
+        if fate.lost or (_COORDINATOR in (source, destination) and self._is_parted(t_s)):
             link.counts = counts._replace(lost=counts.lost + 1)
             return
         due_s = t_s + fate.delay_s
@@ -99,9 +101,12 @@ class PacketSwitch:
             ready.append((destination, packet))
         return ready
 
+    def _is_parted(self, t_s: float) -> bool:
+        return any(start_s <= t_s < end_s for start_s, end_s in self._partitions)
+
     def _push(self, due_s: float, destination: int, packet: bytes) -> None:
         heapq.heappush(self._heap, (due_s, next(self._numbers), destination, packet))
 
 
 def _receiver(host: int) -> Receiver:
-    return "coordinator" if host == 0 else "module"
+    return "coordinator" if host == _COORDINATOR else "module"

@@ -114,10 +114,11 @@ class ImpairedTransport:
     in order, never lost; so are errors of queries, which no message carries, delivered as they come. A
     perfect way delivers from inside the call of the inner transport.
 
-    Partition: at the profile's times, or from `partition` to `heal`, the endpoint is cut off: what it sends
-    and what comes for it is lost, but what is under way to it already arrives. Liveliness then goes as with
-    a session of which nothing is heard: changes are told at the end; if the partition lasts longer than the
-    lease (`LEASE_S`), both sides see the other's tokens vanish after it, and appear again at the end.
+    Partition: from `partition` to `heal`, and at a coordinator at the profile's times, the endpoint is cut
+    off: what it sends and what comes for it is lost, what is under way to it already arrives. Liveliness then
+    goes as with a session of which nothing is heard: changes are told at the end; if the partition lasts
+    longer than the lease (`LEASE_S`), both sides see the other's tokens vanish after it, and appear again at
+    the end.
 
     Thread-safe; the scheduler must run its calls one at a time.
     """
@@ -147,7 +148,7 @@ class ImpairedTransport:
         self._partition = 0
         self._own_tokens: dict[OwnToken, None] = {}
         self._watched: dict[_Declaration, WatchedTokens] = {}
-        for start_s, end_s in profile.partitions:
+        for start_s, end_s in profile.partitions if receiver == "coordinator" else ():
             scheduler.call_later(start_s, self.partition)
             scheduler.call_later(end_s, self.heal)
 

@@ -10,7 +10,8 @@ from module_agent.wire.transport import Transport
 
 def inject(transport: Transport, network: NetworkProfile, seed: int, receiver: Receiver) -> Transport:
     """Return the transport impaired as the profile says for this receiver; a perfect path changes nothing."""
-    if network.path(receiver).is_perfect and not network.partitions:
+    parted = receiver == "coordinator" and network.partitions
+    if network.path(receiver).is_perfect and not parted:
         return transport
     rng = np.random.default_rng(seed)
     return ImpairedTransport(transport, network, rng, TimerThread(), receiver=receiver)

@@ -81,10 +81,11 @@ class PathProfile(_Strict):
 
 
 class NetworkProfile(PathProfile):
-    """Both directions of a network, and when nothing passes at all.
+    """Both directions of a network, and when the coordinator is cut off.
 
     What `to_modules` or `to_coordinator` name replaces, for that direction, what is named here. `partitions`
-    are intervals (start, end) [s] from the start of each endpoint, in order; see `ImpairedTransport`.
+    are intervals (start, end) [s], in order, in which nothing passes between modules and coordinator, from
+    the start of the coordinator's endpoint: it alone is cut off, as clocks of many would not agree on when.
     """
 
     name: str

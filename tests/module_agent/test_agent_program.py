@@ -92,7 +92,8 @@ def test_no_network_is_injected_where_none_is_asked_for() -> None:
     injected = inject(transport, profile("wifi"), 0, "module")  # type: ignore[arg-type]
     assert isinstance(injected, ImpairedTransport)
     only_parted = NetworkProfile(name="parted", partitions=((1.0, 2.0),))
-    injected = inject(transport, only_parted, 0, "module")  # type: ignore[arg-type]
+    assert inject(transport, only_parted, 0, "module") is transport  # type: ignore[arg-type]
+    injected = inject(transport, only_parted, 0, "coordinator")  # type: ignore[arg-type]
     assert isinstance(injected, ImpairedTransport)
     one_way = NetworkProfile(name="one way", to_coordinator=PathProfile(delay_ms=1.0))
     assert inject(transport, one_way, 0, "module") is transport  # type: ignore[arg-type]

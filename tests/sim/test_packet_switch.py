@@ -86,11 +86,19 @@ def test_the_fraction_to_be_reordered_overtakes_and_duplicates_come_behind() -> 
     assert 200 < switch.counts[ONE, TWO].reordered < 400
 
 
-def test_in_a_partition_nothing_passes() -> None:
+def test_in_a_partition_nothing_passes_to_or_from_the_coordinator() -> None:
     switch = PacketSwitch(HOSTS, NetworkProfile(name="t", partitions=((1.0, 2.0),)), 0)
     for t_s in (0.5, 1.0, 1.5, 2.0):
         switch.take(t_s, ONE, packet(ONE, HOSTS[HUB]))
-    assert [t_s for t_s, _, _ in passed(switch)] == [0.5, 2.0]
+        switch.take(t_s, HUB, packet(HUB, HOSTS[TWO]))
+        switch.take(t_s, ONE, packet(ONE, HOSTS[TWO], b"across"))
+    assert [(t_s, to) for t_s, to, body in passed(switch) if not body] == [
+        (0.5, HUB),
+        (0.5, TWO),
+        (2.0, HUB),
+        (2.0, TWO),
+    ]
+    assert switch.counts[ONE, TWO].lost == 0
 
 
 def test_links_have_draws_of_their_own_and_the_seed_decides_them() -> None:
