@@ -1,5 +1,6 @@
 """The table of effects as a page of Markdown: what `sim/EFFECTS.md` holds."""
 
+from module_agent.wire.network_profile import PROFILES
 from sim.effects import EFFECTS, Effect
 from sim.noise_profile import DEFAULT_PROFILE, NOISE_PROFILES, NoiseProfile
 
@@ -22,7 +23,8 @@ Every effect can be switched on its own: `--with NAME` and `--without NAME` of `
 `world`. A noise profile (`--noise`) is a set of them: `ideal` has perfect sensors on a rigid robot, `x5` is a
 module with a calibrated IMU, `{DEFAULT_PROFILE}` (the default) one as delivered, `poor` has everything, and
 larger. Sizes are one standard deviation where they differ between modules or samples, unless the model says
-otherwise; they are drawn once per module from the seed. `x5-sim effects` prints the same table.
+otherwise; they are drawn once per module from the seed. The network is chosen by `--network NAME|FILE`, the
+robot's structure is in its file. `x5-sim effects` prints the same table.
 
 """
 
@@ -30,13 +32,67 @@ otherwise; they are drawn once per module from the seed. `x5-sim effects` prints
 def page() -> str:
     """Return the whole page, one table per part of a module, rows in the order of `EFFECTS`."""
     parts = dict.fromkeys(effect.part for effect in EFFECTS.values())
-    return _HEAD + "\n".join(_table(part) for part in parts)
+    return _HEAD + "\n".join([*(_table(part) for part in parts), _network()])
 
 
 def sizes(effect: Effect, profile: NoiseProfile) -> str:
     """Return an effect's sizes in a profile with their units, or "off"."""
     shown = {field: getattr(profile, field) for field in effect.sizes}
     return ", ".join(_size(field, value) for field, value in shown.items()) if any(shown.values()) else OFF
+
+
+def _network() -> str:
+    lan, wifi = PROFILES["lan"], PROFILES["wifi"]
+    up, burst, stall = wifi.path("coordinator"), wifi.loss_burst, wifi.stall
+    assert burst is not None
+    assert stall is not None
+    rows = (
+        (
+            "delay and jitter",
+            "least delay, and what a gamma, lognormal or Pareto adds; order kept as by one TCP link",
+            f"{lan.delay_ms:g} ms and {lan.jitter_ms:g} ms (`lan`); {wifi.delay_ms:g} ms and "
+            f"{wifi.jitter_ms:g} ms (`wifi`)",
+            "real X5-1: round trip 0.70 ms; `wifi`: Huitema 2023",
+        ),
+        (
+            "loss in bursts",
+            "Gilbert-Elliott channel in continuous time",
+            f"`wifi`: {wifi.loss:.1%}; {burst.loss:.0%} for {burst.mean_ms:g} ms every {burst.apart_s:g} s",
+            "Gilbert 1960, Elliott 1963; sizes: a busy room",
+        ),
+        (
+            "stalls",
+            "nothing passes for a while, then all that has waited",
+            f"`wifi`: {stall.mean_ms:g} ms every {stall.apart_s:g} s",
+            "Huitema 2023: latency spikes of Wi-Fi",
+        ),
+        (
+            "asymmetry",
+            "another path in each direction",
+            f"`wifi`: jitter {wifi.jitter_ms:g} ms down, {up.jitter_ms:g} ms up; see `asymmetric`",
+            "stations contend for the channel, the access point has it more often",
+        ),
+        (
+            "reordering and duplication",
+            "a message overtakes, or arrives twice",
+            f"`wifi`: {wifi.reorder:.1%} and {wifi.duplicate:.1%}",
+            "an assumption: what retransmission below the transport leaves",
+        ),
+        ("partition", "nothing passes in given intervals", "off; in a network file", "chosen by who tests"),
+        (
+            "recorded trace",
+            "delays and losses as measured, repeated",
+            "off; in a network file",
+            "`ping -D -O`",
+        ),
+    )
+    head = [
+        "## Network",
+        "",
+        "| effect | model | size | source | switch |",
+        "|---|---|---|---|---|",
+    ]
+    return "\n".join([*head, *(f"| {' | '.join(row)} | `--network` |" for row in rows), ""])
 
 
 def default_size(effect: Effect) -> str:
