@@ -38,9 +38,13 @@ class Stopped(SystemExit):
     """Raised in the main thread by SIGINT and SIGTERM, so that even a blocked tick ends cleanly."""
 
 
-def _stop(number: int, _frame: FrameType | None) -> None:
+def _ignore_signals() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+def _stop(number: int, _frame: FrameType | None) -> None:
+    _ignore_signals()
     raise Stopped(0 if number == signal.SIGTERM else 130)
 
 
@@ -146,6 +150,9 @@ def _serve(host: AgentHost, worker: ThreadWorker) -> None:
         typer.echo(f"x5-agent: {names}: the world is gone: {error}", err=True)
         raise typer.Exit(EXIT_LOST) from error
     finally:
+        # When the world is gone, whoever ended it most likely ends the agents too: a signal in the middle of
+        # closing would leave the session half open, and its threads would keep the process for ever.
+        _ignore_signals()
         host.close()
         worker.close()
 

@@ -1,19 +1,25 @@
 """What `x5-agent` says when it cannot work; only a hub that is not there yet is waited for."""
 
+import os
 import signal
 import socket
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
+from module_agent import main as agent_program
+from module_agent.hardware import HardwareLost
 from module_agent.main import app
 from module_agent.wire.endpoint import check_endpoint
 from module_agent.wire.impaired_transport import ImpairedTransport
 from module_agent.wire.injected_network import inject
 from module_agent.wire.network_profile import NetworkProfile, PathProfile, profile
+from module_agent.worker import ThreadWorker
 
 
 @pytest.mark.parametrize(
@@ -99,3 +105,31 @@ def test_no_network_is_injected_where_none_is_asked_for() -> None:
     assert inject(transport, one_way, 0, "module") is transport  # type: ignore[arg-type]
     injected = inject(transport, one_way, 0, "coordinator")  # type: ignore[arg-type]
     assert isinstance(injected, ImpairedTransport)
+
+
+class _ClosesUnderSignal:
+    """A host whose world is gone, and that is told to stop while it closes."""
+
+    modules = ()
+    closed = False
+
+    def cycle(self) -> None:
+        raise HardwareLost("the world closed it")
+
+    def close(self) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        self.closed = True
+
+
+def test_a_signal_in_the_middle_of_closing_does_not_leave_an_agent_half_closed() -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    host: Any = _ClosesUnderSignal()
+    signal.signal(signal.SIGTERM, agent_program._stop)
+    try:
+        with pytest.raises(typer.Exit) as ended:
+            agent_program._serve(host, ThreadWorker())
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert host.closed
+    assert ended.value.exit_code == agent_program.EXIT_LOST
