@@ -11,13 +11,14 @@ import typer
 from coordinator.failure import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from coordinator.interruption import SIGNALS
 from coordinator.terminal import Terminal, print_table
-from sim.command_options import Noise, Seed, With, Without, fail
+from sim.command_options import Seed, With, Without, fail
 from sim.experiments.amplitude_plot import plot
 from sim.experiments.amplitude_report import repeats, table, write_results
 from sim.experiments.amplitude_sweep import Series, Trial, repeat_series, run_all, sweep_series
 from sim.experiments.module_bench import ExperimentFailed
 from sim.experiments.thesis_lengths import AMPLITUDES_RAD, LENGTHS_MM, TRIALS
 from sim.noise_choice import NoiseChoice
+from sim.noise_profile import NOISE_PROFILES
 
 T = TypeVar("T", int, float)
 _MOST_AMPLITUDE_RAD = 0.5
@@ -28,7 +29,7 @@ def amplitudes(
         "runs/amplitudes"
     ),
     seed: Seed = 0,
-    noise: Noise = None,
+    noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = "x5",
     with_effects: With = None,
     without_effects: Without = None,
     lengths: Annotated[str, typer.Option(help="Lengths of the arms [mm], separated by commas.")] = ",".join(
@@ -63,7 +64,7 @@ def amplitudes(
         series += repeat_series(arms, trials, seed, choice)
     _check_noise(series[0])
     found = _run(series, processes or os.cpu_count() or 1)
-    settings = {"seed": seed, "noise": choice.profile or series[0].robot.noise, "rigs": rigs}
+    settings = {"seed": seed, "noise": noise, "rigs": rigs}
     switched = {"with": list(choice.on), "without": list(choice.off)}
     try:
         write_results(out, settings | switched, found)
@@ -107,8 +108,9 @@ def _check_noise(series: Series) -> None:
 
 def _title(series: Series) -> str:
     switched = [f"with {name}" for name in series.noise.on] + [f"without {name}" for name in series.noise.off]
-    profile = series.noise.profile or series.robot.noise
-    return f"Link length by circle point analysis: profile {', '.join([profile, *switched])}"
+    return (
+        f"Link length by circle point analysis: profile {', '.join([str(series.noise.profile), *switched])}"
+    )
 
 
 def _one_of(values: tuple[int, ...]) -> str:
