@@ -33,6 +33,8 @@ CONVERGED = 1e-7
 UNKNOWN_ABOVE = 0.1
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
+# Samples, 50 a second.
+LONGEST_LAG = 100
 
 Index = NDArray[np.int64]
 
@@ -117,7 +119,9 @@ def refine_chain(chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY) 
             break
     gyro, accel = _residuals(state, data)
     sigma_gyro, sigma_accel = _spread(gyro), _spread(accel)
-    normal = _normal_equations(state, data, prior, (gyro, accel), (sigma_gyro, sigma_accel))
+    # What the model leaves out (a base that shakes, a link that bends) repeats with the motion.
+    believed = (sigma_gyro * np.sqrt(repeats(gyro)), sigma_accel * np.sqrt(repeats(accel)))
+    normal = _normal_equations(state, data, prior, (gyro, accel), believed)
     _, _, spectrum = _solve(normal, count)
     return _report(state, spectrum, sigma_gyro, sigma_accel, used)
 
@@ -131,6 +135,24 @@ def _residuals(state: _State, data: SensorData) -> tuple[Array, Array]:
 def _spread(residual: Array) -> Array:
     """Return the rms (n,) per axis of residuals (m, n, 3), no smaller than any sensor's resolution."""
     return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), FINEST))
+
+
+def repeats(residual: Array) -> Array:
+    """Return how many samples of residuals (m, n, 3) say the same, for every IMU (n,), at least 1.
+
+    That is 1 + 2 sum |rho(lag)|, the variance of a sum of correlated samples over that of independent ones
+    (Bayley and Hammersley, 1946), with the correlations' magnitude, as what follows the motion is met again
+    at every turn of it; over the lags whose correlation is more than chance makes it, up to 2 s.
+    """
+    samples = residual.shape[0]
+    lags = min(samples // 4, LONGEST_LAG)
+    centred = residual - residual.mean(axis=0)
+    spectrum = np.fft.rfft(centred, 2 * samples, axis=0)
+    covariance = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: lags + 1].sum(axis=2)
+    correlation = np.abs(covariance[1:] / np.maximum(covariance[0], FINEST**2))
+    # Three axes share a lag; of as many correlations of nothing the largest is below four sigmas.
+    correlation[correlation < 4.0 / np.sqrt(3.0 * samples)] = 0.0
+    return np.asarray(1.0 + 2.0 * correlation.sum(axis=0))
 
 
 def _normal_equations(
