@@ -112,10 +112,12 @@ def sensor_data(windows: Sequence[Window], cutoff_hz: float, keep_every: int) ->
 def _filtered(one: Window, cutoff_hz: float, keep_every: int) -> SensorData:
     edge = settling_samples(RATE_HZ, cutoff_hz)
     kept = slice(edge, len(one.t_ns) - edge, keep_every)
-    q, qd, gyro, accel = (
+    q, gyro, accel = (
         zero_phase_low_pass(signal, RATE_HZ, cutoff_hz)
-        for signal in (one.q_rad, one.qd_rad_s, one.gyro_rad_s, one.accel_m_s2)
+        for signal in (one.q_rad, one.gyro_rad_s, one.accel_m_s2)
     )
+    # The module's own velocity is late by its filter; positions are of their instant.
+    qd = differentiate(q, RATE_HZ)
     qdd = differentiate(qd, RATE_HZ)
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
     return SensorData(q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept])

@@ -116,11 +116,12 @@ class Rig:
         network: str | NetworkProfile = "none",
         seed: int = 0,
         tap: Callable[[int, str, str, str, bytes], None] | None = None,
+        noise: str = "x5",
         **firmware: Any,
     ):
         self.robot = load_robot(robot)
         self.loop = VirtualLoop()
-        self.world = World(self.robot, seed)
+        self.world = World(self.robot, seed, noise)
         self.network = VirtualNetwork(self.loop, tap)
         self.serials = self.robot.serials
         self.cut = False

@@ -123,7 +123,7 @@ def test_every_question_is_answered_within_a_few_ticks(rigs: Callable[..., Any])
     rig = rigs(ARM)
     rig.run(asyncio.sleep(0.2))
     ask = encode(Ask(serial=BASE, boot=0, seq=7, sender="tester"))
-    assert decode(Info, _answers(rig, Leaf.INFO, ask)).module_type == "X5-9"
+    assert decode(Info, _answers(rig, Leaf.INFO, ask)).module_type == "X5-9-old"
     assert decode(Status, _answers(rig, Leaf.STATUS, ask)).re == 7
     boot = rig.hosts[BASE].modules[0].firmware.config.boot
     history = HistoryRequest(serial=BASE, boot=boot, seq=8, sender="tester", first_row=3, end_row=9)

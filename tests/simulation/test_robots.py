@@ -1,5 +1,7 @@
 """Every shipped robot is recognised over good and poor networks, the thesis' arms are measured closely.
 
+Modules are as delivered, with uncalibrated IMUs, on bases and links that give, unless a test says otherwise.
+
 Robots share one run per network between their tests; the group keeps those in one process.
 """
 
@@ -12,6 +14,7 @@ import pytest
 from coordinator.plan import Plan
 from coordinator.result import Result
 from coordinator.terminal import Terminal
+from sim.noise_profile import NoiseProfile, noise_profile, switched
 from sim.robot_file import load_robot, shipped_robots
 from sim.score import Score, score
 from sim.virtual_run import VirtualConfig, run_virtual
@@ -32,20 +35,24 @@ class Scored(NamedTuple):
     score: Score
 
 
-Runs = Callable[[str, str, Plan], Scored]
+# A calibrated IMU on a solid robot: what is left are noise, clocks and how motors move.
+SOLID = switched(noise_profile("x5"), off=("base-shake", "link-flex"))
+
+Runs = Callable[..., Scored]
 
 
 @pytest.fixture(scope="session")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
-    done: dict[tuple[str, str, Plan], Scored] = {}
+    done: dict[tuple[str, str, Plan, str], Scored] = {}
 
-    def run(name: str, network: str, plan: Plan) -> Scored:
-        if (name, network, plan) not in done:
+    def run(name: str, network: str, plan: Plan, noise: NoiseProfile | None = None) -> Scored:
+        case = (name, network, plan, repr(noise))
+        if case not in done:
             out: Path = tmp_path_factory.mktemp("run") / "run"
-            config = VirtualConfig(load_robot(name), out, seed=0, network=network, plan=plan)
+            config = VirtualConfig(load_robot(name), out, seed=0, network=network, plan=plan, noise=noise)
             result = run_virtual(config, Terminal(quiet=True))
-            done[name, network, plan] = Scored(result, score(out))
-        return done[name, network, plan]
+            done[case] = Scored(result, score(out))
+        return done[case]
 
     return run
 
@@ -73,11 +80,11 @@ def test_who_is_mounted_on_whom_and_how_is_found(
 def test_link_and_axis_of_the_thesis_arms_are_found(
     runs: Runs, quick_plan: Plan, name: str, network: str
 ) -> None:
-    (link,) = runs(name, network, quick_plan).score.links
+    (link,) = runs(name, network, quick_plan, SOLID).score.links
     assert link.link_length_error_mm is not None
     assert link.axis_error_deg is not None
-    # The accelerometer's scale is known to 0.3 % and the catalogue's place of the IMU to some tenths of a
-    # millimetre: 1.5 mm of 484. The thesis' own errors are 0.6 to 20 mm, 5 % at the most.
+    # The spring's own ringing and the filters leave 0.1 to 0.3 %: 1.5 mm of 484. The thesis' own errors are 0.6
+    # to 20 mm, 5 % at the most.
     assert abs(link.link_length_error_mm) < 2.0
     assert abs(link.link_length_error_mm) < 0.05 * link.link_length_true_mm
     assert link.axis_error_deg < 0.2
@@ -91,8 +98,10 @@ def test_the_claimed_uncertainty_of_a_link_covers_its_error(
     assert link.link_length_error_mm is not None
     assert link.link_length_sigma_mm is not None
     assert abs(link.link_length_error_mm) < 3.0 * link.link_length_sigma_mm
-    # It is no excuse either: a claim of centimetres would cover anything.
-    assert link.link_length_sigma_mm < 0.02 * link.link_length_true_mm + 1.0
+    # It is no excuse either: a claim of centimetres would cover anything. A post that shakes is not in the
+    # model, and leaves a tenth.
+    share = 0.10 if name.endswith("vertical") else 0.02
+    assert link.link_length_sigma_mm < share * link.link_length_true_mm + 1.0
 
 
 @pytest.mark.parametrize(("name", "network"), _grouped(THESIS, "lan"))
@@ -110,9 +119,9 @@ def test_the_kit_arm_is_identified_with_its_inertia(runs: Runs, quick_plan: Plan
     assert found.topology_correct
     assert found.tip_position_rms_mm is not None
     assert found.torque_relative_error is not None
-    # The bar is 20 mm at the tip of the 0.75 m arm; 0.5 mm are measured.
-    assert found.tip_position_rms_mm < 5.0
-    # The bar of published identifications is 6 to 12 %; 0.7 % are measured.
+    # The bar is 20 mm at the tip of the 0.75 m arm; 7 to 9 mm are measured, as the last module's IMU is askew.
+    assert found.tip_position_rms_mm < 20.0
+    # The bar of published identifications is 6 to 12 %; 1.5 % are measured.
     assert found.torque_relative_error < 0.03
     assert found.torque_relative_error_measured is not None
     assert found.torque_relative_error_measured < 0.03
