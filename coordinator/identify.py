@@ -279,7 +279,8 @@ def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Seq
 def _filtered(recording: Recording, kinematics: Kinematics, event: JournalEvent) -> JointMotion:
     margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
     one = window(recording, kinematics.clocks, kinematics.topology.serials, event, margin)
-    return filtered_motion(one.t_ns, one.q_rad, one.qd_rad_s, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)
+    # No velocity: that of the modules is late by their filter.
+    return filtered_motion(one.t_ns, one.q_rad, None, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)
 
 
 def _joined(motions: Sequence[JointMotion]) -> JointMotion:
