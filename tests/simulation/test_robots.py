@@ -83,8 +83,8 @@ def test_link_and_axis_of_the_thesis_arms_are_found(
     (link,) = runs(name, network, quick_plan, SOLID).score.links
     assert link.link_length_error_mm is not None
     assert link.axis_error_deg is not None
-    # The spring's own ringing and the filters leave 0.1 to 0.3 %: 1.5 mm of 484. The thesis' own errors are 0.6
-    # to 20 mm, 5 % at the most.
+    # The spring's own ringing and the filters leave 0.1 to 0.3 %: 1.5 mm of 484. The thesis' own errors are
+    # 0.6 to 20 mm, 5 % at the most.
     assert abs(link.link_length_error_mm) < 2.0
     assert abs(link.link_length_error_mm) < 0.05 * link.link_length_true_mm
     assert link.axis_error_deg < 0.2
@@ -119,7 +119,7 @@ def test_the_kit_arm_is_identified_with_its_inertia(runs: Runs, quick_plan: Plan
     assert found.topology_correct
     assert found.tip_position_rms_mm is not None
     assert found.torque_relative_error is not None
-    # The bar is 20 mm at the tip of the 0.75 m arm; 7 to 9 mm are measured, as the last module's IMU is askew.
+    # The bar is 20 mm at the tip of the 0.75 m arm; 4 to 9 mm are measured: the last module's IMU is askew.
     assert found.tip_position_rms_mm < 20.0
     # The bar of published identifications is 6 to 12 %; 1.5 % are measured.
     assert found.torque_relative_error < 0.03
