@@ -1,7 +1,7 @@
 """The table of what the simulated module does as a real one: effect, model, typical size, source, switch.
 
-The same table is `docs` in the README, the switches `--with` and `--without` of the command line, and the
-material of the named profiles.
+The same table is the page `sim/EFFECTS.md`, the switches `--with` and `--without` of the command line, and
+the material of the named profiles.
 """
 
 from collections.abc import Mapping
@@ -48,7 +48,7 @@ _TABLE = (
         "actuator",
         "every module's friction, motor constant, winding and spring differ from its type's by factors",
         {"friction_spread": 0.15, "motor_spread": 0.03, "spring_spread": 0.05},
-        "thesis 6.1; resistance 8.9-10.1 ohm in a real X5-1 log",
+        "thesis 6.1: each module showed slightly different behaviour; sizes are an assumption",
     ),
     Effect(
         "backlash",
@@ -202,7 +202,7 @@ _TABLE = (
         "structure",
         "the base gives as the robot file says: stiffness, damping, up to six directions",
         {"base_shake": 1.0},
-        "thesis 6.1, figures 17 and 18",
+        "thesis 6.1, figures 17 and 18; the stiffnesses in the robot files are assumptions",
     ),
     Effect(
         "link-flex",

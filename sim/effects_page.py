@@ -1,8 +1,10 @@
 """The table of effects as a page of Markdown: what `sim/EFFECTS.md` holds."""
 
+from module_agent.catalogue import module_type
 from module_agent.wire.network_profile import PROFILES
 from sim.effects import EFFECTS, Effect
 from sim.noise_profile import DEFAULT_PROFILE, NOISE_PROFILES, NoiseProfile
+from sim.physics.actuator import BUS_VOLTAGE_V, SPRING_LOSS_S, STOP_NM_RAD
 
 # How a field's name ends, the unit of its number, and whether small numbers are shown in thousandths of it.
 _UNITS = (
@@ -32,13 +34,62 @@ robot's structure is in its file. `x5-sim effects` prints the same table.
 def page() -> str:
     """Return the whole page, one table per part of a module, rows in the order of `EFFECTS`."""
     parts = dict.fromkeys(effect.part for effect in EFFECTS.values())
-    return _HEAD + "\n".join([*(_table(part) for part in parts), _network()])
+    return _HEAD + "\n".join([*(_table(part) for part in parts), _always(), _network()])
 
 
 def sizes(effect: Effect, profile: NoiseProfile) -> str:
     """Return an effect's sizes in a profile with their units, or "off"."""
     shown = {field: getattr(profile, field) for field in effect.sizes}
     return ", ".join(_size(field, value) for field, value in shown.items()) if any(shown.values()) else OFF
+
+
+def profiles_with(effect: Effect) -> str:
+    """Return the names of the profiles that have an effect."""
+    return ", ".join(name for name, profile in NOISE_PROFILES.items() if sizes(effect, profile) != OFF)
+
+
+def _always() -> str:
+    rows = (
+        (
+            "reflected inertia",
+            "the rotor's, times the gear ratio squared",
+            f"{module_type('X5-1').motor.rotor_inertia_kg_m2:.2g} kg m² at the rotor",
+            "real X5-1 log: the first step",
+        ),
+        (
+            "spring loss",
+            "damping over stiffness of the spring",
+            f"{1e3 * SPRING_LOSS_S:g} ms",
+            "an assumption: rubber's loss factor of 0.1 at 5 Hz, chosen as light arms then ring as little as "
+            "the thesis' did; with a third of it their lengths come out 10 % longer",
+        ),
+        (
+            "end stops",
+            "stiff and lossy, where a type's rotation is limited",
+            f"{STOP_NM_RAD:g} Nm/rad",
+            "an assumption",
+        ),
+        (
+            "voltage and PWM limits",
+            "duty = u x 48 V / bus voltage, cut off at 1",
+            f"{BUS_VOLTAGE_V:g} V",
+            "real X5-1 log",
+        ),
+        (
+            "winding's PWM ceiling",
+            "in the firmware: 1 - 1 / (155 - temperature)",
+            "0.9923 at 25 °C",
+            "published; real X5-1 log: 0.9636 at 127.6 °C",
+        ),
+        (
+            "velocity cut-off",
+            "in the firmware: the velocity target is clamped",
+            "by type: 9.62, 3.43, 1.50 rad/s",
+            "published gains",
+        ),
+    )
+    head = ["## Always there", "", "| effect | model | size | source |", "|---|---|---|---|"]
+    return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows), ""])
 
 
 def _network() -> str:
@@ -108,15 +159,15 @@ def _table(part: str) -> str:
     rows = [
         f"## {part[0].upper()}{part[1:]}",
         "",
-        "| effect | model | default size | source | switch |",
-        "|---|---|---|---|---|",
+        "| effect | model | default size | profiles | source | switch |",
+        "|---|---|---|---|---|---|",
     ]
     for name, effect in EFFECTS.items():
         if effect.part != part:
             continue
-        rows.append(
-            f"| {_title(name)} | {effect.model} | {default_size(effect)} | {effect.source} | `{name}` |"
-        )
+        size, where = default_size(effect), profiles_with(effect)
+        cells = (_title(name), effect.model, size, where, effect.source, f"`{name}`")
+        rows.append(f"| {' | '.join(cells)} |")
     return "\n".join([*rows, ""])
 
 

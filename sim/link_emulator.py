@@ -11,6 +11,7 @@ import select
 import signal
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from types import FrameType
@@ -64,12 +65,14 @@ def forward(tuns: Sequence[int], switch: PacketSwitch, ended: Callable[[], bool]
     while not ended():
         now_s = time.monotonic() - start_s
         for destination, packet in switch.due(now_s):
-            os.write(tuns[destination], packet)
+            with suppress(BlockingIOError):  # a full queue drops, as any link's does
+                os.write(tuns[destination], packet)
         wait_s = _LOOK_S if switch.next_s is None else min(_LOOK_S, max(0.0, switch.next_s - now_s))
         readable, _, _ = select.select(tuns, (), (), wait_s)
         now_s = time.monotonic() - start_s
         for tun in readable:
-            switch.take(now_s, index_of[tun], os.read(tun, _LONGEST_PACKET_BYTES))
+            with suppress(BlockingIOError):
+                switch.take(now_s, index_of[tun], os.read(tun, _LONGEST_PACKET_BYTES))
 
 
 def counts_by_address(

@@ -90,7 +90,7 @@ def simulate(
     seed: int = 0,
     command_age_s: float = COMMAND_AGE_S,
 ) -> Simulated:
-    """Drive a simulated module with a log's commands and read it at the log's instants.
+    """Drive a simulated module with a log's commands and bus voltage and read it at the log's instants.
 
     Position, velocity, effort and current are interpolated between ticks; the PWM is the one in force.
 
@@ -99,7 +99,8 @@ def simulate(
         RobotFileError: unknown module type.
         KeyError: unknown noise profile.
     """
-    world = World(bench_robot(type_name, start_position(log, command_age_s)), seed, noise)
+    robot = bench_robot(type_name, start_position(log, command_age_s))
+    world = World(robot, seed, noise, voltage_v=float(log.voltage_v.mean()))
     world.warm(start_warmth(log)[:, None])
     bench = _Bench(world, type_name)
     # One tick for the lease, then the first command.

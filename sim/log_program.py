@@ -10,10 +10,10 @@ from rich.table import Table
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
 from coordinator.terminal import print_table
 from module_agent.catalogue import CATALOGUE, UnknownModuleType, module_type
-from sim.command_options import Seed, fail
+from sim.command_options import Seed, With, Without, fail
 from sim.log_comparison import CommandRefused, SignalRow, compare, simulate
 from sim.log_plot import plot
-from sim.noise_profile import NOISE_PROFILES, noise_profile
+from sim.noise_profile import NOISE_PROFILES, noise_profile, switched
 from sim.real_log import LogFileError, read_log
 
 
@@ -24,22 +24,27 @@ def compare_log(
         Path | None, typer.Option(help="Plot to write; its figures go beside it [LOG.png].")
     ] = None,
     noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = "ideal",
+    with_effects: With = None,
+    without_effects: Without = None,
     seed: Seed = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
 ) -> None:
     """Run a real module's commands through the simulated module and compare what both did."""
     try:
         module_type(kind)
-        noise_profile(noise)
-        recorded = read_log(log)
+        profile = switched(noise_profile(noise), tuple(with_effects or ()), tuple(without_effects or ()))
     except UnknownModuleType as error:
         fail(f"--type: {error}", EXIT_USAGE)
-    except KeyError as error:
-        fail(f"--noise: {error.args[0]}", EXIT_USAGE)
-    except (LogFileError, OSError) as error:
-        fail(error, EXIT_USAGE)
+    except (KeyError, ValueError) as error:
+        fail(error.args[0], EXIT_USAGE)
     try:
-        simulated = simulate(recorded, kind, noise, seed)
+        recorded = read_log(log)
+    except LogFileError as error:
+        fail(error, EXIT_USAGE)
+    except OSError as error:
+        fail(f"{log}: {error.strerror}", EXIT_USAGE)
+    try:
+        simulated = simulate(recorded, kind, profile, seed)
     except CommandRefused as error:
         fail(f"{log}: {error}", EXIT_FAILED)
     rows = compare(recorded, simulated)

@@ -39,7 +39,7 @@ from sim.command_options import (
 from sim.launcher import LOGS, LaunchConfig, Launcher, LaunchError
 from sim.logged_world import LoggedWorld
 from sim.noise_choice import NoiseChoice
-from sim.robot_file import Robot
+from sim.robot_file import Robot, RobotFileError
 from sim.score_program import print_score
 from sim.truth import write_truth
 from sim.virtual_run import VirtualConfig, run_virtual
@@ -74,7 +74,10 @@ def world(
 
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
-    plant = World(found, seed, choice.of(found))
+    try:
+        plant = World(found, seed, choice.of(found))
+    except RobotFileError as error:
+        fail(error, EXIT_USAGE)
     logged = LoggedWorld(plant)
     try:
         server = BusServer(bus, logged, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
@@ -176,6 +179,8 @@ def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
     try:
         with Terminal(quiet) as terminal:
             result = run_virtual(config, terminal, on_signal=on_signal)
+    except RobotFileError as error:
+        fail(error, EXIT_USAGE)
     except BaseException as error:
         failure = explain(error)
         if failure is None:

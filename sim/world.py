@@ -10,7 +10,7 @@ import numpy as np
 from module_agent.hardware import HardwareLost, HardwareModule, SensorSample
 from sim.module_clock import ModuleClock
 from sim.noise_profile import NoiseProfile, noise_profile
-from sim.physics.actuator import Actuators
+from sim.physics.actuator import BUS_VOLTAGE_V, Actuators
 from sim.physics.equilibrium import equilibrium
 from sim.physics.multibody import Multibody
 from sim.physics.rigid_tree import RigidTree
@@ -65,7 +65,12 @@ class World:
     """
 
     def __init__(
-        self, robot: Robot, seed: int, noise: str | NoiseProfile | None = None, imu_rate_hz: float = 250.0
+        self,
+        robot: Robot,
+        seed: int,
+        noise: str | NoiseProfile | None = None,
+        imu_rate_hz: float = 250.0,
+        voltage_v: float = BUS_VOLTAGE_V,
     ):
         self.robot = robot
         wanted = robot.noise if noise is None else noise
@@ -80,7 +85,7 @@ class World:
         self._tree = RigidTree(self._skeleton)
         self._windings = Windings(len(tree.types), TICK_S, self.profile.heat)
         variation = draw_variation(seed, robot.serials, self.profile)
-        self._actuators = Actuators(tree.types, TICK_S, self.profile, variation, self._skeleton)
+        self._actuators = Actuators(tree.types, TICK_S, self.profile, variation, self._skeleton, voltage_v)
         self._tick = 0
         self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
         self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
@@ -193,7 +198,6 @@ class World:
             q_rad=q[self._joints],
             qd_rad_s=rate[self._joints],
             motor_rad_s=actuators.motor_rate_rad_s,
-            deflection_rad=actuators.deflection_rad,
             elastic_nm=actuators.elastic_nm,
             current_a=actuators.current_a,
             winding_c=self._windings.winding_c,

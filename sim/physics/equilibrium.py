@@ -5,11 +5,16 @@ import numpy as np
 from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import Skeleton
 from sim.pose import Array
+from sim.robot_file import RobotFileError
 
 _STEP = 1e-6
 _ROUNDS = 30
 # The rest position's force error, relative to the largest load: far below what a tick can show.
 _TOLERANCE = 1e-12
+
+
+class FallsOver(RobotFileError):
+    """A robot file that describes a robot too soft to carry itself."""
 
 
 def equilibrium(name: str, tree: RigidTree, skeleton: Skeleton, module_rad: Array) -> tuple[Array, Array]:
@@ -18,7 +23,8 @@ def equilibrium(name: str, tree: RigidTree, skeleton: Skeleton, module_rad: Arra
     Newton's method on k q + bias(q) = 0 over the passive joints.
 
     Raises:
-        ValueError: the springs are too soft to carry the weight: the robot falls over.
+        FallsOver: the springs are too soft to carry the weight.
+        RuntimeError: no rest was found.
     """
     q = np.zeros(len(skeleton.names))
     q[list(skeleton.module)] = module_rad
@@ -36,12 +42,15 @@ def equilibrium(name: str, tree: RigidTree, skeleton: Skeleton, module_rad: Arra
             nudged[joint] += _STEP
             slope[:, column] = (unbalanced(nudged) - residual) / _STEP
         if np.linalg.eigvalsh((slope + slope.T) / 2.0)[0] <= 0.0:
-            raise ValueError(
-                f"robot {name!r} falls over: its base or links are too soft to carry its weight; "
-                "raise the stiffness in the robot file or lower base_shake and link_flex in the profile"
+            raise FallsOver(
+                f"robot {name!r} falls over: its base or links are too soft to carry its weight; raise the "
+                "stiffness in the robot file, or switch them off: --without base-shake --without link-flex"
             )
         q[passive] -= np.linalg.solve(slope, residual)
         load = tree.mass_and_bias(q, still)[1]
         if np.abs(unbalanced(q)).max() <= _TOLERANCE * max(1.0, float(np.abs(load).max())):
             break
+    else:
+        if passive:
+            raise RuntimeError(f"robot {name!r} finds no rest within {_ROUNDS} rounds of Newton's method")
     return q, tree.mass_and_bias(q, still)[1][list(skeleton.module)]

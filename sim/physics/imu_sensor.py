@@ -8,6 +8,7 @@ The chain of a chip, in order:
     4. bias, its first-order Gauss-Markov drift, white noise, noise of the gears;
     5. saturation, then quantisation.
 
+A chip saturates before its low-pass; here a blow that the filter spreads out is clipped less than there.
 1 is constant and linear and 2 treats all axes alike, so they commute: the filter runs every tick on the true
 values, the rest once per reading. The stamp is the sampling instant. The low-pass delays slow motion by
 sqrt(2) / (2 pi f), 2.4 ms at 92 Hz, and no stamp makes up for that, as on the real module: whoever compares

@@ -19,16 +19,15 @@ from sim.pose import Array
 class Instant(NamedTuple):
     """The truth at one instant, arrays (n,) or (n, 3); read only.
 
-    motor_rad_s is seen at the output, as motor positions are. deflection_rad is the spring's own, output
-    minus motor less the gear's gap; elastic_nm what its elasticity exerts on the output. gyro_rad_s and
-    specific_force_m_s2 are in IMU axes; they are those of an earlier instant where the IMU is not due.
+    motor_rad_s is seen at the output, as motor positions are; elastic_nm is what the spring's elasticity
+    exerts on the output. gyro_rad_s and specific_force_m_s2 are in IMU axes; they are those of an earlier instant
+    where the IMU is not due.
     """
 
     t_ns: int
     q_rad: Array
     qd_rad_s: Array
     motor_rad_s: Array
-    deflection_rad: Array
     elastic_nm: Array
     current_a: Array
     winding_c: Array

@@ -26,6 +26,7 @@ pytestmark = pytest.mark.benchmark
 WINDOW_S = 20.0
 STARTUP_S = 60.0
 _HERTZ = os.sysconf("SC_CLK_TCK")
+CORES = os.cpu_count() or 1
 
 
 class Cpu(NamedTuple):
@@ -100,7 +101,7 @@ def _measure(ear: Ear, children: dict[str, list[int]], serials: tuple[str, ...])
             f"  {len(group):2d} x {name:12s} {main + others:6.1f} us a tick each: main thread {main:.1f}, "
             f"others {others:.1f}; {kernel:.1f} of it in the kernel"
         )
-    print(f"  all: {total:.0f} us CPU a tick; on 2 cores at most {2e3 / total:.2f} x real time")
+    print(f"  all: {total:.0f} us CPU a tick; on {CORES} cores at most {1e3 * CORES / total:.2f} x real time")
 
 
 @pytest.mark.parametrize("processes", [16, 4])

@@ -43,16 +43,18 @@ def _report(what: str, figure: str) -> None:
     print(f"\n{what:.<60} {figure}")
 
 
+@pytest.mark.parametrize(("name", "noise"), [("a2085_04", "x5-uncalibrated"), ("arm7", "poor")])
 @pytest.mark.parametrize("dynamics", [False, True])
-def test_virtual_time_over_real_time(tmp_path: Path, dynamics: bool) -> None:
+def test_virtual_time_over_real_time(tmp_path: Path, name: str, noise: str, dynamics: bool) -> None:
+    """`arm7` with `poor` is seven modules with all effects on."""
     config = VirtualConfig(
-        load_robot("a2085_04"), tmp_path / "run", network="lan", plan=Plan(dynamics=dynamics)
+        load_robot(name), tmp_path / "run", network="lan", noise=noise, plan=Plan(dynamics=dynamics)
     )
     start = time.perf_counter()
     result = run_virtual(config, Terminal(quiet=True))
     wall_s = time.perf_counter() - start
     assert result.robot_time_s > 0.0
-    what = f"a2085_04, whole run{' with dynamics' if dynamics else ''}"
+    what = f"{name}, {noise}, whole run{' with dynamics' if dynamics else ''}"
     _report(
         what, f"{result.robot_time_s:.1f} s in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x real time"
     )

@@ -21,6 +21,7 @@ from sim.log_comparison import (
 from sim.log_plot import plot
 from sim.log_warmth import start_warmth
 from sim.main import app
+from sim.noise_profile import noise_profile, switched
 from sim.physics.thermal import CAPACITIES_J_K, RESISTANCES_K_W
 from sim.real_log import LogFileError, RealLog, read_log
 
@@ -50,11 +51,22 @@ def real() -> RealLog:
 @needs_the_log
 def test_the_simulated_x5_1_moves_as_the_real_one_on_its_commands(real: RealLog) -> None:
     found = ratios(compare(real, simulate(real, "X5-1")))
-    assert found["position_rad"] < 0.05
-    assert found["pwm"] < 0.15
-    assert found["velocity_rad_s"] < 0.06
-    # The recorded current is noisy by itself: 0.048 A about its first five harmonics, 38 % of its rms.
-    assert found["winding_current_a"] < 0.6
+    # Wanted are 5 % and 15 %; 1.7 % and 10.3 % are measured.
+    assert found["position_rad"] < 0.03
+    assert found["pwm"] < 0.12
+    assert found["velocity_rad_s"] < 0.05
+    # The recorded current is noisy by itself: 0.048 A about its first five harmonics, 38 % of its rms; 44 %
+    # are measured. Effort is left out: on a bare output it is the sensor's noise.
+    assert found["winding_current_a"] < 0.5
+
+
+@needs_the_log
+def test_without_friction_it_would_not(real: RealLog) -> None:
+    smooth = switched(noise_profile("ideal"), off=("friction", "gear-loss"))
+    found = ratios(compare(real, simulate(real, "X5-1", smooth)))
+    # The velocity's feed-forward gives most of the PWM whatever the friction: position and current tell.
+    assert found["position_rad"] > 0.05
+    assert found["winding_current_a"] > 0.7
 
 
 @needs_the_log
@@ -87,6 +99,13 @@ def test_the_warm_winding_cools_as_recorded(real: RealLog) -> None:
 
 
 # ------------------------------------------------------------------ the comparison itself
+
+
+def test_the_logs_own_bus_voltage_drives_the_module() -> None:
+    log = made_up()
+    low, high = (simulate(log._replace(voltage_v=np.full_like(log.t_s, v)), "X5-1") for v in (24.0, 48.0))
+    # The duty goes with 48 V over the bus voltage: half of it on twice the voltage.
+    assert np.abs(high.pwm).max() == pytest.approx(0.5 * np.abs(low.pwm).max(), rel=0.1)
 
 
 def made_up(seconds: float = 1.0, swing: bool = True) -> RealLog:
@@ -274,7 +293,7 @@ def test_the_command_writes_a_plot_and_figures_and_prints_them(tmp_path: Path) -
     ("options", "words"),
     [
         (("--type", "X6"), "--type: unknown module type 'X6'; the catalogue knows X5-1"),
-        (("--noise", "loud"), "--noise: unknown noise profile 'loud'"),
+        (("--noise", "loud"), "unknown noise profile 'loud'"),
         (("--out", "plot.txt"), "cannot write plot.txt"),
     ],
 )

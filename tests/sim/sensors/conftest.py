@@ -62,7 +62,6 @@ _SCALARS = (
     "q_rad",
     "qd_rad_s",
     "motor_rad_s",
-    "deflection_rad",
     "elastic_nm",
     "current_a",
     "winding_c",
