@@ -20,8 +20,8 @@ class Instant(NamedTuple):
     """The truth at one instant, arrays (n,) or (n, 3); read only.
 
     motor_rad_s is seen at the output, as motor positions are; elastic_nm is what the spring's elasticity
-    exerts on the output. gyro_rad_s and specific_force_m_s2 are in IMU axes; they are those of an earlier instant
-    where the IMU is not due.
+    exerts on the output. gyro_rad_s and specific_force_m_s2 are in IMU axes; they are those of an earlier
+    instant where the IMU is not due.
     """
 
     t_ns: int

@@ -55,6 +55,36 @@ def test_wrong_usage_is_answered_with_what_is_right_and_nothing_is_started(
     assert not out.exists()
 
 
+SOFT = """
+name = "soft"
+[base.compliance]
+mass_kg = 0.1
+inertia = [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0]
+stiffness_nm_rad = [0.5, 0.5, 0.5]
+[[module]]
+serial = "A"
+type = "X5-1"
+parent = "base"
+[[module]]
+serial = "B"
+type = "X5-1"
+parent = "A"
+link = { pose = { xyz_m = [0.0, 0.0, 0.5] } }
+"""
+
+
+@pytest.mark.parametrize("command", [("world", "--bus", "bus"), ("run", "--virtual", "--out", "run")])
+def test_a_robot_too_soft_to_stand_is_wrong_usage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("soft.toml").write_text(SOFT)
+    done = CliRunner().invoke(app, [command[0], "soft.toml", *command[1:]])
+    assert done.exit_code == 2, done.output
+    assert "'soft' falls over" in done.output
+    assert "--without base-shake" in done.output
+
+
 @pytest.mark.parametrize(
     "option", [("--speed", "0"), ("--speed", "nan"), ("--seed", "-1"), ("--noise", "loud")]
 )
