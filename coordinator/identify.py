@@ -24,7 +24,7 @@ from coordinator.kinematics.chain_observations import (
     PairObservation,
     RestObservation,
 )
-from coordinator.kinematics.imu_intrinsics import UNCALIBRATED
+from coordinator.kinematics.imu_intrinsics import UNCALIBRATED, beyond
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.kinematics.topology import MotionSeen, Topology, TopologyError, find_topology
@@ -37,6 +37,8 @@ from module_agent.wire.messages import Estimate
 
 # Five times the 2 Hz of the windowed sine, and above the first resonance of a held joint's spring.
 KINEMATIC_CUTOFF_HZ = 15.0
+# Of some 25 errors an IMU the largest is below this in 99 of 100.
+STRANGE_ABOVE = 3.5
 # Half the time constant of that low-pass: about as many independent samples as there are.
 KINEMATIC_KEEP_EVERY = 5
 # IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
@@ -146,7 +148,19 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         for estimate in found.values()
         if estimate.note
     )
+    notes += _strange_imus(topology.serials, refined)
     return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
+
+
+def _strange_imus(serials: Sequence[str], refined: Refinement) -> tuple[str, ...]:
+    """Say whose IMU came out with errors that its kind does not have: then something is not in the model."""
+    far = dict(zip(serials, beyond(refined.intrinsics, UNCALIBRATED), strict=True))
+    return tuple(
+        f"{serial}: its IMU seems to have {far[serial]:.1f} times the error that its kind has. It is a poor one, "
+        "or the robot's base or links give; lengths and axes near it may be worse than claimed"
+        for serial in serials
+        if far[serial] > STRANGE_ABOVE
+    )
 
 
 def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:

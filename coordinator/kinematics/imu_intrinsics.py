@@ -74,6 +74,12 @@ class ImuIntrinsics(NamedTuple):
         return ImuIntrinsics(self.errors + change)
 
 
+def beyond(intrinsics: ImuIntrinsics, prior: ImuPrior) -> Array:
+    """Return the largest error of every IMU (n,) in standard deviations of what was expected of it."""
+    free = prior.sigmas > 0.0
+    return np.asarray(np.abs(intrinsics.errors[:, free] / prior.sigmas[free]).max(axis=1))
+
+
 def perfect(count: int) -> ImuIntrinsics:
     """Return the errors of IMUs that have none."""
     return ImuIntrinsics(np.zeros((count, SIZE)))

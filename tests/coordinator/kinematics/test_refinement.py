@@ -11,7 +11,15 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from coordinator.chain import Array, Chain
 from coordinator.kinematics import refinement
-from coordinator.kinematics.imu_intrinsics import BIASES_ONLY, SIZE, UNCALIBRATED, ImuIntrinsics, read, slopes
+from coordinator.kinematics.imu_intrinsics import (
+    BIASES_ONLY,
+    SIZE,
+    UNCALIBRATED,
+    ImuIntrinsics,
+    beyond,
+    read,
+    slopes,
+)
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import imu_readings
 from coordinator.kinematics.null_space import name_null_space
@@ -301,6 +309,18 @@ def test_what_the_model_leaves_out_widens_the_intervals(robots: Any, monkeypatch
     # Gyros alone know some parameters; those that the accelerometers tell are believed a good deal less.
     assert wider.min() > 0.999
     assert wider.max() > 2.0
+
+
+def test_an_imu_worse_than_its_kind_is_told_apart(robots: Any) -> None:
+    truth, _ = robots.random(4, joints=4, serial=True)
+    data, _ = _uncalibrated(_sensed(truth), 3)
+    usual = refine_chain(truth, _with_noise(data, 1), UNCALIBRATED)
+    assert beyond(usual.intrinsics, UNCALIBRATED).max() < 3.5
+    gyro = np.array(data.gyro_rad_s)
+    gyro[:, 2] *= 1.08
+    worse = refine_chain(truth, _with_noise(data._replace(gyro_rad_s=gyro), 1), UNCALIBRATED)
+    assert np.argmax(beyond(worse.intrinsics, UNCALIBRATED)) == 2
+    assert beyond(worse.intrinsics, UNCALIBRATED)[2] > 4.0
 
 
 def test_delays_need_the_rates_of_the_readings(robots: Any) -> None:
