@@ -156,7 +156,7 @@ def _strange_imus(serials: Sequence[str], refined: Refinement) -> tuple[str, ...
     """Say whose IMU came out with errors that its kind does not have: then something is not in the model."""
     far = dict(zip(serials, beyond(refined.intrinsics, UNCALIBRATED), strict=True))
     return tuple(
-        f"{serial}: its IMU seems to have {far[serial]:.1f} times the error that its kind has. It is a poor one, "
+        f"{serial}: its IMU seems to have {far[serial]:.1f} times the error that its kind has. It is poor, "
         "or the robot's base or links give; lengths and axes near it may be worse than claimed"
         for serial in serials
         if far[serial] > STRANGE_ABOVE
