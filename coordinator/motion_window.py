@@ -23,11 +23,13 @@ STEP_NS = 4_000_000
 
 
 class Window(NamedTuple):
-    """All modules during one motion: `t_ns` (m,) session time; joints (m, n); IMUs (m, n, 3)."""
+    """All modules during one motion: `t_ns` (m,) session time; joints (m, n); IMUs (m, n, 3).
+
+    Velocities are not among them: those of the modules are late by their filters.
+    """
 
     t_ns: NDArray[np.int64]
     q_rad: Array
-    qd_rad_s: Array
     tau_nm: Array
     gyro_rad_s: Array
     accel_m_s2: Array
@@ -54,11 +56,11 @@ def window(
     common = np.arange(start_ns, end_ns, STEP_NS, dtype=np.int64)
     joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common)
     imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common)
-    return Window(common, joint[..., 0], joint[..., 1], joint[..., 2], imu[..., :3], imu[..., 3:])
+    return Window(common, joint[..., 0], joint[..., 1], imu[..., :3], imu[..., 3:])
 
 
 class _Track(NamedTuple):
-    """One module in session time: position, velocity, effort (m, 3); gyro and accelerometer (k, 6)."""
+    """One module in session time: position and effort (m, 2); gyro and accelerometer (k, 6)."""
 
     t_ns: NDArray[np.int64]
     imu_t_ns: NDArray[np.int64]
@@ -79,7 +81,7 @@ def _track(
     return _Track(
         clock.to_session(rows["t_ns"].astype(np.int64)),
         clock.to_session(imu_t_ns.astype(np.int64)),
-        np.column_stack([rows[field] for field in ("position_rad", "velocity_rad_s", "effort_nm")]),
+        np.column_stack([rows[field] for field in ("position_rad", "effort_nm")]),
         np.column_stack([rows["gyro_rad_s"], rows["accel_m_s2"]])[fresh],
     )
 

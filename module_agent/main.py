@@ -12,8 +12,7 @@ from typing import Annotated
 import typer
 
 from module_agent.bus_client import BusClient
-from module_agent.catalogue import module_type
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.firmware.config import FirmwareConfig, config_of
 from module_agent.hardware import HardwareLost, HardwareModule
 from module_agent.host import AgentHost
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
@@ -51,14 +50,9 @@ def _stop(number: int, _frame: FrameType | None) -> None:
 def _config(
     module: HardwareModule, rate_hz: float, lifetime_ms: float, expiry: ExpiryAction, strategy: int
 ) -> FirmwareConfig:
-    kind = module_type(module.module_type)
-    return FirmwareConfig(
-        serial=module.serial,
-        kind=kind,
-        boot=secrets.randbits(64),
-        limits=catalogue_limits(kind),
-        tick_ns=module.tick_ns,
-        imu_period_ns=module.imu_period_ns,
+    return config_of(
+        module,
+        secrets.randbits(64),
         feedback_rate_hz=rate_hz,
         lifetime_ns=round(lifetime_ms * 1e6),
         expiry_action=expiry,

@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.catalogue import module_type
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.firmware.config import config_of
 from module_agent.hardware import HardwareModule, SensorSample
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.wire.impaired_transport import ImpairedTransport
@@ -71,7 +70,7 @@ class VirtualRobot:
                 settings.robot.name,
                 _Wires(self, index),
                 self.endpoint(module.serial),
-                [_firmware(module, int(boot), settings.feedback_rate_hz)],
+                [config_of(module, int(boot), feedback_rate_hz=settings.feedback_rate_hz)],
                 InlineWorker(),
             )
         self._index = {module.serial: index for index, module in enumerate(self.world.modules)}
@@ -119,16 +118,3 @@ class VirtualRobot:
         for host in self.hosts.values():
             host.close()
         self.world.close()
-
-
-def _firmware(module: HardwareModule, boot: int, rate_hz: float) -> FirmwareConfig:
-    kind = module_type(module.module_type)
-    return FirmwareConfig(
-        serial=module.serial,
-        kind=kind,
-        boot=boot,
-        limits=catalogue_limits(kind),
-        tick_ns=module.tick_ns,
-        imu_period_ns=module.imu_period_ns,
-        feedback_rate_hz=rate_hz,
-    )

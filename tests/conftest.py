@@ -14,8 +14,7 @@ from coordinator.recording import Entry, Recording
 from coordinator.result import Result
 from coordinator.robot_link import RobotLink
 from coordinator.run import Run, RunConfig
-from module_agent.catalogue import module_type
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.firmware.config import config_of
 from module_agent.hardware import HardwareModule, SensorSample
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.wire.impaired_transport import ImpairedTransport
@@ -143,11 +142,8 @@ class Rig:
         """Start the agent of a module, under a boot id of its own."""
         index = self.serials.index(serial)
         module = self.world.modules[index]
-        kind = module_type(module.module_type)
         self._boots += 1
-        config = FirmwareConfig(
-            serial, kind, self._boots, catalogue_limits(kind), module.tick_ns, module.imu_period_ns
-        )._replace(**self._firmware)
+        config = config_of(module, self._boots, **self._firmware)
         self.hosts[serial] = AgentHost(
             self.robot.name,
             _Wires(self, index),

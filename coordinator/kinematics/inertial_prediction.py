@@ -39,7 +39,11 @@ def imu_readings(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2
     Returns:
         Readings in the IMU frames, (m, n, 3).
     """
-    bodies = body_motions(chain, q_rad, qd_rad_s, qdd_rad_s2)
+    return readings_on(chain, body_motions(chain, q_rad, qd_rad_s, qdd_rad_s2))
+
+
+def readings_on(chain: Chain, bodies: list[BodyMotion]) -> ImuReadings:
+    """Predict ideal IMUs from the motion of the bodies, as `body_motions` returns it."""
     joints = len(chain.serials)
     samples = bodies[BASE].omega.shape[1]
     gyro, accel = np.empty((samples, joints, 3)), np.empty((samples, joints, 3))

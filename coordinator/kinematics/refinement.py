@@ -24,7 +24,7 @@ from coordinator.kinematics.imu_intrinsics import (
     slopes,
 )
 from coordinator.kinematics.increments import apply_increment, frozen
-from coordinator.kinematics.inertial_prediction import body_motions, imu_readings
+from coordinator.kinematics.inertial_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.kinematics.inertial_slopes import imu_slopes
 
 ITERATIONS = 12
@@ -79,6 +79,13 @@ class _State(NamedTuple):
     imus: ImuIntrinsics
 
 
+class _Expected(NamedTuple):
+    """What a chain makes of the joints' motion: its bodies' motions, and what perfect IMUs would read."""
+
+    bodies: list[BodyMotion]
+    ideal: ImuReadings
+
+
 class _Normal(NamedTuple):
     """Normal equations: pose block, nuisance block (gravity, IMU errors), coupling, right-hand sides."""
 
@@ -109,25 +116,32 @@ def refine_chain(chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY) 
     sigma_gyro, sigma_accel = np.full(count, 0.01), np.full(count, 0.1)
     used = 0
     for used in range(1, ITERATIONS + 1):
-        gyro, accel = _residuals(state, data)
+        expected = _expected(state.chain, data)
+        gyro, accel = _residuals(state, data, expected)
         if used > 1:
             sigma_gyro, sigma_accel = _spread(gyro), _spread(accel)
-        normal = _normal_equations(state, data, prior, (gyro, accel), (sigma_gyro, sigma_accel))
+        normal = _normal_equations(state, data, prior, expected, (gyro, accel), (sigma_gyro, sigma_accel))
         step, nuisance, _ = _solve(normal, count)
         state = _moved(state, step, nuisance, prior)
         if used > 2 and float(np.abs(step).max()) < CONVERGED:
             break
-    gyro, accel = _residuals(state, data)
+    expected = _expected(state.chain, data)
+    gyro, accel = _residuals(state, data, expected)
     sigma_gyro, sigma_accel = _spread(gyro), _spread(accel)
     # What the model leaves out (a base that shakes, a link that bends) repeats with the motion.
     believed = (sigma_gyro * np.sqrt(repeats(gyro)), sigma_accel * np.sqrt(repeats(accel)))
-    normal = _normal_equations(state, data, prior, (gyro, accel), believed)
+    normal = _normal_equations(state, data, prior, expected, (gyro, accel), believed)
     _, _, spectrum = _solve(normal, count)
     return _report(state, spectrum, sigma_gyro, sigma_accel, used)
 
 
-def _residuals(state: _State, data: SensorData) -> tuple[Array, Array]:
-    ideal = imu_readings(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+def _expected(chain: Chain, data: SensorData) -> _Expected:
+    bodies = body_motions(chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+    return _Expected(bodies, readings_on(chain, bodies))
+
+
+def _residuals(state: _State, data: SensorData, expected: _Expected) -> tuple[Array, Array]:
+    ideal = expected.ideal
     gyro, accel = read(state.imus, ideal.gyro_rad_s, ideal.accel_m_s2, data.imu_rates)
     return data.gyro_rad_s - gyro, data.accel_m_s2 - accel
 
@@ -159,6 +173,7 @@ def _normal_equations(
     state: _State,
     data: SensorData,
     prior: ImuPrior,
+    expected: _Expected,
     residuals: tuple[Array, Array],
     sigmas: tuple[Array, Array],
 ) -> _Normal:
@@ -166,8 +181,7 @@ def _normal_equations(
     count, samples = len(state.chain.serials), len(data.q_rad)
     poses, free = 6 * count, prior.sigmas > 0.0
     information, rhs = _before(state, prior)
-    bodies = body_motions(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
-    ideal = imu_readings(state.chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+    bodies, ideal = expected
     for k in range(count):
         found = imu_slopes(state.chain, bodies, data.q_rad, data.qd_rad_s, k)
         true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity])

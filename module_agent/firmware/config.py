@@ -1,8 +1,9 @@
 """What a module is told once, before its first tick."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from module_agent.catalogue import ModuleType, module_type
+from module_agent.hardware import HardwareModule
 from module_agent.wire.messages import ExpiryAction, GainSet, Info, Limits
 
 FIRMWARE_NAME = "x5-agent 0.1"
@@ -38,6 +39,24 @@ def catalogue_limits(kind: ModuleType) -> Limits:
         max_effort_nm=kind.max_effort_nm,
         min_position_rad=low,
         max_position_rad=high,
+    )
+
+
+def config_of(module: HardwareModule, boot: int, **settings: Any) -> FirmwareConfig:
+    """Return the settings of a module as its hardware and the catalogue describe it; others as given.
+
+    Raises:
+        UnknownModuleType: the catalogue has no such type.
+    """
+    kind = module_type(module.module_type)
+    return FirmwareConfig(
+        serial=module.serial,
+        kind=kind,
+        boot=boot,
+        limits=catalogue_limits(kind),
+        tick_ns=module.tick_ns,
+        imu_period_ns=module.imu_period_ns,
+        **settings,
     )
 
 

@@ -9,15 +9,13 @@ from types import TracebackType
 from typing import NamedTuple
 
 from coordinator.plan import Plan
-from module_agent.catalogue import module_type
 from module_agent.estimate.circle_point_analysis import CircleFit, circle_point_analysis
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.gaussian_filter import TAPS
 from module_agent.estimate.observer import MARGIN_NS
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware
-from module_agent.hardware import HardwareModule
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 from sim.experiments.module_bench import ModuleBench
@@ -59,7 +57,7 @@ class OneJointRig:
         self.robot = robot
         self.world = World(robot, seed, noise)
         self.modules = tuple(
-            ModuleBench(Firmware(_firmware(module, boot)))
+            ModuleBench(Firmware(config_of(module, boot)))
             for boot, module in enumerate(self.world.modules, start=1)
         )
         self._pwm = [0.0, 0.0]
@@ -158,15 +156,3 @@ def _end(record: MotionRecord) -> int:
     if record.end_row is None:
         raise ValueError(f"motion {record.motion_id} has not ended")
     return record.end_row
-
-
-def _firmware(module: HardwareModule, boot: int) -> FirmwareConfig:
-    kind = module_type(module.module_type)
-    return FirmwareConfig(
-        serial=module.serial,
-        kind=kind,
-        boot=boot,
-        limits=catalogue_limits(kind),
-        tick_ns=module.tick_ns,
-        imu_period_ns=module.imu_period_ns,
-    )
