@@ -24,7 +24,7 @@ from coordinator.kinematics.chain_observations import (
     PairObservation,
     RestObservation,
 )
-from coordinator.kinematics.imu_intrinsics import UNCALIBRATED, beyond
+from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.kinematics.topology import MotionSeen, Topology, TopologyError, find_topology
@@ -139,7 +139,8 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         samples = sum(len(w.t_ns) for w in windows) * len(serials)
         keep_every = max(KINEMATIC_KEEP_EVERY, -(-samples // MOST_IMU_SAMPLES))
         data = sensor_data(windows, KINEMATIC_CUTOFF_HZ, keep_every)
-        refined = refine_chain(first.chain, data, UNCALIBRATED)
+        prior = _imu_prior(recording)
+        refined = refine_chain(first.chain, data, prior)
     except (TopologyError, AssemblyError, ValueError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
@@ -148,13 +149,19 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         for estimate in found.values()
         if estimate.note
     )
-    notes += _strange_imus(topology.serials, refined)
+    notes += _strange_imus(topology.serials, refined, prior)
     return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
 
 
-def _strange_imus(serials: Sequence[str], refined: Refinement) -> tuple[str, ...]:
+def _imu_prior(recording: Recording) -> ImuPrior:
+    """Return how well the IMUs are known, as the session was told."""
+    told = [event.imu for event in recording.journal if event.what == "session"]
+    return IMU_PRIORS[told[-1] if told else "uncalibrated"]
+
+
+def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:
     """Say whose IMU came out with errors that its kind does not have: then something is not in the model."""
-    far = dict(zip(serials, beyond(refined.intrinsics, UNCALIBRATED), strict=True))
+    far = dict(zip(serials, beyond(refined.intrinsics, prior), strict=True))
     return tuple(
         f"{serial}: its IMU seems to have {far[serial]:.1f} times the error that its kind has. It is poor, "
         "or the robot's base or links give; lengths and axes near it may be worse than claimed"

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.wire.messages import MotionRecord
 
 Purpose = Literal["rest", "constant", "windowed_sine", "dynamic", "held_out", "other"]
@@ -32,6 +33,7 @@ class JournalEvent(BaseModel):
     text: str = ""
     deaf: tuple[str, ...] | None = None
     robot: str = ""
+    imu: ImuKind = "uncalibrated"
     wall_time_s: float | None = None
 
     def encode(self) -> bytes:

@@ -15,6 +15,7 @@ from coordinator.failure import EXIT_FAILED, EXIT_USAGE, explain
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.interruption import SIGNALS, Interruption, ignore_signals, run_to_end
+from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.recording import Recording
 from coordinator.result import Result
@@ -116,6 +117,9 @@ def run(
         float | None, typer.Option(help="Amplitude of the windowed sine [rad]; by module type if not given.")
     ] = None,
     home: Annotated[float | None, typer.Option(help="Home position of all joints [rad] [0].")] = None,
+    imu: Annotated[
+        ImuKind | None, typer.Option(help="How well the IMUs are known [uncalibrated, as delivered].")
+    ] = None,
     viewer: Annotated[
         str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
     ] = "none",
@@ -141,7 +145,7 @@ def run(
         robot=robot,
         out=out,
         sender=_sender(),
-        plan=_plan(plan, dynamics, amplitude, home),
+        plan=_plan(plan, dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home, imu=imu),
         expect=expect,
         resume=resume,
         spawn_viewer=shown.spawn,
@@ -172,8 +176,8 @@ def resuming(context: typer.Context) -> str:
     return shlex.join([*words, "--resume"])
 
 
-def _plan(path: Path | None, dynamics: bool | None, amplitude: float | None, home: float | None) -> Plan:
-    given = {"dynamics": dynamics, "sine_amplitude_rad": amplitude, "home_rad": home}
+def _plan(path: Path | None, **given: object) -> Plan:
+    """Return the plan of a file, or the default one, with the settings that are given (not None)."""
     try:
         base = load_plan(path) if path is not None else Plan()
         # Validated again: an option can be out of range as well.

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.catalogue import ModuleType
 from module_agent.firmware.gains import default_gains
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
@@ -40,6 +41,8 @@ class Plan(BaseModel):
     dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
     dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
     dynamics: bool = True
+    # How well the modules' IMUs are known beforehand: `kinematics.imu_intrinsics`.
+    imu: ImuKind = "uncalibrated"
     hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
     retries: Annotated[int, Field(ge=0, le=5)] = 2
 

@@ -133,7 +133,9 @@ class Run:
         config = self._config
         try:
             self._radio.start()
-            self._journal(JournalEvent(t_ns=self._clock(), what="session", robot=config.robot))
+            self._journal(
+                JournalEvent(t_ns=self._clock(), what="session", robot=config.robot, imu=config.plan.imu)
+            )
             session = Session(
                 self._link, self._radio, self.recording, config.plan, self._clock, self._journal, self
             )

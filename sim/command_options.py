@@ -6,6 +6,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from coordinator.failure import EXIT_USAGE
+from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.run_folder import RunFolderError, check_free
 from coordinator.scaled_loop import check_speed
@@ -31,6 +32,7 @@ PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with se
 Dynamics = Annotated[
     bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
 ]
+Imu = Annotated[ImuKind | None, typer.Option(help="How well the IMUs are known beforehand [uncalibrated].")]
 Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
 Processes = Annotated[
     int | None, typer.Option(min=1, help="Agent processes that share the modules [one for each module].")
@@ -84,16 +86,16 @@ def free_folder(out: Path | None, robot: Robot) -> Path:
     return folder
 
 
-def motions(path: Path | None, dynamics: bool | None = None) -> Plan:
-    """Return the plan of a file, or end the command."""
+def motions(path: Path | None, **given: object) -> Plan:
+    """Return the plan of a file with the settings that are given (not None), or end the command."""
     try:
         found = load_plan(path) if path is not None else Plan()
     except PlanFileError as error:
         fail(error, EXIT_USAGE)
-    return found if dynamics is None else found.model_copy(update={"dynamics": dynamics})
+    return found.model_copy(update={name: value for name, value in given.items() if value is not None})
 
 
 def motion_arguments(path: Path | None, plan: Plan) -> tuple[str, ...]:
     """Return a plan as arguments for the coordinator."""
-    dynamics = "--dynamics" if plan.dynamics else "--no-dynamics"
-    return (dynamics,) if path is None else ("--plan", str(path), dynamics)
+    options = ("--dynamics" if plan.dynamics else "--no-dynamics", "--imu", plan.imu)
+    return options if path is None else ("--plan", str(path), *options)

@@ -18,6 +18,7 @@ from sim.bus_server import BusServer
 from sim.command_options import (
     Dynamics,
     Endpoint,
+    Imu,
     Network,
     Noise,
     Out,
@@ -110,6 +111,7 @@ def run(
     out: Out = None,
     plan: PlanFile = None,
     dynamics: Dynamics = None,
+    imu: Imu = None,
     speed: Speed = 1.0,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
@@ -119,7 +121,7 @@ def run(
     found = load(robot)
     check(network, speed, endpoint)
     choice = noise_choice(found, noise, with_effects, without_effects)
-    planned = motions(plan, dynamics)
+    planned = motions(plan, dynamics=dynamics, imu=imu)
     folder = free_folder(out, found)
     if virtual:
         _run_virtual(
@@ -236,6 +238,7 @@ def launch(
     speed: Speed = 1.0,
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
     dynamics: Dynamics = None,
+    imu: Imu = None,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
 ) -> None:
@@ -247,7 +250,7 @@ def launch(
         viewer_choice(viewer)
     except ValueError as error:
         fail(error, EXIT_USAGE)
-    options = ("--viewer", viewer, *motion_arguments(plan, motions(plan, dynamics)))
+    options = ("--viewer", viewer, *motion_arguments(plan, motions(plan, dynamics=dynamics, imu=imu)))
     place = _Place(free_folder(out, found), network or found.network, endpoint, processes)
     _run_processes(_launch(robot, found, place, seed, choice, speed, options))
     print_score(place.out)

@@ -7,7 +7,7 @@ they do not reach stays as uncertain as it was before.
 """
 
 from math import radians
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,11 @@ class ImuPrior(NamedTuple):
 BIASES_ONLY = ImuPrior(0.0, 0.0, 0.05, 0.2, 0.0)
 # As delivered: scale good to 1 %, axes to 1 deg; a low-pass before the sampling makes readings late.
 UNCALIBRATED = ImuPrior(0.01, radians(1.0), 0.05, 0.2, 3e-3)
+# Calibrated on a rate table and by gravity: what is left of scale and axes is below what motions tell.
+CALIBRATED = ImuPrior(1e-4, 1e-4, 0.05, 0.2, 3e-3)
+
+ImuKind = Literal["calibrated", "uncalibrated"]
+IMU_PRIORS: dict[ImuKind, ImuPrior] = {"calibrated": CALIBRATED, "uncalibrated": UNCALIBRATED}
 
 
 class ImuIntrinsics(NamedTuple):
