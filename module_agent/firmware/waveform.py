@@ -1,7 +1,8 @@
 """Motion patterns as position and velocity over time, relative to where the motion begins.
 
 All functions are vectorised over the time samples. Sources: thesis eq. 13 (constant motion), eq. 14 (windowed
-sine), table 6 and figure 44 (dynamic pattern); the minimum-jerk path is that of Flash and Hogan, 1985.
+sine), table 6 and figure 44 (dynamic pattern); the minimum-jerk path is that of Flash and Hogan, 1985; sums
+of sines as excitation: Swevers et al., Optimal robot excitation and identification, 1997.
 """
 
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from module_agent.wire.messages import (
     ConstantMotion,
     DynamicPattern,
     GoTo,
+    MultiSine,
     Pattern,
     Rest,
     WindowedSine,
@@ -49,6 +51,8 @@ def duration_s(pattern: Pattern, origin_rad: float) -> float:
             return 2.0 * pattern.centre_s
         case DynamicPattern():
             return 2.0 * pattern.half_width_s * pattern.repeats
+        case MultiSine():
+            return pattern.duration_s
 
 
 def waveform(pattern: Pattern, origin_rad: float, t_s: Array) -> Waveform:
@@ -64,6 +68,8 @@ def waveform(pattern: Pattern, origin_rad: float, t_s: Array) -> Waveform:
             return _windowed_sine(pattern, t_s)
         case DynamicPattern():
             return _dynamic(pattern, t_s)
+        case MultiSine():
+            return _multi_sine(pattern, t_s)
 
 
 def _minimum_jerk(travel_rad: float, total_s: float, t_s: Array) -> Waveform:
@@ -127,3 +133,12 @@ def _dynamic(pattern: DynamicPattern, t_s: Array) -> Waveform:
         scale * window * np.sin(omega * s),
         scale * (window_rate * np.sin(omega * s) + window * omega * np.cos(omega * s)),
     )
+
+
+def _multi_sine(pattern: MultiSine, t_s: Array) -> Waveform:
+    amplitude = np.array([sine.amplitude_rad for sine in pattern.sines])
+    omega = 2.0 * np.pi * np.array([sine.frequency_hz for sine in pattern.sines])
+    phase = t_s[:, None] * omega
+    window, window_rate = taper(t_s, pattern.duration_s)
+    wave, rate = np.sin(phase) @ amplitude, np.cos(phase) @ (amplitude * omega)
+    return Waveform(window * wave, window_rate * wave + window * rate)

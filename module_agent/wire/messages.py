@@ -96,7 +96,24 @@ class DynamicPattern(Part):
     alternate: bool = False
 
 
-Pattern = Annotated[Rest | GoTo | ConstantMotion | WindowedSine | DynamicPattern, Field(discriminator="kind")]
+class Sine(Part):
+    """One part of a `MultiSine`: A sin(2 pi f t) of position."""
+
+    amplitude_rad: Positive
+    frequency_hz: Annotated[float, Field(gt=0.0, le=50.0)]
+
+
+class MultiSine(Part):
+    """Several sines at once: w(t) sum of A_i sin(2 pi f_i t), with w tapered to exactly zero at both ends."""
+
+    kind: Literal["multi_sine"] = "multi_sine"
+    sines: Annotated[tuple[Sine, ...], Field(min_length=1, max_length=8)]
+    duration_s: Annotated[float, Field(gt=0.0, le=60.0)]
+
+
+Pattern = Annotated[
+    Rest | GoTo | ConstantMotion | WindowedSine | DynamicPattern | MultiSine, Field(discriminator="kind")
+]
 
 
 # --------------------------------------------------------------------------- gains

@@ -6,7 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from module_agent.firmware.waveform import Array, Waveform, duration_s, waveform
-from module_agent.wire.messages import ConstantMotion, DynamicPattern, GoTo, Pattern, Rest, WindowedSine
+from module_agent.wire.messages import (
+    ConstantMotion,
+    DynamicPattern,
+    GoTo,
+    MultiSine,
+    Pattern,
+    Rest,
+    Sine,
+    WindowedSine,
+)
 
 PATTERNS: list[Pattern] = [
     Rest(duration_s=1.0),
@@ -18,6 +27,10 @@ PATTERNS: list[Pattern] = [
     WindowedSine(amplitude=1.0, of="velocity", frequency_hz=3.0),
     DynamicPattern(amplitude_rad=0.2),
     DynamicPattern(amplitude_rad=0.4, frequency_hz=0.7, sigma_s=0.5, half_width_s=1.0, alternate=True),
+    MultiSine(
+        sines=(Sine(amplitude_rad=0.25, frequency_hz=0.3), Sine(amplitude_rad=0.05, frequency_hz=2.0)),
+        duration_s=5.0,
+    ),
 ]
 
 
@@ -100,3 +113,12 @@ def test_goto_never_overshoots(origin: float, target: float, speed: float) -> No
     low, high = min(origin, target), max(origin, target)
     assert position.min() >= low - 1e-9
     assert position.max() <= high + 1e-9
+
+
+def test_a_multi_sine_is_the_sum_of_its_sines_where_the_taper_is_one() -> None:
+    sines = (Sine(amplitude_rad=0.25, frequency_hz=0.3), Sine(amplitude_rad=0.05, frequency_hz=2.0))
+    t, found = sampled(MultiSine(sines=sines, duration_s=5.0))
+    middle = (t > 0.76) & (t < 4.24)
+    slow, fast = (s.amplitude_rad * np.sin(2 * np.pi * s.frequency_hz * t) for s in sines)
+    expected = slow + fast
+    np.testing.assert_allclose(found.offset_rad[middle], expected[middle], atol=1e-12)

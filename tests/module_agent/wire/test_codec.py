@@ -30,8 +30,10 @@ from module_agent.wire.messages import (
     Message,
     MotionCommand,
     MotionRecord,
+    MultiSine,
     PidGains,
     Setpoint,
+    Sine,
     Status,
     Stop,
     WindowedSine,
@@ -147,6 +149,16 @@ def test_the_bytes_are_the_committed_ones_and_plain_msgpack_reads_them(message: 
     assert encode(message) == golden
     plain = msgpack.unpackb(golden, use_list=False)
     assert plain == message.model_dump()
+
+
+def test_the_bytes_of_several_sines_at_once_are_the_committed_ones() -> None:
+    """The one pattern that holds a list: tuples on the wire are plain msgpack arrays."""
+    sines = (Sine(amplitude_rad=0.25, frequency_hz=0.5), Sine(amplitude_rad=0.0625, frequency_hz=2.0))
+    command = MotionCommand(**COMMAND, motion_id=4, pattern=MultiSine(sines=sines, duration_s=12.0))
+    golden = bytes.fromhex(json.loads(GOLDEN.read_text())["MotionCommand of several sines"])
+    assert encode(command) == golden
+    assert decode(MotionCommand, golden) == command
+    assert msgpack.unpackb(golden, use_list=False) == command.model_dump()
 
 
 def test_plain_struct_knowledge_reads_the_rows() -> None:
