@@ -20,13 +20,17 @@ from sim.world import TICK_NS, World
 
 
 class VirtualSettings(NamedTuple):
-    """What a virtual robot is told; every seed in it follows from `seed`."""
+    """What a virtual robot is told; every seed in it follows from `seed`.
+
+    `noise_seed` makes it another day of the same robot: other noise and network, the same modules.
+    """
 
     robot: Robot
     profile: NetworkProfile
     seed: int = 0
     noise: str | NoiseProfile | None = None
     feedback_rate_hz: float = 250.0
+    noise_seed: int | None = None
 
 
 class _Wires:
@@ -54,9 +58,10 @@ class VirtualRobot:
     """
 
     def __init__(self, settings: VirtualSettings, loop: VirtualLoop):
-        seeds = np.random.SeedSequence(settings.seed).spawn(2)
+        day = settings.seed if settings.noise_seed is None else (settings.seed, settings.noise_seed)
+        seeds = np.random.SeedSequence(day).spawn(2)
         self.loop = loop
-        self.world = World(settings.robot, settings.seed, settings.noise)
+        self.world = World(settings.robot, settings.seed, settings.noise, noise_seed=settings.noise_seed)
         self.network = VirtualNetwork(loop)
         self.truth = TruthLog(self.world)
         self.pwm = [0.0] * len(self.world.modules)

@@ -21,7 +21,7 @@ COORDINATOR = "coordinator"
 
 
 class VirtualConfig(NamedTuple):
-    """What a virtual run is told; every seed in it follows from `seed`."""
+    """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given."""
 
     robot: Robot
     out: Path
@@ -31,6 +31,7 @@ class VirtualConfig(NamedTuple):
     plan: Plan = Plan()
     connect_viewer: str | None = None
     feedback_rate_hz: float = 250.0
+    noise_seed: int | None = None
 
 
 def run_virtual(
@@ -46,7 +47,12 @@ def run_virtual(
     """
     loop = VirtualLoop()
     settings = VirtualSettings(
-        config.robot, network(config.network), config.seed, config.noise, config.feedback_rate_hz
+        config.robot,
+        network(config.network),
+        config.seed,
+        config.noise,
+        config.feedback_rate_hz,
+        config.noise_seed,
     )
     robot = VirtualRobot(settings, loop)
     try:

@@ -56,7 +56,8 @@ class World:
     the last IMU values are repeated with their own time.
 
     The world begins at rest, the modules' joints where the robot file has them and everything that gives
-    sagged under its weight.
+    sagged under its weight. `noise_seed` draws the sensors' noise and drift anew for the same modules, as on
+    another day; what the modules are hangs on `seed` alone.
 
     Raises:
         ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number, or the robot's base or links are
@@ -71,13 +72,14 @@ class World:
         noise: str | NoiseProfile | None = None,
         imu_rate_hz: float = 250.0,
         voltage_v: float = BUS_VOLTAGE_V,
+        noise_seed: int | None = None,
     ):
         self.robot = robot
         wanted = robot.noise if noise is None else noise
         self.profile = noise_profile(wanted) if isinstance(wanted, str) else wanted
         tree = build_tree(robot)
         imu_ticks = _whole_ticks(imu_rate_hz)
-        drawn = seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S
+        drawn = seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S, noise_seed
         self._sensors = Sensors(*drawn)
         self._skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
         self._joints = np.array(self._skeleton.module)

@@ -41,7 +41,8 @@ class Sensors:
 
     The IMU is read every `imu_ticks` ticks; in between its last values are repeated with their own time.
     Sampling jitter moves a reading off its stamp, to first order and never the stamp itself, so the stamps of
-    successive ticks stay a tick of the module's clock apart.
+    successive ticks stay a tick of the module's clock apart. What is constant in a module hangs on `seed`,
+    what comes and goes on `noise_seed`, which is the same number if it is not given.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class Sensors:
         profile: NoiseProfile,
         imu_ticks: int,
         tick_s: float,
+        noise_seed: int | None = None,
     ):
         self.clocks: tuple[ModuleClock, ...] = tuple(
             draw_clock(generator(seed, s, "clock"), profile) for s in serials
@@ -59,8 +61,9 @@ class Sensors:
         self.errors: SensorErrors = draw_sensor_errors(seed, serials, types, profile)
         self._imu_ticks = imu_ticks
         self._gear = np.array([t.gear_ratio for t in types])
-        self._joints = JointSensors(seed, serials, types, profile, self.errors, tick_s)
-        self._imus = Imus(seed, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
+        noise = seed if noise_seed is None else noise_seed
+        self._joints = JointSensors(noise, serials, types, profile, self.errors, tick_s)
+        self._imus = Imus(noise, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
         self._imu_values = np.zeros((len(types), 6))
         self._imu_ns = [0] * len(types)
 
