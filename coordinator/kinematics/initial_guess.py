@@ -22,6 +22,9 @@ from module_agent.catalogue import ModuleType
 # How far a mounting may be from neutral, in rad and m. It only fills in what no observation says better than
 # this; the refinement that follows knows nothing of it.
 NEUTRAL_SIGMA = 0.25
+# What a neutral direction counts against the poorest that was seen. Mountings are often half a turn from
+# neutral: even a direction seen through a joint that swung along must outweigh it.
+NEUTRAL_SHARE = 1e-3
 
 
 def initial_chain(
@@ -146,7 +149,8 @@ def _align(evidence: _Evidence, neutral: Array) -> Array:
     """Return the IMU's orientation at home from the directions it saw; where they say nothing, neutral."""
     there = np.concatenate([evidence.there, neutral.T])
     here = np.concatenate([evidence.here, np.eye(3)])
-    weight = np.concatenate([evidence.weight, np.full(3, NEUTRAL_SIGMA**-2)])
+    least = evidence.weight.min(initial=NEUTRAL_SIGMA**-2)
+    weight = np.concatenate([evidence.weight, np.full(3, NEUTRAL_SHARE * least)])
     found, _ = Rotation.align_vectors(there, here, weights=weight)
     return np.asarray(found.as_matrix())
 

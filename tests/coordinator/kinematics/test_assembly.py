@@ -95,6 +95,25 @@ def test_every_branch_of_a_tree_has_an_offset_of_its_own_that_nothing_tells(robo
     ]
 
 
+def test_modules_mounted_half_a_turn_from_straight_are_found_through_joints_that_swing_along(
+    robots: Any,
+) -> None:
+    """Parallel joints, each link turned by half a turn: what is seen of an axis tells its sign all the same."""
+    homes = np.tile(np.eye(4), (5, 1, 1))
+    homes[0] = robots.root_pose(X5)
+    turns = [("z", 0.0), ("x", np.pi / 2), ("x", -np.pi / 2), ("x", np.pi / 2), ("y", np.pi / 2)]
+    for k, (about, angle) in enumerate(turns[1:], start=1):
+        homes[k, :3, :3] = Rotation.from_euler(about, angle).as_matrix()
+        homes[k, :3, 3] = [0.05 * (-1) ** k, 0.02 * k, 0.2 * k]
+    chain = robots.build([-1, 0, 1, 2, 3], [False] * 5, homes, [X5] * 5, np.array([0.1, 0.05, 1.0]))
+    positions = robots.positions(chain, 1)
+    # Held joints that swing with 40 % of the moving one's motion.
+    poor = [p._replace(sigma_axis_rad=0.4) for p in robots.observe(chain, positions)]
+    fit = assemble(robots.topology(chain), [X5] * 5, poor, [robots.rest(chain, positions[0])])
+    along = np.sum(fit.chain.axis * chain.axis, axis=1)
+    assert along.min() > np.cos(0.2), along
+
+
 def noisy(robots: Any, chain: Chain, seed: int, positions: np.ndarray) -> tuple[Any, Any]:
     """Observations with errors of exactly the size that the fit believes in."""
     rng = np.random.default_rng(seed)
