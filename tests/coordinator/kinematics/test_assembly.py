@@ -98,7 +98,7 @@ def test_every_branch_of_a_tree_has_an_offset_of_its_own_that_nothing_tells(robo
 def test_modules_mounted_half_a_turn_from_straight_are_found_through_joints_that_swing_along(
     robots: Any,
 ) -> None:
-    """Parallel joints, each link turned by half a turn: what is seen of an axis tells its sign all the same."""
+    """Parallel joints, links turned by half a turn: what is seen of an axis tells its sign all the same."""
     homes = np.tile(np.eye(4), (5, 1, 1))
     homes[0] = robots.root_pose(X5)
     turns = [("z", 0.0), ("x", np.pi / 2), ("x", -np.pi / 2), ("x", np.pi / 2), ("y", np.pi / 2)]
