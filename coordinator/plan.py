@@ -41,6 +41,8 @@ class Plan(BaseModel):
     dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
     dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
     dynamics: bool = True
+    # Who is mounted on whom takes the slow motions alone; without the fast ones there is no chain.
+    topology_only: bool = False
     # How well the modules' IMUs are known beforehand: `kinematics.imu_intrinsics`.
     imu: ImuKind = "uncalibrated"
     hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0

@@ -255,6 +255,8 @@ class Session:
         await self._go(serial, home - 0.5 * travel)
         await self._observe(serial, constant, "constant")
         await self._go(serial, home)
+        if plan.topology_only:
+            return
         await self._observe(serial, plan.sine(self.link.kind(serial)), "windowed_sine")
         self._reporter.estimates(serial)
 

@@ -25,6 +25,8 @@ class MotionSeen(NamedTuple):
     moved: bool
     rate_ratio: float
     axis: Array | None = None
+    sigma: float = 0.1
+    give: float = 0.0
 
 
 class Topology(NamedTuple):

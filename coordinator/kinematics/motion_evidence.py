@@ -1,0 +1,103 @@
+"""How strongly one motion of one joint says which IMUs it carried: rate ratios with honest uncertainties.
+
+An IMU that a joint carries reads gyro = j v, with the joint's rate v and |j| = 1; one that it does not carry
+reads none of v. What else moves an IMU in time with the joint makes the ratio uncertain: shaking and noise,
+which differ from one stretch of the motion to the next, and held joints that give, which their own encoders
+see.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array
+
+BLOCKS = 6
+# Less than this over a motion is no motion: encoders and springs of a joint that is stuck still jitter.
+LEAST_RATE_RAD_S = 0.02
+# Six blocks of four samples are the least that tells how much they differ.
+FEWEST_SAMPLES = 4 * BLOCKS
+
+
+class NotMoved(ValueError):
+    """The joint was told to move and hardly did; the message says how much."""
+
+
+class MotionEvidence(NamedTuple):
+    """What n IMUs saw of one joint's motion; arrays read-only.
+
+    coefficient: (n, 3) regression of each gyro on the joint's rate, in the frame of that IMU.
+    sigma: (n,) one standard deviation of its size, from how much the stretches of the motion differ.
+    give: how much the other joints moved along, relative to this one: that much more or less may an IMU have
+        turned, depending on where it sits.
+    """
+
+    coefficient: Array
+    sigma: Array
+    give: float
+
+    @property
+    def rate_ratio(self) -> Array:
+        """(n,) sizes of the coefficients: 1 if carried, 0 if not."""
+        return np.asarray(np.linalg.norm(self.coefficient, axis=1))
+
+
+def motion_evidence(joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s: Array) -> MotionEvidence:
+    """Regress all gyros, less their offsets, on one joint's rate.
+
+    The spread is that of the jackknife over blocks of the motion (Efron, The Jackknife, 1982, eq. 3.13): it
+    needs no model of how shaking and noise hang together in time.
+
+    Args:
+        joint: column of the joint that was moved.
+        qd_rad_s: (m, n) rates of all joints.
+        gyro_rad_s: (m, n, 3) of all IMUs at the same instants, each in its own frame, filtered alike.
+        offset_rad_s: (n, 3) gyro offsets, from rest.
+
+    Raises:
+        NotMoved: the joint's rate is below `LEAST_RATE_RAD_S` rms.
+        ValueError: fewer than `FEWEST_SAMPLES` samples.
+    """
+    rate = qd_rad_s[:, joint]
+    if rate.size < FEWEST_SAMPLES:
+        raise ValueError(f"{rate.size} samples of the motion; at least {FEWEST_SAMPLES} are needed")
+    size = float(np.sqrt(np.mean(rate**2)))
+    if size < LEAST_RATE_RAD_S:
+        raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {LEAST_RATE_RAD_S} is needed")
+    gyro = gyro_rad_s - offset_rad_s
+    blocks = np.array_split(np.arange(rate.size), BLOCKS)
+    power = np.array([rate[b] @ rate[b] for b in blocks])
+    moment = np.array([np.tensordot(rate[b], gyro[b], axes=1) for b in blocks])
+    coefficient = moment.sum(axis=0) / power.sum()
+    without = (moment.sum(axis=0) - moment) / (power.sum() - power)[:, None, None]
+    scatter = ((without - without.mean(axis=0)) ** 2).sum(axis=(0, 2))
+    others = np.delete(qd_rad_s, joint, axis=1)
+    give = float(np.abs(rate @ others).sum() / power.sum())
+    return MotionEvidence(_frozen(coefficient), _frozen(np.sqrt((BLOCKS - 1) / BLOCKS * scatter)), give)
+
+
+def combined(evidence: list[MotionEvidence]) -> MotionEvidence:
+    """Average what several motions of one joint say, each weighted by its own certainty.
+
+    They are not averaged below the best one's `give`: that repeats with the motion.
+
+    Raises:
+        ValueError: no evidence.
+    """
+    if not evidence:
+        raise ValueError("no motion to judge by")
+    weight = np.array([1.0 / (e.sigma**2 + e.give**2 + 1e-6) for e in evidence])
+    total = weight.sum(axis=0)
+    coefficient = np.sum([w[:, None] * e.coefficient for w, e in zip(weight, evidence, strict=True)], axis=0)
+    spread = np.sum([(w * e.sigma) ** 2 for w, e in zip(weight, evidence, strict=True)], axis=0)
+    return MotionEvidence(
+        _frozen(coefficient / total[:, None]),
+        _frozen(np.sqrt(spread) / total),
+        min(e.give for e in evidence),
+    )
+
+
+def _frozen(array: Array) -> Array:
+    array = np.array(array)
+    array.flags.writeable = False
+    return array
