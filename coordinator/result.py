@@ -37,13 +37,66 @@ class LinkPart(Part):
     link_length_sigma_mm: float
 
 
+class UnknownPart(Part):
+    """Which parameters of one link are not known (names as in `TransformPart.parameters`)."""
+
+    parent: str
+    child: str
+    parameters: list[str]
+
+
 class UnresolvedPart(Part):
-    """What the data does not tell, in words."""
+    """What the data does not tell: in words, as parameters of links, and what would tell it."""
 
     kind: str
     joint: str
     modules: list[str]
     words: str
+    resolved_by: str = ""
+    links: list[UnknownPart] = []
+
+
+class TransformPart(Part):
+    """The pose of a child's mounting face in its parent's moved face; see `kinematics.link_transforms`.
+
+    values and covariance are in the units that `parameters` names. sigma is None where a parameter takes part
+    in what no observation tells; the covariance is that of what is known.
+    """
+
+    parent: str
+    child: str
+    parent_face: str
+    child_face: str
+    parameters: list[str]
+    values: list[float]
+    sigma: list[float | None]
+    covariance: list[list[float]]
+    null_directions: list[list[float]]
+
+
+class ScrewPart(Part):
+    """A joint's screw axis [w, v] at q = 0 in the root frame, and its covariance (6, 6)."""
+
+    serial: str
+    screw: list[float]
+    covariance: list[list[float]]
+
+
+class TipPart(Part):
+    """The end of a branch: M (4, 4) at q = 0, the joints that move it, the covariance of M's twist."""
+
+    serial: str
+    frame: str
+    joints: list[str]
+    home: list[list[float]]
+    covariance: list[list[float]]
+
+
+class ExponentialsPart(Part):
+    """The product of exponentials, T = exp([S_1] q_1) ... exp([S_k] q_k) M of every tip."""
+
+    screws: list[ScrewPart]
+    tips: list[TipPart]
 
 
 class PairPart(Part):
@@ -98,7 +151,11 @@ class DynamicsPart(Part):
 
 
 class Result(Part):
-    """Everything that one session found."""
+    """Everything that one session found.
+
+    chain_covariance and null_basis, (6 n, 6 n) and (6 n, k), are over the increments of
+    `kinematics.increments`: per module of the chain a twist of its pose at q = 0 in the root frame.
+    """
 
     robot: str
     serials: list[str]
@@ -110,7 +167,10 @@ class Result(Part):
     reduced_chi2: float
     unresolved: list[UnresolvedPart]
     null_basis: list[list[float]]
+    chain_covariance: list[list[float]]
     links: list[LinkPart]
+    transforms: list[TransformPart]
+    product_of_exponentials: ExponentialsPart
     pairs: list[PairPart]
     denavit_hartenberg: list[DhPart]
     dynamics: DynamicsPart | None

@@ -2,23 +2,36 @@
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from coordinator.chain import Array
 from coordinator.kinematics.denavit_hartenberg import dh_paths
+from coordinator.kinematics.link_transforms import PARAMETERS, LinkTransform, link_transforms
+from coordinator.kinematics.product_of_exponentials import screw_model
 from coordinator.recording import Recording
 from coordinator.result import (
     DhPart,
     DhRowPart,
     DynamicsPart,
+    ExponentialsPart,
     HeldOutPart,
     LinkPart,
     PairPart,
     Result,
+    ScrewPart,
+    TipPart,
+    TransformPart,
+    UnknownPart,
     UnresolvedPart,
     chain_part,
 )
+from module_agent.catalogue import ModuleType, module_type
 
 if TYPE_CHECKING:
     from coordinator.dynamics.identification import InertialFit
     from coordinator.identify import HeldOutMotion, Kinematics
+    from coordinator.kinematics.assembly import ChainFit
+    from coordinator.kinematics.null_space import Unresolved
 
 
 def build_result(
@@ -29,26 +42,26 @@ def build_result(
 ) -> Result:
     """Return the result of a session."""
     fit, topology = kinematics.fit, kinematics.topology
+    named = {s: _type_name(recording, s) for s in topology.serials}
+    types = [module_type(name) for name in named.values()]
     times = [e.t_ns for e in recording.journal]
     began = [e for e in recording.journal if e.what == "session"]
     finished = [e for e in recording.journal if e.what == "finished"]
     return Result(
         robot=began[-1].robot if began else "",
         serials=list(topology.serials),
-        types={s: _type_name(recording, s) for s in topology.serials},
+        types=named,
         topology_confidence=topology.confidence,
         chain=chain_part(fit.chain),
         rank=fit.rank,
         condition=fit.condition,
         reduced_chi2=fit.reduced_chi2,
-        unresolved=[
-            UnresolvedPart(
-                kind=u.kind, joint=u.joint, modules=list(u.modules), words=f"{u.text} ({u.resolved_by})"
-            )
-            for u in fit.unresolved
-        ],
+        unresolved=[_unresolved(fit, types, u) for u in fit.unresolved],
         null_basis=fit.null_basis.tolist(),
+        chain_covariance=fit.covariance.tolist(),
         links=_links(kinematics),
+        transforms=_transforms(fit, types),
+        product_of_exponentials=_exponentials(fit, types),
         pairs=_pairs(recording),
         denavit_hartenberg=_dh(kinematics),
         dynamics=_dynamics(kinematics, inertia, held_out),
@@ -76,6 +89,83 @@ def _links(kinematics: "Kinematics") -> list[LinkPart]:
         for k, parent in enumerate(topology.parent)
         if parent >= 0
     ]
+
+
+def _unresolved(fit: "ChainFit", types: list[ModuleType], item: "Unresolved") -> UnresolvedPart:
+    links = [
+        UnknownPart(parent=link.parent, child=link.child, parameters=_unknown(link))
+        for link in link_transforms(fit.chain, types, np.zeros_like(fit.covariance), _columns(item))
+        if any(link.unknown)
+    ]
+    return UnresolvedPart(
+        kind=item.kind,
+        joint=item.joint,
+        modules=list(item.modules),
+        words=_words(item, links),
+        resolved_by=item.resolved_by,
+        links=links,
+    )
+
+
+def _words(item: "Unresolved", links: list[UnknownPart]) -> str:
+    """Say which parameters of which links are not known, why, and what would tell them."""
+    short = [", ".join(name.split("_")[0] for name in link.parameters) for link in links]
+    of = [
+        f"{names} of the link {link.parent} - {link.child}" for names, link in zip(short, links, strict=True)
+    ]
+    where = f"{' and '.join(of)}: " if of else ""
+    return f"{where}{item.text}. What would tell it: {item.resolved_by}"
+
+
+def _unknown(link: LinkTransform) -> list[str]:
+    return [name for name, unknown in zip(PARAMETERS, link.unknown, strict=True) if unknown]
+
+
+def _columns(item: "Unresolved") -> Array:
+    return np.asarray(item.directions / np.linalg.norm(item.directions, axis=0))
+
+
+def _transforms(fit: "ChainFit", types: list[ModuleType]) -> list[TransformPart]:
+    # The motions that have been named, not the null vectors of the fit: those are mixed, and off by its
+    # noise.
+    nothing = np.zeros((len(fit.covariance), 0))
+    hidden = np.concatenate([nothing, *(_columns(item) for item in fit.unresolved)], axis=1)
+    return [_transform(link) for link in link_transforms(fit.chain, types, fit.covariance, hidden)]
+
+
+def _transform(link: LinkTransform) -> TransformPart:
+    sigma = np.sqrt(link.covariance.diagonal()).tolist()
+    return TransformPart(
+        parent=link.parent,
+        child=link.child,
+        parent_face=link.parent_face,
+        child_face=link.child_face,
+        parameters=list(PARAMETERS),
+        values=link.values.tolist(),
+        sigma=[None if unknown else s for s, unknown in zip(sigma, link.unknown, strict=True)],
+        covariance=link.covariance.tolist(),
+        null_directions=link.null_directions.tolist(),
+    )
+
+
+def _exponentials(fit: "ChainFit", types: list[ModuleType]) -> ExponentialsPart:
+    model = screw_model(fit.chain, types, fit.covariance)
+    return ExponentialsPart(
+        screws=[
+            ScrewPart(serial=serial, screw=screw.tolist(), covariance=covariance.tolist())
+            for serial, screw, covariance in zip(model.serials, model.screws, model.covariance, strict=True)
+        ],
+        tips=[
+            TipPart(
+                serial=tip.serial,
+                frame=tip.frame,
+                joints=list(tip.joints),
+                home=tip.home.tolist(),
+                covariance=tip.covariance.tolist(),
+            )
+            for tip in model.tips
+        ],
+    )
 
 
 def _pairs(recording: Recording) -> list[PairPart]:

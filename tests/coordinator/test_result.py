@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from coordinator.chain import Chain
-from coordinator.result import SCHEMA, LinkPart, Result, chain_part, write_result
+from coordinator.result import SCHEMA, ExponentialsPart, LinkPart, Result, chain_part, write_result
 
 
 def _chain() -> Chain:
@@ -37,6 +37,9 @@ def _result(robot: str = "robot") -> Result:
         reduced_chi2=1.0,
         unresolved=[],
         null_basis=[[0.0]] * 12,
+        chain_covariance=[[0.0] * 12] * 12,
+        transforms=[],
+        product_of_exponentials=ExponentialsPart(screws=[], tips=[]),
         links=[LinkPart(parent="A", child="B", link_length_mm=171.0, link_length_sigma_mm=0.9)],
         pairs=[],
         denavit_hartenberg=[],
