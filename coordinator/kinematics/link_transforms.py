@@ -75,10 +75,10 @@ def _transform(
     chain: Chain, child: int, from_face: Array, to_face: Array, covariance: Array, null_basis: Array
 ) -> LinkTransform:
     parent = chain.parent[child]
-    pose = np.linalg.solve(from_face, to_face)
+    pose = np.asarray(np.linalg.solve(from_face, to_face), dtype=np.float64)
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
     slope = np.zeros((6, covariance.shape[0]))
-    inverse: Array = np.linalg.inv(from_face)
+    inverse = np.asarray(np.linalg.inv(from_face), dtype=np.float64)
     local = parameter_slope(pose) @ adjoint(inverse)
     slope[:, 6 * child : 6 * child + 6] = local
     slope[:, 6 * parent : 6 * parent + 6] -= local
