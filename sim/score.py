@@ -19,14 +19,12 @@ from coordinator.chain import Array, Chain
 from coordinator.dynamics.differentiation import resample
 from coordinator.kinematics.increments import frozen
 from coordinator.result import SCHEMA, ChainPart, LinkPart, UnresolvedPart
-from sim.gauge import align_gauge, move_root, reorder, reorder_basis, tip_error
+from sim.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.truth import Motion, read_motion, read_truth
 
-POSES = 1000
 # A torque below what the sensor resolves is no scale to measure errors by: a bare output turns against next
 # to nothing.
 LEAST_TORQUE_NM = 0.02
-_SEED = 1
 
 
 class ScoreError(ValueError):
@@ -37,8 +35,8 @@ class LinkScore(BaseModel):
     """One link; a value is None if the result has no such link.
 
     The length is the perpendicular distance from the parent's joint axis to the child's IMU at q = 0, its
-    error is estimate - truth. The axis error is the angle between true and estimated axis of the parent in
-    the child's IMU frame at q = 0.
+    error is estimate - truth. The vector is that from the axis to the IMU, across the axis; its error and the
+    angle between true and estimated axis are those in the child's IMU frame at q = 0.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -48,6 +46,7 @@ class LinkScore(BaseModel):
     link_length_true_mm: float
     link_length_error_mm: float | None
     link_length_sigma_mm: float | None
+    link_vector_error_mm: float | None
     axis_error_deg: float | None
 
 
@@ -175,59 +174,6 @@ def table(found: Score) -> Table:
     return shown
 
 
-def topology_differences(estimated: Chain, truth: Chain) -> list[str]:
-    """Say in words where parents or mounting differ, in the order of the truth; empty if all is right."""
-    words = [f"module {s} was not found" for s in truth.serials if s not in estimated.serials]
-    words += [f"module {s} does not exist" for s in estimated.serials if s not in truth.serials]
-    for true_index, serial in enumerate(truth.serials):
-        if serial not in estimated.serials:
-            continue
-        index = estimated.serials.index(serial)
-        is_on, found_on = _parent(truth, true_index), _parent(estimated, index)
-        if is_on != found_on:
-            words.append(f"module {serial} is mounted on {is_on}, the result says on {found_on}")
-        if truth.reversed[true_index] != estimated.reversed[index]:
-            is_so, found_so = _mounting(truth, true_index), _mounting(estimated, index)
-            words.append(f"module {serial} is mounted {is_so}, the result says {found_so}")
-    return words
-
-
-def link_length_m(chain: Chain, child: int) -> float:
-    """Return the perpendicular distance from the axis of a module's parent to its IMU at q = 0."""
-    parent = chain.parent[child]
-    arm = chain.imu_home[child, :3, 3] - chain.point[parent]
-    return float(np.linalg.norm(np.cross(chain.axis[parent], arm)))
-
-
-def tip_errors(estimated: Chain, truth: Chain, basis: Array) -> tuple[float, float]:
-    """Return rms errors of position [mm] and orientation [deg] of the leaves over random configurations.
-
-    Args:
-        estimated, truth: chains of the same modules with the same parents, in any order.
-        basis: (6 n, k) directions of `estimated` that are unidentifiable.
-    """
-    root = estimated.parent.index(-1)
-    basis = reorder_basis(estimated, basis, truth.serials)
-    origin = truth.serials.index(estimated.serials[root])
-    estimated = reorder(estimated, truth.serials)
-    if origin != truth.parent.index(-1):
-        # With several modules on the base the two chains may begin at different ones, and the root frame is
-        # the first one's housing, in which the catalogue places the IMU.
-        pose = truth.imu_home[origin] @ np.linalg.inv(estimated.imu_home[origin])
-        estimated, basis = move_root(estimated, basis, pose)
-    q = np.random.default_rng(_SEED).uniform(-np.pi, np.pi, (POSES, len(truth.serials)))
-    error = tip_error(align_gauge(estimated, truth, basis, q), truth, q)
-    return 1e3 * error.position_m, float(np.degrees(error.orientation_rad))
-
-
-def _parent(chain: Chain, index: int) -> str:
-    return "the base" if chain.parent[index] < 0 else chain.serials[chain.parent[index]]
-
-
-def _mounting(chain: Chain, index: int) -> str:
-    return "reversed" if chain.reversed[index] else "forward"
-
-
 def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[LinkScore]:
     sigma = {(link.parent, link.child): link.link_length_sigma_mm for link in claimed}
     found = []
@@ -235,35 +181,19 @@ def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[Link
         if truth.parent[child] < 0:
             continue
         parent = truth.serials[truth.parent[child]]
-        error, angle = _link_errors(estimated, truth, child)
+        error = link_errors(estimated, truth, child)
         found.append(
             LinkScore(
                 parent=parent,
                 child=serial,
                 link_length_true_mm=1e3 * link_length_m(truth, child),
-                link_length_error_mm=error,
+                link_length_error_mm=None if error is None else 1e3 * error.length_m,
                 link_length_sigma_mm=sigma.get((parent, serial)),
-                axis_error_deg=angle,
+                link_vector_error_mm=None if error is None else 1e3 * error.vector_m,
+                axis_error_deg=None if error is None else error.axis_deg,
             )
         )
     return found
-
-
-def _link_errors(estimated: Chain, truth: Chain, child: int) -> tuple[float | None, float | None]:
-    """Return the errors of length [mm] and axis [deg] of a true link, None if the result has no such link."""
-    serial = truth.serials[child]
-    if serial not in estimated.serials:
-        return None, None
-    own = estimated.serials.index(serial)
-    if _parent(estimated, own) != _parent(truth, child):
-        return None, None
-    length = 1e3 * (link_length_m(estimated, own) - link_length_m(truth, child))
-    found, expected = (
-        chain.imu_home[k, :3, :3].T @ chain.axis[chain.parent[k]]
-        for chain, k in ((estimated, own), (truth, child))
-    )
-    angle = np.arctan2(np.linalg.norm(np.cross(found, expected)), found @ expected)
-    return length, float(np.degrees(angle))
 
 
 def _torque(run: Path, result: _ResultFile) -> _TorqueScore:

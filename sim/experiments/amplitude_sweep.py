@@ -17,12 +17,12 @@ from coordinator.plan import Plan
 from module_agent.estimate.circle_point_analysis import CircleFit
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
 from module_agent.wire.feedback_rows import Rows
+from sim.chain_score import link_length_m
 from sim.experiments.one_joint_rig import JOINT, OneJointRig, TrialRows, analyse
 from sim.experiments.thesis_lengths import ALIGNMENTS, Alignment, thesis_length
 from sim.noise_choice import NoiseChoice
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import true_chain
-from sim.score import link_length_m
 
 Purpose = Literal["sweep", "repeats"]
 ROBOTS_OWN_NOISE = NoiseChoice()

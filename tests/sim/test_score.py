@@ -12,10 +12,11 @@ from rich.console import Console
 from coordinator.chain import Array, Chain
 from coordinator.kinematics.increments import apply_increment
 from coordinator.result import chain_part
+from sim.chain_score import tip_errors
 from sim.gauge import reorder
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
-from sim.score import Score, ScoreError, score, table, tip_errors, write_score
+from sim.score import Score, ScoreError, score, table, write_score
 from sim.truth import write_truth
 
 ROBOT = load_robot("tree_y")
