@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from coordinator.clock import Clock
+from coordinator.hrdf import write_hrdf
 from coordinator.identify import (
     Identified,
     identify,
@@ -19,7 +20,7 @@ from coordinator.radio import Post, Radio
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.result import Result, write_result
 from coordinator.robot_link import RobotLink
-from coordinator.run_folder import HELD_OUT, RESULT, SESSION, URDF, VIEW, open_run_folder
+from coordinator.run_folder import HELD_OUT, HRDF, RESULT, SESSION, URDF, VIEW, open_run_folder
 from coordinator.session import Session
 from coordinator.session_file import SessionWriter, read_session
 from coordinator.urdf import write_urdf
@@ -187,5 +188,6 @@ def write_outputs(out: Path, found: Identified) -> None:
     phi = found.inertia.phi if found.inertia is not None else None
     types = [module_type(found.result.types[s]) for s in found.result.serials]
     write_urdf(out / URDF, found.kinematics.fit.chain, phi, found.result.robot, types)
+    write_hrdf(out / HRDF, found.kinematics.fit.chain, types, phi, found.result.robot)
     if found.held_out is not None:
         write_held_out(out / HELD_OUT, found.held_out)

@@ -1,4 +1,4 @@
-"""The folder of one run: `session.mcap`, `session.rrd`, `result.json`, `robot.urdf`, `held_out.npz`."""
+"""The folder of one run: recording, view, result and the robot as URDF and HRDF."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,11 +10,12 @@ from coordinator.recording import Recording
 from coordinator.session_file import SessionFileError, read_session
 from module_agent.wire.refusal import WireError
 
-SESSION, VIEW, RESULT, URDF, HELD_OUT = (
+SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT = (
     "session.mcap",
     "session.rrd",
     "result.json",
     "robot.urdf",
+    "robot.hrdf",
     "held_out.npz",
 )
 ASIDE = "session.crashed.mcap"

@@ -72,7 +72,7 @@ def robot_element(
     _comment(robot, "Joint positions are the modules' own; every frame is where it is at q = 0. SI units.")
     SubElement(robot, "link", name="world")
     SubElement(robot, "link", name="base")
-    _joint(robot, "world_to_base", "fixed", "world", "base", _upright(chain.gravity))
+    _joint(robot, "world_to_base", "fixed", "world", "base", upright_pose(chain.gravity))
     for i, serial in enumerate(chain.serials):
         link = SubElement(robot, "link", name=f"body_{serial}")
         if bodies is not None:
@@ -117,7 +117,8 @@ def _shortest_turn(from_direction: Array, to_direction: Array) -> Array:
     return found
 
 
-def _upright(gravity: Array) -> Array:
+def upright_pose(gravity: Array) -> Array:
+    """Return the pose (4, 4) of the root frame in a world with z up, by the shortest turn."""
     pose = np.eye(4)
     length = float(np.linalg.norm(gravity))
     if length > 0.0:

@@ -10,6 +10,7 @@ FILES = (
     "session.rrd",
     "result.json",
     "robot.urdf",
+    "robot.hrdf",
     "held_out.npz",
     "truth.json",
     "truth.npz",
