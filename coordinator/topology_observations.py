@@ -21,8 +21,6 @@ from coordinator.recording import Recording
 # Joints that give ring at 3 to 20 Hz; the slow motion itself is over in about a second.
 CUTOFF_HZ = 10.0
 KEEP_EVERY = 5
-# The IMU's own axes and scale, and links that bend: beyond what encoders and scatter can tell.
-RATIO_FLOOR = 0.05
 
 
 class Seen(NamedTuple):
@@ -138,5 +136,5 @@ def _of_one(seen: MotionEvidence, k: int) -> MotionEvidence:
 def _motion_seen(seen: MotionEvidence) -> MotionSeen:
     ratio = float(seen.rate_ratio[0])
     moved = ratio > 0.5
-    sigma = float(np.sqrt(seen.sigma[0] ** 2 + seen.give**2 + RATIO_FLOOR**2))
-    return MotionSeen(moved, ratio, seen.coefficient[0] / ratio if moved else None, sigma, seen.give)
+    axis = seen.coefficient[0] / ratio if moved else None
+    return MotionSeen(moved, ratio, axis, float(seen.ratio_sigma[0]), seen.give)

@@ -13,6 +13,11 @@ import numpy as np
 from coordinator.chain import Array
 
 BLOCKS = 6
+# Of a thousand observations, one has gone wrong in a way that is in no model: it tells nothing.
+ODD = 1e-3
+# The IMU's own scale and axes, links that bend, a base that shakes: seen by no encoder, and repeating with
+# the motion. Clean ratios of uncalibrated modules are within 0.03 of 0 and 1.
+RATIO_FLOOR = 0.05
 # Less than this over a motion is no motion: encoders and springs of a joint that is stuck still jitter.
 LEAST_RATE_RAD_S = 0.02
 # Six blocks of four samples are the least that tells how much they differ.
@@ -40,6 +45,25 @@ class MotionEvidence(NamedTuple):
     def rate_ratio(self) -> Array:
         """(n,) sizes of the coefficients: 1 if carried, 0 if not."""
         return np.asarray(np.linalg.norm(self.coefficient, axis=1))
+
+    @property
+    def ratio_sigma(self) -> Array:
+        """(n,) what the ratios may be wrong by, systematic errors included.
+
+        The other joints' motion adds anything between -`give` and `give`: a uniform distribution.
+        """
+        return np.asarray(np.sqrt(self.sigma**2 + self.give**2 / 3.0 + RATIO_FLOOR**2))
+
+
+def carried_log_odds(rate_ratio: float, sigma: float) -> float:
+    """Return the log-odds that an IMU with this rate ratio is carried.
+
+    Normal errors about 1 if carried and 0 if not, and in a share `ODD` of all cases anything from 0 to 2: so
+    a ratio that fits neither tells next to nothing, and none tells more than about 9, 1 to 8000.
+    """
+    scale = sigma * np.sqrt(2.0 * np.pi)
+    fits = [np.exp(-0.5 * ((rate_ratio - at) / sigma) ** 2) / scale for at in (1.0, 0.0)]
+    return float(np.log((fits[0] + 0.5 * ODD) / (fits[1] + 0.5 * ODD)))
 
 
 def motion_evidence(joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s: Array) -> MotionEvidence:

@@ -3,15 +3,34 @@
 The joints that move a module's IMU are the ones between it and the base. So the joints that move it, its own
 apart, are its ancestors; the parent is the ancestor that itself has the most ancestors. A module that moves
 with its own joint is mounted reversed: by its output, so that the housing turns.
+
+Every observation counts by its own certainty: the forest is the likeliest one, each of its edges comes with
+the odds that it is right, and what contradicts it or leaves it in doubt is named.
 """
 
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Collection, Iterator, Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
 
 from coordinator.chain import Array
+from coordinator.kinematics.forest_likelihood import (
+    Parents,
+    ancestors,
+    edge_log_odds,
+    likeliest_forest,
+    rivals,
+)
 from coordinator.kinematics.forward import BASE
+from coordinator.kinematics.motion_evidence import carried_log_odds
 
 UNDECIDED = 0.5
+# What is less likely than this (log-odds) to be right is worth another motion: 1 in 100 may be wrong.
+DOUBTFUL_BELOW = float(np.log(99.0))
+# What is less likely than this is not believed at all: one in four would be wrong.
+UNBELIEVABLE_BELOW = float(np.log(3.0))
+# An observation that is surer than this and does not fit has seen something: it is not outvoted.
+CONTRADICTS_ABOVE = float(np.log(19.0))
 
 
 class MotionSeen(NamedTuple):
@@ -20,6 +39,8 @@ class MotionSeen(NamedTuple):
     moved: whether its IMU was carried along.
     rate_ratio: size of the gyro's answer to the joint's rate, 1 if carried, 0 if not.
     axis: (3,) direction in the IMU's frame about which it turned when the joint's position grew, if it did.
+    sigma: one standard deviation of the ratio, systematic errors included. give: the part of it that comes
+        from other joints moving along (see `motion_evidence`).
     """
 
     moved: bool
@@ -28,18 +49,47 @@ class MotionSeen(NamedTuple):
     sigma: float = 0.1
     give: float = 0.0
 
+    @property
+    def log_odds(self) -> float:
+        """Log-odds that the IMU was carried."""
+        size = abs(carried_log_odds(self.rate_ratio, self.sigma))
+        return size if self.moved else -size
+
+
+class Doubt(NamedTuple):
+    """What is not certain, how certain it is, and what was seen least clearly of what would settle it.
+
+    log_odds: that the answer in the topology is right; for a contradiction, that the observation is wrong.
+    joint, observer: the observation to repeat.
+    """
+
+    kind: Literal["parent", "mounting", "contradiction"]
+    module: str
+    log_odds: float
+    joint: str
+    observer: str
+    text: str
+
 
 class Topology(NamedTuple):
     """A forest of modules, parents before children: by depth, then by serial.
 
     parent: index of the parent module, -1 on the base. reversed: mounted by the output.
-    confidence: the smallest distance of any rate ratio from the undecided 0.5; 0.5 is the best there is.
+    confidence: the probability that the least certain of all these answers is right.
+    parent_log_odds, reversed_log_odds: log-odds of every answer, against all that could be instead; 0 is a
+        toss-up, and so is the mounting of a module whose joint did not move.
+    unmoved: modules whose joints did not move. What they carry stands in the forest on their parents.
+    doubts: what another motion should settle, the least certain first.
     """
 
     serials: tuple[str, ...]
     parent: tuple[int, ...]
     reversed: tuple[bool, ...]
     confidence: float
+    parent_log_odds: tuple[float, ...] = ()
+    reversed_log_odds: tuple[float, ...] = ()
+    unmoved: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
 
     @property
     def roots(self) -> tuple[str, ...]:
@@ -58,26 +108,148 @@ class TopologyError(ValueError):
 Observations = Mapping[tuple[str, str], MotionSeen]
 
 
-def find_topology(observations: Observations) -> Topology:
+def find_topology(observations: Observations, unmoved: Collection[str] = ()) -> Topology:
     """Derive the tree from what every module saw of every joint: {(joint, observer): MotionSeen}.
 
+    Args:
+        observations: of all pairs; a few may be missing where the others make up for them.
+        unmoved: modules whose joints did not move, of which therefore nothing was seen.
+
     Raises:
-        TopologyError: observations are missing or contradict each other, with the serials.
+        TopologyError: too many observations are missing, they contradict each other beyond noise, or they
+            leave open how a module is mounted; with the serials.
     """
-    serials = sorted({serial for pair in observations for serial in pair})
-    _check_complete(serials, observations)
-    movers = {k: [i for i in serials if i != k and observations[i, k].moved] for k in serials}
-    for problem in _contradictions(serials, movers):
-        raise _explained(problem, observations)
+    found = likely_topology(observations, unmoved)
+    serials = list(found.serials)
     _check_reversed(serials, observations)
-    ordered = sorted(serials, key=lambda k: (len(movers[k]), k))
-    index = {serial: n for n, serial in enumerate(ordered)}
+    wrong = [d for d in found.doubts if d.kind == "contradiction" and d.log_odds < -CONTRADICTS_ABOVE]
+    if wrong:
+        raise _contradiction_error(wrong[0], serials, observations)
+    open_ = [d for d in found.doubts if d.kind != "contradiction" and d.log_odds < UNBELIEVABLE_BELOW]
+    if open_:
+        raise TopologyError(open_[0].text, tuple(dict.fromkeys((open_[0].module, open_[0].joint))))
+    return found
+
+
+def likely_topology(observations: Observations, unmoved: Collection[str] = ()) -> Topology:
+    """Derive the likeliest tree, however likely it is; `find_topology` is what to believe.
+
+    Raises:
+        TopologyError: a module has seen nothing, or nobody has seen its joint and it is not `unmoved`.
+    """
+    serials = sorted({serial for pair in observations for serial in pair} | set(unmoved))
+    _check_complete(serials, observations, unmoved)
+    odds = _log_odds(serials, observations)
+    leaves = frozenset(serials.index(s) for s in unmoved)
+    parent = likeliest_forest(odds, leaves)
+    others = rivals(parent, odds, leaves)
+    case = _Case(serials, observations, odds, parent, others, edge_log_odds(parent, others))
+    return _described(case, unmoved)
+
+
+class _Case(NamedTuple):
+    """A forest in the order of `serials`, what it was made of, and what else it could be."""
+
+    serials: list[str]
+    observations: Observations
+    odds: Array
+    parent: Parents
+    others: dict[Parents, float]
+    edge_odds: Array
+
+
+def _log_odds(serials: list[str], observations: Observations) -> Array:
+    """Return (n, n) log-odds that joint i carries the IMU of module k, 0 for what was not seen."""
+    odds = np.zeros((len(serials), len(serials)))
+    for i, joint in enumerate(serials):
+        for k, observer in enumerate(serials):
+            seen = observations.get((joint, observer))
+            odds[i, k] = seen.log_odds if seen is not None else 0.0
+    return odds
+
+
+def _described(case: _Case, unmoved: Collection[str]) -> Topology:
+    depth = ancestors(case.parent).sum(axis=0)
+    order = sorted(range(len(case.serials)), key=lambda k: (depth[k], case.serials[k]))
+    index = {k: n for n, k in enumerate(order)} | {BASE: BASE}
+    turned = np.diag(case.odds)
+    moved = [k for k in order if case.serials[k] not in unmoved]
+    least = min([*case.edge_odds, *np.abs(turned[moved])], default=np.inf)
     return Topology(
-        serials=tuple(ordered),
-        parent=tuple(max((index[i] for i in movers[k]), default=BASE) for k in ordered),
-        reversed=tuple(observations[k, k].moved for k in ordered),
-        confidence=min((abs(o.rate_ratio - UNDECIDED) for o in observations.values()), default=UNDECIDED),
+        serials=tuple(case.serials[k] for k in order),
+        parent=tuple(index[case.parent[k]] for k in order),
+        reversed=tuple(bool(turned[k] > 0.0) for k in order),
+        confidence=float(1.0 / (1.0 + np.exp(-least))),
+        parent_log_odds=tuple(float(case.edge_odds[k]) for k in order),
+        reversed_log_odds=tuple(float(abs(turned[k])) for k in order),
+        unmoved=tuple(sorted(unmoved)),
+        doubts=tuple(sorted(_doubts(case, unmoved), key=lambda d: d.log_odds)),
     )
+
+
+# ---------------------------------------------------------------------- doubts
+
+
+def _doubts(case: _Case, unmoved: Collection[str]) -> Iterator[Doubt]:
+    for k, serial in enumerate(case.serials):
+        if case.edge_odds[k] < DOUBTFUL_BELOW:
+            yield _parent_doubt(case, k)
+        if serial not in unmoved and abs(case.odds[k, k]) < DOUBTFUL_BELOW:
+            yield _mounting_doubt(case, k)
+    above = ancestors(case.parent)
+    for i, k in np.argwhere((case.odds > 0.0) != above):
+        if i != k and (case.serials[i], case.serials[k]) in case.observations:
+            yield from _outvoted(case, int(i), int(k))
+
+
+def _parent_doubt(case: _Case, k: int) -> Doubt:
+    """Name the likeliest other parent, and the least certain of the observations that tell them apart."""
+    rival = max((r for r in case.others if r[k] != case.parent[k]), key=lambda r: case.others[r])
+    apart = np.argwhere(ancestors(case.parent) != ancestors(rival))
+    i, o = min(apart, key=lambda pair: abs(case.odds[tuple(pair)]))
+    on, instead = (case.serials[p] if p != BASE else "the base" for p in (case.parent[k], rival[k]))
+    odds, joint, observer = float(case.edge_odds[k]), case.serials[i], case.serials[o]
+    text = (
+        f"whether {case.serials[k]} is mounted on {on} or on {instead} is not certain ({_chance(odds)}): "
+        f"{_saw(case.observations, joint, observer)}; repeat that motion"
+    )
+    return Doubt("parent", case.serials[k], odds, joint, observer, text)
+
+
+def _mounting_doubt(case: _Case, k: int) -> Doubt:
+    serial, odds = case.serials[k], float(abs(case.odds[k, k]))
+    text = (
+        f"whether {serial} is mounted forward or reversed is not certain ({_chance(odds)}): "
+        f"{_saw(case.observations, serial, serial)}; repeat that motion"
+    )
+    return Doubt("mounting", serial, odds, serial, serial, text)
+
+
+def _outvoted(case: _Case, i: int, k: int) -> Iterator[Doubt]:
+    """Name an observation that does not fit; if it is a sure one, all those of which one must be wrong."""
+    joint, observer, odds = case.serials[i], case.serials[k], float(abs(case.odds[i, k]))
+    pairs = {(joint, observer): None}
+    if odds > CONTRADICTS_ABOVE and (
+        found := _impossible(case.serials, case.observations, (joint, observer))
+    ):
+        pairs |= dict.fromkeys(found.pairs)
+    for pair in pairs:
+        text = f"{_saw(case.observations, *pair)}, which does not fit the rest; repeat that motion"
+        yield Doubt("contradiction", pair[1], -odds, *pair, text)
+
+
+def _saw(observations: Observations, joint: str, observer: str) -> str:
+    seen = observations.get((joint, observer))
+    if seen is None:
+        return f"{observer} saw nothing of joint {joint}"
+    return f"{observer} saw joint {joint} with a rate ratio of {seen.rate_ratio:.2f} +- {seen.sigma:.2f}"
+
+
+def _chance(log_odds: float) -> str:
+    return f"{100.0 / (1.0 + np.exp(-log_odds)):.1f} %"
+
+
+# ---------------------------------------------------------------------- what no tree allows
 
 
 class _Contradiction(NamedTuple):
@@ -85,25 +257,22 @@ class _Contradiction(NamedTuple):
     pairs: tuple[tuple[str, str], ...]  # the observations that cannot all be true
 
 
-def _check_complete(serials: list[str], observations: Observations) -> None:
+def _check_complete(serials: list[str], observations: Observations, unmoved: Collection[str]) -> None:
     """A module that never answered is named as such, rather than with each of its missing pairs.
 
     Raises:
-        TopologyError: a pair is missing.
+        TopologyError: a module has seen nothing, or nobody has seen its joint and it is not `unmoved`.
     """
-    missing = [(i, k) for i in serials for k in serials if (i, k) not in observations]
-    if not missing:
-        return
-    silent = tuple(k for k in serials if all((i, k) in missing for i in serials))
-    unmoved = tuple(i for i in serials if all((i, k) in missing for k in serials))
+    joints, observers = {i for i, _ in observations}, {k for _, k in observations}
+    silent = [k for k in serials if k not in observers]
+    unseen = [i for i in serials if i not in joints and i not in unmoved]
     parts = [f"module {k} reported on no joint" for k in silent]
-    parts += [f"nobody reported on joint {i}" for i in unmoved]
-    rest = [(i, k) for i, k in missing if k not in silent and i not in unmoved]
-    parts += [f"module {k} did not report on joint {i}" for i, k in rest]
-    culprits = [*silent, *unmoved, *(serial for pair in rest for serial in pair)]
-    raise TopologyError(
-        "; ".join(parts) + ". Every module must have watched every joint", tuple(dict.fromkeys(culprits))
-    )
+    parts += [f"nobody reported on joint {i}" for i in unseen]
+    if parts:
+        raise TopologyError(
+            "; ".join(parts) + ". Every module must have watched every joint",
+            tuple(dict.fromkeys([*silent, *unseen])),
+        )
 
 
 def _contradictions(serials: list[str], movers: Mapping[str, list[str]]) -> Iterator[_Contradiction]:
@@ -126,13 +295,26 @@ def _contradictions(serials: list[str], movers: Mapping[str, list[str]]) -> Iter
                     )
 
 
-def _explained(problem: _Contradiction, observations: Observations) -> TopologyError:
-    joint, observer = min(problem.pairs, key=lambda pair: abs(observations[pair].rate_ratio - UNDECIDED))
+def _impossible(
+    serials: list[str], observations: Observations, pair: tuple[str, str]
+) -> _Contradiction | None:
+    movers = {k: [i for i in serials if i != k and _carried(observations, i, k)] for k in serials}
+    return next((found for found in _contradictions(serials, movers) if pair in found.pairs), None)
+
+
+def _contradiction_error(doubt: Doubt, serials: list[str], observations: Observations) -> TopologyError:
+    """Say what no tree allows, with the observation that does not fit the rest."""
+    pair = (doubt.joint, doubt.observer)
+    found = _impossible(serials, observations, pair)
+    told, pairs = (f"{found.text}: no tree does that. ", found.pairs) if found is not None else ("", ())
     return TopologyError(
-        f"{problem.text}: no tree does that. The least certain of these is what {observer} saw of joint "
-        f"{joint}, rate ratio {observations[joint, observer].rate_ratio:.2f}; repeat that motion",
-        tuple(dict.fromkeys(serial for pair in problem.pairs for serial in pair)),
+        f"{told}{doubt.text}", tuple(dict.fromkeys(serial for one in (pair, *pairs) for serial in one))
     )
+
+
+def _carried(observations: Observations, joint: str, observer: str) -> bool:
+    seen = observations.get((joint, observer))
+    return seen is not None and seen.moved
 
 
 def _check_reversed(serials: list[str], observations: Observations) -> None:
@@ -142,8 +324,8 @@ def _check_reversed(serials: list[str], observations: Observations) -> None:
         TopologyError: a module turned about something else.
     """
     for k in serials:
-        seen = observations[k, k]
-        if seen.moved and seen.axis is not None and seen.axis[2] > -0.7:
+        seen = observations.get((k, k))
+        if seen is not None and seen.moved and seen.axis is not None and seen.axis[2] > -0.7:
             raise TopologyError(
                 f"{k} moved with its own joint, as a reversed module does, but about "
                 f"{seen.axis.round(2).tolist()} instead of -z of its IMU: check its encoder's sign, "
