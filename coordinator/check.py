@@ -1,0 +1,67 @@
+"""A check of a known robot: two runs, the one that it is known from and a later one, in one report."""
+
+from coordinator.check_change import find_changes
+from coordinator.check_fit import tied_fits
+from coordinator.check_report import CheckReport, Session, compared, other_robot
+from coordinator.kinematics.topology import Topology
+from coordinator.known_robot import KnownRobot
+from coordinator.plan import Plan
+
+BASE_NAME = "base"
+
+
+class CheckError(ValueError):
+    """The two runs cannot be compared; the message says which of them lacks what."""
+
+
+def check_plan(plan: Plan) -> Plan:
+    """Return a plan as short as a check takes: every joint moves as in a full run, for a shorter time."""
+    short = {
+        "dynamics": False,
+        "discover_s": min(plan.discover_s, 0.5),
+        "link_s": min(plan.link_s, 0.5),
+        "settle_s": min(plan.settle_s, 0.3),
+        "travel_speed_rad_s": max(plan.travel_speed_rad_s, 1.5),
+        "sine_centre_s": min(plan.sine_centre_s, 1.6),
+        "sine_sigma_s": min(plan.sine_sigma_s, 0.7),
+    }
+    return plan.model_copy(update=short)
+
+
+def check(known: KnownRobot, later: KnownRobot) -> CheckReport:
+    """Say which links of a robot changed from one run to a later one.
+
+    Raises:
+        CheckError: a recording has a hole, or too few samples.
+    """
+    journal = later.recording.journal
+    times = [event.t_ns for event in journal]
+    session = Session(
+        robot=later.name,
+        known=str(known.folder),
+        robot_time_s=(max(times) - min(times)) / 1e9 if times else 0.0,
+    )
+    before, after = _mounted(known.kinematics.topology), _mounted(later.kinematics.topology)
+    if before != after:
+        return other_robot(
+            session,
+            missing=[s for s in before if s not in after],
+            new=[s for s in after if s not in before],
+            remounted=[s for s in before if s in after and before[s] != after[s]],
+        )
+    try:
+        fits = tied_fits(known, later)
+    except ValueError as error:
+        raise CheckError(f"{later.folder} cannot be compared with {known.folder}: {error}") from error
+    return compared(session, fits.before.chain, fits.after.chain, find_changes(fits))
+
+
+def _mounted(topology: Topology) -> dict[str, tuple[str, bool]]:
+    """Return every module's parent, and whether it is mounted reversed."""
+    names = (*topology.serials, BASE_NAME)
+    return {
+        serial: (names[parent], backwards)
+        for serial, parent, backwards in zip(
+            topology.serials, topology.parent, topology.reversed, strict=True
+        )
+    }

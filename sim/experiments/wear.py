@@ -1,0 +1,178 @@
+"""Wear: a link of a known robot is displaced by a little, and a check on another day is to find it.
+
+The robot is recorded once, and checked on many days: the modules and their errors are the same, noise, drift
+and network are another day's.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array, Chain
+from coordinator.check import check, check_plan
+from coordinator.check_report import CheckReport, LinkCheck
+from coordinator.kinematics.forward import BASE, ancestors
+from coordinator.known_robot import KnownRobot, load_known
+from coordinator.plan import Plan
+from coordinator.terminal import Terminal
+from sim.parts import FreePose, Part
+from sim.robot_file import Robot, load_robot
+from sim.robot_tree import true_chain
+from sim.virtual_run import VirtualConfig, run_virtual
+
+# Seeds that share a robot: it is recorded once for all of them in a process.
+DAYS = 20
+PARALLEL = 0.999
+
+
+class WearTrial(NamedTuple):
+    """What one check made of a robot of which one link was displaced, or none.
+
+    found: it said that something has changed. located: and that of all links it was this one alone.
+    size_error_m: by how much it got the displacement's length wrong, vector_error_m: the displacement; None
+    if it was not located. false_alarm: it named a link that had not changed. child: whose link it was.
+    """
+
+    found: bool
+    located: bool
+    size_error_m: float | None
+    false_alarm: bool
+    robot_time_s: float
+    vector_error_m: float | None
+    child: str | None
+    words: tuple[str, ...]
+
+
+class Wear(NamedTuple):
+    """A link's far end displaced by `displacement_m` (3,), in the frame of the IMU of its module `child`."""
+
+    child: str
+    displacement_m: Array
+
+
+class _Subject(NamedTuple):
+    """Which robot, and what it is checked with."""
+
+    robot: str
+    noise: str
+    network: str
+    seed: int
+
+
+def wear_trial(
+    seed: int,
+    changed: bool,
+    robot: str = "a2085_06",
+    noise: str = "x5-uncalibrated",
+    network: str = "lan",
+    change_m: float = 2e-3,
+) -> WearTrial:
+    """Check a robot that is known, with one link displaced or as it was.
+
+    Args:
+        seed: `DAYS` successive ones are days of the same robot; the link and the direction follow from it.
+        changed: whether a link is displaced.
+        robot: a shipped robot, or a robot file.
+        noise, network: profiles.
+        change_m: by how much.
+    """
+    subject = _Subject(robot, noise, network, seed // DAYS)
+    wear = draw_wear(load_robot(robot), seed, change_m) if changed else None
+    known = _known(subject)
+    with tempfile.TemporaryDirectory() as folder:
+        later = _recorded(subject, Path(folder) / "run", 1 + seed % DAYS, check_plan(Plan()), wear)
+        return _trial(check(known, later), wear)
+
+
+def worn(robot: Robot, wear: Wear) -> Robot:
+    """Return a robot with one link displaced at its far end, and all beyond it with it.
+
+    Raises:
+        ValueError: the robot has no such module.
+    """
+    if wear.child not in robot.serials:
+        raise ValueError(f"robot {robot.name} has no module {wear.child}; it has {', '.join(robot.serials)}")
+    k = robot.serials.index(wear.child)
+    # The link ends in the module's housing frame, or in its output frame: at q = 0 both are parallel to its
+    # IMU's.
+    x, y, z = (float(v) for v in wear.displacement_m)
+    part = Part(pose=FreePose(xyz_m=(x, y, z)))
+    module = robot.modules[k]
+    longer = module.model_copy(update={"link": (*module.link, part)})
+    return robot.model_copy(update={"modules": (*robot.modules[:k], longer, *robot.modules[k + 1 :])})
+
+
+def draw_wear(robot: Robot, seed: int, change_m: float) -> Wear:
+    """Draw a link and a direction: any that some motion can show.
+
+    A displacement along an axis shows in the motions of the joints further up; where all of these have
+    parallel axes, as at the first link of an arm, it moves nothing that any joint could tell.
+    """
+    rng = np.random.default_rng((seed, 0x57EA2))
+    chain = true_chain(robot)
+    k = int(rng.integers(1, len(chain.serials)))
+    direction = rng.standard_normal(3)
+    hidden = _hidden(chain, k)
+    if hidden is not None:
+        direction -= hidden * (hidden @ direction)
+    root = direction / np.linalg.norm(direction)
+    return Wear(chain.serials[k], change_m * chain.imu_home[k, :3, :3].T @ root)
+
+
+def _hidden(chain: Chain, child: int) -> Array | None:
+    """Return the direction along which no joint shows that a module is displaced, in the root frame."""
+    parent = chain.parent[child]
+    axes = chain.axis[list(ancestors(chain, parent))] if parent != BASE else np.zeros((0, 3))
+    return axes[-1] if len(axes) and np.all(np.abs(axes @ axes[-1]) > PARALLEL) else None
+
+
+@lru_cache(maxsize=1)
+def _known(subject: _Subject) -> KnownRobot:
+    with tempfile.TemporaryDirectory() as folder:
+        return _recorded(subject, Path(folder) / "known", 0, Plan(dynamics=False), None)
+
+
+def _recorded(subject: _Subject, out: Path, day: int, plan: Plan, wear: Wear | None) -> KnownRobot:
+    robot = load_robot(subject.robot)
+    config = VirtualConfig(
+        robot if wear is None else worn(robot, wear),
+        out,
+        seed=subject.seed,
+        noise_seed=day,
+        noise=subject.noise,
+        network=subject.network,
+        plan=plan,
+    )
+    run_virtual(config, Terminal(quiet=True))
+    return load_known(out)
+
+
+def _trial(report: CheckReport, wear: Wear | None) -> WearTrial:
+    named = [link for link in report.links if link.changed]
+    child = wear.child if wear is not None else None
+    located = [link.child for link in named] == [child]
+    errors = _errors(named, wear) if located and wear is not None else (None, None)
+    return WearTrial(
+        found=report.changed,
+        located=located,
+        size_error_m=errors[0],
+        false_alarm=report.changed if wear is None else any(link.child != child for link in named),
+        robot_time_s=report.robot_time_s,
+        vector_error_m=errors[1],
+        child=child,
+        words=tuple(report.words),
+    )
+
+
+def _errors(named: Sequence[LinkCheck], wear: Wear) -> tuple[float, float]:
+    """Return how far off the found displacement is, in length and as a vector [m]."""
+    found = 1e-3 * np.array(named[0].displacement_mm)
+    true = wear.displacement_m
+    return (
+        float(abs(np.linalg.norm(found) - np.linalg.norm(true))),
+        float(np.linalg.norm(found - true)),
+    )
