@@ -1,7 +1,9 @@
 """Who moved with whom, out of a recording: every slow motion of every joint, as every IMU saw it.
 
 Slow motion decides: near a resonance of the held joints a fast one shakes modules that it does not carry, and
-holds others still that it does.
+holds others still that it does. The feedback of all modules at once tells more than each module's own view:
+how much other joints gave way, and how far the stretches of the motion agree. What a module found itself
+stands in where its feedback is missing, and makes less certain where it says otherwise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,22 +15,25 @@ from coordinator.chain import Array
 from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.dynamics.differentiation import differentiate, settling_samples, zero_phase_low_pass
 from coordinator.journal import JournalEvent
-from coordinator.kinematics.motion_evidence import MotionEvidence, NotMoved, combined, motion_evidence
-from coordinator.kinematics.topology import MotionSeen, Observations
+from coordinator.kinematics.motion_evidence import MotionEvidence, NotMoved, motion_evidence
+from coordinator.kinematics.topology import MotionSeen, Observations, seen_again
 from coordinator.motion_window import RATE_HZ, window
 from coordinator.recording import Recording
+from module_agent.wire.messages import Estimate, MotionRecord
 
 # Joints that give ring at 3 to 20 Hz; the slow motion itself is over in about a second.
 CUTOFF_HZ = 10.0
 KEEP_EVERY = 5
+# Of a module's own finding nobody knows how far it may be wrong: held joints give by 20 to 30 %.
+OWN_SIGMA = 0.2
 
 
 class Seen(NamedTuple):
     """What a recording says of who moved with whom.
 
     observations: {(joint, observer): MotionSeen}, of what was seen.
-    unmoved: joints that were told to move and did not, with how much they did in words.
-    blind: modules without feedback during any motion, and those whose clocks cannot be mapped.
+    unmoved: joints that were told to move and did not, with the reason in words.
+    blind: modules that saw no motion at all: no feedback, no clock, no findings.
     """
 
     observations: Observations
@@ -38,35 +43,22 @@ class Seen(NamedTuple):
 
 def observe(recording: Recording, serials: Sequence[str]) -> Seen:
     """Evaluate all slow motions of these modules; what is missing is left out rather than guessed."""
-    timed = [s for s in serials if recording.modules[s].round_trips and len(_all_rows(recording, s))]
-    clocks = map_clocks({s: recording.modules[s].round_trips for s in timed}) if timed else {}
-    offsets = {s: _gyro_offset(recording, s) for s in timed}
+    heard = [s for s in serials if recording.modules[s].round_trips and recording.modules[s].rows.end_row]
+    clocks = map_clocks({s: recording.modules[s].round_trips for s in heard}) if heard else {}
+    ear = _Ear(recording, clocks, {s: _gyro_offset(recording, s) for s in heard})
     observations: dict[tuple[str, str], MotionSeen] = {}
     unmoved: dict[str, str] = {}
-    for joint in timed:
-        found: dict[str, list[MotionEvidence]] = {}
-        for event in slow_motions(recording, joint):
-            watchers = _watchers(recording, clocks, timed, event)
-            if joint not in watchers:
-                continue
-            try:
-                seen = _evaluate(recording, clocks, watchers, offsets, event)
-            except NotMoved as error:
-                unmoved[joint] = str(error)
-                continue
-            for k, watcher in enumerate(watchers):
-                found.setdefault(watcher, []).append(_of_one(seen, k))
-        if found:
-            unmoved.pop(joint, None)
-        observations |= {(joint, watcher): _motion_seen(combined(many)) for watcher, many in found.items()}
+    for joint in serials:
+        found, why = _of_joint(ear, serials, joint)
+        observations |= {(joint, observer): seen_again(many) for observer, many in found.items()}
+        if not found:
+            unmoved[joint] = why
     watching = {observer for _, observer in observations}
-    moved_any = bool(observations)
-    blind = tuple(s for s in serials if s not in timed or (moved_any and s not in watching))
-    return Seen(observations, unmoved, blind)
+    return Seen(observations, unmoved, tuple(s for s in serials if s not in watching))
 
 
 def slow_motions(recording: Recording, joint: str) -> list[JournalEvent]:
-    """Return the constant motions of a joint that were completed since its module's latest boot."""
+    """Return the slow motions of a joint that were completed since its module's latest boot."""
     boot = recording.modules[joint].boot
     return [
         event
@@ -80,9 +72,91 @@ def slow_motions(recording: Recording, joint: str) -> list[JournalEvent]:
     ]
 
 
-def _all_rows(recording: Recording, serial: str) -> range:
-    rows = recording.modules[serial].rows
-    return range(rows.first_row, rows.end_row)
+class _Ear(NamedTuple):
+    """The recording, and of every module that was heard its clock and its gyro's offset."""
+
+    recording: Recording
+    clocks: Mapping[str, ClockMap]
+    offsets: Mapping[str, Array]
+
+
+def _of_joint(ear: _Ear, serials: Sequence[str], joint: str) -> tuple[dict[str, list[MotionSeen]], str]:
+    """Return what everyone saw of all motions of a joint; without any, why not."""
+    found: dict[str, list[MotionSeen]] = {}
+    why = "it was never told to move, or never came to the end of its motion"
+    for event in slow_motions(ear.recording, joint):
+        assert event.motion is not None
+        try:
+            by_feedback = _by_feedback(ear, event)
+        except NotMoved as error:
+            why = str(error)
+            continue
+        for observer in serials:
+            seen = _checked(by_feedback.get(observer), _finding(ear.recording, event.motion, joint, observer))
+            if seen is not None:
+                found.setdefault(observer, []).append(seen)
+        why = "nobody saw its motion"
+    return found, why
+
+
+def _by_feedback(ear: _Ear, event: JournalEvent) -> dict[str, MotionSeen]:
+    """Return what the feedback of all modules says of one motion; nothing without that of the joint.
+
+    Raises:
+        NotMoved: the joint hardly moved.
+    """
+    watchers = _watchers(ear, event)
+    if event.serial not in watchers:
+        return {}
+    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
+    one = window(ear.recording, ear.clocks, watchers, event, edge / RATE_HZ)
+    q, gyro = (zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ) for signal in (one.q_rad, one.gyro_rad_s))
+    kept = slice(edge, len(one.t_ns) - edge, KEEP_EVERY)
+    offset = np.array([ear.offsets[s] for s in watchers])
+    seen = motion_evidence(watchers.index(event.serial), differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
+    return {s: _motion_seen(seen, k) for k, s in enumerate(watchers)}
+
+
+def _watchers(ear: _Ear, event: JournalEvent) -> list[str]:
+    """Return the modules that have feedback of all of a motion; a module may fall silent in between."""
+    everyone = sorted(ear.clocks)
+    if event.serial not in everyone or _covered(ear, everyone, event):
+        return everyone
+    return [s for s in everyone if _covered(ear, [event.serial, s], event)]
+
+
+def _covered(ear: _Ear, serials: Sequence[str], event: JournalEvent) -> bool:
+    margin_s = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+    try:
+        found = window(ear.recording, ear.clocks, serials, event, margin_s)
+    except ValueError:
+        return False
+    # A window is cut to what all modules have: one that fell silent early must not cut the others short.
+    whole = window(ear.recording, ear.clocks, [event.serial], event, margin_s)
+    return len(found.t_ns) > 0.9 * len(whole.t_ns)
+
+
+def _motion_seen(seen: MotionEvidence, k: int) -> MotionSeen:
+    ratio = float(seen.rate_ratio[k])
+    moved = ratio > 0.5
+    axis = seen.coefficient[k] / ratio if moved else None
+    return MotionSeen(moved, ratio, axis, float(seen.ratio_sigma[k]), seen.give)
+
+
+def _finding(recording: Recording, motion: MotionRecord, joint: str, observer: str) -> Estimate | None:
+    """Return what a module itself found of one slow motion, if it found anything."""
+    found = recording.estimates.get((joint, observer), {}).get((motion.motion_id,))
+    return found if found is not None and not found.note else None
+
+
+def _checked(seen: MotionSeen | None, finding: Estimate | None) -> MotionSeen | None:
+    """Return what the feedback says, less certain if the module itself found otherwise."""
+    if finding is None:
+        return seen
+    if seen is None:
+        return MotionSeen(finding.moved, finding.rate_ratio, None, OWN_SIGMA)
+    apart = abs(seen.rate_ratio - finding.rate_ratio)
+    return seen._replace(sigma=float(np.hypot(seen.sigma, max(0.0, apart - seen.sigma))))
 
 
 def _gyro_offset(recording: Recording, serial: str) -> Array:
@@ -96,45 +170,3 @@ def _gyro_offset(recording: Recording, serial: str) -> Array:
         return np.zeros(3)
     rows = recording.rows(serial, rests[-1].start_row, rests[-1].end_row)
     return np.asarray(rows["gyro_rad_s"].astype(float).mean(axis=0)) if len(rows) else np.zeros(3)
-
-
-def _watchers(
-    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], event: JournalEvent
-) -> list[str]:
-    """Return the modules that have feedback of all of a motion; a module may fall silent in between."""
-    return [s for s in serials if _covers(recording, clocks, s, event)]
-
-
-def _covers(recording: Recording, clocks: Mapping[str, ClockMap], serial: str, event: JournalEvent) -> bool:
-    try:
-        window(recording, clocks, [event.serial, serial], event)
-    except ValueError:
-        return False
-    return True
-
-
-def _evaluate(
-    recording: Recording,
-    clocks: Mapping[str, ClockMap],
-    watchers: Sequence[str],
-    offsets: Mapping[str, Array],
-    event: JournalEvent,
-) -> MotionEvidence:
-    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
-    one = window(recording, clocks, watchers, event, edge / RATE_HZ)
-    q, gyro = (zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ) for signal in (one.q_rad, one.gyro_rad_s))
-    kept = slice(edge, len(one.t_ns) - edge, KEEP_EVERY)
-    offset = np.array([offsets[s] for s in watchers])
-    rate = differentiate(q, RATE_HZ)[kept]
-    return motion_evidence(watchers.index(event.serial), rate, gyro[kept], offset)
-
-
-def _of_one(seen: MotionEvidence, k: int) -> MotionEvidence:
-    return MotionEvidence(seen.coefficient[k : k + 1], seen.sigma[k : k + 1], seen.give)
-
-
-def _motion_seen(seen: MotionEvidence) -> MotionSeen:
-    ratio = float(seen.rate_ratio[0])
-    moved = ratio > 0.5
-    axis = seen.coefficient[0] / ratio if moved else None
-    return MotionSeen(moved, ratio, axis, float(seen.ratio_sigma[0]), seen.give)

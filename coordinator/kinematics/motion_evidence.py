@@ -100,27 +100,6 @@ def motion_evidence(joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s
     return MotionEvidence(_frozen(coefficient), _frozen(np.sqrt((BLOCKS - 1) / BLOCKS * scatter)), give)
 
 
-def combined(evidence: list[MotionEvidence]) -> MotionEvidence:
-    """Average what several motions of one joint say, each weighted by its own certainty.
-
-    They are not averaged below the best one's `give`: that repeats with the motion.
-
-    Raises:
-        ValueError: no evidence.
-    """
-    if not evidence:
-        raise ValueError("no motion to judge by")
-    weight = np.array([1.0 / (e.sigma**2 + e.give**2 + 1e-6) for e in evidence])
-    total = weight.sum(axis=0)
-    coefficient = np.sum([w[:, None] * e.coefficient for w, e in zip(weight, evidence, strict=True)], axis=0)
-    spread = np.sum([(w * e.sigma) ** 2 for w, e in zip(weight, evidence, strict=True)], axis=0)
-    return MotionEvidence(
-        _frozen(coefficient / total[:, None]),
-        _frozen(np.sqrt(spread) / total),
-        min(e.give for e in evidence),
-    )
-
-
 def _frozen(array: Array) -> Array:
     array = np.array(array)
     array.flags.writeable = False

@@ -8,7 +8,7 @@ Every observation counts by its own certainty: the forest is the likeliest one, 
 the odds that it is right, and what contradicts it or leaves it in doubt is named.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -39,8 +39,9 @@ class MotionSeen(NamedTuple):
     moved: whether its IMU was carried along.
     rate_ratio: size of the gyro's answer to the joint's rate, 1 if carried, 0 if not.
     axis: (3,) direction in the IMU's frame about which it turned when the joint's position grew, if it did.
-    sigma: one standard deviation of the ratio, systematic errors included. give: the part of it that comes
-        from other joints moving along (see `motion_evidence`).
+    sigma: one standard deviation of the ratio, systematic errors included. give: how much other joints moved
+        along (see `motion_evidence`).
+    summed_log_odds: of several motions together, of which this is the clearest; see `seen_again`.
     """
 
     moved: bool
@@ -48,12 +49,31 @@ class MotionSeen(NamedTuple):
     axis: Array | None = None
     sigma: float = 0.1
     give: float = 0.0
+    summed_log_odds: float | None = None
 
     @property
     def log_odds(self) -> float:
         """Log-odds that the IMU was carried."""
+        if self.summed_log_odds is not None:
+            return self.summed_log_odds
         size = abs(carried_log_odds(self.rate_ratio, self.sigma))
         return size if self.moved else -size
+
+
+def seen_again(motions: Sequence[MotionSeen]) -> MotionSeen:
+    """Put together what one module saw of several motions of one joint: the log-odds add up.
+
+    One that went wrong is outvoted by two that did not, where an average would fit nothing.
+
+    Raises:
+        ValueError: no motion.
+    """
+    if not motions:
+        raise ValueError("no motion was seen")
+    total = sum(seen.log_odds for seen in motions)
+    agreeing = [seen for seen in motions if seen.moved == (total > 0.0)] or list(motions)
+    clearest = max(agreeing, key=lambda seen: abs(seen.log_odds))
+    return clearest._replace(moved=total > 0.0, summed_log_odds=total)
 
 
 class Doubt(NamedTuple):

@@ -11,13 +11,13 @@ import numpy as np
 
 from coordinator.interruption import run_to_end
 from coordinator.journal import JournalEvent
-from coordinator.kinematics.topology import Topology, find_topology
+from coordinator.kinematics.topology import Topology
 from coordinator.plan import Plan
 from coordinator.radio import Radio
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.robot_link import RobotLink
 from coordinator.session import Session
-from coordinator.topology_observations import observe
+from coordinator.topology_search import search_topology
 from module_agent.wire.messages import Message
 from module_agent.wire.network_file import network as named_network
 from module_agent.wire.refusal import WireError
@@ -123,9 +123,7 @@ class _Observer:
 
     async def explored(self) -> None:
         try:
-            self.topology = find_topology(
-                observe(self.recording, sorted(self.recording.modules)).observations
-            )
+            self.topology = search_topology(self.recording, sorted(self.recording.modules)).topology
         except ValueError as error:
             self.failure = str(error)
 

@@ -1,0 +1,75 @@
+"""The topology out of a recording: what is found, what is missing, and what to move next when in doubt."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from coordinator.kinematics.topology import (
+    MotionSeen,
+    Topology,
+    TopologyError,
+    find_topology,
+    likely_topology,
+)
+from coordinator.kinematics.topology_advice import NextMotion, next_motions
+from coordinator.recording import Recording
+from coordinator.topology_observations import Seen, observe, slow_motions
+
+
+class TopologyFound(NamedTuple):
+    """The topology of the modules that respond, and notes in words on those that do not, and on doubts."""
+
+    topology: Topology
+    notes: tuple[str, ...]
+
+
+def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFound:
+    """Find the topology of these modules by their slow motions.
+
+    A module that saw nothing is left out; one whose joint did not move is part of it, as a leaf.
+
+    Raises:
+        TopologyError: what was seen contradicts itself or leaves open how a module is mounted.
+    """
+    seen = observe(recording, serials)
+    if not seen.observations:
+        raise TopologyError(_nothing_seen(seen), tuple(serials))
+    topology = find_topology(*_usable(seen))
+    return TopologyFound(topology, tuple(_notes(seen, topology)))
+
+
+def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
+    """Return what to move next to settle doubts about the topology, nothing if there are none left."""
+    serials = sorted({e.serial for e in recording.journal if e.what == "motion" and e.purpose == "rest"})
+    seen = observe(recording, serials)
+    if not seen.observations:
+        return ()
+    observations, unmoved = _usable(seen)
+    try:
+        doubts = likely_topology(observations, unmoved).doubts
+    except TopologyError:
+        return ()
+    repeated = {s: len(slow_motions(recording, s)) - 1 for s in serials}
+    return next_motions(doubts, observations, repeated)
+
+
+def _usable(seen: Seen) -> tuple[dict[tuple[str, str], MotionSeen], list[str]]:
+    """Return the observations among modules that saw something, and the joints that did not move."""
+    left = {p: o for p, o in seen.observations.items() if p[0] not in seen.blind}
+    return left, [s for s in seen.unmoved if s not in seen.blind]
+
+
+def _nothing_seen(seen: Seen) -> str:
+    reasons = "; ".join(f"joint {serial}: {why}" for serial, why in seen.unmoved.items())
+    return f"no module saw any motion, so nothing is known of the topology. {reasons}"
+
+
+def _notes(seen: Seen, topology: Topology) -> list[str]:
+    notes = [f"{s} saw no motion at all and is left out: who carries it is not known" for s in seen.blind]
+    notes += [
+        f"joint {s} did not move ({why}): its mounting is not known, and whatever it carries shows on what "
+        "carries it"
+        for s, why in seen.unmoved.items()
+        if s in topology.unmoved
+    ]
+    notes += [f"in doubt: {doubt.text}" for doubt in topology.doubts]
+    return notes
