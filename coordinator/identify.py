@@ -28,10 +28,12 @@ from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.kinematics.topology import MotionSeen, Topology, TopologyError, find_topology
+from coordinator.kinematics.whole_motion import circles_of_all, seen_by_all
 from coordinator.motion_window import RATE_HZ, Window, sensor_data, window
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.result_parts import build_result
+from coordinator.whole_exploration import respond, whole_motion
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.wire.messages import Estimate
 
@@ -126,14 +128,14 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     """
     serials = _explored(recording)
     try:
-        topology = find_topology(_seen(recording, serials))
         clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
+        topology = find_topology(_seen(recording, clocks, serials))
         types = [_type(recording, s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
         first = assemble(
             topology,
             types,
-            _pairs(recording, topology.serials, windows),
+            _pairs(recording, clocks, topology.serials, windows),
             [_rest(recording, topology.serials)],
         )
         samples = sum(len(w.t_ns) for w in windows) * len(serials)
@@ -198,7 +200,7 @@ def _motions(recording: Recording, *purposes: Purpose) -> list[JournalEvent]:
 
 def _explored(recording: Recording) -> list[str]:
     rested = sorted({e.serial for e in _motions(recording, "rest")})
-    explored = {e.serial for e in _motions(recording, "windowed_sine")}
+    explored = {e.serial for e in _motions(recording, "windowed_sine", "whole")}
     missing = [s for s in rested if s not in explored]
     if not rested or missing:
         raise IdentificationError(
@@ -224,8 +226,13 @@ def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose)
     return None
 
 
-def _seen(recording: Recording, serials: Sequence[str]) -> dict[tuple[str, str], MotionSeen]:
+def _seen(
+    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]
+) -> dict[tuple[str, str], MotionSeen]:
     """Return who moved with whom, by the slow motion where it was seen (see `estimate.observer`)."""
+    whole = whole_motion(recording, serials)
+    if whole is not None:
+        return seen_by_all(serials, respond(recording, clocks, serials, whole))
     seen: dict[tuple[str, str], MotionSeen] = {}
     for joint in serials:
         for observer in serials:
@@ -240,8 +247,13 @@ def _seen(recording: Recording, serials: Sequence[str]) -> dict[tuple[str, str],
     return seen
 
 
-def _pairs(recording: Recording, serials: Sequence[str], windows: Sequence[Window]) -> list[PairObservation]:
+def _pairs(
+    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str], windows: Sequence[Window]
+) -> list[PairObservation]:
     """Return the circles as observations; one that turned by more than the joint did is believed less."""
+    whole = whole_motion(recording, serials)
+    if whole is not None:
+        return circles_of_all(serials, respond(recording, clocks, serials, whole))
     sines = {
         e.serial: i for i, e in enumerate(_exploration_motions(recording)) if e.purpose == "windowed_sine"
     }
@@ -286,7 +298,8 @@ def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
 
 
 def _exploration_motions(recording: Recording) -> list[JournalEvent]:
-    return _motions(recording, "constant", "windowed_sine")
+    # All joints at once are in the window of any of them.
+    return _motions(recording, "constant", "windowed_sine") + _motions(recording, "whole")[:1]
 
 
 def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:

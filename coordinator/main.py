@@ -16,7 +16,7 @@ from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.interruption import SIGNALS, Interruption, ignore_signals, run_to_end
 from coordinator.kinematics.imu_intrinsics import ImuKind
-from coordinator.plan import Plan, PlanFileError, load_plan
+from coordinator.plan import Mode, Plan, PlanFileError, load_plan
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.run import Run, RunConfig, write_outputs
@@ -120,6 +120,9 @@ def run(
     imu: Annotated[
         ImuKind | None, typer.Option(help="How well the IMUs are known [uncalibrated, as delivered].")
     ] = None,
+    mode: Annotated[
+        Mode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
+    ] = None,
     viewer: Annotated[
         str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
     ] = "none",
@@ -145,7 +148,7 @@ def run(
         robot=robot,
         out=out,
         sender=_sender(),
-        plan=_plan(plan, dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home, imu=imu),
+        plan=_plan(plan, dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home, imu=imu, mode=mode),
         expect=expect,
         resume=resume,
         spawn_viewer=shown.spawn,

@@ -2,7 +2,7 @@
 
 import tomllib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -11,6 +11,7 @@ from module_agent.catalogue import ModuleType
 from module_agent.firmware.gains import default_gains
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
+Mode = Literal["joint", "whole"]
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
 
 
@@ -23,10 +24,14 @@ class Plan(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    # One joint after the other, or all at once: sooner done, without the agents' own estimates.
+    mode: Mode = "joint"
+    # Of the motion of all joints at once; by their number if not set.
+    whole_duration_s: Seconds | None = None
     discover_s: Seconds = 1.0
     link_s: Seconds = 1.0
     home_rad: float = 0.0
-    travel_speed_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 0.8
+    travel_speed_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 1.0
     settle_s: Seconds = 0.6
     rest_s: Seconds = 2.0
     # Thesis 6.2.1.1: from an offset of 0.5 rad at 1 rad/s for 0.75 s.

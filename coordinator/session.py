@@ -12,6 +12,8 @@ import numpy as np
 from coordinator.clock import Clock
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.link_errors import MotionInterrupted
+from coordinator.motion_design.limits import joint_limits, likely_inertia_kg_m2
+from coordinator.motion_design.whole_robot import JointSetting, whole_patterns
 from coordinator.plan import Plan
 from coordinator.radio import Radio
 from coordinator.recording import Recording
@@ -20,6 +22,8 @@ from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
 # Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
 ESTIMATE_WAIT_S = 0.6
+# Who moves all joints at once is in a hurry; a second tells the gyros' offsets to 0.1 mrad/s.
+WHOLE_REST_S = 1.0
 
 
 class Reporter(Protocol):
@@ -82,15 +86,19 @@ class Session:
         await self._discover(expect)
         await self._check_link()
         serials = self.link.serials
-        self._total = 6 + len(serials) * (3 if self._plan.dynamics else 1)
+        explorations = 1 if self._plan.mode == "whole" else len(serials)
+        self._total = 6 + explorations + (2 * len(serials) if self._plan.dynamics else 0)
         self._mend_after_restart()
         starts = {s: self._position(s) for s in serials}
         try:
             await self._take()
             await self._step("home", "all joints to their home position", self._home)
             await self._step("rest", "listening at rest", self._rest)
-            for serial in serials:
-                await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
+            if self._plan.mode == "whole":
+                await self._step("explore", "exploring all joints at once", self._explore_all)
+            else:
+                for serial in serials:
+                    await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
             self._report("topology and chain")
             await self._reporter.explored()
             if self._plan.dynamics:
@@ -157,11 +165,12 @@ class Session:
 
     def _mend_after_restart(self) -> None:
         """Forget what the journal says is done if a module has booted since: its zero may have moved."""
-        for step, event in list(self._done.items()):
+        moved = [e for e in self._recording.journal if e.what == "motion"]
+        for event in [*self._done.values(), *moved]:
             record = self._recording.modules.get(event.serial)
-            if event.serial and (record is None or record.boot != event.boot):
-                del self._done[step]
-                self._reporter.note(f"{step} is done again: module {event.serial} has booted since")
+            rebooted = event.serial and (record is None or record.boot != event.boot)
+            if rebooted and self._done.pop(event.step, None) is not None:
+                self._reporter.note(f"{event.step} is done again: module {event.serial} has booted since")
         for journey in ("home", "back"):
             self._done.pop(journey, None)
         if self._done:
@@ -242,7 +251,8 @@ class Session:
         await asyncio.sleep(self._plan.settle_s)
 
     async def _rest(self) -> None:
-        pattern = Rest(duration_s=self._plan.rest_s)
+        longest = WHOLE_REST_S if self._plan.mode == "whole" else self._plan.rest_s
+        pattern = Rest(duration_s=min(longest, self._plan.rest_s))
         records = await self.link.run(dict.fromkeys(self.link.serials, pattern))
         for serial, record in records.items():
             self._note_motion("rest", serial, record, "rest")
@@ -259,6 +269,30 @@ class Session:
             return
         await self._observe(serial, plan.sine(self.link.kind(serial)), "windowed_sine")
         self._reporter.estimates(serial)
+
+    async def _explore_all(self) -> None:
+        """All joints about home at the same time, each at frequencies of its own (thesis 7.2)."""
+        kinds = {serial: self.link.kind(serial) for serial in self.link.serials}
+        inertia = likely_inertia_kg_m2(list(kinds.values()))
+        settings = {
+            serial: JointSetting(
+                joint_limits(kind, self._rest_torque_nm(serial), inertia), self._plan.home_rad
+            )
+            for serial, kind in kinds.items()
+        }
+        records = await self.link.run(whole_patterns(settings, self._plan.whole_duration_s))
+        for serial, record in records.items():
+            self._note_motion("explore", serial, record, "whole")
+
+    def _rest_torque_nm(self, serial: str) -> float:
+        """Return what a joint holds at home, as it did at rest."""
+        rests = [
+            e.motion
+            for e in self._recording.journal
+            if e.purpose == "rest" and e.serial == serial and e.motion
+        ]
+        rows = self._recording.rows(serial, rests[-1].start_row, rests[-1].end_row or 0)
+        return float(rows["effort_nm"].mean())
 
     async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> None:
         record = await self._move(f"explore/{serial}", serial, pattern, purpose)

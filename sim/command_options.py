@@ -7,6 +7,7 @@ import typer
 
 from coordinator.failure import EXIT_USAGE
 from coordinator.kinematics.imu_intrinsics import ImuKind
+from coordinator.plan import Mode as PlanMode
 from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.run_folder import RunFolderError, check_free
 from coordinator.scaled_loop import check_speed
@@ -33,6 +34,9 @@ Dynamics = Annotated[
     bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
 ]
 Imu = Annotated[ImuKind | None, typer.Option(help="How well the IMUs are known beforehand [uncalibrated].")]
+Mode = Annotated[
+    PlanMode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
+]
 Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
 Processes = Annotated[
     int | None, typer.Option(min=1, help="Agent processes that share the modules [one for each module].")
@@ -97,5 +101,5 @@ def motions(path: Path | None, **given: object) -> Plan:
 
 def motion_arguments(path: Path | None, plan: Plan) -> tuple[str, ...]:
     """Return a plan as arguments for the coordinator."""
-    options = ("--dynamics" if plan.dynamics else "--no-dynamics", "--imu", plan.imu)
+    options = ("--dynamics" if plan.dynamics else "--no-dynamics", "--imu", plan.imu, "--mode", plan.mode)
     return options if path is None else ("--plan", str(path), *options)

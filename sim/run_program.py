@@ -19,6 +19,7 @@ from sim.command_options import (
     Dynamics,
     Endpoint,
     Imu,
+    Mode,
     Network,
     Noise,
     Out,
@@ -112,6 +113,7 @@ def run(
     plan: PlanFile = None,
     dynamics: Dynamics = None,
     imu: Imu = None,
+    mode: Mode = None,
     speed: Speed = 1.0,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
@@ -121,7 +123,7 @@ def run(
     found = load(robot)
     check(network, speed, endpoint)
     choice = noise_choice(found, noise, with_effects, without_effects)
-    planned = motions(plan, dynamics=dynamics, imu=imu)
+    planned = motions(plan, dynamics=dynamics, imu=imu, mode=mode)
     folder = free_folder(out, found)
     if virtual:
         _run_virtual(
@@ -239,6 +241,7 @@ def launch(
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
     dynamics: Dynamics = None,
     imu: Imu = None,
+    mode: Mode = None,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
 ) -> None:
@@ -250,7 +253,11 @@ def launch(
         viewer_choice(viewer)
     except ValueError as error:
         fail(error, EXIT_USAGE)
-    options = ("--viewer", viewer, *motion_arguments(plan, motions(plan, dynamics=dynamics, imu=imu)))
+    options = (
+        "--viewer",
+        viewer,
+        *motion_arguments(plan, motions(plan, dynamics=dynamics, imu=imu, mode=mode)),
+    )
     place = _Place(free_folder(out, found), network or found.network, endpoint, processes)
     _run_processes(_launch(robot, found, place, seed, choice, speed, options))
     print_score(place.out)

@@ -1,0 +1,75 @@
+"""What a joint may be asked for, by its type, what it carries and what it held at rest."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.catalogue import ModuleType
+
+# Of the type's speed: back-EMF then leaves a third of the voltage for torque.
+SPEED_SHARE = 0.7
+# The maker's thermal resistances winding-housing, housing-body, body-ambient [K/W]; how much warmer than a
+# room of 25 C the winding may get, and how much more resistance copper then has (0.393 %/K).
+THERMAL_K_W = 4.626 + 1.0 + 8.0
+WINDING_RISE_K = 130.0
+HOT_RESISTANCE = 1.0 + 0.00393 * WINDING_RISE_K
+# Gravity may take all of the continuous torque. So much of the type's torque is still given to a motion,
+# which is over before the winding is warm; and so much is never asked for.
+LEAST_SHARE = 0.1
+RESERVE_SHARE = 0.2
+# Of the range of a module that does not turn through; the end stops are felt before they are met.
+RANGE_SHARE = 0.9
+# Links and brackets weigh about 0.6 of the modules; a module with its link reaches about 0.12 m further.
+LINK_MASS_SHARE = 0.6
+REACH_PER_MODULE_M = 0.12
+
+
+class JointLimits(NamedTuple):
+    """The largest speed and acceleration of a motion, and the places it may reach."""
+
+    speed_rad_s: float
+    accel_rad_s2: float
+    low_rad: float
+    high_rad: float
+
+    def room_rad(self, home_rad: float) -> float:
+        """Return how far a motion about `home_rad` may go to either side."""
+        return min(self.high_rad - home_rad, home_rad - self.low_rad)
+
+
+def continuous_torque_nm(kind: ModuleType) -> float:
+    """Return the torque that a module holds for ever: its winding's losses i^2 R warm it by 130 K."""
+    motor = kind.motor
+    current_a = np.sqrt(WINDING_RISE_K / THERMAL_K_W / (motor.resistance_ohm * HOT_RESISTANCE))
+    torque = current_a * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
+    return min(float(torque), kind.max_effort_nm)
+
+
+def joint_limits(kind: ModuleType, rest_torque_nm: float, inertia_kg_m2: float) -> JointLimits:
+    """Return what a joint may do.
+
+    Args:
+        kind: its type.
+        rest_torque_nm: what it held where the motion takes place.
+        inertia_kg_m2: of what it moves, about its axis; too large rather than too small.
+
+    Raises:
+        ValueError: an inertia that is not positive.
+    """
+    if not inertia_kg_m2 > 0.0:
+        raise ValueError(f"an inertia of {inertia_kg_m2} kg m^2; it must be positive")
+    held = abs(rest_torque_nm)
+    least = min(LEAST_SHARE * kind.max_effort_nm, (1.0 - RESERVE_SHARE) * kind.max_effort_nm - held)
+    torque = max(continuous_torque_nm(kind) - held, least, 0.0)
+    low, high = kind.range_rad or (-np.pi, np.pi)
+    return JointLimits(
+        SPEED_SHARE * kind.max_speed_rad_s, torque / inertia_kg_m2, RANGE_SHARE * low, RANGE_SHARE * high
+    )
+
+
+def likely_inertia_kg_m2(kinds: list[ModuleType]) -> float:
+    """Return the inertia of a stretched arm of all these modules about its base: no joint carries more."""
+    mass = (1.0 + LINK_MASS_SHARE) * sum(kind.mass_kg for kind in kinds)
+    reach = REACH_PER_MODULE_M * len(kinds)
+    # Each module's own housing turns too, a lone one about itself.
+    return mass * reach**2 / 3.0 + 2e-3
