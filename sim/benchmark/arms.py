@@ -1,0 +1,117 @@
+"""Whole robots: links, axes and tips against the truth, the thesis' chain on the same recordings."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from statistics import median
+
+from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.row import Row, for_few, largest, mean_abs, rms, scaled
+from sim.experiments.arm_trial import ArmTrial, Mode, TipErrors, arm_trial
+
+ARMS = ("a2085_04", "a2085_06", "arm7")
+WHOLE_ARM = COST_ARM = "a2085_06"
+PROFILES = ("x5", "x5-uncalibrated")
+TIP_MM = {"x5": 1.0, "x5-uncalibrated": 4.0}
+# Where the IMU's own axes are only known to a degree, no tip's orientation is known better.
+TIP_DEG = {"x5": 0.1, "x5-uncalibrated": None}
+AXIS_DEG = {"x5": 0.1, "x5-uncalibrated": None}
+JOINT_TIME_S, THESIS_JOINT_TIME_S = 10.0, 18.0
+WHOLE_TIME_S = 20.0
+REFINEMENT_S = 5.0
+# About what a trial takes on one core.
+_COST_S = {"a2085_04": 8.0, "a2085_06": 14.0, "arm7": 16.0}
+_WHOLE_COST_S = 6.0
+
+
+def arm_cases(trials: int, seed: int) -> list[Case]:
+    """Return one case for every arm and profile, joint by joint and all joints at once."""
+    joints = [_case(arm, noise, "joint", trials, seed) for arm in ARMS for noise in PROFILES]
+    return joints + [_case(WHOLE_ARM, noise, "whole", trials, seed) for noise in PROFILES]
+
+
+def _case(arm: str, noise: str, mode: Mode, trials: int, seed: int) -> Case:
+    how = "joint by joint" if mode == "joint" else "all joints at once"
+    cost_s = _COST_S[arm] if mode == "joint" else _WHOLE_COST_S
+    # The same modules in both profiles and both modes.
+    work = tuple(
+        Trial(arm_trial, (arm, noise, trial_seed(seed, arm, number), mode), cost_s)
+        for number in range(trials)
+    )
+    return Case(f"{arm}, {noise}, {how}", work, partial(_summary, f"{arm}, {noise}, {how}", noise, mode))
+
+
+def _summary(case: str, noise: str, mode: Mode, trials: Sequence[ArmTrial]) -> Summary:
+    """Return the rows of an arm; a trial that ended early, or with another topology, is counted as wrong."""
+    rows = [
+        _wrong(case, trials),
+        *_tip_rows(case, noise, trials),
+        *_link_rows(case, noise, trials),
+        *_time_rows(case, mode, trials),
+    ]
+    if mode == "joint" and case.startswith(COST_ARM):
+        spent = [t.identify_s for t in trials if not t.why]
+        figure = "from recording to chain, median [s of one core]"
+        rows.append(Row(case, figure, None, median(spent) if spent else None, None, REFINEMENT_S))
+    return Summary(tuple(rows), sigmas_off(trials))
+
+
+def sigmas_off(trials: Sequence[ArmTrial]) -> tuple[float, ...]:
+    """Return |error| / sigma of every link's length that was claimed."""
+    links = [link for trial in trials for link in trial.links]
+    return tuple(
+        abs(link.error_m) / link.sigma_m for link in links if link.error_m is not None and link.sigma_m
+    )
+
+
+def _wrong(case: str, trials: Sequence[ArmTrial]) -> Row:
+    wrong = sum(bool(trial.why or trial.differences) for trial in trials)
+    return Row(case, f"runs without the right topology, of {len(trials)}", None, float(wrong), None, 0.0)
+
+
+def _tip_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, Row]:
+    def over(thesis: bool, figure: Callable[[TipErrors], float]) -> float | None:
+        tips = [trial.thesis_tip if thesis else trial.tip for trial in trials]
+        return rms([figure(tip) for tip in tips if tip is not None])
+
+    position = Row(
+        case,
+        "tip position, rms [mm]",
+        scaled(over(True, lambda tip: tip.position_m), 1e3),
+        scaled(over(False, lambda tip: tip.position_m), 1e3),
+        limit=for_few(TIP_MM[noise], len(trials)),
+    )
+    orientation = Row(
+        case,
+        "tip orientation, rms [deg]",
+        over(True, lambda tip: tip.orientation_deg),
+        over(False, lambda tip: tip.orientation_deg),
+        limit=for_few(TIP_DEG[noise], len(trials)),
+    )
+    return position, orientation
+
+
+def _link_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, Row, Row]:
+    links = [link for trial in trials for link in trial.links]
+    thesis_mm = scaled(mean_abs([link.thesis_error_m for link in links]), 1e3)
+    ours_mm = scaled(mean_abs([link.error_m for link in links]), 1e3)
+    vector_mm = scaled(mean_abs([link.vector_error_m for link in links]), 1e3)
+    return (
+        Row(case, "link length, mean |error| [mm]", thesis_mm, ours_mm),
+        Row(case, "link vector, mean |error| [mm]", None, vector_mm),
+        Row(
+            case,
+            "axis, largest error [deg]",
+            largest([link.thesis_axis_error_deg for link in links]),
+            largest([link.axis_error_deg for link in links]),
+            limit=AXIS_DEG[noise],
+        ),
+    )
+
+
+def _time_rows(case: str, mode: Mode, trials: Sequence[ArmTrial]) -> tuple[Row, ...]:
+    done = [trial for trial in trials if not trial.why]
+    if mode == "whole":
+        spent = largest([trial.robot_time_s for trial in done])
+        return (Row(case, "robot time in all, longest [s]", None, spent, None, WHOLE_TIME_S),)
+    each = largest([trial.robot_time_s / trial.joints for trial in done])
+    return (Row(case, "robot time a joint, longest [s]", THESIS_JOINT_TIME_S, each, None, JOINT_TIME_S),)

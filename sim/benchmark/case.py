@@ -1,0 +1,70 @@
+"""What a benchmark consists of: cases, their trials, and the rows that follow from what the trials found."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+from zlib import crc32
+
+import numpy as np
+
+from sim.benchmark.row import Row
+
+
+class Trial(NamedTuple):
+    """One piece of work for a worker process: a function of a module and its arguments, both picklable.
+
+    cost_s: about how long it takes; long ones are begun first, so that all processes end together.
+    """
+
+    work: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    cost_s: float = 1.0
+
+
+class Failed(NamedTuple):
+    """What stands in place of a trial's result when it raised; `text` says what."""
+
+    text: str
+
+
+class Summary(NamedTuple):
+    """What follows from the trials of a case.
+
+    sigmas_off: |error| / claimed sigma of every interval that was claimed, for the coverage over all cases.
+    """
+
+    rows: tuple[Row, ...]
+    sigmas_off: tuple[float, ...] = ()
+
+
+class Case(NamedTuple):
+    """Trials that belong together; `summarise` is given the results of those that did not fail, in order."""
+
+    name: str
+    trials: tuple[Trial, ...]
+    summarise: Callable[[Sequence[Any]], Summary]
+
+
+class CaseResult(NamedTuple):
+    """What came of a case; failures in words."""
+
+    case: str
+    trials: int
+    summary: Summary
+    failures: tuple[str, ...]
+
+
+def concluded(case: Case, results: Sequence[Any]) -> CaseResult:
+    """Summarise the results of all trials of a case; one that failed makes a row that misses its bar."""
+    failures = tuple(result.text for result in results if isinstance(result, Failed))
+    summary = case.summarise([result for result in results if not isinstance(result, Failed)])
+    if failures:
+        failed = Row(
+            case.name, f"trials that failed, of {len(results)}", None, float(len(failures)), None, 0.0
+        )
+        summary = summary._replace(rows=(failed, *summary.rows))
+    return CaseResult(case.name, len(results), summary, failures)
+
+
+def trial_seed(seed: int, name: str, number: int) -> int:
+    """Return the seed of a trial; it depends on nothing but the benchmark's seed, a name and a number."""
+    return int(np.random.SeedSequence(seed, spawn_key=(crc32(name.encode()), number)).generate_state(1)[0])

@@ -1,0 +1,108 @@
+"""One line of a benchmark: a figure of a case, by the thesis' way, by ours, its bound, and its bar."""
+
+from collections.abc import Sequence
+from math import isfinite, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gammaincinv
+
+# A range of per cent in which the share of 95 % intervals that cover must lie.
+COVERAGE = (92.0, 98.0)
+# With fewer intervals than this, chance alone leaves the range: one standard deviation is then over 1.5 %.
+FEW_INTERVALS = 200
+_SIGMAS_95 = 1.96
+_SIGMAS_99 = 2.58
+# The trials of a case that the bars of means are meant for.
+ENOUGH_TRIALS = 13
+
+Limit = float | tuple[float, float] | None
+
+
+class Row(NamedTuple):
+    """A figure of a case; None where there is none.
+
+    limit: what `ours` must not exceed, or a range that it must lie in; None for a figure without a bar.
+    """
+
+    case: str
+    figure: str
+    thesis: float | None
+    ours: float | None
+    bound: float | None = None
+    limit: Limit = None
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether the bar is met; None without one. A figure that could not be measured misses its bar."""
+        if self.limit is None:
+            return None
+        if self.ours is None:
+            return False
+        low, high = self.limit if isinstance(self.limit, tuple) else (float("-inf"), self.limit)
+        return low <= self.ours <= high
+
+    def plain(self) -> dict[str, object]:
+        """Return the row as it stands in JSON."""
+        figures = {name: _finite(getattr(self, name)) for name in ("thesis", "ours", "bound")}
+        return {**self._asdict(), **figures, "holds": self.holds}
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and isfinite(value) else None
+
+
+def mean_abs(values: Sequence[float | None]) -> float | None:
+    """Return the mean size of the values that are there, None if none is."""
+    known = [abs(value) for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def rms(values: Sequence[float | None]) -> float | None:
+    """Return the root mean square of the values that are there, None if none is."""
+    known = [value for value in values if value is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
+
+def largest(values: Sequence[float | None]) -> float | None:
+    """Return the largest size of the values that are there, None if none is."""
+    known = [abs(value) for value in values if value is not None]
+    return max(known, default=None)
+
+
+def ratio(over: float | None, under: float | None) -> float | None:
+    """Return a ratio, None where one of the two is not known or the lower one is 0."""
+    return None if over is None or not under else over / under
+
+
+def scaled(value: float | None, factor: float) -> float | None:
+    """Return a value in another unit."""
+    return None if value is None else factor * value
+
+
+def for_few(limit: float | None, trials: int) -> float | None:
+    """Return the bar of a mean or rms over fewer trials than it is meant for: wider, by what chance does.
+
+    The rms of n Gaussian errors exceeds sigma sqrt(chi2(n) / n) in one of 200 cases; the bar grows as that
+    does from `ENOUGH_TRIALS` down to n.
+    """
+    if limit is None or not 0 < trials < ENOUGH_TRIALS:
+        return limit
+    few, enough = (sqrt(2.0 * float(gammaincinv(0.5 * n, 0.995)) / n) for n in (trials, ENOUGH_TRIALS))
+    return limit * few / enough
+
+
+def coverage(case: str, sigmas_off: Sequence[float]) -> Row:
+    """Return the share of 95 % intervals that cover the truth, from |error| / sigma of every interval [%].
+
+    The bar is `COVERAGE`; with few intervals it is wider by what chance does to them in 99 of 100 cases.
+    """
+    figure = f"95 % intervals that cover, of {len(sigmas_off)} [%]"
+    if not sigmas_off:
+        return Row(case, figure, None, None, None, COVERAGE)
+    share = 100.0 * float(np.mean(np.asarray(sigmas_off) <= _SIGMAS_95))
+    chance = 0.0
+    if len(sigmas_off) < FEW_INTERVALS:
+        chance = 100.0 * _SIGMAS_99 * sqrt(0.95 * 0.05 / len(sigmas_off))
+    low, high = COVERAGE
+    return Row(case, figure, None, share, None, (max(low - chance, 0.0), min(high + chance, 100.0)))

@@ -1,0 +1,145 @@
+"""Worker processes for trials: as many as cores, renewed after some trials, and gone when they must be.
+
+A process grows by tens of megabytes with every virtual run, so that each works for some minutes only. One
+that dies takes its trial with it, which counts as failed, and is replaced.
+"""
+
+import multiprocessing
+import signal
+import tempfile
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from sim.benchmark.case import Failed, Trial
+
+# To start a process costs about three seconds of imports.
+SECONDS_PER_PROCESS = 150.0
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+def run_trials(
+    trials: Sequence[Trial], processes: int, on_done: Callable[[int, Any], None] = lambda index, result: None
+) -> list[Any]:
+    """Run trials in several processes; return their results in order, `Failed` where one raised.
+
+    Whatever ends this early ends the processes at once and removes their temporary folders.
+    """
+    results: list[Any] = [None] * len(trials)
+    waiting = sorted(range(len(trials)), key=lambda index: -trials[index].cost_s)
+    with _team(min(processes, len(trials))) as team:
+        while waiting or any(worker.busy for worker in team):
+            for worker in team:
+                if waiting and not worker.busy:
+                    index = waiting.pop(0)
+                    worker.begin(index, trials[index])
+            for index, result in _finished(team):
+                results[index] = result
+                on_done(index, result)
+    return results
+
+
+@contextmanager
+def _team(size: int) -> Iterator[list["_Worker"]]:
+    # Trials that are ended in their middle leave temporary folders behind: all of them are in this one.
+    with tempfile.TemporaryDirectory(prefix="x5-benchmark-") as folder:
+        team = [_Worker(folder) for _ in range(size)]
+        try:
+            yield team
+        finally:
+            for worker in team:
+                worker.end()
+
+
+def _finished(team: Sequence["_Worker"]) -> Iterator[tuple[int, Any]]:
+    busy = {worker.pipe: worker for worker in team if worker.busy}
+    for pipe in wait(list(busy)):
+        if isinstance(pipe, Connection):
+            yield busy[pipe].finish()
+
+
+class _Worker:
+    """One process at a time, and the pipe to it."""
+
+    def __init__(self, folder: str):
+        self._folder = folder
+        self._left_s = 0.0
+        self._index: int | None = None
+        self._process: BaseProcess | None = None
+        self.pipe: Connection
+
+    @property
+    def busy(self) -> bool:
+        """Whether a trial is under way."""
+        return self._index is not None
+
+    def begin(self, index: int, trial: Trial) -> None:
+        """Hand over a trial, to a new process if there is none."""
+        if self._process is None or not self._process.is_alive():
+            self._start()
+        self._index = index
+        self._left_s -= trial.cost_s
+        self.pipe.send(trial)
+
+    def finish(self) -> tuple[int, Any]:
+        """Return the trial's index and result; to be called when the pipe has something to say."""
+        index, self._index = self._index, None
+        assert index is not None
+        try:
+            result = self.pipe.recv()
+        except (EOFError, OSError):
+            result = Failed(f"the worker process died with exit code {self._exit_code()}")
+            self.end()
+        if self._left_s <= 0.0:
+            self.end()
+        return index, result
+
+    def end(self) -> None:
+        """End the process, at once if it is at work."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        if self.busy:
+            process.terminate()
+        self.pipe.close()
+        process.join()
+        process.close()
+
+    def _start(self) -> None:
+        self.pipe, far = _CONTEXT.Pipe()
+        self._process = _CONTEXT.Process(target=_work, args=(far, self._folder), daemon=True)
+        self._process.start()
+        # Only the worker holds the far end from here on, so that its death is heard.
+        far.close()
+        self._left_s = SECONDS_PER_PROCESS
+
+    def _exit_code(self) -> int | None:
+        assert self._process is not None
+        self._process.join()
+        return self._process.exitcode
+
+
+def _work(pipe: Connection, folder: str) -> None:
+    """Run trials until the pipe is closed."""
+    # Ctrl-C, which a terminal sends to all processes, is for the one that started them to hear.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    tempfile.tempdir = folder
+    while True:
+        try:
+            trial = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(_result(trial))
+
+
+def _result(trial: Trial) -> Any:
+    try:
+        return trial.work(*trial.arguments)
+    except Exception as error:
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{last.filename.rpartition('/')[2]}, line {last.lineno}"
+        words = ", ".join(map(str, trial.arguments))
+        return Failed(f"{trial.work.__name__}({words}): {type(error).__name__} in {place}: {error}")

@@ -1,0 +1,91 @@
+"""A session in virtual time that is kept in memory: the same agents, coordinator and world, and no files.
+
+What it records is what a run's `session.mcap` holds, for experiments that need many sessions and no folder.
+"""
+
+import asyncio
+
+from coordinator.interruption import run_to_end
+from coordinator.journal import JournalEvent
+from coordinator.kinematics.topology_advice import NextMotion
+from coordinator.plan import Plan
+from coordinator.radio import Radio
+from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
+from coordinator.robot_link import RobotLink
+from coordinator.session import Session
+from coordinator.topology_search import doubtful_motions
+from module_agent.wire.messages import Message
+from module_agent.wire.refusal import WireError
+from sim.virtual_loop import VirtualLoop
+from sim.virtual_robot import VirtualRobot, VirtualSettings
+
+COORDINATOR = "coordinator"
+
+
+def record_session(settings: VirtualSettings, plan: Plan) -> Recording:
+    """Run one session from discovery to its end and return what the coordinator has recorded of it.
+
+    Raises:
+        what `coordinator.session` raises: nobody there, an unfit link, a module lost, a motion interrupted.
+    """
+    loop = VirtualLoop()
+    robot = VirtualRobot(settings, loop)
+    keeper = _Keeper()
+    endpoint = robot.endpoint(COORDINATOR)
+    radio = Radio(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
+    link = RobotLink(radio, keeper.recording, lambda: loop.now_ns, COORDINATOR)
+    session = Session(link, radio, keeper.recording, plan, lambda: loop.now_ns, keeper.journal, keeper)
+    robot.start()
+    try:
+        keeper.journal(
+            JournalEvent(t_ns=loop.now_ns, what="session", robot=settings.robot.name, imu=plan.imu)
+        )
+        run_to_end(loop, loop.create_task(_to_end(session, radio, robot)))
+        keeper.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))
+        return keeper.recording
+    finally:
+        robot.close()
+        loop.close()
+
+
+async def _to_end(session: Session, radio: Radio, robot: VirtualRobot) -> None:
+    radio.start()
+    try:
+        await session.run(len(robot.world.modules))
+    finally:
+        radio.close()
+        robot.stop()
+        await asyncio.sleep(0)
+
+
+class _Keeper:
+    """Keeps what is recorded; nobody watches the session."""
+
+    def __init__(self) -> None:
+        self.recording = Recording()
+
+    def record(self, entry: Entry) -> Message | None:
+        try:
+            message = self.recording.add(entry)
+        except (WireError, ValueError):
+            return None  # counted by the recording, by reason
+        return message if isinstance(message, Message) else None
+
+    def journal(self, event: JournalEvent) -> None:
+        self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """Nobody watches."""
+
+    def note(self, text: str) -> None:
+        """Nobody reads."""
+
+    def estimates(self, joint: str) -> None:
+        """Nothing is drawn."""
+
+    async def doubts(self) -> tuple[NextMotion, ...]:
+        """Look for doubts about the topology, as a run does."""
+        return doubtful_motions(self.recording)
+
+    async def explored(self) -> None:
+        """What follows from the recording is computed from it afterwards."""

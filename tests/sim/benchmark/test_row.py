@@ -1,0 +1,94 @@
+"""A bar is met or missed by what was measured, and chance is allowed for where there are few trials."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from sim.benchmark.row import (
+    COVERAGE,
+    ENOUGH_TRIALS,
+    FEW_INTERVALS,
+    Row,
+    coverage,
+    for_few,
+    largest,
+    mean_abs,
+    ratio,
+    rms,
+)
+
+
+@pytest.mark.parametrize(
+    ("ours", "limit", "holds"),
+    [
+        (0.5, 0.5, True),
+        (0.51, 0.5, False),
+        (0.0, 0.0, True),
+        (None, 0.5, False),
+        (math.nan, 0.5, False),
+        (95.0, (92.0, 98.0), True),
+        (99.0, (92.0, 98.0), False),
+        (91.9, (92.0, 98.0), False),
+        (1e9, None, None),
+        (None, None, None),
+    ],
+)
+def test_a_bar_is_met_up_to_its_limit_and_missed_without_a_figure(
+    ours: float | None, limit: float | tuple[float, float] | None, holds: bool | None
+) -> None:
+    assert Row("arm", "error [mm]", None, ours, None, limit).holds is holds
+
+
+def test_a_row_in_json_has_the_agreed_fields_and_no_number_that_json_lacks() -> None:
+    found = Row("arm", "error [mm]", math.inf, math.nan, 0.1, 0.5).plain()
+    assert list(found) == ["case", "figure", "thesis", "ours", "bound", "limit", "holds"]
+    assert (found["thesis"], found["ours"], found["bound"], found["holds"]) == (None, None, 0.1, False)
+
+
+def test_what_is_not_there_is_left_out_of_means() -> None:
+    assert mean_abs([-3.0, None, 1.0]) == 2.0
+    assert rms([3.0, None, -4.0]) == pytest.approx(math.sqrt(12.5))
+    assert largest([-3.0, 2.0, None]) == 3.0
+    for figure in (mean_abs, rms, largest):
+        assert figure([None]) is None
+        assert figure([]) is None
+    assert ratio(1.0, None) is None
+    assert ratio(1.0, 0.0) is None
+    assert ratio(3.0, 2.0) == 1.5
+
+
+def test_a_bar_of_means_is_the_stated_one_from_thirteen_trials_on_and_wider_below() -> None:
+    assert for_few(0.5, ENOUGH_TRIALS) == for_few(0.5, 40) == 0.5
+    wider = [for_few(0.5, trials) for trials in range(1, ENOUGH_TRIALS + 1)]
+    assert all(few > more for few, more in pairwise(wider) if few and more)
+    assert for_few(None, 1) is None
+
+
+@pytest.mark.parametrize("trials", [1, 4])
+def test_an_rms_that_holds_over_thirteen_trials_holds_as_surely_over_fewer(trials: int) -> None:
+    """Of errors whose rms exceeds a bar in one of 200 cases, fewer exceed the wider bar as rarely."""
+    rng = np.random.default_rng(trials)
+    rms_of_many = np.sqrt(np.mean(rng.standard_normal((100_000, trials)) ** 2, axis=1))
+    bar = np.quantile(np.sqrt(np.mean(rng.standard_normal((100_000, ENOUGH_TRIALS)) ** 2, axis=1)), 0.995)
+    few = for_few(float(bar), trials)
+    assert few is not None
+    # 500 of 100 000 are expected, with a standard deviation of 22, and as much for the quantile.
+    assert 0.0040 < np.mean(rms_of_many > few) < 0.0060
+
+
+def test_honest_intervals_of_any_number_meet_the_bar_of_coverage_and_shy_or_bold_ones_do_not() -> None:
+    rng = np.random.default_rng(5)
+    for count in (10, 60, FEW_INTERVALS, 1000):
+        rows = [coverage("all", list(np.abs(rng.standard_normal(count)))) for _ in range(200)]
+        # Chance leaves the range in one of a hundred where it is widened; at 200 by two sigmas, in one of 20.
+        assert np.mean([row.holds for row in rows]) > (0.97 if count != FEW_INTERVALS else 0.90)
+    many = np.abs(rng.standard_normal(1000))
+    assert not coverage("all", list(2.0 * many)).holds
+    assert not coverage("all", list(0.3 * many)).holds
+    assert coverage("all", list(many)).limit == COVERAGE
+
+
+def test_coverage_without_intervals_misses_its_bar() -> None:
+    assert coverage("all", []).holds is False
