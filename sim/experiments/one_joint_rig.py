@@ -9,10 +9,19 @@ from types import TracebackType
 from typing import NamedTuple
 
 from coordinator.plan import Plan
-from module_agent.estimate.circle_point_analysis import CircleFit, circle_point_analysis
+from module_agent.estimate.circle_point_analysis import CircleFit, circle_point_analysis, rest_reading
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.gaussian_filter import TAPS
+from module_agent.estimate.joint_regression import (
+    CALIBRATED,
+    ImuKnowledge,
+    JointRegression,
+    SeenMotion,
+    regress_joint,
+    seen_motion,
+)
 from module_agent.estimate.observer import MARGIN_NS
+from module_agent.estimate.smooth_motion import SMOOTH_S
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
 from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware
@@ -144,6 +153,29 @@ def analyse(trial: TrialRows, taps: int = TAPS) -> CircleFit:
     return circle_point_analysis(
         imu_window(trial.rest), _aligned(trial.constant), _aligned(trial.sine), taps=taps
     )
+
+
+def regress(trial: TrialRows, knowledge: ImuKnowledge = CALIBRATED) -> JointRegression:
+    """Run the agents' joint regression on a trial.
+
+    Raises:
+        ValueError: too little motion, with what would be enough.
+    """
+    return regress_joint(seen_motions(trial), rest_reading(imu_window(trial.rest)), knowledge)
+
+
+def seen_motions(trial: TrialRows, smooth_s: float = SMOOTH_S) -> list[SeenMotion]:
+    """Return the trial's motions as the joint regression takes them.
+
+    Raises:
+        ValueError: too few samples, or unevenly spaced ones.
+    """
+    found = []
+    for motion in (trial.constant, trial.sine):
+        own, joint = imu_window(motion.imu), joint_window(motion.joint)
+        offset_ns = clock_delay(own, joint, motion.rough_offset_ns).offset_ns
+        found.append(seen_motion(own, joint, offset_ns, smooth_s))
+    return found
 
 
 def _aligned(motion: MotionRows) -> AlignedMotion:

@@ -1,0 +1,86 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from module_agent.estimate.joint_model import COMPLIANCE, DELAY, GRAVITY, HINGE, KAPPA, RADIAL, predict
+from module_agent.estimate.smooth_motion import SmoothMotion
+from module_agent.estimate.windows import JointWindow
+
+T_S = np.linspace(0.5, 2.5, 60)
+
+
+@pytest.fixture
+def motion() -> SmoothMotion:
+    t_s = np.arange(0.0, 3.0, 0.004)
+    angle = 0.3 + 0.2 * np.sin(2 * np.pi * 2 * t_s) + 0.1 * np.sin(2 * np.pi * 0.7 * t_s)
+    return SmoothMotion(JointWindow((1e9 * t_s).astype(np.int64), angle, np.zeros_like(angle)))
+
+
+def parameters(compliance: float = 0.0) -> np.ndarray:
+    p = np.random.default_rng(3).normal(0.0, 1e-3, DELAY + 1)
+    p[:2] = 0.0
+    p[RADIAL], p[GRAVITY] = (0.2, -0.1), (3.0, 8.0, 4.0)
+    p[COMPLIANCE], p[HINGE] = compliance, 0.1
+    return p
+
+
+def numeric(read: Callable[[np.ndarray], np.ndarray], p: np.ndarray, column: int, step: float) -> np.ndarray:
+    up, down = p.copy(), p.copy()
+    up[column] += step
+    down[column] -= step
+    return (read(up) - read(down)) / (2 * step)
+
+
+def test_derivatives_are_those_of_the_readings(motion: SmoothMotion) -> None:
+    p = parameters()
+    _, jacobian = predict(motion, T_S, p, DELAY)
+    for column in range(2, p.size):
+        step = 1e-6 if column == COMPLIANCE else 1e-4
+        expected = numeric(lambda at: predict(motion, T_S, at, DELAY)[0], p, column, step)
+        # Differences of readings of 10 m/s^2 over such steps are good to 1e-8; the compliance's are of 1e3.
+        scale = max(1.0, float(np.abs(expected).max()))
+        assert np.allclose(jacobian[:, :, column], expected, atol=2e-6 * scale), column
+
+
+def test_a_bending_link_changes_the_other_derivatives_by_what_is_left_out_at_most(
+    motion: SmoothMotion,
+) -> None:
+    p = parameters(compliance=3e-5)
+    _, jacobian = predict(motion, T_S, p, DELAY)
+    for column in (2, 3, 4, 5, 6, KAPPA.start, COMPLIANCE, HINGE, DELAY):
+        expected = numeric(lambda at: predict(motion, T_S, at, DELAY)[0], p, column, 1e-7)
+        scale = float(np.abs(expected).max())
+        # The load's own dependence on gravity and radius is c g / d: 2e-3 of the readings' derivatives.
+        assert np.abs(jacobian[:, :, column] - expected).max() < 5e-3 * scale, column
+
+
+def test_turning_the_frame_turns_both_sensors(motion: SmoothMotion) -> None:
+    predicted, jacobian = predict(motion, T_S, parameters(), DELAY)
+    for column, direction in ((0, (1.0, 0.0, 0.0)), (1, (0.0, 1.0, 0.0))):
+        for sensor in (slice(0, 3), slice(3, 6)):
+            assert np.allclose(jacobian[:, sensor, column], np.cross(direction, predicted[:, sensor]))
+
+
+def test_a_point_mass_on_a_bent_link_feels_what_newton_says() -> None:
+    """Independent: integrate c delta'' + delta = -c q'', and differentiate the true circle of the IMU."""
+    c, distance, rate = 2.5e-5, 0.48, 2000.0
+    t_s = np.arange(0.0, 4.0, 1.0 / rate)
+    omega = 2 * np.pi * 2.0
+    q = 0.1 * np.sin(omega * t_s)
+    # The steady answer of that spring to a sine: the body turns by 1 / (1 - c omega^2) of the encoder.
+    theta = q / (1.0 - c * omega**2)
+    tangential = distance * -(omega**2) * theta
+    radial = -distance * (0.1 * omega * np.cos(omega * t_s) / (1.0 - c * omega**2)) ** 2
+    slow = slice(None, None, 8)
+    joint = SmoothMotion(JointWindow((1e9 * t_s[slow]).astype(np.int64), q[slow], q[slow]), smooth_s=0.012)
+    p = np.zeros(DELAY + 1)
+    p[RADIAL], p[COMPLIANCE] = (distance, 0.0), c
+    at = t_s[2000:6000:8]
+    predicted, _ = predict(joint, at, p, DELAY)
+    # The low-pass of 12 ms takes 1.1 % of 2 Hz and 4.4 % of 4 Hz.
+    gain = np.exp(-0.5 * (omega * 0.012) ** 2)
+    assert np.allclose(predicted[:, 4], gain * tangential[2000:6000:8], atol=1e-4 * np.abs(tangential).max())
+    mean = radial.mean()
+    expected = mean + gain**4 * (radial[2000:6000:8] - mean)
+    assert np.allclose(predicted[:, 3], expected, atol=1e-3 * np.abs(radial).max())
