@@ -13,7 +13,6 @@ import numpy as np
 
 from coordinator.chain import Array, Chain
 from coordinator.dynamics.differentiation import settling_samples
-from coordinator.identify import KINEMATIC_CUTOFF_HZ, KINEMATIC_KEEP_EVERY, MOST_IMU_SAMPLES
 from coordinator.kinematics.imu_intrinsics import UNCALIBRATED, ImuIntrinsics
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.known_robot import KnownRobot
@@ -21,7 +20,13 @@ from coordinator.motion_window import RATE_HZ, Window, sensor_data, window
 
 # Scale and axes of an IMU that has been corrected for them: for the two sessions they are the same.
 TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5)
-MOVING = ("constant", "windowed_sine")
+# Six times the 2 Hz of the windowed sine, and below the resonances of links and bases. Half the time constant
+# of that low-pass makes about as many independent samples as there are.
+CUTOFF_HZ = 12.0
+KEEP_EVERY = 5
+# IMU samples of a session that are fitted at most.
+MOST_IMU_SAMPLES = 40_000
+MOVING = ("constant", "windowed_sine", "whole")
 
 
 class TiedFits(NamedTuple):
@@ -46,9 +51,10 @@ def tied_fits(known: KnownRobot, later: KnownRobot) -> TiedFits:
 
 def exploration(run: KnownRobot, serials: Sequence[str]) -> list[Window]:
     """Return what all modules read during the last exploration of every joint, in the order of `serials`."""
-    margin = settling_samples(RATE_HZ, KINEMATIC_CUTOFF_HZ) / RATE_HZ
+    margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
     last = {
-        (event.serial, event.purpose): event
+        # All take part in a motion of the whole robot: it is one stretch of the recording.
+        ("" if event.purpose == "whole" else event.serial, event.purpose): event
         for event in run.recording.journal
         if event.what == "motion" and event.purpose in MOVING
     }
@@ -72,5 +78,5 @@ def _turned(matrices: Array, vectors: Array) -> Array:
 
 def _fit(chain: Chain, windows: Sequence[Window]) -> Refinement:
     samples = sum(len(one.t_ns) for one in windows) * len(chain.serials)
-    keep_every = max(KINEMATIC_KEEP_EVERY, -(-samples // MOST_IMU_SAMPLES))
-    return refine_chain(chain, sensor_data(windows, KINEMATIC_CUTOFF_HZ, keep_every), TIED)
+    keep_every = max(KEEP_EVERY, -(-samples // MOST_IMU_SAMPLES))
+    return refine_chain(chain, sensor_data(windows, CUTOFF_HZ, keep_every), TIED)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from coordinator.chain import Chain
 from coordinator.identify import IdentificationError, Kinematics, identify_kinematics
+from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.recording import Recording
 from coordinator.run_folder import SESSION, load_recording
 from coordinator.session_file import SessionFileError
@@ -31,6 +32,11 @@ class KnownRobot(NamedTuple):
     def name(self) -> str:
         """The robot's name, as the run was told."""
         return next((e.robot for e in reversed(self.recording.journal) if e.what == "session"), "")
+
+    @property
+    def imu(self) -> ImuKind:
+        """How well its IMUs were known, as the run was told."""
+        return next((e.imu for e in reversed(self.recording.journal) if e.what == "session"), "uncalibrated")
 
 
 def load_known(folder: Path) -> KnownRobot:

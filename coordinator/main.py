@@ -1,38 +1,33 @@
 """`x5-coordinator`: identify a robot, replay a recording, list, stop, picture."""
 
-import os
-import secrets
 import shlex
-import socket
 from pathlib import Path
-from typing import Annotated, NamedTuple, NoReturn
+from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 from rich.table import Table
 
-from coordinator.failure import EXIT_FAILED, EXIT_USAGE, explain
+from coordinator.attended_run import Place, join, run_attended, sender_name
+from coordinator.check_program import check_robot
+from coordinator.command_options import Connect, Expect, Listen, Network, Robot, fail, planned
+from coordinator.failure import EXIT_FAILED, EXIT_USAGE
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
-from coordinator.interruption import SIGNALS, Interruption, ignore_signals, run_to_end
 from coordinator.kinematics.imu_intrinsics import ImuKind
-from coordinator.plan import Mode, Plan, PlanFileError, load_plan
+from coordinator.plan import Mode
 from coordinator.recording import Recording
 from coordinator.result import Result
-from coordinator.run import Run, RunConfig, write_outputs
+from coordinator.run import RunConfig, write_outputs
 from coordinator.run_folder import load_recording
-from coordinator.scaled_loop import ScaledLoop, check_speed
+from coordinator.scaled_loop import check_speed
 from coordinator.session_file import SessionFileError
 from coordinator.terminal import Terminal
 from coordinator.viewer_choice import viewer_choice
 from module_agent.catalogue import UnknownModuleType
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
-from module_agent.wire.injected_network import inject
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.network_file import network as network_named
-from module_agent.wire.network_profile import PROFILES, NetworkProfile
-from module_agent.wire.transport import EndpointInUse, Transport, TransportError
-from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
+from module_agent.wire.transport import Transport, TransportError
 
 app = typer.Typer(
     add_completion=False,
@@ -42,58 +37,9 @@ app = typer.Typer(
     help="Let a robot measure its own body.",
 )
 
-JOIN_TIMEOUT_S = 5.0
-
-Robot = Annotated[str, typer.Option(help="Name of the robot, part of every key.")]
-Listen = Annotated[str, typer.Option(help="Zenoh endpoint to listen on, the hub of the agents.")]
-Connect = Annotated[
-    list[str] | None,
-    typer.Option(help="Zenoh router to connect to, instead of listening; repeat for several."),
-]
-Network = Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}, or a TOML file.")]
-Expect = Annotated[int | None, typer.Option(min=1, help="Wait for this many modules, no more and no fewer.")]
-
 Enough = Annotated[
     int | None, typer.Option(min=1, help="Search until so many are there; fewer is a failure.")
 ]
-
-
-class _Place(NamedTuple):
-    """Where the robot is to be met: a hub to be, or routers to connect to; and through which network."""
-
-    listen: str
-    connect: tuple[str, ...]
-    network: NetworkProfile = PROFILES["none"]
-    seed: int = 0
-
-
-class _Joined(NamedTuple):
-    transport: Transport
-    is_hub: bool
-
-
-def _fail(text: object, code: int) -> NoReturn:
-    typer.echo(f"x5-coordinator: {text}", err=True)
-    raise typer.Exit(code)
-
-
-def _join(place: _Place, terminal: Terminal) -> _Joined:
-    if place.connect:
-        routers = ZenohConfig(mode="client", connect=place.connect, connect_timeout_s=JOIN_TIMEOUT_S)
-        return _Joined(inject(open_zenoh(routers), place.network, place.seed, "coordinator"), False)
-    try:
-        hub = open_zenoh(ZenohConfig.hub(place.listen))
-        return _Joined(inject(hub, place.network, place.seed, "coordinator"), True)
-    except EndpointInUse:
-        # By another coordinator, or a router: join it as a client.
-        joining = ZenohConfig(mode="client", connect=(place.listen,), connect_timeout_s=JOIN_TIMEOUT_S)
-        transport = open_zenoh(joining)
-        terminal.note(f"{place.listen} is in use: joined the hub there")
-        return _Joined(inject(transport, place.network, place.seed, "coordinator"), False)
-
-
-def _sender() -> str:
-    return f"coordinator-{os.getpid()}@{socket.gethostname()}-{secrets.token_hex(2)}"[:64]
 
 
 @app.command()
@@ -143,12 +89,14 @@ def run(
         check_speed(speed)
         injected = network_named(network)
     except ValueError as error:
-        _fail(error, EXIT_USAGE)
+        fail(error, EXIT_USAGE)
     config = RunConfig(
         robot=robot,
         out=out,
-        sender=_sender(),
-        plan=_plan(plan, dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home, imu=imu, mode=mode),
+        sender=sender_name(),
+        plan=planned(
+            plan, dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home, imu=imu, mode=mode
+        ),
         expect=expect,
         resume=resume,
         spawn_viewer=shown.spawn,
@@ -157,7 +105,9 @@ def run(
     )
     advice = f"to go on: {resuming(context)}" if advise else ""
     with Terminal(quiet) as terminal:
-        result = _run(config, _Place(listen, tuple(connect or ()), injected, seed), speed, terminal, advice)
+        result = run_attended(
+            config, Place(listen, tuple(connect or ()), injected, seed), speed, terminal, advice
+        )
     _print(result, terminal)
     terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
 
@@ -177,59 +127,6 @@ def resuming(context: typer.Context) -> str:
             for one in value if isinstance(value, list | tuple) else [value]:
                 words += [option.opts[0], str(one)]
     return shlex.join([*words, "--resume"])
-
-
-def _plan(path: Path | None, **given: object) -> Plan:
-    """Return the plan of a file, or the default one, with the settings that are given (not None)."""
-    try:
-        base = load_plan(path) if path is not None else Plan()
-        # Validated again: an option can be out of range as well.
-        return Plan.model_validate({**base.model_dump(), **{k: v for k, v in given.items() if v is not None}})
-    except PlanFileError as error:
-        _fail(error, EXIT_USAGE)
-    except ValidationError as error:
-        first = error.errors()[0]
-        _fail(f"{first['loc'][0]} = {first['input']}: {first['msg']}", EXIT_USAGE)
-
-
-def _run(config: RunConfig, place: _Place, speed: float, terminal: Terminal, advice: str) -> Result:
-    loop = ScaledLoop(speed)
-    interruption: Interruption | None = None
-    try:
-        work = _prepared(config, place, loop, terminal)
-        task = loop.create_task(work.run())
-        interruption = Interruption(loop, task)
-        for number in SIGNALS:
-            loop.add_signal_handler(number, interruption)
-        try:
-            return run_to_end(loop, task)
-        except BaseException as error:
-            failure = explain(error)
-            if failure is None:
-                raise
-            kept = f"{failure.text}; {work.standstill}; recorded up to here: {config.out}"
-            _fail("\n".join((kept, advice)).rstrip(), failure.exit_code)
-    finally:
-        loop.run_until_complete(loop.shutdown_default_executor())
-        # Closing hands the signals back to Python.
-        loop.close()
-        if interruption is not None and interruption.asked:
-            ignore_signals()
-
-
-def _prepared(config: RunConfig, place: _Place, loop: ScaledLoop, terminal: Terminal) -> Run:
-    """Open everything, or nothing."""
-    try:
-        transport = _join(place, terminal).transport
-    except (OSError, TransportError) as error:
-        _fail(error, EXIT_USAGE)
-    try:
-        return Run(config, transport, loop.clock_ns, loop.call_soon_threadsafe, terminal)
-    except BaseException as error:
-        transport.close()
-        if isinstance(error, ValueError | OSError):
-            _fail(error, EXIT_USAGE)
-        raise
 
 
 def _print(result: Result, terminal: Terminal) -> None:
@@ -260,7 +157,7 @@ def replay(
         recording: Recording = load_recording(session)
         found = identify(recording)
     except (SessionFileError, IdentificationError, UnknownModuleType) as error:
-        _fail(error, EXIT_FAILED)
+        fail(error, EXIT_FAILED)
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, found)
     _print(found.result, Terminal())
@@ -272,17 +169,17 @@ def _search(
     """Join a robot's network to look at it; whoever is its hub now waits for the agents to come."""
     try:
         check_chunk("robot", robot)
-        joined = _join(_Place(listen, tuple(connect or ())), Terminal())
+        joined = join(Place(listen, tuple(connect or ())), Terminal())
     except (ValueError, OSError, TransportError) as error:
-        _fail(error, EXIT_USAGE)
+        fail(error, EXIT_USAGE)
     return joined.transport, Search(least_s=AS_HUB_S if joined.is_hub else 0.0, expect=expect)
 
 
 def _check_all(robot: str, found: int, expect: int | None) -> None:
     if not found:
-        _fail(f"no module of robot {robot!r} answers", EXIT_FAILED)
+        fail(f"no module of robot {robot!r} answers", EXIT_FAILED)
     if expect is not None and found < expect:
-        _fail(f"{found} modules of robot {robot!r} answer, {expect} are expected", EXIT_FAILED)
+        fail(f"{found} modules of robot {robot!r} answer, {expect} are expected", EXIT_FAILED)
 
 
 @app.command("list")
@@ -310,7 +207,7 @@ def list_modules(
             )
         Terminal().console.print(table)
     if deaf:
-        _fail(f"no status from {', '.join(deaf)}", EXIT_FAILED)
+        fail(f"no status from {', '.join(deaf)}", EXIT_FAILED)
     _check_all(robot, len(statuses), expect)
 
 
@@ -320,10 +217,10 @@ def stop(
 ) -> None:
     """Stop every module of a robot at once, whoever holds it."""
     transport, search = _search(robot, listen, connect, expect)
-    stopped, deaf = stop_robot(transport, robot, _sender(), search)
+    stopped, deaf = stop_robot(transport, robot, sender_name(), search)
     Terminal().note(f"stopped: {', '.join(stopped) or 'none'}")
     if deaf:
-        _fail(f"no confirmation from {', '.join(deaf)}", EXIT_FAILED)
+        fail(f"no confirmation from {', '.join(deaf)}", EXIT_FAILED)
     _check_all(robot, len(stopped), expect)
 
 
@@ -340,7 +237,10 @@ def screenshot(
     try:
         picture(recording, out, tab)
     except (ScreenshotFailed, ValueError, OSError) as error:
-        _fail(error, EXIT_FAILED)
+        fail(error, EXIT_FAILED)
+
+
+app.command("check")(check_robot)
 
 
 if __name__ == "__main__":

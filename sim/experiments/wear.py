@@ -84,7 +84,7 @@ def wear_trial(
     wear = draw_wear(load_robot(robot), seed, change_m) if changed else None
     known = _known(subject)
     with tempfile.TemporaryDirectory() as folder:
-        later = _recorded(subject, Path(folder) / "run", 1 + seed % DAYS, check_plan(Plan()), wear)
+        later = _recorded(subject, Path(folder) / "run", 1 + seed % DAYS, check_plan(known, Plan()), wear)
         return _trial(check(known, later), wear)
 
 

@@ -1,0 +1,120 @@
+"""A known robot is checked on another day: a link that has slipped is found, a sound robot is left in peace.
+
+Modules are as delivered, with uncalibrated IMUs, on links that give.
+"""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from coordinator.check import check, check_plan
+from coordinator.check_program import CHECK, EXIT_CHANGED
+from coordinator.known_robot import KnownRobot, KnownRobotError, load_known
+from coordinator.main import app
+from coordinator.plan import Plan
+from coordinator.terminal import Terminal
+from sim.experiments.wear import Wear, draw_wear, worn
+from sim.robot_file import Robot, load_robot
+from sim.robot_tree import true_chain
+from sim.virtual_run import VirtualConfig, run_virtual
+
+ARM = "a2085_03"
+SLIPPED_M = 4e-3
+
+
+class Days(NamedTuple):
+    """The same robot: as it was known, another day, and worn yet another day."""
+
+    known: KnownRobot
+    sound: KnownRobot
+    worn: KnownRobot
+    wear: Wear
+
+
+def _lived(robot: Robot, out: Path, day: int, plan: Plan) -> KnownRobot:
+    run_virtual(VirtualConfig(robot, out, seed=5, noise_seed=day, network="lan", plan=plan), Terminal(True))
+    return load_known(out)
+
+
+@pytest.fixture(scope="module")
+def days(tmp_path_factory: pytest.TempPathFactory) -> Days:
+    folder, robot = tmp_path_factory.mktemp("days"), load_robot(ARM)
+    known = _lived(robot, folder / "known", 0, Plan(dynamics=False, sine_centre_s=1.6, sine_sigma_s=0.7))
+    plan = check_plan(known, Plan())
+    wear = Wear(robot.serials[2], np.array([SLIPPED_M, 0.0, 0.0]))
+    return Days(
+        known,
+        _lived(robot, folder / "sound", 1, plan),
+        _lived(worn(robot, wear), folder / "worn", 2, plan),
+        wear,
+    )
+
+
+def test_a_sound_robot_is_left_in_peace(days: Days) -> None:
+    report = check(days.known, days.sound)
+    assert not report.changed
+    assert report.words[0].startswith("no link has changed")
+    # What would have been found is about what is: no claim of micrometres.
+    assert all(link.would_find_mm is None or link.would_find_mm > 0.5 for link in report.links)
+    # Three joints of 8 s, and the session's own 6 s.
+    assert report.robot_time_s < 30.0
+
+
+def test_a_link_that_slipped_is_found_located_and_sized(days: Days) -> None:
+    report = check(days.known, days.worn)
+    named = [link for link in report.links if link.changed]
+    assert [link.child for link in named] == [days.wear.child]
+    # The bar of a 2 mm change.
+    assert np.linalg.norm(np.array(named[0].displacement_mm) - 1e3 * days.wear.displacement_m) < 0.5
+    assert abs(named[0].length_mm - 1e3 * SLIPPED_M) < 3.0 * named[0].length_sigma_mm
+    assert named[0].sigmas > 4.0
+    assert days.wear.child in report.words[0]
+
+
+def test_the_command_says_so_and_exits_with_4(days: Days) -> None:
+    arguments = ["check", str(days.known.folder), "--measured"]
+    sound = CliRunner().invoke(app, [*arguments, str(days.sound.folder)])
+    assert sound.exit_code == 0, sound.output
+    slipped = CliRunner().invoke(app, [*arguments, str(days.worn.folder), "--json"])
+    assert slipped.exit_code == EXIT_CHANGED
+    written = json.loads((days.worn.folder / CHECK).read_text())
+    assert written["changed"] is True
+    assert [link["child"] for link in written["links"] if link["changed"]] == [days.wear.child]
+    assert not list(days.worn.folder.glob("*.part"))
+
+
+def test_modules_that_are_not_the_known_ones_are_named(days: Days) -> None:
+    topology = days.sound.kinematics.topology
+    other = topology._replace(serials=(*topology.serials[:-1], "stranger"))
+    report = check(days.known, days.sound._replace(kinematics=days.sound.kinematics._replace(topology=other)))
+    assert report.changed
+    assert report.modules_missing == [topology.serials[-1]]
+    assert report.modules_new == ["stranger"]
+
+
+def test_a_folder_without_a_recording_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(KnownRobotError, match=r"holds no session\.mcap"):
+        load_known(tmp_path)
+    done = CliRunner().invoke(app, ["check", str(tmp_path), "--out", str(tmp_path / "new")])
+    assert done.exit_code == 2
+
+
+def test_a_check_needs_a_robot_or_a_run(tmp_path: Path) -> None:
+    assert CliRunner().invoke(app, ["check", str(tmp_path)]).exit_code == 2
+
+
+@pytest.mark.parametrize("name", ["arm6", "a2085_06", "tree_y"])
+def test_worn_robots_are_displaced_where_they_say_and_only_there(name: str) -> None:
+    robot = load_robot(name)
+    sound = true_chain(robot)
+    for seed in range(5):
+        wear = draw_wear(robot, seed, 2e-3)
+        assert np.linalg.norm(wear.displacement_m) == pytest.approx(2e-3)
+        k = robot.serials.index(wear.child)
+        moved = true_chain(worn(robot, wear)).imu_home[:, :3, 3] - sound.imu_home[:, :3, 3]
+        assert moved[k] == pytest.approx(sound.imu_home[k, :3, :3] @ wear.displacement_m, abs=1e-12)
+        assert np.allclose(moved[:k], 0.0, atol=1e-12)
