@@ -2,7 +2,8 @@
 
 A module answers at a time that lies between sending and receiving; the middle is wrong by at most half the
 round trip, so the quickest trips say most. Offset and drift are fitted by least squares with weights that
-fall with the excess of a trip over the quickest one.
+fall with the excess of a trip over the quickest one: the tail of slow trips has no say, however heavy.
+What no number of trips tells is how the quickest one divides into there and back.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,10 @@ SHORTEST_FIT_NS = 10_000_000_000
 # Questions to two modules that were asked within this are compared with each other.
 SAME_MOMENT_NS = 5_000_000
 FEWEST_PAIRS = 5
+# What holds up one trip holds up its neighbours: their errors count as one within this.
+TOGETHER_NS = 500_000_000
+# A crystal's rate where no slope is fitted; and what temperature does to it within a session.
+CRYSTAL_DRIFT, LEAST_DRIFT_SIGMA = 1e-4, 1e-7
 
 
 _Columns = tuple[Times, Times, Times]
@@ -30,13 +35,19 @@ _Columns = tuple[Times, Times, Times]
 class ClockMap(NamedTuple):
     """session = module + offset_ns + drift * (module - origin_ns).
 
-    `uncertainty_ns` is half the quickest trip.
+    `sigma_ns` and `drift_sigma` are one standard deviation of offset and drift, independent of each other as
+    the origin is the trips' middle. Of maps from round trips those of two modules are independent too.
     """
 
     origin_ns: int
     offset_ns: float
     drift: float
-    uncertainty_ns: float
+    sigma_ns: float
+    drift_sigma: float = 0.0
+
+    def corrected(self, ahead_ns: float, fast: float) -> "ClockMap":
+        """Return the map whose session times are less by `ahead_ns` at the origin, and by `fast` per ns."""
+        return self._replace(offset_ns=self.offset_ns - ahead_ns, drift=self.drift - fast)
 
     def to_session(self, module_ns: Times) -> Times:
         """Map module times (n,) to session times (n,), both integer nanoseconds."""
@@ -73,8 +84,7 @@ def _map(trips: _Columns) -> ClockMap:
     base = int(sent[0]) - origin
     trip = (received - sent).astype(np.float64)
     middle = (sent - (module + base)).astype(np.float64) + 0.5 * trip
-    offset, drift = _fit(module - origin, middle, 1.0 / (trip - trip.min() + FLOOR_NS))
-    return ClockMap(origin, base + offset, drift, 0.5 * float(trip.min()))
+    return _fitted(origin, base, _fit(module - origin, middle, trip), trip)
 
 
 def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
@@ -90,7 +100,7 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
     columns = {name: _columns(trips[name]) for name in sorted(trips)}
     reference, *others = columns
     whole = _map(columns[reference])
-    base = ClockMap(whole.origin_ns, whole.offset_ns, 0.0, whole.uncertainty_ns)
+    base = whole._replace(drift=0.0, drift_sigma=0.0)
     return {reference: base, **{name: _beside(base, columns[reference], columns[name]) for name in others}}
 
 
@@ -112,9 +122,10 @@ def _beside(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
     origin = int(module[0])
     shift = int(module_r[near[0]]) - origin
     offset = (module_r[near] - (module + shift)).astype(np.float64) + apart
-    trip = (received - sent + received_r[near] - sent_r[near]).astype(np.float64)
-    constant, drift = _fit(module - origin, offset, 1.0 / (trip - trip.min() + FLOOR_NS))
-    return ClockMap(origin, base.offset_ns + shift + constant, drift, 0.5 * float(trip.min()))
+    both = (received - sent + received_r[near] - sent_r[near]).astype(np.float64)
+    line = _fit(module - origin, offset, both)
+    found = _fitted(origin, shift, line, (received - sent).astype(np.float64))
+    return found._replace(offset_ns=base.offset_ns + found.offset_ns)
 
 
 def _columns(trips: Sequence[RoundTrip]) -> _Columns:
@@ -124,10 +135,41 @@ def _columns(trips: Sequence[RoundTrip]) -> _Columns:
     return sent, received, module
 
 
-def _fit(since: Times, offset: NDArray[np.float64], weight: NDArray[np.float64]) -> tuple[float, float]:
-    """Return offset and drift of a line, drift zero over a time too short for one."""
-    x = since.astype(np.float64)
+class _Line(NamedTuple):
+    """offset = constant + slope * (since - centre), with standard deviations."""
+
+    centre_ns: int
+    constant_ns: float
+    slope: float
+    constant_sigma_ns: float
+    slope_sigma: float
+
+
+def _fitted(origin_ns: int, base_ns: int, line: _Line, trip_ns: NDArray[np.float64]) -> ClockMap:
+    # There may take any share of the quickest trip: uniform, so that half of it is root three sigmas.
+    divided = 0.5 * float(trip_ns.min()) / np.sqrt(3.0)
+    sigma = float(np.hypot(divided, line.constant_sigma_ns))
+    drift_sigma = max(line.slope_sigma, LEAST_DRIFT_SIGMA)
+    return ClockMap(origin_ns + line.centre_ns, base_ns + line.constant_ns, line.slope, sigma, drift_sigma)
+
+
+def _fit(since: Times, offset: NDArray[np.float64], trip: NDArray[np.float64]) -> _Line:
+    """Fit a line, of slope zero over a time too short for one.
+
+    Sigmas are those of weighted least squares whose errors differ in size and come together (White, 1980;
+    Liang and Zeger, 1986): from the scatter of what the trips of one moment add to the estimate.
+    """
+    weight = (trip - trip.min() + FLOOR_NS) ** -2.0
+    weight = weight / weight.sum()
+    centre = round(float(weight @ since))
+    x = (since - centre).astype(np.float64)
+    constant = float(weight @ offset)
+    moments = np.unique(since // TOGETHER_NS, return_inverse=True)[1]
     if x.max() - x.min() < SHORTEST_FIT_NS:
-        return float(np.average(offset, weights=weight**2)), 0.0
-    drift, constant = (float(value) for value in np.polyfit(x, offset, 1, w=weight))
-    return constant, drift
+        scatter = np.bincount(moments, weight * (offset - constant))
+        return _Line(centre, constant, 0.0, float(np.linalg.norm(scatter)), CRYSTAL_DRIFT)
+    lever = weight * x / float(weight @ x**2)
+    slope = float(lever @ (offset - constant))
+    rest = offset - constant - slope * x
+    sigmas = (float(np.linalg.norm(np.bincount(moments, share * rest))) for share in (weight, lever))
+    return _Line(centre, constant, slope, *sigmas)

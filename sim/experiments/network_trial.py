@@ -122,7 +122,7 @@ def scored(run: Path, robot: str, network: str, seed: int) -> NetworkTrial:
         None if result.tip_position_rms_mm is None else 1e-3 * result.tip_position_rms_mm,
         result.tip_orientation_rms_deg,
         clock_error_s(clocks, read_motion(run / "truth.npz")),
-        float(np.sqrt(np.mean([1e-18 * clock.uncertainty_ns**2 for clock in clocks.values()]))),
+        float(np.sqrt(np.mean([1e-18 * clock.sigma_ns**2 for clock in clocks.values()]))),
     )
 
 
