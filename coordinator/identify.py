@@ -27,12 +27,13 @@ from coordinator.kinematics.chain_observations import (
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement, refine_chain
-from coordinator.kinematics.topology import MotionSeen, Topology, TopologyError, find_topology
+from coordinator.kinematics.topology import Topology, TopologyError, find_topology
 from coordinator.kinematics.whole_motion import circles_of_all, seen_by_all
 from coordinator.motion_window import RATE_HZ, Window, sensor_data, window
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.result_parts import build_result
+from coordinator.topology_search import TopologyFound, left_out, search_topology
 from coordinator.whole_exploration import respond, whole_motion
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.wire.messages import Estimate
@@ -129,7 +130,8 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     serials = _explored(recording)
     try:
         clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
-        topology = find_topology(_seen(recording, clocks, serials))
+        found = _topology(recording, clocks, serials)
+        topology = found.topology
         types = [_type(recording, s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
         first = assemble(
@@ -151,6 +153,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         for estimate in found.values()
         if estimate.note
     )
+    notes += found.notes
     notes += _strange_imus(topology.serials, refined, prior)
     return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
 
@@ -201,7 +204,7 @@ def _motions(recording: Recording, *purposes: Purpose) -> list[JournalEvent]:
 def _explored(recording: Recording) -> list[str]:
     rested = sorted({e.serial for e in _motions(recording, "rest")})
     explored = {e.serial for e in _motions(recording, "windowed_sine", "whole")}
-    missing = [s for s in rested if s not in explored]
+    missing = [s for s in rested if s not in explored and s not in left_out(recording)]
     if not rested or missing:
         raise IdentificationError(
             "no rest was recorded" if not rested else f"no exploration of {', '.join(missing)} was recorded"
@@ -226,25 +229,13 @@ def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose)
     return None
 
 
-def _seen(
-    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]
-) -> dict[tuple[str, str], MotionSeen]:
-    """Return who moved with whom, by the slow motion where it was seen (see `estimate.observer`)."""
+def _topology(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> TopologyFound:
+    """Find who is mounted on whom, by the slow motions or by that of all joints at once."""
     whole = whole_motion(recording, serials)
-    if whole is not None:
-        return seen_by_all(serials, respond(recording, clocks, serials, whole))
-    seen: dict[tuple[str, str], MotionSeen] = {}
-    for joint in serials:
-        for observer in serials:
-            slow = _estimate(recording, joint, observer, "constant")
-            fast = _estimate(recording, joint, observer, "windowed_sine")
-            estimate = slow if slow is not None else fast
-            if estimate is None:
-                continue
-            circle = fast.circle if fast is not None else None
-            axis = np.array(circle.axis) if circle is not None else None
-            seen[joint, observer] = MotionSeen(estimate.moved, estimate.rate_ratio, axis)
-    return seen
+    if whole is None:
+        return search_topology(recording, serials)
+    response = respond(recording, clocks, serials, whole)
+    return TopologyFound(find_topology(seen_by_all(serials, response)), ())
 
 
 def _pairs(
@@ -255,10 +246,12 @@ def _pairs(
     if whole is not None:
         return circles_of_all(serials, respond(recording, clocks, serials, whole))
     sines = {
-        e.serial: i for i, e in enumerate(_exploration_motions(recording)) if e.purpose == "windowed_sine"
+        e.serial: i
+        for i, e in enumerate(_exploration_motions(recording, serials))
+        if e.purpose == "windowed_sine"
     }
     pairs = []
-    for joint in serials:
+    for joint in [s for s in serials if s in sines]:
         q_mean = windows[sines[joint]].q_rad.mean(axis=0)
         for observer in serials:
             estimate = _estimate(recording, joint, observer, "windowed_sine")
@@ -297,14 +290,16 @@ def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
     return RestObservation(np.array(force), max(scatter), np.array(position))
 
 
-def _exploration_motions(recording: Recording) -> list[JournalEvent]:
+def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
+    """Return the motions that the chain is fitted to, of modules that take part in it."""
     # All joints at once are in the window of any of them.
-    return _motions(recording, "constant", "windowed_sine") + _motions(recording, "whole")[:1]
+    found = _motions(recording, "constant", "windowed_sine") + _motions(recording, "whole")[:1]
+    return [event for event in found if event.serial in serials]
 
 
 def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:
     margin = settling_samples(RATE_HZ, KINEMATIC_CUTOFF_HZ) / RATE_HZ
-    return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording)]
+    return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording, serials)]
 
 
 # ---------------------------------------------------------------------- dynamics

@@ -15,6 +15,7 @@ from coordinator.identify import (
     write_held_out,
 )
 from coordinator.journal import JournalEvent, standstill
+from coordinator.kinematics.topology_advice import NextMotion
 from coordinator.plan import Plan
 from coordinator.radio import Post, Radio
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
@@ -23,6 +24,7 @@ from coordinator.robot_link import RobotLink
 from coordinator.run_folder import HELD_OUT, HRDF, RESULT, SESSION, URDF, VIEW, open_run_folder
 from coordinator.session import Session
 from coordinator.session_file import SessionWriter, read_session
+from coordinator.topology_search import doubtful_motions
 from coordinator.urdf import write_urdf
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
@@ -119,6 +121,10 @@ class Run:
     def estimates(self, joint: str) -> None:
         """Show the local estimates of a joint."""
         self._feed.estimates(joint, self._clock())
+
+    async def doubts(self) -> tuple[NextMotion, ...]:
+        """Look for doubts about the topology as soon as all joints are explored."""
+        return await self._compute(lambda: doubtful_motions(self.recording))
 
     async def explored(self) -> None:
         """Assemble topology and chain as soon as all joints are explored, and show them."""

@@ -4,13 +4,15 @@ Steps are journaled: a step that the journal says is done is not done again when
 """
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from coordinator.clock import Clock
 from coordinator.journal import JournalEvent, Purpose
+from coordinator.kinematics.topology_advice import MOST_REPEATS, NextMotion
 from coordinator.link_errors import MotionInterrupted
 from coordinator.motion_design.limits import joint_limits, likely_inertia_kg_m2
 from coordinator.motion_design.whole_robot import JointSetting, whole_patterns
@@ -39,6 +41,10 @@ class Reporter(Protocol):
 
     def estimates(self, joint: str) -> None:
         """All estimates of the motions of a joint have arrived."""
+        ...
+
+    async def doubts(self) -> Sequence[NextMotion]:
+        """All joints are explored. Return what to move again to settle doubts about the topology."""
         ...
 
     async def explored(self) -> None:
@@ -99,6 +105,7 @@ class Session:
             else:
                 for serial in serials:
                     await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
+            await self._settle_doubts()
             self._report("topology and chain")
             await self._reporter.explored()
             if self._plan.dynamics:
@@ -270,6 +277,33 @@ class Session:
         await self._observe(serial, plan.sine(self.link.kind(serial)), "windowed_sine")
         self._reporter.estimates(serial)
 
+    async def _settle_doubts(self) -> None:
+        """Move again what leaves the topology in doubt, until nothing does or trying has no end."""
+        for turn in range(MOST_REPEATS):
+            motions = await self._reporter.doubts()
+            self._total += len(motions)
+            for motion in motions:
+                self._reporter.note(motion.words)
+                await self._step(
+                    f"settle/{turn}/{motion.joint}",
+                    f"moving joint {motion.joint} again",
+                    partial(self._move_again, motion),
+                    motion.joint,
+                )
+            if not motions:
+                return
+
+    async def _move_again(self, motion: NextMotion, serial: str) -> None:
+        slow, home = self._plan.constant(), self._plan.home_rad
+        others = {s: home + motion.others_rad for s in self.link.serials if s != serial}
+        if motion.others_rad:
+            await self._go_all(others)
+        await self._go(serial, home - 0.5 * motion.travel_rad(slow))
+        await self._observe(serial, motion.pattern(slow), "constant")
+        await self._go(serial, home)
+        if motion.others_rad:
+            await self._go_all(dict.fromkeys(others, home))
+
     async def _explore_all(self) -> None:
         """All joints about home at the same time, each at frequencies of its own (thesis 7.2)."""
         kinds = {serial: self.link.kind(serial) for serial in self.link.serials}
@@ -316,9 +350,11 @@ class Session:
     # ------------------------------------------------------------------ pieces
 
     async def _go(self, serial: str, target_rad: float) -> None:
-        await self.link.run(
-            {serial: GoTo(target_rad=target_rad, max_speed_rad_s=self._plan.travel_speed_rad_s)}
-        )
+        await self._go_all({serial: target_rad})
+
+    async def _go_all(self, targets_rad: Mapping[str, float]) -> None:
+        speed = self._plan.travel_speed_rad_s
+        await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in targets_rad.items()})
         await asyncio.sleep(self._plan.settle_s)
 
     async def _move(self, step: str, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:

@@ -14,12 +14,24 @@ from coordinator.kinematics.topology_advice import NextMotion, next_motions
 from coordinator.recording import Recording
 from coordinator.topology_observations import Seen, observe, slow_motions
 
+# Step of the journal's notes on modules that the session went on without.
+LEFT_OUT = "left_out/"
+
 
 class TopologyFound(NamedTuple):
     """The topology of the modules that respond, and notes in words on those that do not, and on doubts."""
 
     topology: Topology
     notes: tuple[str, ...]
+
+
+def left_out(recording: Recording) -> dict[str, str]:
+    """Return the modules that the session went on without, with the reason in words."""
+    return {
+        event.step.removeprefix(LEFT_OUT): event.text
+        for event in recording.journal
+        if event.what == "note" and event.step.startswith(LEFT_OUT)
+    }
 
 
 def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFound:
@@ -34,12 +46,16 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
     if not seen.observations:
         raise TopologyError(_nothing_seen(seen), tuple(serials))
     topology = find_topology(*_usable(seen))
-    return TopologyFound(topology, tuple(_notes(seen, topology)))
+    without = [f"{s} took no part: {why}" for s, why in left_out(recording).items()]
+    return TopologyFound(topology, (*without, *_notes(seen, topology)))
 
 
 def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
     """Return what to move next to settle doubts about the topology, nothing if there are none left."""
-    serials = sorted({e.serial for e in recording.journal if e.what == "motion" and e.purpose == "rest"})
+    motions = [e for e in recording.journal if e.what == "motion"]
+    if any(e.purpose == "whole" for e in motions):
+        return ()  # a slow motion beside that of all joints at once would stand in its place
+    serials = sorted({e.serial for e in motions if e.purpose == "rest"})
     seen = observe(recording, serials)
     if not seen.observations:
         return ()

@@ -128,10 +128,23 @@ def test_a_module_that_has_not_told_its_type_is_named(run: list[Entry]) -> None:
         identify(_recorded(cut))
 
 
-def test_a_module_that_saw_nothing_of_a_joint_is_named(run: list[Entry]) -> None:
+def test_a_module_whose_own_estimates_are_lost_is_placed_by_its_feedback(run: list[Entry]) -> None:
     cut = [e for e in run if not _on(e, Leaf.ESTIMATE, TIP)]
-    with pytest.raises(IdentificationError, match=TIP):
-        identify(_recorded(cut))
+    topology = identify_kinematics(_recorded(cut)).topology
+    assert (topology.serials, topology.parent, topology.reversed) == ((BASE, TIP), (-1, 0), (False, False))
+    assert topology.confidence > 0.99
+
+
+def test_a_module_that_saw_nothing_at_all_is_left_out_and_named(run: list[Entry]) -> None:
+    event = next(e for e in map(_event, run) if e is not None and e.what == "done" and e.step == "rest")
+    cut = [
+        e
+        for e in run
+        if not _on(e, Leaf.ESTIMATE, TIP) and not (_on(e, Leaf.FEEDBACK, TIP) and e.t_ns > event.t_ns)
+    ]
+    found = identify_kinematics(_recorded(cut))
+    assert found.topology.serials == (BASE,)
+    assert any(TIP in note and "left out" in note for note in found.notes)
 
 
 def test_a_module_that_never_answered_has_no_clock_and_that_is_said(run: list[Entry]) -> None:
