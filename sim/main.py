@@ -9,6 +9,7 @@ from rich.table import Table
 
 from coordinator.failure import EXIT_USAGE
 from coordinator.terminal import print_table
+from sim.benchmark.program import app as benchmark
 from sim.command_options import RobotArgument, fail, load
 from sim.drawing import draw
 from sim.effects import EFFECTS
@@ -90,6 +91,7 @@ app.command()(launch)
 app.command("score")(score_run)
 app.command()(amplitudes)
 app.command()(compare_log)
+app.add_typer(benchmark, name="benchmark")
 
 if __name__ == "__main__":
     app()

@@ -1,0 +1,57 @@
+"""The benchmark of kinematics: its cases, and what holds over all of them."""
+
+from collections.abc import Sequence
+from fnmatch import fnmatch
+from typing import NamedTuple
+
+from sim.benchmark.arms import arm_cases
+from sim.benchmark.case import Case, CaseResult
+from sim.benchmark.joints import joint_cases
+from sim.benchmark.networks import network_cases
+from sim.benchmark.row import Row, coverage
+from sim.benchmark.topologies import topology_cases
+from sim.benchmark.wears import wear_cases
+
+TRIALS = 13
+ALL = "all cases"
+
+
+class Effort(NamedTuple):
+    """How many trials there are of everything."""
+
+    joints: int
+    arms: int
+    robots: int
+    networks: int
+    changed: int
+    unchanged: int
+
+
+QUICK = Effort(joints=1, arms=1, robots=2, networks=1, changed=1, unchanged=1)
+
+
+def full(trials: int = TRIALS) -> Effort:
+    """Return the effort that the bars are meant for, with that many trials a case."""
+    return Effort(trials, trials, robots=200, networks=trials, changed=trials, unchanged=100)
+
+
+def kinematic_cases(effort: Effort, seed: int) -> list[Case]:
+    """Return all cases, in the order in which they are reported."""
+    return [
+        *joint_cases(effort.joints, seed),
+        *arm_cases(effort.arms, seed),
+        *topology_cases(effort.robots, seed),
+        *network_cases(effort.networks, seed),
+        *wear_cases(effort.changed, effort.unchanged, seed),
+    ]
+
+
+def chosen(cases: Sequence[Case], pattern: str) -> list[Case]:
+    """Return the cases whose name holds the pattern, in which * and ? stand for anything."""
+    return [case for case in cases if fnmatch(case.name, f"*{pattern}*")]
+
+
+def over_all(results: Sequence[CaseResult]) -> list[Row]:
+    """Return the rows that are about all cases together; none where no case claimed an interval."""
+    off = [value for result in results for value in result.summary.sigmas_off]
+    return [coverage(ALL, off)] if off else []

@@ -1,0 +1,115 @@
+"""`x5-sim benchmark`: figures of the whole system on simulated robots, against the bars set for it."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coordinator.failure import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
+from coordinator.interruption import SIGNALS
+from coordinator.terminal import Terminal
+from sim.benchmark.case import Case, CaseResult
+from sim.benchmark.kinematics import QUICK, TRIALS, chosen, full, kinematic_cases, over_all
+from sim.benchmark.plot import plot
+from sim.benchmark.results import Results, gathered, write_results
+from sim.benchmark.runner import run_cases
+from sim.benchmark.table import print_rows
+from sim.command_options import Seed, fail
+
+EXIT_MISSED = 4
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Measure the whole system on simulated robots, against the bars that are set for it.",
+)
+
+
+@app.callback()
+def _benchmark() -> None:
+    """Keep `kinematics` a command of its own name."""
+
+
+@app.command()
+def kinematics(
+    json_file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
+    plot_file: Annotated[Path | None, typer.Option("--plot", help="Picture to write: PNG, SVG, PDF.")] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Every row with few trials, in about a minute on two cores.")
+    ] = False,
+    trials: Annotated[
+        int | None,
+        typer.Option(min=1, help=f"Trials a case; 200 robots and 100 unchanged checks besides [{TRIALS}]."),
+    ] = None,
+    seed: Seed = 0,
+    only: Annotated[str, typer.Option(help="Cases whose name holds this; * and ? stand for anything.")] = "",
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
+    ] = None,
+) -> None:
+    """Compare the thesis' estimator, ours and the physical limit on the same recordings of simulated robots.
+
+    Exit code 0 if all bars are met, 4 if one is missed, 1 if a file cannot be written, 2 for wrong usage,
+    130 if interrupted; nothing is written then.
+    """
+    if quick and trials is not None:
+        fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
+    for file in (json_file, plot_file):
+        if file is not None and not file.parent.is_dir():
+            fail(f"{file}: there is no folder {file.parent}", EXIT_USAGE)
+    effort = QUICK if quick else full(trials or TRIALS)
+    cases = kinematic_cases(effort, seed)
+    wanted = chosen(cases, only)
+    if not wanted:
+        fail(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases), EXIT_USAGE)
+    started_s = time.monotonic()
+    found = _run(wanted, processes or os.cpu_count() or 1)
+    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "trials": effort._asdict()}
+    results = gathered("kinematics", settings, found, over_all(found), time.monotonic() - started_s)
+    _report(results, json_file, plot_file)
+    if results.missed:
+        raise typer.Exit(EXIT_MISSED)
+
+
+def _run(cases: list[Case], processes: int) -> list[CaseResult]:
+    total = sum(len(case.trials) for case in cases)
+    done = 0
+
+    def show(case: Case, left: int) -> None:
+        nonlocal done
+        done += 1
+        # A pipe is told of whole cases only.
+        if terminal.console.is_terminal or not left:
+            terminal.step(done, total, case.name)
+
+    # Processes that share the cores already must not each start as many threads; they inherit this.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        with Terminal() as terminal:
+            return run_cases(cases, processes, show)
+    except KeyboardInterrupt:
+        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
+
+
+def _report(results: Results, json_file: Path | None, plot_file: Path | None) -> None:
+    print_rows(results.rows, f"Benchmark of {results.benchmark}")
+    for text in results.failures:
+        typer.echo(f"failed: {text}", err=True)
+    held = sum(row.holds is True for row in results.rows)
+    typer.echo(f"{held} bars met, {len(results.missed)} missed, {results.wall_time_s:.0f} s")
+    try:
+        if json_file is not None:
+            write_results(json_file, results)
+        if plot_file is not None:
+            plot(results.rows, plot_file)
+    except OSError as error:
+        fail(f"cannot write {error.filename}: {error.strerror}", EXIT_FAILED)
+    except ValueError as error:
+        fail(f"cannot draw {plot_file}: {error}", EXIT_FAILED)
