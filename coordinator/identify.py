@@ -19,6 +19,7 @@ from coordinator.dynamics.prediction import TorqueError, torque_error
 from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
+from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.chain_observations import (
     DISTANCE_FLOOR_M,
     PairObservation,
@@ -26,26 +27,21 @@ from coordinator.kinematics.chain_observations import (
 )
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
-from coordinator.kinematics.refinement import Refinement, refine_chain
+from coordinator.kinematics.refinement import Refinement
 from coordinator.kinematics.topology import Topology, TopologyError, find_topology
 from coordinator.kinematics.whole_motion import circles_of_all, seen_by_all
-from coordinator.motion_window import RATE_HZ, Window, sensor_data, window
+from coordinator.motion_window import RATE_HZ, Window, noise_floor, window
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.result_parts import build_result
+from coordinator.robot_refinement import CUTOFF_HZ, refine_robot
 from coordinator.topology_search import TopologyFound, left_out, search_topology
 from coordinator.whole_exploration import respond, whole_motion
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.wire.messages import Estimate
 
-# Five times the 2 Hz of the windowed sine, and above the first resonance of a held joint's spring.
-KINEMATIC_CUTOFF_HZ = 15.0
-# Of some 25 errors an IMU the largest is below this in 99 of 100.
+# Of some 30 errors an IMU the largest is below this in 99 of 100.
 STRANGE_ABOVE = 3.5
-# Half the time constant of that low-pass: about as many independent samples as there are.
-KINEMATIC_KEEP_EVERY = 5
-# IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
-MOST_IMU_SAMPLES = 40_000
 DYNAMIC_CUTOFF_HZ = 12.0
 
 
@@ -84,6 +80,7 @@ class Kinematics(NamedTuple):
         for k, serial in enumerate(self.topology.serials):
             parent = self.topology.parent[k]
             mounted = ", mounted reversed" if self.topology.reversed[k] else ""
+            mounted += self.topology.caveat(k)
             if parent < 0:
                 lines.append(f"{serial} on the base{mounted}")
                 continue
@@ -140,11 +137,9 @@ def identify_kinematics(recording: Recording) -> Kinematics:
             _pairs(recording, clocks, topology.serials, windows),
             [_rest(recording, topology.serials)],
         )
-        samples = sum(len(w.t_ns) for w in windows) * len(serials)
-        keep_every = max(KINEMATIC_KEEP_EVERY, -(-samples // MOST_IMU_SAMPLES))
-        data = sensor_data(windows, KINEMATIC_CUTOFF_HZ, keep_every)
         prior = _imu_prior(recording)
-        refined = refine_chain(first.chain, data, prior)
+        floor = _base_floor(recording, clocks, topology)
+        refined = refine_robot(first.chain, types, windows, prior, floor)
     except (TopologyError, AssemblyError, ValueError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
@@ -290,6 +285,14 @@ def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
     return RestObservation(np.array(force), max(scatter), np.array(position))
 
 
+def _base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topology) -> NoiseFloor | None:
+    """Return the noise of the IMU that rides on the base, if the first module's does."""
+    if topology.reversed[0]:
+        return None
+    still = [e for e in _motions(recording, "rest") if e.serial == topology.serials[0]]
+    return noise_floor(window(recording, clocks, topology.serials, still[0]), CUTOFF_HZ, 0)
+
+
 def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
     """Return the motions that the chain is fitted to, of modules that take part in it."""
     # All joints at once are in the window of any of them.
@@ -298,7 +301,7 @@ def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[J
 
 
 def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:
-    margin = settling_samples(RATE_HZ, KINEMATIC_CUTOFF_HZ) / RATE_HZ
+    margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
     return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording, serials)]
 
 

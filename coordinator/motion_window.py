@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from coordinator.chain import Array
 from coordinator.clock_map import ClockMap
@@ -15,7 +16,8 @@ from coordinator.dynamics.differentiation import (
     zero_phase_low_pass,
 )
 from coordinator.journal import JournalEvent
-from coordinator.kinematics.refinement import SensorData
+from coordinator.kinematics.base_motion import NoiseFloor, outstanding
+from coordinator.kinematics.sensor_data import SensorData
 from coordinator.recording import Recording
 
 RATE_HZ = 250.0
@@ -105,21 +107,61 @@ def _no_row(serial: str, event: JournalEvent) -> str:
     return f"module {serial} has no row in the {motion}: its recording has a hole"
 
 
-def sensor_data(windows: Sequence[Window], cutoff_hz: float, keep_every: int) -> SensorData:
-    """Filter all signals of all windows alike, differentiate, and keep one sample in `keep_every`."""
-    parts = [_filtered(one, cutoff_hz, keep_every) for one in windows]
-    return SensorData(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _filtered(one: Window, cutoff_hz: float, keep_every: int) -> SensorData:
+def noise_floor(rest: Window, cutoff_hz: float, module: int) -> NoiseFloor:
+    """Return what one module's IMU scatters at rest, through the same low-pass as `sensor_data`."""
     edge = settling_samples(RATE_HZ, cutoff_hz)
-    kept = slice(edge, len(one.t_ns) - edge, keep_every)
+    gyro, accel = (
+        zero_phase_low_pass(signal[:, module], RATE_HZ, cutoff_hz)[edge:-edge].var(axis=0)
+        for signal in (rest.gyro_rad_s, rest.accel_m_s2)
+    )
+    return NoiseFloor(gyro, accel, cutoff_hz)
+
+
+def sensor_data(
+    windows: Sequence[Window], cutoff_hz: float, keep_every: int, floor: NoiseFloor | None = None
+) -> SensorData:
+    """Filter all signals of all windows alike, differentiate, and keep one sample in `keep_every`.
+
+    With the noise `floor` of the first module's IMU, which rides on the base, it has the base's motion.
+    """
+    return thinned([filtered(one, cutoff_hz, floor) for one in windows], keep_every)
+
+
+def thinned(parts: Sequence[SensorData], keep_every: int) -> SensorData:
+    """Join what was filtered, one sample in `keep_every` of each."""
+    parts = [
+        part._replace(motion=np.full(len(part.q_rad), number, dtype=np.int64))
+        for number, part in enumerate(parts)
+    ]
+    columns = zip(*parts, strict=True)
+    return SensorData(
+        *(None if one[0] is None else np.concatenate([part[::keep_every] for part in one]) for one in columns)  # type: ignore[arg-type]
+    )
+
+
+def filtered(
+    one: Window, cutoff_hz: float, floor: NoiseFloor | None = None, imu_late_s: float = 0.0
+) -> SensorData:
+    """Filter all signals of a window alike and differentiate; what the filter has not settled on is cut.
+
+    The joints are seen as late as the IMUs are.
+    """
+    edge = settling_samples(RATE_HZ, cutoff_hz)
+    kept = slice(edge, len(one.t_ns) - edge)
     q, gyro, accel = (
         zero_phase_low_pass(signal, RATE_HZ, cutoff_hz)
         for signal in (one.q_rad, one.gyro_rad_s, one.accel_m_s2)
     )
+    if imu_late_s:
+        t_s = np.arange(len(q)) / RATE_HZ
+        q = CubicSpline(t_s, q)(t_s - imu_late_s)
     # The module's own velocity is late by its filter; positions are of their instant.
     qd = differentiate(q, RATE_HZ)
     qdd = differentiate(qd, RATE_HZ)
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
-    return SensorData(q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept])
+    base = None
+    if floor is not None:
+        omega = outstanding(gyro[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
+        force = outstanding(accel[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
+        base = np.concatenate([omega, differentiate(omega, RATE_HZ), force], axis=1)[kept]
+    return SensorData(q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept], base)

@@ -1,5 +1,6 @@
 """What every IMU of a chain reads during a motion: the forward model of the batch refinement."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from coordinator.chain import Array, Chain
 from coordinator.cross_product import cross
+from coordinator.kinematics.base_motion import BaseMotion
 from coordinator.kinematics.forward import BASE, carrier
 from coordinator.kinematics.increments import skew
 
@@ -29,6 +31,19 @@ class BodyMotion(NamedTuple):
     acceleration: Array
 
 
+class LinkTurn(NamedTuple):
+    """A small turn of a link about a place (3,) of the body that it starts from, in that body's frame.
+
+    theta_rad: (3, 3, m) rotation vector, its first and its second time derivative.
+    """
+
+    hinge: Array
+    theta_rad: Array
+
+
+LinkTurns = Mapping[int, Sequence[LinkTurn]]
+
+
 def imu_readings(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2: ArrayLike) -> ImuReadings:
     """Predict ideal IMUs: f = R^T (a + alpha x p + omega x (omega x p)), with a against free fall.
 
@@ -42,13 +57,15 @@ def imu_readings(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2
     return readings_on(chain, body_motions(chain, q_rad, qd_rad_s, qdd_rad_s2))
 
 
-def readings_on(chain: Chain, bodies: list[BodyMotion]) -> ImuReadings:
-    """Predict ideal IMUs from the motion of the bodies, as `body_motions` returns it."""
+def readings_on(chain: Chain, bodies: list[BodyMotion], turns: LinkTurns | None = None) -> ImuReadings:
+    """Predict ideal IMUs from the motion of the bodies, as `body_motions` returns it for the same `turns`."""
     joints = len(chain.serials)
     samples = bodies[BASE].omega.shape[1]
     gyro, accel = np.empty((samples, joints, 3)), np.empty((samples, joints, 3))
     for k in range(joints):
         motion = bodies[carrier(chain, k)]
+        if turns and not chain.reversed[k]:
+            motion = _given(motion, turns.get(k, ()))
         turn, place = chain.imu_home[k, :3, :3], chain.imu_home[k, :3, 3, None]
         gyro[:, k] = motion.omega.T @ turn
         accel[:, k] = acceleration_at(motion, place).T @ turn
@@ -56,20 +73,49 @@ def readings_on(chain: Chain, bodies: list[BodyMotion]) -> ImuReadings:
 
 
 def body_motions(
-    chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2: ArrayLike
+    chain: Chain,
+    q_rad: ArrayLike,
+    qd_rad_s: ArrayLike,
+    qdd_rad_s2: ArrayLike,
+    base_motion: BaseMotion | None = None,
+    turns: LinkTurns | None = None,
 ) -> list[BodyMotion]:
     """Return the motion of every body, the base in the last place, where the index -1 finds it.
 
-    Args as in `imu_readings`.
+    Args as in `imu_readings`. `base_motion` is what the first module's IMU saw of the base; None means rest.
+    `turns` are those of the links that give, by the module that each link carries.
     """
     q, qd, qdd = (np.asarray(signal, dtype=float).T for signal in (q_rad, qd_rad_s, qdd_rad_s2))
-    rest = np.zeros((3, q.shape[1]))
-    base = BodyMotion(rest, rest, np.broadcast_to(chain.gravity[:, None], rest.shape))
+    base = _base(chain, q.shape[1], base_motion)
     bodies: list[BodyMotion] = []
     for i, parent in enumerate(chain.parent):
         below = base if parent == BASE else bodies[parent]
+        below = below if turns is None else _given(below, turns.get(i, ()))
         bodies.append(_carry(below, chain.axis[i], chain.point[i][:, None], q[i], qd[i], qdd[i]))
     return [*bodies, base]
+
+
+def _given(body: BodyMotion, turns: Sequence[LinkTurn]) -> BodyMotion:
+    """Return the motion beyond hinges that turn a little, to first order, in the frame that turns along."""
+    for turn in turns:
+        angle, rate, acceleration = turn.theta_rad
+        at_hinge = acceleration_at(body, turn.hinge[:, None])
+        omega = body.omega + rate - cross(angle, body.omega)
+        alpha = body.alpha + acceleration + cross(body.omega, rate) - cross(angle, body.alpha)
+        moved = BodyMotion(omega, alpha, at_hinge - cross(angle, at_hinge))
+        body = moved._replace(acceleration=acceleration_at(moved, -turn.hinge[:, None]))
+    return body
+
+
+def _base(chain: Chain, samples: int, seen: BaseMotion | None) -> BodyMotion:
+    gravity = np.broadcast_to(chain.gravity[:, None], (3, samples))
+    if seen is None:
+        rest = np.zeros((3, samples))
+        return BodyMotion(rest, rest, gravity)
+    turn, place = chain.imu_home[0, :3, :3], chain.imu_home[0, :3, 3, None]
+    omega, alpha, acceleration = (turn @ signal.T for signal in seen)
+    at_imu = BodyMotion(omega, alpha, gravity + acceleration)
+    return BodyMotion(omega, alpha, acceleration_at(at_imu, -place))
 
 
 def acceleration_at(body: BodyMotion, place: Array) -> Array:

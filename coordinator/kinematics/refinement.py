@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.chain import Array, Chain
+from coordinator.kinematics.base_motion import BaseMotion
 from coordinator.kinematics.imu_intrinsics import (
     BIASES_ONLY,
     ImuIntrinsics,
@@ -26,33 +27,21 @@ from coordinator.kinematics.imu_intrinsics import (
 from coordinator.kinematics.increments import apply_increment, frozen
 from coordinator.kinematics.inertial_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.kinematics.inertial_slopes import imu_slopes
+from coordinator.kinematics.link_flex import FlexSlopes, no_flex
+from coordinator.kinematics.sensor_data import SensorData
 
-ITERATIONS = 12
+ITERATIONS = 20
 CONVERGED = 1e-7
 # What the data knows worse than this (in rad, or in m) it does not know: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
+# A step (rad, m) along what only the motion of the base tells.
+FARTHEST = 0.3
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
 # Samples, 50 a second.
 LONGEST_LAG = 100
 
 Index = NDArray[np.int64]
-
-
-class SensorData(NamedTuple):
-    """Samples of all joints and IMUs on one time base and through one low-pass, m samples of n modules.
-
-    q_rad, qd_rad_s, qdd_rad_s2: (m, n). gyro_rad_s, accel_m_s2: (m, n, 3) in the IMU frames. imu_rates:
-    (m, n, 6) how fast these two change [rad/s^2, m/s^3]; None if no IMU is late. The samples are far enough
-    apart for their errors to be independent.
-    """
-
-    q_rad: Array
-    qd_rad_s: Array
-    qdd_rad_s2: Array
-    gyro_rad_s: Array
-    accel_m_s2: Array
-    imu_rates: Array | None = None
 
 
 class Refinement(NamedTuple):
@@ -71,12 +60,14 @@ class Refinement(NamedTuple):
     residual_gyro_rad_s: Array
     residual_accel_m_s2: Array
     intrinsics: ImuIntrinsics
+    compliance: Array
     iterations: int
 
 
 class _State(NamedTuple):
     chain: Chain
     imus: ImuIntrinsics
+    compliance: Array
 
 
 class _Expected(NamedTuple):
@@ -84,6 +75,8 @@ class _Expected(NamedTuple):
 
     bodies: list[BodyMotion]
     ideal: ImuReadings
+    shaken: list[BodyMotion] | None
+    carried: ImuReadings
 
 
 class _Normal(NamedTuple):
@@ -96,7 +89,9 @@ class _Normal(NamedTuple):
     nuisance_rhs: Array
 
 
-def refine_chain(chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY) -> Refinement:
+def refine_chain(
+    chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY, flex: FlexSlopes | None = None
+) -> Refinement:
     """Refine a chain that is roughly right (within about 0.2 rad and 0.1 m).
 
     Args:
@@ -112,43 +107,68 @@ def refine_chain(chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY) 
     count = len(chain.serials)
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise ValueError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
-    state = _State(chain, perfect(count))
-    sigma_gyro, sigma_accel = np.full(count, 0.01), np.full(count, 0.1)
+    flex = flex if flex is not None else no_flex(count, len(data.q_rad))
+    state = _State(chain, perfect(count), np.zeros(len(flex.links)))
+    shape = (len(data.motions), count)
+    sigmas = np.full(shape, 0.01), np.full(shape, 0.1)
     used = 0
     for used in range(1, ITERATIONS + 1):
-        expected = _expected(state.chain, data)
+        expected = _expected(state, data, flex)
         gyro, accel = _residuals(state, data, expected)
         if used > 1:
-            sigma_gyro, sigma_accel = _spread(gyro), _spread(accel)
-        normal = _normal_equations(state, data, prior, expected, (gyro, accel), (sigma_gyro, sigma_accel))
-        step, nuisance, _ = _solve(normal, count)
+            sigmas = _spread(data, gyro), _spread(data, accel)
+        normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), sigmas)
+        step, nuisance, spectrum = _solve(normal, count)
+        if expected.shaken is not None:
+            seen = expected._replace(bodies=expected.shaken)
+            shaken = _normal_equations(state, data, prior, flex, seen, (gyro, accel), sigmas)
+            step += _along_unknown(shaken, spectrum, count)
         state = _moved(state, step, nuisance, prior)
         if used > 2 and float(np.abs(step).max()) < CONVERGED:
             break
-    expected = _expected(state.chain, data)
+    expected = _expected(state, data, flex)
     gyro, accel = _residuals(state, data, expected)
-    sigma_gyro, sigma_accel = _spread(gyro), _spread(accel)
-    # What the model leaves out (a base that shakes, a link that bends) repeats with the motion.
-    believed = (sigma_gyro * np.sqrt(repeats(gyro)), sigma_accel * np.sqrt(repeats(accel)))
-    normal = _normal_equations(state, data, prior, expected, (gyro, accel), believed)
+    # What the model leaves out repeats with the motion.
+    believed = _believed(data, gyro), _believed(data, accel)
+    normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), believed)
     _, _, spectrum = _solve(normal, count)
-    return _report(state, spectrum, sigma_gyro, sigma_accel, used)
+    return _report(state, spectrum, _rms(gyro), _rms(accel), used)
 
 
-def _expected(chain: Chain, data: SensorData) -> _Expected:
+def _expected(state: _State, data: SensorData, flex: FlexSlopes) -> _Expected:
+    chain = state.chain
     bodies = body_motions(chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
-    return _Expected(bodies, readings_on(chain, bodies))
+    ideal = readings_on(chain, bodies)
+    carried, motions = ideal, None
+    if data.base_motion is not None:
+        base = BaseMotion(*np.split(data.base_motion, 3, axis=1))
+        motions = body_motions(chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2, base)
+        carried = readings_on(chain, motions)
+    given = np.tensordot(state.compliance, flex.slopes, axes=1).transpose(1, 2, 0)
+    carried = ImuReadings(carried.gyro_rad_s + given[..., :3], carried.accel_m_s2 + given[..., 3:])
+    return _Expected(bodies, ideal, motions, carried)
 
 
 def _residuals(state: _State, data: SensorData, expected: _Expected) -> tuple[Array, Array]:
-    ideal = expected.ideal
+    ideal = expected.carried
     gyro, accel = read(state.imus, ideal.gyro_rad_s, ideal.accel_m_s2, data.imu_rates)
     return data.gyro_rad_s - gyro, data.accel_m_s2 - accel
 
 
-def _spread(residual: Array) -> Array:
+def _rms(residual: Array) -> Array:
     """Return the rms (n,) per axis of residuals (m, n, 3), no smaller than any sensor's resolution."""
     return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), FINEST))
+
+
+def _spread(data: SensorData, residual: Array) -> Array:
+    """Return the rms of every motion, (motions, n): gears that turn shake an IMU more than those at rest."""
+    return np.stack([_rms(residual[samples]) for samples in data.motions])
+
+
+def _believed(data: SensorData, residual: Array) -> Array:
+    """Return the spread of every motion, (motions, n), widened for what repeats in it."""
+    parts = [residual[samples] for samples in data.motions]
+    return np.stack([_rms(part) * np.sqrt(repeats(part)) for part in parts])
 
 
 def repeats(residual: Array) -> Array:
@@ -173,6 +193,7 @@ def _normal_equations(
     state: _State,
     data: SensorData,
     prior: ImuPrior,
+    flex: FlexSlopes,
     expected: _Expected,
     residuals: tuple[Array, Array],
     sigmas: tuple[Array, Array],
@@ -180,17 +201,18 @@ def _normal_equations(
     """Build the weighted normal equations, IMU by IMU; the root stays."""
     count, samples = len(state.chain.serials), len(data.q_rad)
     poses, free = 6 * count, prior.sigmas > 0.0
-    information, rhs = _before(state, prior)
-    bodies, ideal = expected
+    information, rhs = _before(state, prior, flex)
+    bodies, ideal, _, _ = expected
+    motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
     for k in range(count):
         found = imu_slopes(state.chain, bodies, data.q_rad, data.qd_rad_s, k)
-        true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity])
+        true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity, flex.slopes[..., k]])
         rates = None if data.imu_rates is None else data.imu_rates[:, k]
         own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
-        weight = 1.0 / np.repeat([sigma[k] for sigma in sigmas], 3)[:, None]
+        weight = 1.0 / np.repeat([sigma[:, k] for sigma in sigmas], 3, axis=0)[:, motion]
         rows = (np.concatenate([true, own]) * weight).reshape(-1, 6 * samples)
         target = (np.concatenate([part[:, k] for part in residuals], axis=1).T * weight).ravel()
-        at = _places(found.modules, k, count, int(free.sum()))
+        at = _places(found.modules, k, count, len(flex.links), int(free.sum()))
         information[np.ix_(at, at)] += rows @ rows.T
         rhs[at] += rows @ target
     return _Normal(
@@ -202,23 +224,24 @@ def _normal_equations(
     )
 
 
-def _before(state: _State, prior: ImuPrior) -> tuple[Array, Array]:
+def _before(state: _State, prior: ImuPrior, flex: FlexSlopes) -> tuple[Array, Array]:
     """Return the information on [increments (6 n), gravity (3), free IMU errors], and its right-hand side.
 
     Before any sample only the IMUs' errors are known: they are small.
     """
     count, free = len(state.chain.serials), prior.sigmas > 0.0
     nothing = np.zeros(6 * count + 3)
-    known = np.concatenate([nothing, np.tile(prior.sigmas[free] ** -2.0, count)])
-    held = np.concatenate([nothing, state.imus.errors[:, free].ravel()])
+    known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(prior.sigmas[free] ** -2.0, count)])
+    held = np.concatenate([nothing, state.compliance, state.imus.errors[:, free].ravel()])
     return np.diag(known), -known * held
 
 
-def _places(modules: Sequence[int], imu: int, count: int, size: int) -> Index:
+def _places(modules: Sequence[int], imu: int, count: int, links: int, size: int) -> Index:
     """Return where the parameters that one IMU feels stand among all of them, in the order of its slopes."""
     increments = [6 * module + np.arange(6) for module in modules]
-    gravity, own = 6 * count + np.arange(3), 6 * count + 3 + size * imu + np.arange(size)
-    return np.concatenate([*increments, gravity, own])
+    shared = 6 * count + np.arange(3 + links)
+    own = 6 * count + 3 + links + size * imu + np.arange(size)
+    return np.concatenate([*increments, shared, own])
 
 
 class _Spectrum(NamedTuple):
@@ -247,11 +270,26 @@ def _solve(normal: _Normal, count: int) -> tuple[Array, Array, _Spectrum]:
     return np.concatenate([np.zeros(6), step]), nuisance, spectrum
 
 
+def _along_unknown(normal: _Normal, spectrum: _Spectrum, count: int) -> Array:
+    """Return the step (6 n,) along what the joints' motions leave unknown, by the base's motion."""
+    through = np.linalg.solve(normal.nuisance, np.column_stack([normal.cross.T, normal.nuisance_rhs]))
+    unknown = spectrum.vectors[:, ~spectrum.known]
+    information = unknown.T @ (normal.pose - normal.cross @ through[:, :-1]) @ unknown
+    rhs = unknown.T @ (normal.pose_rhs - normal.cross @ through[:, -1])
+    step = np.linalg.solve(information + np.eye(len(rhs)) * FARTHEST**-2.0, rhs)
+    return np.concatenate([np.zeros(6), unknown @ np.clip(step, -FARTHEST, FARTHEST)])
+
+
 def _moved(state: _State, step: Array, nuisance: Array, prior: ImuPrior) -> _State:
     chain, free = apply_increment(state.chain, step), prior.sigmas > 0.0
     change = np.zeros_like(state.imus.errors)
-    change[:, free] = nuisance[3:].reshape(len(change), -1)
-    return _State(chain._replace(gravity=frozen(chain.gravity + nuisance[:3])), state.imus.moved(change))
+    links = 3 + len(state.compliance)
+    change[:, free] = nuisance[links:].reshape(len(change), -1)
+    return _State(
+        chain._replace(gravity=frozen(chain.gravity + nuisance[:3])),
+        state.imus.moved(change),
+        state.compliance + nuisance[3:links],
+    )
 
 
 def _report(
@@ -274,5 +312,6 @@ def _report(
         residual_gyro_rad_s=frozen(sigma_gyro),
         residual_accel_m_s2=frozen(sigma_accel),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
+        compliance=frozen(state.compliance),
         iterations=iterations,
     )

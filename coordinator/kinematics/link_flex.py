@@ -1,0 +1,226 @@
+"""Links that give under what they carry: quasi-static bending and twisting of each link at one place.
+
+A tube that is clamped at one end moves its other end like a rigid bar on a hinge (pseudo-rigid-body model,
+Howell, Compliant Mechanisms, 2001, section 5). What turns the hinge is the moment of all that lies beyond:
+the modules' masses, which the catalogue gives, times their specific forces. Links resonate at ten times the
+motions' frequencies and more, so the turn follows the moment at once: theta = C M, with one compliance for
+bending and one for twisting to be estimated. Without it a link that gives by 1 % comes out 0.7 % long.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array, Chain
+from coordinator.cross_product import cross
+from coordinator.dynamics.differentiation import differentiate
+from coordinator.kinematics.base_motion import BaseMotion
+from coordinator.kinematics.forward import BASE
+from coordinator.kinematics.inertial_prediction import (
+    BodyMotion,
+    ImuReadings,
+    LinkTurn,
+    acceleration_at,
+    body_motions,
+    readings_on,
+    turned,
+)
+from coordinator.kinematics.sensor_data import SensorData
+from module_agent.catalogue import ModuleType
+
+# Where the hinge is, as a share of the length: 0 for a clamp that gives, 0.15 for a clamped beam (Howell,
+# section 5), up to a third where the end's slope counts more than its place.
+HINGE_SHARE, HINGE_SHARE_SIGMA = 0.15, 0.1
+
+
+JointTrack = tuple[Array, Array, Array]  # positions, velocities, accelerations, (m, n) each
+
+
+class LinkLoad(NamedTuple):
+    """The moment that turns one link, and where; root frame at q = 0.
+
+    hinge: (3,) the place. along: (3,) unit direction of the link. length_m: of the link.
+    moment: (3, 3, m) moment [Nm], its first and its second time derivative, in the frame of the body that
+    the link starts from.
+    """
+
+    hinge: Array
+    along: Array
+    length_m: float
+    moment: Array
+
+    def bending(self, compliance: float) -> LinkTurn:
+        """Return how the link turns across its direction, for a compliance in rad/Nm."""
+        return LinkTurn(self.hinge, compliance * (self.moment - self._about_itself()))
+
+    def twisting(self, compliance: float) -> LinkTurn:
+        """Return how the link turns about its direction, for a compliance in rad/Nm."""
+        return LinkTurn(self.hinge, compliance * self._about_itself())
+
+    def _about_itself(self) -> Array:
+        return np.asarray(self.along[:, None] * np.einsum("i,dim->dm", self.along, self.moment)[:, None])
+
+
+def link_loads(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    bodies: Sequence[BodyMotion],
+    q_rad: Array,
+    rate_hz: float,
+) -> list[LinkLoad | None]:
+    """Return the load of the link below every module; None for modules on the base.
+
+    Args:
+        chain: n joints; roughly right.
+        kinds: (n,) their types, which give the masses.
+        bodies: their motion, from `body_motions`, over one stretch of time without holes.
+        q_rad: (m, n) joint positions.
+        rate_hz: of the samples.
+    """
+    samples = len(q_rad)
+    carried = [np.zeros((2, 3, samples)) for _ in chain.parent]  # force, and moment about the root's origin
+    loads: list[LinkLoad | None] = [None] * len(chain.parent)
+    for i in reversed(range(len(chain.parent))):
+        parent = chain.parent[i]
+        if chain.reversed[i]:
+            carried[i] += _weight(chain, kinds[i], i, bodies[i])
+        if parent == BASE:
+            continue
+        below = _seen_from_below(chain, i, q_rad[:, i], carried[i])
+        if not chain.reversed[i]:
+            below += _weight(chain, kinds[i], i, bodies[parent])
+        start, end = link_ends(chain, kinds, i)
+        length = float(np.linalg.norm(end - start))
+        hinge = start + HINGE_SHARE * (end - start)
+        moment = below[1] - cross(hinge[:, None], below[0])
+        first = differentiate(moment.T, rate_hz)
+        series = np.stack([moment, first.T, differentiate(first, rate_hz).T])
+        loads[i] = LinkLoad(hinge, (end - start) / max(length, 1e-9), length, series)
+        carried[parent] += below
+    return loads
+
+
+def joined(parts: Sequence[Sequence[LinkLoad | None]], keep_every: int = 1) -> list[LinkLoad | None]:
+    """Join the loads of several stretches of time, link by link, one sample in `keep_every` of each."""
+    found: list[LinkLoad | None] = []
+    for of_link in zip(*parts, strict=True):
+        known = [part for part in of_link if part is not None]
+        moments = [part.moment[..., ::keep_every] for part in known]
+        found.append(known[0]._replace(moment=np.concatenate(moments, axis=2)) if known else None)
+    return found
+
+
+def link_ends(chain: Chain, kinds: Sequence[ModuleType], module: int) -> tuple[Array, Array]:
+    """Return where the link below a module begins, at its parent's face, and where it ends, at its own."""
+    parent = chain.parent[module]
+    begins = _face(chain, kinds, parent, output=not chain.reversed[parent])
+    return begins, _face(chain, kinds, module, output=chain.reversed[module])
+
+
+def _face(chain: Chain, kinds: Sequence[ModuleType], module: int, output: bool) -> Array:
+    kind, home = kinds[module], chain.imu_home[module]
+    seen = np.array(kind.output_xyz if output else (0.0, 0.0, 0.0)) - np.array(kind.imu_xyz)
+    return np.asarray(home[:3, :3] @ seen + home[:3, 3])
+
+
+def _weight(chain: Chain, kind: ModuleType, module: int, body: BodyMotion) -> Array:
+    """Return the force (3, m) of a module's mass on what carries it, and its moment about the origin."""
+    home = chain.imu_home[module]
+    place = (home[:3, :3] @ (np.array(kind.com_xyz) - np.array(kind.imu_xyz)) + home[:3, 3])[:, None]
+    force = -kind.mass_kg * acceleration_at(body, place)
+    return np.stack([force, cross(np.broadcast_to(place, force.shape), force)])
+
+
+def _seen_from_below(chain: Chain, joint: int, q: Array, load: Array) -> Array:
+    """Return force and moment (2, 3, m) beyond a joint as the body below it sees them."""
+    axis, point = chain.axis[joint], np.broadcast_to(chain.point[joint][:, None], load[0].shape)
+    about_point = np.stack([load[0], load[1] - cross(point, load[0])], axis=1)
+    force, moment = np.swapaxes(turned(axis, q, about_point), 0, 1)
+    return np.stack([force, moment + cross(point, force)])
+
+
+class FlexSlopes(NamedTuple):
+    """How IMU readings change with the links' compliances.
+
+    links: (p,) the module that each compliance's link carries. sigmas: (p,) how well each is known before,
+    in `UNIT_RAD_NM`, or in shares of the length for hinges. slopes: (p, 6, m, n) of [gyro, specific force].
+    """
+
+    links: tuple[int, ...]
+    sigmas: Array
+    slopes: Array
+
+
+# One unit of compliance; that of a metre of light aluminium tube.
+UNIT_RAD_NM = 1e-4
+# Tubes of the manufacturer's kits have 1.2e-4 rad/Nm; anything ten times as soft is no link of a robot.
+COMPLIANCE_SIGMA = 5.0
+
+
+def flex_slopes(chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | None]) -> FlexSlopes:
+    """Return the slopes of all IMUs' readings by every link's compliance in bending and in twisting."""
+    still = readings_on(chain, body_motions(chain, *joints))
+    links: list[int] = []
+    slopes: list[Array] = []
+    for module, load in enumerate(loads):
+        if load is None:
+            continue
+        for turn in (load.bending(UNIT_RAD_NM), load.twisting(UNIT_RAD_NM)):
+            links.append(module)
+            slopes.append(_change(chain, joints, still, module, turn))
+    if not links:
+        return no_flex(len(chain.serials), len(joints[0]))
+    return FlexSlopes(tuple(links), np.full(len(links), COMPLIANCE_SIGMA), np.array(slopes))
+
+
+def _change(chain: Chain, joints: JointTrack, still: ImuReadings, module: int, turn: LinkTurn) -> Array:
+    """Return what a turn of one link makes of all IMUs' readings, (6, m, n)."""
+    turns = {module: [turn]}
+    moved = readings_on(chain, body_motions(chain, *joints, turns=turns), turns)
+    change = [moved.gyro_rad_s - still.gyro_rad_s, moved.accel_m_s2 - still.accel_m_s2]
+    return np.concatenate(change, axis=2).transpose(2, 0, 1)
+
+
+def hinge_slopes(
+    chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | None], known: FlexSlopes, compliance: Array
+) -> FlexSlopes:
+    """Return slopes by the places of the hinges, as shares of the links' lengths, beside those known.
+
+    Their size follows from the compliances (p,) found with the slopes known.
+    """
+    if not known.links:
+        return known
+    links: list[int] = []
+    slopes: list[Array] = []
+    still = readings_on(chain, body_motions(chain, *joints))
+    for place, module in enumerate(known.links[::2]):
+        load = loads[module]
+        assert load is not None
+        turn = load.bending(UNIT_RAD_NM * float(compliance[2 * place]))
+        there = turn._replace(hinge=turn.hinge + load.length_m * load.along)
+        change = _change(chain, joints, still, module, there) - _change(chain, joints, still, module, turn)
+        links.append(module)
+        slopes.append(change)
+    sigmas = np.concatenate([known.sigmas, np.full(len(links), HINGE_SHARE_SIGMA)])
+    return FlexSlopes((*known.links, *links), sigmas, np.concatenate([known.slopes, np.array(slopes)]))
+
+
+def no_flex(count: int, samples: int) -> FlexSlopes:
+    """Return the slopes of links that do not give, for so many modules and samples."""
+    return FlexSlopes((), np.zeros(0), np.zeros((0, 6, samples, count)))
+
+
+def loads_of(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    parts: Sequence[SensorData],
+    rate_hz: float,
+) -> list[list[LinkLoad | None]]:
+    """Return the loads over each of several stretches of time, as `link_loads` does over one."""
+    found = []
+    for part in parts:
+        base = None if part.base_motion is None else BaseMotion(*np.split(part.base_motion, 3, axis=1))
+        bodies = body_motions(chain, part.q_rad, part.qd_rad_s, part.qdd_rad_s2, base)
+        found.append(link_loads(chain, kinds, bodies, part.q_rad, rate_hz))
+    return found
