@@ -45,15 +45,16 @@ class Case(NamedTuple):
 
 
 class CaseResult(NamedTuple):
-    """What came of a case; failures in words."""
+    """What came of a case; failures in words. cpu_s: processor time of all its trials."""
 
     case: str
     trials: int
     summary: Summary
     failures: tuple[str, ...]
+    cpu_s: float = 0.0
 
 
-def concluded(case: Case, results: Sequence[Any]) -> CaseResult:
+def concluded(case: Case, results: Sequence[Any], cpu_s: float = 0.0) -> CaseResult:
     """Summarise the results of all trials of a case; one that failed makes a row that misses its bar."""
     failures = tuple(result.text for result in results if isinstance(result, Failed))
     summary = case.summarise([result for result in results if not isinstance(result, Failed)])
@@ -62,7 +63,7 @@ def concluded(case: Case, results: Sequence[Any]) -> CaseResult:
             case.name, f"trials that failed, of {len(results)}", None, float(len(failures)), None, 0.0
         )
         summary = summary._replace(rows=(failed, *summary.rows))
-    return CaseResult(case.name, len(results), summary, failures)
+    return CaseResult(case.name, len(results), summary, failures, cpu_s)
 
 
 def trial_seed(seed: int, name: str, number: int) -> int:

@@ -103,7 +103,8 @@ def _report(results: Results, json_file: Path | None, plot_file: Path | None) ->
     for text in results.failures:
         typer.echo(f"failed: {text}", err=True)
     held = sum(row.holds is True for row in results.rows)
-    typer.echo(f"{held} bars met, {len(results.missed)} missed, {results.wall_time_s:.0f} s")
+    cost = f"{results.wall_time_s:.0f} s, of processors {results.cpu_time_s:.0f} s"
+    typer.echo(f"{held} bars met, {len(results.missed)} missed; {cost}")
     try:
         if json_file is not None:
             write_results(json_file, results)

@@ -15,14 +15,28 @@ SCHEMA = 1
 _MEASURED_WITH = ("x5-self-model", "numpy", "scipy", "numba", "pybullet")
 
 
+class Cost(NamedTuple):
+    """The processor time of a case's trials."""
+
+    case: str
+    trials: int
+    cpu_time_s: float
+
+
 class Results(NamedTuple):
-    """The rows of a benchmark, what failed in words, and what was asked for."""
+    """The rows of a benchmark, what failed in words, what was asked for, and what it cost."""
 
     benchmark: str
     settings: dict[str, object]
     rows: tuple[Row, ...]
     failures: tuple[str, ...]
+    costs: tuple[Cost, ...]
     wall_time_s: float
+
+    @property
+    def cpu_time_s(self) -> float:
+        """Processor time of all trials."""
+        return sum(cost.cpu_time_s for cost in self.costs)
 
     @property
     def missed(self) -> tuple[Row, ...]:
@@ -40,7 +54,8 @@ def gathered(
     """Put the rows of all cases together, those over all of them last."""
     rows = [row for case in cases for row in case.summary.rows]
     failures = tuple(f"{case.case}: {text}" for case in cases for text in case.failures)
-    return Results(benchmark, settings, (*rows, *over_all), failures, wall_time_s)
+    costs = tuple(Cost(case.case, case.trials, round(case.cpu_s, 2)) for case in cases)
+    return Results(benchmark, settings, (*rows, *over_all), failures, costs, wall_time_s)
 
 
 def write_results(path: Path, results: Results) -> None:
@@ -52,6 +67,7 @@ def write_results(path: Path, results: Results) -> None:
         "versions": {"python": platform.python_version()} | {name: version(name) for name in _MEASURED_WITH},
         "rows": [row.plain() for row in results.rows],
         "failures": list(results.failures),
+        "costs": [cost._asdict() for cost in results.costs],
         "wall_time_s": results.wall_time_s,
     }
     text = json.dumps(document, indent=1, allow_nan=False) + "\n"

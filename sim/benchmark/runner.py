@@ -1,10 +1,9 @@
 """Runs the cases of a benchmark in worker processes, all their trials mixed, and hears how it goes."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 from sim.benchmark.case import Case, CaseResult, concluded
-from sim.benchmark.workers import run_trials
+from sim.benchmark.workers import Done, run_trials
 
 
 def run_cases(
@@ -22,8 +21,11 @@ def run_cases(
         left[number] -= 1
         on_trial(case, left[number])
 
-    results = run_trials([trial for case in cases for trial in case.trials], processes, done)
-    own: list[list[Any]] = [[] for _ in cases]
-    for (number, _), result in zip(owner, results, strict=True):
-        own[number].append(result)
-    return [concluded(case, found) for case, found in zip(cases, own, strict=True)]
+    found = run_trials([trial for case in cases for trial in case.trials], processes, done)
+    own: list[list[Done]] = [[] for _ in cases]
+    for (number, _), each in zip(owner, found, strict=True):
+        own[number].append(each)
+    return [
+        concluded(case, [each.result for each in mine], sum(each.cpu_s for each in mine))
+        for case, mine in zip(cases, own, strict=True)
+    ]

@@ -7,12 +7,13 @@ that dies takes its trial with it, which counts as failed, and is replaced.
 import multiprocessing
 import signal
 import tempfile
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, NamedTuple
 
 from sim.benchmark.case import Failed, Trial
 
@@ -21,14 +22,21 @@ SECONDS_PER_PROCESS = 150.0
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
+class Done(NamedTuple):
+    """What a trial returned, `Failed` if it raised, and the processor time that it took."""
+
+    result: Any
+    cpu_s: float
+
+
 def run_trials(
     trials: Sequence[Trial], processes: int, on_done: Callable[[int, Any], None] = lambda index, result: None
-) -> list[Any]:
-    """Run trials in several processes; return their results in order, `Failed` where one raised.
+) -> list[Done]:
+    """Run trials in several processes and return what came of them, in order.
 
     Whatever ends this early ends the processes at once and removes their temporary folders.
     """
-    results: list[Any] = [None] * len(trials)
+    done: dict[int, Done] = {}
     waiting = sorted(range(len(trials)), key=lambda index: -trials[index].cost_s)
     with _team(min(processes, len(trials))) as team:
         while waiting or any(worker.busy for worker in team):
@@ -36,10 +44,10 @@ def run_trials(
                 if waiting and not worker.busy:
                     index = waiting.pop(0)
                     worker.begin(index, trials[index])
-            for index, result in _finished(team):
-                results[index] = result
-                on_done(index, result)
-    return results
+            for index, found in _finished(team):
+                done[index] = found
+                on_done(index, found.result)
+    return [done[index] for index in range(len(trials))]
 
 
 @contextmanager
@@ -54,7 +62,7 @@ def _team(size: int) -> Iterator[list["_Worker"]]:
                 worker.end()
 
 
-def _finished(team: Sequence["_Worker"]) -> Iterator[tuple[int, Any]]:
+def _finished(team: Sequence["_Worker"]) -> Iterator[tuple[int, Done]]:
     busy = {worker.pipe: worker for worker in team if worker.busy}
     for pipe in wait(list(busy)):
         if isinstance(pipe, Connection):
@@ -84,18 +92,18 @@ class _Worker:
         self._left_s -= trial.cost_s
         self.pipe.send(trial)
 
-    def finish(self) -> tuple[int, Any]:
-        """Return the trial's index and result; to be called when the pipe has something to say."""
+    def finish(self) -> tuple[int, Done]:
+        """Return the trial's index and what came of it; to be called when the pipe has something to say."""
         index, self._index = self._index, None
         assert index is not None
         try:
-            result = self.pipe.recv()
+            found = Done(*self.pipe.recv())
         except (EOFError, OSError):
-            result = Failed(f"the worker process died with exit code {self._exit_code()}")
+            found = Done(Failed(f"the worker process died with exit code {self._exit_code()}"), 0.0)
             self.end()
         if self._left_s <= 0.0:
             self.end()
-        return index, result
+        return index, found
 
     def end(self) -> None:
         """End the process, at once if it is at work."""
@@ -132,7 +140,9 @@ def _work(pipe: Connection, folder: str) -> None:
             trial = pipe.recv()
         except EOFError:
             return
-        pipe.send(_result(trial))
+        start_s = time.process_time()
+        result = _result(trial)
+        pipe.send((result, time.process_time() - start_s))
 
 
 def _result(trial: Trial) -> Any:

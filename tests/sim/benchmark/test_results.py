@@ -9,7 +9,7 @@ from rich.console import Console
 
 from sim.benchmark.case import Case, Failed, Summary, Trial, concluded, trial_seed
 from sim.benchmark.plot import plot
-from sim.benchmark.results import SCHEMA, Results, gathered, write_results
+from sim.benchmark.results import SCHEMA, Cost, Results, gathered, write_results
 from sim.benchmark.row import Row
 from sim.benchmark.runner import run_cases
 from sim.benchmark.table import print_rows, table
@@ -28,7 +28,14 @@ def total(results: Any) -> Summary:
 
 
 def test_the_file_holds_every_row_with_its_verdict_and_what_was_asked_for(tmp_path: Path) -> None:
-    found = Results("kinematics", {"seed": 3, "quick": True}, ROWS, ("long arm: it fell",), 12.5)
+    found = Results(
+        "kinematics",
+        {"seed": 3, "quick": True},
+        ROWS,
+        ("long arm: it fell",),
+        (Cost("long arm", 13, 30.5),),
+        12.5,
+    )
     path = tmp_path / "found.json"
     path.write_text("of yesterday")
     write_results(path, found)
@@ -38,6 +45,7 @@ def test_the_file_holds_every_row_with_its_verdict_and_what_was_asked_for(tmp_pa
     assert [row["holds"] for row in document["rows"]] == [True, False, False, None, True]
     assert document["rows"][4]["limit"] == [92.0, 98.0]
     assert document["failures"] == ["long arm: it fell"]
+    assert document["costs"] == [{"case": "long arm", "trials": 13, "cpu_time_s": 30.5}]
     assert set(document["versions"]) >= {"python", "numpy", "numba"}
     assert [each.name for each in tmp_path.iterdir()] == ["found.json"]
     assert found.missed == (ROWS[1], ROWS[2])
@@ -101,6 +109,7 @@ def test_a_case_is_summarised_from_its_own_trials_in_their_order() -> None:
     told: list[tuple[str, int]] = []
     squares, cubes = run_cases(cases, 2, lambda case, left: told.append((case.name, left)))
     assert squares.summary == total([4, 9])
+    assert squares.cpu_s >= 0.0
     assert cubes.summary == total([8])
     assert sorted(told) == [("cubes", 0), ("squares", 0), ("squares", 1)]
     found = gathered("sums", {}, [squares, cubes], [Row("all", "", None, None)], 1.0)

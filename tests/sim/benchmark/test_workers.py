@@ -15,12 +15,16 @@ from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import SECONDS_PER_PROCESS, run_trials
 
 
+def results(trials: list[Trial], processes: int) -> list[Any]:
+    return [done.result for done in run_trials(trials, processes)]
+
+
 def test_results_come_in_the_order_of_the_trials_whatever_the_number_of_processes() -> None:
     # The longest ones are begun first: here from the last to the first.
     trials = [Trial(math.factorial, (n,), cost_s=float(n)) for n in range(7)]
     expected = [math.factorial(n) for n in range(7)]
-    assert run_trials(trials, 1) == expected
-    assert run_trials(trials, 3) == expected
+    assert results(trials, 1) == expected
+    assert results(trials, 3) == expected
 
 
 def test_every_trial_is_told_of_once_with_its_result() -> None:
@@ -30,7 +34,7 @@ def test_every_trial_is_told_of_once_with_its_result() -> None:
 
 
 def test_a_trial_that_raises_says_what_and_the_others_go_on() -> None:
-    first, second = run_trials([Trial(math.sqrt, (-1.0,)), Trial(math.sqrt, (4.0,))], 1)
+    first, second = results([Trial(math.sqrt, (-1.0,)), Trial(math.sqrt, (4.0,))], 1)
     assert isinstance(first, Failed)
     assert first.text.startswith("sqrt(-1.0): ValueError in workers.py, line ")
     assert second == 2.0
@@ -38,20 +42,20 @@ def test_a_trial_that_raises_says_what_and_the_others_go_on() -> None:
 
 def test_a_worker_that_dies_takes_its_trial_along_and_is_replaced() -> None:
     # os._exit ends a process as a crash does: nothing is said.
-    first, second = run_trials([Trial(os._exit, (7,), cost_s=2.0), Trial(math.sqrt, (4.0,))], 1)
+    first, second = results([Trial(os._exit, (7,), cost_s=2.0), Trial(math.sqrt, (4.0,))], 1)
     assert first == Failed("the worker process died with exit code 7")
     assert second == 2.0
 
 
 def test_a_result_that_cannot_be_sent_is_a_trial_that_failed() -> None:
-    (found,) = run_trials([Trial(memoryview, (b"",))], 1)
+    (found,) = results([Trial(memoryview, (b"",))], 1)
     assert isinstance(found, Failed)
 
 
 def test_a_worker_is_renewed_before_it_has_grown_too_large() -> None:
-    short = run_trials([Trial(os.getpid, ()) for _ in range(3)], 1)
+    short = results([Trial(os.getpid, ()) for _ in range(3)], 1)
     assert len(set(short)) == 1
-    long = run_trials([Trial(os.getpid, (), cost_s=SECONDS_PER_PROCESS) for _ in range(3)], 1)
+    long = results([Trial(os.getpid, (), cost_s=SECONDS_PER_PROCESS) for _ in range(3)], 1)
     assert len(set(long)) == 3
 
 
@@ -71,6 +75,12 @@ def test_an_interruption_ends_the_workers_at_once_and_removes_their_folders() ->
     assert len(left) == 1
     assert not left[0].exists()
     assert left[0].parent.name.startswith("x5-benchmark-")
+
+
+def test_the_processor_time_of_a_trial_is_its_own() -> None:
+    asleep, at_work = run_trials([Trial(time.sleep, (0.2,)), Trial(pow, (7, 300_000))], 1)
+    # A big power takes tens of milliseconds of work, sleep next to nothing.
+    assert asleep.cpu_s < 0.5 * at_work.cpu_s
 
 
 def test_no_trials_need_no_process() -> None:
