@@ -81,6 +81,7 @@ class Kinematics(NamedTuple):
             parent = self.topology.parent[k]
             mounted = ", mounted reversed" if self.topology.reversed[k] else ""
             mounted += self.topology.caveat(k)
+            mounted += self.topology.caveat(k)
             if parent < 0:
                 lines.append(f"{serial} on the base{mounted}")
                 continue

@@ -99,6 +99,22 @@ class ExponentialsPart(Part):
     tips: list[TipPart]
 
 
+class MountingPart(Part):
+    """Where a module is mounted (`parent` is None on the base) and which way round, with log-odds of both.
+
+    Log-odds of 4.6 are 99 %, 0 is a toss-up, None says that nothing else is possible. A module whose joint
+    did not move shows as a leaf, and its way round is not known. There is no such list of a topology that
+    was known beforehand.
+    """
+
+    serial: str
+    parent: str | None
+    parent_log_odds: float | None
+    reversed: bool
+    reversed_log_odds: float
+    joint_moved: bool
+
+
 class PairPart(Part):
     """The agent's circle point analysis of one joint by one IMU."""
 
@@ -161,6 +177,7 @@ class Result(Part):
     serials: list[str]
     types: dict[str, str]
     topology_confidence: float
+    topology: list[MountingPart] = []
     chain: ChainPart
     rank: int
     condition: float

@@ -16,6 +16,7 @@ from coordinator.result import (
     ExponentialsPart,
     HeldOutPart,
     LinkPart,
+    MountingPart,
     PairPart,
     Result,
     ScrewPart,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from coordinator.identify import HeldOutMotion, Kinematics
     from coordinator.kinematics.assembly import ChainFit
     from coordinator.kinematics.null_space import Unresolved
+    from coordinator.kinematics.topology import Topology
 
 
 def build_result(
@@ -52,6 +54,7 @@ def build_result(
         serials=list(topology.serials),
         types=named,
         topology_confidence=topology.confidence,
+        topology=_mountings(topology),
         chain=chain_part(fit.chain),
         rank=fit.rank,
         condition=fit.condition,
@@ -70,6 +73,30 @@ def build_result(
         wall_time_s=finished[-1].wall_time_s if finished else None,
         trace_hash=recording.trace_hash,
     )
+
+
+def _mountings(topology: "Topology") -> list[MountingPart]:
+    if not topology.parent_log_odds:
+        return []
+    columns = zip(
+        topology.serials,
+        topology.parent,
+        topology.parent_log_odds,
+        topology.reversed,
+        topology.reversed_log_odds,
+        strict=True,
+    )
+    return [
+        MountingPart(
+            serial=serial,
+            parent=topology.serials[p] if p >= 0 else None,
+            parent_log_odds=on if np.isfinite(on) else None,
+            reversed=turned,
+            reversed_log_odds=how,
+            joint_moved=serial not in topology.unmoved,
+        )
+        for serial, p, on, turned, how in columns
+    ]
 
 
 def _type_name(recording: Recording, serial: str) -> str:

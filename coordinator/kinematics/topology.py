@@ -97,7 +97,8 @@ class Topology(NamedTuple):
     parent: index of the parent module, -1 on the base. reversed: mounted by the output.
     confidence: the probability that the least certain of all these answers is right.
     parent_log_odds, reversed_log_odds: log-odds of every answer, against all that could be instead; 0 is a
-        toss-up, and so is the mounting of a module whose joint did not move.
+        toss-up, and so is the mounting of a module whose joint did not move. Empty if nobody has weighed
+        them, as of a topology that was known beforehand.
     unmoved: modules whose joints did not move. What they carry stands in the forest on their parents.
     doubts: what another motion should settle, the least certain first.
     """
@@ -115,6 +116,15 @@ class Topology(NamedTuple):
     def roots(self) -> tuple[str, ...]:
         """The modules on the base."""
         return tuple(s for s, p in zip(self.serials, self.parent, strict=True) if p == BASE)
+
+    def caveat(self, k: int) -> str:
+        """Return in words what is not certain of the module with this index, nothing if all is."""
+        if self.serials[k] in self.unmoved:
+            return ", its joint did not move: mounting and what it carries unknown"
+        if not self.parent_log_odds:
+            return ""
+        least = min(self.parent_log_odds[k], self.reversed_log_odds[k])
+        return f", {_chance(least)} sure" if least < DOUBTFUL_BELOW else ""
 
 
 class TopologyError(ValueError):

@@ -135,6 +135,18 @@ def test_a_module_whose_own_estimates_are_lost_is_placed_by_its_feedback(run: li
     assert topology.confidence > 0.99
 
 
+def test_the_result_says_how_surely_every_module_is_mounted_where_and_how(run: list[Entry]) -> None:
+    found = identify(_recorded(run)).result
+    base, tip = found.topology
+    assert (base.serial, base.parent, tip.serial, tip.parent) == (BASE, None, TIP, BASE)
+    # One slow motion of the joint beneath is all that tells, and no motion tells more than 1 in 8000.
+    assert tip.parent_log_odds is not None
+    assert 5.0 < tip.parent_log_odds < 10.0
+    assert (base.joint_moved, tip.joint_moved) == (True, True)
+    least = min(m for part in found.topology for m in (part.parent_log_odds, part.reversed_log_odds) if m)
+    assert found.topology_confidence == pytest.approx(1.0 / (1.0 + np.exp(-least)))
+
+
 def test_a_module_that_saw_nothing_at_all_is_left_out_and_named(run: list[Entry]) -> None:
     event = next(e for e in map(_event, run) if e is not None and e.what == "done" and e.step == "rest")
     cut = [

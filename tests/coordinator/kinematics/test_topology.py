@@ -237,6 +237,15 @@ def test_what_a_joint_that_is_stuck_carries_stands_on_what_carries_it_and_all_el
         assert odds == 0.0 if s == stuck else turned == reverse[s]
 
 
+def test_what_is_not_certain_of_a_module_is_said_in_words() -> None:
+    seen = watch(CHAIN, FORWARD) | {("B", "C"): MotionSeen(True, 0.6, sigma=0.15)}
+    found = likely_topology({pair: o for pair, o in seen.items() if pair[0] != "A"}, ["A"])
+    words = dict(zip(found.serials, (found.caveat(k) for k in range(3)), strict=True))
+    assert words["A"] == ", its joint did not move: mounting and what it carries unknown"
+    assert words["B"] == ""
+    assert words["C"].endswith(" % sure")
+
+
 def test_a_housing_that_turns_the_wrong_way_about_its_own_axis_is_named() -> None:
     seen = watch(CHAIN, {"A": False, "B": True, "C": False})
     assert find_topology(seen).reversed == (False, True, False)
