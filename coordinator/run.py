@@ -1,11 +1,15 @@
 """A whole identification run: session, recording, estimates, viewer and files, on any transport and clock."""
 
 import asyncio
+import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
+from coordinator.beside import Beside
 from coordinator.clock import Clock
 from coordinator.hrdf import write_hrdf
 from coordinator.identify import (
@@ -21,6 +25,7 @@ from coordinator.radio import Post, Radio
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.result import Result, write_result
 from coordinator.robot_link import RobotLink
+from coordinator.robot_so_far import RobotSoFar, robot_so_far
 from coordinator.run_folder import HELD_OUT, HRDF, RESULT, SESSION, URDF, VIEW, open_run_folder
 from coordinator.session import Session
 from coordinator.session_file import SessionWriter, read_session
@@ -35,6 +40,7 @@ from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Transport
 
 T = TypeVar("T")
+logger = logging.getLogger(__name__)
 
 
 class RunConfig(NamedTuple):
@@ -55,7 +61,15 @@ class RunConfig(NamedTuple):
 class Run:
     """One run in one folder."""
 
-    def __init__(self, config: RunConfig, transport: Transport, clock: Clock, post: Post, screen: Screen):
+    def __init__(
+        self,
+        config: RunConfig,
+        transport: Transport,
+        clock: Clock,
+        post: Post,
+        screen: Screen,
+        beside: Beside | None = None,
+    ):
         crashed = open_run_folder(config.out, config.resume, config.robot)
         self._config = config
         self._clock = clock
@@ -68,7 +82,8 @@ class Run:
             config.out / VIEW, config.spawn_viewer, config.connect_viewer, config.serve_viewer
         )
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
-        self._feed = ViewerFeed(viewer, self.recording, FILE if config.inline else LIVE)
+        self._feed = ViewerFeed(viewer, self.recording, FILE if config.inline else LIVE, beside)
+        self._looking: asyncio.Task[None] | None = None
         if crashed is not None:
             self._take_over(crashed)
         self._radio = Radio(transport, config.robot, clock, post, self._record)
@@ -111,7 +126,7 @@ class Run:
     def step(self, index: int, total: int, text: str) -> None:
         """Pass on that a step begins."""
         self._screen.step(index, total, text)
-        self._feed.met({s: self._link.kind(s).name for s in self._link.serials})
+        self._feed.met({s: self._link.kind(s).name for s in self._link.serials}, self._clock())
         self._feed.step(self._clock(), f"{index} of {total}: {text}")
 
     def note(self, text: str) -> None:
@@ -119,8 +134,37 @@ class Run:
         self._screen.note(text)
 
     def estimates(self, joint: str) -> None:
-        """Show the local estimates of a joint."""
+        """Show the local estimates of a joint, and the robot as far as it is known now."""
         self._feed.estimates(joint, self._clock())
+        # Of a resumed run the joints of before too.
+        explored = sorted({moved for moved, _ in self.recording.estimates})
+        if self._config.inline:
+            self._show_so_far(self._so_far(explored))
+        elif self._looking is None or self._looking.done():
+            # While the last look is still being worked out there is no other: the next joint brings one.
+            self._looking = asyncio.create_task(self._look(explored))
+
+    async def _look(self, explored: list[str]) -> None:
+        self._show_so_far(await self._compute(lambda: self._so_far(explored)))
+
+    def _so_far(self, explored: list[str]) -> RobotSoFar | None:
+        """Return the robot as far as it is known; only to be looked at, so that a run does not fail by it."""
+        try:
+            return robot_so_far(self.recording, explored)
+        except (ValueError, KeyError, np.linalg.LinAlgError) as error:
+            logger.info("nothing to show of the robot so far: %s", error)
+            return None
+
+    def _show_so_far(self, found: RobotSoFar | None) -> None:
+        if found is not None:
+            self._feed.so_far(self._clock(), found)
+
+    async def _looked(self) -> None:
+        """Wait for a look that is still being worked out: what comes after it is newer."""
+        if self._looking is not None:
+            (failure,) = await asyncio.gather(self._looking, return_exceptions=True)
+            if isinstance(failure, Exception):
+                logger.warning("the robot so far could not be shown: %s", failure)
 
     async def doubts(self) -> tuple[NextMotion, ...]:
         """Look for doubts about the topology as soon as all joints are explored."""
@@ -128,6 +172,7 @@ class Run:
 
     async def explored(self) -> None:
         """Assemble topology and chain as soon as all joints are explored, and show them."""
+        await self._looked()
         found = await self._compute(lambda: identify_kinematics(self.recording))
         self._feed.chain(self._clock(), found.fit)
         for line in found.words():
@@ -164,6 +209,7 @@ class Run:
         finally:
             self._radio.close()
             self._writer.close()
+            await self._looked()
             self._feed.close()
             if self._radio.dropped:
                 self._screen.note(
@@ -183,6 +229,7 @@ class Run:
     def _write(self, found: Identified) -> None:
         out = self._config.out
         write_outputs(out, found)
+        self._feed.chain(self._clock(), found.kinematics.fit)
         if found.held_out is not None:
             self._feed.held_out(found.held_out)
         self._feed.step(self._clock(), "done")

@@ -4,20 +4,28 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
+from coordinator.beside import Beside
+from coordinator.chain import Array
 from coordinator.clock_map import ClockMap, map_clock
 from coordinator.identify import HeldOutMotion
 from coordinator.kinematics.assembly import ChainFit
+from coordinator.kinematics.axis_angles import axis_angles
+from coordinator.kinematics.forward import BASE
 from coordinator.recording import Entry, ModuleRecord, Recording
+from coordinator.robot_so_far import RobotSoFar
+from coordinator.viewer.blueprint import AXIS_ANGLE, LINK_LENGTH
+from coordinator.viewer.side_by_side import side_by_side
 from coordinator.viewer.viewer import Viewer
 from module_agent.wire.messages import Feedback, Message, Status
 
 MAP_PERIOD_NS = 1_000_000_000
 POSE_PERIOD_NS = 33_000_000
 NETWORK_PERIOD_NS = 500_000_000
+# The lines of estimates go on while there are no newer ones.
+ESTIMATES_PERIOD_NS = 2_000_000_000
 RECENT_TRIPS = 100
 # Name of the plot of what a module itself finds: its distance from the nearest joint that moves it.
-LOCAL = "distance_from_joint"
+LOCAL = "own_distance"
 
 
 class Screen(Protocol):
@@ -49,30 +57,34 @@ class _Shown(NamedTuple):
 
     name: str
     serial: str
-    value_mm: float
-    sigma_mm: float
+    value: float
+    sigma: float
+    units: str = "mm"
 
 
 class ViewerFeed:
     """Feeds one viewer from one recording; the viewer's time counts from the beginning of the session.
 
-    Rows and poses are gathered for as long as `pace` says; `close` shows what is left.
+    Rows and poses are gathered for as long as `pace` says; `close` shows what is left. `beside` draws what it
+    knows besides.
     """
 
-    def __init__(self, viewer: Viewer, recording: Recording, pace: Pace = LIVE):
+    def __init__(self, viewer: Viewer, recording: Recording, pace: Pace = LIVE, beside: Beside | None = None):
         self._viewer = viewer
         self._recording = recording
+        self._beside = beside
         self.pace = pace
         self._maps: dict[tuple[str, int], tuple[int, ClockMap]] = {}
         self._pending: dict[tuple[str, int], list[tuple[int, int]]] = {}
         self._rows_ns = 0
-        self._chain: Chain | None = None
+        self._drawn = False
         self._pose_ns = 0
         self._poses: list[tuple[int, Array]] = []
         self._network_ns: dict[str, int] = {}
         self._known: tuple[str, ...] = ()
         self._origin_ns: int | None = None
         self._shown: dict[tuple[str, str], _Shown] = {}
+        self._shown_ns = 0
 
     def on_message(self, entry: Entry, message: Message) -> None:
         """Show one recorded message, if it is one that is shown."""
@@ -85,6 +97,8 @@ class ViewerFeed:
             self._on_status(entry, message)
         if entry.t_ns - self._rows_ns >= self.pace.rows_ns:
             self._show_rows(entry.t_ns)
+        if entry.t_ns - self._shown_ns >= ESTIMATES_PERIOD_NS:
+            self._show_again(entry.t_ns)
 
     def since_start(self, session_ns: int) -> int:
         """Return the time that the viewer shows for a session time."""
@@ -126,17 +140,17 @@ class ViewerFeed:
         return found
 
     def _pose(self, now_ns: int) -> None:
-        if self._chain is None or now_ns - self._pose_ns < POSE_PERIOD_NS:
+        if not self._drawn or now_ns - self._pose_ns < POSE_PERIOD_NS:
             return
         self._pose_ns = now_ns
-        self._poses.append((self.since_start(now_ns), self._positions(self._chain)))
+        self._poses.append((self.since_start(now_ns), self._positions()))
         if self._poses[-1][0] - self._poses[0][0] >= self.pace.poses_ns:
             self._show_poses()
 
     def _show_poses(self) -> None:
         if self._poses:
             times, positions = zip(*self._poses, strict=True)
-            self._viewer.poses(times, positions)
+            self._viewer.poses(times, positions, self._known)
             self._poses.clear()
 
     def close(self) -> None:
@@ -145,9 +159,9 @@ class ViewerFeed:
         self._show_poses()
         self._viewer.close()
 
-    def _positions(self, chain: Chain) -> Array:
-        q = np.zeros(len(chain.serials))
-        for index, serial in enumerate(chain.serials):
+    def _positions(self) -> Array:
+        q = np.zeros(len(self._known))
+        for index, serial in enumerate(self._known):
             log = self._recording.modules[serial].rows
             rows = log.rows(log.end_row - 1, log.end_row)
             if len(rows):
@@ -167,22 +181,29 @@ class ViewerFeed:
             status.serial, self.since_start(entry.t_ns), round_trip_ms, age_ns / 1e6, refused
         )
 
-    def met(self, types: dict[str, str]) -> None:
+    def met(self, types: dict[str, str], session_ns: int) -> None:
         """Show the modules that were found."""
         if tuple(types) != self._known:
+            self._show_poses()  # of those before
             self._known = tuple(types)
             self._viewer.modules(self._known, types)
+            if self._beside is not None:
+                self._beside.met(self._viewer, self.since_start(session_ns))
+                self._drawn = True
 
     def step(self, session_ns: int, text: str) -> None:
         """Show that a step begins; what is known by now is shown once more, so that it draws a line."""
-        now_ns = self.since_start(session_ns)
-        self._viewer.phase(now_ns, text)
+        self._viewer.phase(self.since_start(session_ns), text)
+        self._show_again(session_ns)
+
+    def _show_again(self, session_ns: int) -> None:
+        self._shown_ns = session_ns
         for shown in self._shown.values():
-            self._show(now_ns, shown)
+            self._show(self.since_start(session_ns), shown)
 
     def _show(self, now_ns: int, shown: _Shown) -> None:
         self._shown[shown.name, shown.serial] = shown
-        self._viewer.estimate(shown.name, shown.serial, now_ns, shown.value_mm, shown.sigma_mm, "mm")
+        self._viewer.estimate(shown.name, shown.serial, now_ns, shown.value, shown.sigma, shown.units)
 
     def estimates(self, joint: str, session_ns: int) -> None:
         """Show the distances from a joint that the modules found, where no nearer joint is known yet."""
@@ -191,22 +212,39 @@ class ViewerFeed:
             if circle is None:
                 continue
             known = self._shown.get((LOCAL, observer))
-            if known is None or 1e3 * circle.distance_m <= known.value_mm:
+            if known is None or 1e3 * circle.distance_m <= known.value:
                 shown = _Shown(LOCAL, observer, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
                 self._show(self.since_start(session_ns), shown)
 
+    def so_far(self, session_ns: int, found: RobotSoFar) -> None:
+        """Show the robot as far as it is known, and the estimates of links that nothing can come between."""
+        drawn = side_by_side(found.fit.chain)
+        self._draw(session_ns, found.fit._replace(chain=drawn))
+        self._show_links(session_ns, found.fit, found.beside)
+
     def chain(self, session_ns: int, fit: ChainFit) -> None:
         """Show the identified robot; it then turns as the robot turns."""
+        self._draw(session_ns, fit._replace(chain=side_by_side(fit.chain)))
+        self._show_links(session_ns, fit, tuple(parent != BASE for parent in fit.chain.parent))
+
+    def _draw(self, session_ns: int, fit: ChainFit) -> None:
         self._show_poses()  # of the chain before
         chain, now_ns = fit.chain, self.since_start(session_ns)
+        if self._beside is not None:
+            self._beside.chain(self._viewer, now_ns, chain, fit.unresolved)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
         sigma = [s if np.isfinite(s) else 0.0 for s in fit.link_length_sigma_m.tolist()]
         self._viewer.chain(now_ns, chain, sigma)
-        self._chain = chain
-        for k, parent in enumerate(chain.parent):
-            if parent >= 0:
-                length, spread = 1e3 * float(fit.link_length_m[k]), 1e3 * float(fit.link_length_sigma_m[k])
-                self._show(now_ns, _Shown("link_length", chain.serials[k], length, spread))
+        self._drawn = True
+
+    def _show_links(self, session_ns: int, fit: ChainFit, shown: tuple[bool, ...]) -> None:
+        now_ns = self.since_start(session_ns)
+        angle, spread = (np.degrees(value) for value in axis_angles(fit.chain, fit.covariance))
+        for k, serial in enumerate(fit.chain.serials):
+            if shown[k]:
+                length, sigma = 1e3 * float(fit.link_length_m[k]), 1e3 * float(fit.link_length_sigma_m[k])
+                self._show(now_ns, _Shown(LINK_LENGTH, serial, length, sigma))
+                self._show(now_ns, _Shown(AXIS_ANGLE, serial, float(angle[k]), float(spread[k]), "deg"))
 
     def held_out(self, found: HeldOutMotion) -> None:
         """Show measured and predicted torques of the held-out motions."""

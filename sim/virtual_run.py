@@ -13,7 +13,9 @@ from coordinator.viewer_feed import Screen
 from module_agent.wire.network_file import network
 from sim.noise_profile import NoiseProfile
 from sim.robot_file import Robot
+from sim.robot_tree import true_chain
 from sim.truth import write_truth
+from sim.truth_view import TruthView
 from sim.virtual_loop import VirtualLoop
 from sim.virtual_robot import VirtualRobot, VirtualSettings
 
@@ -70,6 +72,7 @@ def run_virtual(
             lambda: loop.now_ns,
             loop.call_soon,
             screen,
+            TruthView(true_chain(config.robot), [module.type for module in config.robot.modules]),
         )
         if between is not None:
             between(robot)

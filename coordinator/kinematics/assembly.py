@@ -80,8 +80,12 @@ def assemble(
     types: Sequence[ModuleType],
     pairs: Sequence[PairObservation],
     rests: Sequence[RestObservation],
+    least_gain: float = 0.0,
 ) -> ChainFit:
     """Fit the chain; `types` are those of the modules in the order of the topology.
+
+    A step that lowers the weighted squares by less than `least_gain` of them ends it: a look at a robot in
+    between need not be worked out to the last digit.
 
     The steps are those of Gauss and Newton in the resolved directions only (least squares of least norm by a
     truncated SVD), so that unresolved directions stay where the neutral first guess has put them.
@@ -94,7 +98,7 @@ def assemble(
         raise ValueError(f"{len(types)} module types for {len(topology.serials)} modules")
     seen = pack(topology.serials, pairs, rests)
     size = float(np.mean([np.linalg.norm(r.specific_force_m_s2, axis=1).mean() for r in rests]))
-    chain = _refine(initial_chain(topology, types, seen, size), seen)
+    chain = _refine(initial_chain(topology, types, seen, size), seen, least_gain)
     _check_directions(chain, seen)
     return _describe(chain, seen, pairs)
 
@@ -125,17 +129,19 @@ def _level(chain: Chain) -> Array:
     return np.asarray(vt[1:].T)
 
 
-def _refine(chain: Chain, seen: ChainObservations) -> Chain:
+def _refine(chain: Chain, seen: ChainObservations, least_gain: float) -> Chain:
     rest = residuals(chain, seen)
     for _ in range(STEPS):
         parts = _solve(chain, seen)
         keep = slice(parts.rank)
         step = -parts.vt[keep].T @ ((parts.u[:, keep].T @ rest) / parts.s[keep])
-        better = _shortened(chain, seen, step, float(rest @ rest))
+        before = float(rest @ rest)
+        better = _shortened(chain, seen, step, before)
         if better is None:
             return chain
         chain, rest = better
-        if np.abs(step).max() < STILL:
+        gain = 1.0 - float(rest @ rest) / before
+        if np.abs(step).max() < STILL or gain < least_gain:
             return chain
     return chain
 

@@ -6,6 +6,7 @@ Wildcards in the middle of a path match nothing, silently; so every view names i
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import rerun as rr
 import rerun.blueprint as rrb
 
 from coordinator.viewer import layout
@@ -13,11 +14,15 @@ from coordinator.viewer.parameter import Parameter, is_dynamic
 from coordinator.viewer.topology_graph import Topology, extent
 
 IDENTIFICATION, DYNAMICS, IMU, NETWORK = TABS = ("Identification", "Dynamics", "IMU", "Network")
-LINK_LENGTH = "link_length"
+LINK_LENGTH, AXIS_ANGLE = OF_LINKS = ("link_length", "axis_angle")
 
 # More than this on one page leaves plots too small to read; there are further pages for the rest.
 MODULES_PER_PAGE = 4
 ROWS_PER_PAGE, COLUMNS_PER_PAGE = 3, 3
+
+_WHOLE_RUN = rr.TimeRange(
+    rr.TimeRangeBoundary.absolute(seconds=0), rr.TimeRangeBoundary.cursor_relative(seconds=0)
+)
 
 
 class Contents(NamedTuple):
@@ -28,6 +33,7 @@ class Contents(NamedTuple):
     estimated: tuple[Parameter, ...] = ()
     topology: Topology | None = None
     reach_m: float | None = None
+    truth: bool = False
 
 
 def views(contents: Contents) -> Contents:
@@ -61,7 +67,7 @@ def _left(contents: Contents) -> rrb.Vertical:
         rrb.TextDocumentView(origin=layout.PHASE_NOW, name="Step"),
         _robot(contents),
         _of_modules("Joint position [rad]", contents.serials, layout.module_path, layout.POSITION),
-        row_shares=[1, 7, 3],
+        row_shares=[1.5, 7, 3],
     )
 
 
@@ -78,7 +84,8 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         origin="/world",
         contents=["/world/**"],
-        name=f"{contents.robot}: as identified (orange links)",
+        name=f"{contents.robot}: as identified (orange links)"
+        + (", truth in grey" if contents.truth else ""),
         background=(24, 26, 32),
         line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, stroke_width=0.6, color=(110, 115, 125, 90)),
         eye_controls=eye,
@@ -89,13 +96,13 @@ def _identification(contents: Contents) -> rrb.Vertical:
     # The links of the identified robot come before what single modules made of single joints.
     geometric = sorted(
         (parameter for parameter in contents.estimated if not is_dynamic(parameter)),
-        key=lambda parameter: parameter.name != LINK_LENGTH,
+        key=lambda parameter: (parameter.name not in OF_LINKS, parameter.name != LINK_LENGTH),
     )
     log = rrb.TextLogView(
         origin=layout.PHASE_LOG, name="Log", columns=rrb.TextLogColumns(text_log_columns=["Body"])
     )
     return rrb.Vertical(
-        _parameters(geometric, "Estimates") if geometric else _awaited(contents),
+        _parameters(geometric, "Estimates", contents) if geometric else _awaited(contents),
         rrb.Horizontal(_topology(contents), log, column_shares=[2, 3]),
         row_shares=[3, 2],
         name=IDENTIFICATION,
@@ -111,9 +118,12 @@ def _awaited(contents: Contents) -> rrb.View:
     )
 
 
-def _parameters(parameters: Sequence[Parameter], name: str) -> rrb.Container:
+def _parameters(parameters: Sequence[Parameter], name: str, contents: Contents) -> rrb.Container:
     """Give every parameter a row and every module a column, on as many pages as it takes."""
     serials = list(dict.fromkeys(serial for p in parameters for serial in p.ranges_by_serial()))
+    # From the base to the tips, as far as that is known.
+    known = contents.topology.serials if contents.topology is not None else ()
+    serials.sort(key=lambda serial: known.index(serial) if serial in known else len(known))
     rows = [parameters[i : i + ROWS_PER_PAGE] for i in range(0, len(parameters), ROWS_PER_PAGE)]
     columns = [serials[i : i + COLUMNS_PER_PAGE] for i in range(0, len(serials), COLUMNS_PER_PAGE)]
     if len(rows) == len(columns) == 1:
@@ -138,7 +148,9 @@ def _estimate(parameter: Parameter, serial: str) -> rrb.View:
     seen = parameter.ranges_by_serial()[serial]
     return rrb.TimeSeriesView(
         origin=layout.estimate_path(parameter.name, serial),
-        name=f"{serial} {parameter.title()} [{parameter.units}] ± 1σ",
+        name=f"{serial} {parameter.title()} [{parameter.units}]",
+        # All in the same time, so that one sees what a motion does to each of them.
+        axis_x=rrb.TimeAxis(view_range=_WHOLE_RUN),
         axis_y=None if seen is None else rrb.ScalarAxis(range=seen),
         plot_legend=rrb.PlotLegend(visible=False),
     )
@@ -172,7 +184,7 @@ def _dynamics(contents: Contents) -> rrb.Vertical:
     inertial = [parameter for parameter in contents.estimated if is_dynamic(parameter)]
     return rrb.Vertical(
         _paged(held_out, MODULES_PER_PAGE, "Held-out torque"),
-        rrb.Tabs(of_all, _parameters(inertial, "Parameters"), active_tab=0) if inertial else of_all,
+        rrb.Tabs(of_all, _parameters(inertial, "Parameters", contents), active_tab=0) if inertial else of_all,
         row_shares=[1, 1],
         name=DYNAMICS,
     )

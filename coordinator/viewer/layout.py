@@ -2,7 +2,7 @@
 
 /world/{est,true}/...           the robot as identified and, from the simulator's tools, as it is
 /modules/<serial>/<group>       one vector entity per group of sensors
-/estimates/<parameter>/<serial> value with variance
+/estimates/<parameter>/<serial> value with variance; below it the 95 % interval and, if known, the truth
 /residuals/<serial>/...         held-out torque, measured and predicted
 /network/<serial>/...           round trip, age of the newest sample, refusals
 /topology, /phase/...           the tree of modules; the steps of the run
@@ -20,7 +20,9 @@ Colour = tuple[int, int, int, int]
 
 ESTIMATE_COLOUR: Final[Colour] = (255, 150, 40, 150)
 PREDICTION_COLOUR: Final[Colour] = (255, 150, 40, 255)
-TRUTH_COLOUR: Final[Colour] = (150, 150, 150, 255)
+TRUTH_COLOUR: Final[Colour] = (165, 165, 170, 255)
+# In 3D it is seen through, so that it does not hide the estimate that it should coincide with.
+TRUE_BODY_COLOUR: Final[Colour] = (190, 190, 195, 110)
 COMMAND_COLOUR: Final[Colour] = (225, 225, 225, 255)
 
 # Far apart in hue and light enough for the dark background. Orange is the estimate's and grey is the truth's.
@@ -69,6 +71,16 @@ def module_path(serial: str, group: str) -> str:
 def estimate_path(name: str, serial: str) -> str:
     """Return the entity of one estimated parameter of a module."""
     return f"/estimates/{part(name)}/{part(serial)}"
+
+
+def interval_path(name: str, serial: str) -> str:
+    """Return the entity of the 95 % interval of an estimated parameter: its two ends."""
+    return f"{estimate_path(name, serial)}/interval"
+
+
+def truth_path(name: str, serial: str) -> str:
+    """Return the entity of a parameter's true value, which only simulations know."""
+    return f"{estimate_path(name, serial)}/true"
 
 
 def residual_path(serial: str, group: str) -> str:

@@ -10,6 +10,10 @@ FIRST_SIGMAS = 2.5
 ZOOM_BELOW = 1.0 / 30.0
 ZOOMED_SIGMAS = 8.0
 AGREEING_SIGMAS = 4.0
+# Of a normal distribution 95 % lie nearer to the middle.
+NINETY_FIVE_SIGMAS = 1.96
+# What is put into a plot besides, such as the truth, is this part of it away from its edge.
+BESIDE_EDGE = 0.06
 
 
 class Estimate(NamedTuple):
@@ -44,10 +48,12 @@ class Parameter(NamedTuple):
         """Return the name as one reads it."""
         return self.name.replace("_", " ")
 
-    def seen(self, serial: str, value: float, sigma: float, previous: float | None) -> "Parameter":
-        """Return the parameter with a plot in which this estimate and its band can be seen."""
+    def seen(
+        self, serial: str, value: float, sigma: float, previous: float | None, truth: float | None = None
+    ) -> "Parameter":
+        """Return the parameter with a plot in which this estimate, its band and the truth can be seen."""
         ranges = self.ranges_by_serial()
-        ranges[serial] = fitting(ranges.get(serial), value, sigma, previous)
+        ranges[serial] = including(fitting(ranges.get(serial), value, sigma, previous), truth)
         return self._replace(ranges=tuple(ranges.items()))
 
 
@@ -67,8 +73,17 @@ def fitting(before: Range | None, value: float, sigma: float, previous: float | 
         low, high = min(low, value - FIRST_SIGMAS * sigma), max(high, value + FIRST_SIGMAS * sigma)
     agrees = previous is not None and abs(value - previous) < AGREEING_SIGMAS * sigma
     if agrees and 2.0 * sigma < ZOOM_BELOW * (high - low):
-        return (value - ZOOMED_SIGMAS * sigma, value + ZOOMED_SIGMAS * sigma)
+        return including((value - ZOOMED_SIGMAS * sigma, value + ZOOMED_SIGMAS * sigma), previous)
     return (low, high)
+
+
+def including(around: Range | None, value: float | None) -> Range | None:
+    """Return a range in which a further value can be seen too."""
+    if around is None or value is None or not math.isfinite(value):
+        return around
+    low, high = around
+    edge = BESIDE_EDGE * (max(high, value) - min(low, value))
+    return (low if value > low else value - edge, high if value < high else value + edge)
 
 
 def is_dynamic(parameter: Parameter) -> bool:
@@ -77,10 +92,13 @@ def is_dynamic(parameter: Parameter) -> bool:
 
 
 def with_estimate(
-    parameters: tuple[Parameter, ...], estimate: Estimate, previous: float | None
+    parameters: tuple[Parameter, ...],
+    estimate: Estimate,
+    previous: float | None,
+    truth: float | None = None,
 ) -> tuple[Parameter, ...]:
     """Return the parameters with this estimate among them; the units are those said first."""
     known = {parameter.name: parameter for parameter in parameters}
     parameter = known.get(estimate.name, Parameter(estimate.name, estimate.units))
-    known[estimate.name] = parameter.seen(estimate.serial, estimate.value, estimate.sigma, previous)
+    known[estimate.name] = parameter.seen(estimate.serial, estimate.value, estimate.sigma, previous, truth)
     return tuple(known.values())

@@ -7,8 +7,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from coordinator.viewer import layout
-from coordinator.viewer.parameter import Estimate
+from coordinator.viewer.parameter import NINETY_FIVE_SIGMAS, Estimate
 from coordinator.viewer.time_series import IntArray, send_scalars
+
+LEGEND = "Band: 1σ. Thin lines and spheres: 95 %. Grey: the truth, where it is known."
 
 
 def set_time(stream: rr.RecordingStream, t_ns: int) -> None:
@@ -19,11 +21,14 @@ def set_time(stream: rr.RecordingStream, t_ns: int) -> None:
 def log_phase(stream: rr.RecordingStream, text: str) -> None:
     """Log a step of the run: a line of the log, and the heading that says what is going on."""
     stream.log(layout.PHASE_LOG, rr.TextLog(text, level=rr.TextLogLevel.INFO))
-    stream.log(layout.PHASE_NOW, rr.TextDocument(text))
+    stream.log(layout.PHASE_NOW, rr.TextDocument(f"**{text}**\n\n{LEGEND}", media_type="text/markdown"))
 
 
 def log_estimate(stream: rr.RecordingStream, estimate: Estimate, colour: layout.Colour) -> None:
-    """Log a value with its variance, drawn as a line in a band of one sigma; not finite sigma: no band."""
+    """Log a value with its variance and the ends of its 95 % interval; not finite sigma: neither.
+
+    The viewer draws a line in a band of one sigma, and two thin lines that are right 95 times in 100.
+    """
     known = math.isfinite(estimate.sigma)
     drawn = rr.Measurements(
         [estimate.value],
@@ -37,6 +42,31 @@ def log_estimate(stream: rr.RecordingStream, estimate: Estimate, colour: layout.
         interpolation_mode="stepafter",
     )
     stream.log(layout.estimate_path(estimate.name, estimate.serial), drawn)
+    reach = NINETY_FIVE_SIGMAS * estimate.sigma if known else math.nan
+    ends = [estimate.value - reach, estimate.value + reach]
+    stream.log(layout.interval_path(estimate.name, estimate.serial), rr.Scalars(ends))
+
+
+def log_interval_style(stream: rr.RecordingStream, name: str, serial: str, colour: layout.Colour) -> None:
+    """Log how the ends of a parameter's interval are drawn, static."""
+    style = rr.SeriesLines(
+        names=["95 %: from", "95 %: to"],
+        colors=[layout.shade(colour, 0.75)] * 2,
+        widths=[1.0, 1.0],
+        interpolation_mode="stepafter",
+    )
+    stream.log(layout.interval_path(name, serial), style, static=True)
+
+
+def log_truth_style(stream: rr.RecordingStream, name: str, serial: str) -> None:
+    """Log how a parameter's true value is drawn, static."""
+    style = rr.SeriesLines(names="true", colors=[layout.TRUTH_COLOUR], widths=[1.5])
+    stream.log(layout.truth_path(name, serial), style, static=True)
+
+
+def log_truth(stream: rr.RecordingStream, name: str, serial: str, value: float) -> None:
+    """Log a parameter's true value; it is a line from the first estimate to the last."""
+    stream.log(layout.truth_path(name, serial), rr.Scalars(value))
 
 
 def log_network(

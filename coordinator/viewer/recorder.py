@@ -11,6 +11,9 @@ from coordinator.viewer import topology_graph as graphs
 from coordinator.viewer.parameter import Estimate, with_estimate
 from coordinator.viewer.time_series import Batch, IntArray
 
+# Times the reach that the eye was set for.
+OUTGROWN = 1.25
+
 
 class Recorder:
     """Everything that one run has logged so far; used by one thread only."""
@@ -24,12 +27,17 @@ class Recorder:
         self._states = time_series.StateChanges()
         self._scenes: dict[str, robot_scene.Scene] = {}
         self._q_rad: dict[str, float] = {}
-        self._values: dict[tuple[str, str], float] = {}
+        self._estimates: dict[tuple[str, str], Estimate] = {}
+        self._truths: dict[tuple[str, str], float] = {}
 
     def modules(self, serials: Sequence[str], types: Mapping[str, str]) -> None:
         """Make modules known: their types, names, colours and places in the layout."""
         self._types.update(types)
         self._know(serials)
+
+    def name_types(self, types: Mapping[str, str]) -> None:
+        """Make types known of modules that nobody may have heard of; what is known of others stays."""
+        self._types = {**types, **self._types}
 
     def rows(self, batch: Batch) -> None:
         """Log rows."""
@@ -66,13 +74,30 @@ class Recorder:
         self._show()
 
     def estimate(self, t_ns: int, estimate: Estimate) -> None:
-        """Log an estimated parameter."""
+        """Log an estimated parameter, and the true value beside it where that is known.
+
+        One that is shown once more, so that its line goes on, does not change its plot.
+        """
         which = (estimate.name, estimate.serial)
-        estimated = with_estimate(self._contents.estimated, estimate, self._values.get(which))
-        self._contents = self._contents._replace(estimated=estimated)
-        self._values[which] = estimate.value
+        truth, previous = self._truths.get(which), self._estimates.get(which)
+        colour = self._palette.colour(estimate.serial)
+        if previous is None:
+            progress.log_interval_style(self._stream, *which, colour)
+        if estimate != previous:
+            before = None if previous is None else previous.value
+            estimated = with_estimate(self._contents.estimated, estimate, before, truth)
+            self._contents = self._contents._replace(estimated=estimated)
+            self._estimates[which] = estimate
         progress.set_time(self._stream, t_ns)
-        progress.log_estimate(self._stream, estimate, self._palette.colour(estimate.serial))
+        progress.log_estimate(self._stream, estimate, colour)
+        if truth is not None:
+            progress.log_truth(self._stream, *which, truth)
+
+    def true_value(self, name: str, serial: str, value: float) -> None:
+        """Make the true value of a parameter known, to be drawn with its estimates."""
+        if (name, serial) not in self._truths:
+            progress.log_truth_style(self._stream, name, serial)
+        self._truths[name, serial] = value
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.Look) -> None:
         """Draw the robot from now on, in the posture it was last seen in; at q = 0 before the first pose."""
@@ -84,22 +109,26 @@ class Recorder:
             robot_scene.clear_gone(self._stream, before, scene)
         robot_scene.log_scene(self._stream, scene, self._posture(chain))
         self._scenes[look.world] = scene
+        self._contents = self._contents._replace(truth=layout.TRUE_WORLD in self._scenes)
         self._frame(chain)
 
-    def poses(self, t_ns: IntArray, q_rad: Array) -> None:
-        """Turn the robots that are drawn at `t_ns` (k,); `q_rad` (k, n) in the identified chain's order."""
+    def poses(self, t_ns: IntArray, q_rad: Array, serials: Sequence[str] | None) -> None:
+        """Turn the robots that are drawn at `t_ns` (k,); `q_rad` (k, n) of `serials`.
+
+        Without `serials` it is in the identified chain's order. Joints that are not named stay as they are.
+        """
         first = self._scenes.get(layout.ESTIMATED_WORLD, self._scenes.get(layout.TRUE_WORLD))
-        if first is None:
+        if first is None and serials is None:
             return  # before there is a robot there is nothing to turn
-        serials = first.chain.serials
-        if q_rad.shape != (t_ns.size, len(serials)):
-            raise ValueError(f"{t_ns.size} poses of shape {q_rad.shape} for a robot of {len(serials)} joints")
-        self._q_rad.update(zip(serials, q_rad[-1].tolist(), strict=True))
+        named = tuple(serials or ()) if first is None or serials is not None else first.chain.serials
+        if q_rad.shape != (t_ns.size, len(named)):
+            raise ValueError(f"{t_ns.size} poses of shape {q_rad.shape} for a robot of {len(named)} joints")
+        self._q_rad.update(zip(named, q_rad[-1].tolist(), strict=True))
         for scene in self._scenes.values():
             postures = np.tile(self._posture(scene.chain), (t_ns.size, 1))
             for column, serial in enumerate(scene.chain.serials):
-                if serial in serials:
-                    postures[:, column] = q_rad[:, serials.index(serial)]
+                if serial in named:
+                    postures[:, column] = q_rad[:, named.index(serial)]
             robot_scene.send_poses(self._stream, scene, t_ns, postures)
 
     def residuals(self, serial: str, t_ns: IntArray, measured_nm: Array, predicted_nm: Array) -> None:
@@ -120,8 +149,8 @@ class Recorder:
         placed = robot_geometry.modules(chain, self._types)
         reach = robot_geometry.reach_m(chain, placed)
         self._stream.log(layout.GRAVITY, robot_scene.gravity_arrow(chain, reach))
-        # The eye is set once, so that a refined chain does not take it out of the hands of whoever looks.
-        if self._contents.reach_m is None:
+        # The eye stays in the hands of whoever looks, unless the robot has outgrown what is seen.
+        if self._contents.reach_m is None or reach > OUTGROWN * self._contents.reach_m:
             self._contents = self._contents._replace(reach_m=reach)
             self._show()
 

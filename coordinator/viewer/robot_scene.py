@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE, body_displacements
 from coordinator.viewer import layout
+from coordinator.viewer.parameter import NINETY_FIVE_SIGMAS
 from coordinator.viewer.robot_geometry import Link, Module, from_z, links, modules, upright
 from coordinator.viewer.time_series import IntArray, time_column
 
@@ -18,8 +19,8 @@ OUTPUT_RADIUS_M = 0.024
 OUTPUT_THICKNESS_M = 0.008
 AXIS_LENGTH_M = 0.09
 IMU_AXIS_LENGTH_M = 0.05
-# So that a spread of millimetres can be seen next to a housing, its sphere is drawn at three sigma.
-SPREAD = 3.0
+# Sigmas: as far as the 95 % intervals of the plots.
+SPREAD = NINETY_FIVE_SIGMAS
 
 Drawn = rr.AsComponents
 
@@ -27,7 +28,8 @@ Drawn = rr.AsComponents
 class Look(NamedTuple):
     """How a robot is drawn in one world: `link` for what joins modules; `plain` paints everything so.
 
-    The truth is of wire and without labels, so that it does not hide the estimate that it coincides with.
+    The truth is translucent and without labels, so that it does not hide the estimate that it should coincide
+    with.
     """
 
     world: str
@@ -42,9 +44,9 @@ ESTIMATE_LOOK = Look(
 )
 TRUTH_LOOK = Look(
     layout.TRUE_WORLD,
-    layout.TRUTH_COLOUR,
-    layout.TRUTH_COLOUR,
-    rr.components.FillMode.MajorWireframe,
+    layout.TRUE_BODY_COLOUR,
+    layout.TRUE_BODY_COLOUR,
+    rr.components.FillMode.TransparentFillMajorWireframe,
     labels=False,
 )
 
@@ -151,7 +153,8 @@ def _body(
     drawn: list[tuple[str, tuple[Drawn, ...]]] = []
     if housed:
         drawn.append((f"{path}/housing", (_housings(chain, placed, paint, sigma_m, look, housed),)))
-        drawn += [(f"{path}/imu/{layout.part(chain.serials[k])}", _imu(chain, k)) for k in housed]
+        if look.plain is None:
+            drawn += [(f"{path}/imu/{layout.part(chain.serials[k])}", _imu(chain, k)) for k in housed]
     turning = [k for k, module in enumerate(placed) if module.output_body == body]
     if turning:
         drawn.append((f"{path}/output", (_outputs(placed, paint, look, turning),)))
@@ -160,6 +163,9 @@ def _body(
         if sigma_m is not None and np.isfinite(sigma_m[body]):
             drawn.append((f"{path}/spread", (_spread(placed[body], sigma_m[body], look),)))
     joined = [link for link in links(chain, placed) if link.body == body and _length(link) > 1e-4]
+    if body == BASE and look.plain is not None:
+        # The base is where the identified robot's first module stands, and the truth may be drawn elsewhere.
+        joined = []
     if joined:
         drawn.append((f"{path}/link", (_links(joined, look),)))
     return drawn

@@ -105,12 +105,21 @@ class Viewer:
         found = Estimate(name, serial, float(value), float(sigma), units)
         self._submit(partial(self._recorder.estimate, t_ns, found), essential=True)
 
+    def true_value(self, name: str, serial: str, value: float) -> None:
+        """Draw the true value of a parameter with its estimates; only the simulator's tools know it."""
+        self._submit(partial(self._recorder.true_value, name, serial, float(value)), essential=True)
+
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None = None) -> None:
         """Draw the robot as identified, with (n,) standard deviations of its joints' places [m]."""
         self._chain(t_ns, chain, sigma_m, robot_scene.ESTIMATE_LOOK)
 
-    def true_chain(self, t_ns: int, chain: Chain) -> None:
-        """Draw the robot as it is, in grey; only the simulator's tools know it."""
+    def true_chain(self, t_ns: int, chain: Chain, types: Mapping[str, str] | None = None) -> None:
+        """Draw the robot as it is, in grey; only the simulator's tools know it.
+
+        `types` are the module types of those that were not named by `modules`.
+        """
+        if types is not None:
+            self._submit(partial(self._recorder.name_types, dict(types)), essential=True)
         self._chain(t_ns, chain, None, robot_scene.TRUTH_LOOK)
 
     def pose(self, t_ns: int, q_rad: ArrayLike) -> None:
@@ -120,16 +129,21 @@ class Viewer:
         self._next_pose_ns = t_ns + POSE_PERIOD_NS
         self.poses([t_ns], np.array(q_rad, dtype=float)[None])
 
-    def poses(self, t_ns: ArrayLike, q_rad: ArrayLike) -> None:
+    def poses(self, t_ns: ArrayLike, q_rad: ArrayLike, serials: Sequence[str] | None = None) -> None:
         """Turn the robot to `q_rad` (k, n) at `t_ns` (k,), all of which are shown.
 
+        The columns are those of `serials`, or of the identified chain if left out.
+
         Raises:
-            ValueError: there is not one time per pose.
+            ValueError: there is not one time per pose, or one serial per column.
         """
         times, postures = np.array(t_ns, dtype=np.int64), np.array(q_rad, dtype=float)
         if times.shape != postures.shape[:1]:
             raise ValueError(f"times of shape {times.shape} for poses of shape {postures.shape}")
-        self._submit(partial(self._recorder.poses, times, postures))
+        if serials is not None and postures.shape[1:] != (len(serials),):
+            raise ValueError(f"poses of shape {postures.shape} for {len(serials)} serials")
+        named = None if serials is None else tuple(serials)
+        self._submit(partial(self._recorder.poses, times, postures, named))
 
     def residuals(self, serial: str, t_ns: IntArray, measured_nm: ArrayLike, predicted_nm: ArrayLike) -> None:
         """Show held-out torque at `t_ns` (m,): measured (m,) and predicted (m,).

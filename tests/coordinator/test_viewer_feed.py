@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from coordinator.chain import Chain
+from coordinator.kinematics.assembly import ChainFit
 from coordinator.recording import Entry, Recording
 from coordinator.viewer_feed import FILE, LIVE, Pace, ViewerFeed
 from module_agent.wire.keys import Leaf
@@ -30,7 +31,7 @@ class Shown:
         found = zip(t_ns.tolist(), rows["position_rad"].tolist(), strict=True)
         self.rows_of.setdefault(serial, []).extend(found)
 
-    def poses(self, t_ns: Any, q_rad: Any) -> None:
+    def poses(self, t_ns: Any, q_rad: Any, serials: Any) -> None:
         self.calls.append("poses")
         self.turned += [(int(t), list(q)) for t, q in zip(t_ns, q_rad, strict=True)]
 
@@ -59,7 +60,7 @@ class Rig:
             self.hear(self.wire.request(Leaf.STATUS, self.wire.ask(serial, seq=4), 0))
             answer = self.wire.status(serial, re=4, t_ns=AHEAD_NS)
             self.hear(self.wire.reply(Leaf.STATUS, answer, 0))
-        self.feed.met(dict.fromkeys(serials, "X5-4"))
+        self.feed.met(dict.fromkeys(serials, "X5-4"), 0)
 
     def publish(self, first: int, serial: str = "A", late_ns: int = 0) -> None:
         """Five rows, which arrive 2 ms after the last of them and `late_ns`."""
@@ -73,6 +74,25 @@ class Rig:
 @pytest.fixture(params=[LIVE, FILE], ids=["live", "file"])
 def rig(wire: SimpleNamespace, request: pytest.FixtureRequest) -> Rig:
     return Rig(wire, request.param)
+
+
+def _fit(chain: Chain) -> ChainFit:
+    count = len(chain.serials)
+    nothing = np.zeros((6 * count,) * 2)
+    return ChainFit(
+        chain=chain,
+        covariance=nothing,
+        rank=0,
+        unknowns=0,
+        singular_values=np.zeros(0),
+        condition=1.0,
+        unresolved=(),
+        null_basis=nothing[:, :0],
+        link_length_m=np.full(count, 0.3),
+        link_length_sigma_m=np.full(count, 0.001),
+        reduced_chi2=1.0,
+        misfit_sigma=np.zeros(0),
+    )
 
 
 def _rows(*numbers: int) -> list[tuple[int, float]]:
@@ -119,7 +139,7 @@ def test_rows_of_a_module_that_fell_silent_are_shown_with_those_of_the_others(ri
 
 
 def test_nothing_is_shown_of_a_module_whose_clock_is_not_known(rig: Rig) -> None:
-    rig.feed.met({"A": "X5-4"})
+    rig.feed.met({"A": "X5-4"}, 0)
     for first in range(0, 2000, 5):
         rig.publish(first)
     rig.feed.close()
@@ -129,7 +149,7 @@ def test_nothing_is_shown_of_a_module_whose_clock_is_not_known(rig: Rig) -> None
 def test_the_robot_turns_thirty_times_a_second_as_its_newest_rows_say(rig: Rig) -> None:
     rig.meet("A")
     arm = Chain(("A",), (-1,), (False,), np.eye(3)[:1], np.zeros((1, 3)), np.eye(4)[None], np.eye(3)[2])
-    fit: Any = SimpleNamespace(chain=arm, link_length_m=np.zeros(1), link_length_sigma_m=np.zeros(1))
+    fit = _fit(arm)
     rig.feed.chain(0, fit)
     for first in range(0, 1000, 5):
         rig.publish(first)

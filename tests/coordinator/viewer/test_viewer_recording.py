@@ -101,6 +101,40 @@ def test_an_estimate_keeps_its_value_variance_and_unit(viewer: Viewer, file: Pat
     assert table[f"{path}:Measurements:units"][0][0] == "m"
 
 
+def test_an_estimate_has_the_ends_of_its_interval_and_the_truth_beside_it(
+    viewer: Viewer, file: Path, read: Read
+) -> None:
+    viewer.true_value("link_length", "a", 0.3)
+    viewer.estimate("link_length", "a", 5, 0.25, 0.01, "m")
+    viewer.estimate("link_length", "a", 9, 0.26, float("inf"), "m")
+    done(viewer)
+    ends = read(file, "/estimates/link_length/a/interval")
+    first, last = column(ends, "/estimates/link_length/a/interval:Scalars:scalars")
+    # 1.96 sigma to either side hold 95 % of a normal distribution.
+    assert first.tolist() == pytest.approx([0.2304, 0.2696])
+    assert np.isnan(last).all()
+    truth = read(file, "/estimates/link_length/a/true")
+    assert times_ns(truth) == [5, 9]
+    assert column(truth, "/estimates/link_length/a/true:Scalars:scalars")[:, 0].tolist() == [0.3, 0.3]
+
+
+def test_the_truth_and_the_estimate_turn_together_even_where_only_some_joints_are_identified(
+    viewer: Viewer, file: Path, read: Read, arm: Chain, types: dict[str, str]
+) -> None:
+    part = Chain(*(value[:1] for value in arm[:6]), arm.gravity)  # type: ignore[arg-type]
+    viewer.modules(["a"], {"a": types["a"]})
+    viewer.true_chain(5, arm, types)
+    viewer.chain(10, part)
+    viewer.poses([20], [[-1.1, 0.7]], ["b/1", "a"])
+    done(viewer)
+    body = "/world/true/body/b\\/1"
+    moved = _transform(read(file, "/world/true/**").iloc[-1], body)
+    expected = imu_poses(arm, np.array([[0.7, -1.1]]))[0, 1] @ np.linalg.inv(arm.imu_home[1])
+    np.testing.assert_allclose(moved, expected, atol=1e-6)
+    turned = _transform(read(file, "/world/est/**").iloc[-1], "/world/est/body/a")
+    assert turned[0, 0] == pytest.approx(np.cos(0.7))
+
+
 def test_held_out_torque_and_what_is_left_of_it(viewer: Viewer, file: Path, read: Read) -> None:
     viewer.residuals("a", np.array([1, 2]), [1.0, 2.0], [0.5, 2.25])
     done(viewer)
@@ -192,7 +226,7 @@ def test_a_refined_robot_keeps_its_posture_and_loses_what_is_no_longer_known(
     body = "/world/est/body/b\\/1"
     np.testing.assert_array_equal(_transform(table.iloc[1], body), _transform(table.iloc[2], body))
     spread = table[f"{body}/spread:Ellipsoids3D:half_sizes"]
-    assert spread[0][0].tolist() == pytest.approx([0.06] * 3)  # three sigma
+    assert spread[0][0].tolist() == pytest.approx([0.0392] * 3)  # 95 % of a normal distribution
     assert len(spread[2]) == 0
 
 
@@ -248,6 +282,8 @@ def test_mistakes_of_the_caller_are_raised_at_the_call(viewer: Viewer, make_rows
         viewer.rows("a", np.arange(4), make_rows(0, 5))
     with pytest.raises(ValueError, match="for poses of shape"):
         viewer.poses([1, 2], [[0.1, 0.2]])
+    with pytest.raises(ValueError, match="for 3 serials"):
+        viewer.poses([1], [[0.1, 0.2]], ["a", "b", "c"])
     with pytest.raises(ValueError, match="have shapes"):
         viewer.residuals("a", np.arange(2), [1.0], [1.0, 2.0])
     with pytest.raises(ValueError, match=r"'b'.*parent index 1"):
