@@ -23,8 +23,11 @@ Gravity's known strength calibrates E in the plane in which the joint turns it; 
 covariance of r keeps the uncertainty of before.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
+from module_agent.estimate.base_motion import ACCELERATION, FORCE, RATE, BaseMotion
 from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED, SmoothMotion
 from module_agent.estimate.windows import Array
 
@@ -33,34 +36,53 @@ from module_agent.estimate.windows import Array
 TURN, RADIAL, GRAVITY = slice(0, 2), slice(2, 4), slice(4, 7)
 ACCEL_BIAS, GYRO_BIAS, KAPPA = slice(7, 10), slice(10, 13), slice(13, 16)
 ACCEL_MATRIX, FELT = slice(16, 22), slice(22, 28)
-COMPLIANCE, HINGE, DELAY = 28, 29, 30
+COMPLIANCE, HINGE = 28, 29
+# Of what carries the joint: the angle from the housing's x to e1 at q = 0, by how much its IMU is late, where
+# the joint's axis is from its IMU across the axis, and how far the child's IMU is from its own along it.
+BEARING, LATE, PIVOT, HEIGHT = 30, 31, slice(32, 34), 34
+DELAY = 35
 ALONG = 6  # gravity along the axis
 
 _LEAST_DISTANCE_M = 0.05  # where gravity's pull over the distance would grow beyond all bounds
 # Readings are polynomials of what these are steps of, so differences are as good as derivatives.
 _STEPS = {COMPLIANCE: 1e-7, HINGE: 1e-2}
+_BASE_STEPS = {BEARING: 1e-4, PIVOT.start: 1e-2, PIVOT.start + 1: 1e-2, HEIGHT: 1e-2}
 _STEP_S = 1e-4
 
 
-def predict(joint: SmoothMotion, t_s: Array, p: Array, delay: int) -> tuple[Array, Array]:
+class Motion(NamedTuple):
+    """A joint's motion, and that of what carries it where it shakes."""
+
+    joint: SmoothMotion
+    base: BaseMotion | None
+
+
+def predict(motion: Motion, t_s: Array, p: Array, delay: int) -> tuple[Array, Array]:
     """Return readings (n, 6), gyro first, along (e1, e2, j), and their derivatives by parameters (n, 6, k).
 
-    The derivatives leave out how radial vector and gravity change the load that bends the link: 1e-5 of them.
+    The derivatives leave out how radial vector and gravity change the load that bends the link: 2e-3 of them.
 
     Args:
-        joint: the motion; t_s (n,): times of the readings since its first sample, but for the delay.
+        motion: of the joint; t_s (n,): times of the readings since its first sample, but for the delay.
         p: the parameters; `delay` is the place of this motion's delay among them.
     """
-    values, slopes = joint.values(t_s - p[delay]), joint.slopes(t_s - p[delay])
-    predicted = readings(values, p)
-    jacobian = _linear(values, p)
+    at = t_s - p[delay]
+    values, shake = motion.joint.values(at), _shake(motion, at, p)
+    predicted = readings(values, shake, p)
+    jacobian = _linear(values, shake, p)
+    slopes = motion.joint.slopes(at)
     later, sooner = values + _STEP_S * slopes, values - _STEP_S * slopes
-    jacobian[:, :, delay] = (readings(sooner, p) - readings(later, p)) / (2.0 * _STEP_S)
-    for column, step in _STEPS.items():
+    before, after = _shake(motion, at - _STEP_S, p), _shake(motion, at + _STEP_S, p)
+    jacobian[:, :, delay] = (readings(sooner, before, p) - readings(later, after, p)) / (2.0 * _STEP_S)
+    steps = _STEPS
+    if shake is not None:
+        steps = _STEPS | _BASE_STEPS
+        jacobian[:, :, LATE] = (readings(values, after, p) - readings(values, before, p)) / (2.0 * _STEP_S)
+    for column, step in steps.items():
         up, down = p.copy(), p.copy()
         up[column] += step
         down[column] -= step
-        jacobian[:, :, column] = (readings(values, up) - readings(values, down)) / (2.0 * step)
+        jacobian[:, :, column] = (readings(values, shake, up) - readings(values, shake, down)) / (2.0 * step)
     for sensor in (slice(0, 3), slice(3, 6)):
         # Turning the frame about e1 and e2 turns what is in it: u x reading.
         x, y, z = predicted[:, sensor].T
@@ -69,14 +91,49 @@ def predict(joint: SmoothMotion, t_s: Array, p: Array, delay: int) -> tuple[Arra
     return predicted, jacobian
 
 
-def readings(values: Array, p: Array) -> Array:
-    """Return gyro and accelerometer (n, 6) along (e1, e2, j) for the columns of `SmoothMotion.values`."""
-    rate, *carried = _carried(values, p)
-    found = _force_across(carried, p) @ _mix(p).T
-    found[:, :3] += rate[:, None] * (p[KAPPA] + _AXIS) + p[GYRO_BIAS]
+def readings(values: Array, shake: Array | None, p: Array) -> Array:
+    """Return gyro and accelerometer (n, 6) along (e1, e2, j).
+
+    Args:
+        values: the columns of `SmoothMotion.values`.
+        shake: those of `BaseMotion.values`, or None for what stands still.
+    """
+    rate, *carried = _carried(values, shake, p)
+    force = _force_across(carried, p)
+    turning = rate[:, None] * (p[KAPPA] + _AXIS)
+    along = np.full(len(values), p[ALONG])
+    if shake is not None:
+        across, turn, twist, push = _base_across(values, shake, p)
+        force = force + across
+        turning[:, :2] += turn
+        along += push + twist @ (p[3], -p[2]) + 2.0 * rate * (turn @ p[RADIAL])
+    found = force @ _mix(p).T
+    found[:, :3] += turning + p[GYRO_BIAS]
     found[:, 3:] += p[ACCEL_BIAS]
-    found[:, 5] += p[ALONG]
+    found[:, 5] += along
     return np.asarray(found)
+
+
+def _shake(motion: Motion, at: Array, p: Array) -> Array | None:
+    return None if motion.base is None else motion.base.values(at + p[LATE])
+
+
+def _base_across(values: Array, shake: Array, p: Array) -> tuple[Array, Array, Array, Array]:
+    """Return what the base's shake is at the joint's axis, in the child's axes.
+
+    Specific force, rate and angular acceleration across the axis (n, 2), and specific force along it (n,).
+    """
+    bearing, height = p[BEARING], p[HEIGHT]
+    turn = np.array([[np.cos(bearing), np.sin(bearing)], [-np.sin(bearing), np.cos(bearing)]])
+    cosine, sine = values[:, COSINE], values[:, SINE]
+    (s1, s2), (w1, w2, _), (a1, a2, a3) = p[PIVOT], shake[:, RATE].T, shake[:, ACCELERATION].T
+    # The pivot stands in the housing, and so turns backwards in axes that turn with the child.
+    back = np.stack([cosine * s1 + sine * s2, cosine * s2 - sine * s1], axis=1)
+    force = shake[:, FORCE][:, :2] + a3[:, None] * np.stack([-back[:, 1], back[:, 0]], axis=1)
+    force = force + height * np.stack([a2, -a1], axis=1)
+    push = shake[:, 2] + a1 * back[:, 1] - a2 * back[:, 0]
+    rate, twist = np.stack([w1, w2], axis=1), np.stack([a1, a2], axis=1)
+    return force @ turn, rate @ turn, twist @ turn, push
 
 
 def felt_columns(force: Array) -> Array:
@@ -90,7 +147,7 @@ def felt_columns(force: Array) -> Array:
 _AXIS = np.array([0.0, 0.0, 1.0])
 
 
-def _carried(values: Array, p: Array) -> list[Array]:
+def _carried(values: Array, shake: Array | None, p: Array) -> list[Array]:
     """Return how the body turns: rate, tangential acceleration, squared rate, cosine and sine; (n,) each.
 
     The tangential acceleration is that at the IMU over its distance, which is not the angular acceleration
@@ -99,10 +156,11 @@ def _carried(values: Array, p: Array) -> list[Array]:
     c, rate = p[COMPLIANCE], values[:, 0]
     load, slope, curve = _load(values, p)
     cosine, sine, bent = values[:, COSINE], values[:, SINE], c * load
+    swing, twist = (shake[:, 5], shake[:, 8]) if shake is not None else (0.0, 0.0)
     return [
-        rate - c * slope,
-        values[:, 1] - (1.0 - p[HINGE]) * c * curve,
-        values[:, SQUARED] - 2.0 * c * rate * slope,
+        rate - c * slope + swing,
+        values[:, 1] - (1.0 - p[HINGE]) * c * curve + twist,
+        values[:, SQUARED] - 2.0 * c * rate * slope + 2.0 * rate * swing,
         cosine + bent * sine,
         sine - bent * cosine,
     ]
@@ -139,24 +197,29 @@ def _mix(p: Array) -> Array:
     return np.vstack([p[FELT].reshape(3, 2), np.eye(3, 2) + p[ACCEL_MATRIX].reshape(3, 2)])
 
 
-def _linear(values: Array, p: Array) -> Array:
+def _linear(values: Array, shake: Array | None, p: Array) -> Array:
     """Return the derivatives (n, 6, k) by all that the readings are linear in; the others are zero."""
-    rate, *carried = _carried(values, p)
+    rate, *carried = _carried(values, shake, p)
     tangential, squared, cosine, sine = carried
     jacobian, mix = np.zeros((len(values), 6, p.size)), _mix(p)
-    across = (
+    columns = (
         (RADIAL.start, -squared, tangential),
         (RADIAL.start + 1, -tangential, -squared),
         (GRAVITY.start, cosine, -sine),
         (GRAVITY.start + 1, sine, cosine),
     )
-    for column, first, second in across:
+    for column, first, second in columns:
         jacobian[:, :, column] = first[:, None] * mix[:, 0] + second[:, None] * mix[:, 1]
     jacobian[:, 5, ALONG] = 1.0
     jacobian[:, 3:, ACCEL_BIAS] = np.eye(3)
     jacobian[:, :3, GYRO_BIAS] = np.eye(3)
     jacobian[:, :3, KAPPA] = np.eye(3) * rate[:, None, None]
-    columns = felt_columns(_force_across(carried, p))
-    jacobian[:, :3, FELT] = columns
-    jacobian[:, 3:, ACCEL_MATRIX] = columns
+    force = _force_across(carried, p)
+    if shake is not None:
+        across, turn, twist, _ = _base_across(values, shake, p)
+        force = force + across
+        jacobian[:, 5, RADIAL] += np.stack([-twist[:, 1], twist[:, 0]], axis=1) + 2.0 * rate[:, None] * turn
+    felt = felt_columns(force)
+    jacobian[:, :3, FELT] = felt
+    jacobian[:, 3:, ACCEL_MATRIX] = felt
     return jacobian

@@ -7,28 +7,36 @@ covariance of the result.
 """
 
 from collections.abc import Sequence
-from math import radians
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from module_agent.estimate.base_motion import BaseMotion
 from module_agent.estimate.circle_point_analysis import RestReading
 from module_agent.estimate.joint_model import (
     ACCEL_BIAS,
-    ACCEL_MATRIX,
     ALONG,
+    BEARING,
     COMPLIANCE,
     DELAY,
     FELT,
     GRAVITY,
     GYRO_BIAS,
     HINGE,
-    KAPPA,
     RADIAL,
     TURN,
+    Motion,
     felt_columns,
     predict,
+)
+from module_agent.estimate.joint_prior import (
+    CALIBRATED,
+    GRAVITY_M_S2,
+    GRAVITY_SIGMA_M_S2,
+    Beliefs,
+    ImuKnowledge,
+    beliefs,
 )
 from module_agent.estimate.smooth_motion import (
     COSINE,
@@ -41,48 +49,60 @@ from module_agent.estimate.smooth_motion import (
 )
 from module_agent.estimate.windows import Array, ImuWindow, JointWindow
 
-GRAVITY_M_S2 = 9.81
-GRAVITY_SIGMA_M_S2 = 0.015  # from the equator to 60 degrees of latitude it is 9.78 to 9.82
-# Samples beyond the noise of one: the low-pass correlates neighbours, so every one says little more.
+# The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.
 STRIDE = 7
 ITERATIONS = 12
 SETTLED = 1e-3  # of every parameter's deviation
-# A link bends so that it rings at 12 Hz or above: c = 1 / (2 pi f)^2.
-COMPLIANCE_SIGMA_S2 = 2e-4
-# A bent link's hinge as a share of the distance: at the axis where its clamp gives, at 0.15 by beam theory.
-HINGE_SHARE, HINGE_SHARE_SIGMA = 0.0, 0.05
-GYRO_FEELS_S_M = 2e-4  # rad/s per m/s^2: 0.1 deg/s/g in data sheets
 BIAS_DRIFT_RAD_S = 1e-4  # of a gyro, within the minute between rest and motion
-
-
-class ImuKnowledge(NamedTuple):
-    """How well an IMU is known beforehand, one standard deviation each."""
-
-    scale: float
-    misalignment_rad: float
-    accel_bias_m_s2: float
-
-
-# Calibrated on a rate table and by gravity, and what data sheets of this class of IMU allow.
-CALIBRATED = ImuKnowledge(1e-4, 1e-4, 0.2)
-AS_DELIVERED = ImuKnowledge(0.01, radians(1.0), 0.2)
+LEAST_CARRIED = 0.25
+# With less of gravity across the axis than this, two IMUs do not agree on directions across it.
+LEAST_ACROSS_M_S2 = 1.0
 
 
 class SeenMotion(NamedTuple):
-    """A joint's motion and what an IMU saw of it: t_imu = t_joint + `offset_ns` and a delay to be found."""
+    """A joint's motion and what an IMU saw of it: t_imu = t_joint + `offset_ns` and a delay to be found.
+
+    base: how what carries the joint shook meanwhile, None where nobody saw it.
+    """
 
     imu: SmoothImu
     joint: SmoothMotion
     offset_ns: int
+    base: BaseMotion | None = None
 
 
-def seen_motion(imu: ImuWindow, joint: JointWindow, offset_ns: int, smooth_s: float = SMOOTH_S) -> SeenMotion:
-    """Put both windows of one motion behind the low-pass.
+class MotionWindows(NamedTuple):
+    """One motion as it was sampled: the observer's IMU, the joint, and the IMU of the joint's own module.
+
+    t_imu = t_joint + `offset_ns` and a delay to be found; the two last share a clock.
+    """
+
+    imu: ImuWindow
+    joint: JointWindow
+    carrier: ImuWindow
+    offset_ns: int
+
+
+def seen_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_S) -> list[SeenMotion]:
+    """Put the motions of one joint behind the low-pass.
 
     Raises:
         ValueError: too few samples for the low-pass, or unevenly spaced ones.
     """
-    return SeenMotion(smooth_imu(imu, smooth_s), SmoothMotion(joint, smooth_s), offset_ns)
+    if not windows:
+        return []
+    # One rest for all, as the joint swings about it; of the longest, where the mean is best.
+    longest = max((window.carrier for window in windows), key=lambda imu: imu.t_ns.size)
+    still = np.hstack([longest.gyro_rad_s, longest.accel_m_s2]).mean(axis=0)
+    return [
+        SeenMotion(
+            smooth_imu(window.imu, smooth_s),
+            SmoothMotion(window.joint, smooth_s),
+            window.offset_ns,
+            BaseMotion(window.joint, window.carrier, still, smooth_s),
+        )
+        for window in windows
+    ]
 
 
 class JointRegression(NamedTuple):
@@ -93,6 +113,7 @@ class JointRegression(NamedTuple):
     delays_s: per motion, beyond its offset.
     covariance: (6, 6) of axis [rad] and radial vector [m], both in frame u; singular along the axis.
     accel_noise_m_s2, gyro_noise_rad_s: white noise of one sample, from the residuals.
+    base_shakes: whether what carries the joint was seen to shake, and that was taken off.
     """
 
     axis: Array
@@ -109,6 +130,7 @@ class JointRegression(NamedTuple):
     accel_noise_m_s2: float
     gyro_noise_rad_s: float
     samples: int
+    base_shakes: bool
 
 
 class _State(NamedTuple):
@@ -119,26 +141,42 @@ class _State(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Readings of one motion (n, 6), gyro first, and the times of them since the joint's first sample."""
+    """One motion and the readings of it (n, 6), gyro first, at times since the joint's first sample."""
 
+    motion: Motion
     readings: Array
     t_s: Array
     white: float
 
 
+class _Problem(NamedTuple):
+    """All that the parameters are found from; `untold_m` is what shake of unknown direction may do to d."""
+
+    rows: tuple[_Rows, ...]
+    beliefs: Beliefs
+    rest: RestReading | None
+    untold_m: float
+
+
+class _Optimum(NamedTuple):
+    """Where the fit ended: the normal matrix J^T W J there, and the noise of one sample, gyro's first."""
+
+    state: _State
+    normal: Array
+    noise: Array
+
+
 def regress_joint(
     motions: Sequence[SeenMotion], rest: RestReading | None, knowledge: ImuKnowledge = CALIBRATED
 ) -> JointRegression:
-    """Fit the model of the module's text to all motions of one joint.
+    """Fit the model of `joint_model` to all motions of one joint, and what the IMU read at rest.
 
     Raises:
-        ValueError: no motion, too few samples of one, or a joint or an IMU that did not move.
+        ValueError: no motion, too few samples of one, or an IMU that did not move with the joint.
     """
-    rows, prior, state, noise = _fit(motions, rest, knowledge)
-    normal, _, noise = _normal_equations(motions, rows, state, prior, noise)
-    return _result(
-        state, np.asarray(np.linalg.inv(normal), dtype=np.float64), noise, sum(len(r.t_s) for r in rows)
-    )
+    problem, guess = _problem(motions, rest, knowledge)
+    best = _minimise(problem, guess)
+    return _result(best, _inverse(best.normal), problem)
 
 
 def distance_bound_m(
@@ -156,55 +194,79 @@ def distance_bound_m(
     Raises:
         ValueError: as `regress_joint`.
     """
-    rows, prior, state, _ = _fit(motions, rest, knowledge)
-    normal, _, _ = _normal_equations(motions, rows, state, prior, np.array(noise))
+    problem, guess = _problem(motions, rest, knowledge)
+    best = _minimise(problem, guess)
+    normal, _, _ = _normal_equations(problem, best.state, np.array(noise))
     known = np.arange(len(normal)) != HINGE
     covariance = np.zeros_like(normal)
-    covariance[np.ix_(known, known)] = np.linalg.inv(normal[np.ix_(known, known)])
-    return _result(state, covariance, np.array(noise), 0).sigma_distance_m
+    covariance[np.ix_(known, known)] = _inverse(normal[np.ix_(known, known)])
+    return _result(best, covariance, problem._replace(untold_m=0.0)).sigma_distance_m
 
 
-def _fit(
-    motions: Sequence[SeenMotion], rest: RestReading | None, knowledge: ImuKnowledge
-) -> "tuple[list[_Rows], _Prior, _State, Array]":
-    if not motions:
-        raise ValueError("no motion of the joint: at least one is needed")
-    rows = [_rows(motion) for motion in motions]
-    prior, state = _prior(knowledge, rest, len(motions)), _first_guess(motions, rows)
+def _minimise(problem: _Problem, state: _State) -> _Optimum:
     noise = np.array([1e-3, 2e-2])
     for _ in range(ITERATIONS):
-        normal, gradient, noise = _normal_equations(motions, rows, state, prior, noise)
-        step: Array = np.asarray(np.linalg.solve(normal, gradient), dtype=np.float64)
+        normal, gradient, noise = _normal_equations(problem, state, noise)
+        step = np.asarray(np.linalg.solve(normal, gradient), dtype=np.float64)
         state = _moved(state, step)
         if np.all(np.abs(step) <= SETTLED / np.sqrt(np.diag(normal))):
             break
-    return rows, prior, state, noise
+    normal, _, noise = _normal_equations(problem, state, noise)
+    return _Optimum(state, normal, noise)
+
+
+def _inverse(normal: Array) -> Array:
+    return np.asarray(np.linalg.inv(normal), dtype=np.float64)
 
 
 # ---------------------------------------------------------------------- the data
 
 
-def _rows(motion: SeenMotion) -> _Rows:
-    since_ns = motion.imu.t_ns - motion.offset_ns - motion.joint.origin_ns
+def _problem(
+    motions: Sequence[SeenMotion], rest: RestReading | None, knowledge: ImuKnowledge
+) -> tuple[_Problem, _State]:
+    """Return the problem, and a first guess of its solution."""
+    if not motions:
+        raise ValueError("no motion of the joint: at least one is needed")
+    rows = [_rows(motion) for motion in motions]
+    known = beliefs(knowledge, len(motions))
+    guess = _first_guess(rows, known)
+    bases = [motion.base for motion in motions if motion.base is not None]
+    untold_m = 0.0
+    if len(bases) == len(motions) and any(base.shakes for base in bases):
+        across, housing = guess.values[GRAVITY][:2], bases[-1].gravity
+        if min(np.hypot(*across), np.hypot(*housing)) < LEAST_ACROSS_M_S2:
+            # The longest motion tells best; half of a push of unknown direction is along the radius.
+            untold_m = max(bases, key=lambda base: base.end_s - base.start_s).push_m / np.sqrt(2.0)
+            bases = [base.about_the_axis() for base in bases]
+        else:
+            guess.values[BEARING] = np.arctan2(across[1], across[0]) - np.arctan2(housing[1], housing[0])
+            known.mean[BEARING] = guess.values[BEARING]
+        rows = [r._replace(motion=Motion(r.motion.joint, b)) for r, b in zip(rows, bases, strict=True)]
+    return _Problem(tuple(rows), known, rest, float(untold_m)), guess
+
+
+def _rows(seen: SeenMotion) -> _Rows:
+    since_ns = seen.imu.t_ns - seen.offset_ns - seen.joint.origin_ns
     t_s = since_ns.astype(np.float64) * 1e-9
     # A little is kept for the delay to move in.
-    inside = np.flatnonzero((t_s > motion.joint.start_s + 0.01) & (t_s < motion.joint.end_s - 0.01))[::STRIDE]
+    inside = np.flatnonzero((t_s > seen.joint.start_s + 0.01) & (t_s < seen.joint.end_s - 0.01))[::STRIDE]
     if inside.size < 20:
         raise ValueError(f"{inside.size} IMU samples fall into the joint's motion: at least 20 are needed")
-    readings: Array = np.hstack([motion.imu.gyro_rad_s[inside], motion.imu.accel_m_s2[inside]])
-    return _Rows(readings, t_s[inside], motion.imu.white)
+    readings = np.hstack([seen.imu.gyro_rad_s[inside], seen.imu.accel_m_s2[inside]])
+    return _Rows(Motion(seen.joint, None), readings, t_s[inside], seen.imu.white)
 
 
-def _first_guess(motions: Sequence[SeenMotion], rows: Sequence[_Rows]) -> _State:
+def _first_guess(rows: Sequence[_Rows], known: Beliefs) -> _State:
     """Solve the model without compliance, delay and sensor errors, where it is linear."""
-    values = np.concatenate([m.joint.values(r.t_s) for m, r in zip(motions, rows, strict=True)])
-    readings = np.concatenate([r.readings for r in rows])
+    values = np.concatenate([row.motion.joint.values(row.t_s) for row in rows])
+    readings = np.concatenate([row.readings for row in rows])
     rate, acceleration = values[:, 0], values[:, 1]
     cosine, sine, squared = values[:, COSINE], values[:, SINE], values[:, SQUARED]
     one = np.ones_like(rate)
     gyro = np.linalg.lstsq(np.stack([rate, one], axis=1), readings[:, :3], rcond=None)[0]
     size = float(np.linalg.norm(gyro[0]))
-    if size < 0.25:
+    if size < LEAST_CARRIED:
         raise ValueError(
             f"the gyro turned by {size:.2g} of what the joint did: this IMU does not move with it"
         )
@@ -215,7 +277,7 @@ def _first_guess(motions: Sequence[SeenMotion], rows: Sequence[_Rows]) -> _State
     # Across the axis, from the cosine's and the sine's coefficients alike.
     gravity = 0.5 * (force[1] + np.cross(axis, force[2]))
     frame = _frame(axis)
-    found = np.zeros(DELAY + len(motions))
+    found = known.mean.copy()
     found[RADIAL], found[GRAVITY] = (frame.T @ radial)[:2], frame.T @ gravity
     found[ALONG] = axis @ force[0]
     found[GYRO_BIAS] = frame.T @ gyro[1]
@@ -231,55 +293,34 @@ def _frame(axis: Array) -> Array:
 # ---------------------------------------------------------------------- the model
 
 
-class _Prior(NamedTuple):
-    """Beliefs about the parameters, means and weights 1 / sigma^2, and the IMU's reading at rest."""
-
-    mean: Array
-    weight: Array
-    rest: RestReading | None
-
-
-def _prior(knowledge: ImuKnowledge, rest: RestReading | None, motions: int) -> _Prior:
-    sigma = np.full(DELAY + motions, np.inf)
-    scale, turn = knowledge.scale, knowledge.misalignment_rad
-    # What the scale makes of gravity along the axis cannot be told from a bias.
-    sigma[ACCEL_BIAS] = np.hypot(knowledge.accel_bias_m_s2, GRAVITY_M_S2 * max(scale, turn))
-    sigma[KAPPA] = turn, turn, scale
-    sigma[ACCEL_MATRIX] = scale, turn, turn, scale, turn, turn
-    sigma[FELT] = GYRO_FEELS_S_M
-    sigma[COMPLIANCE], sigma[HINGE] = COMPLIANCE_SIGMA_S2, HINGE_SHARE_SIGMA
-    sigma[GYRO_BIAS] = 0.1
-    sigma[DELAY:] = 0.02
-    mean = np.zeros_like(sigma)
-    mean[HINGE] = HINGE_SHARE
-    return _Prior(mean, 1.0 / sigma**2, rest)
-
-
-def _normal_equations(
-    motions: Sequence[SeenMotion], rows: Sequence[_Rows], state: _State, prior: _Prior, noise: Array
-) -> tuple[Array, Array, Array]:
+def _normal_equations(problem: _Problem, state: _State, noise: Array) -> tuple[Array, Array, Array]:
     """Return J^T W J, J^T W e, and the noise of one sample (gyro, accel) that the residuals show."""
-    normal = np.diag(prior.weight)
-    gradient = prior.weight * (prior.mean - state.values)
-    if prior.rest is not None:
-        _add_rest(normal, gradient, prior.rest, state)
-    size = float(np.linalg.norm(state.values[GRAVITY]))
-    along = state.values[GRAVITY] / size
-    normal[GRAVITY, GRAVITY] += np.outer(along, along) / GRAVITY_SIGMA_M_S2**2
-    gradient[GRAVITY] += along * (GRAVITY_M_S2 - size) / GRAVITY_SIGMA_M_S2**2
+    normal = np.diag(problem.beliefs.weight)
+    gradient = problem.beliefs.weight * (problem.beliefs.mean - state.values)
+    _add_gravity(normal, gradient, state)
+    if problem.rest is not None:
+        _add_rest(normal, gradient, problem.rest, state)
     power, count = np.zeros(2), 0
-    for i, (motion, row) in enumerate(zip(motions, rows, strict=True)):
-        predicted, slopes = predict(motion.joint, row.t_s, state.values, DELAY + i)
+    for i, row in enumerate(problem.rows):
+        predicted, slopes = predict(row.motion, row.t_s, state.values, DELAY + i)
         residual = _in_frame(row.readings, state.frame) - predicted
         for sensor in range(2):
             part = slice(3 * sensor, 3 * sensor + 3)
-            weight = STRIDE / (noise[sensor] ** 2)
+            weight = STRIDE / noise[sensor] ** 2
             jacobian, error = slopes[:, part].reshape(-1, slopes.shape[2]), residual[:, part].ravel()
             normal += weight * jacobian.T @ jacobian
             gradient += weight * jacobian.T @ error
             power[sensor] += row.white * float(error @ error)
         count += residual.size // 2
-    return normal, gradient, np.sqrt(power / count)
+    return normal, gradient, np.asarray(np.sqrt(power / count))
+
+
+def _add_gravity(normal: Array, gradient: Array, state: _State) -> None:
+    """Add that gravity's strength is known."""
+    size = float(np.linalg.norm(state.values[GRAVITY]))
+    along = state.values[GRAVITY] / size
+    normal[GRAVITY, GRAVITY] += np.outer(along, along) / GRAVITY_SIGMA_M_S2**2
+    gradient[GRAVITY] += along * (GRAVITY_M_S2 - size) / GRAVITY_SIGMA_M_S2**2
 
 
 def _add_rest(normal: Array, gradient: Array, rest: RestReading, state: _State) -> None:
@@ -306,8 +347,8 @@ def _moved(state: _State, step: Array) -> _State:
     return _State(state.frame @ Rotation.from_rotvec(turn).as_matrix(), values)
 
 
-def _result(state: _State, covariance: Array, noise: Array, samples: int) -> JointRegression:
-    p, frame = state.values, state.frame
+def _result(best: _Optimum, covariance: Array, problem: _Problem) -> JointRegression:
+    p, frame = best.state.values, best.state.frame
     r1, r2 = p[RADIAL]
     distance = float(np.hypot(r1, r2))
     # The axis turns by u x j and carries the radial vector along by u x r.
@@ -316,6 +357,7 @@ def _result(state: _State, covariance: Array, noise: Array, samples: int) -> Joi
     gain[3:, :2] = np.outer(frame[:, 2], [r2, -r1])
     gain[3:, RADIAL] = frame[:, :2]
     six = gain @ covariance @ gain.T
+    six[3:, 3:] += problem.untold_m**2 * frame[:, :2] @ frame[:, :2].T
     radial = frame[:, :2] @ p[RADIAL]
     along = radial / max(distance, 1e-6)
     return JointRegression(
@@ -330,9 +372,10 @@ def _result(state: _State, covariance: Array, noise: Array, samples: int) -> Joi
         gyro_bias_rad_s=_frozen(frame @ p[GYRO_BIAS]),
         compliance_s2=float(p[COMPLIANCE]),
         delays_s=tuple(float(x) for x in p[DELAY:]),
-        accel_noise_m_s2=float(noise[1]),
-        gyro_noise_rad_s=float(noise[0]),
-        samples=samples,
+        accel_noise_m_s2=float(best.noise[1]),
+        gyro_noise_rad_s=float(best.noise[0]),
+        samples=sum(len(row.t_s) for row in problem.rows),
+        base_shakes=any(row.motion.base is not None for row in problem.rows),
     )
 
 

@@ -10,10 +10,9 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from module_agent.estimate.windows import Array, ImuWindow, JointWindow
+from module_agent.estimate.windows import Array, ImuWindow, JointWindow, Times
 
 # Passes 2 Hz with 0.969 and 4 Hz with 0.88. Encoder counts of 2 pi / 2^16 at 250 Hz become 0.014 rad/s^2 of
 # noise in the acceleration, which shortens d by 5e-5 where the joint's is 2 rad/s^2 rms.
@@ -36,7 +35,7 @@ class SmoothImu(NamedTuple):
     white: variance of white noise in a sample before the filter over that after it.
     """
 
-    t_ns: NDArray[np.int64]
+    t_ns: Times
     gyro_rad_s: Array
     accel_m_s2: Array
     white: float
@@ -82,15 +81,27 @@ def smooth_imu(imu: ImuWindow, smooth_s: float = SMOOTH_S) -> SmoothImu:
     Raises:
         ValueError: as `SmoothMotion`.
     """
-    step_s = _step_s(imu.t_ns, "IMU", smooth_s)
+    t_ns, gyro = low_passed(imu.t_ns, imu.gyro_rad_s, smooth_s)
+    _, accel = low_passed(imu.t_ns, imu.accel_m_s2, smooth_s)
+    return SmoothImu(t_ns, gyro, accel, white_ratio(imu.t_ns, smooth_s))
+
+
+def white_ratio(t_ns: Times, smooth_s: float, order: int = 0) -> float:
+    """Return the variance of white noise in one of evenly spaced samples over that behind the filter."""
+    step_s = 1e-9 * float(t_ns[-1] - t_ns[0]) / (t_ns.size - 1)
+    weights = derivative_kernel(step_s, smooth_s, order)
+    return 1.0 / float(weights @ weights)
+
+
+def low_passed(t_ns: Times, signal: Array, smooth_s: float, order: int = 0) -> tuple[Times, Array]:
+    """Return the times whose filter lies within the window, and the `order`-th derivative there.
+
+    Raises:
+        ValueError: as `SmoothMotion`.
+    """
+    step_s = _step_s(t_ns, "IMU", smooth_s)
     reach = _reach(step_s, smooth_s)
-    weights = derivative_kernel(step_s, smooth_s, 0)
-    return SmoothImu(
-        imu.t_ns[reach : imu.t_ns.size - reach],
-        _filtered(imu.gyro_rad_s, step_s, smooth_s, 0),
-        _filtered(imu.accel_m_s2, step_s, smooth_s, 0),
-        1.0 / float(weights @ weights),
-    )
+    return t_ns[reach : t_ns.size - reach], _filtered(signal, step_s, smooth_s, order)
 
 
 def derivative_kernel(step_s: float, smooth_s: float, order: int) -> Array:
@@ -121,7 +132,7 @@ def _reach(step_s: float, smooth_s: float) -> int:
     return int(np.ceil(REACH * smooth_s / step_s))
 
 
-def _step_s(t_ns: NDArray[np.int64], whose: str, smooth_s: float) -> float:
+def _step_s(t_ns: Times, whose: str, smooth_s: float) -> float:
     if t_ns.size < 2:
         raise ValueError(f"{t_ns.size} {whose} samples: too few for the low-pass of {1e3 * smooth_s:.0f} ms")
     steps = 1e-9 * np.diff(t_ns)

@@ -9,14 +9,10 @@ Bayesian bound of van Trees). The hinge of a bent link it knows to be where it i
 import numpy as np
 
 from module_agent.estimate.circle_point_analysis import rest_reading
-from module_agent.estimate.joint_regression import (
-    AS_DELIVERED,
-    CALIBRATED,
-    ImuKnowledge,
-    distance_bound_m,
-)
+from module_agent.estimate.joint_prior import AS_DELIVERED, CALIBRATED, ImuKnowledge
+from module_agent.estimate.joint_regression import distance_bound_m, seen_motions
 from module_agent.estimate.windows import imu_window
-from sim.experiments.one_joint_rig import TrialRows, seen_motions
+from sim.experiments.one_joint_rig import TrialRows, windows
 from sim.noise_profile import NoiseProfile
 from sim.physics.imu_sensor import WHITE_RATE_HZ
 
@@ -50,5 +46,5 @@ def bound_m(trial: TrialRows, profile: NoiseProfile) -> float:
         ValueError: too little motion, with what would be enough.
     """
     rest = rest_reading(imu_window(trial.rest))
-    motions = seen_motions(trial, _LIGHTLY_S)
+    motions = seen_motions(windows(trial), _LIGHTLY_S)
     return distance_bound_m(motions, rest, imu_knowledge(profile), white_noise(profile))

@@ -12,16 +12,14 @@ from coordinator.plan import Plan
 from module_agent.estimate.circle_point_analysis import CircleFit, circle_point_analysis, rest_reading
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.gaussian_filter import TAPS
+from module_agent.estimate.joint_prior import CALIBRATED, ImuKnowledge
 from module_agent.estimate.joint_regression import (
-    CALIBRATED,
-    ImuKnowledge,
     JointRegression,
-    SeenMotion,
+    MotionWindows,
     regress_joint,
-    seen_motion,
+    seen_motions,
 )
 from module_agent.estimate.observer import MARGIN_NS
-from module_agent.estimate.smooth_motion import SMOOTH_S
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
 from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware
@@ -161,20 +159,20 @@ def regress(trial: TrialRows, knowledge: ImuKnowledge = CALIBRATED) -> JointRegr
     Raises:
         ValueError: too little motion, with what would be enough.
     """
-    return regress_joint(seen_motions(trial), rest_reading(imu_window(trial.rest)), knowledge)
+    return regress_joint(seen_motions(windows(trial)), rest_reading(imu_window(trial.rest)), knowledge)
 
 
-def seen_motions(trial: TrialRows, smooth_s: float = SMOOTH_S) -> list[SeenMotion]:
+def windows(trial: TrialRows) -> list[MotionWindows]:
     """Return the trial's motions as the joint regression takes them.
 
     Raises:
-        ValueError: too few samples, or unevenly spaced ones.
+        ValueError: too few samples to tell the clocks apart.
     """
     found = []
     for motion in (trial.constant, trial.sine):
         own, joint = imu_window(motion.imu), joint_window(motion.joint)
         offset_ns = clock_delay(own, joint, motion.rough_offset_ns).offset_ns
-        found.append(seen_motion(own, joint, offset_ns, smooth_s))
+        found.append(MotionWindows(own, joint, imu_window(motion.joint), offset_ns))
     return found
 
 

@@ -3,7 +3,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from module_agent.estimate.joint_model import COMPLIANCE, DELAY, GRAVITY, HINGE, KAPPA, RADIAL, predict
+from module_agent.estimate.joint_model import (
+    BEARING,
+    COMPLIANCE,
+    DELAY,
+    GRAVITY,
+    HINGE,
+    KAPPA,
+    RADIAL,
+    Motion,
+    predict,
+)
 from module_agent.estimate.smooth_motion import SmoothMotion
 from module_agent.estimate.windows import JointWindow
 
@@ -34,10 +44,10 @@ def numeric(read: Callable[[np.ndarray], np.ndarray], p: np.ndarray, column: int
 
 def test_derivatives_are_those_of_the_readings(motion: SmoothMotion) -> None:
     p = parameters()
-    _, jacobian = predict(motion, T_S, p, DELAY)
-    for column in range(2, p.size):
+    _, jacobian = predict(Motion(motion, None), T_S, p, DELAY)
+    for column in [*range(2, BEARING), DELAY]:
         step = 1e-6 if column == COMPLIANCE else 1e-4
-        expected = numeric(lambda at: predict(motion, T_S, at, DELAY)[0], p, column, step)
+        expected = numeric(lambda at: predict(Motion(motion, None), T_S, at, DELAY)[0], p, column, step)
         # Differences of readings of 10 m/s^2 over such steps are good to 1e-8; the compliance's are of 1e3.
         scale = max(1.0, float(np.abs(expected).max()))
         assert np.allclose(jacobian[:, :, column], expected, atol=2e-6 * scale), column
@@ -47,16 +57,16 @@ def test_a_bending_link_changes_the_other_derivatives_by_what_is_left_out_at_mos
     motion: SmoothMotion,
 ) -> None:
     p = parameters(compliance=3e-5)
-    _, jacobian = predict(motion, T_S, p, DELAY)
+    _, jacobian = predict(Motion(motion, None), T_S, p, DELAY)
     for column in (2, 3, 4, 5, 6, KAPPA.start, COMPLIANCE, HINGE, DELAY):
-        expected = numeric(lambda at: predict(motion, T_S, at, DELAY)[0], p, column, 1e-7)
+        expected = numeric(lambda at: predict(Motion(motion, None), T_S, at, DELAY)[0], p, column, 1e-7)
         scale = float(np.abs(expected).max())
         # The load's own dependence on gravity and radius is c g / d: 2e-3 of the readings' derivatives.
         assert np.abs(jacobian[:, :, column] - expected).max() < 5e-3 * scale, column
 
 
 def test_turning_the_frame_turns_both_sensors(motion: SmoothMotion) -> None:
-    predicted, jacobian = predict(motion, T_S, parameters(), DELAY)
+    predicted, jacobian = predict(Motion(motion, None), T_S, parameters(), DELAY)
     for column, direction in ((0, (1.0, 0.0, 0.0)), (1, (0.0, 1.0, 0.0))):
         for sensor in (slice(0, 3), slice(3, 6)):
             assert np.allclose(jacobian[:, sensor, column], np.cross(direction, predicted[:, sensor]))
@@ -77,7 +87,7 @@ def test_a_point_mass_on_a_bent_link_feels_what_newton_says() -> None:
     p = np.zeros(DELAY + 1)
     p[RADIAL], p[COMPLIANCE] = (distance, 0.0), c
     at = t_s[2000:6000:8]
-    predicted, _ = predict(joint, at, p, DELAY)
+    predicted, _ = predict(Motion(joint, None), at, p, DELAY)
     # The low-pass of 12 ms takes 1.1 % of 2 Hz and 4.4 % of 4 Hz.
     gain = np.exp(-0.5 * (omega * 0.012) ** 2)
     assert np.allclose(predicted[:, 4], gain * tangential[2000:6000:8], atol=1e-4 * np.abs(tangential).max())
