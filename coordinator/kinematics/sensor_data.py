@@ -14,7 +14,7 @@ class SensorData(NamedTuple):
 
     q_rad, qd_rad_s, qdd_rad_s2: (m, n). gyro_rad_s, accel_m_s2: (m, n, 3) in the IMU frames. imu_rates:
     (m, n, 6) how fast these two change [rad/s^2, m/s^3]; None if no IMU is late. base_motion: (m, 9) the
-    base's rate, angular acceleration and acceleration beyond rest, as `BaseMotion` has them; None if it rests.
+    base's rate, angular acceleration and acceleration beyond rest, as `BaseMotion` has them; None at rest.
     motion: (m,) the number of the motion that a sample belongs to, from 0 on; None if all belong to one. The
     samples of a motion are equally far apart, far enough for their errors to be independent.
     """

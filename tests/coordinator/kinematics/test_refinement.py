@@ -13,6 +13,7 @@ from coordinator.chain import Array, Chain
 from coordinator.kinematics import refinement
 from coordinator.kinematics.imu_intrinsics import (
     BIASES_ONLY,
+    DELAY,
     SIZE,
     UNCALIBRATED,
     ImuIntrinsics,
@@ -264,7 +265,7 @@ def test_a_late_imu_is_told_by_how_late_it_is(robots: Any) -> None:
     data, imus = _uncalibrated(_sensed(truth), 5)
     found = refine_chain(truth, _with_noise(data, 2), UNCALIBRATED)
     # 900 gyro samples of 2 mrad/s on changes of some 5 rad/s^2: 0.02 ms, with room for what is shared.
-    np.testing.assert_allclose(found.intrinsics.errors[1:, -1], imus.errors[1:, -1], atol=2e-4)
+    np.testing.assert_allclose(found.intrinsics.errors[1:, DELAY], imus.errors[1:, DELAY], atol=2e-4)
 
 
 def test_the_slopes_by_an_imus_own_errors_are_those_of_differences() -> None:

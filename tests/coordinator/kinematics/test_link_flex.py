@@ -1,0 +1,193 @@
+"""Links that give turn as hinges do, under the moments of what they carry, and give themselves away."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.chain import Array, Chain
+from coordinator.cross_product import cross
+from coordinator.dynamics.regressor import inverse_dynamics
+from coordinator.kinematics.inertial_prediction import (
+    LinkTurn,
+    acceleration_at,
+    body_motions,
+    imu_readings,
+    readings_on,
+)
+from coordinator.kinematics.link_flex import (
+    UNIT_RAD_NM,
+    flex_slopes,
+    hinge_slopes,
+    joined,
+    link_ends,
+    link_loads,
+    no_flex,
+)
+from coordinator.kinematics.refinement import refine_chain
+from coordinator.kinematics.sensor_data import SensorData
+from module_agent.catalogue import ModuleType
+
+RATE_HZ = 250.0
+
+
+def _swing(joints: int, seconds: float = 6.0) -> tuple[Array, Array, Array]:
+    """Slow and fast swings of all joints, (m, n) each at 250 Hz."""
+    t = np.arange(0, seconds, 1 / RATE_HZ)[:, None]
+    phase = np.arange(joints) * 1.3
+    slow, fast = 1.5 + 0.2 * phase, 11.0 + phase
+    q = 0.4 * np.sin(slow * t + phase) + 0.1 * np.sin(fast * t + phase)
+    qd = 0.4 * slow * np.cos(slow * t + phase) + 0.1 * fast * np.cos(fast * t + phase)
+    return q, qd, -0.4 * slow**2 * np.sin(slow * t + phase) - 0.1 * fast**2 * np.sin(fast * t + phase)
+
+
+def _forward(robots: Any, seed: int, joints: int) -> tuple[Chain, list[ModuleType]]:
+    chain, types = robots.random(seed, joints, serial=True)
+    up = np.array(chain.gravity)
+    homes = np.array(chain.imu_home)
+    return robots.build(list(chain.parent), [False] * joints, homes, types, up), types
+
+
+def test_a_turn_of_a_link_is_that_of_a_joint_in_it(robots: Any) -> None:
+    """Put a joint into the link: to first order its small turns are what a `LinkTurn` predicts."""
+    chain, _ = _forward(robots, 3, 3)
+    axis, place = np.array([0.6, 0.0, 0.8]), np.array([0.05, -0.1, 0.2])
+    q, qd, qdd = _swing(3, 1.0)
+    size = 1e-4
+    angle, rate, acceleration = (size * signal[:, 0] for signal in _swing(1, 1.0))
+    # The extra joint's own module carries no IMU that is looked at.
+    wide = Chain(
+        ("M00", "M01", "hinge", "M02"),
+        (-1, 0, 1, 2),
+        (False,) * 4,
+        np.insert(chain.axis, 2, axis, axis=0),
+        np.insert(chain.point, 2, place, axis=0),
+        np.insert(chain.imu_home, 2, np.eye(4), axis=0),
+        chain.gravity,
+    )
+    both = [
+        np.insert(own, 2, turn, axis=1)
+        for own, turn in zip((q, qd, qdd), (angle, rate, acceleration), strict=True)
+    ]
+    exact = imu_readings(wide, *both)
+    turns = {2: [LinkTurn(place, np.stack([np.outer(axis, s) for s in (angle, rate, acceleration)]))]}
+    found = readings_on(chain, body_motions(chain, q, qd, qdd, turns=turns), turns)
+    rigid = imu_readings(chain, q, qd, qdd)
+    for given, right, stiff in zip(found, exact, rigid, strict=True):
+        # The turn is felt, and felt rightly but for what goes with its square.
+        assert np.abs(right[:, 3] - stiff[:, 2]).max() > size
+        np.testing.assert_allclose(given[:, 2], right[:, 3], atol=100 * size**2)
+
+
+def test_the_moment_about_a_joint_is_that_of_newton_and_euler(robots: Any) -> None:
+    """The modules as point masses, by the independent regressor: the torque about a joint beyond a link."""
+    chain, types = _forward(robots, 5, 3)
+    q, qd, qdd = _swing(3, 2.0)
+    bodies = body_motions(chain, q, qd, qdd)
+    loads = link_loads(chain, types, bodies, q, RATE_HZ)
+    phi = np.zeros((3, 10))
+    for k, kind in enumerate(types):
+        # Module k rides on body k - 1; the base carries the first.
+        if k:
+            home, com = chain.imu_home[k], np.array(kind.com_xyz) - np.array(kind.imu_xyz)
+            place = home[:3, :3] @ com + home[:3, 3]
+            own = np.eye(3) * (place @ place) - np.outer(place, place)
+            inertia = kind.mass_kg * own[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+            phi[k - 1] = [kind.mass_kg, *(kind.mass_kg * place), *inertia]
+    torque = inverse_dynamics(chain, phi, q, qd, qdd)
+    # Link 2 hangs on body 1, whose joint carries nothing but module 2: its load's moment about joint 1.
+    load = loads[2]
+    assert load is not None
+    home, com = chain.imu_home[2], np.array(types[2].com_xyz) - np.array(types[2].imu_xyz)
+    place = home[:3, :3] @ com + home[:3, 3]
+    # A point mass: force from the moment about the hinge alone is not to be had, so compare at the joint.
+    force = -types[2].mass_kg * acceleration_at(bodies[1], place[:, None])
+    about_joint = load.moment[0] + cross((load.hinge - chain.point[1])[:, None], force)
+    np.testing.assert_allclose(-chain.axis[1] @ about_joint, torque[:, 1], atol=1e-9)
+
+
+def test_loads_change_as_their_derivatives_say(robots: Any) -> None:
+    chain, types = _forward(robots, 5, 4)
+    q, qd, qdd = _swing(4)
+    load = link_loads(chain, types, body_motions(chain, q, qd, qdd), q, RATE_HZ)[2]
+    assert load is not None
+    moment, rate, acceleration = load.moment[..., 50:-50]
+    by_differences = np.gradient(moment, 1 / RATE_HZ, axis=1)
+    np.testing.assert_allclose(by_differences[:, 1:-1], rate[:, 1:-1], rtol=0.02, atol=0.05)
+    np.testing.assert_allclose(
+        np.gradient(rate, 1 / RATE_HZ, axis=1)[:, 1:-1], acceleration[:, 1:-1], rtol=0.02, atol=1.0
+    )
+
+
+def _bent(chain: Chain, types: list[ModuleType], compliance: float, seed: int) -> tuple[SensorData, Array]:
+    """What a robot reads whose links all bend; and the loads' thinned samples."""
+    joints = _swing(len(types), 12.0)
+    bodies = body_motions(chain, *joints)
+    loads = joined([link_loads(chain, types, bodies, joints[0], RATE_HZ)], 5)
+    few = tuple(signal[::5] for signal in joints)
+    turns = {k: [load.bending(compliance * UNIT_RAD_NM)] for k, load in enumerate(loads) if load is not None}
+    seen = readings_on(chain, body_motions(chain, *few, turns=turns), turns)
+    rng = np.random.default_rng(seed)
+    gyro, accel = (true + rng.normal(0, s, true.shape) for true, s in zip(seen, (5e-4, 1e-2), strict=True))
+    return SensorData(*few, gyro, accel), loads
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_links_that_bend_come_out_as_long_as_they_are(robots: Any, seed: int) -> None:
+    chain, types = _forward(robots, 20 + seed, 4)
+    data, loads = _bent(chain, types, 4.0, seed)
+    stiff = refine_chain(chain, data)
+    flex = flex_slopes(chain, data.joints, loads)
+    found = refine_chain(chain, data, flex=flex)
+    apart = [np.abs(one.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]).max() for one in (stiff, found)]
+    assert apart[1] < 0.2 * apart[0]
+    # Links that carry something tell how they bend; the last one's load is a module of 0.3 kg.
+    told = found.compliance[0::2]
+    np.testing.assert_allclose(told[:2], 4.0, atol=1.0)
+    # And none of them twists.
+    assert np.abs(found.compliance[1::2]).max() < 5.0
+
+
+def test_where_a_link_bends_is_a_share_of_its_length(robots: Any) -> None:
+    """Readings of links that bend at their clamps differ from the model's by the hinges' slopes."""
+    chain, types = _forward(robots, 21, 3)
+    data, loads = _bent(chain, types, 4.0, 0)
+    flex = flex_slopes(chain, data.joints, loads)
+    known = hinge_slopes(chain, data.joints, loads, flex, np.full(len(flex.links), 4.0))
+    assert known.links[len(flex.links) :] == (1, 2)
+    still = readings_on(chain, body_motions(chain, *data.joints))
+    load = loads[1]
+    assert load is not None
+    turn = load.bending(4.0 * UNIT_RAD_NM)
+    share = 0.07
+    turns = {1: [turn._replace(hinge=turn.hinge + share * load.length_m * load.along)]}
+    moved = readings_on(chain, body_motions(chain, *data.joints, turns=turns), turns)
+    by_slopes = 4.0 * flex.slopes[0] + share * known.slopes[len(flex.links)]
+    np.testing.assert_allclose(
+        # What goes with the square of the turn is left out: a thousandth.
+        (moved.accel_m_s2 - still.accel_m_s2).transpose(2, 0, 1),
+        by_slopes[3:],
+        atol=1e-3 * float(np.abs(by_slopes[3:]).max()),
+    )
+
+
+def test_a_link_leads_from_the_parents_face_to_its_own(robots: Any) -> None:
+    """Tubes end where modules begin: a straight link's length is that between the faces."""
+    chain, types = robots.random(11, 5, serial=True)
+    for module in range(1, 5):
+        begin, end = link_ends(chain, types, module)
+        parent = chain.parent[module]
+        # The parent's distal face lies on its axis, and the child's side of the link on the child's.
+        for place, k in ((begin, parent), (end, module)):
+            off = place - chain.point[k]
+            assert np.linalg.norm(np.cross(chain.axis[k], off)) < 1e-12
+
+
+def test_a_robot_without_links_has_nothing_that_bends(robots: Any) -> None:
+    chain, types = _forward(robots, 1, 1)
+    joints = _swing(1, 1.0)
+    loads = link_loads(chain, types, body_motions(chain, *joints), joints[0], RATE_HZ)
+    assert loads == [None]
+    found = flex_slopes(chain, joints, loads)
+    assert found.links == no_flex(1, len(joints[0])).links
+    assert found.slopes.shape == (0, 6, len(joints[0]), 1)
