@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.catalogue import ModuleType
+from module_agent.firmware.waveform import duration_s, waveform
+from module_agent.wire.messages import Pattern
 
 # Of the type's speed: back-EMF then leaves a third of the voltage for torque.
 SPEED_SHARE = 0.7
@@ -22,6 +24,8 @@ RANGE_SHARE = 0.9
 # Links and brackets weigh about 0.6 of the modules; a module with its link reaches about 0.12 m further.
 LINK_MASS_SHARE = 0.6
 REACH_PER_MODULE_M = 0.12
+# Of any motion: 100 a period at 4 Hz for 15 s.
+PEAK_SAMPLES = 6001
 
 
 class JointLimits(NamedTuple):
@@ -73,3 +77,10 @@ def likely_inertia_kg_m2(kinds: list[ModuleType]) -> float:
     reach = REACH_PER_MODULE_M * len(kinds)
     # Each module's own housing turns too, a lone one about itself.
     return mass * reach**2 / 3.0 + 2e-3
+
+
+def motion_peaks(pattern: Pattern, origin_rad: float = 0.0) -> tuple[float, float]:
+    """Return the largest speed [rad/s] and acceleration [rad/s^2] of a motion."""
+    t_s = np.linspace(0.0, duration_s(pattern, origin_rad), PEAK_SAMPLES)
+    velocity = waveform(pattern, origin_rad, t_s).velocity_rad_s
+    return float(np.abs(velocity).max()), float(np.abs(np.gradient(velocity, t_s)).max())

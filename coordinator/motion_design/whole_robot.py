@@ -9,24 +9,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.motion_design.limits import JointLimits
-from module_agent.firmware.waveform import duration_s, waveform
-from module_agent.wire.messages import MultiSine, Pattern, Sine
+from coordinator.motion_design.limits import JointLimits, motion_peaks
+from module_agent.wire.messages import MultiSine, Sine
 
-# Slow: several turns of gravity within the window. Fast: below the resonances of joints and links that give.
-SLOW_HZ = (0.15, 0.5)
-FAST_HZ = (1.0, 2.2)
+# Slow: several turns of gravity within the window. Fast: links and bases that give lengthen what they carry
+# by (f / 13 Hz)^2 or so, whatever the amplitude.
+SLOW_HZ = (0.15, 0.4)
+FAST_HZ = (0.6, 1.3)
 # Nobody knows yet what a robot may run into: all joints together carry a tip as far as the sum of them.
 SLOW_RAD = 0.25
-FAST_RAD = 0.06
+FAST_RAD = 0.12
 # Half of speed and acceleration is left to the fast motion.
 SLOW_SHARE = 0.5
 SHORTEST_S = 11.0
 # Periods of the difference of neighbouring frequencies within the flat part of the window.
-BEATS = 1.0
+BEATS = 0.5
 FLAT_SHARE = 0.7
-# Of any motion: 100 a period at 4 Hz for 15 s.
-PEAK_SAMPLES = 6001
 
 
 class JointSetting(NamedTuple):
@@ -82,14 +80,7 @@ def _pattern(serial: str, setting: JointSetting, slow_hz: float, fast_hz: float,
 
 def _within(limits: JointLimits, pattern: MultiSine) -> MultiSine:
     """Return a motion made smaller if the taper, which adds to speed and acceleration, asks for too much."""
-    speed, accel = peaks(pattern)
+    speed, accel = motion_peaks(pattern)
     scale = min(1.0, limits.speed_rad_s / speed, limits.accel_rad_s2 / accel)
     smaller = tuple(s.model_copy(update={"amplitude_rad": scale * s.amplitude_rad}) for s in pattern.sines)
     return pattern.model_copy(update={"sines": smaller})
-
-
-def peaks(pattern: Pattern, origin_rad: float = 0.0) -> tuple[float, float]:
-    """Return the largest speed [rad/s] and acceleration [rad/s^2] of a motion."""
-    t_s = np.linspace(0.0, duration_s(pattern, origin_rad), PEAK_SAMPLES)
-    velocity = waveform(pattern, origin_rad, t_s).velocity_rad_s
-    return float(np.abs(velocity).max()), float(np.abs(np.gradient(velocity, t_s)).max())
