@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 from scipy.stats import chi2
 
 from coordinator.chain import Array, Chain
 from coordinator.check_fit import TiedFits
 from coordinator.kinematics.forward import descendants
-from coordinator.kinematics.increments import adjoint, frozen
+from coordinator.kinematics.increments import adjoint, frozen, increments_between
 from coordinator.kinematics.refinement import UNKNOWN_ABOVE
 
 # What two sessions of unlike motions leave between them for each link, of the same robot: links and springs
@@ -118,12 +117,6 @@ def find_changes(fits: TiedFits, false_alarms: float = FALSE_ALARMS) -> Findings
         limit[child] = _would_find(_explained(problem, [child])[0], false_alarms / len(links))
     each = tuple(_explained(problem, links)[i] for i in range(len(links)))
     return Findings(found, tuple(alarms), each, frozen(limit), least)
-
-
-def increments_between(before: Chain, after: Chain) -> Array:
-    """Return the twists (6 n,) that displace the housings of one chain to the other's (see `increments`)."""
-    moved = RigidTransform.from_matrix(after.imu_home) * RigidTransform.from_matrix(before.imu_home).inv()
-    return np.asarray(moved.as_exp_coords()).reshape(-1)
 
 
 def _problem(fits: TiedFits) -> _Problem:

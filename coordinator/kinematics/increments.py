@@ -31,6 +31,12 @@ def apply_increment(chain: Chain, delta: ArrayLike) -> Chain:
     )
 
 
+def increments_between(before: Chain, after: Chain) -> Array:
+    """Return the twists (6 n,) that displace the housings of one chain to the other's."""
+    moved = RigidTransform.from_matrix(after.imu_home) * RigidTransform.from_matrix(before.imu_home).inv()
+    return np.asarray(moved.as_exp_coords()).reshape(-1)
+
+
 def adjoint(pose: Array) -> Array:
     """Return the (..., 6, 6) adjoints of (..., 4, 4) poses, for twists as [rotation, translation]."""
     turn = pose[..., :3, :3]
