@@ -36,6 +36,8 @@ CONVERGED = 1e-7
 UNKNOWN_ABOVE = 0.1
 # A step (rad, m) along what only the motion of the base tells.
 FARTHEST = 0.3
+# From the equator to the poles, from the sea to the mountains: 9.764 to 9.834 (WGS 84).
+GRAVITY_M_S2, GRAVITY_SIGMA_M_S2 = 9.81, 0.02
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
 # Samples, 50 a second.
@@ -47,13 +49,16 @@ Index = NDArray[np.int64]
 class Refinement(NamedTuple):
     """A refined chain; increments are as in `increments`, of all n modules (the first one's are zero).
 
-    covariance: (6 n, 6 n), zero along what is unknown. null_basis: (6 n, k) orthonormal directions that the
-    data does not know. residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis. intrinsics: the IMUs' own
-    errors; where nothing tells them, they are those expected.
+    covariance: (6 n, 6 n), zero along what is unknown. noise_covariance: the same if the sensors' noise were
+    all, without what the model leaves out, which two sessions with the same motions share. null_basis:
+    (6 n, k) orthonormal directions that the data does not know. residual_gyro_rad_s, residual_accel_m_s2:
+    (n,) rms per axis. intrinsics: the IMUs' own errors; where nothing tells them, they are those expected.
+    compliance: of the links, in the order and units of `FlexSlopes`.
     """
 
     chain: Chain
     covariance: Array
+    noise_covariance: Array
     null_basis: Array
     rank: int
     condition: float
@@ -132,7 +137,9 @@ def refine_chain(
     believed = _believed(data, gyro), _believed(data, accel)
     normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), believed)
     _, _, spectrum = _solve(normal, count)
-    return _report(state, spectrum, _rms(gyro), _rms(accel), used)
+    white = _spread(data, gyro), _spread(data, accel)
+    by_noise = _normal_equations(state, data, prior, flex, expected, (gyro, accel), white)
+    return _report(state, spectrum, _reduced(by_noise)[0], _rms(gyro), _rms(accel), used)
 
 
 def _expected(state: _State, data: SensorData, flex: FlexSlopes) -> _Expected:
@@ -227,13 +234,19 @@ def _normal_equations(
 def _before(state: _State, prior: ImuPrior, flex: FlexSlopes) -> tuple[Array, Array]:
     """Return the information on [increments (6 n), gravity (3), free IMU errors], and its right-hand side.
 
-    Before any sample only the IMUs' errors are known: they are small.
+    Before any sample the IMUs' errors are known: they are small; and so is gravity's size, which is what
+    tells an accelerometer's scale. What `chain` would change of gravity's size is all that is held.
     """
     count, free = len(state.chain.serials), prior.sigmas > 0.0
     nothing = np.zeros(6 * count + 3)
     known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(prior.sigmas[free] ** -2.0, count)])
     held = np.concatenate([nothing, state.compliance, state.imus.errors[:, free].ravel()])
-    return np.diag(known), -known * held
+    information, rhs = np.diag(known), -known * held
+    size = float(np.linalg.norm(state.chain.gravity))
+    up, at = state.chain.gravity / size, slice(6 * count, 6 * count + 3)
+    information[at, at] += np.outer(up, up) / GRAVITY_SIGMA_M_S2**2
+    rhs[at] += up * (GRAVITY_M_S2 - size) / GRAVITY_SIGMA_M_S2**2
+    return information, rhs
 
 
 def _places(modules: Sequence[int], imu: int, count: int, links: int, size: int) -> Index:
@@ -255,11 +268,16 @@ class _Spectrum(NamedTuple):
         return self.sigmas <= UNKNOWN_ABOVE
 
 
+def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
+    """Return information and right-hand side of the poses with the nuisance taken out, and what took it."""
+    through: Array = np.linalg.solve(normal.nuisance, np.column_stack([normal.cross.T, normal.nuisance_rhs]))
+    information = normal.pose - normal.cross @ through[:, :-1]
+    return information, normal.pose_rhs - normal.cross @ through[:, -1], through
+
+
 def _solve(normal: _Normal, count: int) -> tuple[Array, Array, _Spectrum]:
     """Return the step of all modules (6 n,), that of the nuisance, the spectrum; unknown directions stay."""
-    through = np.linalg.solve(normal.nuisance, np.column_stack([normal.cross.T, normal.nuisance_rhs]))
-    information = normal.pose - normal.cross @ through[:, :-1]
-    rhs = normal.pose_rhs - normal.cross @ through[:, -1]
+    information, rhs, through = _reduced(normal)
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     with np.errstate(divide="ignore"):
         sigmas = 1.0 / np.sqrt(np.maximum(values, 0.0))
@@ -272,10 +290,9 @@ def _solve(normal: _Normal, count: int) -> tuple[Array, Array, _Spectrum]:
 
 def _along_unknown(normal: _Normal, spectrum: _Spectrum, count: int) -> Array:
     """Return the step (6 n,) along what the joints' motions leave unknown, by the base's motion."""
-    through = np.linalg.solve(normal.nuisance, np.column_stack([normal.cross.T, normal.nuisance_rhs]))
+    information, rhs, _ = _reduced(normal)
     unknown = spectrum.vectors[:, ~spectrum.known]
-    information = unknown.T @ (normal.pose - normal.cross @ through[:, :-1]) @ unknown
-    rhs = unknown.T @ (normal.pose_rhs - normal.cross @ through[:, -1])
+    information, rhs = unknown.T @ information @ unknown, unknown.T @ rhs
     step = np.linalg.solve(information + np.eye(len(rhs)) * FARTHEST**-2.0, rhs)
     return np.concatenate([np.zeros(6), unknown @ np.clip(step, -FARTHEST, FARTHEST)])
 
@@ -293,19 +310,26 @@ def _moved(state: _State, step: Array, nuisance: Array, prior: ImuPrior) -> _Sta
 
 
 def _report(
-    state: _State, spectrum: _Spectrum, sigma_gyro: Array, sigma_accel: Array, iterations: int
+    state: _State,
+    spectrum: _Spectrum,
+    by_noise: Array,
+    sigma_gyro: Array,
+    sigma_accel: Array,
+    iterations: int,
 ) -> Refinement:
     known = spectrum.known
-    kept = spectrum.vectors[:, known] * spectrum.sigmas[known]
+    kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
-    covariance = np.zeros((size, size))
-    covariance[6:, 6:] = kept @ kept.T
+    covariance, noise = np.zeros((size, size)), np.zeros((size, size))
+    covariance[6:, 6:] = (kept * spectrum.sigmas[known] ** 2) @ kept.T
+    noise[6:, 6:] = kept @ np.linalg.solve(kept.T @ by_noise @ kept, kept.T)
     unknown = np.zeros((size, int(np.count_nonzero(~known))))
     unknown[6:] = spectrum.vectors[:, ~known]
     sigmas = spectrum.sigmas[known]
     return Refinement(
         chain=state.chain,
         covariance=frozen(covariance),
+        noise_covariance=frozen(noise),
         null_basis=frozen(unknown),
         rank=int(np.count_nonzero(known)),
         condition=float(sigmas.max() / sigmas.min()) if sigmas.size else float("inf"),

@@ -24,7 +24,13 @@ from coordinator.kinematics.imu_intrinsics import (
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import imu_readings
 from coordinator.kinematics.null_space import name_null_space
-from coordinator.kinematics.refinement import SensorData, refine_chain, repeats
+from coordinator.kinematics.refinement import (
+    GRAVITY_M_S2,
+    GRAVITY_SIGMA_M_S2,
+    refine_chain,
+    repeats,
+)
+from coordinator.kinematics.sensor_data import SensorData
 
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03
 
@@ -199,6 +205,7 @@ def test_scipy_finds_the_same_minimum(robots: Any) -> None:
                 ((data.accel_m_s2 - read.accel_m_s2 - biases[1]) * w_accel).ravel(),
                 biases[0].ravel() / BIASES_ONLY.gyro_bias_rad_s,
                 biases[1].ravel() / BIASES_ONLY.accel_bias_m_s2,
+                [(np.linalg.norm(truth.gravity + tilt) - GRAVITY_M_S2) / GRAVITY_SIGMA_M_S2],
             ]
         )
 
