@@ -4,10 +4,10 @@ import asyncio
 from typing import NamedTuple
 
 from coordinator.identify import IdentificationError
-from coordinator.link_errors import ModuleLost, MotionInterrupted, RobotStopped
+from coordinator.link_errors import ModuleLost, MotionInterrupted, RobotStopped, UnfitLink
 from coordinator.radio import NoAnswer, Refused
 from coordinator.run_folder import RunFolderError
-from coordinator.session import NobodyThere, UnfitLink
+from coordinator.session import NobodyThere
 from coordinator.session_file import SessionFileError
 from module_agent.catalogue import UnknownModuleType
 from module_agent.wire.transport import TransportError

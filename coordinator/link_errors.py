@@ -1,4 +1,8 @@
-"""How the hold on a robot is lost in the middle of a session; each names the module."""
+"""How the hold on a robot is not to be had, or lost in the middle of a session; each names the module."""
+
+
+class UnfitLink(RuntimeError):
+    """The network cannot carry a session; nothing has moved. The message says what was measured."""
 
 
 class ModuleLost(RuntimeError):

@@ -1,7 +1,8 @@
 """The coordinator's hold on all modules of a robot: leases, keep-alives, motions, complete recordings."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Awaitable, Callable, Container, Coroutine, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 from coordinator.clock import Clock
@@ -32,8 +33,12 @@ from module_agent.wire.refusal import Refusal
 POLL_S = 0.02
 # Four keep-alives within the default lifetime of 250 ms.
 KEEP_ALIVE_S = 0.06
+# A renewal that takes longer, or is lost, says for a while that the network is poor.
+LATE_NS = 100_000_000
+POOR_NS = 10_000_000_000
 LEASE_NS = 1_000_000_000
 ATTEMPTS = 8
+HOLES_AT_ONCE = 8
 SILENT_NS = 1_000_000_000
 TOKEN_GONE_NS = 300_000_000
 # Refusals that the next attempt can mend: it carries a newer echo and a newer sequence number.
@@ -62,6 +67,8 @@ class RobotLink:
         self._last_id = 0
         self._renewals: set[asyncio.Task[None]] = set()
         self._taken_by: dict[str, str] = {}
+        self._running: dict[str, tuple[int, Pattern]] = {}
+        self._poor_until_ns = 0
 
     # ------------------------------------------------------------------ knowing them
 
@@ -169,6 +176,11 @@ class RobotLink:
             await asyncio.sleep(POLL_S)
         return True
 
+    @property
+    def is_poor(self) -> bool:
+        """Whether of late the network was slow with renewals, or lost some."""
+        return self._clock() < self._poor_until_ns
+
     # ------------------------------------------------------------------ leases
 
     async def acquire(self, serial: str) -> None:
@@ -181,6 +193,7 @@ class RobotLink:
         async def attempt() -> Ack:
             return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "acquire"))
 
+        self._running.pop(serial, None)
         ack = await self._persist(serial, attempt)
         self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
 
@@ -199,22 +212,48 @@ class RobotLink:
         }
 
     async def keep_alive(self) -> None:
-        """Renew all leases until cancelled; a late answer does not hold up the next renewal."""
+        """Renew all leases until cancelled; a late answer does not hold up the next renewal.
+
+        While renewals come late or not at all, the modules' motions are told again in between, which says as
+        much as a renewal does. Messages on one key keep their order, so that one that is held up holds up
+        all behind it; on two keys that seldom happens at the same time.
+        """
         while True:
             for serial in list(self._tokens):
-                task = asyncio.create_task(self._renew(serial))
-                self._renewals.add(task)
-                task.add_done_callback(self._renewals.discard)
-            await asyncio.sleep(KEEP_ALIVE_S)
+                self._send(self._renew(serial))
+            await asyncio.sleep(0.5 * KEEP_ALIVE_S)
+            if self.is_poor:
+                for serial in list(self._tokens):
+                    again = self._repeat if serial in self._running else self._renew
+                    self._send(again(serial))
+            await asyncio.sleep(0.5 * KEEP_ALIVE_S)
+
+    def _send(self, work: Coroutine[None, None, None]) -> None:
+        task = asyncio.create_task(work)
+        self._renewals.add(task)
+        task.add_done_callback(self._renewals.discard)
 
     async def _renew(self, serial: str) -> None:
+        sent_ns = self._clock()
         try:
             await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
         except NoAnswer:
-            return  # lost on the way; the next one follows, and silence is noticed by `check`
+            pass  # lost on the way; the next one follows, and silence is noticed by `check`
         except Refused as refused:
             if refused.ack.reason == Refusal.HELD.value:
                 self._taken_by[serial] = refused.ack.detail
+        if self._clock() - sent_ns > LATE_NS:
+            self._poor_until_ns = self._clock() + POOR_NS
+
+    async def _repeat(self, serial: str) -> None:
+        """Tell a module again of its latest motion; it begins no motion twice."""
+        running = self._running.get(serial)
+        if running is None:
+            return
+        motion = self._motion(serial, *running)
+        # Lost or refused: the next renewal follows.
+        with contextlib.suppress(NoAnswer, Refused):
+            await self._radio.command(serial, Leaf.MOTION, motion, timeout_s=0.3)
 
     async def release_all(self) -> None:
         """Let go of all modules; their motors are off then."""
@@ -271,16 +310,26 @@ class RobotLink:
         """Run one motion on each of the given modules at the same time; return how they went.
 
         Raises:
-            MotionInterrupted: one of them expired or was stopped.
+            MotionInterrupted: one of them expired or was stopped, or another module that this sender holds
+            expired meanwhile and let go of its joint.
             ModuleLost: see `check`.
         """
         numbers = {serial: self._next_id() for serial in patterns}
-        for serial, pattern in patterns.items():
-            await self._start(serial, numbers[serial], pattern)
+        await together(self._start(serial, numbers[serial], pattern) for serial, pattern in patterns.items())
         longest = max(duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items())
         ended = await self.wait(
-            lambda: all(self._ended(serial, number) for serial, number in numbers.items()), longest + 3.0
+            lambda: (
+                all(self._ended(serial, number) for serial, number in numbers.items())
+                or self._limp(numbers) is not None
+            ),
+            longest + 3.0,
         )
+        if self.is_poor:
+            # What is to tell of a module that let go may itself be lost.
+            await together(self.ask_status(serial) for serial in self._tokens)
+        limp = self._limp(numbers)
+        if limp is not None:
+            raise MotionInterrupted(next(iter(patterns)), f"spoilt: module {limp} expired and let go")
         records: dict[str, MotionRecord] = {}
         for serial, number in numbers.items():
             status = self.module(serial).status if ended else await self.ask_status(serial)
@@ -289,6 +338,15 @@ class RobotLink:
                 raise MotionInterrupted(serial, motion.outcome if motion is not None else "lost")
             records[serial] = motion
         return records
+
+    def _limp(self, moved: Container[str]) -> str | None:
+        """Return a module that should have held still meanwhile and has expired."""
+        for serial in self._tokens:
+            status = self.module(serial).status
+            fresh = status is not None and status.t_ns > self._armed_ns[serial]
+            if serial not in moved and fresh and status is not None and status.state == "expired":
+                return serial
+        return None
 
     def _origin(self, serial: str) -> float:
         status = self.module(serial).status
@@ -303,15 +361,17 @@ class RobotLink:
             return status.state in ("expired", "stopped", "fault", "idle")
         return motion.outcome != "running"
 
+    def _motion(self, serial: str, number: int, pattern: Pattern) -> MotionCommand:
+        return MotionCommand.model_validate({**self._head(serial), "motion_id": number, "pattern": pattern})
+
     async def _start(self, serial: str, number: int, pattern: Pattern) -> None:
         async def attempt() -> Ack:
-            command = MotionCommand.model_validate(
-                {**self._head(serial), "motion_id": number, "pattern": pattern}
-            )
-            return await self._radio.command(serial, Leaf.MOTION, command)
+            return await self._radio.command(serial, Leaf.MOTION, self._motion(serial, number, pattern))
 
+        self._running.pop(serial, None)
         try:
             await self._persist(serial, attempt)
+            self._running[serial] = number, pattern
         except Refused as refused:
             if refused.ack.reason in UNSTARTED:
                 raise MotionInterrupted(serial, f"refused: {refused.ack.detail}") from refused
@@ -321,9 +381,11 @@ class RobotLink:
 
     async def complete_rows(self) -> None:
         """Fetch whatever feedback rows the network has dropped, of every module, up to now."""
-        for serial in self.serials:
-            status = await self.ask_status(serial)
-            await self._complete(serial, status.next_row)
+        await together(self._complete_now(serial) for serial in self.serials)
+
+    async def _complete_now(self, serial: str) -> None:
+        status = await self.ask_status(serial)
+        await self._complete(serial, status.next_row)
 
     async def close_gaps(self) -> None:
         """Fetch what is missing before the newest row of every module that has arrived.
@@ -335,8 +397,7 @@ class RobotLink:
             gaps = [s for s, end in ends.items() if self.module(s).rows.missing(self._complete_row[s], end)]
             if not gaps:
                 return
-            for serial in gaps:
-                await self._complete(serial, ends[serial])
+            await together(self._complete(serial, ends[serial]) for serial in gaps)
 
     async def _complete(self, serial: str, end: int) -> None:
         rows = self.module(serial).rows
@@ -346,7 +407,7 @@ class RobotLink:
             if not missing:
                 break
             try:
-                await self._fetch(serial, *missing[0])
+                await together(self._fetch(serial, *hole) for hole in missing[:HOLES_AT_ONCE])
             except Refused as refused:
                 # What passed while nobody listened, between a crash and its resumption, may be forgotten by
                 # now; steps that are done had all their rows before.
@@ -394,3 +455,10 @@ class RobotLink:
             if await self.wait(lambda: found() is not None, 0.3):
                 break
         return found()
+
+
+async def together(work: Iterable[Coroutine[None, None, object]]) -> None:
+    """Do all of it at once, all to its end; raise what the first of those that failed raised."""
+    for outcome in await asyncio.gather(*work, return_exceptions=True):
+        if isinstance(outcome, BaseException):
+            raise outcome

@@ -4,26 +4,28 @@ Steps are journaled: a step that the journal says is done is not done again when
 """
 
 import asyncio
+import itertools
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from functools import partial
 from typing import Protocol
 
-import numpy as np
-
 from coordinator.clock import Clock
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.topology_advice import MOST_REPEATS, NextMotion
+from coordinator.link_check import check_link
 from coordinator.link_errors import MotionInterrupted
 from coordinator.motion_design.limits import joint_limits, likely_inertia_kg_m2
 from coordinator.motion_design.whole_robot import JointSetting, whole_patterns
 from coordinator.plan import Plan
 from coordinator.radio import Radio
 from coordinator.recording import Recording
-from coordinator.robot_link import RobotLink
+from coordinator.robot_link import RobotLink, together
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
 # Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
 ESTIMATE_WAIT_S = 0.6
+# A poor network interrupts more than one motion in ten; so many times the plan's retries leave none undone.
+POOR_RETRIES = 4
 # Who moves all joints at once is in a hurry; a second tells the gyros' offsets to 0.1 mrad/s.
 WHOLE_REST_S = 1.0
 
@@ -50,10 +52,6 @@ class Reporter(Protocol):
     async def explored(self) -> None:
         """All joints are explored: topology and chain can be assembled. Raises if they cannot."""
         ...
-
-
-class UnfitLink(RuntimeError):
-    """The network cannot carry a session; nothing has moved. The message says what was measured."""
 
 
 class NobodyThere(RuntimeError):
@@ -90,7 +88,8 @@ class Session:
     async def run(self, expect: int | None = None) -> None:
         """Discover, check, take, move, and let go; raises what went wrong after stopping the robot."""
         await self._discover(expect)
-        await self._check_link()
+        self._report("checking the link")
+        await check_link(self.link, self._clock, self._plan.link_s, self._reporter.note)
         serials = self.link.serials
         explorations = 1 if self._plan.mode == "whole" else len(serials)
         self._total = 6 + explorations + (2 * len(serials) if self._plan.dynamics else 0)
@@ -140,36 +139,6 @@ class Session:
             self.link.kind(serial)
         self._reporter.note(f"found {len(known)}: {', '.join(self.link.serials)}")
 
-    async def _check_link(self) -> None:
-        """Measure rate and round trip for a second; refuse a link that cannot keep a motion alive."""
-        self._report("checking the link")
-        before = {s: self.link.module(s).rows.end_row for s in self.link.serials}
-        start = self._clock()
-        while self._clock() - start < int(self._plan.link_s * 1e9):
-            for serial in self.link.serials:
-                await self.link.ask_status(serial)
-            await asyncio.sleep(0.05)
-        span_s = (self._clock() - start) / 1e9
-        for serial in self.link.serials:
-            record, info = self.link.module(serial), self.link.info(serial)
-            rate = (record.rows.end_row - before[serial]) / span_s
-            trips = [(t.received_ns - t.sent_ns) / 1e6 for t in record.round_trips]
-            median, worst = float(np.median(trips)), float(np.percentile(trips, 95))
-            self._reporter.note(
-                f"{serial} ({info.module_type}): {rate:.0f} rows/s, "
-                f"round trip {median:.2f} ms, 95 % {worst:.2f} ms"
-            )
-            if rate < 0.5 * info.feedback_rate_hz:
-                raise UnfitLink(
-                    f"unfit: module {serial} delivers {rate:.0f} rows/s of {info.feedback_rate_hz:.0f}; "
-                    "check the network and the load of its machine"
-                )
-            if worst > 0.5 * info.lifetime_ns / 1e6:
-                raise UnfitLink(
-                    f"unfit: round trips to module {serial} take {worst:.0f} ms (95 %), commands live "
-                    f"{info.lifetime_ns / 1e6:.0f} ms; check the network"
-                )
-
     def _mend_after_restart(self) -> None:
         """Forget what the journal says is done if a module has booted since: its zero may have moved."""
         moved = [e for e in self._recording.journal if e.what == "motion"]
@@ -190,12 +159,19 @@ class Session:
 
     async def _arm(self) -> None:
         """Acquire every module, and set gains where the plan wants others than the factory's."""
-        for serial in self.link.serials:
-            await self.link.acquire(serial)
-            if self._plan.hold_stiffness != 1.0:
-                strategy = self.link.info(serial).gains.strategy
-                gains = self._plan.exploring_gains(self.link.kind(serial), strategy)
-                await self.link.set_gains(serial, gains)
+        # At once: what is armed and has no motion yet expires the more easily.
+        await together(self._arm_one(serial) for serial in self.link.serials)
+
+    async def _arm_one(self, serial: str) -> None:
+        await self.link.acquire(serial)
+        if self._plan.hold_stiffness != 1.0:
+            strategy = self.link.info(serial).gains.strategy
+            gains = self._plan.exploring_gains(self.link.kind(serial), strategy)
+            await self.link.set_gains(serial, gains)
+
+    def _retries(self) -> int:
+        """Return how often an interrupted step is done again."""
+        return self._plan.retries * (POOR_RETRIES if self.link.is_poor else 1)
 
     async def _step(
         self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
@@ -204,7 +180,7 @@ class Session:
         if name in self._done:
             return
         self._journal(JournalEvent(t_ns=self._clock(), what="begin", step=name))
-        for attempt in range(self._plan.retries + 1):
+        for attempt in itertools.count():
             try:
                 if attempt:
                     await self._rearm()
@@ -212,7 +188,7 @@ class Session:
                 break
             except MotionInterrupted as error:
                 await self.link.check_now()
-                if attempt == self._plan.retries:
+                if attempt >= self._retries():
                     raise
                 self._reporter.note(f"{error}; re-arming and trying again")
                 self._journal(JournalEvent(t_ns=self._clock(), what="note", step=name, text=str(error)))

@@ -247,8 +247,11 @@ def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callab
     async def work() -> None:
         keeper = await _armed(link)
         keeper.cancel()
-        with pytest.raises(MotionInterrupted, match=f"the motion of module {BASE} was expired"):
+        # Either may expire first, by the age of its last feedback.
+        why = f"the motion of module {BASE} was (expired|spoilt: module {TIP} expired and let go)"
+        with pytest.raises(MotionInterrupted, match=why):
             await link.run({BASE: SLOW})
+        await asyncio.sleep(0.05)
         assert rig.state(BASE) == "expired"
         for serial in link.serials:
             await link.acquire(serial)

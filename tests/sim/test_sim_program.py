@@ -151,10 +151,11 @@ def test_an_interrupted_virtual_run_stops_the_robot_and_closes_its_recording(tmp
 
 
 def test_a_virtual_run_that_fails_says_so_in_one_line(tmp_path: Path) -> None:
-    # Round trips of 60 ms and more: the link is refused before anything moves.
-    plan = tmp_path / "plan.toml"
+    # Round trips of 300 ms: the link is refused before anything moves.
+    plan, slow = tmp_path / "plan.toml", tmp_path / "slow.toml"
     plan.write_text("discover_s = 0.3\nlink_s = 0.3\n")
-    given = ["run", ROBOT, "--virtual", "--network", "bad", "--plan", str(plan), "--quiet"]
+    slow.write_text("delay_ms = 150.0\n")
+    given = ["run", ROBOT, "--virtual", "--network", str(slow), "--plan", str(plan), "--quiet"]
     done = subprocess.run(
         [sys.executable, "-m", "sim.main", *given, "--out", str(tmp_path / "run")],
         capture_output=True,

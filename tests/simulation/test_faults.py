@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.link_errors import ModuleLost, MotionInterrupted
+from coordinator.link_errors import ModuleLost, MotionInterrupted, UnfitLink
 from coordinator.plan import Plan
 from coordinator.run_folder import load_recording
-from coordinator.session import NobodyThere, UnfitLink
+from coordinator.session import NobodyThere
 from module_agent.wire.network_profile import NetworkProfile
 from sim.score import score
 
