@@ -1,11 +1,12 @@
 """Which link of a robot has changed between two sessions, by how much, and how surely.
 
-The increments from the former chain to the later one, d ~ N(D x, C), are compared under hypotheses. A link
-that changes by a twist displaces everything beyond it by that same twist, so that "link k changed" has six
-parameters, and "nothing changed" none. The gain in chi^2 of the best six is chi^2-distributed with as many
-degrees of freedom as of the six can be seen (Wilks, 1938); the probability of as large a gain by chance is
-multiplied by the number of links that are looked at (Bonferroni). Links are taken in one by one, the one that
-explains most first, until what is left is chance.
+The increments from the former chain to the later one, d ~ N(D x, C), are compared under hypotheses; C is
+that of the sensors' noise alone, as what a model leaves out is common to both sessions, and of the floors
+below. A link that changes by a twist displaces everything beyond it by that same twist, so that "link k
+changed" has six parameters, and "nothing changed" none. The gain in chi^2 of the best six is
+chi^2-distributed with as many degrees of freedom as of the six can be seen (Wilks, 1938); the probability of
+as large a gain by chance is multiplied by the number of links that are looked at (Bonferroni). Links are
+taken in one by one, the one that explains most first, until what is left is chance.
 """
 
 from collections.abc import Sequence
@@ -124,7 +125,7 @@ def _problem(fits: TiedFits) -> _Problem:
     slopes = {child: _slope(chain, child) for child in range(1, len(chain.serials))}
     kept = _visible(fits)
     own = np.diag(np.repeat([FLOOR_RAD, FLOOR_M], 3) ** 2)
-    covariance = fits.before.covariance[6:, 6:] + fits.after.covariance[6:, 6:]
+    covariance = fits.before.noise_covariance[6:, 6:] + fits.after.noise_covariance[6:, 6:]
     covariance = covariance + sum(slope @ own @ slope.T for slope in slopes.values())
     white = np.linalg.inv(np.linalg.cholesky(kept.T @ covariance @ kept)) @ kept.T
     difference = increments_between(chain, fits.after.chain)[6:]

@@ -38,7 +38,7 @@ def _spread(chain: Chain, hidden: np.ndarray) -> np.ndarray:
 
 def _fit(chain: Chain, covariance: np.ndarray, hidden: np.ndarray) -> Refinement:
     values: dict[str, object] = dict.fromkeys(Refinement._fields)
-    values |= {"chain": chain, "covariance": covariance, "null_basis": hidden}
+    values |= {"chain": chain, "noise_covariance": covariance, "null_basis": hidden}
     return Refinement(**values)  # type: ignore[arg-type]
 
 
@@ -158,7 +158,7 @@ def test_it_is_the_generalised_least_squares_estimate(draw: Draw) -> None:
             for unit, size in zip(np.eye(6), np.repeat([FLOOR_RAD, FLOOR_M], 3), strict=True)
         )
     )
-    weight = np.linalg.inv(2.0 * fits.before.covariance[6:, 6:] + floor)
+    weight = np.linalg.inv(2.0 * fits.before.noise_covariance[6:, 6:] + floor)
     difference = increments_between(chain, fits.after.chain)[6:]
     expected = np.linalg.solve(columns.T @ weight @ columns, columns.T @ weight @ difference)
     (change,) = find_changes(fits).changed
