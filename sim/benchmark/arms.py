@@ -69,34 +69,34 @@ def _wrong(case: str, trials: Sequence[ArmTrial]) -> Row:
 
 
 def _tip_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, Row]:
-    def over(thesis: bool, figure: Callable[[TipErrors], float]) -> float | None:
-        tips = [trial.thesis_tip if thesis else trial.tip for trial in trials]
-        return rms([figure(tip) for tip in tips if tip is not None])
+    thesis, ours, bound = (
+        [tip for tip in tips if tip is not None]
+        for tips in (
+            [trial.thesis_tip for trial in trials],
+            [trial.tip for trial in trials],
+            [trial.tip_bound for trial in trials],
+        )
+    )
 
-    position = Row(
-        case,
-        "tip position, rms [mm]",
-        scaled(over(True, lambda tip: tip.position_m), 1e3),
-        scaled(over(False, lambda tip: tip.position_m), 1e3),
-        limit=for_few(TIP_MM[noise], len(trials)),
+    def row(figure: str, of: Callable[[TipErrors], float], limit: float | None) -> Row:
+        values = [rms([of(tip) for tip in tips]) for tips in (thesis, ours, bound)]
+        return Row(case, figure, values[0], values[1], values[2], for_few(limit, len(trials)))
+
+    return (
+        row("tip position, rms [mm]", lambda tip: 1e3 * tip.position_m, TIP_MM[noise]),
+        row("tip orientation, rms [deg]", lambda tip: tip.orientation_deg, TIP_DEG[noise]),
     )
-    orientation = Row(
-        case,
-        "tip orientation, rms [deg]",
-        over(True, lambda tip: tip.orientation_deg),
-        over(False, lambda tip: tip.orientation_deg),
-        limit=for_few(TIP_DEG[noise], len(trials)),
-    )
-    return position, orientation
 
 
 def _link_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, Row, Row]:
     links = [link for trial in trials for link in trial.links]
     thesis_mm = scaled(mean_abs([link.thesis_error_m for link in links]), 1e3)
     ours_mm = scaled(mean_abs([link.error_m for link in links]), 1e3)
+    # The mean size of a Gaussian error is sqrt(2 / pi) of its standard deviation.
+    bound_mm = scaled(rms([link.bound_m for link in links]), 1e3 * 0.7979)
     vector_mm = scaled(mean_abs([link.vector_error_m for link in links]), 1e3)
     return (
-        Row(case, "link length, mean |error| [mm]", thesis_mm, ours_mm),
+        Row(case, "link length, mean |error| [mm]", thesis_mm, ours_mm, bound_mm),
         Row(case, "link vector, mean |error| [mm]", None, vector_mm),
         Row(
             case,

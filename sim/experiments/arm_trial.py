@@ -12,11 +12,14 @@ import numpy as np
 from coordinator.chain import Array, Chain
 from coordinator.failure import explain
 from coordinator.identify import Kinematics, identify_kinematics
+from coordinator.kinematics.assembly import link_lengths
 from coordinator.kinematics.imu_intrinsics import ImuKind
+from coordinator.kinematics.increments import apply_increment
 from coordinator.plan import Plan
 from coordinator.recording import Recording
 from module_agent.wire.network_file import network as named_network
 from sim.chain_score import link_errors, link_length_m, tip_errors, topology_differences
+from sim.gauge import tip_error
 from sim.noise_profile import NoiseProfile, noise_profile
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import true_chain
@@ -24,14 +27,17 @@ from sim.virtual_robot import VirtualSettings
 from sim.virtual_session import record_session
 
 Mode = Literal["joint", "whole"]
+# The rms over so many draws scatters by some 15 %, more poses would not make it less.
+BOUND_DRAWS, BOUND_POSES = 24, 100
 
 
 class ArmLink(NamedTuple):
     """The errors of one true link; None where the chain has no such link.
 
     error_m: estimate - truth of the distance from the parent's axis to the child's IMU. vector_error_m: the
-    size of the error of that distance as a vector. sigma_m: as claimed for the length. The thesis' are those
-    of its chain, None in a mode that has none.
+    size of the error of that distance as a vector. sigma_m: as claimed for the length. bound_m: what it would
+    be if the sensors' noise were all that there is. The thesis' are those of its chain, None in a mode that
+    has none.
     """
 
     parent: str
@@ -39,6 +45,7 @@ class ArmLink(NamedTuple):
     true_m: float
     error_m: float | None
     sigma_m: float | None
+    bound_m: float | None
     vector_error_m: float | None
     axis_error_deg: float | None
     thesis_error_m: float | None
@@ -56,7 +63,9 @@ class ArmTrial(NamedTuple):
     """What came of one trial; of one that did not come to its end only the first five fields tell.
 
     why: what ended it, empty if nothing did. differences: what is wrong with the topology, in words; tips are
-    not compared then. identify_s: processor time from the recording to the chain.
+    not compared then. tip_bound: the errors to expect from the sensors' noise alone, by the curvature of the
+    fit (Cramer and Rao) at the noise that is left in it. identify_s: processor time from the recording to the
+    chain.
     """
 
     robot: str
@@ -68,6 +77,7 @@ class ArmTrial(NamedTuple):
     links: tuple[ArmLink, ...] = ()
     tip: TipErrors | None = None
     thesis_tip: TipErrors | None = None
+    tip_bound: TipErrors | None = None
     robot_time_s: float = 0.0
     identify_s: float = 0.0
 
@@ -136,6 +146,7 @@ def _scored(
         links=_links(truth, kinematics, None if first is None else first.chain),
         tip=None if differences else _tip(fit.chain, truth, fit.null_basis),
         thesis_tip=None if differences or first is None else _tip(first.chain, truth, first.null_basis),
+        tip_bound=expected_tip(fit.chain, kinematics.refinement.noise_covariance, begun.seed),
         robot_time_s=float(np.ptp(times)) * 1e-9,
         identify_s=spent_s,
     )
@@ -146,24 +157,37 @@ def _tip(chain: Chain, truth: Chain, null_basis: Array) -> TipErrors:
     return TipErrors(1e-3 * position_mm, orientation_deg)
 
 
+def expected_tip(chain: Chain, covariance: Array, seed: int) -> TipErrors:
+    """Return the errors of the tips that a covariance (6 n, 6 n) of increments stands for, by draws."""
+    rng = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(covariance)
+    spread = vectors * np.sqrt(np.maximum(values, 0.0))
+    q = rng.uniform(-np.pi, np.pi, (BOUND_POSES, len(chain.serials)))
+    drawn = rng.standard_normal((BOUND_DRAWS, len(covariance)))
+    found = [tip_error(apply_increment(chain, spread @ each), chain, q) for each in drawn]
+    squares = np.mean(np.square(found), axis=0)
+    return TipErrors(float(np.sqrt(squares[0])), float(np.degrees(np.sqrt(squares[1]))))
+
+
 def _links(truth: Chain, kinematics: Kinematics, thesis: Chain | None) -> tuple[ArmLink, ...]:
     fit = kinematics.fit
+    _, bounds = link_lengths(fit.chain, kinematics.refinement.noise_covariance)
     found = []
     for child, parent in enumerate(truth.parent):
         if parent < 0:
             continue
         ours = link_errors(fit.chain, truth, child)
         theirs = None if thesis is None else link_errors(thesis, truth, child)
-        sigma_m = None
-        if ours is not None:
-            sigma_m = float(fit.link_length_sigma_m[fit.chain.serials.index(truth.serials[child])])
+        # Without a link of ours there is no place of it in our chain either.
+        own = fit.chain.serials.index(truth.serials[child]) if ours is not None else None
         found.append(
             ArmLink(
                 parent=truth.serials[parent],
                 child=truth.serials[child],
                 true_m=link_length_m(truth, child),
                 error_m=None if ours is None else ours.length_m,
-                sigma_m=sigma_m,
+                sigma_m=None if own is None else float(fit.link_length_sigma_m[own]),
+                bound_m=None if own is None else float(bounds[own]),
                 vector_error_m=None if ours is None else ours.vector_m,
                 axis_error_deg=None if ours is None else ours.axis_deg,
                 thesis_error_m=None if theirs is None else theirs.length_m,

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sim.benchmark.arms import ARMS, COST_ARM, WHOLE_ARM, arm_cases
@@ -123,7 +124,7 @@ def test_uncalibrated_arms_have_a_bar_where_gravity_calibrates_their_axis(
 
 
 def arm(tip_mm: float, **changed: Any) -> ArmTrial:
-    link = ArmLink("a", "b", 0.3, 1e-3, 5e-4, 2e-3, 0.05, -8e-3, 0.4)
+    link = ArmLink("a", "b", 0.3, 1e-3, 5e-4, 2e-4, 2e-3, 0.05, -8e-3, 0.4)
     done = ArmTrial(
         robot="a2085_06",
         mode="joint",
@@ -133,6 +134,7 @@ def arm(tip_mm: float, **changed: Any) -> ArmTrial:
         links=(link,),
         tip=TipErrors(1e-3 * tip_mm, 0.08),
         thesis_tip=TipErrors(3e-2, 1.5),
+        tip_bound=TipErrors(2e-4, 0.01),
         robot_time_s=54.0,
         identify_s=2.0,
     )
@@ -146,11 +148,16 @@ def test_an_arms_tip_is_the_rms_over_its_trials_with_the_thesis_beside() -> None
     tip = found["tip position, rms [mm]"]
     assert tip.ours == pytest.approx(((7 * 0.36 + 6 * 1.44) / 13) ** 0.5)
     assert (tip.thesis, tip.limit, tip.holds) == (pytest.approx(30.0), 1.0, True)
+    assert tip.bound == pytest.approx(0.2)
     assert found["tip orientation, rms [deg]"].limit == 0.1
     assert found["robot time a joint, longest [s]"].ours == pytest.approx(9.0)
     assert found["robot time a joint, longest [s]"].thesis == 18.0
     assert found["from recording to chain, median [s of one core]"].limit == 5.0
-    assert found["link length, mean |error| [mm]"].thesis == pytest.approx(8.0)
+    length = found["link length, mean |error| [mm]"]
+    assert (length.thesis, length.bound) == (
+        pytest.approx(8.0),
+        pytest.approx(0.2 * (2 / np.pi) ** 0.5, rel=1e-3),
+    )
     assert summary.sigmas_off == pytest.approx([2.0] * 13)
 
 
