@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -14,18 +14,23 @@ from coordinator.clock import Clock
 from coordinator.hrdf import write_hrdf
 from coordinator.identify import (
     Identified,
+    Kinematics,
     identify,
     identify_kinematics,
     write_held_out,
 )
 from coordinator.journal import JournalEvent, standstill
 from coordinator.kinematics.topology_advice import NextMotion
+from coordinator.known_difference import difference, joints_to_explore
+from coordinator.known_robot import keep_known, known_within, load_known
+from coordinator.known_update import updated
+from coordinator.look import Looks
 from coordinator.plan import Plan
 from coordinator.radio import Post, Radio
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.result import Result, write_result
 from coordinator.robot_link import RobotLink
-from coordinator.robot_so_far import RobotSoFar, robot_so_far
+from coordinator.robot_so_far import RobotSoFar
 from coordinator.run_folder import HELD_OUT, HRDF, RESULT, SESSION, URDF, VIEW, open_run_folder
 from coordinator.session import Session
 from coordinator.session_file import SessionWriter, read_session
@@ -44,7 +49,13 @@ logger = logging.getLogger(__name__)
 
 
 class RunConfig(NamedTuple):
-    """What a run is told. `inline` computes on the event loop, as virtual time needs it."""
+    """What a run is told. `inline` computes on the event loop, as virtual time needs it.
+
+    `refined_looks`: modules up to which the robot is refined, not only assembled, for every look at it while
+    it is being explored; None for any number, as in a thread beside the run it keeps nobody waiting.
+    `known`: the folder of a run that the robot is known from. Then all joints are moved at once for a glance,
+    and by themselves only those next to what is other.
+    """
 
     robot: str
     out: Path
@@ -56,6 +67,8 @@ class RunConfig(NamedTuple):
     connect_viewer: str | None = None
     serve_viewer: int | None = None
     inline: bool = False
+    refined_looks: int | None = None
+    known: Path | None = None
 
 
 class Run:
@@ -70,7 +83,14 @@ class Run:
         screen: Screen,
         beside: Beside | None = None,
     ):
+        # Before anything is made of the new folder.
+        before = load_known(config.known) if config.known is not None else None
         crashed = open_run_folder(config.out, config.resume, config.robot)
+        if before is not None:
+            keep_known(before, config.out)
+        self._known = before.kinematics if before is not None else known_within(config.out)
+        if self._known is not None:
+            config = config._replace(plan=config.plan.model_copy(update={"mode": "whole"}))
         self._config = config
         self._clock = clock
         self._screen = screen
@@ -83,6 +103,7 @@ class Run:
         )
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
         self._feed = ViewerFeed(viewer, self.recording, FILE if config.inline else LIVE, beside)
+        self._looks = Looks(self.recording, config.refined_looks)
         self._looking: asyncio.Task[None] | None = None
         if crashed is not None:
             self._take_over(crashed)
@@ -150,7 +171,7 @@ class Run:
     def _so_far(self, explored: list[str]) -> RobotSoFar | None:
         """Return the robot as far as it is known; only to be looked at, so that a run does not fail by it."""
         try:
-            return robot_so_far(self.recording, explored)
+            return self._looks.look(explored)
         except (ValueError, KeyError, np.linalg.LinAlgError) as error:
             logger.info("nothing to show of the robot so far: %s", error)
             return None
@@ -173,10 +194,23 @@ class Run:
     async def explored(self) -> None:
         """Assemble topology and chain as soon as all joints are explored, and show them."""
         await self._looked()
-        found = await self._compute(lambda: identify_kinematics(self.recording))
+        found = await self._compute(lambda: self._revised(identify_kinematics(self.recording)))
         self._feed.chain(self._clock(), found.fit)
         for line in found.words():
             self._screen.note(line)
+
+    async def _closer(self) -> Sequence[str]:
+        """Return the joints next to what is other about a known robot, by a glance at all of it."""
+        found = await self._compute(lambda: identify_kinematics(self.recording))
+        if self._known is None:
+            return ()
+        other = difference(self._known.topology, found.topology)
+        for line in other.words():
+            self._screen.note(line)
+        return joints_to_explore(found.topology, other)
+
+    def _revised(self, found: Kinematics) -> Kinematics:
+        return updated(self._known, found) if self._known is not None else found
 
     # ------------------------------------------------------------------ the run
 
@@ -188,8 +222,9 @@ class Run:
             self._journal(
                 JournalEvent(t_ns=self._clock(), what="session", robot=config.robot, imu=config.plan.imu)
             )
+            closer = self._closer if self._known is not None else None
             session = Session(
-                self._link, self._radio, self.recording, config.plan, self._clock, self._journal, self
+                self._link, self._radio, self.recording, config.plan, self._clock, self._journal, self, closer
             )
             await session.run(config.expect)
             self._journal(
@@ -201,7 +236,7 @@ class Run:
             self._radio.close()
             self._writer.close()
             self._screen.note("estimating")
-            found = await self._compute(lambda: identify(self.recording))
+            found = await self._compute(lambda: identify(self.recording, self._revised))
             self._write(found)
             if self._crashed is not None:
                 self._crashed.unlink()

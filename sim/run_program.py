@@ -51,6 +51,9 @@ from sim.world import World
 # the world's time is its own to stretch, while a motor that is let go in a motion spoils it. Agents that die
 # are noticed at once all the same.
 PATIENCE_S = 0.2
+# Larger robots are only assembled while they are being explored: their refinements would take longer than the
+# run.
+REFINED_LOOKS = 8
 
 
 def world(
@@ -127,7 +130,16 @@ def run(
     folder = free_folder(out, found)
     if virtual:
         _run_virtual(
-            VirtualConfig(found, folder, seed, network or found.network, choice.of(found), planned), quiet
+            VirtualConfig(
+                found,
+                folder,
+                seed,
+                network or found.network,
+                choice.of(found),
+                planned,
+                refined_looks=REFINED_LOOKS,
+            ),
+            quiet,
         )
     else:
         options = (*motion_arguments(plan, planned), *(("--quiet",) if quiet else ()))

@@ -23,7 +23,10 @@ COORDINATOR = "coordinator"
 
 
 class VirtualConfig(NamedTuple):
-    """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given."""
+    """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given.
+
+    `known` and `refined_looks` as in `RunConfig`: nobody watches a virtual run, so that none is the rule.
+    """
 
     robot: Robot
     out: Path
@@ -34,6 +37,8 @@ class VirtualConfig(NamedTuple):
     connect_viewer: str | None = None
     feedback_rate_hz: float = 250.0
     noise_seed: int | None = None
+    refined_looks: int = 0
+    known: Path | None = None
 
 
 def run_virtual(
@@ -67,6 +72,8 @@ def run_virtual(
                 expect=len(robot.world.modules),
                 connect_viewer=config.connect_viewer,
                 inline=True,
+                refined_looks=config.refined_looks,
+                known=config.known,
             ),
             robot.endpoint(COORDINATOR),
             lambda: loop.now_ns,

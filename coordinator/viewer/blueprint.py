@@ -77,7 +77,7 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
         size = max(contents.reach_m, 0.2)
         eye = rrb.EyeControls3D(
             # Far enough for all that the robot can reach, not only for where it stands now.
-            position=[1.0 * size, -1.6 * size, 0.9 * size],
+            position=[0.75 * size, -1.2 * size, 0.68 * size],
             look_target=[0.0, 0.0, 0.1 * size],
             eye_up=[0.0, 0.0, 1.0],
         )
