@@ -159,6 +159,7 @@ class HostedModule:
             rate_ratio=finding.rate_ratio,
             gravity_m_s2=finding.gravity_m_s2,
             circle=finding.circle,
+            regression=finding.regression,
             note=finding.note,
         )
 

@@ -98,6 +98,8 @@ def _shakes(t_ns: Times, readings: Array, angle: Array, smooth_s: float) -> tupl
     # speed, and so weighs most where the columns are largest.
     reach = (len(readings) - len(smooth)) // 2
     fast = readings[reach : len(readings) - reach] - smooth
+    if not np.any(fast, axis=0).all():
+        return False, 0.0  # readings that never change are those of no IMU
     white = fast**2 / (1.0 - 1.0 / white_ratio(t_ns, smooth_s))
     scatter = np.einsum("ni,nj,nk->kij", columns, columns, white)
     inverse = np.linalg.inv(normal)

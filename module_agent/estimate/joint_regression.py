@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from module_agent.estimate.base_motion import BaseMotion
 from module_agent.estimate.circle_point_analysis import RestReading
 from module_agent.estimate.joint_model import (
     ACCEL_BIAS,
@@ -38,16 +37,10 @@ from module_agent.estimate.joint_prior import (
     ImuKnowledge,
     beliefs,
 )
-from module_agent.estimate.smooth_motion import (
-    COSINE,
-    SINE,
-    SMOOTH_S,
-    SQUARED,
-    SmoothImu,
-    SmoothMotion,
-    smooth_imu,
-)
-from module_agent.estimate.windows import Array, ImuWindow, JointWindow
+from module_agent.estimate.seen_motion import SeenMotion
+from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED
+from module_agent.estimate.windows import Array
+from module_agent.wire.messages import RegressionEstimate, Vector3
 
 # The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.
 STRIDE = 7
@@ -57,52 +50,6 @@ BIAS_DRIFT_RAD_S = 1e-4  # of a gyro, within the minute between rest and motion
 LEAST_CARRIED = 0.25
 # With less of gravity across the axis than this, two IMUs do not agree on directions across it.
 LEAST_ACROSS_M_S2 = 1.0
-
-
-class SeenMotion(NamedTuple):
-    """A joint's motion and what an IMU saw of it: t_imu = t_joint + `offset_ns` and a delay to be found.
-
-    base: how what carries the joint shook meanwhile, None where nobody saw it.
-    """
-
-    imu: SmoothImu
-    joint: SmoothMotion
-    offset_ns: int
-    base: BaseMotion | None = None
-
-
-class MotionWindows(NamedTuple):
-    """One motion as it was sampled: the observer's IMU, the joint, and the IMU of the joint's own module.
-
-    t_imu = t_joint + `offset_ns` and a delay to be found; the two last share a clock.
-    """
-
-    imu: ImuWindow
-    joint: JointWindow
-    carrier: ImuWindow
-    offset_ns: int
-
-
-def seen_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_S) -> list[SeenMotion]:
-    """Put the motions of one joint behind the low-pass.
-
-    Raises:
-        ValueError: too few samples for the low-pass, or unevenly spaced ones.
-    """
-    if not windows:
-        return []
-    # One rest for all, as the joint swings about it; of the longest, where the mean is best.
-    longest = max((window.carrier for window in windows), key=lambda imu: imu.t_ns.size)
-    still = np.hstack([longest.gyro_rad_s, longest.accel_m_s2]).mean(axis=0)
-    return [
-        SeenMotion(
-            smooth_imu(window.imu, smooth_s),
-            SmoothMotion(window.joint, smooth_s),
-            window.offset_ns,
-            BaseMotion(window.joint, window.carrier, still, smooth_s),
-        )
-        for window in windows
-    ]
 
 
 class JointRegression(NamedTuple):
@@ -131,6 +78,26 @@ class JointRegression(NamedTuple):
     gyro_noise_rad_s: float
     samples: int
     base_shakes: bool
+
+
+def regression_estimate(found: JointRegression, delay_s: float) -> RegressionEstimate:
+    """Return the result as the part of a message that carries it; `delay_s` is that of its last motion."""
+    upper = found.covariance[np.triu_indices(6)]
+    return RegressionEstimate(
+        axis=_vector(found.axis),
+        radial_m=_vector(found.radial_m),
+        distance_m=found.distance_m,
+        sigma_axis_rad=min(found.sigma_axis_rad, 10.0),
+        sigma_distance_m=min(found.sigma_distance_m, 1e3),
+        covariance=tuple(float(np.clip(value, -1e6, 1e6)) for value in upper),
+        gravity_m_s2=_vector(found.gravity_m_s2),
+        gyro_bias_rad_s=_vector(found.gyro_bias_rad_s),
+        accel_bias_m_s2=_vector(found.accel_bias_m_s2),
+        compliance_s2=found.compliance_s2,
+        delay_s=delay_s,
+        base_shakes=found.base_shakes,
+        samples=found.samples,
+    )
 
 
 class _State(NamedTuple):
@@ -383,3 +350,7 @@ def _frozen(values: Array) -> Array:
     found = np.array(values, dtype=float)
     found.flags.writeable = False
     return found
+
+
+def _vector(values: Array) -> Vector3:
+    return float(values[0]), float(values[1]), float(values[2])

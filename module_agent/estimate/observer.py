@@ -8,17 +8,21 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from module_agent.estimate.circle_point_analysis import (
+    RestReading,
     circle_estimate,
     circle_point_analysis,
     rest_reading,
 )
 from module_agent.estimate.clock_delay import clock_delay
+from module_agent.estimate.joint_prior import AS_DELIVERED, ImuKnowledge
+from module_agent.estimate.joint_regression import regress_joint, regression_estimate
 from module_agent.estimate.motion_detection import detect_motion
+from module_agent.estimate.seen_motion import MotionWindows, seen_motions
 from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, imu_window, joint_window
 from module_agent.firmware.history import History
 from module_agent.neighbours import JointMotion
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.messages import CircleEstimate, MotionRecord, Vector3
+from module_agent.wire.messages import CircleEstimate, MotionRecord, RegressionEstimate, Vector3
 
 # Own samples to either side of a motion: more than the rough clock mapping may be wrong by.
 MARGIN_NS = 150_000_000
@@ -33,6 +37,15 @@ class Finding(NamedTuple):
     rate_ratio: float
     gravity_m_s2: Vector3
     circle: CircleEstimate | None
+    regression: RegressionEstimate | None
+    note: str
+
+
+class _Local(NamedTuple):
+    """Both estimates of one joint, and why there is no regression where there is none."""
+
+    circle: CircleEstimate | None
+    regression: RegressionEstimate | None
     note: str
 
 
@@ -42,15 +55,20 @@ class _Constant(NamedTuple):
     boot: int
     motion_id: int
     motion: AlignedMotion
+    windows: MotionWindows
     moved: bool
 
 
 class Observer:
-    """Keeps, per joint, the constant motion until the windowed sine comes, and the findings."""
+    """Keeps, per joint, the constant motion until the windowed sine comes, and the findings.
 
-    def __init__(self, serial: str, boot: int):
+    `knowledge` is how well the module's own IMU is known.
+    """
+
+    def __init__(self, serial: str, boot: int, knowledge: ImuKnowledge = AS_DELIVERED):
         self.serial = serial
         self.boot = boot
+        self.knowledge = knowledge
         self.findings: dict[str, Finding] = {}
         self._constant: dict[str, _Constant] = {}
         self._rest: tuple[int, Rows] | None = None
@@ -73,7 +91,7 @@ class Observer:
     def _analyse(self, motion: JointMotion, own: ImuWindow, rest: ImuWindow) -> Finding:
         numbers: tuple[int, ...] = (motion.record.motion_id,)
         gravity: Vector3 = (0.0, 0.0, 0.0)
-        moved, ratio, circle = False, 0.0, None
+        moved, ratio, local = False, 0.0, None
         try:
             still = rest_reading(rest)
             x, y, z = (float(value) for value in still.specific_force_m_s2)
@@ -82,11 +100,12 @@ class Observer:
             rough = motion.rough_offset_ns.get(self.serial, 0)
             delay = clock_delay(own, joint, rough)
             aligned = align(own, joint, delay.offset_ns)
+            windows = MotionWindows(own, joint, imu_window(motion.rows), delay.offset_ns)
             seen = detect_motion([aligned], still.gyro_offset_rad_s)
             moved, ratio = seen.moved, seen.rate_ratio
             if motion.record.pattern.kind == "constant":
                 self._constant[motion.serial] = _Constant(
-                    motion.boot, motion.record.motion_id, aligned, moved
+                    motion.boot, motion.record.motion_id, aligned, windows, moved
                 )
             else:
                 # Slow motion decides: near a resonance of the held joints the windowed sine shakes modules
@@ -96,11 +115,24 @@ class Observer:
                 if moved:
                     fit = circle_point_analysis(rest, constant.motion, aligned)
                     circle = circle_estimate(fit, delay.delay_s)
-            note = ""
+                    local = self._regress(circle, [constant.windows, windows], still)
+            note = "" if local is None else local.note
         except ValueError as error:
             # Said to whoever listens: an estimate that cannot be had is a finding too.
             note = str(error)
-        return Finding(motion.serial, numbers, moved, ratio, gravity, circle, note[:512])
+        if local is None:
+            local = _Local(None, None, note)
+        return Finding(
+            motion.serial, numbers, moved, ratio, gravity, local.circle, local.regression, note[:512]
+        )
+
+    def _regress(self, circle: CircleEstimate, windows: list[MotionWindows], still: RestReading) -> _Local:
+        try:
+            found = regress_joint(seen_motions(windows), still, self.knowledge)
+        except ValueError as error:
+            return _Local(circle, None, f"no joint regression: {error}")
+        delay_s = circle.delay_s + found.delays_s[-1]
+        return _Local(circle, regression_estimate(found, delay_s), "")
 
     def _constant_of(self, motion: JointMotion) -> _Constant:
         constant = self._constant.get(motion.serial)

@@ -238,8 +238,37 @@ class CircleEstimate(Part):
     samples: Counter
 
 
+class RegressionEstimate(Part):
+    """A joint regression of one joint in one IMU's frame (`estimate.joint_regression`).
+
+    `axis`, `radial_m` and `sigma_*` mean what they mean in a `CircleEstimate`; `covariance` is the upper
+    triangle, row by row, of that of axis and radial vector (6 x 6, in the IMU's frame). `gravity_m_s2` is the
+    specific force of rest with the joint at zero. A motion of frequency f turns the IMU by
+    `compliance_s2` (2 pi f)^2 more than the encoder says. `delay_s` is that of the IMU's samples beyond the
+    rough mapping of the clocks, in the last motion. `base_shakes`: the shake of what carries the joint was
+    seen by the joint's own module, and taken off.
+    """
+
+    axis: Vector3
+    radial_m: Vector3
+    distance_m: Finite
+    sigma_axis_rad: Annotated[float, Field(ge=0.0, le=10.0)]
+    sigma_distance_m: Annotated[float, Field(ge=0.0, le=1e3)]
+    covariance: Annotated[tuple[Finite, ...], Field(min_length=21, max_length=21)]
+    gravity_m_s2: Vector3
+    gyro_bias_rad_s: Vector3
+    accel_bias_m_s2: Vector3
+    compliance_s2: Finite
+    delay_s: Finite
+    base_shakes: bool
+    samples: Counter
+
+
 class Estimate(Message):
-    """What this module (`serial`) makes of the motion of one joint (`joint`). Published on `estimate`."""
+    """What this module (`serial`) makes of the motion of one joint (`joint`). Published on `estimate`.
+
+    `circle` is the thesis' estimator, `regression` the one that reaches the sensors' limit.
+    """
 
     joint: Name
     motion_ids: Annotated[tuple[Counter, ...], Field(max_length=16)]
@@ -247,6 +276,7 @@ class Estimate(Message):
     rate_ratio: Annotated[float, Field(ge=0.0, le=1e6)]
     gravity_m_s2: Vector3
     circle: CircleEstimate | None
+    regression: RegressionEstimate | None = None
     note: Text = ""
 
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from module_agent.estimate.circle_point_analysis import rest_reading
 from module_agent.estimate.joint_prior import AS_DELIVERED, CALIBRATED, ImuKnowledge
-from module_agent.estimate.joint_regression import distance_bound_m, seen_motions
+from module_agent.estimate.joint_regression import distance_bound_m
+from module_agent.estimate.seen_motion import seen_motions
 from module_agent.estimate.windows import imu_window
 from sim.experiments.one_joint_rig import TrialRows, windows
 from sim.noise_profile import NoiseProfile

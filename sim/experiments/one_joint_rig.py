@@ -13,13 +13,9 @@ from module_agent.estimate.circle_point_analysis import CircleFit, circle_point_
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.gaussian_filter import TAPS
 from module_agent.estimate.joint_prior import CALIBRATED, ImuKnowledge
-from module_agent.estimate.joint_regression import (
-    JointRegression,
-    MotionWindows,
-    regress_joint,
-    seen_motions,
-)
+from module_agent.estimate.joint_regression import JointRegression, regress_joint
 from module_agent.estimate.observer import MARGIN_NS
+from module_agent.estimate.seen_motion import MotionWindows, seen_motions
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
 from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware

@@ -32,6 +32,7 @@ from module_agent.wire.messages import (
     MotionRecord,
     MultiSine,
     PidGains,
+    RegressionEstimate,
     Setpoint,
     Sine,
     Status,
@@ -65,6 +66,21 @@ CIRCLE = CircleEstimate(
     singular_values=(3.0, 0.1, 0.03),
     delay_s=0.002,
     samples=1400,
+)
+REGRESSION = RegressionEstimate(
+    axis=(0.0, 0.0, 1.0),
+    radial_m=(0.484, 0.0, 0.0),
+    distance_m=0.484,
+    sigma_axis_rad=0.001,
+    sigma_distance_m=0.00025,
+    covariance=tuple(1e-8 * (number + 1) for number in range(21)),
+    gravity_m_s2=(0.0, 9.81, 0.0),
+    gyro_bias_rad_s=(0.01, -0.02, 0.03),
+    accel_bias_m_s2=(0.02, 0.0, -0.01),
+    compliance_s2=2.5e-5,
+    delay_s=0.002,
+    base_shakes=True,
+    samples=240,
 )
 
 
@@ -122,6 +138,7 @@ EXAMPLES: list[Message] = [
         rate_ratio=0.99,
         gravity_m_s2=(0.0, 0.0, 9.81),
         circle=CIRCLE,
+        regression=REGRESSION,
     ),
     Ack(
         **HEAD,
