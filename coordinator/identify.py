@@ -5,7 +5,7 @@ over all exploration motions, then the inertial parameters, checked on motions t
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -101,13 +101,15 @@ class Identified(NamedTuple):
     result: Result
 
 
-def identify(recording: Recording) -> Identified:
-    """Compute everything from a recording.
+def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | None = None) -> Identified:
+    """Compute everything from a recording; `revise` is what is known beforehand put into the kinematics.
 
     Raises:
         IdentificationError: what is needed is not there, or contradicts itself.
     """
     kinematics = identify_kinematics(recording)
+    if revise is not None:
+        kinematics = revise(kinematics)
     inertia, held_out = None, None
     if _motions(recording, "dynamic"):
         inertia, means = _inertia(recording, kinematics)

@@ -1,15 +1,21 @@
 """A robot that is known from a former run: its recording, and what it says of the robot."""
 
+import shutil
 from pathlib import Path
 from typing import NamedTuple
 
 from coordinator.chain import Chain
 from coordinator.identify import IdentificationError, Kinematics, identify_kinematics
 from coordinator.kinematics.imu_intrinsics import ImuKind
+from coordinator.known_update import updated
 from coordinator.recording import Recording
 from coordinator.run_folder import SESSION, load_recording
 from coordinator.session_file import SessionFileError
 from module_agent.catalogue import UnknownModuleType
+
+# In the folder of a run that brought a known robot up to date: the recording of the run that the robot was
+# known from, so that the folder tells the robot by itself.
+KNOWN = "known"
 
 
 class KnownRobotError(ValueError):
@@ -42,6 +48,7 @@ class KnownRobot(NamedTuple):
 def load_known(folder: Path) -> KnownRobot:
     """Read a run's folder, and identify its robot again from the recording.
 
+    A run that brought a known robot up to date holds that one's recording too, and both together tell it.
     The recording, not `result.json`, since two sessions are compared by what the sensors read.
 
     Raises:
@@ -52,6 +59,27 @@ def load_known(folder: Path) -> KnownRobot:
         raise KnownRobotError(f"{folder} holds no {SESSION}: give the folder of a run that has finished")
     try:
         recording = load_recording(path)
-        return KnownRobot(folder, recording, identify_kinematics(recording))
+        kinematics, before = identify_kinematics(recording), known_within(folder)
+        if before is not None:
+            kinematics = updated(before, kinematics)
+        return KnownRobot(folder, recording, kinematics)
     except (SessionFileError, IdentificationError, UnknownModuleType) as error:
         raise KnownRobotError(f"{path} does not tell the robot: {error}") from error
+
+
+def known_within(folder: Path) -> Kinematics | None:
+    """Return the kinematics of the robot as it was known to the run in a folder; None if it was not.
+
+    Raises:
+        KnownRobotError: as `load_known`.
+    """
+    return load_known(folder / KNOWN).kinematics if (folder / KNOWN).is_dir() else None
+
+
+def keep_known(known: KnownRobot, folder: Path) -> None:
+    """Copy the recordings that a robot is known from into the folder of a run."""
+    there, here = known.folder, folder / KNOWN
+    while (there / SESSION).is_file():
+        here.mkdir()
+        shutil.copyfile(there / SESSION, here / SESSION)
+        there, here = there / KNOWN, here / KNOWN

@@ -59,7 +59,10 @@ class NobodyThere(RuntimeError):
 
 
 class Session:
-    """Runs the steps on a robot. `journal` records an event; `reporter` hears of progress."""
+    """Runs the steps on a robot. `journal` records an event; `reporter` hears of progress.
+
+    `closer` is asked after a motion of all joints at once which of them to explore by themselves as well.
+    """
 
     def __init__(
         self,
@@ -70,8 +73,10 @@ class Session:
         clock: Clock,
         journal: Callable[[JournalEvent], None],
         reporter: Reporter,
+        closer: Callable[[], Awaitable[Sequence[str]]] | None = None,
     ):
         self.link = link
+        self._closer = closer
         self._radio = radio
         self._recording = recording
         self._plan = plan
@@ -101,6 +106,7 @@ class Session:
             await self._step("rest", "listening at rest", self._rest)
             if self._plan.mode == "whole":
                 await self._step("explore", "exploring all joints at once", self._explore_all)
+                await self._look_closer()
             else:
                 for serial in serials:
                     await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
@@ -252,6 +258,13 @@ class Session:
             return
         await self._observe(serial, plan.sine(self.link.kind(serial)), "windowed_sine")
         self._reporter.estimates(serial)
+
+    async def _look_closer(self) -> None:
+        """Explore by itself every joint that a motion of all at once leaves open, if anybody says which."""
+        closer = await self._closer() if self._closer is not None else ()
+        self._total += len(closer)
+        for serial in closer:
+            await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
 
     async def _settle_doubts(self) -> None:
         """Move again what leaves the topology in doubt, until nothing does or trying has no end."""

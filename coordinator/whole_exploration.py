@@ -23,11 +23,12 @@ CUTOFF_HZ = 15.0
 def whole_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent | None:
     """Return the latest motion in which all these joints took part at once, as that of the first of them.
 
-    None if not all of them did, or if they were moved one by one as well: those motions tell more clearly.
+    None if not all of them did, or if all were moved one by one as well: those motions tell more clearly.
     """
     motions = [e for e in recording.journal if e.what == "motion"]
     latest = {e.serial: e for e in motions if e.purpose == "whole"}
-    if any(e.purpose in ("constant", "windowed_sine") for e in motions):
+    alone = {e.serial for e in motions if e.purpose == "windowed_sine"}
+    if all(s in alone for s in serials):
         return None
     return latest[serials[0]] if serials and all(s in latest for s in serials) else None
 
