@@ -30,12 +30,13 @@ from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement
 from coordinator.kinematics.topology import Topology, TopologyError, find_topology
 from coordinator.kinematics.whole_motion import circles_of_all, seen_by_all
+from coordinator.left_out import left_out
 from coordinator.motion_window import RATE_HZ, Window, noise_floor, window
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.result_parts import build_result
 from coordinator.robot_refinement import CUTOFF_HZ, refine_robot
-from coordinator.topology_search import TopologyFound, left_out, search_topology
+from coordinator.topology_search import TopologyFound, search_topology
 from coordinator.whole_exploration import respond, whole_motion
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.wire.messages import Estimate

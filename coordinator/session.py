@@ -12,12 +12,13 @@ from typing import Protocol
 from coordinator.clock import Clock
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.topology_advice import MOST_REPEATS, NextMotion
+from coordinator.left_out import LeftOut, left_out_event
 from coordinator.link_check import check_link
 from coordinator.link_errors import MotionInterrupted
 from coordinator.motion_design.limits import joint_limits, likely_inertia_kg_m2
 from coordinator.motion_design.whole_robot import JointSetting, whole_patterns
 from coordinator.plan import Plan
-from coordinator.radio import Radio
+from coordinator.radio import Radio, Refused
 from coordinator.recording import Recording
 from coordinator.robot_link import RobotLink, together
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
@@ -87,6 +88,7 @@ class Session:
         self._index = 0
         self._total = 4
         self._keeper: asyncio.Task[None] | None = None
+        self._left_out = LeftOut(link, self._note_left_out)
 
     # ------------------------------------------------------------------ the run
 
@@ -102,18 +104,20 @@ class Session:
         starts = {s: self._position(s) for s in serials}
         try:
             await self._take()
-            await self._step("home", "all joints to their home position", self._home)
+            await self._if_it_moves("home", "all joints to their home position", self._home)
             await self._step("rest", "listening at rest", self._rest)
             if self._plan.mode == "whole":
                 await self._step("explore", "exploring all joints at once", self._explore_all)
                 await self._look_closer()
             else:
                 for serial in serials:
-                    await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
+                    text = f"exploring joint {serial}"
+                    await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
             await self._settle_doubts()
             self._report("topology and chain")
             await self._reporter.explored()
             if self._plan.dynamics:
+                serials = self._left_out.movers()
                 for serial in serials:
                     await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
                 for serial in serials:
@@ -140,10 +144,14 @@ class Session:
             names = ", ".join(sorted(known)) or "none"
             wanted = "at least one" if expect is None else str(expect)
             raise NobodyThere(f"{wanted} module expected, found {len(known)}: {names}")
-        await self.link.meet(sorted(known))
+        await self._left_out.meet(sorted(known))
+        if not self.link.serials:
+            raise NobodyThere(
+                f"none of the modules that announced themselves responds: {', '.join(sorted(known))}"
+            )
         for serial in self.link.serials:
             self.link.kind(serial)
-        self._reporter.note(f"found {len(known)}: {', '.join(self.link.serials)}")
+        self._reporter.note(f"found {len(self.link.serials)}: {', '.join(self.link.serials)}")
 
     def _mend_after_restart(self) -> None:
         """Forget what the journal says is done if a module has booted since: its zero may have moved."""
@@ -166,7 +174,7 @@ class Session:
     async def _arm(self) -> None:
         """Acquire every module, and set gains where the plan wants others than the factory's."""
         # At once: what is armed and has no motion yet expires the more easily.
-        await together(self._arm_one(serial) for serial in self.link.serials)
+        await together(self._arm_one(serial) for serial in self._left_out.movers())
 
     async def _arm_one(self, serial: str) -> None:
         await self.link.acquire(serial)
@@ -203,6 +211,23 @@ class Session:
         boot = self.link.module(serial).boot if serial else 0
         self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
 
+    async def _if_it_moves(
+        self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
+    ) -> None:
+        """Do a step; without a module that will not move, however often it is told, if that comes up."""
+        while not (arguments and arguments[0] in self._left_out.why):
+            try:
+                await self._step(name, text, work, *arguments)
+                return
+            except (Refused, MotionInterrupted) as error:
+                if not self._left_out.without(error):
+                    raise
+                await self._rearm()
+
+    def _note_left_out(self, serial: str, why: str) -> None:
+        self._reporter.note(f"going on without {serial}: {why}")
+        self._journal(left_out_event(self._clock(), serial, why))
+
     async def _rearm(self) -> None:
         await self._arm()
         await self._home()
@@ -211,7 +236,8 @@ class Session:
         speed = self._plan.travel_speed_rad_s
 
         async def back() -> None:
-            await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in starts.items()})
+            movers = self._left_out.movers()
+            await self.link.run({s: GoTo(target_rad=starts[s], max_speed_rad_s=speed) for s in movers})
 
         await self._step("back", "back to where it stood", back)
         await self.link.release_all()
@@ -236,13 +262,15 @@ class Session:
 
     async def _home(self) -> None:
         speed, home = self._plan.travel_speed_rad_s, self._plan.home_rad
-        await self.link.run({s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self.link.serials})
+        await self.link.run(
+            {s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self._left_out.movers()}
+        )
         await asyncio.sleep(self._plan.settle_s)
 
     async def _rest(self) -> None:
         longest = WHOLE_REST_S if self._plan.mode == "whole" else self._plan.rest_s
         pattern = Rest(duration_s=min(longest, self._plan.rest_s))
-        records = await self.link.run(dict.fromkeys(self.link.serials, pattern))
+        records = await self.link.run(dict.fromkeys(self._left_out.movers(), pattern))
         for serial, record in records.items():
             self._note_motion("rest", serial, record, "rest")
 
@@ -284,7 +312,7 @@ class Session:
 
     async def _move_again(self, motion: NextMotion, serial: str) -> None:
         slow, home = self._plan.constant(), self._plan.home_rad
-        others = {s: home + motion.others_rad for s in self.link.serials if s != serial}
+        others = {s: home + motion.others_rad for s in self._left_out.movers() if s != serial}
         if motion.others_rad:
             await self._go_all(others)
         await self._go(serial, home - 0.5 * motion.travel_rad(slow))

@@ -11,11 +11,9 @@ from coordinator.kinematics.topology import (
     likely_topology,
 )
 from coordinator.kinematics.topology_advice import NextMotion, next_motions
+from coordinator.left_out import left_out
 from coordinator.recording import Recording
 from coordinator.topology_observations import Seen, observe, slow_motions
-
-# Step of the journal's notes on modules that the session went on without.
-LEFT_OUT = "left_out/"
 
 
 class TopologyFound(NamedTuple):
@@ -23,15 +21,6 @@ class TopologyFound(NamedTuple):
 
     topology: Topology
     notes: tuple[str, ...]
-
-
-def left_out(recording: Recording) -> dict[str, str]:
-    """Return the modules that the session went on without, with the reason in words."""
-    return {
-        event.step.removeprefix(LEFT_OUT): event.text
-        for event in recording.journal
-        if event.what == "note" and event.step.startswith(LEFT_OUT)
-    }
 
 
 def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFound:

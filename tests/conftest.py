@@ -107,7 +107,10 @@ class _Cuttable:
 
 
 class Rig:
-    """World, network and agents of one shipped robot; `cut` severs the coordinator from all of them."""
+    """World, network and agents of one robot; `cut` severs the coordinator from all of them.
+
+    `beside` is a rig whose network, and with it whose time, this one shares.
+    """
 
     def __init__(
         self,
@@ -116,12 +119,14 @@ class Rig:
         seed: int = 0,
         tap: Callable[[int, str, str, str, bytes], None] | None = None,
         noise: str = "x5",
+        beside: "Rig | None" = None,
         **firmware: Any,
     ):
         self.robot = load_robot(robot)
-        self.loop = VirtualLoop()
+        self._guest = beside is not None
+        self.loop = VirtualLoop() if beside is None else beside.loop
         self.world = World(self.robot, seed, noise)
-        self.network = VirtualNetwork(self.loop, tap)
+        self.network = VirtualNetwork(self.loop, tap) if beside is None else beside.network
         self.serials = self.robot.serials
         self.cut = False
         self.truth = TruthLog(self.world)
@@ -138,12 +143,12 @@ class Rig:
         self._ticking = True
         self.loop.call_soon(self._tick, self.loop.time() + TICK_S)
 
-    def boot(self, serial: str) -> None:
-        """Start the agent of a module, under a boot id of its own."""
+    def boot(self, serial: str, **settings: Any) -> None:
+        """Start the agent of a module, under a boot id of its own; `settings` of its firmware come first."""
         index = self.serials.index(serial)
         module = self.world.modules[index]
         self._boots += 1
-        config = config_of(module, self._boots, **self._firmware)
+        config = config_of(module, self._boots, **self._firmware)._replace(**settings)
         self.hosts[serial] = AgentHost(
             self.robot.name,
             _Wires(self, index),
@@ -229,9 +234,23 @@ class Rig:
 
     def session(self, out: Path, plan: Plan, resume: bool = False, sender: str = "coordinator") -> Result:
         """Run a whole identification and write its folder, truth included."""
+        result = self.run(self.begin(out, plan, resume, sender).run())
+        write_truth(out / "truth.json", self.robot)
+        self.truth.save(out / "truth.npz")
+        return result
+
+    def begin(
+        self,
+        out: Path,
+        plan: Plan,
+        resume: bool = False,
+        sender: str = "coordinator",
+        expect: int | None = None,
+    ) -> Run:
+        """Make a coordinator that is to run a whole identification."""
         notes = Notes()
         config = RunConfig(
-            self.robot.name, out, sender, plan, expect=len(self.serials), resume=resume, inline=True
+            self.robot.name, out, sender, plan, expect or len(self.serials), resume=resume, inline=True
         )
         run = Run(
             config,
@@ -241,10 +260,7 @@ class Rig:
             notes,
         )
         self.notes = notes.lines
-        result = self.run(run.run())
-        write_truth(out / "truth.json", self.robot)
-        self.truth.save(out / "truth.npz")
-        return result
+        return run
 
     def end_tasks(self) -> None:
         """End what a killed coordinator has left behind, as the end of its process would."""
@@ -259,11 +275,13 @@ class Rig:
 
     def close(self) -> None:
         self._ticking = False
-        self.end_tasks()
+        if not self._guest:
+            self.end_tasks()
         for host in self.hosts.values():
             host.close()
         self.world.close()
-        self.loop.close()
+        if not self._guest:
+            self.loop.close()
 
 
 @pytest.fixture
@@ -276,7 +294,7 @@ def rigs() -> Iterator[Callable[..., Rig]]:
         return made[-1]
 
     yield make
-    for rig in made:
+    for rig in reversed(made):
         rig.close()
 
 

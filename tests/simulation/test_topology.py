@@ -1,0 +1,197 @@
+"""The session finds who is mounted on whom although modules do not respond, joints are stuck or disturbed."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.journal import JournalEvent
+from coordinator.kinematics.topology_advice import NextMotion
+from coordinator.plan import Plan
+from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
+from coordinator.session import NobodyThere, Session
+from coordinator.topology_search import TopologyFound, doubtful_motions, search_topology
+from module_agent.firmware.config import config_of
+from module_agent.wire.keys import Leaf, parse
+from sim.experiments.random_robots import PLAN, topology_trial
+from sim.virtual_network import VirtualEndpoint
+
+# yaw - lift - elbow (reversed) - wrist: the first axis is vertical, so that nothing falls when it lets go.
+ARM = """
+name = "four"
+[[module]]
+serial = "yaw"
+type = "X5-9"
+parent = "base"
+[[module]]
+serial = "lift"
+type = "X5-9"
+parent = "yaw"
+link = { bracket = "HeavyRightOutside" }
+[[module]]
+serial = "elbow"
+type = "X5-4"
+parent = "lift"
+mounted = "reversed"
+link = { tube = { length_m = 0.15, twist_rad = 0.5 } }
+[[module]]
+serial = "wrist"
+type = "X5-1"
+parent = "elbow"
+link = { bracket = "X5LightRight" }
+"""
+Rigs = Callable[..., Any]
+
+
+@pytest.fixture
+def arm(rigs: Rigs, tmp_path: Path) -> Any:
+    (tmp_path / "four.toml").write_text(ARM)
+    return rigs(str(tmp_path / "four.toml"), "lan", 5, noise="x5-uncalibrated")
+
+
+class Watcher:
+    """A reporter of a session that keeps what it is told, and lets others hear of its steps."""
+
+    def __init__(self, recording: Recording, on_step: Callable[[str], None]):
+        self.recording = recording
+        self.notes: list[str] = []
+        self._on_step = on_step
+
+    def step(self, index: int, total: int, text: str) -> None:
+        assert index <= total
+        self._on_step(text)
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def estimates(self, joint: str) -> None:
+        """Nothing is drawn."""
+
+    async def doubts(self) -> Sequence[NextMotion]:
+        return doubtful_motions(self.recording)
+
+    async def explored(self) -> None:
+        """What follows is computed afterwards."""
+
+    def journal(self, event: JournalEvent) -> None:
+        self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
+
+
+def explore(
+    rig: Any, plan: Plan = PLAN, on_step: Callable[[str], None] = lambda text: None
+) -> tuple[Recording, Watcher]:
+    radio, recording, link = rig.link("coordinator")
+    watcher = Watcher(recording, on_step)
+    rig.run(Session(link, radio, recording, plan, lambda: rig.loop.now_ns, watcher.journal, watcher).run())
+    radio.close()
+    return recording, watcher
+
+
+def rested(recording: Recording) -> list[str]:
+    return sorted({e.serial for e in recording.journal if e.purpose == "rest"})
+
+
+def edges(found: TopologyFound) -> dict[str, tuple[str, bool]]:
+    topology = found.topology
+    names = (*topology.serials, "base")
+    columns = zip(topology.serials, topology.parent, topology.reversed, strict=True)
+    return {serial: (names[p], turned) for serial, p, turned in columns}
+
+
+WHOLE = {"yaw": ("base", False), "lift": ("yaw", False), "elbow": ("lift", True), "wrist": ("elbow", False)}
+
+
+def test_an_arm_that_nothing_disturbs_is_found_without_a_doubt(arm: Any) -> None:
+    recording, watcher = explore(arm)
+    found = search_topology(recording, arm.serials)
+    assert edges(found) == WHOLE
+    assert found.topology.doubts == ()
+    assert found.topology.confidence > 0.99
+    assert not any("again" in note for note in watcher.notes)
+
+
+def test_what_a_joint_with_a_dead_motor_carries_shows_on_what_carries_it(arm: Any) -> None:
+    index = arm.serials.index("yaw")
+    arm.watchers.append(lambda: arm.pwm.__setitem__(index, 0.0))
+    found = search_topology(explore(arm)[0], arm.serials)
+    assert found.topology.unmoved == ("yaw",)
+    assert edges(found) == WHOLE | {"lift": ("base", False)}
+    assert any(note.startswith("joint yaw did not move") for note in found.notes)
+
+
+def test_a_push_while_a_joint_moves_is_a_doubt_that_another_motion_settles(arm: Any) -> None:
+    """Somebody turns the arm's first joint while the wrist makes its slow motion: all IMUs turn along."""
+    yaw, until_s = arm.serials.index("yaw"), [0.0]
+
+    def listen(text: str) -> None:
+        if text == "exploring joint wrist":
+            until_s[0] = arm.loop.time() + 2.0
+
+    def push() -> None:
+        if arm.loop.time() < until_s[0]:
+            arm.pwm[yaw] = 0.6
+
+    arm.watchers.append(push)
+    recording, watcher = explore(arm, on_step=listen)
+    found = search_topology(recording, arm.serials)
+    assert edges(found) == WHOLE
+    assert any(e.what == "done" and e.step == "settle/0/wrist" for e in recording.journal)
+    assert any("joint wrist moves" in note and "sure" not in note for note in watcher.notes)
+
+
+@pytest.mark.parametrize(("gone", "left"), [("wrist", {}), ("elbow", {"wrist": ("lift", False)})])
+def test_a_module_that_does_not_answer_is_left_out_and_all_else_is_right(
+    arm: Any, gone: str, left: dict[str, tuple[str, bool]]
+) -> None:
+    arm.run(asyncio.sleep(0.2))
+    arm.freeze(gone)
+    recording, watcher = explore(arm)
+    found = search_topology(recording, rested(recording))
+    assert edges(found) == {s: on for s, on in (WHOLE | left).items() if s != gone}
+    assert any(f"going on without {gone}" in note for note in watcher.notes)
+    assert any(note.startswith(f"{gone} took no part") for note in found.notes)
+
+
+def test_a_module_that_sends_no_feedback_is_left_out_by_name(
+    arm: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publish = VirtualEndpoint.publish
+
+    def mute(self: VirtualEndpoint, key: str, payload: bytes) -> None:
+        if parse(key)[1:] != ("wrist", Leaf.FEEDBACK):
+            publish(self, key, payload)
+
+    monkeypatch.setattr(VirtualEndpoint, "publish", mute)
+    recording, watcher = explore(arm)
+    assert edges(search_topology(recording, rested(recording))) == {s: WHOLE[s] for s in arm.serials[:3]}
+    assert any("module wrist answers, but sends no feedback" in note for note in watcher.notes)
+
+
+def test_a_joint_whose_limits_forbid_the_motion_is_named_and_all_else_is_explored(arm: Any) -> None:
+    module = arm.world.modules[arm.serials.index("elbow")]
+    limits = config_of(module, 1).limits
+    narrow = limits.model_copy(update={"min_position_rad": -0.1, "max_position_rad": 0.1})
+    arm.kill("elbow")
+    arm.boot("elbow", limits=narrow)
+    recording, watcher = explore(arm)
+    found = search_topology(recording, rested(recording))
+    assert found.topology.unmoved == ("elbow",)
+    assert edges(found) == WHOLE | {"elbow": ("lift", False), "wrist": ("lift", False)}
+    assert any("going on without elbow" in note for note in watcher.notes)
+
+
+def test_where_no_module_responds_the_session_says_so(arm: Any) -> None:
+    arm.run(asyncio.sleep(0.2))
+    for serial in arm.serials:
+        arm.freeze(serial)
+    with pytest.raises(NobodyThere, match="none of the modules that announced themselves responds"):
+        explore(arm)
+
+
+def test_a_random_robot_finds_out_how_it_is_built() -> None:
+    found = topology_trial(14)
+    assert found.modules == 5
+    assert found.differences == ()
+    assert found.confidence > 0.99
