@@ -1,6 +1,7 @@
 """`x5-coordinator`: identify a robot, replay a recording, list, stop, picture."""
 
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +15,8 @@ from coordinator.failure import EXIT_FAILED, EXIT_USAGE
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
+from coordinator.known_robot import KnownRobotError, known_within
+from coordinator.known_update import updated
 from coordinator.plan import Mode
 from coordinator.recording import Recording
 from coordinator.result import Result
@@ -69,6 +72,10 @@ def run(
     mode: Annotated[
         Mode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
     ] = None,
+    known: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a former run of this robot: only what is other is looked at closely."),
+    ] = None,
     viewer: Annotated[
         str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
     ] = "none",
@@ -102,6 +109,7 @@ def run(
         spawn_viewer=shown.spawn,
         connect_viewer=shown.connect,
         serve_viewer=serve_port if shown.serve else None,
+        known=known,
     )
     advice = f"to go on: {resuming(context)}" if advise else ""
     with Terminal(quiet) as terminal:
@@ -155,8 +163,9 @@ def replay(
     folder = out if out is not None else session.parent
     try:
         recording: Recording = load_recording(session)
-        found = identify(recording)
-    except (SessionFileError, IdentificationError, UnknownModuleType) as error:
+        before = known_within(session.parent)
+        found = identify(recording, partial(updated, before) if before is not None else None)
+    except (SessionFileError, IdentificationError, UnknownModuleType, KnownRobotError) as error:
         fail(error, EXIT_FAILED)
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, found)

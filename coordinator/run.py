@@ -84,7 +84,7 @@ class Run:
         beside: Beside | None = None,
     ):
         # Before anything is made of the new folder.
-        before = load_known(config.known) if config.known is not None else None
+        before = load_known(config.known) if config.known is not None and not config.resume else None
         crashed = open_run_folder(config.out, config.resume, config.robot)
         if before is not None:
             keep_known(before, config.out)
