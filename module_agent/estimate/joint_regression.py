@@ -38,7 +38,7 @@ from module_agent.estimate.joint_prior import (
     beliefs,
 )
 from module_agent.estimate.seen_motion import SeenMotion
-from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED
+from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED, white_ratio
 from module_agent.estimate.windows import Array
 from module_agent.wire.messages import RegressionEstimate, Vector3
 
@@ -108,7 +108,10 @@ class _State(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """One motion and the readings of it (n, 6), gyro first, at times since the joint's first sample."""
+    """One motion and the readings of it (n, 6), gyro first, at times since the joint's first sample.
+
+    white: the variance of white noise in a sample of the IMU over that of `_slow` residuals.
+    """
 
     motion: Motion
     readings: Array
@@ -126,10 +129,23 @@ class _Problem(NamedTuple):
 
 
 class _Optimum(NamedTuple):
-    """Where the fit ended: the normal matrix J^T W J there, and the noise of one sample, gyro's first."""
+    """Where the fit ended, the covariance of the parameters, and the noise of one sample, gyro's first."""
 
     state: _State
+    covariance: Array
+    noise: Array
+
+
+class _Equations(NamedTuple):
+    """Normal equations J^T W J and J^T W e, and what the residuals show.
+
+    scatter: J^T W V W J with V the residuals' own squares: J^T W J where the noise is what W takes it for.
+    noise: (2,) of one sample, gyro's first.
+    """
+
     normal: Array
+    gradient: Array
+    scatter: Array
     noise: Array
 
 
@@ -143,7 +159,7 @@ def regress_joint(
     """
     problem, guess = _problem(motions, rest, knowledge)
     best = _minimise(problem, guess)
-    return _result(best, _inverse(best.normal), problem)
+    return _result(best, problem)
 
 
 def distance_bound_m(
@@ -163,23 +179,25 @@ def distance_bound_m(
     """
     problem, guess = _problem(motions, rest, knowledge)
     best = _minimise(problem, guess)
-    normal, _, _ = _normal_equations(problem, best.state, np.array(noise))
+    normal = _equations(problem, best.state, np.array(noise)).normal
     known = np.arange(len(normal)) != HINGE
     covariance = np.zeros_like(normal)
     covariance[np.ix_(known, known)] = _inverse(normal[np.ix_(known, known)])
-    return _result(best, covariance, problem._replace(untold_m=0.0)).sigma_distance_m
+    bound = _result(best._replace(covariance=covariance), problem._replace(untold_m=0.0))
+    return bound.sigma_distance_m
 
 
 def _minimise(problem: _Problem, state: _State) -> _Optimum:
     noise = np.array([1e-3, 2e-2])
     for _ in range(ITERATIONS):
-        normal, gradient, noise = _normal_equations(problem, state, noise)
-        step = np.asarray(np.linalg.solve(normal, gradient), dtype=np.float64)
-        state = _moved(state, step)
-        if np.all(np.abs(step) <= SETTLED / np.sqrt(np.diag(normal))):
+        at = _equations(problem, state, noise)
+        step = np.asarray(np.linalg.solve(at.normal, at.gradient), dtype=np.float64)
+        state, noise = _moved(state, step), at.noise
+        if np.all(np.abs(step) <= SETTLED / np.sqrt(np.diag(at.normal))):
             break
-    normal, _, noise = _normal_equations(problem, state, noise)
-    return _Optimum(state, normal, noise)
+    end = _equations(problem, state, noise)
+    inverse = _inverse(end.normal)
+    return _Optimum(state, inverse @ end.scatter @ inverse, end.noise)
 
 
 def _inverse(normal: Array) -> Array:
@@ -221,7 +239,9 @@ def _rows(seen: SeenMotion) -> _Rows:
     if inside.size < 20:
         raise ValueError(f"{inside.size} IMU samples fall into the joint's motion: at least 20 are needed")
     readings = np.hstack([seen.imu.gyro_rad_s[inside], seen.imu.accel_m_s2[inside]])
-    return _Rows(Motion(seen.joint, None), readings, t_s[inside], seen.imu.white)
+    step_s = 1e-9 * float(seen.imu.t_ns[-1] - seen.imu.t_ns[0]) / (seen.imu.t_ns.size - 1)
+    white = white_ratio(seen.imu.t_ns, float(np.hypot(seen.imu.smooth_s, STRIDE * step_s)))
+    return _Rows(Motion(seen.joint, None), readings, t_s[inside], white)
 
 
 def _first_guess(rows: Sequence[_Rows], known: Beliefs) -> _State:
@@ -260,13 +280,14 @@ def _frame(axis: Array) -> Array:
 # ---------------------------------------------------------------------- the model
 
 
-def _normal_equations(problem: _Problem, state: _State, noise: Array) -> tuple[Array, Array, Array]:
-    """Return J^T W J, J^T W e, and the noise of one sample (gyro, accel) that the residuals show."""
+def _equations(problem: _Problem, state: _State, noise: Array) -> _Equations:
+    """Set up the normal equations at a state, for noise of one sample (gyro, accel)."""
     normal = np.diag(problem.beliefs.weight)
     gradient = problem.beliefs.weight * (problem.beliefs.mean - state.values)
     _add_gravity(normal, gradient, state)
     if problem.rest is not None:
         _add_rest(normal, gradient, problem.rest, state)
+    scatter = normal.copy()
     power, count = np.zeros(2), 0
     for i, row in enumerate(problem.rows):
         predicted, slopes = predict(row.motion, row.t_s, state.values, DELAY + i)
@@ -274,12 +295,28 @@ def _normal_equations(problem: _Problem, state: _State, noise: Array) -> tuple[A
         for sensor in range(2):
             part = slice(3 * sensor, 3 * sensor + 3)
             weight = STRIDE / noise[sensor] ** 2
-            jacobian, error = slopes[:, part].reshape(-1, slopes.shape[2]), residual[:, part].ravel()
-            normal += weight * jacobian.T @ jacobian
-            gradient += weight * jacobian.T @ error
-            power[sensor] += row.white * float(error @ error)
-        count += residual.size // 2
-    return normal, gradient, np.asarray(np.sqrt(power / count))
+            jacobian = slopes[:, part]
+            flat = jacobian.reshape(-1, jacobian.shape[2])
+            square = row.white * np.mean(_slow(residual[:, part]) ** 2, axis=1)
+            normal += weight * flat.T @ flat
+            gradient += weight * flat.T @ residual[:, part].ravel()
+            uneven = (jacobian * (square / noise[sensor] ** 2)[:, None, None]).reshape(flat.shape)
+            scatter += weight * uneven.T @ flat
+            power[sensor] += float(square.sum())
+        count += len(residual)
+    return _Equations(normal, gradient, scatter, np.asarray(np.sqrt(power / count)))
+
+
+def _slow(residual: Array) -> Array:
+    """Return residuals (n, k) behind a low-pass that takes no motion away, and most of what is faster.
+
+    What counts is the residuals' power where the motion has its own; beyond are rounded encoder counts and
+    links that ring. The binomial of four has the spread of one step, so the whole is nearly a Gaussian.
+    """
+    padded = np.pad(residual, ((2, 2), (0, 0)), mode="reflect")
+    return np.asarray(
+        (padded[:-4] + 4.0 * padded[1:-3] + 6.0 * padded[2:-2] + 4.0 * padded[3:-1] + padded[4:]) / 16.0
+    )
 
 
 def _add_gravity(normal: Array, gradient: Array, state: _State) -> None:
@@ -314,7 +351,7 @@ def _moved(state: _State, step: Array) -> _State:
     return _State(state.frame @ Rotation.from_rotvec(turn).as_matrix(), values)
 
 
-def _result(best: _Optimum, covariance: Array, problem: _Problem) -> JointRegression:
+def _result(best: _Optimum, problem: _Problem) -> JointRegression:
     p, frame = best.state.values, best.state.frame
     r1, r2 = p[RADIAL]
     distance = float(np.hypot(r1, r2))
@@ -323,7 +360,7 @@ def _result(best: _Optimum, covariance: Array, problem: _Problem) -> JointRegres
     gain[:3, :2] = np.stack([-frame[:, 1], frame[:, 0]], axis=1)
     gain[3:, :2] = np.outer(frame[:, 2], [r2, -r1])
     gain[3:, RADIAL] = frame[:, :2]
-    six = gain @ covariance @ gain.T
+    six = gain @ best.covariance @ gain.T
     six[3:, 3:] += problem.untold_m**2 * frame[:, :2] @ frame[:, :2].T
     radial = frame[:, :2] @ p[RADIAL]
     along = radial / max(distance, 1e-6)

@@ -30,15 +30,12 @@ COSINE, SINE, SQUARED = 6, 7, 8
 
 
 class SmoothImu(NamedTuple):
-    """IMU samples behind the low-pass: `t_ns` (n,), gyro and accelerometer (n, 3); `white` scales noise.
-
-    white: variance of white noise in a sample before the filter over that after it.
-    """
+    """IMU samples behind the low-pass of `smooth_s`: `t_ns` (n,), gyro and accelerometer (n, 3)."""
 
     t_ns: Times
     gyro_rad_s: Array
     accel_m_s2: Array
-    white: float
+    smooth_s: float
 
 
 class SmoothMotion:
@@ -83,13 +80,13 @@ def smooth_imu(imu: ImuWindow, smooth_s: float = SMOOTH_S) -> SmoothImu:
     """
     t_ns, gyro = low_passed(imu.t_ns, imu.gyro_rad_s, smooth_s)
     _, accel = low_passed(imu.t_ns, imu.accel_m_s2, smooth_s)
-    return SmoothImu(t_ns, gyro, accel, white_ratio(imu.t_ns, smooth_s))
+    return SmoothImu(t_ns, gyro, accel, smooth_s)
 
 
-def white_ratio(t_ns: Times, smooth_s: float, order: int = 0) -> float:
+def white_ratio(t_ns: Times, smooth_s: float) -> float:
     """Return the variance of white noise in one of evenly spaced samples over that behind the filter."""
     step_s = 1e-9 * float(t_ns[-1] - t_ns[0]) / (t_ns.size - 1)
-    weights = derivative_kernel(step_s, smooth_s, order)
+    weights = derivative_kernel(step_s, smooth_s, 0)
     return 1.0 / float(weights @ weights)
 
 

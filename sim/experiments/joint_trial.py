@@ -1,15 +1,16 @@
 """One trial on the thesis' one-joint arm, and what the thesis' estimator, ours and the bound say of it."""
 
-from math import acos, degrees
+from math import acos, degrees, pi
 from typing import NamedTuple
 
 import numpy as np
 
 from coordinator.plan import Plan
+from module_agent.estimate.joint_prior import CALIBRATED
 from sim.chain_score import link_length_m
 from sim.experiments.joint_bound import bound_m, imu_knowledge
 from sim.experiments.one_joint_rig import IMU, JOINT, OneJointRig, TrialRows, analyse, regress
-from sim.experiments.thesis_lengths import Alignment, thesis_length
+from sim.experiments.thesis_lengths import Alignment, ThesisLength, thesis_length
 from sim.noise_profile import NoiseProfile, noise_profile
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
@@ -33,6 +34,18 @@ class JointTrial(NamedTuple):
     robot_time_s: float
 
 
+def trial_plan(arm: ThesisLength, profile: NoiseProfile) -> Plan:
+    """Return the thesis' motions for an arm, at the amplitude that it chose.
+
+    An IMU that is not calibrated is calibrated by gravity, if the slow motion lets gravity change along the
+    tangent of the IMU's circle: an arm about a horizontal axis then swings about where it hangs, and not
+    about the horizontal, where +-0.5 rad change that pull by a tenth. It hangs at -pi/2 (thesis_*.toml).
+    """
+    delivered = imu_knowledge(profile) != CALIBRATED
+    home_rad = -0.5 * pi if delivered and arm.alignment == "vertical" else 0.0
+    return Plan(sine_amplitude_rad=arm.amplitude_rad, home_rad=home_rad)
+
+
 def joint_trial(
     length_mm: int, alignment: Alignment, noise: str | NoiseProfile, seed: int, plan: Plan | None = None
 ) -> JointTrial:
@@ -42,7 +55,7 @@ def joint_trial(
         length_mm, alignment: one of the thesis' eight arms (`thesis_lengths`).
         noise: profile, by name or as `switched` makes it.
         seed: of the rig's modules and their noise.
-        plan: the motions; those of the thesis, at the amplitude that it chose for the arm, when None.
+        plan: the motions; those of `trial_plan` when None.
 
     Raises:
         KeyError: the thesis had no such arm, or there is no such profile.
@@ -50,8 +63,7 @@ def joint_trial(
         ValueError: too little motion, with what would be enough.
     """
     profile = noise_profile(noise) if isinstance(noise, str) else noise
-    amplitude = thesis_length(alignment, length_mm).amplitude_rad
-    wanted = plan if plan is not None else Plan(sine_amplitude_rad=amplitude)
+    wanted = plan if plan is not None else trial_plan(thesis_length(alignment, length_mm), profile)
     with OneJointRig(load_robot(f"thesis_{length_mm}_{alignment}"), seed, profile) as rig:
         rows = rig.trial(wanted)
         return judge(rig, rows, profile)
