@@ -13,6 +13,7 @@ import numpy as np
 
 from coordinator.chain import Array
 from coordinator.clock_map import ClockMap, map_clocks
+from coordinator.clock_refinement import refine_clocks
 from coordinator.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
 from coordinator.dynamics.identification import InertialFit, solve_pseudo_inverse
 from coordinator.dynamics.prediction import TorqueError, torque_error
@@ -141,6 +142,8 @@ def identify_kinematics(recording: Recording) -> Kinematics:
             _pairs(recording, clocks, topology.serials, windows),
             [_rest(recording, topology.serials)],
         )
+        clocks |= refine_clocks(first.chain, clocks, windows).clocks
+        windows = _exploration(recording, clocks, topology.serials)
         prior = _imu_prior(recording)
         floor = _base_floor(recording, clocks, topology)
         refined = refine_robot(first.chain, types, windows, prior, floor)
