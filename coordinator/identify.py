@@ -29,15 +29,15 @@ from coordinator.kinematics.chain_observations import (
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement
-from coordinator.kinematics.topology import Topology, TopologyError, find_topology
-from coordinator.kinematics.whole_motion import circles_of_all, seen_by_all
+from coordinator.kinematics.topology import Topology, TopologyError
+from coordinator.kinematics.whole_motion import circles_of_all
 from coordinator.left_out import left_out
 from coordinator.motion_window import RATE_HZ, Window, noise_floor, window
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.result_parts import build_result
 from coordinator.robot_refinement import CUTOFF_HZ, refine_robot
-from coordinator.topology_search import TopologyFound, search_topology
+from coordinator.topology_search import search_topology
 from coordinator.whole_exploration import respond, whole_motion
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.wire.messages import Estimate
@@ -82,7 +82,6 @@ class Kinematics(NamedTuple):
         for k, serial in enumerate(self.topology.serials):
             parent = self.topology.parent[k]
             mounted = ", mounted reversed" if self.topology.reversed[k] else ""
-            mounted += self.topology.caveat(k)
             mounted += self.topology.caveat(k)
             if parent < 0:
                 lines.append(f"{serial} on the base{mounted}")
@@ -132,7 +131,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     serials = _explored(recording)
     try:
         clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
-        found = _topology(recording, clocks, serials)
+        found = search_topology(recording, serials)
         topology = found.topology
         types = [_type(recording, s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
@@ -229,15 +228,6 @@ def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose)
         if ids[-1] == number:
             return estimate
     return None
-
-
-def _topology(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> TopologyFound:
-    """Find who is mounted on whom, by the slow motions or by that of all joints at once."""
-    whole = whole_motion(recording, serials)
-    if whole is None:
-        return search_topology(recording, serials)
-    response = respond(recording, clocks, serials, whole)
-    return TopologyFound(find_topology(seen_by_all(serials, response)), ())
 
 
 def _pairs(

@@ -3,17 +3,21 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from coordinator.clock_map import map_clocks
 from coordinator.kinematics.topology import (
     MotionSeen,
     Topology,
     TopologyError,
     find_topology,
     likely_topology,
+    seen_again,
 )
 from coordinator.kinematics.topology_advice import NextMotion, next_motions
+from coordinator.kinematics.whole_motion import seen_by_all
 from coordinator.left_out import left_out
 from coordinator.recording import Recording
 from coordinator.topology_observations import Seen, observe, slow_motions
+from coordinator.whole_exploration import respond, whole_motion
 
 
 class TopologyFound(NamedTuple):
@@ -26,12 +30,13 @@ class TopologyFound(NamedTuple):
 def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFound:
     """Find the topology of these modules by their slow motions.
 
-    A module that saw nothing is left out; one whose joint did not move is part of it, as a leaf.
+    Of all joints moved at once, that motion counts along. A module that saw nothing is left out; one whose
+    joint did not move is part of it, as a leaf.
 
     Raises:
         TopologyError: what was seen contradicts itself or leaves open how a module is mounted.
     """
-    seen = observe(recording, serials)
+    seen = _seen(recording, serials)
     if not seen.observations:
         raise TopologyError(_nothing_seen(seen), tuple(serials))
     topology = find_topology(*_usable(seen))
@@ -41,20 +46,31 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
 
 def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
     """Return what to move next to settle doubts about the topology, nothing if there are none left."""
-    motions = [e for e in recording.journal if e.what == "motion"]
-    if any(e.purpose == "whole" for e in motions):
-        return ()  # a slow motion beside that of all joints at once would stand in its place
-    serials = sorted({e.serial for e in motions if e.purpose == "rest"})
-    seen = observe(recording, serials)
-    if not seen.observations:
-        return ()
-    observations, unmoved = _usable(seen)
+    serials = sorted({e.serial for e in recording.journal if e.what == "motion" and e.purpose == "rest"})
     try:
+        observations, unmoved = _usable(_seen(recording, serials))
         doubts = likely_topology(observations, unmoved).doubts
-    except TopologyError:
-        return ()
-    repeated = {s: len(slow_motions(recording, s)) - 1 for s in serials}
+    except ValueError:
+        return ()  # nothing to go by; whoever assembles the robot next says what is missing
+    first = 0 if whole_motion(recording, serials) is not None else 1
+    repeated = {s: len(slow_motions(recording, s)) - first for s in serials}
     return next_motions(doubts, observations, repeated)
+
+
+def _seen(recording: Recording, serials: Sequence[str]) -> Seen:
+    """Return what the slow motions say, and the motion of all joints at once, put together.
+
+    Raises:
+        ValueError: the motion of all joints cannot be evaluated; see `whole_exploration.respond`.
+    """
+    slow, whole = observe(recording, serials), whole_motion(recording, serials)
+    if whole is None:
+        return slow
+    clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
+    found = dict(seen_by_all(serials, respond(recording, clocks, serials, whole)))
+    for pair, seen in slow.observations.items():
+        found[pair] = seen_again([found[pair], seen])
+    return Seen(found, {}, ())
 
 
 def _usable(seen: Seen) -> tuple[dict[tuple[str, str], MotionSeen], list[str]]:
