@@ -1,0 +1,153 @@
+"""A module is added, taken off or swapped: only what is other is measured again, the rest is kept."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from coordinator.chain import Chain
+from coordinator.known_robot import KNOWN, KnownRobot, load_known
+from coordinator.main import app
+from coordinator.plan import Plan
+from coordinator.run_folder import RESULT
+from sim.robot_file import Robot, load_robot
+from sim.score import score
+from sim.virtual_run import VirtualConfig, run_virtual
+from tests.conftest import Notes
+
+ARM = "a2085_03"
+
+
+class Updated(NamedTuple):
+    """A robot brought up to date: as it was known, as it is, and what was said."""
+
+    known: KnownRobot
+    found: KnownRobot
+    notes: list[str]
+
+
+Bring = Callable[[Robot, Robot], Updated]
+
+
+@pytest.fixture(scope="module")
+def bring(tmp_path_factory: pytest.TempPathFactory) -> Bring:
+    """Let a robot be known, and bring it up to date another day."""
+    known: dict[tuple[str, ...], Path] = {}
+    done: dict[tuple[tuple[str, ...], ...], Updated] = {}
+    short = Plan(dynamics=False, sine_centre_s=1.2, sine_sigma_s=0.5, settle_s=0.3, whole_duration_s=6.0)
+
+    def run(robot: Robot, out: Path, day: int, before: Path | None = None) -> list[str]:
+        notes = Notes()
+        run_virtual(VirtualConfig(robot, out, 3, noise_seed=day, noise="x5", plan=short, known=before), notes)
+        return notes.lines
+
+    def make(before: Robot, after: Robot) -> Updated:
+        case = before.serials, after.serials
+        if case in done:
+            return done[case]
+        folder = tmp_path_factory.mktemp("plug")
+        if before.serials not in known:
+            known[before.serials] = folder / "known"
+            run(before, folder / "known", 0)
+        lines = run(after, folder / "new", 1, known[before.serials])
+        done[case] = Updated(load_known(known[before.serials]), load_known(folder / "new"), lines)
+        return done[case]
+
+    return make
+
+
+def _without_last(robot: Robot) -> Robot:
+    return robot.model_copy(update={"modules": robot.modules[:-1]})
+
+
+def _swapped(robot: Robot, k: int) -> Robot:
+    """Another module of the same type in one place."""
+    names = {robot.serials[k]: "spare"}
+    modules = tuple(
+        m.model_copy(
+            update={"serial": names.get(m.serial, m.serial), "parent": names.get(m.parent, m.parent)}
+        )
+        for m in robot.modules
+    )
+    return robot.model_copy(update={"modules": modules})
+
+
+def _explored(lines: list[str]) -> list[str]:
+    """Return the joints that were moved by themselves."""
+    return [line.rsplit(" ", 1)[-1] for line in lines if "exploring joint " in line]
+
+
+def _seen_from(chain: Chain, first: str, serial: str) -> np.ndarray:
+    a, b = (chain.imu_home[chain.serials.index(s)] for s in (first, serial))
+    return np.asarray(np.linalg.inv(a) @ b)
+
+
+def test_a_module_that_was_added_is_measured_and_the_others_are_kept(bring: Bring) -> None:
+    robot = load_robot(ARM)
+    first, second, last = robot.serials
+    done = bring(_without_last(robot), robot)
+    assert _explored(done.notes) == [first, second]
+    assert f"module {last} is new" in done.notes
+    found = score(done.found.folder)
+    assert found.topology_correct
+    kept = (_seen_from(run.chain, first, second) for run in (done.known, done.found))
+    assert np.allclose(next(kept), next(kept), atol=1e-9)
+    # The new link's own error is that of any short exploration: 0.3 % of 0.33 m, and its claim covers it.
+    (link,) = [one for one in found.links if one.child == last]
+    assert link.link_length_error_mm is not None
+    assert link.link_length_sigma_mm is not None
+    assert abs(link.link_length_error_mm) < max(3.0 * link.link_length_sigma_mm, 1.0)
+    assert link.link_length_sigma_mm < 10.0
+
+
+def test_a_module_that_was_taken_off_moves_nothing_but_a_glance(bring: Bring) -> None:
+    robot = load_robot(ARM)
+    done = bring(robot, _without_last(robot))
+    assert _explored(done.notes) == []
+    assert f"module {robot.serials[-1]} is gone" in done.notes
+    assert done.found.chain.serials == robot.serials[:-1]
+    kept = (_seen_from(run.chain, *robot.serials[:2]) for run in (done.known, done.found))
+    assert np.allclose(next(kept), next(kept), atol=1e-9)
+    assert score(done.found.folder).topology_correct
+
+
+def test_of_a_module_that_was_swapped_only_its_own_links_are_measured_again(bring: Bring) -> None:
+    robot = load_robot(ARM)
+    done = bring(robot, _swapped(robot, 1))
+    assert _explored(done.notes) == [robot.serials[0], "spare"]
+    assert {f"module {robot.serials[1]} is gone", "module spare is new"} <= set(done.notes)
+    found = score(done.found.folder)
+    assert found.topology_correct
+    for link in found.links:
+        assert link.link_length_error_mm is not None
+        assert link.link_length_sigma_mm is not None
+        assert abs(link.link_length_error_mm) < max(3.0 * link.link_length_sigma_mm, 1.0)
+
+
+def test_the_folder_tells_the_robot_by_itself_and_a_replay_the_same(bring: Bring, tmp_path: Path) -> None:
+    robot = load_robot(ARM)
+    done = bring(robot, _swapped(robot, 1))
+    assert (done.found.folder / KNOWN / "session.mcap").is_file()
+    again = CliRunner().invoke(
+        app, ["replay", str(done.found.folder / "session.mcap"), "--out", str(tmp_path)]
+    )
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / RESULT).read_text() == (done.found.folder / RESULT).read_text()
+
+
+def test_a_folder_that_holds_no_run_is_no_known_robot(tmp_path: Path) -> None:
+    arguments = [
+        "run",
+        "--out",
+        str(tmp_path / "new"),
+        "--listen",
+        "tcp/127.0.0.1:0",
+        "--known",
+        str(tmp_path),
+    ]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 2
+    assert not (tmp_path / "new").exists()
