@@ -4,7 +4,6 @@ The robot is recorded once, and checked on many days: the modules and their erro
 and network are another day's.
 """
 
-import tempfile
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -15,14 +14,16 @@ import numpy as np
 from coordinator.chain import Array, Chain
 from coordinator.check import check, check_plan
 from coordinator.check_report import CheckReport, LinkCheck
+from coordinator.identify import identify_kinematics
 from coordinator.kinematics.forward import BASE, ancestors
-from coordinator.known_robot import KnownRobot, load_known
+from coordinator.known_robot import KnownRobot
 from coordinator.plan import Plan
-from coordinator.terminal import Terminal
+from module_agent.wire.network_file import network as network_named
 from sim.parts import FreePose, Part
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import true_chain
-from sim.virtual_run import VirtualConfig, run_virtual
+from sim.virtual_robot import VirtualSettings
+from sim.virtual_session import record_session
 
 # Seeds that share a robot: it is recorded once for all of them in a process.
 DAYS = 20
@@ -83,9 +84,8 @@ def wear_trial(
     subject = _Subject(robot, noise, network, seed // DAYS)
     wear = draw_wear(load_robot(robot), seed, change_m) if changed else None
     known = _known(subject)
-    with tempfile.TemporaryDirectory() as folder:
-        later = _recorded(subject, Path(folder) / "run", 1 + seed % DAYS, check_plan(known, Plan()), wear)
-        return _trial(check(known, later), wear)
+    later = _recorded(subject, 1 + seed % DAYS, check_plan(known, Plan()), wear)
+    return _trial(check(known, later), wear)
 
 
 def worn(robot: Robot, wear: Wear) -> Robot:
@@ -132,23 +132,20 @@ def _hidden(chain: Chain, child: int) -> Array | None:
 
 @lru_cache(maxsize=1)
 def _known(subject: _Subject) -> KnownRobot:
-    with tempfile.TemporaryDirectory() as folder:
-        return _recorded(subject, Path(folder) / "known", 0, Plan(dynamics=False), None)
+    return _recorded(subject, 0, Plan(dynamics=False), None)
 
 
-def _recorded(subject: _Subject, out: Path, day: int, plan: Plan, wear: Wear | None) -> KnownRobot:
+def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> KnownRobot:
     robot = load_robot(subject.robot)
-    config = VirtualConfig(
+    settings = VirtualSettings(
         robot if wear is None else worn(robot, wear),
-        out,
-        seed=subject.seed,
+        network_named(subject.network),
+        subject.seed,
+        subject.noise,
         noise_seed=day,
-        noise=subject.noise,
-        network=subject.network,
-        plan=plan,
     )
-    run_virtual(config, Terminal(quiet=True))
-    return load_known(out)
+    recording = record_session(settings, plan)
+    return KnownRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
 
 
 def _trial(report: CheckReport, wear: Wear | None) -> WearTrial:
