@@ -294,6 +294,7 @@ def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[J
     """Return the motions that the chain is fitted to, of modules that take part in it."""
     # All joints at once are in the window of any of them.
     found = _motions(recording, "constant", "windowed_sine") + _motions(recording, "whole")[:1]
+    found += [e for e in recording.journal if e.what == "motion" and e.purpose == "repeat"]
     return [event for event in found if event.serial in serials]
 
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.wire.messages import MotionRecord
 
-Purpose = Literal["rest", "constant", "windowed_sine", "whole", "dynamic", "held_out", "other"]
+Purpose = Literal["rest", "constant", "windowed_sine", "repeat", "whole", "dynamic", "held_out", "other"]
 
 
 class JournalEvent(BaseModel):

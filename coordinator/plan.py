@@ -12,6 +12,7 @@ from module_agent.firmware.gains import default_gains
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
 Mode = Literal["joint", "whole"]
+Motions = Literal["thesis", "designed"]
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
 
 
@@ -26,6 +27,15 @@ class Plan(BaseModel):
 
     # One joint after the other, or all at once: sooner done, without the agents' own estimates.
     mode: Mode = "joint"
+    # The thesis' motions of every joint as below; or those designed for it (`motion_design`), and then one of
+    # all joints at once.
+    motions: Motions = "thesis"
+    # Of designed motions: how long exploring a joint may take, journeys included; by their number if not set,
+    # so that all of the session takes 10 s a joint.
+    joint_s: Seconds | None = None
+    # Of designed motions: fast ones are repeated until the sensors leave less than this of a radius open, by
+    # the information predicted of them, or until more would not help.
+    precision_mm: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
     # Of the motion of all joints at once; by their number if not set.
     whole_duration_s: Seconds | None = None
     discover_s: Seconds = 1.0

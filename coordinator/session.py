@@ -15,8 +15,7 @@ from coordinator.kinematics.topology_advice import MOST_REPEATS, NextMotion
 from coordinator.left_out import LeftOut, left_out_event
 from coordinator.link_check import check_link
 from coordinator.link_errors import MotionInterrupted
-from coordinator.motion_design.limits import joint_limits, likely_inertia_kg_m2
-from coordinator.motion_design.whole_robot import JointSetting, whole_patterns
+from coordinator.motion_choice import MotionChoice
 from coordinator.plan import Plan
 from coordinator.radio import Radio, Refused
 from coordinator.recording import Recording
@@ -84,6 +83,7 @@ class Session:
         self._clock = clock
         self._journal = journal
         self._reporter = reporter
+        self._choice = MotionChoice(plan, recording, lambda: self._left_out.movers(), link.kind)
         self._done = {e.step: e for e in recording.journal if e.what == "done"}
         self._index = 0
         self._total = 4
@@ -98,7 +98,7 @@ class Session:
         self._report("checking the link")
         await check_link(self.link, self._clock, self._plan.link_s, self._reporter.note)
         serials = self.link.serials
-        explorations = 1 if self._plan.mode == "whole" else len(serials)
+        explorations = 1 if self._plan.mode == "whole" else len(serials) + (self._plan.motions == "designed")
         self._total = 6 + explorations + (2 * len(serials) if self._plan.dynamics else 0)
         self._mend_after_restart()
         starts = {s: self._position(s) for s in serials}
@@ -113,6 +113,8 @@ class Session:
                 for serial in serials:
                     text = f"exploring joint {serial}"
                     await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
+                if self._plan.motions == "designed" and not self._plan.topology_only:
+                    await self._step("explore", "exploring all joints at once", self._explore_all)
             await self._settle_doubts()
             self._report("topology and chain")
             await self._reporter.explored()
@@ -277,22 +279,34 @@ class Session:
     async def _explore(self, serial: str) -> None:
         """Constant motion through home, then the windowed sine about home (thesis 4.3.1)."""
         plan, home = self._plan, self._plan.home_rad
-        constant = plan.constant()
+        constant = self._choice.slow(serial)
         travel = constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
         await self._go(serial, home - 0.5 * travel)
-        await self._observe(serial, constant, "constant")
+        slow = await self._observe(serial, constant, "constant")
         await self._go(serial, home)
         if plan.topology_only:
             return
-        await self._observe(serial, plan.sine(self.link.kind(serial)), "windowed_sine")
+        fast = await self._observe(serial, self._choice.fast(serial, slow), "windowed_sine")
         self._reporter.estimates(serial)
+        await self._repeat(serial, [slow, fast])
+
+    async def _repeat(self, serial: str, done: list[MotionRecord]) -> None:
+        """Repeat the fast motion, or another that tells more, until the radius is known as well as asked."""
+        while (more := self._choice.again(serial, done)) is not None:
+            done.append(await self._move(f"explore/{serial}", serial, more, "repeat"))
+        if self._plan.precision_mm is not None:
+            self._reporter.note(
+                f"joint {serial}: {len(done) - 2} repeats, {self._choice.predicted_mm(serial, done):.2f} mm "
+                f"of radius by the sensors, {self._plan.precision_mm:.2f} mm asked for"
+            )
 
     async def _look_closer(self) -> None:
         """Explore by itself every joint that a motion of all at once leaves open, if anybody says which."""
         closer = await self._closer() if self._closer is not None else ()
         self._total += len(closer)
         for serial in closer:
-            await self._step(f"explore/{serial}", f"exploring joint {serial}", self._explore, serial)
+            text = f"exploring joint {serial}"
+            await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
 
     async def _settle_doubts(self) -> None:
         """Move again what leaves the topology in doubt, until nothing does or trying has no end."""
@@ -323,29 +337,11 @@ class Session:
 
     async def _explore_all(self) -> None:
         """All joints about home at the same time, each at frequencies of its own (thesis 7.2)."""
-        kinds = {serial: self.link.kind(serial) for serial in self.link.serials}
-        inertia = likely_inertia_kg_m2(list(kinds.values()))
-        settings = {
-            serial: JointSetting(
-                joint_limits(kind, self._rest_torque_nm(serial), inertia), self._plan.home_rad
-            )
-            for serial, kind in kinds.items()
-        }
-        records = await self.link.run(whole_patterns(settings, self._plan.whole_duration_s))
+        records = await self.link.run(self._choice.whole())
         for serial, record in records.items():
             self._note_motion("explore", serial, record, "whole")
 
-    def _rest_torque_nm(self, serial: str) -> float:
-        """Return what a joint holds at home, as it did at rest."""
-        rests = [
-            e.motion
-            for e in self._recording.journal
-            if e.purpose == "rest" and e.serial == serial and e.motion
-        ]
-        rows = self._recording.rows(serial, rests[-1].start_row, rests[-1].end_row or 0)
-        return float(rows["effort_nm"].mean())
-
-    async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> None:
+    async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
         record = await self._move(f"explore/{serial}", serial, pattern, purpose)
         for observer in self.link.serials:
             found = await self.link.estimate(observer, serial, record.motion_id, ESTIMATE_WAIT_S)
@@ -353,6 +349,7 @@ class Session:
                 self._reporter.note(f"{observer} has no estimate of the {purpose} motion of {serial}")
             elif found.note:
                 self._reporter.note(f"{observer} on joint {serial}: {found.note}")
+        return record
 
     async def _excite(self, serial: str) -> None:
         pattern = self._plan.dynamic(self.link.kind(serial))

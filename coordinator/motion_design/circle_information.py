@@ -5,10 +5,10 @@ An IMU that a joint carries, with the joint's axis j and the radial vector r in 
     w = (I + E_w) j dq/dt + b_w
     f = (I + E_f) (R(j, -q) g + j x r d2q/dt2 - r (dq/dt)^2) + b_f,    both late by a delay,
 
-g the specific force of rest at q = 0 in its frame (thesis eqs 12 to 24, with the sensors' own errors). Unknown
-are r across the axis, the axis, g but for its size, and the errors of the IMU, which a prior knows in part. The
-covariance is the inverse of the information, sum of slopes^T slopes / sigma^2 and the prior: the Cramer-Rao
-bound. Joint angles count as known: encoders are far better than what they are compared with.
+g the specific force of rest at q = 0 in its frame (thesis eqs 12 to 24, with the sensors' own errors).
+Unknown are r across the axis, the axis, g but for its size, and the errors of the IMU, which a prior knows in
+part. The covariance is the inverse of the information, sum of slopes^T slopes / sigma^2 and the prior: the
+Cramer-Rao bound. Joint angles count as known: encoders are far better than what they are compared with.
 """
 
 from typing import NamedTuple

@@ -2,10 +2,11 @@
 
 Every candidate within the joint's limits and the time there is gets the variance of the radius that it
 leaves: that of the noise (`circle_information`), and the square of what links and bases that give add, which
-grows with the frequency's square whatever the amplitude. So slow and wide motions win, until noise takes over.
+grows with the frequency's square whatever the amplitude. So slow and wide motions win, until the noise takes
+over.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +25,9 @@ from module_agent.wire.messages import ConstantMotion, Pattern, WindowedSine
 # Before anything has moved, a link is taken to be as long as a kit's tube.
 LIKELY_RADIUS_M = 0.3
 GRAVITY_M_S2 = 9.81
-# Links and bases that give lengthen what a motion of frequency f shows by (f / f_g)^2: the simulated arms on
-# a post came out by 0.6 % too long at 1 Hz.
-GIVE_HZ = 13.0
+# Links and bases that give lengthen what a motion of frequency f shows by (f / f_g)^2: by 0.6 % at 1 Hz on
+# the simulated arms. The refinement leaves a tenth of that, where it has found how they give.
+GIVE_HZ = 40.0
 SWEEPS_RAD = (0.3, 0.45, 0.7, 1.0)
 FREQUENCIES_HZ = (0.6, 0.8, 1.0, 1.4, 2.0)
 # Nobody knows yet what a joint's motion may run into.
@@ -81,13 +82,16 @@ class JointMotions(NamedTuple):
         return float(np.hypot(self.sigma_m, self.give_m))
 
 
-def design_joint(task: JointTask) -> JointMotions:
-    """Return the motions that leave the radius least uncertain.
+def design_joint(task: JointTask, constant: ConstantMotion | None = None) -> JointMotions:
+    """Return the motions that leave the radius least uncertain; the slow one is `constant`, if it is given.
 
     Raises:
         ValueError: nothing fits into range, limits and time, with all three.
     """
-    found = [_judged(task, constant, sine) for constant, sine in _candidates(task)]
+    slow = [constant] if constant is not None else _sweeps(task)
+    found = [
+        _judged(task, one, sine) for one in slow for sine in _sines(task, task.budget_s - _other_s(task, one))
+    ]
     if not found:
         raise ValueError(
             f"no motion fits: {task.budget_s:.1f} s, {task.limits.room_rad(task.home_rad):.2f} rad to either "
@@ -96,7 +100,13 @@ def design_joint(task: JointTask) -> JointMotions:
     return min(found, key=lambda motions: motions.error_m)
 
 
-def predicted_sigma_m(task: JointTask, patterns: list[Pattern]) -> float:
+def next_sine(task: JointTask, done: Sequence[Pattern], lasting_s: float) -> WindowedSine | None:
+    """Return the fast motion that tells most beside those that are done; None if none fits."""
+    found = list(_sines(task, lasting_s))
+    return min(found, key=lambda sine: predicted_sigma_m(task, [*done, sine]), default=None)
+
+
+def predicted_sigma_m(task: JointTask, patterns: Sequence[Pattern]) -> float:
     """Return the sigma of the radius after all these motions, each begun at home or through it.
 
     Where on its circle gravity finds the IMU is not known: the mean variance of two places a quarter apart.
@@ -130,16 +140,13 @@ def _path(pattern: Pattern) -> JointPath:
     return JointPath(found.offset_rad - middle, found.velocity_rad_s, acceleration, RATE_HZ)
 
 
-def _candidates(task: JointTask) -> Iterator[tuple[ConstantMotion, WindowedSine]]:
-    for sweep in SWEEPS_RAD:
-        constant = _sweep(task, sweep)
-        if constant is None:
-            continue
-        left_s = task.budget_s - _other_s(task, constant)
-        for frequency_hz in FREQUENCIES_HZ:
-            sine = _sine(task, frequency_hz, min(left_s, LONGEST_SINE_S))
-            if sine is not None:
-                yield constant, sine
+def _sweeps(task: JointTask) -> list[ConstantMotion]:
+    return [one for sweep in SWEEPS_RAD if (one := _sweep(task, sweep)) is not None]
+
+
+def _sines(task: JointTask, lasting_s: float) -> list[WindowedSine]:
+    most_s = min(lasting_s, LONGEST_SINE_S)
+    return [one for f in FREQUENCIES_HZ if (one := _sine(task, f, most_s)) is not None]
 
 
 def _sweep(task: JointTask, sweep_rad: float) -> ConstantMotion | None:
