@@ -4,20 +4,21 @@ from collections.abc import Sequence
 from fnmatch import fnmatch
 from typing import NamedTuple
 
-from sim.benchmark.arms import arm_cases
+from sim.benchmark.arms import arm_cases, shortened_plan
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.joints import joint_cases
 from sim.benchmark.networks import network_cases
 from sim.benchmark.row import Row, coverage
 from sim.benchmark.topologies import topology_cases
 from sim.benchmark.wears import wear_cases
+from sim.noise_profile import noise_profile
 
 TRIALS = 13
 ALL = "all cases"
 
 
 class Effort(NamedTuple):
-    """How many trials there are of everything."""
+    """How many trials there are of everything; `shortened`: whether arms move less long than they may."""
 
     joints: int
     arms: int
@@ -25,9 +26,10 @@ class Effort(NamedTuple):
     networks: int
     changed: int
     unchanged: int
+    shortened: bool = False
 
 
-QUICK = Effort(joints=1, arms=1, robots=2, networks=1, changed=1, unchanged=1)
+QUICK = Effort(joints=1, arms=1, robots=1, networks=1, changed=1, unchanged=1, shortened=True)
 
 
 def full(trials: int = TRIALS) -> Effort:
@@ -37,11 +39,12 @@ def full(trials: int = TRIALS) -> Effort:
 
 def kinematic_cases(effort: Effort, seed: int) -> list[Case]:
     """Return all cases, in the order in which they are reported."""
+    plan = shortened_plan(noise_profile("x5")) if effort.shortened else None
     return [
         *joint_cases(effort.joints, seed),
-        *arm_cases(effort.arms, seed),
+        *arm_cases(effort.arms, seed, effort.shortened),
         *topology_cases(effort.robots, seed),
-        *network_cases(effort.networks, seed),
+        *network_cases(effort.networks, seed, plan),
         *wear_cases(effort.changed, effort.unchanged, seed),
     ]
 

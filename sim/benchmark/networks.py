@@ -3,30 +3,32 @@
 from collections.abc import Sequence
 from functools import partial
 
+from coordinator.plan import Plan
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
-from sim.benchmark.row import Row, coverage, for_few, ratio, rms, scaled
+from sim.benchmark.row import Row, count, coverage, for_few, ratio, rms, scaled
 from sim.experiments.network_trial import NetworkTrial, apart, network_trial
 from sim.noise_profile import noise_profile
 
+# Clocks are 50 ms and 100 ppm apart, see `network_trial.apart`.
 ROBOT = "a2085_04"
 PERFECT, POOR, BAD = "none", "wifi", "bad"
 OVER_PERFECT = 1.2
 _COST_S = 9.0
 
 
-def network_cases(trials: int, seed: int) -> list[Case]:
+def network_cases(trials: int, seed: int, plan: Plan | None = None) -> list[Case]:
     """Return `wifi` beside a perfect network on the same modules, and `bad` by itself."""
     noise = apart(noise_profile("x5"))
+    cost_s = _COST_S if plan is None else 0.5 * _COST_S
 
     def work(*networks: str) -> tuple[Trial, ...]:
         return tuple(
-            Trial(network_trial, (ROBOT, network, noise, trial_seed(seed, ROBOT, number)), _COST_S)
+            Trial(network_trial, (ROBOT, network, noise, trial_seed(seed, ROBOT, number), plan), cost_s)
             for number in range(trials)
             for network in networks
         )
 
-    pair = f"{ROBOT}, x5, clocks 50 ms and 100 ppm apart, {POOR}"
-    bad = f"{ROBOT}, x5, clocks 50 ms and 100 ppm apart, {BAD}"
+    pair, bad = (f"{ROBOT}, x5, clocks apart, {network}" for network in (POOR, BAD))
     return [
         Case(pair, work(PERFECT, POOR), partial(_pairs, pair)),
         Case(bad, work(BAD), partial(_bad, bad)),
@@ -71,8 +73,7 @@ def _right(trial: NetworkTrial) -> bool:
 
 
 def _wrong(case: str, trials: Sequence[NetworkTrial]) -> Row:
-    wrong = sum(not _right(trial) for trial in trials)
-    return Row(case, f"runs without the right topology, of {len(trials)}", None, float(wrong), None, 0.0)
+    return count(case, "runs without the right topology", [not _right(trial) for trial in trials])
 
 
 def _errors(trials: Sequence[NetworkTrial]) -> list[float]:
@@ -86,7 +87,7 @@ def _tips(trials: Sequence[NetworkTrial]) -> list[float | None]:
 def _ratio(
     case: str, of: str, trials: int, perfect: Sequence[float | None], poor: Sequence[float | None]
 ) -> Row:
-    figure = f"{of}, rms error over that on a perfect network"
+    figure = f"{of}, rms error over a perfect network's"
     return Row(case, figure, None, ratio(rms(poor), rms(perfect)), None, for_few(OVER_PERFECT, trials))
 
 

@@ -39,7 +39,10 @@ def kinematics(
     json_file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
     plot_file: Annotated[Path | None, typer.Option("--plot", help="Picture to write: PNG, SVG, PDF.")] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Every row with few trials, in about a minute on two cores.")
+        bool,
+        typer.Option(
+            "--quick", help="Every row, with few trials and shorter motions, in a minute on two cores."
+        ),
     ] = False,
     trials: Annotated[
         int | None,

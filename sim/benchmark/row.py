@@ -80,6 +80,11 @@ def scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else factor * value
 
 
+def count(case: str, figure: str, hits: Sequence[bool]) -> Row:
+    """Return how often something was so that must never be; of no cases there is nothing to tell."""
+    return Row(case, f"{figure}, of {len(hits)}", None, float(sum(hits)) if hits else None, None, 0.0)
+
+
 def for_few(limit: float | None, trials: int) -> float | None:
     """Return the bar of a mean or rms over fewer trials than it is meant for: wider, by what chance does.
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from sim.benchmark.case import Case, Summary, Trial
-from sim.benchmark.row import Row, largest
+from sim.benchmark.row import Row, count, largest
 from sim.experiments.random_robots import TopologyTrial, topology_trial
 
 NOISE = "x5-uncalibrated"
@@ -18,11 +18,11 @@ def topology_cases(robots: int, seed: int) -> list[Case]:
 
 def _summary(trials: Sequence[TopologyTrial]) -> Summary:
     case = f"random robots, {NOISE}"
-    wrong = sum(bool(trial.differences) for trial in trials)
+    wrong = [bool(trial.differences) for trial in trials]
     least = min((trial.confidence for trial in trials), default=None)
     return Summary(
         (
-            Row(case, f"wrong topology or mounting, of {len(trials)}", None, float(wrong), None, 0.0),
+            count(case, "wrong topology or mounting", wrong),
             Row(case, "least confidence of all", None, least),
             Row(case, "motions repeated for doubt, most", None, largest([float(t.repeats) for t in trials])),
         )

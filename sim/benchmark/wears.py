@@ -2,9 +2,10 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 from sim.benchmark.case import Case, Summary, Trial
-from sim.benchmark.row import Row, largest, scaled
+from sim.benchmark.row import Row, count, largest, scaled
 from sim.experiments.wear import DAYS, WearTrial, wear_trial
 
 ROBOT = "a2085_06"
@@ -14,49 +15,52 @@ CHECK_S = 60.0
 _KNOWN_COST_S, _CHECK_COST_S = 18.0, 10.0
 
 
+class Checks(NamedTuple):
+    """Checks of one robot, with a link changed and as it was."""
+
+    changed: tuple[WearTrial, ...]
+    unchanged: tuple[WearTrial, ...]
+
+
 def wear_cases(changed: int, unchanged: int, seed: int) -> list[Case]:
-    """Return the two cases; a robot is recorded once for the checks of all its days."""
-    worn = f"{ROBOT}, one link changed by {1e3 * CHANGE_M:.0f} mm"
-    same = f"{ROBOT}, unchanged"
-    return [
-        Case(worn, _work(seed, changed, True), partial(_changed, worn)),
-        Case(same, _work(seed, unchanged, False), partial(_unchanged, same)),
-    ]
-
-
-def wear_days(seeds: Sequence[int], changed: bool) -> list[WearTrial]:
-    """Check a robot on several days, one after the other in one process."""
-    return [wear_trial(seed, changed, ROBOT, change_m=CHANGE_M) for seed in seeds]
-
-
-def _work(seed: int, checks: int, changed: bool) -> tuple[Trial, ...]:
+    """Return the one case; each of its trials is about one robot, recorded once for all its checks."""
+    robots = max(-(-unchanged // DAYS), -(-changed // DAYS), 1)
     # Another thousand robots for another seed: no benchmark makes that many.
     first = 1000 * DAYS * seed
-    days = [range(first + begin, first + min(begin + DAYS, checks)) for begin in range(0, checks, DAYS)]
-    return tuple(
-        Trial(wear_days, (tuple(each), changed), _KNOWN_COST_S + _CHECK_COST_S * len(each)) for each in days
+    days = [range(first + DAYS * robot, first + DAYS * (robot + 1)) for robot in range(robots)]
+    work = []
+    for robot, own in enumerate(days):
+        worn, same = own[: _share(changed, robots, robot)], own[: _share(unchanged, robots, robot)]
+        cost_s = _KNOWN_COST_S + _CHECK_COST_S * (len(worn) + len(same))
+        work.append(Trial(checks_of_one_robot, (tuple(worn), tuple(same)), cost_s))
+    name = f"{ROBOT}, wear"
+    return [Case(name, tuple(work), partial(_summary, name))]
+
+
+def checks_of_one_robot(changed: Sequence[int], unchanged: Sequence[int]) -> Checks:
+    """Check a robot on several days, one after the other in one process; the arguments are seeds."""
+    return Checks(
+        tuple(wear_trial(seed, True, ROBOT, change_m=CHANGE_M) for seed in changed),
+        tuple(wear_trial(seed, False, ROBOT, change_m=CHANGE_M) for seed in unchanged),
     )
 
 
-def _changed(case: str, days: Sequence[Sequence[WearTrial]]) -> Summary:
-    checks = [check for day in days for check in day]
-    wrong = sum(not (check.found and check.located) for check in checks)
-    size_mm = scaled(largest([check.size_error_m for check in checks]), 1e3)
-    rows = (
-        Row(case, f"not found, or not located, of {len(checks)}", None, float(wrong), None, 0.0),
-        Row(case, "size of the change, largest error [mm]", None, size_mm, None, SIZE_MM),
-        _time(case, checks),
+def _share(checks: int, robots: int, robot: int) -> int:
+    """Return how many of the checks are those of one robot."""
+    return checks // robots + (robot < checks % robots)
+
+
+def _summary(case: str, robots: Sequence[Checks]) -> Summary:
+    changed = [check for robot in robots for check in robot.changed]
+    unchanged = [check for robot in robots for check in robot.unchanged]
+    size_mm = scaled(largest([check.size_error_m for check in changed]), 1e3)
+    spent_s = largest([check.robot_time_s for check in changed + unchanged])
+    what = f"{1e3 * CHANGE_M:.0f} mm"
+    return Summary(
+        (
+            count(case, f"{what} not found, or not located", [not (c.found and c.located) for c in changed]),
+            Row(case, f"size of the {what}, largest error [mm]", None, size_mm, None, SIZE_MM),
+            count(case, "false alarms without a change", [check.false_alarm for check in unchanged]),
+            Row(case, "robot time of a check, longest [s]", None, spent_s, None, CHECK_S),
+        )
     )
-    return Summary(rows)
-
-
-def _unchanged(case: str, days: Sequence[Sequence[WearTrial]]) -> Summary:
-    checks = [check for day in days for check in day]
-    alarms = sum(check.false_alarm for check in checks)
-    rows = (Row(case, f"false alarms, of {len(checks)}", None, float(alarms), None, 0.0), _time(case, checks))
-    return Summary(rows)
-
-
-def _time(case: str, checks: Sequence[WearTrial]) -> Row:
-    spent = largest([check.robot_time_s for check in checks])
-    return Row(case, "robot time of a check, longest [s]", None, spent, None, CHECK_S)

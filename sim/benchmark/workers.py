@@ -19,6 +19,7 @@ from sim.benchmark.case import Failed, Trial
 
 # To start a process costs about three seconds of imports.
 SECONDS_PER_PROCESS = 150.0
+LONGEST_WORDS = 40
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
@@ -151,5 +152,11 @@ def _result(trial: Trial) -> Any:
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{last.filename.rpartition('/')[2]}, line {last.lineno}"
-        words = ", ".join(map(str, trial.arguments))
+        words = ", ".join(_short(argument) for argument in trial.arguments)
         return Failed(f"{trial.work.__name__}({words}): {type(error).__name__} in {place}: {error}")
+
+
+def _short(argument: object) -> str:
+    """Return an argument in a few words: a profile or a robot by its name."""
+    words = str(getattr(argument, "name", argument))
+    return words if len(words) <= LONGEST_WORDS else words[:LONGEST_WORDS] + "..."

@@ -13,7 +13,7 @@ from sim.benchmark.networks import network_cases
 from sim.benchmark.row import Row
 from sim.benchmark.runner import concluded
 from sim.benchmark.topologies import topology_cases
-from sim.benchmark.wears import wear_cases, wear_days
+from sim.benchmark.wears import Checks, wear_cases
 from sim.experiments.arm_trial import ArmLink, ArmTrial, TipErrors
 from sim.experiments.joint_trial import JointTrial
 from sim.experiments.network_trial import NetworkTrial
@@ -41,7 +41,7 @@ def test_the_quick_benchmark_has_every_case_of_the_full_one_and_fewer_trials() -
     assert [case.name for case in quick] == [case.name for case in whole]
     assert len({case.name for case in whole}) == len(whole)
     assert all(few.trials for few in quick)
-    assert all(len(few.trials) < len(many.trials) for few, many in zip(quick[:32], whole[:32], strict=True))
+    assert all(len(few.trials) < len(many.trials) for few, many in zip(quick, whole, strict=True))
 
 
 def test_the_full_benchmark_has_the_trials_that_the_bars_are_about() -> None:
@@ -50,7 +50,8 @@ def test_the_full_benchmark_has_the_trials_that_the_bars_are_about() -> None:
     assert len(joints) == len(ALIGNMENTS) * len(LENGTHS_MM) * len(SETTINGS) == 24
     assert {len(case.trials) for case in joints} == {TRIALS} == {13}
     assert len(case_named(cases, "random robots").trials) == 200
-    assert sum(len(trial.arguments[0]) for trial in case_named(cases, "unchanged").trials) == 100
+    wear = case_named(cases, "wear").trials
+    assert [sum(len(trial.arguments[which]) for trial in wear) for which in (0, 1)] == [13, 100]
     for arm in ARMS:
         assert len(chosen(cases, f"{arm}*joint by joint")) == 2
 
@@ -152,7 +153,7 @@ def test_an_arms_tip_is_the_rms_over_its_trials_with_the_thesis_beside() -> None
     assert found["tip orientation, rms [deg]"].limit == 0.1
     assert found["robot time a joint, longest [s]"].ours == pytest.approx(9.0)
     assert found["robot time a joint, longest [s]"].thesis == 18.0
-    assert found["from recording to chain, median [s of one core]"].limit == 5.0
+    assert found["refinement and all before it, median [s of a core]"].limit == 5.0
     length = found["link length, mean |error| [mm]"]
     assert (length.thesis, length.bound) == (
         pytest.approx(8.0),
@@ -166,7 +167,16 @@ def test_uncalibrated_arms_have_four_millimetres_and_no_bar_for_what_their_imus_
     found = rows(case.summarise([arm(3.0)] * 13))
     assert found["tip position, rms [mm]"].limit == 4.0
     assert found["tip orientation, rms [deg]"].limit is None
-    assert not any("recording to chain" in figure for figure in found)
+    assert not any("refinement" in figure for figure in found)
+
+
+def test_shortened_motions_meet_no_bar_of_time_and_one_arm_moves_in_full_all_the_same() -> None:
+    cases = chosen(arm_cases(1, 0, shortened=True), "joint by joint")
+    limits = [rows(case.summarise([arm(0.5)]))["robot time a joint, longest [s]"].limit for case in cases]
+    assert limits == [10.0] + [None] * 5
+    plans = [case.trials[0].arguments[-1] for case in cases]
+    assert plans[0] is None
+    assert [plan.imu for plan in plans[1:]] == ["uncalibrated", "calibrated"] * 2 + ["uncalibrated"]
 
 
 def test_all_joints_at_once_have_twenty_seconds_in_all() -> None:
@@ -237,7 +247,7 @@ def test_a_network_is_compared_on_the_same_modules_and_where_both_came_to_a_resu
     found = rows(pair.summarise([*trials, lost]))
     assert found["runs without the right topology, of 3"].ours == 1.0
     for figure in ("tip position", "link lengths"):
-        row = found[f"{figure}, rms error over that on a perfect network"]
+        row = found[f"{figure}, rms error over a perfect network's"]
         assert row.ours == pytest.approx(1.1)
     assert found["tip position, rms [mm]"].ours == pytest.approx(2.2)
 
@@ -245,7 +255,7 @@ def test_a_network_is_compared_on_the_same_modules_and_where_both_came_to_a_resu
 def test_a_poor_network_that_moves_the_estimates_by_a_third_misses_its_bar() -> None:
     pair, _ = network_cases(13, 0)
     trials = [network(name, s, e) for s in range(13) for name, e in (("none", 1.0), ("wifi", 1.33))]
-    row = rows(pair.summarise(trials))["link lengths, rms error over that on a perfect network"]
+    row = rows(pair.summarise(trials))["link lengths, rms error over a perfect network's"]
     assert (row.limit, row.holds) == (1.2, False)
 
 
@@ -272,27 +282,43 @@ def check(**changed: Any) -> WearTrial:
 
 
 def test_a_change_must_be_found_located_and_sized_in_time() -> None:
-    worn, _ = wear_cases(3, 3, 0)
+    (case,) = wear_cases(3, 0, 0)
     lost = check(located=False, size_error_m=None, vector_error_m=None)
-    found = rows(worn.summarise([[check(), check(size_error_m=6e-4)], [lost]]))
-    assert found["not found, or not located, of 3"].ours == 1.0
-    assert found["size of the change, largest error [mm]"].holds is False
+    checks = [Checks((check(), check(size_error_m=6e-4)), ()), Checks((lost,), ())]
+    found = rows(case.summarise(checks))
+    assert found["2 mm not found, or not located, of 3"].ours == 1.0
+    assert found["size of the 2 mm, largest error [mm]"].holds is False
     assert found["robot time of a check, longest [s]"].holds
 
 
 def test_a_false_alarm_misses_its_bar() -> None:
-    _, same = wear_cases(3, 3, 0)
+    (case,) = wear_cases(3, 3, 0)
     quiet = check(found=False, located=False, size_error_m=None, child=None)
-    assert rows(same.summarise([[quiet] * 3]))["false alarms, of 3"].holds
-    assert rows(same.summarise([[quiet, check(false_alarm=True)]]))["false alarms, of 2"].holds is False
+    alarm = "false alarms without a change, of 3"
+    assert rows(case.summarise([Checks((), (quiet,) * 3)]))[alarm].holds
+    assert rows(case.summarise([Checks((), (quiet, quiet, check(false_alarm=True)))]))[alarm].holds is False
 
 
 def test_checks_of_one_robot_are_made_in_one_process() -> None:
-    _, same = wear_cases(1, 100, 0)
-    days = [trial.arguments[0] for trial in same.trials]
-    assert [len(each) for each in days] == [DAYS] * (100 // DAYS)
-    assert all(len({seed // DAYS for seed in each}) == 1 for each in days)
-    assert all(trial.work is wear_days for trial in same.trials)
+    (case,) = wear_cases(13, 100, 0)
+    assert [[len(seeds) for seeds in trial.arguments] for trial in case.trials] == [
+        [3, DAYS],
+        [3, DAYS],
+        [3, DAYS],
+        [2, DAYS],
+        [2, DAYS],
+    ]
+    robots = [{seed // DAYS for seeds in trial.arguments for seed in seeds} for trial in case.trials]
+    assert all(len(each) == 1 for each in robots)
+    assert len(set.union(*robots)) == 5
+
+
+# ---------------------------------------------------------------------- what was not measured
+
+
+@pytest.mark.parametrize("case", kinematic_cases(QUICK, seed=0), ids=lambda case: case.name)
+def test_no_bar_is_met_by_trials_that_all_failed(case: Case) -> None:
+    assert [row.holds for row in case.summarise([]).rows if row.limit is not None].count(True) == 0
 
 
 # ---------------------------------------------------------------------- over all

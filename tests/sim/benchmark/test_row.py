@@ -11,6 +11,7 @@ from sim.benchmark.row import (
     ENOUGH_TRIALS,
     FEW_INTERVALS,
     Row,
+    count,
     coverage,
     for_few,
     largest,
@@ -59,6 +60,13 @@ def test_what_is_not_there_is_left_out_of_means() -> None:
     assert ratio(3.0, 2.0) == 1.5
 
 
+def test_what_must_never_be_is_counted_and_of_no_cases_nothing_is_known() -> None:
+    found = count("robots", "wrong", [False, True, True])
+    assert (found.figure, found.ours, found.holds) == ("wrong, of 3", 2.0, False)
+    assert count("robots", "wrong", [False]).holds
+    assert count("robots", "wrong", []).holds is False
+
+
 def test_a_bar_of_means_is_the_stated_one_from_thirteen_trials_on_and_wider_below() -> None:
     assert for_few(0.5, ENOUGH_TRIALS) == for_few(0.5, 40) == 0.5
     wider = [for_few(0.5, trials) for trials in range(1, ENOUGH_TRIALS + 1)]
@@ -80,10 +88,10 @@ def test_an_rms_that_holds_over_thirteen_trials_holds_as_surely_over_fewer(trial
 
 def test_honest_intervals_of_any_number_meet_the_bar_of_coverage_and_shy_or_bold_ones_do_not() -> None:
     rng = np.random.default_rng(5)
-    for count in (10, 60, FEW_INTERVALS, 1000):
-        rows = [coverage("all", list(np.abs(rng.standard_normal(count)))) for _ in range(200)]
+    for number in (10, 60, FEW_INTERVALS, 1000):
+        rows = [coverage("all", list(np.abs(rng.standard_normal(number)))) for _ in range(200)]
         # Chance leaves the range in one of a hundred where it is widened; at 200 by two sigmas, in one of 20.
-        assert np.mean([row.holds for row in rows]) > (0.97 if count != FEW_INTERVALS else 0.90)
+        assert np.mean([row.holds for row in rows]) > (0.97 if number != FEW_INTERVALS else 0.90)
     many = np.abs(rng.standard_normal(1000))
     assert not coverage("all", list(2.0 * many)).holds
     assert not coverage("all", list(0.3 * many)).holds
