@@ -3,41 +3,41 @@
 Trials of one seed on different networks are of the same modules, clocks included, so that they come in pairs.
 """
 
-import tempfile
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from coordinator.clock_map import ClockMap
-from coordinator.identify import identify
-from coordinator.journal import JournalEvent
-from coordinator.kinematics.imu_intrinsics import ImuKind
+from coordinator.failure import explain
+from coordinator.identify import Kinematics, identify_kinematics
 from coordinator.plan import Plan
 from coordinator.recording import Recording
-from coordinator.run import write_outputs
-from coordinator.run_folder import SESSION, load_recording
-from coordinator.terminal import Terminal
-from sim.experiments.module_bench import ExperimentFailed
+from module_agent.wire.network_file import network as named_network
+from sim.chain_score import link_errors, tip_errors, topology_differences
+from sim.experiments.arm_trial import arm_plan, imu_kind
+from sim.module_clock import ModuleClock, module_time
 from sim.noise_profile import NoiseProfile, noise_profile
-from sim.robot_file import load_robot
-from sim.score import score
-from sim.truth import Motion, read_motion
-from sim.virtual_run import VirtualConfig, run_virtual
+from sim.robot_file import Robot, load_robot
+from sim.robot_tree import true_chain
+from sim.virtual_robot import VirtualSettings
+from sim.virtual_session import record_session
+from sim.world import World
 
 OFFSET_S = 0.05
 DRIFT_PPM = 100.0
-# Every so many ticks of the world the clocks' maps are compared with the truth.
-EVERY = 500
+# Instants of a session at which the clocks' maps are compared with one another.
+INSTANTS = 200
 
 
 class NetworkTrial(NamedTuple):
     """What came of one trial; of one that did not come to its end only the first four fields tell.
 
     why: what ended the trial before its end, empty if nothing did. again: motions that were interrupted and
-    done again. Links are in the order of the robot's file: errors of their lengths, claimed sigmas, errors
-    of their parents' axes. clock_error_s: the root mean square, over modules and times, of how far the
-    modules' clocks are mapped apart from one another; clock_sigma_s: the same as claimed.
+    done again. Links are in the order of the robot's file, those that were not found left out: errors of
+    their lengths, claimed sigmas, errors of their parents' axes. clock_error_s: the root mean square, over
+    modules and times, of how far the modules' clocks are mapped apart from one another; clock_sigma_s: the
+    same as claimed.
     """
 
     robot: str
@@ -57,12 +57,7 @@ class NetworkTrial(NamedTuple):
 
 
 def network_trial(
-    robot: str,
-    network: str,
-    noise: str | NoiseProfile | None,
-    seed: int,
-    plan: Plan | None = None,
-    keep: Path | None = None,
+    robot: str, network: str, noise: str | NoiseProfile | None, seed: int, plan: Plan | None = None
 ) -> NetworkTrial:
     """Run, identify and score one robot over one network, in virtual time and without dynamics.
 
@@ -71,58 +66,55 @@ def network_trial(
         network: a network profile or file.
         noise: a noise profile; `apart` gives it clocks that differ by 50 ms and 100 ppm.
         seed: of the modules, their noise and the network.
-        plan: of the session; the IMUs count as calibrated where their errors of scale are none.
-        keep: folder for the run; None for one that is gone afterwards.
+        plan: of the session; None for that of `arm_trial`.
     """
-    with tempfile.TemporaryDirectory() as gone:
-        out = keep or Path(gone) / "run"
-        described = load_robot(robot)
-        found = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or described.noise)
-        config = VirtualConfig(
-            described,
-            out,
-            seed=seed,
-            network=network,
-            noise=found,
-            plan=plan or Plan(dynamics=False, imu=_kind(found)),
-        )
-        try:
-            run_virtual(config, Terminal(quiet=True))
-        except (RuntimeError, TimeoutError, ValueError) as error:
-            return NetworkTrial(robot, network, seed, f"{type(error).__name__}: {error}")
-        return scored(out, robot, network, seed)
+    described = load_robot(robot)
+    found = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or described.noise)
+    settings = VirtualSettings(described, named_network(network), seed, found)
+    begun = NetworkTrial(robot, network, seed, "")
+    try:
+        recording = record_session(settings, plan or arm_plan("joint", imu_kind(found)))
+        kinematics = identify_kinematics(recording)
+    except Exception as error:
+        failure = explain(error)
+        if failure is None:
+            raise
+        return begun._replace(why=failure.text)
+    world = World(described, seed, found)
+    try:
+        clocks = dict(zip(described.serials, world.clocks, strict=True))
+    finally:
+        world.close()
+    return scored(begun, described, clocks, recording, kinematics)
 
 
-def scored(run: Path, robot: str, network: str, seed: int) -> NetworkTrial:
-    """Identify anew from what a run has recorded, write its files, and score them.
-
-    Raises:
-        IdentificationError: see `coordinator.identify`.
-        ScoreError: the run has no truth beside it.
-    """
-    recording = load_recording(run / SESSION)
-    found = identify(recording)
-    write_outputs(run, found)
-    result = score(run)
-    errors = [link.link_length_error_mm for link in result.links]
-    sigmas = [link.link_length_sigma_mm for link in result.links]
-    axes = [link.axis_error_deg for link in result.links]
-    clocks = found.kinematics.clocks
-    return NetworkTrial(
-        robot,
-        network,
-        seed,
-        "",
-        _again(recording),
-        result.robot_time_s,
-        result.topology_correct,
-        tuple(1e-3 * e for e in errors if e is not None),
-        tuple(1e-3 * s for s in sigmas if s is not None),
-        tuple(a for a in axes if a is not None),
-        None if result.tip_position_rms_mm is None else 1e-3 * result.tip_position_rms_mm,
-        result.tip_orientation_rms_deg,
-        clock_error_s(clocks, read_motion(run / "truth.npz")),
-        float(np.sqrt(np.mean([1e-18 * clock.sigma_ns**2 for clock in clocks.values()]))),
+def scored(
+    begun: NetworkTrial,
+    robot: Robot,
+    clocks: Mapping[str, ModuleClock],
+    recording: Recording,
+    kinematics: Kinematics,
+) -> NetworkTrial:
+    """Return the trial with everything that comparing the result with the truth says."""
+    truth, fit = true_chain(robot), kinematics.fit
+    differences = topology_differences(fit.chain, truth)
+    tip = (None, None) if differences else tip_errors(fit.chain, truth, fit.null_basis)
+    children = [child for child, parent in enumerate(truth.parent) if parent >= 0]
+    errors = {child: found for child in children if (found := link_errors(fit.chain, truth, child))}
+    own = [fit.chain.serials.index(truth.serials[child]) for child in errors]
+    end_s = 1e-9 * float(np.ptp([event.t_ns for event in recording.journal]))
+    found_clocks = kinematics.clocks
+    return begun._replace(
+        again=sum(e.what == "note" and "the motion of module" in e.text for e in recording.journal),
+        robot_time_s=end_s,
+        topology_right=not differences,
+        link_error_m=tuple(error.length_m for error in errors.values()),
+        link_sigma_m=tuple(float(fit.link_length_sigma_m[k]) for k in own),
+        axis_error_deg=tuple(error.axis_deg for error in errors.values()),
+        tip_position_m=None if tip[0] is None else 1e-3 * tip[0],
+        tip_orientation_deg=tip[1],
+        clock_error_s=clock_error_s(found_clocks, clocks, end_s),
+        clock_sigma_s=_rms([1e-9 * clock.sigma_ns for clock in found_clocks.values()]),
     )
 
 
@@ -133,26 +125,23 @@ def apart(noise: NoiseProfile, offset_s: float = OFFSET_S, drift_ppm: float = DR
     )
 
 
-def clock_error_s(clocks: dict[str, ClockMap], motion: Motion) -> float:
-    """Return how far the same instants of all modules are mapped apart, root mean square over both."""
-    columns = [
-        clocks[serial].to_session(motion.clock_ns[::EVERY, column])
-        for column, serial in enumerate(motion.serials)
-        if serial in clocks
-    ]
-    if len(columns) < 2:
-        raise ExperimentFailed(f"{len(columns)} clocks have nothing to be compared with")
-    mapped = np.stack(columns, axis=1)
+def clock_error_s(found: Mapping[str, ClockMap], true: Mapping[str, ModuleClock], end_s: float) -> float:
+    """Return how far the same instants of all modules are mapped apart, root mean square over both.
+
+    Instants are spread over a session from the world's start to `end_s`.
+    """
+    instants = [round(1e9 * t) for t in np.linspace(0.0, end_s, INSTANTS)]
+    mapped = np.stack(
+        [
+            clock.to_session(np.array([module_time(true[s], t) for t in instants], dtype=np.int64))
+            for s, clock in found.items()
+        ],
+        axis=1,
+    )
     # Whole nanoseconds of years do not fit a float: differences first.
     relative = (mapped - mapped[:, :1]).astype(np.float64)
-    spread = relative - relative.mean(axis=1, keepdims=True)
-    return 1e-9 * float(np.sqrt(np.mean(spread**2)))
+    return _rms(1e-9 * (relative - relative.mean(axis=1, keepdims=True)).ravel())
 
 
-def _kind(noise: NoiseProfile) -> ImuKind:
-    return "uncalibrated" if noise.accel_scale or noise.imu_misalignment_rad else "calibrated"
-
-
-def _again(recording: Recording) -> int:
-    notes: list[JournalEvent] = [e for e in recording.journal if e.what == "note"]
-    return sum("the motion of module" in note.text for note in notes)
+def _rms(values: Sequence[float] | np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
