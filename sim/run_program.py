@@ -12,6 +12,7 @@ import typer
 from coordinator.failure import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, explain
 from coordinator.interruption import SIGNALS, Interruption, ignore_signals
 from coordinator.terminal import Terminal
+from coordinator.viewer.targets import NATIVE_PORT, proxy_url
 from coordinator.viewer_choice import viewer_choice
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
 from sim.bus_server import BusServer
@@ -44,6 +45,7 @@ from sim.noise_choice import NoiseChoice
 from sim.robot_file import Robot, RobotFileError
 from sim.score_program import print_score
 from sim.truth import write_truth
+from sim.truth_recording import add_truth
 from sim.virtual_run import VirtualConfig, run_virtual
 from sim.world import World
 
@@ -145,7 +147,19 @@ def run(
         options = (*motion_arguments(plan, planned), *(("--quiet",) if quiet else ()))
         place = _Place(folder, network or found.network, endpoint, processes)
         _run_processes(_launch(robot, found, place, seed, choice, speed, options))
+        _add_truth(folder, None)
     print_score(folder)
+
+
+def _add_truth(folder: Path, viewer: str | None) -> None:
+    """Draw the true robot beside the identified one, which the coordinator could not do."""
+    add_truth(folder, viewer, lambda text: typer.echo(text, err=True))
+
+
+def _address(viewer: str) -> str | None:
+    """Return where the viewer of a run can still be reached when the run is over."""
+    choice = viewer_choice(viewer)
+    return proxy_url(NATIVE_PORT) if choice.spawn else choice.connect
 
 
 class _Place(NamedTuple):
@@ -272,4 +286,5 @@ def launch(
     )
     place = _Place(free_folder(out, found), network or found.network, endpoint, processes)
     _run_processes(_launch(robot, found, place, seed, choice, speed, options))
+    _add_truth(place.out, _address(viewer))
     print_score(place.out)

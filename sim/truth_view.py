@@ -29,15 +29,19 @@ class TruthView:
         self._types = dict(zip(truth.serials, types, strict=True))
 
     def met(self, viewer: Viewer, t_ns: int) -> None:
-        """Draw the robot, and make the true values of what will be estimated known."""
+        """Draw the robot as it stands."""
         viewer.true_chain(t_ns, self._truth, self._types)
+        self.values(viewer)
+
+    def values(self, viewer: Viewer, t_ns: Sequence[int] = ()) -> None:
+        """Make the true values of what is estimated known, and draw them at `t_ns`."""
         nothing = np.zeros((6 * len(self._truth.serials),) * 2)
         lengths, _ = link_lengths(self._truth, nothing)
         angles, _ = axis_angles(self._truth, nothing)
         for k, serial in enumerate(self._truth.serials):
             if self._truth.parent[k] != BASE:
-                viewer.true_value(LINK_LENGTH, serial, 1e3 * float(lengths[k]))
-                viewer.true_value(AXIS_ANGLE, serial, float(np.degrees(angles[k])))
+                viewer.true_value(LINK_LENGTH, serial, 1e3 * float(lengths[k]), t_ns)
+                viewer.true_value(AXIS_ANGLE, serial, float(np.degrees(angles[k])), t_ns)
 
     def chain(self, viewer: Viewer, t_ns: int, chain: Chain, unresolved: tuple[Unresolved, ...]) -> None:
         """Draw the robot where the identified one stands."""

@@ -19,6 +19,8 @@ LINK_LENGTH, AXIS_ANGLE = OF_LINKS = ("link_length", "axis_angle")
 # More than this on one page leaves plots too small to read; there are further pages for the rest.
 MODULES_PER_PAGE = 4
 ROWS_PER_PAGE, COLUMNS_PER_PAGE = 3, 3
+# About a housing's length, which is seen around what the joints can reach.
+HOUSING_M = 0.12
 
 _WHOLE_RUN = rr.TimeRange(
     rr.TimeRangeBoundary.absolute(seconds=0), rr.TimeRangeBoundary.cursor_relative(seconds=0)
@@ -74,7 +76,7 @@ def _left(contents: Contents) -> rrb.Vertical:
 def _robot(contents: Contents) -> rrb.Spatial3DView:
     eye = None
     if contents.reach_m is not None:
-        size = max(contents.reach_m, 0.2)
+        size = contents.reach_m + HOUSING_M
         eye = rrb.EyeControls3D(
             # Far enough for all that the robot can reach, not only for where it stands now.
             position=[0.75 * size, -1.2 * size, 0.68 * size],

@@ -18,8 +18,9 @@ OUTGROWN = 1.25
 class Recorder:
     """Everything that one run has logged so far; used by one thread only."""
 
-    def __init__(self, stream: rr.RecordingStream, robot: str) -> None:
+    def __init__(self, stream: rr.RecordingStream, robot: str, lays_out: bool = True) -> None:
         self._stream = stream
+        self._lays_out = lays_out
         self._palette = layout.Palette()
         self._types: dict[str, str] = {}
         self._contents = blueprint.Contents(robot)
@@ -93,11 +94,14 @@ class Recorder:
         if truth is not None:
             progress.log_truth(self._stream, *which, truth)
 
-    def true_value(self, name: str, serial: str, value: float) -> None:
+    def true_value(self, name: str, serial: str, value: float, t_ns: Sequence[int]) -> None:
         """Make the true value of a parameter known, to be drawn with its estimates."""
         if (name, serial) not in self._truths:
             progress.log_truth_style(self._stream, name, serial)
         self._truths[name, serial] = value
+        for t in t_ns:
+            progress.set_time(self._stream, t)
+            progress.log_truth(self._stream, name, serial, value)
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.Look) -> None:
         """Draw the robot from now on, in the posture it was last seen in; at q = 0 before the first pose."""
@@ -168,6 +172,6 @@ class Recorder:
             self._show()
 
     def _show(self) -> None:
-        if self._contents != self._shown:
+        if self._lays_out and self._contents != self._shown:
             self._shown = self._contents
             self._stream.send_blueprint(blueprint.build(self._contents))

@@ -13,11 +13,11 @@ from rerun.experimental import ViewerClient
 
 from coordinator.viewer import layout, viewer_process
 from coordinator.viewer.blueprint import TABS
+from coordinator.viewer.merge import MAGIC, is_recording
 from coordinator.viewer.targets import proxy_url
 
 SETTLE_SECONDS = 40.0
 SAME_PICTURES = 3
-MAGIC = b"RRF"
 _POLL_SECONDS = 0.4
 
 
@@ -61,9 +61,8 @@ def screenshots(
             raise ValueError(f"no tab {tab!r}; there are {', '.join(TABS)}")
     if not rrd.is_file():
         raise FileNotFoundError(f"no recording at {rrd}")
-    with rrd.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise ScreenshotFailed(f"{rrd} is no Rerun recording: it does not begin with {MAGIC.decode()!r}")
+    if not is_recording(rrd):
+        raise ScreenshotFailed(f"{rrd} is no Rerun recording: it does not begin with {MAGIC.decode()!r}")
     port = viewer_process.free_port()
     viewer = _start(port, size)
     try:

@@ -42,7 +42,9 @@ class Opened(NamedTuple):
     web_server: viewer_process.ViewerProcess | None
 
 
-def open_targets(stream: rr.RecordingStream, targets: ViewerTargets, blueprint: rrb.Blueprint) -> Opened:
+def open_targets(
+    stream: rr.RecordingStream, targets: ViewerTargets, blueprint: rrb.Blueprint | None
+) -> Opened:
     """Attach the stream to its targets; a live one that cannot be reached is reported and left out.
 
     Raises:

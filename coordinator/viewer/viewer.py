@@ -32,7 +32,9 @@ class Viewer:
     The methods are to be called from one thread.
     """
 
-    def __init__(self, robot: str, run_id: str, targets: ViewerTargets, waits: bool = False) -> None:
+    def __init__(
+        self, robot: str, run_id: str, targets: ViewerTargets, waits: bool = False, lays_out: bool = True
+    ) -> None:
         """Open the targets; the only part that may take seconds, where a viewer has to be started.
 
         Args:
@@ -40,14 +42,15 @@ class Viewer:
             run_id: the recording's identity; the same one in two processes makes one recording.
             targets: where to; with none at all, nothing is recorded and all calls do nothing.
             waits: let calls wait when there is too much, instead of dropping it: for virtual time.
+            lays_out: send layouts; without, what is logged adds to a run that has its layout from elsewhere.
 
         Raises:
             OSError: the file cannot be written. A live viewer that is not there is only reported.
         """
         self._stream = rr.RecordingStream(layout.APPLICATION_ID, recording_id=run_id)
-        first = blueprint.build(blueprint.Contents(robot))
+        first = blueprint.build(blueprint.Contents(robot)) if lays_out else None
         self._opened = open_targets(self._stream, targets, first)
-        self._recorder = Recorder(self._stream, robot)
+        self._recorder = Recorder(self._stream, robot, lays_out)
         self._thread = (
             LoggingThread(on_idle=self._recorder.show_if_new, on_end=self._recorder.finish, waits=waits)
             if self._opened.records
@@ -105,9 +108,13 @@ class Viewer:
         found = Estimate(name, serial, float(value), float(sigma), units)
         self._submit(partial(self._recorder.estimate, t_ns, found), essential=True)
 
-    def true_value(self, name: str, serial: str, value: float) -> None:
-        """Draw the true value of a parameter with its estimates; only the simulator's tools know it."""
-        self._submit(partial(self._recorder.true_value, name, serial, float(value)), essential=True)
+    def true_value(self, name: str, serial: str, value: float, t_ns: Sequence[int] = ()) -> None:
+        """Draw the true value of a parameter with its estimates; only the simulator's tools know it.
+
+        It is drawn at `t_ns` too, for estimates that somebody else draws.
+        """
+        times = tuple(int(t) for t in t_ns)
+        self._submit(partial(self._recorder.true_value, name, serial, float(value), times), essential=True)
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None = None) -> None:
         """Draw the robot as identified, with (n,) standard deviations of its joints' places [m]."""
