@@ -14,6 +14,7 @@ from sim.command_options import RobotArgument, fail, load
 from sim.drawing import draw
 from sim.effects import EFFECTS
 from sim.effects_page import OFF, default_size, page, sizes
+from sim.experiments.estimator_program import estimators
 from sim.experiments.program import amplitudes
 from sim.log_program import compare_log
 from sim.noise_profile import NOISE_PROFILES
@@ -90,6 +91,7 @@ app.command()(run)
 app.command()(launch)
 app.command("score")(score_run)
 app.command()(amplitudes)
+app.command()(estimators)
 app.command()(compare_log)
 app.add_typer(benchmark, name="benchmark")
 

@@ -38,7 +38,7 @@ from module_agent.estimate.joint_prior import (
     beliefs,
 )
 from module_agent.estimate.seen_motion import SeenMotion
-from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED, white_ratio
+from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
 from module_agent.estimate.windows import Array
 from module_agent.wire.messages import RegressionEstimate, Vector3
 
@@ -117,6 +117,7 @@ class _Rows(NamedTuple):
     readings: Array
     t_s: Array
     white: float
+    instrument: SmoothMotion | None
 
 
 class _Problem(NamedTuple):
@@ -137,7 +138,7 @@ class _Optimum(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Normal equations J^T W J and J^T W e, and what the residuals show.
+    """Normal equations J^T W J and J^T W e, and what the residuals show; with an instrument Z it is Z^T W J.
 
     scatter: J^T W V W J with V the residuals' own squares: J^T W J where the noise is what W takes it for.
     noise: (2,) of one sample, gyro's first.
@@ -197,7 +198,7 @@ def _minimise(problem: _Problem, state: _State) -> _Optimum:
             break
     end = _equations(problem, state, noise)
     inverse = _inverse(end.normal)
-    return _Optimum(state, inverse @ end.scatter @ inverse, end.noise)
+    return _Optimum(state, inverse @ end.scatter @ inverse.T, end.noise)
 
 
 def _inverse(normal: Array) -> Array:
@@ -241,7 +242,7 @@ def _rows(seen: SeenMotion) -> _Rows:
     readings = np.hstack([seen.imu.gyro_rad_s[inside], seen.imu.accel_m_s2[inside]])
     step_s = 1e-9 * float(seen.imu.t_ns[-1] - seen.imu.t_ns[0]) / (seen.imu.t_ns.size - 1)
     white = white_ratio(seen.imu.t_ns, float(np.hypot(seen.imu.smooth_s, STRIDE * step_s)))
-    return _Rows(Motion(seen.joint, None), readings, t_s[inside], white)
+    return _Rows(Motion(seen.joint, None), readings, t_s[inside], white, seen.instrument)
 
 
 def _first_guess(rows: Sequence[_Rows], known: Beliefs) -> _State:
@@ -292,19 +293,26 @@ def _equations(problem: _Problem, state: _State, noise: Array) -> _Equations:
     for i, row in enumerate(problem.rows):
         predicted, slopes = predict(row.motion, row.t_s, state.values, DELAY + i)
         residual = _in_frame(row.readings, state.frame) - predicted
+        weighing = slopes
+        if row.instrument is not None:
+            clean = row.motion._replace(joint=row.instrument)
+            _, weighing = predict(clean, row.t_s, state.values, DELAY + i)
         for sensor in range(2):
             part = slice(3 * sensor, 3 * sensor + 3)
             weight = STRIDE / noise[sensor] ** 2
-            jacobian = slopes[:, part]
-            flat = jacobian.reshape(-1, jacobian.shape[2])
             square = row.white * np.mean(_slow(residual[:, part]) ** 2, axis=1)
-            normal += weight * flat.T @ flat
-            gradient += weight * flat.T @ residual[:, part].ravel()
-            uneven = (jacobian * (square / noise[sensor] ** 2)[:, None, None]).reshape(flat.shape)
-            scatter += weight * uneven.T @ flat
+            by_weight, by_slope = _flat(weighing[:, part]), _flat(slopes[:, part])
+            normal += weight * by_weight.T @ by_slope
+            gradient += weight * by_weight.T @ residual[:, part].ravel()
+            uneven = by_weight * np.repeat(square / noise[sensor] ** 2, 3)[:, None]
+            scatter += weight * uneven.T @ by_weight
             power[sensor] += float(square.sum())
         count += len(residual)
     return _Equations(normal, gradient, scatter, np.asarray(np.sqrt(power / count)))
+
+
+def _flat(slopes: Array) -> Array:
+    return slopes.reshape(-1, slopes.shape[2])
 
 
 def _slow(residual: Array) -> Array:

@@ -14,12 +14,15 @@ class SeenMotion(NamedTuple):
     """A joint's motion and what an IMU saw of it: t_imu = t_joint + `offset_ns` and a delay to be found.
 
     base: how what carries the joint shook meanwhile, None where nobody saw it.
+    instrument: the same motion without the encoder's noise, if the equations are to be weighed with it (the
+        method of instrumental variables); None weighs them with the encoder's own.
     """
 
     imu: SmoothImu
     joint: SmoothMotion
     offset_ns: int
     base: BaseMotion | None = None
+    instrument: SmoothMotion | None = None
 
 
 class MotionWindows(NamedTuple):

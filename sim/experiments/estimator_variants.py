@@ -1,0 +1,163 @@
+"""Where the joint regression may take the joint's motion from, and what each source makes of one trial.
+
+The encoder counts in steps, the gyro drifts and sees the link's bending too, the command is what the joint
+was told and not what it did. All variants solve the same equations (`joint_regression`); they differ in the
+angle that these are written in, and in what weighs them:
+
+    encoder   the encoder's angle; the gyro is a reading, which tells the axis and how the link bends
+    gyro      the gyro's integral, of which the encoder tells offset and slope only
+    fused     the gyro's integral where it is fast, the encoder's angle where it is slow
+    command   the encoder's angle, the equations weighed with the command behind the filter that fits it
+
+Gyro and fused see the bending and a base's swing as they are, but not how a swinging base pushes; of a gyro
+whose scale is wrong they take the error. The agents use `encoder`.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.estimate.circle_point_analysis import rest_reading
+from module_agent.estimate.gaussian_filter import gaussian_filter
+from module_agent.estimate.joint_regression import JointRegression, regress_joint
+from module_agent.estimate.seen_motion import MotionWindows, SeenMotion, seen_motions
+from module_agent.estimate.smooth_motion import SmoothMotion
+from module_agent.estimate.windows import Array, ImuWindow, JointWindow, imu_window
+from sim.chain_score import link_length_m
+from sim.experiments.joint_bound import bound_m, imu_knowledge
+from sim.experiments.joint_trial import trial_plan
+from sim.experiments.one_joint_rig import IMU, OneJointRig, TrialRows, analyse, regress, windows
+from sim.experiments.thesis_lengths import Alignment, thesis_length
+from sim.noise_profile import NoiseProfile
+from sim.robot_file import load_robot
+from sim.robot_tree import true_chain
+
+# The encoder tells what is slower than this Gaussian low-pass, the gyro the rest: 96 % of 2 Hz, so that a
+# link's bending is all in the angle.
+CROSSOVER_S = 0.2
+# The joint follows its command within this many rows of 4 ms either way.
+FOLLOWS_ROWS = 24
+
+
+class Found(NamedTuple):
+    """An estimator's error of the distance, and one sigma as it states it, both in metres."""
+
+    error_m: float
+    sigma_m: float
+
+
+class Comparison(NamedTuple):
+    """What every estimator made of one trial, by name, and the bound of that recording [m]."""
+
+    found: dict[str, Found]
+    bound_m: float
+
+
+Variant = Callable[[TrialRows, NoiseProfile], tuple[float, float]]
+
+
+def compare(length_mm: int, alignment: Alignment, profile: NoiseProfile, seed: int) -> Comparison:
+    """Run one trial of the thesis' arm and all estimators on it, without those that find too little motion.
+
+    Raises:
+        KeyError: the thesis had no such arm.
+        ExperimentFailed: a module refused a motion, or broke it off.
+    """
+    robot = load_robot(f"thesis_{length_mm}_{alignment}")
+    with OneJointRig(robot, seed, profile) as rig:
+        trial = rig.trial(trial_plan(thesis_length(alignment, length_mm), profile))
+    return judge_all(trial, profile, link_length_m(true_chain(robot), child=IMU))
+
+
+def judge_all(trial: TrialRows, profile: NoiseProfile, true_m: float) -> Comparison:
+    """Run all estimators on one recording whose true distance is known."""
+    found: dict[str, Found] = {}
+    for name, variant in VARIANTS.items():
+        try:
+            distance_m, sigma_m = variant(trial, profile)
+        except ValueError:
+            continue
+        found[name] = Found(distance_m - true_m, sigma_m)
+    return Comparison(found, bound_m(trial, profile))
+
+
+# ---------------------------------------------------------------------- the variants
+
+
+def _thesis(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    fit = analyse(trial)
+    return fit.distance_m, fit.sigma_distance_m
+
+
+def _encoder(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    return _told(regress(trial, imu_knowledge(profile)))
+
+
+def _gyro(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    return _regressed(trial, profile, [_by_gyro(trial, window, None) for window in windows(trial)])
+
+
+def _fused(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    return _regressed(trial, profile, [_by_gyro(trial, window, CROSSOVER_S) for window in windows(trial)])
+
+
+def _command(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    motions = [
+        seen._replace(instrument=SmoothMotion(_commanded(window.joint, motion.joint["position_command_rad"])))
+        for seen, window, motion in zip(
+            seen_motions(windows(trial)), windows(trial), (trial.constant, trial.sine), strict=True
+        )
+    ]
+    return _regressed(trial, profile, motions)
+
+
+VARIANTS: Mapping[str, Variant] = {
+    "thesis": _thesis,
+    "encoder": _encoder,
+    "gyro": _gyro,
+    "fused": _fused,
+    "command": _command,
+}
+
+
+def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[SeenMotion]) -> tuple[float, float]:
+    rest = rest_reading(imu_window(trial.rest))
+    return _told(regress_joint(motions, rest, imu_knowledge(profile)))
+
+
+def _told(found: JointRegression) -> tuple[float, float]:
+    return found.distance_m, found.sigma_distance_m
+
+
+def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None) -> SeenMotion:
+    """Return the motion with an angle from the gyro; the encoder gives its slow part, or offset and slope."""
+    since_ns = window.imu.t_ns - window.offset_ns
+    inside = (since_ns >= window.joint.t_ns[0]) & (since_ns <= window.joint.t_ns[-1])
+    imu = ImuWindow(*(column[inside] for column in window.imu))
+    t_s = 1e-9 * (imu.t_ns - imu.t_ns[0])
+    encoder = np.interp(since_ns[inside], window.joint.t_ns, window.joint.position_rad)
+    rest = rest_reading(imu_window(trial.rest))
+    gyro = imu.gyro_rad_s - rest.gyro_offset_rad_s
+    rate = np.gradient(encoder, t_s)
+    axis = rate @ gyro
+    along = gyro @ axis / np.linalg.norm(axis)
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (along[1:] + along[:-1]) * np.diff(t_s))])
+    rest_of = encoder - turned
+    if crossover_s is None:
+        turned = turned + np.polyval(np.polyfit(t_s, rest_of, 1), t_s)
+    else:
+        spread = crossover_s * (t_s.size - 1) / t_s[-1]
+        turned = turned + gaussian_filter(rest_of, 2 * round(4.0 * spread) + 1, spread)
+    joint = JointWindow(since_ns[inside], turned, along)
+    return seen_motions([window._replace(joint=joint)])[0]._replace(base=None)
+
+
+def _commanded(joint: JointWindow, command_rad: Array) -> JointWindow:
+    """Return the joint's motion as its command tells it: the command behind the filter that fits it best."""
+    command = np.where(np.isfinite(command_rad), command_rad, joint.position_rad)
+    padded = np.pad(command, (FOLLOWS_ROWS, 0), mode="edge")
+    lags = np.lib.stride_tricks.sliding_window_view(padded, FOLLOWS_ROWS + 1)[:, ::4]
+    columns = np.hstack([lags, np.ones((len(lags), 1))])
+    weights, *_ = np.linalg.lstsq(columns, joint.position_rad, rcond=1e-9)
+    return joint._replace(position_rad=columns @ weights)
