@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
-import numpy as np
-
 from coordinator.beside import Beside
 from coordinator.clock import Clock
 from coordinator.hrdf import write_hrdf
@@ -172,9 +170,12 @@ class Run:
         """Return the robot as far as it is known; only to be looked at, so that a run does not fail by it."""
         try:
             return self._looks.look(explored)
-        except (ValueError, KeyError, np.linalg.LinAlgError) as error:
+        except (ValueError, KeyError) as error:
             logger.info("nothing to show of the robot so far: %s", error)
-            return None
+        except Exception:
+            # A run must not end for want of a picture.
+            logger.exception("the robot so far could not be worked out")
+        return None
 
     def _show_so_far(self, found: RobotSoFar | None) -> None:
         if found is not None:
