@@ -7,11 +7,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.chain import Chain
+from coordinator.chain import Array, Chain
 from coordinator.kinematics.base_heading import faced
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.imu_intrinsics import DELAY, ImuPrior
-from coordinator.kinematics.link_flex import LinkLoad, flex_slopes, hinge_slopes, joined, loads_of
+from coordinator.kinematics.link_flex import (
+    FlexSlopes,
+    LinkLoad,
+    flex_slopes,
+    hinge_slopes,
+    joined,
+    loads_of,
+    with_hinges_moved,
+)
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.kinematics.sensor_data import SensorData
 from coordinator.motion_window import RATE_HZ, Window, filtered, thinned
@@ -55,10 +63,29 @@ def refine_robot(
     parts = _parts(windows, floor, late_s)
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
     giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
-    fine, carried = thinned(parts, keep), joined(loads, keep)
-    flex = flex_slopes(giving.chain, fine.joints, carried)
-    flex = hinge_slopes(giving.chain, fine.joints, carried, flex, giving.compliance)
-    return refine_chain(giving.chain, fine, prior, flex)
+    if not giving.compliance.size:
+        return refine_chain(giving.chain, thinned(parts, keep), prior)
+    # Where the hinges are changes what turns them: once roughly, then for good.
+    coarse = thinned(parts, COARSE * keep)
+    flex = _hinged(giving.chain, coarse, joined(loads, COARSE * keep), giving.compliance)
+    hinged = refine_chain(giving.chain, coarse, prior, flex)
+    links = len(giving.compliance)
+    moved = hinged.compliance[links:]
+    loads = with_hinges_moved(loads, flex.links[:links:2], moved)
+    fine = thinned(parts, keep)
+    flex = _hinged(hinged.chain, fine, joined(loads, keep), hinged.compliance[:links], moved)
+    return refine_chain(hinged.chain, fine, prior, flex)
+
+
+def _hinged(
+    chain: Chain,
+    data: SensorData,
+    loads: Sequence[LinkLoad | None],
+    compliance: Array,
+    moved: Array | None = None,
+) -> FlexSlopes:
+    flex = flex_slopes(chain, data.joints, loads)
+    return hinge_slopes(chain, data.joints, loads, flex, compliance, moved)
 
 
 def _parts(windows: Sequence[Window], floor: NoiseFloor | None, late_s: float = 0.0) -> list[SensorData]:

@@ -32,7 +32,14 @@ from module_agent.catalogue import ModuleType
 # Where the hinge is, as a share of the length: 0 for a clamp that gives, 0.15 for a clamped beam (Howell,
 # section 5), up to a third where the end's slope counts more than its place.
 HINGE_SHARE, HINGE_SHARE_SIGMA = 0.15, 0.1
+# And how far it may be beside the line from face to face: tubes are centimetres beside the modules' axes.
+HINGE_ASIDE_SIGMA_M = 0.02
+HINGE_SIGMAS = (HINGE_SHARE_SIGMA, HINGE_ASIDE_SIGMA_M, HINGE_ASIDE_SIGMA_M)
 
+
+# A link's own mass: that of the manufacturer's tubes, 0.2 kg of ends and 0.4 kg/m. It need not be exact: what
+# a compliance is multiplied with is not told apart from it.
+LINK_MASS_KG, LINK_MASS_KG_M = 0.2, 0.4
 
 JointTrack = tuple[Array, Array, Array]  # positions, velocities, accelerations, (m, n) each
 
@@ -41,13 +48,14 @@ class LinkLoad(NamedTuple):
     """The moment that turns one link, and where; root frame at q = 0.
 
     hinge: (3,) the place. along: (3,) unit direction of the link. length_m: of the link.
-    moment: (3, 3, m) moment [Nm], its first and its second time derivative, in the frame of the body that
-    the link starts from.
+    force, moment: (3, 3, m) force [N] and moment about the hinge [Nm], their first and their second time
+    derivatives, in the frame of the body that the link starts from.
     """
 
     hinge: Array
     along: Array
     length_m: float
+    force: Array
     moment: Array
 
     def bending(self, compliance: float) -> LinkTurn:
@@ -57,6 +65,21 @@ class LinkLoad(NamedTuple):
     def twisting(self, compliance: float) -> LinkTurn:
         """Return how the link turns about its direction, for a compliance in rad/Nm."""
         return LinkTurn(self.hinge, compliance * self._about_itself())
+
+    def moved(self, shift: Array) -> "LinkLoad":
+        """Return the load of a hinge that is somewhere else by (3,) metres."""
+        about = self.moment - cross(np.broadcast_to(shift[:, None], self.force.shape), self.force)
+        return self._replace(hinge=self.hinge + shift, moment=about)
+
+    def turns(self, bending: float, twisting: float) -> list[LinkTurn]:
+        """Return how the link turns across its direction and about it, for two compliances in rad/Nm."""
+        return [self.bending(bending), self.twisting(twisting)]
+
+    @property
+    def shifts(self) -> Array:
+        """Unit shifts (3, 3) of the hinge: by the link's length along it, and by a metre to either side."""
+        aside = np.linalg.svd(self.along[None])[2][1:]
+        return np.vstack([self.length_m * self.along, aside])
 
     def _about_itself(self) -> Array:
         return np.asarray(self.along[:, None] * np.einsum("i,dim->dm", self.along, self.moment)[:, None])
@@ -84,21 +107,27 @@ def link_loads(
     for i in reversed(range(len(chain.parent))):
         parent = chain.parent[i]
         if chain.reversed[i]:
-            carried[i] += _weight(chain, kinds[i], i, bodies[i])
+            carried[i] += _weight(bodies[i], _centre(chain, kinds, i), kinds[i].mass_kg)
         if parent == BASE:
             continue
         below = _seen_from_below(chain, i, q_rad[:, i], carried[i])
-        if not chain.reversed[i]:
-            below += _weight(chain, kinds[i], i, bodies[parent])
         start, end = link_ends(chain, kinds, i)
         length = float(np.linalg.norm(end - start))
+        below += _weight(bodies[parent], 0.5 * (start + end), LINK_MASS_KG + LINK_MASS_KG_M * length)
+        if not chain.reversed[i]:
+            below += _weight(bodies[parent], _centre(chain, kinds, i), kinds[i].mass_kg)
         hinge = start + HINGE_SHARE * (end - start)
         moment = below[1] - cross(hinge[:, None], below[0])
-        first = differentiate(moment.T, rate_hz)
-        series = np.stack([moment, first.T, differentiate(first, rate_hz).T])
-        loads[i] = LinkLoad(hinge, (end - start) / max(length, 1e-9), length, series)
+        along = (end - start) / max(length, 1e-9)
+        loads[i] = LinkLoad(hinge, along, length, *(_series(part, rate_hz) for part in (below[0], moment)))
         carried[parent] += below
     return loads
+
+
+def _series(values: Array, rate_hz: float) -> Array:
+    """Return values (3, m), their first and their second derivative, (3, 3, m)."""
+    first = differentiate(values.T, rate_hz)
+    return np.stack([values, first.T, differentiate(first, rate_hz).T])
 
 
 def joined(parts: Sequence[Sequence[LinkLoad | None]], keep_every: int = 1) -> list[LinkLoad | None]:
@@ -106,8 +135,14 @@ def joined(parts: Sequence[Sequence[LinkLoad | None]], keep_every: int = 1) -> l
     found: list[LinkLoad | None] = []
     for of_link in zip(*parts, strict=True):
         known = [part for part in of_link if part is not None]
-        moments = [part.moment[..., ::keep_every] for part in known]
-        found.append(known[0]._replace(moment=np.concatenate(moments, axis=2)) if known else None)
+        force, moment = (
+            [getattr(part, name)[..., ::keep_every] for part in known] for name in ("force", "moment")
+        )
+        found.append(
+            known[0]._replace(force=np.concatenate(force, axis=2), moment=np.concatenate(moment, axis=2))
+            if known
+            else None
+        )
     return found
 
 
@@ -124,12 +159,16 @@ def _face(chain: Chain, kinds: Sequence[ModuleType], module: int, output: bool) 
     return np.asarray(home[:3, :3] @ seen + home[:3, 3])
 
 
-def _weight(chain: Chain, kind: ModuleType, module: int, body: BodyMotion) -> Array:
-    """Return the force (3, m) of a module's mass on what carries it, and its moment about the origin."""
-    home = chain.imu_home[module]
-    place = (home[:3, :3] @ (np.array(kind.com_xyz) - np.array(kind.imu_xyz)) + home[:3, 3])[:, None]
-    force = -kind.mass_kg * acceleration_at(body, place)
-    return np.stack([force, cross(np.broadcast_to(place, force.shape), force)])
+def _centre(chain: Chain, kinds: Sequence[ModuleType], module: int) -> Array:
+    kind, home = kinds[module], chain.imu_home[module]
+    seen = np.array(kind.com_xyz) - np.array(kind.imu_xyz)
+    return np.asarray(home[:3, :3] @ seen + home[:3, 3])
+
+
+def _weight(body: BodyMotion, place: Array, mass_kg: float) -> Array:
+    """Return the force (3, m) of a mass at a place (3,) of a body on it, and its moment about the origin."""
+    force = -mass_kg * acceleration_at(body, place[:, None])
+    return np.stack([force, cross(np.broadcast_to(place[:, None], force.shape), force)])
 
 
 def _seen_from_below(chain: Chain, joint: int, q: Array, load: Array) -> Array:
@@ -144,12 +183,14 @@ class FlexSlopes(NamedTuple):
     """How IMU readings change with the links' compliances.
 
     links: (p,) the module that each compliance's link carries. sigmas: (p,) how well each is known before,
-    in `UNIT_RAD_NM`, or in shares of the length for hinges. slopes: (p, 6, m, n) of [gyro, specific force].
+    in `UNIT_RAD_NM`, or for hinges in shares of the length and in metres. slopes: (p, 6, m, n) of [gyro,
+    specific force]. taken: (p,) what is counted in already, which belongs to what is known before.
     """
 
     links: tuple[int, ...]
     sigmas: Array
     slopes: Array
+    taken: Array
 
 
 # One unit of compliance; that of a metre of light aluminium tube.
@@ -171,23 +212,30 @@ def flex_slopes(chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | Non
             slopes.append(_change(chain, joints, still, module, turn))
     if not links:
         return no_flex(len(chain.serials), len(joints[0]))
-    return FlexSlopes(tuple(links), np.full(len(links), COMPLIANCE_SIGMA), np.array(slopes))
+    count = len(links)
+    return FlexSlopes(tuple(links), np.full(count, COMPLIANCE_SIGMA), np.array(slopes), np.zeros(count))
 
 
-def _change(chain: Chain, joints: JointTrack, still: ImuReadings, module: int, turn: LinkTurn) -> Array:
-    """Return what a turn of one link makes of all IMUs' readings, (6, m, n)."""
-    turns = {module: [turn]}
+def _change(chain: Chain, joints: JointTrack, still: ImuReadings, module: int, *turn: LinkTurn) -> Array:
+    """Return what turns of one link make of all IMUs' readings, (6, m, n)."""
+    turns = {module: turn}
     moved = readings_on(chain, body_motions(chain, *joints, turns=turns), turns)
     change = [moved.gyro_rad_s - still.gyro_rad_s, moved.accel_m_s2 - still.accel_m_s2]
     return np.concatenate(change, axis=2).transpose(2, 0, 1)
 
 
 def hinge_slopes(
-    chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | None], known: FlexSlopes, compliance: Array
+    chain: Chain,
+    joints: JointTrack,
+    loads: Sequence[LinkLoad | None],
+    known: FlexSlopes,
+    compliance: Array,
+    taken: Array | None = None,
 ) -> FlexSlopes:
-    """Return slopes by the places of the hinges, as shares of the links' lengths, beside those known.
+    """Return slopes by the places of the hinges (see `LinkLoad.shifts`), beside those known.
 
-    Their size follows from the compliances (p,) found with the slopes known.
+    Their size follows from the compliances (2 l,) found with the slopes known, of l links. taken: (3 l,) by
+    how much the hinges of the loads have been moved already.
     """
     if not known.links:
         return known
@@ -197,18 +245,35 @@ def hinge_slopes(
     for place, module in enumerate(known.links[::2]):
         load = loads[module]
         assert load is not None
-        turn = load.bending(UNIT_RAD_NM * float(compliance[2 * place]))
-        there = turn._replace(hinge=turn.hinge + load.length_m * load.along)
-        change = _change(chain, joints, still, module, there) - _change(chain, joints, still, module, turn)
-        links.append(module)
-        slopes.append(change)
-    sigmas = np.concatenate([known.sigmas, np.full(len(links), HINGE_SHARE_SIGMA)])
-    return FlexSlopes((*known.links, *links), sigmas, np.concatenate([known.slopes, np.array(slopes)]))
+        bending, twisting = UNIT_RAD_NM * compliance[2 * place : 2 * place + 2]
+        here = _change(chain, joints, still, module, *load.turns(bending, twisting))
+        for shift in load.shifts:
+            # Linear in the shift: a centimetre is small, and far from what numbers resolve.
+            there = load.moved(0.01 * shift).turns(bending, twisting)
+            slopes.append(100.0 * (_change(chain, joints, still, module, *there) - here))
+            links.append(module)
+    return FlexSlopes(
+        (*known.links, *links),
+        np.concatenate([known.sigmas, np.tile(HINGE_SIGMAS, len(links) // 3)]),
+        np.concatenate([known.slopes, np.array(slopes)]),
+        np.concatenate([known.taken, np.zeros(len(links)) if taken is None else taken]),
+    )
+
+
+def with_hinges_moved(
+    loads: Sequence[Sequence[LinkLoad | None]], links: Sequence[int], moved: Array
+) -> list[list[LinkLoad | None]]:
+    """Return loads with the hinges of some links moved by (3 l,), in the units of `LinkLoad.shifts`."""
+    by_link = dict(zip(links, moved.reshape(-1, 3), strict=True))
+    return [
+        [load and load.moved(by_link[module] @ load.shifts) for module, load in enumerate(part)]
+        for part in loads
+    ]
 
 
 def no_flex(count: int, samples: int) -> FlexSlopes:
     """Return the slopes of links that do not give, for so many modules and samples."""
-    return FlexSlopes((), np.zeros(0), np.zeros((0, 6, samples, count)))
+    return FlexSlopes((), np.zeros(0), np.zeros((0, 6, samples, count)), np.zeros(0))
 
 
 def loads_of(

@@ -240,7 +240,7 @@ def _before(state: _State, prior: ImuPrior, flex: FlexSlopes) -> tuple[Array, Ar
     count, free = len(state.chain.serials), prior.sigmas > 0.0
     nothing = np.zeros(6 * count + 3)
     known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(prior.sigmas[free] ** -2.0, count)])
-    held = np.concatenate([nothing, state.compliance, state.imus.errors[:, free].ravel()])
+    held = np.concatenate([nothing, state.compliance + flex.taken, state.imus.errors[:, free].ravel()])
     information, rhs = np.diag(known), -known * held
     size = float(np.linalg.norm(state.chain.gravity))
     up, at = state.chain.gravity / size, slice(6 * count, 6 * count + 3)
@@ -270,7 +270,8 @@ class _Spectrum(NamedTuple):
 
 def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
     """Return information and right-hand side of the poses with the nuisance taken out, and what took it."""
-    through: Array = np.linalg.solve(normal.nuisance, np.column_stack([normal.cross.T, normal.nuisance_rhs]))
+    sides = np.column_stack([normal.cross.T, normal.nuisance_rhs])
+    through: Array = np.linalg.solve(normal.nuisance, sides).astype(np.float64)
     information = normal.pose - normal.cross @ through[:, :-1]
     return information, normal.pose_rhs - normal.cross @ through[:, -1], through
 
