@@ -175,3 +175,36 @@ def test_the_work_holds_copies_so_that_ticks_may_go_on_meanwhile(
     for _ in range(3000):
         scene.history.append(blank)
     assert job() == before
+
+
+def test_the_regression_comes_with_the_circle_and_is_closer(horizontal_link: Any, observer: Observer) -> None:
+    gravity = 9.81 * np.array(horizontal_link.gravity) / np.linalg.norm(horizontal_link.gravity)
+    hinge = horizontal_link._replace(gravity=gravity)
+    scene = Scene(hinge, seed=1)
+    first = scene.observe(observer, "constant")
+    found = scene.observe(observer, "sine")
+    assert first.regression is None
+    regression = found.regression
+    assert regression is not None
+    # An IMU as delivered: its scale is believed to 1 %, and gravity tells it better.
+    assert regression.distance_m == pytest.approx(0.245, abs=2e-3)
+    assert abs(regression.distance_m - 0.245) < 3.0 * regression.sigma_distance_m
+    assert regression.sigma_distance_m < 2.4e-3
+    assert np.degrees(np.arccos(min(1.0, np.dot(regression.axis, hinge.axis)))) < 1.0
+    assert regression.delay_s == pytest.approx(-12e-3, abs=1e-3)
+    assert not regression.base_shakes
+
+
+def test_a_joint_whose_rows_have_a_gap_gives_a_circle_and_says_why_no_regression(
+    horizontal_link: Any, observer: Observer
+) -> None:
+    scene = Scene(horizontal_link)
+    motion = scene.motions["sine"]
+    rows = np.delete(motion.rows, slice(700, 720))
+    scene.motions["sine"] = motion._replace(rows=rows)
+    scene.observe(observer, "constant")
+    found = scene.observe(observer, "sine")
+    assert found.circle is not None
+    assert found.regression is None
+    assert "no joint regression" in found.note
+    assert "evenly spaced" in found.note
