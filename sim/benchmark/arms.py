@@ -4,11 +4,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from statistics import median
 
-from coordinator.plan import Plan
+from coordinator.kinematics.imu_intrinsics import ImuKind
+from coordinator.plan import Mode, Motions, Plan
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
 from sim.benchmark.row import Row, count, for_few, largest, mean_abs, rms, scaled
-from sim.experiments.arm_trial import ArmTrial, Mode, TipErrors, arm_plan, arm_trial, imu_kind
-from sim.noise_profile import NoiseProfile, noise_profile
+from sim.experiments.arm_trial import ArmTrial, TipErrors, arm_plan, arm_trial, imu_kind
+from sim.noise_profile import noise_profile
 
 ARMS = ("a2085_04", "a2085_06", "arm7")
 WHOLE_ARM = COST_ARM = "a2085_06"
@@ -20,7 +21,9 @@ AXIS_DEG = {"x5": 0.1, "x5-uncalibrated": None}
 JOINT_TIME_S, THESIS_JOINT_TIME_S = 10.0, 18.0
 WHOLE_TIME_S = 20.0
 REFINEMENT_S = 5.0
+# Less of everything, whoever chooses the motions.
 SHORTENED = {
+    "joint_s": 4.0,
     "discover_s": 0.3,
     "link_s": 0.3,
     "rest_s": 1.0,
@@ -34,26 +37,30 @@ _COST_S = {"a2085_04": 8.0, "a2085_06": 14.0, "arm7": 16.0}
 _WHOLE_COST_S = 6.0
 
 
-def arm_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
+def arm_cases(trials: int, seed: int, shortened: bool = False, motions: Motions | None = None) -> list[Case]:
     """Return one case for every arm and profile, joint by joint and all joints at once.
 
-    `shortened` motions save time: joint by joint, of all cases but the first.
+    `shortened` motions save time: joint by joint, of all cases but the first. `motions`: see `arm_plan`.
     """
     joints = [(arm, noise) for arm in ARMS for noise in PROFILES]
-    first = [_case(*joints[0], "joint", trials, seed, shortened=False)]
-    others = [_case(arm, noise, "joint", trials, seed, shortened) for arm, noise in joints[1:]]
-    return first + others + [_case(WHOLE_ARM, noise, "whole", trials, seed, False) for noise in PROFILES]
+    cases = []
+    for number, (arm, noise) in enumerate(joints):
+        short = shortened and number > 0
+        plan = arm_plan("joint", _imu(noise), motions)
+        own = plan.model_copy(update=SHORTENED) if short else plan
+        cases.append(_case(arm, noise, own, trials, seed, short))
+    whole = [_case(WHOLE_ARM, noise, arm_plan("whole", _imu(noise)), trials, seed) for noise in PROFILES]
+    return cases + whole
 
 
-def shortened_plan(noise: NoiseProfile) -> Plan:
-    """Return a plan of shortened motions, for a look at whether all is in order."""
-    return arm_plan("joint", imu_kind(noise)).model_copy(update=SHORTENED)
+def _imu(noise: str) -> ImuKind:
+    return imu_kind(noise_profile(noise))
 
 
-def _case(arm: str, noise: str, mode: Mode, trials: int, seed: int, shortened: bool) -> Case:
+def _case(arm: str, noise: str, plan: Plan, trials: int, seed: int, shortened: bool = False) -> Case:
+    mode = plan.mode
     how = "joint by joint" if mode == "joint" else "all joints at once"
     cost_s = _COST_S[arm] if mode == "joint" else _WHOLE_COST_S
-    plan = shortened_plan(noise_profile(noise)) if shortened else None
     # The same modules in both profiles and both modes.
     work = tuple(
         Trial(

@@ -4,14 +4,15 @@ from collections.abc import Sequence
 from fnmatch import fnmatch
 from typing import NamedTuple
 
-from sim.benchmark.arms import arm_cases, shortened_plan
+from coordinator.plan import Motions
+from sim.benchmark.arms import SHORTENED, arm_cases
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.joints import joint_cases
 from sim.benchmark.networks import network_cases
 from sim.benchmark.row import Row, coverage
 from sim.benchmark.topologies import topology_cases
 from sim.benchmark.wears import wear_cases
-from sim.noise_profile import noise_profile
+from sim.experiments.arm_trial import arm_plan
 
 TRIALS = 13
 ALL = "all cases"
@@ -37,12 +38,13 @@ def full(trials: int = TRIALS) -> Effort:
     return Effort(trials, trials, robots=200, networks=trials, changed=trials, unchanged=100)
 
 
-def kinematic_cases(effort: Effort, seed: int) -> list[Case]:
-    """Return all cases, in the order in which they are reported."""
-    plan = shortened_plan(noise_profile("x5")) if effort.shortened else None
+def kinematic_cases(effort: Effort, seed: int, motions: Motions | None = None) -> list[Case]:
+    """Return all cases, in the order in which they are reported; `motions`: see `arm_plan`."""
+    calibrated = arm_plan("joint", "calibrated", motions)
+    plan = calibrated.model_copy(update=SHORTENED) if effort.shortened else calibrated
     return [
         *joint_cases(effort.joints, seed),
-        *arm_cases(effort.arms, seed, effort.shortened),
+        *arm_cases(effort.arms, seed, effort.shortened, motions),
         *topology_cases(effort.robots, seed),
         *network_cases(effort.networks, seed, plan),
         *wear_cases(effort.changed, effort.unchanged, seed),

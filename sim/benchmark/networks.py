@@ -19,11 +19,10 @@ _COST_S = 9.0
 def network_cases(trials: int, seed: int, plan: Plan | None = None) -> list[Case]:
     """Return `wifi` beside a perfect network on the same modules, and `bad` by itself."""
     noise = apart(noise_profile("x5"))
-    cost_s = _COST_S if plan is None else 0.5 * _COST_S
 
     def work(*networks: str) -> tuple[Trial, ...]:
         return tuple(
-            Trial(network_trial, (ROBOT, network, noise, trial_seed(seed, ROBOT, number), plan), cost_s)
+            Trial(network_trial, (ROBOT, network, noise, trial_seed(seed, ROBOT, number), plan), _COST_S)
             for number in range(trials)
             for network in networks
         )

@@ -10,6 +10,7 @@ import typer
 
 from coordinator.failure import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from coordinator.interruption import SIGNALS
+from coordinator.plan import Motions
 from coordinator.terminal import Terminal
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.kinematics import QUICK, TRIALS, chosen, full, kinematic_cases, over_all
@@ -49,6 +50,9 @@ def kinematics(
         typer.Option(min=1, help=f"Trials a case; 200 robots and 100 unchanged checks besides [{TRIALS}]."),
     ] = None,
     seed: Seed = 0,
+    motions: Annotated[
+        Motions | None, typer.Option(help="How whole arms explore joint by joint [as in a run].")
+    ] = None,
     only: Annotated[str, typer.Option(help="Cases whose name holds this; * and ? stand for anything.")] = "",
     processes: Annotated[
         int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
@@ -65,13 +69,14 @@ def kinematics(
         if file is not None and not file.parent.is_dir():
             fail(f"{file}: there is no folder {file.parent}", EXIT_USAGE)
     effort = QUICK if quick else full(trials or TRIALS)
-    cases = kinematic_cases(effort, seed)
+    cases = kinematic_cases(effort, seed, motions)
     wanted = chosen(cases, only)
     if not wanted:
         fail(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases), EXIT_USAGE)
     started_s = time.monotonic()
     found = _run(wanted, processes or os.cpu_count() or 1)
-    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "trials": effort._asdict()}
+    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "motions": motions}
+    settings |= effort._asdict()
     results = gathered("kinematics", settings, found, over_all(found), time.monotonic() - started_s)
     _report(results, json_file, plot_file)
     if results.missed:

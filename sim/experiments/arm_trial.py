@@ -5,7 +5,7 @@ batch refinement makes of all motions.
 """
 
 import time
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from coordinator.identify import Kinematics, identify_kinematics
 from coordinator.kinematics.assembly import link_lengths
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.kinematics.increments import apply_increment
-from coordinator.plan import Plan
+from coordinator.plan import Mode, Motions, Plan
 from coordinator.recording import Recording
 from module_agent.wire.network_file import network as named_network
 from sim.chain_score import link_errors, link_length_m, tip_errors, topology_differences
@@ -26,7 +26,6 @@ from sim.robot_tree import true_chain
 from sim.virtual_robot import VirtualSettings
 from sim.virtual_session import record_session
 
-Mode = Literal["joint", "whole"]
 # The rms over so many draws scatters by some 15 %, more poses would not make it less.
 BOUND_DRAWS, BOUND_POSES = 24, 100
 
@@ -120,9 +119,10 @@ def arm_trial(
     )
 
 
-def arm_plan(mode: Mode, imu: ImuKind) -> Plan:
-    """Return the plan of a trial: kinematics only."""
-    return Plan.model_validate({"dynamics": False, "imu": imu} | ({} if mode == "joint" else {"mode": mode}))
+def arm_plan(mode: Mode, imu: ImuKind, motions: Motions | None = None) -> Plan:
+    """Return the plan of a trial: kinematics only; `motions` other than a run's by default."""
+    plan = Plan(mode=mode, imu=imu, dynamics=False)
+    return plan if motions is None else plan.model_copy(update={"motions": motions})
 
 
 def imu_kind(noise: NoiseProfile) -> ImuKind:

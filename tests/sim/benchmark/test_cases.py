@@ -14,7 +14,7 @@ from sim.benchmark.row import Row
 from sim.benchmark.runner import concluded
 from sim.benchmark.topologies import topology_cases
 from sim.benchmark.wears import Checks, wear_cases
-from sim.experiments.arm_trial import ArmLink, ArmTrial, TipErrors
+from sim.experiments.arm_trial import ArmLink, ArmTrial, TipErrors, arm_plan
 from sim.experiments.joint_trial import JointTrial
 from sim.experiments.network_trial import NetworkTrial
 from sim.experiments.random_robots import TopologyTrial
@@ -175,8 +175,16 @@ def test_shortened_motions_meet_no_bar_of_time_and_one_arm_moves_in_full_all_the
     limits = [rows(case.summarise([arm(0.5)]))["robot time a joint, longest [s]"].limit for case in cases]
     assert limits == [10.0] + [None] * 5
     plans = [case.trials[0].arguments[-1] for case in cases]
-    assert plans[0] is None
-    assert [plan.imu for plan in plans[1:]] == ["uncalibrated", "calibrated"] * 2 + ["uncalibrated"]
+    assert plans[0] == arm_plan("joint", "calibrated")
+    assert [plan.imu for plan in plans] == ["calibrated", "uncalibrated"] * 3
+    assert all(plan.sine_centre_s < plans[0].sine_centre_s for plan in plans[1:])
+
+
+def test_other_motions_are_those_of_whole_arms_joint_by_joint() -> None:
+    cases = kinematic_cases(QUICK, seed=0, motions="designed")
+    plans = {case.name: case.trials[0].arguments[-1] for case in cases}
+    assert all(plan.motions == "designed" for name, plan in plans.items() if "joint by joint" in name)
+    assert plans["a2085_04, x5, clocks apart, wifi"].motions == "designed"
 
 
 def test_all_joints_at_once_have_twenty_seconds_in_all() -> None:
