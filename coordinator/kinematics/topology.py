@@ -24,7 +24,6 @@ from coordinator.kinematics.forest_likelihood import (
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.motion_evidence import carried_log_odds
 
-UNDECIDED = 0.5
 # What is less likely than this (log-odds) to be right is worth another motion: 1 in 100 may be wrong.
 DOUBTFUL_BELOW = float(np.log(99.0))
 # What is less likely than this is not believed at all: one in four would be wrong.

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.failure import explain
 from coordinator.kinematics.topology import Topology, TopologyError
 from coordinator.plan import Plan
 from coordinator.recording import Recording
@@ -36,7 +37,8 @@ class TopologyTrial(NamedTuple):
     """What came out for one robot. `differences` say in words what is wrong, empty if all is right.
 
     confidence: the probability that the coordinator itself gives to its least certain answer; 0 without one.
-    repeats: the motions that it repeated for doubt. robot_time_s: from discovery to the robot's release.
+    repeats: the motions that it repeated for doubt. robot_time_s: from discovery to the robot's release; NaN
+        of a session that did not come to its end.
     """
 
     seed: int
@@ -52,11 +54,16 @@ def topology_trial(
 ) -> TopologyTrial:
     """Let the random robot of a seed find its topology in virtual time, all chance of the same seed.
 
-    Raises:
-        what `coordinator.session` raises if the session does not come to its end.
+    A session that does not come to its end has found nothing, and why is the difference.
     """
     robot = random_robot(seed)
-    recording = record_session(VirtualSettings(robot, named_network(network), seed, noise), plan)
+    try:
+        recording = record_session(VirtualSettings(robot, named_network(network), seed, noise), plan)
+    except Exception as error:
+        failure = explain(error)
+        if failure is None:
+            raise
+        return TopologyTrial(seed, len(robot.modules), (failure.text,), 0.0, 0, float("nan"))
     return judged(robot, seed, recording)
 
 

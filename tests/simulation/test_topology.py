@@ -190,6 +190,15 @@ def test_where_no_module_responds_the_session_says_so(arm: Any) -> None:
         explore(arm)
 
 
+def test_a_session_that_breaks_off_has_found_nothing_and_says_why(tmp_path: Path) -> None:
+    """Six seconds without any message in the midst of the exploration."""
+    parted = tmp_path / "parted.toml"
+    parted.write_text("delay_ms = 0.5\npartitions = [[3.0, 9.0]]\n")
+    found = topology_trial(14, network=str(parted))
+    assert found.confidence == 0.0
+    assert "is lost" in found.differences[0]
+
+
 def test_a_random_robot_finds_out_how_it_is_built() -> None:
     found = topology_trial(14)
     assert found.modules == 5
