@@ -8,7 +8,8 @@ from coordinator.chain import Array
 from coordinator.kinematics.chain_observations import PairObservation
 from module_agent.wire.messages import CircleEstimate, Estimate, RegressionEstimate
 
-# The usual windowed sine's. At it a structure that gives turns the IMU by c omega^2 more than the encoder says.
+# The usual windowed sine's. At it a structure that gives turns the IMU by c omega^2 more than the encoder
+# says.
 _OMEGA_RAD_S = 2.0 * pi * 2.0
 
 
