@@ -6,11 +6,13 @@ A base that shakes and links that bend are found in turn: each needs a chain tha
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.spatial.transform import RigidTransform
 
 from coordinator.chain import Array, Chain
 from coordinator.kinematics.base_heading import faced
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.imu_intrinsics import DELAY, ImuPrior
+from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.link_flex import (
     FlexSlopes,
     LinkLoad,
@@ -18,6 +20,7 @@ from coordinator.kinematics.link_flex import (
     hinge_slopes,
     joined,
     loads_of,
+    turns_under,
     with_hinges_moved,
 )
 from coordinator.kinematics.refinement import Refinement, refine_chain
@@ -64,17 +67,33 @@ def refine_robot(
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
     giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
     if not giving.compliance.size:
-        return refine_chain(giving.chain, thinned(parts, keep), prior)
+        return _anchored(chain, refine_chain(giving.chain, thinned(parts, keep), prior), parts)
     # Where the hinges are changes what turns them: once roughly, then for good.
     coarse = thinned(parts, COARSE * keep)
     flex = _hinged(giving.chain, coarse, joined(loads, COARSE * keep), giving.compliance)
     hinged = refine_chain(giving.chain, coarse, prior, flex)
     links = len(giving.compliance)
-    moved = hinged.compliance[links:]
-    loads = with_hinges_moved(loads, flex.links[:links:2], moved)
+    moved, joints = hinged.compliance[links:], flex.links[:links:2]
+    loads = with_hinges_moved(loads, joints, moved)
+    turns = [turns_under(part, joints, hinged.compliance[:links]) for part in loads]
+    loads = loads_of(hinged.chain, kinds, parts, RATE_HZ, turns)
+    loads = with_hinges_moved(loads, joints, moved)
     fine = thinned(parts, keep)
     flex = _hinged(hinged.chain, fine, joined(loads, keep), hinged.compliance[:links], moved)
-    return refine_chain(hinged.chain, fine, prior, flex)
+    return _anchored(chain, refine_chain(hinged.chain, fine, prior, flex), parts)
+
+
+def _anchored(first: Chain, found: Refinement, parts: Sequence[SensorData]) -> Refinement:
+    """Put what no motion tells back to where it was at first, unless the base's motion tells it.
+
+    What noise alone moves on the way would be shown, and written, as if it were known.
+    """
+    if parts[0].base_motion is not None:
+        return found
+    moved = found.chain.imu_home @ np.linalg.inv(first.imu_home)
+    increment = RigidTransform.from_matrix(moved).as_exp_coords().ravel()
+    back = -found.null_basis @ (found.null_basis.T @ increment)
+    return found._replace(chain=apply_increment(found.chain, back))
 
 
 def _hinged(

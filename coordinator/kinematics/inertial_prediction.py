@@ -65,7 +65,7 @@ def readings_on(chain: Chain, bodies: list[BodyMotion], turns: LinkTurns | None 
     for k in range(joints):
         motion = bodies[carrier(chain, k)]
         if turns and not chain.reversed[k]:
-            motion = _given(motion, turns.get(k, ()))
+            motion = given(motion, turns.get(k, ()))
         turn, place = chain.imu_home[k, :3, :3], chain.imu_home[k, :3, 3, None]
         gyro[:, k] = motion.omega.T @ turn
         accel[:, k] = acceleration_at(motion, place).T @ turn
@@ -90,12 +90,12 @@ def body_motions(
     bodies: list[BodyMotion] = []
     for i, parent in enumerate(chain.parent):
         below = base if parent == BASE else bodies[parent]
-        below = below if turns is None else _given(below, turns.get(i, ()))
+        below = below if turns is None else given(below, turns.get(i, ()))
         bodies.append(_carry(below, chain.axis[i], chain.point[i][:, None], q[i], qd[i], qdd[i]))
     return [*bodies, base]
 
 
-def _given(body: BodyMotion, turns: Sequence[LinkTurn]) -> BodyMotion:
+def given(body: BodyMotion, turns: Sequence[LinkTurn]) -> BodyMotion:
     """Return the motion beyond hinges that turn a little, to first order, in the frame that turns along."""
     for turn in turns:
         angle, rate, acceleration = turn.theta_rad

@@ -21,8 +21,10 @@ from coordinator.kinematics.inertial_prediction import (
     BodyMotion,
     ImuReadings,
     LinkTurn,
+    LinkTurns,
     acceleration_at,
     body_motions,
+    given,
     readings_on,
     turned,
 )
@@ -91,6 +93,7 @@ def link_loads(
     bodies: Sequence[BodyMotion],
     q_rad: Array,
     rate_hz: float,
+    turns: LinkTurns | None = None,
 ) -> list[LinkLoad | None]:
     """Return the load of the link below every module; None for modules on the base.
 
@@ -100,6 +103,8 @@ def link_loads(
         bodies: their motion, from `body_motions`, over one stretch of time without holes.
         q_rad: (m, n) joint positions.
         rate_hz: of the samples.
+        turns: how the links turn, as far as it is known, and is counted in `bodies`: near a resonance what
+            gives is a load itself.
     """
     samples = len(q_rad)
     carried = [np.zeros((2, 3, samples)) for _ in chain.parent]  # force, and moment about the root's origin
@@ -113,9 +118,10 @@ def link_loads(
         below = _seen_from_below(chain, i, q_rad[:, i], carried[i])
         start, end = link_ends(chain, kinds, i)
         length = float(np.linalg.norm(end - start))
-        below += _weight(bodies[parent], 0.5 * (start + end), LINK_MASS_KG + LINK_MASS_KG_M * length)
+        beyond = given(bodies[parent], (turns or {}).get(i, ()))
+        below += _weight(beyond, 0.5 * (start + end), LINK_MASS_KG + LINK_MASS_KG_M * length)
         if not chain.reversed[i]:
-            below += _weight(bodies[parent], _centre(chain, kinds, i), kinds[i].mass_kg)
+            below += _weight(beyond, _centre(chain, kinds, i), kinds[i].mass_kg)
         hinge = start + HINGE_SHARE * (end - start)
         moment = below[1] - cross(hinge[:, None], below[0])
         along = (end - start) / max(length, 1e-9)
@@ -271,6 +277,18 @@ def with_hinges_moved(
     ]
 
 
+def turns_under(
+    loads: Sequence[LinkLoad | None], links: Sequence[int], compliance: Array
+) -> dict[int, list[LinkTurn]]:
+    """Return how links turn under their loads, for compliances (2 l,) in bending and twisting by turns."""
+    found = {}
+    for module, pair in zip(links, compliance.reshape(-1, 2), strict=True):
+        load = loads[module]
+        if load is not None:
+            found[module] = load.turns(*(UNIT_RAD_NM * pair))
+    return found
+
+
 def no_flex(count: int, samples: int) -> FlexSlopes:
     """Return the slopes of links that do not give, for so many modules and samples."""
     return FlexSlopes((), np.zeros(0), np.zeros((0, 6, samples, count)), np.zeros(0))
@@ -281,11 +299,12 @@ def loads_of(
     kinds: Sequence[ModuleType],
     parts: Sequence[SensorData],
     rate_hz: float,
+    turns: Sequence[LinkTurns] | None = None,
 ) -> list[list[LinkLoad | None]]:
     """Return the loads over each of several stretches of time, as `link_loads` does over one."""
     found = []
-    for part in parts:
+    for part, turned_links in zip(parts, turns or [{}] * len(parts), strict=True):
         base = None if part.base_motion is None else BaseMotion(*np.split(part.base_motion, 3, axis=1))
-        bodies = body_motions(chain, part.q_rad, part.qd_rad_s, part.qdd_rad_s2, base)
-        found.append(link_loads(chain, kinds, bodies, part.q_rad, rate_hz))
+        bodies = body_motions(chain, part.q_rad, part.qd_rad_s, part.qdd_rad_s2, base, turned_links)
+        found.append(link_loads(chain, kinds, bodies, part.q_rad, rate_hz, turned_links))
     return found
