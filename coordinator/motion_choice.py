@@ -5,10 +5,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS
-from coordinator.motion_design.limits import JointLimits, joint_limits, likely_inertia_kg_m2
+from coordinator.motion_design.limits import (
+    JointLimits,
+    joint_limits,
+    least_accel_rad_s2,
+    likely_inertia_kg_m2,
+)
 from coordinator.motion_design.load import measured_load
 from coordinator.motion_design.one_joint import (
     LIKELY_RADIUS_M,
+    JointMotions,
     JointTask,
     design_joint,
     next_sine,
@@ -50,15 +56,15 @@ class MotionChoice:
 
     def slow(self, serial: str) -> ConstantMotion:
         """Return a joint's slow motion, before anything is known of its load but whom there is to carry."""
-        if self._plan.motions == "thesis":
-            return self._plan.constant()
-        return design_joint(self._task(serial, self._unmoved_limits(serial))).constant
+        found = self._designed(serial, self._unmoved_limits(serial)) if self._designs() else None
+        return found.constant if found is not None else self._plan.constant()
 
     def fast(self, serial: str, slow: MotionRecord) -> WindowedSine:
         """Return a joint's fast motion, from the load that its slow motion has shown."""
-        if self._plan.motions == "thesis" or not isinstance(slow.pattern, ConstantMotion):
+        if not self._designs() or not isinstance(slow.pattern, ConstantMotion):
             return self._plan.sine(self._kind(serial))
-        return design_joint(self._task(serial, self._moved_limits(serial, slow)), slow.pattern).sine
+        found = self._designed(serial, self._moved_limits(serial, slow), slow.pattern)
+        return found.sine if found is not None else self._plan.sine(self._kind(serial))
 
     def again(self, serial: str, done: Sequence[MotionRecord]) -> WindowedSine | None:
         """Return one more fast motion if the precision asked for needs one and it would help; else None."""
@@ -85,6 +91,18 @@ class MotionChoice:
         return whole_patterns(settings, self._plan.whole_duration_s)
 
     # ------------------------------------------------------------------ what is known
+
+    def _designs(self) -> bool:
+        return self._plan.motions == "designed"
+
+    def _designed(
+        self, serial: str, limits: JointLimits, slow: ConstantMotion | None = None
+    ) -> JointMotions | None:
+        """Return the best motions; none if none fits into the time, and the plan's have to do."""
+        try:
+            return design_joint(self._task(serial, limits), slow)
+        except ValueError:
+            return None
 
     def _task(self, serial: str, limits: JointLimits) -> JointTask:
         force = self._rest_rows(serial)["accel_m_s2"].astype(float).mean(axis=0)
@@ -115,13 +133,18 @@ class MotionChoice:
 
     def _unmoved_limits(self, serial: str) -> JointLimits:
         inertia = likely_inertia_kg_m2([self._kind(s) for s in self._serials()])
-        return joint_limits(self._kind(serial), self._rest_torque_nm(serial), inertia)
+        return self._limits(serial, inertia)
 
     def _moved_limits(self, serial: str, slow: MotionRecord) -> JointLimits:
         rows = self._recording.rows(serial, slow.start_row, slow.end_row or slow.start_row)
         rate_hz = 1e9 * (len(rows) - 1) / float(rows["t_ns"][-1] - rows["t_ns"][0])
         load = measured_load(rows["position_rad"].astype(float), rows["effort_nm"].astype(float), rate_hz)
-        return joint_limits(self._kind(serial), self._rest_torque_nm(serial), load.at_most_kg_m2)
+        return self._limits(serial, load.at_most_kg_m2)
+
+    def _limits(self, serial: str, inertia_kg_m2: float) -> JointLimits:
+        found = joint_limits(self._kind(serial), self._rest_torque_nm(serial), inertia_kg_m2)
+        least = least_accel_rad_s2(len(self._serials()))
+        return found._replace(accel_rad_s2=max(found.accel_rad_s2, least))
 
     def _rest_torque_nm(self, serial: str) -> float:
         """Return what a joint holds at home, as it did at rest."""

@@ -24,6 +24,9 @@ RANGE_SHARE = 0.9
 # Links and brackets weigh about 0.6 of the modules; a module with its link reaches about 0.12 m further.
 LINK_MASS_SHARE = 0.6
 REACH_PER_MODULE_M = 0.12
+GRAVITY_M_S2 = 9.81
+# Of the torque that holds an arm level: whoever can carry an arm has so much left to move it.
+LEVEL_SHARE = 0.05
 # Of any motion: 100 a period at 4 Hz for 15 s.
 PEAK_SAMPLES = 6001
 
@@ -77,6 +80,14 @@ def likely_inertia_kg_m2(kinds: list[ModuleType]) -> float:
     reach = REACH_PER_MODULE_M * len(kinds)
     # Each module's own housing turns too, a lone one about itself.
     return mass * reach**2 / 3.0 + 2e-3
+
+
+def least_accel_rad_s2(modules: int) -> float:
+    """Return the acceleration that a joint always has left, in an arm of so many modules that holds itself.
+
+    Holding a stretched uniform arm level takes m g L / 2, turning it m L^2 / 3 times the acceleration.
+    """
+    return LEVEL_SHARE * 1.5 * GRAVITY_M_S2 / (REACH_PER_MODULE_M * modules)
 
 
 def motion_peaks(pattern: Pattern, origin_rad: float = 0.0) -> tuple[float, float]:

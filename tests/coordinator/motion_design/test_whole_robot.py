@@ -9,6 +9,7 @@ from coordinator.motion_design.limits import (
     JointLimits,
     continuous_torque_nm,
     joint_limits,
+    least_accel_rad_s2,
     likely_inertia_kg_m2,
 )
 from coordinator.motion_design.whole_robot import JointSetting, whole_duration_s, whole_patterns
@@ -117,6 +118,17 @@ def test_what_gravity_warms_is_what_the_copper_bears() -> None:
         # 13.6 K/W to the room and 51 % more resistance at 155 C, see the module's text.
         rise_k = current**2 * motor.resistance_ohm * 1.51 * 13.63
         assert rise_k < 131.0
+
+
+@pytest.mark.parametrize("count", [2, 7, 16])
+def test_an_arm_that_holds_itself_level_can_always_move_a_little(count: int) -> None:
+    level_nm, inertia = 1.0, 1.0 / (0.5 * 9.81) * (0.12 * count) / 3.0  # per m g L / 2 of a uniform arm
+    assert least_accel_rad_s2(count) * inertia == pytest.approx(0.05 * level_nm)
+    # Fast enough for the slow sine's rate to stand out of a gyro's errors of some mrad/s.
+    limits = JointLimits(1.0, least_accel_rad_s2(count), -3.0, 3.0)
+    asked = {f"M{k:02d}": JointSetting(limits, 0.0) for k in range(count)}
+    for pattern in whole_patterns(asked).values():
+        assert np.sqrt(np.mean(sampled(pattern)[1] ** 2)) > 0.02
 
 
 def test_an_inertia_that_is_none_is_refused() -> None:
