@@ -19,6 +19,9 @@ from module_agent.estimate.windows import Array, ImuWindow, JointWindow, Times
 # The columns of `BaseMotion.values`: specific force, angular rate and its derivative along axes that turn
 # with the child; the third is the joint's axis.
 FORCE, RATE, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
+# The first and the second time derivative of the force across the axis, and of the acceleration about it.
+SLOPE, CURVE = slice(9, 12), slice(12, 15)
+_LOADING = [0, 1, 8]
 # Chi^2 of 12 coefficients, all of them noise, is above this once in 10,000.
 SHAKES_ABOVE = 39.0
 # An IMU that reads this much of the joint's rate about the axis sits on the moving side: its module is
@@ -55,21 +58,23 @@ class BaseMotion:
         # These axes turn with the joint: of the slope, - rate x (rate's direction) is not the housing's.
         slopes += rate[:, None] * np.stack([-smooth[:, 4], smooth[:, 3], 0.0 * rate], axis=1)
         knots = 1e-9 * (t_ns - int(joint.t_ns[0]))
-        self._spline = CubicSpline(knots, np.hstack([smooth, slopes]))
+        values = np.hstack([smooth, slopes])
+        loading = CubicSpline(knots, values[:, _LOADING])
+        self._spline = CubicSpline(knots, np.hstack([values, loading(knots, 1), loading(knots, 2)]))
         self.start_s, self.end_s = float(knots[0]), float(knots[-1])
         self.gravity: Array = np.array(still[3:5])
         self.shakes, self.push_m = _shakes(imu.t_ns, readings, angle, smooth_s)
-        self._known = np.ones(9)
+        self._known = np.ones(15)
 
     def values(self, t_s: Array) -> Array:
-        """Return (n, 9), the columns named above; beyond the ends they stay as they are there."""
+        """Return (n, 15), the columns named above; beyond the ends they stay as they are there."""
         return np.asarray(self._spline(np.clip(t_s, self.start_s, self.end_s)) * self._known)
 
     def about_the_axis(self) -> "BaseMotion":
         """Return only what needs no direction across the axis: the swing about it, and the push along it."""
         found = copy(self)
-        found._known = np.zeros(9)
-        found._known[[2, 5, 8]] = 1.0
+        found._known = np.zeros(15)
+        found._known[[2, 5, 8, 11, 14]] = 1.0
         return found
 
 

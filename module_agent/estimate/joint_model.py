@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.estimate.base_motion import ACCELERATION, FORCE, RATE, BaseMotion
+from module_agent.estimate.base_motion import ACCELERATION, CURVE, FORCE, RATE, SLOPE, BaseMotion
 from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED, SmoothMotion
 from module_agent.estimate.windows import Array
 
@@ -123,8 +123,7 @@ def _base_across(values: Array, shake: Array, p: Array) -> tuple[Array, Array, A
 
     Specific force, rate and angular acceleration across the axis (n, 2), and specific force along it (n,).
     """
-    bearing, height = p[BEARING], p[HEIGHT]
-    turn = np.array([[np.cos(bearing), np.sin(bearing)], [-np.sin(bearing), np.cos(bearing)]])
+    height, turn = p[HEIGHT], _bearing(p)
     cosine, sine = values[:, COSINE], values[:, SINE]
     (s1, s2), (w1, w2, _), (a1, a2, a3) = p[PIVOT], shake[:, RATE].T, shake[:, ACCELERATION].T
     # The pivot stands in the housing, and so turns backwards in axes that turn with the child.
@@ -154,7 +153,7 @@ def _carried(values: Array, shake: Array | None, p: Array) -> list[Array]:
     where the link's hinge is not on the axis.
     """
     c, rate = p[COMPLIANCE], values[:, 0]
-    load, slope, curve = _load(values, p)
+    load, slope, curve = _load(values, shake, p)
     cosine, sine, bent = values[:, COSINE], values[:, SINE], c * load
     swing, twist = (shake[:, 5], shake[:, 8]) if shake is not None else (0.0, 0.0)
     return [
@@ -166,21 +165,33 @@ def _carried(values: Array, shake: Array | None, p: Array) -> list[Array]:
     ]
 
 
-def _load(values: Array, p: Array) -> tuple[Array, Array, Array]:
+def _load(values: Array, shake: Array | None, p: Array) -> list[Array]:
     """Return what bends the link, as an acceleration of what it carries [rad/s^2], and its two derivatives.
 
-    That is q'' and gravity's pull, and to first order in c the acceleration of the bending itself: - c q''''.
+    That is q'' and gravity's pull; the base's swing and what of its push is along the tangent; and to first
+    order in c the acceleration of the bending itself: - c q''''.
     """
     rate, acceleration, jerk, snap, fifth, sixth, cosine, sine, squared = values.T
     (g1, g2, _), (r1, r2), c = p[GRAVITY], p[RADIAL], p[COMPLIANCE]
     square = max(r1**2 + r2**2, _LEAST_DISTANCE_M**2)
     even, odd = (r1 * g2 - r2 * g1) / square, -(r1 * g1 + r2 * g2) / square
     pull, slope = even * cosine + odd * sine, odd * cosine - even * sine
-    return (
+    loads = [
         acceleration + pull - c * snap,
         jerk + slope * rate - c * fifth,
         snap + slope * acceleration - pull * squared - c * sixth,
-    )
+    ]
+    if shake is None:
+        return loads
+    tangent = _bearing(p) @ (-r2, r1) / square
+    pushes = (shake[:, [0, 1, 8]], shake[:, SLOPE], shake[:, CURVE])
+    return [load + push[:, :2] @ tangent + push[:, 2] for load, push in zip(loads, pushes, strict=True)]
+
+
+def _bearing(p: Array) -> Array:
+    """Return (2, 2): vectors of the housing (n, 2), in rows, times this are along e1 and e2."""
+    cosine, sine = np.cos(p[BEARING]), np.sin(p[BEARING])
+    return np.array([[cosine, sine], [-sine, cosine]])
 
 
 def _force_across(carried: list[Array], p: Array) -> Array:
