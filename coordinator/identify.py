@@ -26,6 +26,7 @@ from coordinator.kinematics.chain_observations import (
     PairObservation,
     RestObservation,
 )
+from coordinator.kinematics.free_motions import settled
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement
@@ -177,17 +178,18 @@ def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) 
 
 
 def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
-    length, sigma = link_lengths(refined.chain, refined.covariance)
+    fit = settled(refined.chain, refined.covariance, refined.null_basis, first.chain)
+    length, sigma = link_lengths(fit.chain, fit.covariance)
     # What no motion can tell: the IMU's place in the housing.
     believed = np.sqrt(sigma**2 + DISTANCE_FLOOR_M**2)
     believed.flags.writeable = False
     return first._replace(
-        chain=refined.chain,
-        covariance=refined.covariance,
+        chain=fit.chain,
+        covariance=fit.covariance,
         rank=refined.rank,
         condition=refined.condition,
-        unresolved=name_null_space(refined.chain, refined.null_basis),
-        null_basis=refined.null_basis,
+        unresolved=name_null_space(fit.chain, fit.null_basis),
+        null_basis=fit.null_basis,
         link_length_m=length,
         link_length_sigma_m=believed,
     )

@@ -1,0 +1,90 @@
+"""What no observation tells may be anywhere; brought back, the robot is the one that it was."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.chain import Chain
+from coordinator.kinematics.forward import descendants
+from coordinator.kinematics.free_motions import carried, free_motions, moved, nearest, settled
+from coordinator.kinematics.increments import apply_increment
+from coordinator.kinematics.null_space import Unresolved, name_null_space
+
+
+def hidden(chain: Chain) -> tuple[Unresolved, ...]:
+    """What a fixed base with a vertical first axis leaves open: height and heading of every branch on it."""
+    columns = []
+    for child in [k for k, parent in enumerate(chain.parent) if parent == 0]:
+        for twist in (
+            np.r_[np.zeros(3), chain.axis[0]],
+            np.r_[chain.axis[0], np.cross(chain.point[0], chain.axis[0])],
+        ):
+            column = np.zeros((len(chain.serials), 6))
+            column[list(descendants(chain, child))] = twist
+            columns.append(column.ravel())
+    basis, _ = np.linalg.qr(np.array(columns).T)
+    found = name_null_space(chain, basis)
+    assert len(found) == len(columns)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_robot_that_has_drifted_by_what_cannot_be_known_comes_back(robots: Any, seed: int) -> None:
+    chain, _ = robots.random(seed, joints=5)
+    free = free_motions(chain, hidden(chain))
+    rng = np.random.default_rng(seed)
+    # Up to half a turn, and half a metre.
+    away = moved(
+        chain, free, rng.uniform(-0.5, 0.5, len(free)) * [np.pi if "rot" in f.kind else 1 for f in free]
+    )
+    back = moved(away, free, nearest(away, free, range(5), chain.imu_home))
+    np.testing.assert_allclose(back.imu_home, chain.imu_home, atol=1e-6)
+    np.testing.assert_allclose(back.point, chain.point, atol=1e-6)
+
+
+def test_without_anything_unknown_nothing_moves(robots: Any) -> None:
+    chain, _ = robots.random(2, joints=4)
+    other, _ = robots.random(3, joints=4)
+    assert nearest(chain, (), range(4), other.imu_home).size == 0
+    np.testing.assert_array_equal(moved(chain, (), np.zeros(0)).imu_home, chain.imu_home)
+
+
+def test_a_change_of_the_robot_is_the_same_change_after_it_was_brought_back(robots: Any) -> None:
+    chain, _ = robots.random(4, joints=4, serial=True)
+    free = free_motions(chain, hidden(chain))
+    amounts = np.array([0.3, -1.1])
+    delta = np.random.default_rng(1).normal(size=24) * 1e-6
+    delta[:6] = 0.0
+    after = moved(chain, free, amounts)
+    changed = apply_increment(after, carried(chain, after, delta[:, None])[:, 0].copy())
+    expected = moved(apply_increment(chain, delta), free, amounts)
+    # Of first order: the axis that the branch was turned about is the root's, which does not change.
+    np.testing.assert_allclose(changed.imu_home, expected.imu_home, atol=1e-10)
+
+
+def test_motions_of_another_tree_than_the_chains_are_left_out(robots: Any) -> None:
+    chain, _ = robots.random(4, joints=4, serial=True)
+    items = hidden(chain)
+    turned = chain._replace(serials=chain.serials[::-1])
+    assert free_motions(turned, items) == ()
+    combination = items[0]._replace(kind="combination", joint="")
+    assert free_motions(chain, [combination]) == ()
+
+
+def test_a_fit_that_drifted_is_settled_with_all_that_is_known_of_it(robots: Any) -> None:
+    chain, _ = robots.random(6, joints=5)
+    items = hidden(chain)
+    free = free_motions(chain, items)
+    basis, _ = np.linalg.qr(np.concatenate([item.directions for item in items], axis=1))
+    root = np.random.default_rng(2).normal(size=(30, 30)) * 1e-4
+    root[:6] = 0.0
+    known = root - basis @ (basis.T @ root)
+    away = moved(chain, free, np.full(len(free), 0.4))
+    drifted_basis, _ = np.linalg.qr(carried(chain, away, basis))
+    drifted = carried(chain, away, carried(chain, away, known @ known.T).T)
+    back = settled(away, drifted, drifted_basis, chain)
+    np.testing.assert_allclose(back.chain.imu_home, chain.imu_home, atol=1e-6)
+    np.testing.assert_allclose(back.covariance, known @ known.T, atol=1e-12)
+    # The same space, whatever vectors span it.
+    np.testing.assert_allclose(back.null_basis @ back.null_basis.T, basis @ basis.T, atol=1e-6)
