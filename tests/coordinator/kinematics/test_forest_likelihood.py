@@ -17,6 +17,9 @@ from coordinator.kinematics.forest_likelihood import (
     rivals,
 )
 
+# One in a hundred is wrong.
+DOUBTFUL = np.log(99.0)
+
 
 def forests(n: int) -> Iterator[Parents]:
     """Every forest of n modules: 3, 16, 125, 1296 of 2 to 5 (Cayley's formula, (n + 1)^(n - 1))."""
@@ -64,7 +67,7 @@ def test_of_observations_with_one_flipped_the_likeliest_forest_is_found(
 @given(st.integers(0, 2**32))
 @settings(deadline=None, max_examples=20)
 def test_the_odds_of_an_edge_are_those_of_counting_through_all_forests(seed: int) -> None:
-    """What lies two moves away is wrong in several observations at once, and at most doubles the odds."""
+    """What lies two moves away is wrong in several observations at once: it counts only among the sure."""
     rng, n = np.random.default_rng(seed), 4
     every = list(forests(n))
     truth = every[rng.integers(len(every))]
@@ -74,7 +77,11 @@ def test_the_odds_of_an_edge_are_those_of_counting_through_all_forests(seed: int
     for k in range(n):
         right = np.array([parent[k] == truth[k] for parent in every])
         exact = np.logaddexp.reduce(weight[right]) - np.logaddexp.reduce(weight[~right])
-        assert found[k] == pytest.approx(exact, abs=np.log(2.0))
+        if exact < DOUBTFUL:
+            # Of 400 drawn, the farthest is 0.25 off.
+            assert found[k] == pytest.approx(exact, abs=0.4)
+        else:
+            assert found[k] > DOUBTFUL - 0.1
 
 
 def test_a_module_that_carries_nothing_is_given_no_children() -> None:
