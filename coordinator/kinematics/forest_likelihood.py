@@ -4,7 +4,8 @@ A forest says of every joint and IMU whether the one carries the other. With ind
 log-likelihood, up to a constant, is the sum of the log-odds of all pairs that it says are carried. Other
 forests are weighed against it that differ by one move: a module mounted elsewhere with all that it carries,
 or taken out alone and put elsewhere, beneath some of what is mounted there. These are what one or a few
-wrong observations would make of it.
+wrong observations would make of it. What lies farther off is not counted: it matters only where less than
+1 % is in doubt, and makes that look like up to seven times less.
 """
 
 from collections.abc import Collection, Iterator, Sequence
