@@ -7,7 +7,8 @@ import numpy as np
 
 from coordinator.clock import Clock
 from coordinator.link_errors import UnfitLink
-from coordinator.robot_link import RobotLink, together
+from coordinator.robot_link import RobotLink
+from coordinator.together import together
 
 # Of the round trips so many must take at most half a command's life: the keep-alives between them, several to
 # a life, bridge the rest.

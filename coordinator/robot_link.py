@@ -2,13 +2,16 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Container, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Container, Coroutine, Mapping, Sequence
+from functools import partial
 from typing import TypeVar
 
 from coordinator.clock import Clock
 from coordinator.link_errors import ModuleLost, MotionInterrupted, RobotStopped
 from coordinator.radio import NoAnswer, Radio, Refused
 from coordinator.recording import ModuleRecord, Recording
+from coordinator.row_completion import RowCompletion
+from coordinator.together import together
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.firmware.waveform import duration_s
 from module_agent.wire.keys import Leaf
@@ -38,7 +41,6 @@ LATE_NS = 100_000_000
 POOR_NS = 10_000_000_000
 LEASE_NS = 1_000_000_000
 ATTEMPTS = 8
-HOLES_AT_ONCE = 8
 SILENT_NS = 1_000_000_000
 TOKEN_GONE_NS = 300_000_000
 # Refusals that the next attempt can mend: it carries a newer echo and a newer sequence number.
@@ -62,8 +64,7 @@ class RobotLink:
         self._tokens: dict[str, int] = {}
         self._boots: dict[str, int] = {}
         self._armed_ns: dict[str, int] = {}
-        self._complete_row: dict[str, int] = {}
-        self._met_row: dict[str, int] = {}
+        self._rows: dict[str, RowCompletion] = {}
         self._last_id = 0
         self._renewals: set[asyncio.Task[None]] = set()
         self._taken_by: dict[str, str] = {}
@@ -98,7 +99,8 @@ class RobotLink:
             if not isinstance(info, Info):
                 raise NoAnswer(serial, Leaf.INFO, f"its answer is {type(info).__name__}")
             self._boots[serial] = info.boot
-            self._met_row[serial] = self.module(serial).rows.end_row
+            log = self.module(serial).rows
+            self._rows[serial] = RowCompletion(log, partial(self._fetch, serial))
         self.serials = tuple(serials)
 
     async def _ask_info(self, serial: str) -> object:
@@ -196,6 +198,8 @@ class RobotLink:
         self._running.pop(serial, None)
         ack = await self._persist(serial, attempt)
         self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
+        # Its life counts from what was known before the question: on a slow network little of it is left.
+        self._send(self._renew(serial))
 
     def _lease(self, serial: str, action: str) -> LeaseRequest:
         return LeaseRequest.model_validate({**self._head(serial), "action": action, "duration_ns": LEASE_NS})
@@ -385,7 +389,7 @@ class RobotLink:
 
     async def _complete_now(self, serial: str) -> None:
         status = await self.ask_status(serial)
-        await self._complete(serial, status.next_row)
+        await self._rows[serial].complete(status.next_row)
 
     async def close_gaps(self) -> None:
         """Fetch what is missing before the newest row of every module that has arrived.
@@ -394,29 +398,13 @@ class RobotLink:
         """
         for _ in range(ATTEMPTS):
             ends = {serial: self.module(serial).rows.end_row for serial in self.serials}
-            gaps = [s for s, end in ends.items() if self.module(s).rows.missing(self._complete_row[s], end)]
+            gaps = [serial for serial, end in ends.items() if self._rows[serial].has_gap(end)]
             if not gaps:
                 return
-            await together(self._complete(serial, ends[serial]) for serial in gaps)
-
-    async def _complete(self, serial: str, end: int) -> None:
-        rows = self.module(serial).rows
-        first = self._complete_row.get(serial, rows.first_row)
-        for _ in range(200):
-            missing = rows.missing(first, end)
-            if not missing:
-                break
-            try:
-                await together(self._fetch(serial, *hole) for hole in missing[:HOLES_AT_ONCE])
-            except Refused as refused:
-                # What passed while nobody listened, between a crash and its resumption, may be forgotten by
-                # now; steps that are done had all their rows before.
-                if refused.ack.reason != Refusal.GONE.value or missing[0][0] >= self._met_row[serial]:
-                    raise
-                first = missing[0][1]
-        self._complete_row[serial] = end
+            await together(self._rows[serial].complete(ends[serial]) for serial in gaps)
 
     async def _fetch(self, serial: str, first: int, end: int) -> None:
+        """Ask for rows until they, or a refusal, have come."""
         await self._persist(serial, lambda: self._ask_history(serial, first, end))
 
     async def _ask_history(self, serial: str, first: int, end: int) -> object:
@@ -455,10 +443,3 @@ class RobotLink:
             if await self.wait(lambda: found() is not None, 0.3):
                 break
         return found()
-
-
-async def together(work: Iterable[Coroutine[None, None, object]]) -> None:
-    """Do all of it at once, all to its end; raise what the first of those that failed raised."""
-    for outcome in await asyncio.gather(*work, return_exceptions=True):
-        if isinstance(outcome, BaseException):
-            raise outcome

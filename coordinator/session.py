@@ -19,7 +19,8 @@ from coordinator.motion_choice import MotionChoice
 from coordinator.plan import Plan
 from coordinator.radio import Radio, Refused
 from coordinator.recording import Recording
-from coordinator.robot_link import RobotLink, together
+from coordinator.robot_link import RobotLink
+from coordinator.together import together
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
 # Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.

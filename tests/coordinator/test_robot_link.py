@@ -11,7 +11,7 @@ from coordinator.link_errors import ModuleLost, MotionInterrupted
 from coordinator.radio import NoAnswer, Radio, Refused
 from coordinator.robot_link import RobotLink
 from module_agent.wire.keys import Leaf
-from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, Rest
+from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest
 from module_agent.wire.network_profile import NetworkProfile
 
 ARM = "thesis_171_horizontal"
@@ -353,3 +353,98 @@ def test_motion_numbers_grow_from_one_coordinator_to_the_next(rigs: Callable[...
         assert mine[0] < mine[1] < mine[2] < theirs
 
     rig.run(work())
+
+
+def _commands(monkeypatch: pytest.MonkeyPatch, radio: Radio) -> list[MotionCommand]:
+    """Return a list that fills with the motion commands that go out."""
+    sent: list[MotionCommand] = []
+
+    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+        if isinstance(message, MotionCommand):
+            sent.append(message)
+        return await Radio.command(radio, serial, leaf, message, timeout_s)
+
+    monkeypatch.setattr(radio, "command", command)
+    return sent
+
+
+@pytest.mark.parametrize(("delay_ms", "is_poor"), [(5.0, False), (52.0, True)])
+def test_where_renewals_are_slow_motions_are_told_again_and_run_once(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, delay_ms: float, is_poor: bool
+) -> None:
+    rig = rigs(ARM, NetworkProfile(name="slow", delay_ms=delay_ms))
+    radio, recording, link = rig.link()
+    sent = _commands(monkeypatch, radio)
+
+    async def work() -> None:
+        await _met(link)
+        # First, as in a session: what is armed must hear renewals while the next answers slowly.
+        keeper = asyncio.create_task(link.keep_alive())
+        for serial in link.serials:
+            await link.acquire(serial)
+        record = (await link.run({BASE: SLOW}))[BASE]
+        assert record.outcome == "done"
+        assert link.is_poor == is_poor
+        assert {command.motion_id for command in sent} == {record.motion_id}
+        assert (len(sent) > 1) == is_poor
+        # Newer than each other, as renewals are: a copy that is late has no say.
+        assert [command.seq for command in sent] == sorted({command.seq for command in sent})
+        keeper.cancel()
+        await link.complete_rows()
+
+    rig.run(work())
+    moved = recording.modules[BASE].rows.rows(0, recording.modules[BASE].rows.end_row)["motion_id"]
+    # It begins once, and ends once.
+    assert np.count_nonzero(np.diff((moved > 0).astype(int)) > 0) == 1
+
+
+def test_a_motion_during_which_another_joint_let_go_is_spoilt(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM, "lan")
+    radio, _, link = rig.link()
+
+    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+        if serial == TIP and leaf is Leaf.LEASE and rig.state(BASE) == "moving":
+            raise NoAnswer(serial, leaf, "Timeout")
+        return await Radio.command(radio, serial, leaf, message, timeout_s)
+
+    monkeypatch.setattr(radio, "command", command)
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        why = f"the motion of module {BASE} was spoilt: module {TIP} expired and let go"
+        with pytest.raises(MotionInterrupted, match=why):
+            await link.run({BASE: SLOW})
+        # Armed again, both move as before.
+        for serial in link.serials:
+            await link.acquire(serial)
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_many_holes_of_all_modules_are_fetched_together(rigs: Callable[..., Any]) -> None:
+    """One after the other 40 holes at 60 ms a round trip would take the longer half of a motion."""
+    rig = rigs(ARM, NetworkProfile(name="far", delay_ms=30.0))
+    _, recording, link = rig.link()
+
+    async def work() -> float:
+        keeper = await _armed(link)
+        await link.complete_rows()
+        for _ in range(20):
+            rig.cut = True
+            await asyncio.sleep(0.02)
+            rig.cut = False
+            await asyncio.sleep(0.06)
+        begun_s = rig.loop.time()
+        await link.complete_rows()
+        keeper.cancel()
+        return rig.loop.time() - begun_s
+
+    taken_s = rig.run(work())
+    for serial in link.serials:
+        log = recording.modules[serial].rows
+        assert log.missing(0, log.end_row - 50) == [] or log.first_row > 0
+    # A question for the status and at most six rounds of eight holes, each within 80 ms by the ticks.
+    assert taken_s < 0.08 * 7
