@@ -52,13 +52,13 @@ def tied_fits(known: KnownRobot, later: KnownRobot) -> TiedFits:
 def exploration(run: KnownRobot, serials: Sequence[str]) -> list[Window]:
     """Return what all modules read during the last exploration of every joint, in the order of `serials`."""
     margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
-    last = {
-        # All take part in a motion of the whole robot: it is one stretch of the recording.
-        ("" if event.purpose == "whole" else event.serial, event.purpose): event
-        for event in run.recording.journal
-        if event.what == "motion" and event.purpose in MOVING
-    }
-    return [window(run.recording, run.kinematics.clocks, serials, e, margin) for e in last.values()]
+    moving = [e for e in run.recording.journal if e.what == "motion" and e.purpose in MOVING]
+    # All take part in a motion of the whole robot: it is one stretch of the recording.
+    last = {("" if e.purpose == "whole" else e.serial, e.purpose): e for e in moving}
+    repeats = [e for e in run.recording.journal if e.what == "motion" and e.purpose == "repeat"]
+    return [
+        window(run.recording, run.kinematics.clocks, serials, e, margin) for e in [*last.values(), *repeats]
+    ]
 
 
 def corrected(windows: Sequence[Window], imus: ImuIntrinsics) -> list[Window]:
