@@ -19,6 +19,7 @@ from coordinator.plan import Mode, Motions, Plan
 from coordinator.recording import Recording
 from module_agent.wire.network_file import network as named_network
 from sim.chain_score import link_errors, link_length_m, tip_errors, topology_differences
+from sim.experiments.thesis_chain import thesis_chain
 from sim.gauge import tip_error
 from sim.noise_profile import NoiseProfile, noise_profile
 from sim.robot_file import Robot, load_robot
@@ -138,7 +139,7 @@ def _scored(
     begun: ArmTrial, robot: Robot, recording: Recording, kinematics: Kinematics, spent_s: float
 ) -> ArmTrial:
     truth = true_chain(robot)
-    fit, first = kinematics.fit, kinematics.first if begun.mode == "joint" else None
+    fit, first = kinematics.fit, thesis_chain(recording, kinematics.topology)
     differences = topology_differences(fit.chain, truth)
     times = [event.t_ns for event in recording.journal]
     return begun._replace(
