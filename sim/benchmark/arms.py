@@ -24,13 +24,14 @@ REFINEMENT_S = 5.0
 # Less of everything, whoever chooses the motions.
 SHORTENED = {
     "joint_s": 4.0,
+    "whole_duration_s": 5.0,
     "discover_s": 0.3,
     "link_s": 0.3,
-    "rest_s": 1.0,
+    "rest_s": 0.8,
     "settle_s": 0.3,
-    "travel_speed_rad_s": 1.4,
-    "sine_centre_s": 1.3,
-    "sine_sigma_s": 0.45,
+    "travel_speed_rad_s": 2.0,
+    "sine_centre_s": 1.0,
+    "sine_sigma_s": 0.35,
 }
 # About what a trial takes on one core.
 _COST_S = {"a2085_04": 8.0, "a2085_06": 14.0, "arm7": 16.0}
