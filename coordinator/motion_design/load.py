@@ -9,6 +9,8 @@ from coordinator.dynamics.differentiation import differentiate, settling_samples
 
 # Below what a held spring rings at; the ramps of a slow motion last 0.15 s and more.
 CUTOFF_HZ = 6.0
+# Whatever a joint carries, it has an output and a gear train of its own.
+LEAST_KG_M2 = 2e-3
 
 
 class Load(NamedTuple):
@@ -20,7 +22,7 @@ class Load(NamedTuple):
     @property
     def at_most_kg_m2(self) -> float:
         """What it hardly exceeds: two standard deviations more, and a fifth for what the fit leaves out."""
-        return 1.2 * (max(self.inertia_kg_m2, 0.0) + 2.0 * self.sigma_kg_m2)
+        return max(1.2 * (max(self.inertia_kg_m2, 0.0) + 2.0 * self.sigma_kg_m2), LEAST_KG_M2)
 
 
 def measured_load(q_rad: Array, tau_nm: Array, rate_hz: float) -> Load:

@@ -69,3 +69,9 @@ def test_exploring_gains_stiffen_the_position_loop_alone() -> None:
 def test_impossible_plans_are_refused_by_field(field: str, value: float) -> None:
     with pytest.raises(ValidationError, match=field):
         Plan.model_validate({field: value})
+
+
+@pytest.mark.parametrize(("field", "value"), [("mode", "half"), ("motions", "best"), ("precision_mm", 0.0)])
+def test_modes_and_motions_that_there_are_not_are_refused_by_field(field: str, value: object) -> None:
+    with pytest.raises(ValidationError, match=field):
+        Plan.model_validate({field: value})

@@ -40,3 +40,4 @@ def test_what_it_is_at_most_is_seldom_exceeded_and_no_guess_at_random() -> None:
 
 def test_an_arm_that_seems_to_weigh_less_than_nothing_weighs_what_it_may() -> None:
     assert Load(-0.1, 0.05).at_most_kg_m2 == pytest.approx(0.12)
+    assert Load(0.0, 0.0).at_most_kg_m2 > 0.0
