@@ -26,7 +26,7 @@ TASK = JointTask(
 )
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=20)
 @given(
     st.sampled_from(TYPES),
     st.floats(0.005, 3.0),
