@@ -33,7 +33,8 @@ class LinkChange(NamedTuple):
 
     rotation_rad, displacement_m: (3,), zero along what cannot be seen. covariance: (6, 6) of [rotation,
     displacement] over what can be seen. unseen: (k, 6) orthonormal directions of the same that cannot.
-    gain: by how much the change lowers chi^2, which has `seen` degrees of freedom.
+    gain: by how much the change lowers chi^2, which has `seen` degrees of freedom; of several links together
+    what each of them adds to the others.
     """
 
     child: int
@@ -111,12 +112,11 @@ def find_changes(fits: TiedFits, false_alarms: float = FALSE_ALARMS) -> Findings
             break
         changed.append(best)
         alarms.append(alarm)
-    together = _explained(problem, [c.child for c in changed])
-    found = tuple(one._replace(gain=c.gain) for one, c in zip(together, changed, strict=True))
+    found = tuple(_explained(problem, [c.child for c in changed]).links)
     limit = np.full(len(fits.before.chain.serials), np.nan)
     for child in links:
-        limit[child] = _would_find(_explained(problem, [child])[0], false_alarms / len(links))
-    each = tuple(_explained(problem, links)[i] for i in range(len(links)))
+        limit[child] = _would_find(_explained(problem, [child]).links[0], false_alarms / len(links))
+    each = tuple(_explained(problem, links).links)
     return Findings(found, tuple(alarms), each, frozen(limit), least)
 
 
@@ -149,22 +149,29 @@ def _visible(fits: TiedFits) -> Array:
 
 def _next(problem: _Problem, taken: Sequence[int]) -> LinkChange:
     """Return the link that explains most of what those taken leave."""
-    before = sum(c.gain for c in _explained(problem, taken)[:1])
+    before = _explained(problem, taken).gain
     candidates = []
     for child in problem.slopes:
         if child not in taken:
-            one = _explained(problem, [child, *taken])[0]
-            candidates.append(one._replace(gain=one.gain - before))
+            together = _explained(problem, [child, *taken])
+            candidates.append(together.links[0]._replace(gain=together.gain - before))
     return min(candidates, key=lambda c: (c.chance, -c.gain))
 
 
-def _explained(problem: _Problem, children: Sequence[int]) -> list[LinkChange]:
-    """Return the changes of some links that explain the differences best; the gain is that of all together.
+class _Explained(NamedTuple):
+    """Changes of some links, and by how much all together lower chi^2."""
+
+    links: list[LinkChange]
+    gain: float
+
+
+def _explained(problem: _Problem, children: Sequence[int]) -> _Explained:
+    """Return the changes of some links that explain the differences best.
 
     What cannot be seen is left at zero.
     """
     if not children:
-        return []
+        return _Explained([], 0.0)
     slopes = np.concatenate([problem.slopes[child] for child in children], axis=1)
     values, vectors = np.linalg.eigh(slopes.T @ slopes)
     known = values > UNKNOWN_ABOVE**-2
@@ -175,11 +182,10 @@ def _explained(problem: _Problem, children: Sequence[int]) -> list[LinkChange]:
     for i, child in enumerate(children):
         at = slice(6 * i, 6 * i + 6)
         unseen = _unseen(vectors[at][:, ~known])
-        part = twist[at]
-        found.append(
-            LinkChange(child, frozen(part[:3]), frozen(part[3:]), frozen(covariance[at, at]), unseen, gain)
-        )
-    return found
+        part, spread = twist[at], covariance[at, at]
+        own = float(part @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ part)
+        found.append(LinkChange(child, frozen(part[:3]), frozen(part[3:]), frozen(spread), unseen, own))
+    return _Explained(found, gain)
 
 
 def _unseen(parts: Array) -> Array:

@@ -101,6 +101,14 @@ def test_a_link_that_is_displaced_by_two_millimetres_is_found_and_sized(
     assert abs(found.changed[0].length_m - 2e-3) < 4.0 * found.changed[0].length_sigma_m
 
 
+def test_links_beside_the_one_that_changed_look_as_chance_makes_them(draw: Draw) -> None:
+    twist = np.array([0.0, 0.0, 0.0, 0.0, 2e-3, 0.0])
+    found = find_changes(draw(ARM, np.random.default_rng(9), "A-4", twist))
+    for one in found.each:
+        # Of four links the least likely is below 1 in 1000 once in 250 robots.
+        assert (one.chance < 1e-6) if one.child == 3 else (one.chance > 1e-3)
+
+
 def test_of_two_links_that_changed_both_are_named_the_surer_one_first(draw: Draw) -> None:
     rng = np.random.default_rng(3)
     fits = draw(ARM, rng, "A-5", np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0]))
