@@ -149,7 +149,7 @@ PROFILES: dict[str, NetworkProfile] = {
             duplicate=0.001,
             to_coordinator=PathProfile(jitter_ms=4.0, loss=0.006),
         ),
-        # Beyond what the default command lifetime can bear: round trips to 300 ms, 5 % lost in all.
+        # At the edge of what the default command lifetime can bear: round trips to 300 ms, 5 % lost in all.
         NetworkProfile(
             name="bad",
             delay_ms=10.0,
