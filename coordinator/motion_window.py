@@ -22,11 +22,14 @@ from coordinator.recording import Recording
 
 RATE_HZ = 250.0
 STEP_NS = 4_000_000
+# A joint whose position scatters by more steps of its encoder than this moves: its noise is nothing beside it.
+MOVING_STEPS = 20.0
 
 
 class Window(NamedTuple):
     """All modules during one motion: `t_ns` (m,) session time; joints (m, n); IMUs (m, n, 3).
 
+    step_rad: (n,) the smallest difference between two readings of every encoder, 0 if all were alike.
     Velocities are not among them: those of the modules are late by their filters.
     """
 
@@ -35,6 +38,7 @@ class Window(NamedTuple):
     tau_nm: Array
     gyro_rad_s: Array
     accel_m_s2: Array
+    step_rad: Array | None = None
 
 
 def window(
@@ -58,7 +62,8 @@ def window(
     common = np.arange(start_ns, end_ns, STEP_NS, dtype=np.int64)
     joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common)
     imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common)
-    return Window(common, joint[..., 0], joint[..., 1], imu[..., :3], imu[..., 3:])
+    step = np.array([_step(track.joint[:, 0]) for track in tracks])
+    return Window(common, joint[..., 0], joint[..., 1], imu[..., :3], imu[..., 3:], step)
 
 
 class _Track(NamedTuple):
@@ -86,6 +91,12 @@ def _track(
         np.column_stack([rows[field] for field in ("position_rad", "effort_nm")]),
         np.column_stack([rows["gyro_rad_s"], rows["accel_m_s2"]])[fresh],
     )
+
+
+def _step(position: Array) -> float:
+    """Return the smallest change between readings of an encoder; 0 if none has changed."""
+    apart = np.diff(np.unique(position))
+    return float(apart.min()) if apart.size else 0.0
 
 
 def _span(
@@ -127,6 +138,15 @@ def sensor_data(
     return thinned([filtered(one, cutoff_hz, floor) for one in windows], keep_every)
 
 
+def encoder_steps(windows: Sequence[Window]) -> Array | None:
+    """Return what the encoders resolve (n,), by the smallest change in any window; 0 if none."""
+    steps = [one.step_rad for one in windows if one.step_rad is not None]
+    if not steps:
+        return None
+    found = np.min(np.where(np.array(steps) > 0.0, steps, np.inf), axis=0)
+    return np.asarray(np.where(np.isfinite(found), found, 0.0))
+
+
 def thinned(parts: Sequence[SensorData], keep_every: int) -> SensorData:
     """Join what was filtered, one sample in `keep_every` of each."""
     parts = [
@@ -140,11 +160,16 @@ def thinned(parts: Sequence[SensorData], keep_every: int) -> SensorData:
 
 
 def filtered(
-    one: Window, cutoff_hz: float, floor: NoiseFloor | None = None, imu_late_s: float = 0.0
+    one: Window,
+    cutoff_hz: float,
+    floor: NoiseFloor | None = None,
+    imu_late_s: float = 0.0,
+    step_rad: Array | None = None,
 ) -> SensorData:
     """Filter all signals of a window alike and differentiate; what the filter has not settled on is cut.
 
-    The joints are seen as late as the IMUs are.
+    The joints are seen as late as the IMUs are. With the steps (n,) of their encoders, which make noise that
+    differentiation brings up, the instrument is what stands out of it.
     """
     edge = settling_samples(RATE_HZ, cutoff_hz)
     kept = slice(edge, len(one.t_ns) - edge)
@@ -155,6 +180,11 @@ def filtered(
     if imu_late_s:
         t_s = np.arange(len(q)) / RATE_HZ
         q = CubicSpline(t_s, q)(t_s - imu_late_s)
+    instrument = None
+    if step_rad is not None:
+        smooth = np.where(q.std(axis=0) > MOVING_STEPS * step_rad, q, q.mean(axis=0))
+        speed = differentiate(smooth, RATE_HZ)
+        instrument = np.concatenate([smooth, speed, differentiate(speed, RATE_HZ)], axis=1)[kept]
     # The module's own velocity is late by its filter; positions are of their instant.
     qd = differentiate(q, RATE_HZ)
     qdd = differentiate(qd, RATE_HZ)
@@ -164,4 +194,6 @@ def filtered(
         omega = outstanding(gyro[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
         force = outstanding(accel[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
         base = np.concatenate([omega, differentiate(omega, RATE_HZ), force], axis=1)[kept]
-    return SensorData(q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept], base)
+    return SensorData(
+        q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept], base, None, instrument
+    )

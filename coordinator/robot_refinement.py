@@ -6,13 +6,11 @@ A base that shakes and links that bend are found in turn: each needs a chain tha
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform
 
 from coordinator.chain import Array, Chain
 from coordinator.kinematics.base_heading import faced
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.imu_intrinsics import DELAY, ImuPrior
-from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.link_flex import (
     FlexSlopes,
     LinkLoad,
@@ -25,7 +23,7 @@ from coordinator.kinematics.link_flex import (
 )
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.kinematics.sensor_data import SensorData
-from coordinator.motion_window import RATE_HZ, Window, filtered, thinned
+from coordinator.motion_window import RATE_HZ, Window, encoder_steps, filtered, thinned
 from module_agent.catalogue import ModuleType
 
 # Six times the 2 Hz of the windowed sine, and above the resonance of a base that is worth the name.
@@ -63,11 +61,11 @@ def refine_robot(
     rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior)
     # The first IMU may see no motion that would tell how late it is; all are of one make.
     late_s = float(np.median(rigid.intrinsics.errors[1:, DELAY])) if len(chain.serials) > 1 else 0.0
-    parts = _parts(windows, floor, late_s)
+    parts = _parts(windows, floor, late_s, encoder_steps(windows))
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
     giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
     if not giving.compliance.size:
-        return _anchored(chain, refine_chain(giving.chain, thinned(parts, keep), prior), parts)
+        return refine_chain(giving.chain, thinned(parts, keep), prior)
     # Where the hinges are changes what turns them: once roughly, then for good.
     coarse = thinned(parts, COARSE * keep)
     flex = _hinged(giving.chain, coarse, joined(loads, COARSE * keep), giving.compliance)
@@ -80,20 +78,7 @@ def refine_robot(
     loads = with_hinges_moved(loads, joints, moved)
     fine = thinned(parts, keep)
     flex = _hinged(hinged.chain, fine, joined(loads, keep), hinged.compliance[:links], moved)
-    return _anchored(chain, refine_chain(hinged.chain, fine, prior, flex), parts)
-
-
-def _anchored(first: Chain, found: Refinement, parts: Sequence[SensorData]) -> Refinement:
-    """Put what no motion tells back to where it was at first, unless the base's motion tells it.
-
-    What noise alone moves on the way would be shown, and written, as if it were known.
-    """
-    if parts[0].base_motion is not None:
-        return found
-    moved = found.chain.imu_home @ np.linalg.inv(first.imu_home)
-    increment = RigidTransform.from_matrix(moved).as_exp_coords().ravel()
-    back = -found.null_basis @ (found.null_basis.T @ increment)
-    return found._replace(chain=apply_increment(found.chain, back))
+    return refine_chain(hinged.chain, fine, prior, flex)
 
 
 def _hinged(
@@ -103,12 +88,17 @@ def _hinged(
     compliance: Array,
     moved: Array | None = None,
 ) -> FlexSlopes:
-    flex = flex_slopes(chain, data.joints, loads)
-    return hinge_slopes(chain, data.joints, loads, flex, compliance, moved)
+    flex = flex_slopes(chain, data.smooth, loads)
+    return hinge_slopes(chain, data.smooth, loads, flex, compliance, moved)
 
 
-def _parts(windows: Sequence[Window], floor: NoiseFloor | None, late_s: float = 0.0) -> list[SensorData]:
-    return [filtered(one, CUTOFF_HZ, floor, late_s) for one in windows]
+def _parts(
+    windows: Sequence[Window],
+    floor: NoiseFloor | None,
+    late_s: float = 0.0,
+    step_rad: Array | None = None,
+) -> list[SensorData]:
+    return [filtered(one, CUTOFF_HZ, floor, late_s, step_rad) for one in windows]
 
 
 def _giving(
@@ -124,7 +114,7 @@ def _giving(
     """
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
-    flex = flex_slopes(rigid.chain, resting.joints, loads)
+    flex = flex_slopes(rigid.chain, resting.smooth, loads)
     at_rest = refine_chain(rigid.chain, resting, prior, flex)
     data = thinned(parts, keep)
     nobody_else = len(rigid.chain.serials) == 1

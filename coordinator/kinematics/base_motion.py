@@ -38,9 +38,9 @@ class NoiseFloor(NamedTuple):
 
 
 def outstanding(signal: Array, variance: Array, cutoff_hz: float, rate_hz: float) -> Array:
-    """Return what of a signal (m, 3) about its mean is not noise, frequency by frequency.
+    """Return what of signals (m, k) about their means is not noise, frequency by frequency.
 
-    The noise is white up to the cut-off with the given variances (3,). The weights are Wiener's, 1 - N / S
+    The noise is white up to the cut-off with the given variances (k,). The weights are Wiener's, 1 - N / S
     with S the smoothed periodogram; a frequency whose power could be that of noise is left out.
     """
     samples = len(signal)

@@ -305,6 +305,6 @@ def loads_of(
     found = []
     for part, turned_links in zip(parts, turns or [{}] * len(parts), strict=True):
         base = None if part.base_motion is None else BaseMotion(*np.split(part.base_motion, 3, axis=1))
-        bodies = body_motions(chain, part.q_rad, part.qd_rad_s, part.qdd_rad_s2, base, turned_links)
-        found.append(link_loads(chain, kinds, bodies, part.q_rad, rate_hz, turned_links))
+        bodies = body_motions(chain, *part.smooth, base, turned_links)
+        found.append(link_loads(chain, kinds, bodies, part.smooth[0], rate_hz, turned_links))
     return found

@@ -144,13 +144,11 @@ def refine_chain(
 
 def _expected(state: _State, data: SensorData, flex: FlexSlopes) -> _Expected:
     chain = state.chain
-    bodies = body_motions(chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
+    bodies = body_motions(chain, *data.smooth)
     ideal = readings_on(chain, bodies)
-    carried, motions = ideal, None
-    if data.base_motion is not None:
-        base = BaseMotion(*np.split(data.base_motion, 3, axis=1))
-        motions = body_motions(chain, data.q_rad, data.qd_rad_s, data.qdd_rad_s2, base)
-        carried = readings_on(chain, motions)
+    base = None if data.base_motion is None else BaseMotion(*np.split(data.base_motion, 3, axis=1))
+    motions = None if base is None else body_motions(chain, *data.smooth, base)
+    carried = readings_on(chain, body_motions(chain, *data.joints, base))
     given = np.tensordot(state.compliance, flex.slopes, axes=1).transpose(1, 2, 0)
     carried = ImuReadings(carried.gyro_rad_s + given[..., :3], carried.accel_m_s2 + given[..., 3:])
     return _Expected(bodies, ideal, motions, carried)
@@ -212,7 +210,7 @@ def _normal_equations(
     bodies, ideal, _, _ = expected
     motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
     for k in range(count):
-        found = imu_slopes(state.chain, bodies, data.q_rad, data.qd_rad_s, k)
+        found = imu_slopes(state.chain, bodies, *data.smooth[:2], k)
         true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity, flex.slopes[..., k]])
         rates = None if data.imu_rates is None else data.imu_rates[:, k]
         own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)

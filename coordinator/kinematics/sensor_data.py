@@ -17,6 +17,8 @@ class SensorData(NamedTuple):
     base's rate, angular acceleration and acceleration beyond rest, as `BaseMotion` has them; None at rest.
     motion: (m,) the number of the motion that a sample belongs to, from 0 on; None if all belong to one. The
     samples of a motion are equally far apart, far enough for their errors to be independent.
+    instrument: (m, 3 n) positions, velocities and accelerations without the encoders' noise, and without what
+    is no larger; None if they are as measured.
     """
 
     q_rad: Array
@@ -27,11 +29,20 @@ class SensorData(NamedTuple):
     imu_rates: Array | None = None
     base_motion: Array | None = None
     motion: NDArray[np.int64] | None = None
+    instrument: Array | None = None
 
     @property
     def joints(self) -> tuple[Array, Array, Array]:
         """Positions, velocities and accelerations, (m, n) each."""
         return self.q_rad, self.qd_rad_s, self.qdd_rad_s2
+
+    @property
+    def smooth(self) -> tuple[Array, Array, Array]:
+        """What the readings are differentiated by: noise in there would pass for motion, and bias the fit."""
+        if self.instrument is None:
+            return self.joints
+        q, qd, qdd = np.split(self.instrument, 3, axis=1)
+        return q, qd, qdd
 
     @property
     def motions(self) -> list[slice]:
