@@ -22,7 +22,10 @@ from coordinator.recording import Recording
 
 RATE_HZ = 250.0
 STEP_NS = 4_000_000
-# A joint whose position scatters by more steps of its encoder than this moves: its noise is nothing beside it.
+# Four times the 2 Hz of the windowed sine. Loads of links are differentiated four times, which brings up an
+# encoder's noise with the fourth power of the frequency.
+INSTRUMENT_CUTOFF_HZ = 8.0
+# A joint whose position scatters by fewer steps of its encoder than this is taken to stand still.
 MOVING_STEPS = 20.0
 
 
@@ -182,7 +185,8 @@ def filtered(
         q = CubicSpline(t_s, q)(t_s - imu_late_s)
     instrument = None
     if step_rad is not None:
-        smooth = np.where(q.std(axis=0) > MOVING_STEPS * step_rad, q, q.mean(axis=0))
+        slow = zero_phase_low_pass(q, RATE_HZ, INSTRUMENT_CUTOFF_HZ)
+        smooth = np.where(q.std(axis=0) > MOVING_STEPS * step_rad, slow, q.mean(axis=0))
         speed = differentiate(smooth, RATE_HZ)
         instrument = np.concatenate([smooth, speed, differentiate(speed, RATE_HZ)], axis=1)[kept]
     # The module's own velocity is late by its filter; positions are of their instant.
