@@ -17,7 +17,7 @@ from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.known_robot import KnownRobotError, known_within
 from coordinator.known_update import updated
-from coordinator.plan import Mode
+from coordinator.plan import Mode, Motions
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.run import RunConfig, write_outputs
@@ -72,6 +72,9 @@ def run(
     mode: Annotated[
         Mode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
     ] = None,
+    motions: Annotated[
+        Motions | None, typer.Option(help="The thesis' motions, or designed for each joint [thesis].")
+    ] = None,
     known: Annotated[
         Path | None,
         typer.Option(help="Folder of a former run of this robot: only what is other is looked at closely."),
@@ -102,7 +105,13 @@ def run(
         out=out,
         sender=sender_name(),
         plan=planned(
-            plan, dynamics=dynamics, sine_amplitude_rad=amplitude, home_rad=home, imu=imu, mode=mode
+            plan,
+            dynamics=dynamics,
+            sine_amplitude_rad=amplitude,
+            home_rad=home,
+            imu=imu,
+            mode=mode,
+            motions=motions,
         ),
         expect=expect,
         resume=resume,

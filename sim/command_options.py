@@ -8,6 +8,7 @@ import typer
 from coordinator.failure import EXIT_USAGE
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.plan import Mode as PlanMode
+from coordinator.plan import Motions as PlanMotions
 from coordinator.plan import Plan, PlanFileError, load_plan
 from coordinator.run_folder import RunFolderError, check_free
 from coordinator.scaled_loop import check_speed
@@ -36,6 +37,10 @@ Dynamics = Annotated[
 Imu = Annotated[ImuKind | None, typer.Option(help="How well the IMUs are known beforehand [uncalibrated].")]
 Mode = Annotated[
     PlanMode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
+]
+Motions = Annotated[
+    PlanMotions | None,
+    typer.Option("--motions", help="The thesis' motions, or designed for each joint [thesis]."),
 ]
 Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
 Processes = Annotated[
@@ -101,5 +106,6 @@ def motions(path: Path | None, **given: object) -> Plan:
 
 def motion_arguments(path: Path | None, plan: Plan) -> tuple[str, ...]:
     """Return a plan as arguments for the coordinator."""
-    options = ("--dynamics" if plan.dynamics else "--no-dynamics", "--imu", plan.imu, "--mode", plan.mode)
+    dynamics = "--dynamics" if plan.dynamics else "--no-dynamics"
+    options = (dynamics, "--imu", plan.imu, "--mode", plan.mode, "--motions", plan.motions)
     return options if path is None else ("--plan", str(path), *options)

@@ -21,6 +21,7 @@ from sim.command_options import (
     Endpoint,
     Imu,
     Mode,
+    Motions,
     Network,
     Noise,
     Out,
@@ -119,6 +120,7 @@ def run(
     dynamics: Dynamics = None,
     imu: Imu = None,
     mode: Mode = None,
+    how: Motions = None,
     speed: Speed = 1.0,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
@@ -128,7 +130,7 @@ def run(
     found = load(robot)
     check(network, speed, endpoint)
     choice = noise_choice(found, noise, with_effects, without_effects)
-    planned = motions(plan, dynamics=dynamics, imu=imu, mode=mode)
+    planned = motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how)
     folder = free_folder(out, found)
     if virtual:
         _run_virtual(
@@ -268,6 +270,7 @@ def launch(
     dynamics: Dynamics = None,
     imu: Imu = None,
     mode: Mode = None,
+    how: Motions = None,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
 ) -> None:
@@ -282,7 +285,7 @@ def launch(
     options = (
         "--viewer",
         viewer,
-        *motion_arguments(plan, motions(plan, dynamics=dynamics, imu=imu, mode=mode)),
+        *motion_arguments(plan, motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how)),
     )
     place = _Place(free_folder(out, found), network or found.network, endpoint, processes)
     _run_processes(_launch(robot, found, place, seed, choice, speed, options))

@@ -50,9 +50,7 @@ def kinematics(
         typer.Option(min=1, help=f"Trials a case; 200 robots and 100 unchanged checks besides [{TRIALS}]."),
     ] = None,
     seed: Seed = 0,
-    motions: Annotated[
-        Motions | None, typer.Option(help="How whole arms explore joint by joint [as in a run].")
-    ] = None,
+    motions: Annotated[Motions, typer.Option(help="How whole arms explore joint by joint.")] = "designed",
     only: Annotated[str, typer.Option(help="Cases whose name holds this; * and ? stand for anything.")] = "",
     processes: Annotated[
         int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
