@@ -13,20 +13,16 @@ import numpy as np
 
 from coordinator.chain import Array, Chain
 from coordinator.dynamics.differentiation import settling_samples
+from coordinator.journal import Purpose
 from coordinator.kinematics.imu_intrinsics import UNCALIBRATED, ImuIntrinsics
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.known_robot import KnownRobot
 from coordinator.motion_window import RATE_HZ, Window, sensor_data, window
+from coordinator.robot_refinement import CUTOFF_HZ, KEEP_EVERY, MOST_IMU_SAMPLES
 
 # Scale and axes of an IMU that has been corrected for them: for the two sessions they are the same.
 TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5)
-# Six times the 2 Hz of the windowed sine, and below the resonances of links and bases. Half the time constant
-# of that low-pass makes about as many independent samples as there are.
-CUTOFF_HZ = 12.0
-KEEP_EVERY = 5
-# IMU samples of a session that are fitted at most.
-MOST_IMU_SAMPLES = 40_000
-MOVING = ("constant", "windowed_sine", "whole")
+MOVING: tuple[Purpose, ...] = ("constant", "windowed_sine", "whole")
 
 
 class TiedFits(NamedTuple):
@@ -52,13 +48,11 @@ def tied_fits(known: KnownRobot, later: KnownRobot) -> TiedFits:
 def exploration(run: KnownRobot, serials: Sequence[str]) -> list[Window]:
     """Return what all modules read during the last exploration of every joint, in the order of `serials`."""
     margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
-    moving = [e for e in run.recording.journal if e.what == "motion" and e.purpose in MOVING]
+    moving = run.recording.motions(*MOVING)
     # All take part in a motion of the whole robot: it is one stretch of the recording.
     last = {("" if e.purpose == "whole" else e.serial, e.purpose): e for e in moving}
-    repeats = [e for e in run.recording.journal if e.what == "motion" and e.purpose == "repeat"]
-    return [
-        window(run.recording, run.kinematics.clocks, serials, e, margin) for e in [*last.values(), *repeats]
-    ]
+    events = [*last.values(), *run.recording.motions("repeat")]
+    return [window(run.recording, run.kinematics.clocks, serials, e, margin) for e in events]
 
 
 def corrected(windows: Sequence[Window], imus: ImuIntrinsics) -> list[Window]:

@@ -151,8 +151,9 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         raise IdentificationError(str(error)) from error
     notes = tuple(
         f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"
-        for found in recording.estimates.values()
-        for estimate in found.values()
+        # Copies: while this is computed beside a session, late estimates still arrive.
+        for found in list(recording.estimates.values())
+        for estimate in list(found.values())
         if estimate.note
     )
     notes += found.notes
@@ -198,9 +199,8 @@ def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
 def _motions(recording: Recording, *purposes: Purpose) -> list[JournalEvent]:
     """Return the last motion of every purpose of every joint, in the order of the journal."""
     latest: dict[tuple[str, str], JournalEvent] = {}
-    for event in recording.journal:
-        if event.what == "motion" and event.purpose in purposes and event.motion is not None:
-            latest[event.serial, event.purpose] = event
+    for event in recording.motions(*purposes):
+        latest[event.serial, event.purpose] = event
     return list(latest.values())
 
 
@@ -226,7 +226,7 @@ def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose)
     """Return what `observer` made of the latest motion of this purpose of `joint`."""
     found = [e for e in _motions(recording, purpose) if e.serial == joint]
     number = found[-1].motion.motion_id if found and found[-1].motion is not None else -1
-    for ids, estimate in recording.estimates.get((joint, observer), {}).items():
+    for ids, estimate in list(recording.estimates.get((joint, observer), {}).items()):
         if ids[-1] == number:
             return estimate
     return None
@@ -294,10 +294,11 @@ def _base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Top
 
 def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
     """Return the motions that the chain is fitted to, of modules that take part in it."""
+    alone = _motions(recording, "constant", "windowed_sine")
+    whole, repeats = _motions(recording, "whole"), recording.motions("repeat")
+    alone, whole, repeats = ([e for e in some if e.serial in serials] for some in (alone, whole, repeats))
     # All joints at once are in the window of any of them.
-    found = _motions(recording, "constant", "windowed_sine") + _motions(recording, "whole")[:1]
-    found += [e for e in recording.journal if e.what == "motion" and e.purpose == "repeat"]
-    return [event for event in found if event.serial in serials]
+    return [*alone, *whole[:1], *repeats]
 
 
 def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:

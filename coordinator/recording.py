@@ -8,7 +8,7 @@ import hashlib
 import struct
 from typing import Literal, NamedTuple
 
-from coordinator.journal import JournalEvent
+from coordinator.journal import JournalEvent, Purpose
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.keys import Leaf, parse
@@ -197,6 +197,22 @@ class Recording:
         sent_ns = self._sent.pop((entry.topic, re), None)
         if entry.kind == "reply" and sent_ns is not None:
             module.round_trips.append(RoundTrip(sent_ns, entry.t_ns, module_ns))
+
+    def motions(self, *purposes: Purpose) -> list[JournalEvent]:
+        """Return the motions of these purposes whose rows are those of their module's latest boot.
+
+        A module that boots numbers its rows anew, and may have lost its zero: what it did before is no part
+        of the robot that is there.
+        """
+        boots = {serial: module.boot for serial, module in list(self.modules.items())}
+        return [
+            event
+            for event in list(self.journal)
+            if event.what == "motion"
+            and event.purpose in purposes
+            and event.motion is not None
+            and event.boot in (0, boots.get(event.serial, event.boot))
+        ]
 
     def rows(self, serial: str, first: int, end: int) -> Rows:
         """Return the rows of a range of the latest boot of a module that have arrived."""

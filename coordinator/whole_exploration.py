@@ -25,9 +25,8 @@ def whole_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent |
 
     None if not all of them did, or if all were moved one by one as well: those motions tell more clearly.
     """
-    motions = [e for e in recording.journal if e.what == "motion"]
-    latest = {e.serial: e for e in motions if e.purpose == "whole"}
-    alone = {e.serial for e in motions if e.purpose == "windowed_sine"}
+    latest = {e.serial: e for e in recording.motions("whole")}
+    alone = {e.serial for e in recording.motions("windowed_sine")}
     if all(s in alone for s in serials):
         return None
     return latest[serials[0]] if serials and all(s in latest for s in serials) else None

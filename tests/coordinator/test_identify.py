@@ -111,6 +111,23 @@ def test_a_motion_that_was_done_again_counts_the_last_time_only(run: list[Entry]
     np.testing.assert_allclose(again.imu_home, once.imu_home, atol=1e-7)
 
 
+def test_a_motion_from_before_a_module_booted_does_not_count(run: list[Entry]) -> None:
+    # Its numbers are those of other rows, here of the rest.
+    event, rest = (
+        next(e for e in map(_event, run) if e is not None and e.purpose == purpose)
+        for purpose in ("windowed_sine", "rest")
+    )
+    assert rest.motion is not None
+    before = event.model_copy(update={"purpose": "repeat", "boot": event.boot + 1, "motion": rest.motion})
+    stale = Entry("journal", JOURNAL_TOPIC, 0, before.encode())
+    fresh = Entry("journal", JOURNAL_TOPIC, 0, before.model_copy(update={"boot": event.boot}).encode())
+    with_stale, with_fresh, once = (
+        identify_kinematics(_recorded(each)).fit.chain for each in ([*run, stale], [*run, fresh], run)
+    )
+    np.testing.assert_array_equal(with_stale.imu_home, once.imu_home)
+    assert not np.array_equal(with_fresh.imu_home, once.imu_home)
+
+
 def test_an_empty_recording_says_that_nothing_was_recorded() -> None:
     with pytest.raises(IdentificationError, match="no rest was recorded"):
         identify(Recording())
