@@ -29,6 +29,8 @@ class RowCompletion:
     async def complete(self, end: int) -> None:
         """Fetch what is missing before row `end`.
 
+        After `ROUNDS` it is given up until the next time; what is missing still counts as missing.
+
         Raises:
             Refused: rows since the module was met are kept no longer.
             NoAnswer: it does not answer.
@@ -37,7 +39,8 @@ class RowCompletion:
         for _ in range(ROUNDS):
             missing = self._log.missing(first, end)
             if not missing:
-                break
+                self._whole_to = end
+                return
             try:
                 await together(self._fetch(*hole) for hole in missing[:HOLES_AT_ONCE])
             except Refused as refused:
@@ -46,7 +49,6 @@ class RowCompletion:
                 if refused.ack.reason != Refusal.GONE.value or missing[0][0] >= self._met_row:
                     raise
                 first = missing[0][1]
-        self._whole_to = end
 
     @property
     def _first(self) -> int:

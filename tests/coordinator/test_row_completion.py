@@ -69,6 +69,17 @@ def test_rows_from_before_the_module_was_met_may_be_forgotten_and_later_ones_not
         asyncio.run(met.complete(15))
 
 
+def test_rows_that_never_come_still_count_as_missing(wire: SimpleNamespace) -> None:
+    log = _with_holes(wire, 1)
+
+    async def answered_with_nothing(first: int, end: int) -> None:
+        pass
+
+    completion = RowCompletion(log, answered_with_nothing)
+    asyncio.run(completion.complete(15))
+    assert completion.has_gap(15)
+
+
 def test_what_is_done_together_is_done_to_its_end_though_some_of_it_fails() -> None:
     done: list[int] = []
 
