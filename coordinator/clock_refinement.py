@@ -22,7 +22,7 @@ from coordinator.kinematics.increments import frozen
 from coordinator.kinematics.inertial_prediction import turned
 
 RATE_HZ = 250.0
-# Five times the 2 Hz of the windowed sine, as the chain's refinement has it.
+# Seven times the 2 Hz of the windowed sine: a lag shows in how fast rates change.
 CUTOFF_HZ = 15.0
 # Half the time constant of that low-pass: about as many samples as are independent.
 KEEP_EVERY = 5

@@ -123,11 +123,11 @@ def refine_chain(
         if used > 1:
             sigmas = _spread(data, gyro), _spread(data, accel)
         normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), sigmas)
-        step, nuisance, spectrum = _solve(normal, count)
+        step, nuisance, spectrum = _solve(normal)
         if expected.shaken is not None:
             seen = expected._replace(bodies=expected.shaken)
             shaken = _normal_equations(state, data, prior, flex, seen, (gyro, accel), sigmas)
-            step += _along_unknown(shaken, spectrum, count)
+            step += _along_unknown(shaken, spectrum)
         state = _moved(state, step, nuisance, prior)
         if used > 2 and float(np.abs(step).max()) < CONVERGED:
             break
@@ -136,7 +136,7 @@ def refine_chain(
     # What the model leaves out repeats with the motion.
     believed = _believed(data, gyro), _believed(data, accel)
     normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), believed)
-    _, _, spectrum = _solve(normal, count)
+    _, _, spectrum = _solve(normal)
     white = _spread(data, gyro), _spread(data, accel)
     by_noise = _normal_equations(state, data, prior, flex, expected, (gyro, accel), white)
     return _report(state, spectrum, _reduced(by_noise)[0], _rms(gyro), _rms(accel), used)
@@ -274,7 +274,7 @@ def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
     return information, normal.pose_rhs - normal.cross @ through[:, -1], through
 
 
-def _solve(normal: _Normal, count: int) -> tuple[Array, Array, _Spectrum]:
+def _solve(normal: _Normal) -> tuple[Array, Array, _Spectrum]:
     """Return the step of all modules (6 n,), that of the nuisance, the spectrum; unknown directions stay."""
     information, rhs, through = _reduced(normal)
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
@@ -287,7 +287,7 @@ def _solve(normal: _Normal, count: int) -> tuple[Array, Array, _Spectrum]:
     return np.concatenate([np.zeros(6), step]), nuisance, spectrum
 
 
-def _along_unknown(normal: _Normal, spectrum: _Spectrum, count: int) -> Array:
+def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
     """Return the step (6 n,) along what the joints' motions leave unknown, by the base's motion."""
     information, rhs, _ = _reduced(normal)
     unknown = spectrum.vectors[:, ~spectrum.known]
