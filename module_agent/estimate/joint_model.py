@@ -37,7 +37,7 @@ TURN, RADIAL, GRAVITY = slice(0, 2), slice(2, 4), slice(4, 7)
 ACCEL_BIAS, GYRO_BIAS, KAPPA = slice(7, 10), slice(10, 13), slice(13, 16)
 ACCEL_MATRIX, FELT = slice(16, 22), slice(22, 28)
 COMPLIANCE, HINGE = 28, 29
-# Of what carries the joint: the angle from the housing's x to e1 at q = 0, by how much its IMU is late, where
+# Of what carries the joint: the angle from e1 to the housing's x at q = 0, by how much its IMU is late, where
 # the joint's axis is from its IMU across the axis, and how far the child's IMU is from its own along it.
 BEARING, LATE, PIVOT, HEIGHT = 30, 31, slice(32, 34), 34
 DELAY = 35
