@@ -65,9 +65,10 @@ def rms(values: Sequence[float | None]) -> float | None:
 
 
 def largest(values: Sequence[float | None]) -> float | None:
-    """Return the largest size of the values that are there, None if none is."""
+    """Return the largest size of the values that are there, None if none is; no number if one is none."""
     known = [abs(value) for value in values if value is not None]
-    return max(known, default=None)
+    # Python's max passes over a NaN, or not, by its place.
+    return float(np.max(known)) if known else None
 
 
 def ratio(over: float | None, under: float | None) -> float | None:

@@ -1,6 +1,7 @@
 """A bar is met or missed by what was measured, and chance is allowed for where there are few trials."""
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -58,6 +59,17 @@ def test_what_is_not_there_is_left_out_of_means() -> None:
     assert ratio(1.0, None) is None
     assert ratio(1.0, 0.0) is None
     assert ratio(3.0, 2.0) == 1.5
+
+
+@pytest.mark.parametrize("figure", [mean_abs, rms, largest])
+@pytest.mark.parametrize("values", [[math.nan, 1.0], [1.0, math.nan]])
+def test_one_value_that_is_no_number_makes_the_figure_none_and_the_bar_missed(
+    figure: Callable[[list[float | None]], float | None], values: list[float | None]
+) -> None:
+    found = figure(values)
+    assert found is not None
+    assert math.isnan(found)
+    assert Row("arm", "error [mm]", None, found, None, 5.0).holds is False
 
 
 def test_what_must_never_be_is_counted_and_of_no_cases_nothing_is_known() -> None:
