@@ -24,7 +24,6 @@ REFINEMENT_S = 5.0
 # Less of everything, whoever chooses the motions.
 SHORTENED = {
     "joint_s": 4.0,
-    "whole_duration_s": 5.0,
     "discover_s": 0.3,
     "link_s": 0.3,
     "rest_s": 0.8,

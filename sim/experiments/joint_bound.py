@@ -23,7 +23,8 @@ _LIGHTLY_S = 0.010
 
 def imu_knowledge(profile: NoiseProfile) -> ImuKnowledge:
     """Return what is known beforehand of an IMU under this profile: whether it is calibrated."""
-    return AS_DELIVERED if profile.accel_scale or profile.imu_misalignment_rad else CALIBRATED
+    errs = profile.accel_scale or profile.gyro_scale or profile.imu_misalignment_rad
+    return AS_DELIVERED if errs else CALIBRATED
 
 
 def white_noise(profile: NoiseProfile, rate_hz: float = WHITE_RATE_HZ) -> tuple[float, float]:
