@@ -59,7 +59,6 @@ class JointRegression(NamedTuple):
     compliance_s2: c of the module's text; a motion of f Hz is larger by c (2 pi f)^2 than the encoder says.
     delays_s: per motion, beyond its offset.
     covariance: (6, 6) of axis [rad] and radial vector [m], both in frame u; singular along the axis.
-    accel_noise_m_s2, gyro_noise_rad_s: white noise of one sample, from the residuals.
     base_shakes: whether what carries the joint was seen to shake, and that was taken off.
     """
 
@@ -74,8 +73,6 @@ class JointRegression(NamedTuple):
     gyro_bias_rad_s: Array
     compliance_s2: float
     delays_s: tuple[float, ...]
-    accel_noise_m_s2: float
-    gyro_noise_rad_s: float
     samples: int
     base_shakes: bool
 
@@ -130,11 +127,10 @@ class _Problem(NamedTuple):
 
 
 class _Optimum(NamedTuple):
-    """Where the fit ended, the covariance of the parameters, and the noise of one sample, gyro's first."""
+    """Where the fit ended, and the covariance of the parameters."""
 
     state: _State
     covariance: Array
-    noise: Array
 
 
 class _Equations(NamedTuple):
@@ -198,7 +194,7 @@ def _minimise(problem: _Problem, state: _State) -> _Optimum:
             break
     end = _equations(problem, state, noise)
     inverse = _inverse(end.normal)
-    return _Optimum(state, inverse @ end.scatter @ inverse.T, end.noise)
+    return _Optimum(state, inverse @ end.scatter @ inverse.T)
 
 
 def _inverse(normal: Array) -> Array:
@@ -386,8 +382,6 @@ def _result(best: _Optimum, problem: _Problem) -> JointRegression:
         gyro_bias_rad_s=_frozen(frame @ p[GYRO_BIAS]),
         compliance_s2=float(p[COMPLIANCE]),
         delays_s=tuple(float(x) for x in p[DELAY:]),
-        accel_noise_m_s2=float(best.noise[1]),
-        gyro_noise_rad_s=float(best.noise[0]),
         samples=sum(len(row.t_s) for row in problem.rows),
         base_shakes=any(row.motion.base is not None for row in problem.rows),
     )

@@ -3,7 +3,9 @@
 The bound is that of an estimator that knows the noise of the IMU and the joint's true motion, and nothing
 else that `joint_regression` does not know either: axis, radial vector, gravity, biases, delays, the link's
 compliance, and the sensors' scales and axes within what is believed of them beforehand (then it is the
-Bayesian bound of van Trees). The hinge of a bent link it knows to be where it is.
+Bayesian bound of van Trees). A calibrated IMU is believed to 1e-4, while the simulated one has no error of
+scale and axes at all: whoever knew that had a bound that is lower by a third at 484 mm and by a hundredth to
+a tenth at 171 mm. The hinge of a bent link it knows to be where it is.
 """
 
 import numpy as np
