@@ -29,6 +29,7 @@ from coordinator.kinematics.chain_observations import (
 from coordinator.kinematics.free_motions import settled
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
+from coordinator.kinematics.pair_estimate import circle_observation
 from coordinator.kinematics.refinement import Refinement
 from coordinator.kinematics.topology import Topology, TopologyError
 from coordinator.kinematics.whole_motion import circles_of_all
@@ -144,7 +145,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         )
         clocks |= refine_clocks(first.chain, clocks, windows).clocks
         windows = _exploration(recording, clocks, topology.serials)
-        prior = _imu_prior(recording)
+        prior = IMU_PRIORS[recording.imu]
         floor = _base_floor(recording, clocks, topology)
         refined = refine_robot(first.chain, types, windows, prior, floor)
     except (TopologyError, AssemblyError, ValueError) as error:
@@ -159,12 +160,6 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     notes += found.notes
     notes += _strange_imus(topology.serials, refined, prior)
     return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
-
-
-def _imu_prior(recording: Recording) -> ImuPrior:
-    """Return how well the IMUs are known, as the session was told."""
-    told = [event.imu for event in recording.journal if event.what == "session"]
-    return IMU_PRIORS[told[-1] if told else "uncalibrated"]
 
 
 def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:
@@ -235,7 +230,7 @@ def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose)
 def _pairs(
     recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str], windows: Sequence[Window]
 ) -> list[PairObservation]:
-    """Return the circles as observations; one that turned by more than the joint did is believed less."""
+    """Return the circles as observations."""
     whole = whole_motion(recording, serials)
     if whole is not None:
         return circles_of_all(serials, respond(recording, clocks, serials, whole))
@@ -249,20 +244,10 @@ def _pairs(
         q_mean = windows[sines[joint]].q_rad.mean(axis=0)
         for observer in serials:
             estimate = _estimate(recording, joint, observer, "windowed_sine")
-            if estimate is None or estimate.circle is None or joint == observer:
+            if estimate is None or joint == observer:
                 continue
-            circle, excess = estimate.circle, abs(estimate.rate_ratio - 1.0)
-            pairs.append(
-                PairObservation(
-                    joint,
-                    observer,
-                    np.array(circle.axis),
-                    np.array(circle.radial_m),
-                    circle.sigma_axis_rad + excess,
-                    circle.sigma_distance_m + excess * circle.distance_m,
-                    q_mean,
-                )
-            )
+            pair = circle_observation(estimate, q_mean)
+            pairs += [] if pair is None else [pair]
     return pairs
 
 

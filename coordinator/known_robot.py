@@ -42,7 +42,7 @@ class KnownRobot(NamedTuple):
     @property
     def imu(self) -> ImuKind:
         """How well its IMUs were known, as the run was told."""
-        return next((e.imu for e in reversed(self.recording.journal) if e.what == "session"), "uncalibrated")
+        return self.recording.imu
 
 
 def load_known(folder: Path) -> KnownRobot:

@@ -55,16 +55,16 @@ class Looks:
         if found is None or not self._is_refined(found):
             return found
         try:
-            return _refined(found, self._kinds(found), self._parts_of(found), self._prior())
+            return _refined(found, self._kinds(found), self._parts_of(found), self._prior)
         except (ValueError, np.linalg.LinAlgError):
             return found
 
     def _is_refined(self, found: RobotSoFar) -> bool:
         return self._most_refined is None or len(found.fit.chain.serials) <= self._most_refined
 
+    @property
     def _prior(self) -> ImuPrior:
-        told = [event.imu for event in self._recording.journal if event.what == "session"]
-        return IMU_PRIORS[told[-1] if told else "uncalibrated"]
+        return IMU_PRIORS[self._recording.imu]
 
     def _kinds(self, found: RobotSoFar) -> list[ModuleType]:
         infos = [self._recording.modules[s].info for s in found.fit.chain.serials]

@@ -9,6 +9,7 @@ import struct
 from typing import Literal, NamedTuple
 
 from coordinator.journal import JournalEvent, Purpose
+from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.keys import Leaf, parse
@@ -197,6 +198,12 @@ class Recording:
         sent_ns = self._sent.pop((entry.topic, re), None)
         if entry.kind == "reply" and sent_ns is not None:
             module.round_trips.append(RoundTrip(sent_ns, entry.t_ns, module_ns))
+
+    @property
+    def imu(self) -> ImuKind:
+        """How well the IMUs are known beforehand, as the session was told last."""
+        told = [event.imu for event in list(self.journal) if event.what == "session"]
+        return told[-1] if told else "uncalibrated"
 
     def motions(self, *purposes: Purpose) -> list[JournalEvent]:
         """Return the motions of these purposes whose rows are those of their module's latest boot.

@@ -15,6 +15,7 @@ from coordinator.journal import JournalEvent
 from coordinator.kinematics.assembly import ChainFit, assemble
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation
 from coordinator.kinematics.forward import BASE
+from coordinator.kinematics.pair_estimate import circle_observation
 from coordinator.kinematics.topology import MotionSeen, Topology, likely_topology
 from coordinator.recording import Recording
 from module_agent.catalogue import module_type
@@ -105,23 +106,14 @@ def _circle(found: Sequence[Estimate]) -> Estimate | None:
 def _pair(
     recording: Recording, joint: str, observer: str, topology: Topology, q_rad: Array
 ) -> PairObservation | None:
-    """Return a circle as an observation; one that turned by more than the joint did is believed less."""
+    """Return a circle as an observation."""
     estimate = _circle(list(recording.estimates.get((joint, observer), {}).values()))
-    if estimate is None or estimate.circle is None:
+    if estimate is None:
         return None
-    circle, excess = estimate.circle, abs(estimate.rate_ratio - 1.0)
     # The others hold where they rested.
     at = q_rad.copy()
     at[topology.serials.index(joint)] = _mean_position(recording, joint, estimate.motion_ids)
-    return PairObservation(
-        joint,
-        observer,
-        np.array(circle.axis),
-        np.array(circle.radial_m),
-        circle.sigma_axis_rad + excess,
-        circle.sigma_distance_m + excess * circle.distance_m,
-        at,
-    )
+    return circle_observation(estimate, at)
 
 
 def _motions(recording: Recording, serial: str) -> list[JournalEvent]:

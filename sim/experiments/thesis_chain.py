@@ -12,7 +12,7 @@ from coordinator.chain import Array
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation
-from coordinator.kinematics.pair_estimate import pair_observation
+from coordinator.kinematics.pair_estimate import circle_observation
 from coordinator.kinematics.topology import Topology
 from coordinator.recording import Recording
 from module_agent.catalogue import ModuleType, module_type
@@ -52,7 +52,7 @@ def _pairs(recording: Recording, serials: Sequence[str], still_rad: Array) -> li
             found = _estimate(recording, joint, observer, event.motion.motion_id)
             if found is None or joint == observer:
                 continue
-            pair = pair_observation(found.model_copy(update={"regression": None}), q_rad)
+            pair = circle_observation(found, q_rad)
             pairs += [] if pair is None else [pair]
     return pairs
 

@@ -53,7 +53,14 @@ class Seen:
                 sigma_distance_m=1e-4,
                 distance_m=float(np.linalg.norm(radial)),
             )
-        return SimpleNamespace(moved=moved, rate_ratio=float(moved), circle=circle, motion_ids=(2,))
+        return SimpleNamespace(
+            serial=observer,
+            joint=joint,
+            moved=moved,
+            rate_ratio=float(moved),
+            circle=circle,
+            motion_ids=(2,),
+        )
 
     def rows(self, serial: str, first: int, end: int) -> np.ndarray:
         found = np.zeros(end - first, ROW)
