@@ -70,7 +70,12 @@ class RunConfig(NamedTuple):
 
 
 class Run:
-    """One run in one folder."""
+    """One run in one folder.
+
+    Raises:
+        ValueError: a plan that leaves out what a run needs; a folder that is not to be used, or that tells no
+            robot.
+    """
 
     def __init__(
         self,
@@ -82,6 +87,11 @@ class Run:
         beside: Beside | None = None,
     ):
         # Before anything is made of the new folder.
+        if config.plan.topology_only:
+            raise ValueError(
+                "the plan sets topology_only, which leaves out the fast motions; a run identifies the chain "
+                "too, and needs them: set it to false"
+            )
         before = load_known(config.known) if config.known is not None and not config.resume else None
         crashed = open_run_folder(config.out, config.resume, config.robot)
         if before is not None:

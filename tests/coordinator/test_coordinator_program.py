@@ -68,6 +68,15 @@ def test_wrong_usage_is_answered_with_what_is_right_and_nothing_is_made(
     assert not out.exists()
 
 
+def test_a_plan_without_fast_motions_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    (tmp_path / "plan.toml").write_text("topology_only = true\n")
+    arguments = ["run", "--out", str(tmp_path / "run"), "--plan", str(tmp_path / "plan.toml")]
+    done = CliRunner().invoke(app, [*arguments, "--listen", free_endpoint()])
+    assert done.exit_code == 2
+    assert "topology_only" in done.output
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_robot_that_nobody_announces_leaves_a_folder_that_may_be_used_again(tmp_path: Path) -> None:
     plan = tmp_path / "plan.toml"
     plan.write_text("discover_s = 0.1\n")
