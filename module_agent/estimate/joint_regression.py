@@ -50,6 +50,7 @@ BIAS_DRIFT_RAD_S = 1e-4  # of a gyro, within the minute between rest and motion
 LEAST_CARRIED = 0.25
 # With less of gravity across the axis than this, two IMUs do not agree on directions across it.
 LEAST_ACROSS_M_S2 = 1.0
+PINNED = 1e6  # the weight of a parameter that is to stay as it is
 
 
 class JointRegression(NamedTuple):
@@ -221,6 +222,9 @@ def _problem(
             # The longest motion tells best; half of a push of unknown direction is along the radius.
             untold_m = max(bases, key=lambda base: base.end_s - base.start_s).push_m / np.sqrt(2.0)
             bases = [base.about_the_axis() for base in bases]
+            # The bearing turns only the pivot then, which is believed alike in all directions: one is as good
+            # as the other, and free it makes the steps swing about the optimum.
+            known.weight[BEARING] = PINNED
         else:
             guess.values[BEARING] = np.arctan2(across[1], across[0]) - np.arctan2(housing[1], housing[0])
             known.mean[BEARING] = guess.values[BEARING]

@@ -49,6 +49,17 @@ def test_a_tall_base_that_rocks_is_seen_by_the_joints_own_module_and_taken_off()
     assert abs(blind.distance_m - 0.484) > 3e-3
 
 
+def test_where_gravity_tells_no_direction_the_fit_settles_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with OneJointRig(load_robot("thesis_484_horizontal"), 11, "x5") as rig:
+        trial = rig.trial(trial_plan(thesis_length("horizontal", 484), NOISE_PROFILES["x5"]))
+    found = regress(trial)
+    assert found.base_shakes
+    monkeypatch.setattr("module_agent.estimate.joint_regression.ITERATIONS", 40)
+    assert regress(trial).distance_m == pytest.approx(found.distance_m, abs=1e-6)
+
+
 def without_carrier(trial: TrialRows) -> TrialRows:
     """The same trial with a joint whose own IMU is dead."""
     motions = []
