@@ -11,7 +11,7 @@ from module_agent.worker import ThreadWorker
 
 
 def _finding(joint: str) -> Finding:
-    return Finding(joint, (1,), False, 0.0, (0.0, 0.0, 9.81), None, "")
+    return Finding(joint, (1,), False, 0.0, (0.0, 0.0, 9.81), None, None, "")
 
 
 def test_jobs_run_beside_the_caller_in_the_order_of_submission() -> None:
