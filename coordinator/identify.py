@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
+from coordinator.chain import Array, Chain
 from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.clock_refinement import refine_clocks
 from coordinator.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
@@ -147,7 +147,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = _base_floor(recording, clocks, topology)
-        refined = refine_robot(first.chain, types, windows, prior, floor)
+        refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
     except (TopologyError, AssemblyError, ValueError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
@@ -173,19 +173,32 @@ def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) 
     )
 
 
+def _settled(refined: Refinement, reference: Chain) -> Refinement:
+    """Return a refinement with what it does not know where `reference` has it (`free_motions.settled`)."""
+    known, by_noise = (
+        settled(refined.chain, covariance, refined.null_basis, reference)
+        for covariance in (refined.covariance, refined.noise_covariance)
+    )
+    return refined._replace(
+        chain=known.chain,
+        covariance=known.covariance,
+        noise_covariance=by_noise.covariance,
+        null_basis=known.null_basis,
+    )
+
+
 def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
-    fit = settled(refined.chain, refined.covariance, refined.null_basis, first.chain)
-    length, sigma = link_lengths(fit.chain, fit.covariance)
+    length, sigma = link_lengths(refined.chain, refined.covariance)
     # What no motion can tell: the IMU's place in the housing.
     believed = np.sqrt(sigma**2 + DISTANCE_FLOOR_M**2)
     believed.flags.writeable = False
     return first._replace(
-        chain=fit.chain,
-        covariance=fit.covariance,
+        chain=refined.chain,
+        covariance=refined.covariance,
         rank=refined.rank,
         condition=refined.condition,
-        unresolved=name_null_space(fit.chain, fit.null_basis),
-        null_basis=fit.null_basis,
+        unresolved=name_null_space(refined.chain, refined.null_basis),
+        null_basis=refined.null_basis,
         link_length_m=length,
         link_length_sigma_m=believed,
     )
