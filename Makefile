@@ -6,10 +6,11 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo test check bench clean
+.PHONY: help demo kinematics test check bench clean
 
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh, one process per module, and is scored"
+	@echo "make kinematics  the thesis' estimator, ours and the physical limit, every row in about a minute"
 	@echo "make test    all tests"
 	@echo "make check   format, lint, types and import floors"
 	@echo "make bench   benchmarks"
@@ -25,6 +26,10 @@ demo: $(STAMP)
 	@rm -rf runs/demo
 	$(BIN)/x5-sim run a2085_04 --network lan --out runs/demo
 	@echo "Look at it: $(BIN)/rerun runs/demo/session.rrd"
+
+kinematics: $(STAMP)
+	@mkdir -p runs
+	$(BIN)/x5-sim benchmark kinematics --quick --json runs/kinematics.json
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
