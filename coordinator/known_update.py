@@ -161,18 +161,10 @@ def _index(chain: Chain) -> dict[str, int]:
 def updated(known: Kinematics, found: Kinematics) -> Kinematics:
     """Return a session's kinematics with the known robot's geometry wherever nothing is other."""
     other = difference(known.topology, found.topology)
-    result = placed(_as_fitted(known), _as_fitted(found), other.parts)
+    result = placed(known.refinement, found.refinement, other.parts)
     refinement = found.refinement._replace(**result._asdict())
     notes = (*(line for line in other.words()), *found.notes)
     return found._replace(refinement=refinement, fit=_fit(found.fit, result), notes=notes)
-
-
-def _as_fitted(kinematics: Kinematics) -> Refinement:
-    """Return the refinement with what nothing tells where the fit has it (`free_motions.settled`)."""
-    fit = kinematics.fit
-    return kinematics.refinement._replace(
-        chain=fit.chain, covariance=fit.covariance, null_basis=fit.null_basis
-    )
 
 
 def _fit(found: ChainFit, result: Placed) -> ChainFit:
