@@ -8,7 +8,6 @@ needed to subtract the shake; how well it is known is not claimed.
 import numpy as np
 
 from coordinator.chain import Array, Chain
-from coordinator.kinematics.base_motion import BaseMotion
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import body_motions, readings_on
 from coordinator.kinematics.null_space import name_null_space
@@ -38,10 +37,7 @@ def faced(chain: Chain, data: SensorData, null_basis: Array) -> Chain:
 
 def _agreement(chain: Chain, data: SensorData) -> float:
     """Return the product of the gyros' readings beyond those on a resting base, and the base's share."""
-    joints = (data.q_rad, data.qd_rad_s, data.qdd_rad_s2)
-    assert data.base_motion is not None
-    base = BaseMotion(*np.split(data.base_motion, 3, axis=1))
-    resting = readings_on(chain, body_motions(chain, *joints)).gyro_rad_s
-    shaken = readings_on(chain, body_motions(chain, *joints, base)).gyro_rad_s
+    resting = readings_on(chain, body_motions(chain, *data.joints)).gyro_rad_s
+    shaken = readings_on(chain, body_motions(chain, *data.joints, data.base)).gyro_rad_s
     seen = data.gyro_rad_s - resting
     return float(np.sum((seen - seen.mean(axis=0)) * (shaken - resting)))

@@ -15,7 +15,6 @@ import numpy as np
 from coordinator.chain import Array, Chain
 from coordinator.cross_product import cross
 from coordinator.dynamics.differentiation import differentiate
-from coordinator.kinematics.base_motion import BaseMotion
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.inertial_prediction import (
     BodyMotion,
@@ -304,7 +303,6 @@ def loads_of(
     """Return the loads over each of several stretches of time, as `link_loads` does over one."""
     found = []
     for part, turned_links in zip(parts, turns or [{}] * len(parts), strict=True):
-        base = None if part.base_motion is None else BaseMotion(*np.split(part.base_motion, 3, axis=1))
-        bodies = body_motions(chain, *part.smooth, base, turned_links)
+        bodies = body_motions(chain, *part.smooth, part.base, turned_links)
         found.append(link_loads(chain, kinds, bodies, part.smooth[0], rate_hz, turned_links))
     return found

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.chain import Array, Chain
-from coordinator.kinematics.base_motion import BaseMotion
 from coordinator.kinematics.imu_intrinsics import (
     BIASES_ONLY,
     ImuIntrinsics,
@@ -146,7 +145,7 @@ def _expected(state: _State, data: SensorData, flex: FlexSlopes) -> _Expected:
     chain = state.chain
     bodies = body_motions(chain, *data.smooth)
     ideal = readings_on(chain, bodies)
-    base = None if data.base_motion is None else BaseMotion(*np.split(data.base_motion, 3, axis=1))
+    base = data.base
     motions = None if base is None else body_motions(chain, *data.smooth, base)
     carried = readings_on(chain, body_motions(chain, *data.joints, base))
     given = np.tensordot(state.compliance, flex.slopes, axes=1).transpose(1, 2, 0)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.chain import Array
+from coordinator.kinematics.base_motion import BaseMotion
 
 
 class SensorData(NamedTuple):
@@ -43,6 +44,14 @@ class SensorData(NamedTuple):
             return self.joints
         q, qd, qdd = np.split(self.instrument, 3, axis=1)
         return q, qd, qdd
+
+    @property
+    def base(self) -> BaseMotion | None:
+        """How the base moved; None at rest."""
+        if self.base_motion is None:
+            return None
+        omega, alpha, acceleration = np.split(self.base_motion, 3, axis=1)
+        return BaseMotion(omega, alpha, acceleration)
 
     @property
     def motions(self) -> list[slice]:
