@@ -142,7 +142,8 @@ def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> Kno
         network_named(subject.network),
         subject.seed,
         subject.noise,
-        noise_seed=day,
+        # Other robots have other days: no two checks share their noise.
+        noise_seed=subject.seed * (DAYS + 1) + day,
     )
     recording = record_session(settings, plan)
     return KnownRobot(Path(f"day {day}"), recording, identify_kinematics(recording))

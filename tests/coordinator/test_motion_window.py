@@ -7,7 +7,15 @@ import pytest
 
 from coordinator.clock_map import ClockMap
 from coordinator.journal import JournalEvent
-from coordinator.motion_window import RATE_HZ, STEP_NS, sensor_data, window
+from coordinator.motion_window import (
+    RATE_HZ,
+    STEP_NS,
+    Window,
+    encoder_steps,
+    filtered,
+    sensor_data,
+    window,
+)
 from coordinator.recording import Recording
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.keys import Leaf
@@ -140,3 +148,38 @@ def test_filtered_data_is_the_motion_and_its_derivative(wire: SimpleNamespace) -
         scale = np.abs(_signal(t_s, serial, 2)).max()
         np.testing.assert_allclose(data.qdd_rad_s2[:half, column], _signal(t_s, serial, 2), atol=5e-3 * scale)
     np.testing.assert_array_equal(data.q_rad[:half], data.q_rad[half:])
+
+
+def _noisy_window(step_rad: float) -> Window:
+    """Joint 0 swings at 1 Hz, joint 1 is held; both encoders resolve a step. No IMU sees anything."""
+    t_s = np.arange(1500) / RATE_HZ
+    true = np.stack([0.3 * np.sin(2 * np.pi * t_s), np.full_like(t_s, 0.2)], axis=1)
+    jitter = np.random.default_rng(0).uniform(-step_rad, step_rad, true.shape)
+    nothing = np.zeros((*true.shape, 3))
+    read = step_rad * np.round((true + jitter) / step_rad)
+    return Window(
+        np.arange(1500) * STEP_NS, read, np.zeros_like(true), nothing, nothing, np.full(2, step_rad)
+    )
+
+
+def test_the_instrument_has_the_motion_and_not_the_encoders_noise() -> None:
+    one = _noisy_window(1e-4)
+    data = filtered(one, 12.0, step_rad=encoder_steps([one]))
+    q, _, qdd = data.smooth
+    # A held joint's noise is differentiated to 0.1 rad/s^2 as measured, and is nothing in the instrument.
+    assert data.qdd_rad_s2[:, 1].std() > 0.02
+    assert not qdd[:, 1].any()
+    assert np.ptp(q[:, 1]) == 0.0
+    # The one that moves keeps its motion to what a step hides, with less of the noise.
+    t_s = (np.arange(len(q)) + (1500 - len(q)) // 2) / RATE_HZ
+    true = -0.3 * (2 * np.pi) ** 2 * np.sin(2 * np.pi * t_s)
+    middle = slice(100, -100)
+    off, raw = (np.std((signal[:, 0] - true)[middle]) for signal in (qdd, data.qdd_rad_s2))
+    assert off < 0.6 * raw
+    assert off < 0.01 * true.std()
+
+
+def test_without_a_known_step_the_instrument_is_what_was_measured() -> None:
+    data = filtered(_noisy_window(1e-4), 12.0)
+    assert data.smooth[2] is data.qdd_rad_s2
+    assert encoder_steps([_noisy_window(1e-4)._replace(step_rad=None)]) is None

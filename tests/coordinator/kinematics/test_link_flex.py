@@ -191,3 +191,19 @@ def test_a_robot_without_links_has_nothing_that_bends(robots: Any) -> None:
     found = flex_slopes(chain, joints, loads)
     assert found.links == no_flex(1, len(joints[0])).links
     assert found.slopes.shape == (0, 6, len(joints[0]), 1)
+
+
+def test_noise_of_encoders_makes_no_link_shorter_where_the_instrument_is_free_of_it(robots: Any) -> None:
+    """Accelerations with a fifth of noise: as regressors they shrink what they multiply by its square."""
+    chain, types = _forward(robots, 20, 4)
+    data, _ = _bent(chain, types, 0.0, 0)
+    noisy = data.qdd_rad_s2 + np.random.default_rng(5).normal(0, 0.2, data.qdd_rad_s2.shape) * (
+        data.qdd_rad_s2.std(axis=0)
+    )
+    read = data._replace(qdd_rad_s2=noisy)
+    known = refine_chain(chain, read._replace(instrument=np.concatenate(data.joints, axis=1)))
+    blind = refine_chain(chain, read)
+    apart, shrunk = (
+        np.abs(one.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]).max() for one in (known, blind)
+    )
+    assert apart < 0.5 * shrunk
