@@ -16,7 +16,7 @@ from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.dynamics.differentiation import differentiate, settling_samples, zero_phase_low_pass
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.motion_evidence import MotionEvidence, NotMoved, motion_evidence
-from coordinator.kinematics.topology import MotionSeen, Observations, seen_again
+from coordinator.kinematics.topology import DOUBTFUL_BELOW, MotionSeen, Observations, seen_again
 from coordinator.motion_window import RATE_HZ, window
 from coordinator.recording import Recording
 from module_agent.wire.messages import Estimate, MotionRecord
@@ -42,19 +42,25 @@ class Seen(NamedTuple):
 
 
 def observe(recording: Recording, serials: Sequence[str]) -> Seen:
-    """Evaluate all slow motions of these modules; what is missing is left out rather than guessed."""
+    """Evaluate all slow motions of these modules; what is missing is left out rather than guessed.
+
+    Twice: what the first look is sure of, whom a joint carries about which axis, tells the second what held
+    joints that gave way did to the IMUs.
+    """
     heard = [s for s in serials if recording.modules[s].round_trips and recording.modules[s].rows.end_row]
     clocks = map_clocks({s: recording.modules[s].round_trips for s in heard}) if heard else {}
     ear = _Ear(recording, clocks, {s: _gyro_offset(recording, s) for s in heard})
-    observations: dict[tuple[str, str], MotionSeen] = {}
-    unmoved: dict[str, str] = {}
-    for joint in serials:
-        found, why = _of_joint(ear, serials, joint)
-        observations |= {(joint, observer): seen_again(many) for observer, many in found.items()}
-        if not found:
-            unmoved[joint] = why
+    heard_of = {joint: _heard(ear, joint) for joint in serials}
+    first, _ = _look(recording, serials, heard_of, {})
+    surely = {pair: _axis(seen) for pair, seen in first.items() if abs(seen.log_odds) > DOUBTFUL_BELOW}
+    observations, unmoved = _look(recording, serials, heard_of, surely)
     watching = {observer for _, observer in observations}
     return Seen(observations, unmoved, tuple(s for s in serials if s not in watching))
+
+
+def _axis(seen: MotionSeen) -> Array | None:
+    """Return the axis of a joint in the frame of an IMU, zero if it does not carry it."""
+    return seen.axis if seen.moved else np.zeros(3)
 
 
 def slow_motions(recording: Recording, joint: str) -> list[JournalEvent]:
@@ -80,41 +86,91 @@ class _Ear(NamedTuple):
     offsets: Mapping[str, Array]
 
 
-def _of_joint(ear: _Ear, serials: Sequence[str], joint: str) -> tuple[dict[str, list[MotionSeen]], str]:
+class _Heard(NamedTuple):
+    """One motion of one joint, as all that have feedback of it read it: kept samples (m, n) and (m, n, 3)."""
+
+    event: JournalEvent
+    watchers: tuple[str, ...]
+    qd_rad_s: Array
+    gyro_rad_s: Array
+    offset_rad_s: Array
+
+
+def _heard(ear: _Ear, joint: str) -> list[_Heard]:
+    """Return the slow motions of a joint; without watchers, those of which its own feedback is missing."""
+    return [_of_motion(ear, event) for event in slow_motions(ear.recording, joint)]
+
+
+def _of_motion(ear: _Ear, event: JournalEvent) -> _Heard:
+    watchers = _watchers(ear, event)
+    if event.serial not in watchers:
+        return _Heard(event, (), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
+    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
+    one = window(ear.recording, ear.clocks, watchers, event, edge / RATE_HZ)
+    q, gyro = (zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ) for signal in (one.q_rad, one.gyro_rad_s))
+    kept = slice(edge, len(one.t_ns) - edge, KEEP_EVERY)
+    offset = np.array([ear.offsets[s] for s in watchers])
+    return _Heard(event, tuple(watchers), differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
+
+
+# Of (joint, observer): the axis in the observer's frame, zero if it is not carried.
+Axes = Mapping[tuple[str, str], Array | None]
+
+
+def _look(
+    recording: Recording, serials: Sequence[str], heard_of: Mapping[str, list[_Heard]], axes: Axes
+) -> tuple[dict[tuple[str, str], MotionSeen], dict[str, str]]:
+    """Return what was seen of all joints, and of those of which nothing was, why not."""
+    observations: dict[tuple[str, str], MotionSeen] = {}
+    unmoved: dict[str, str] = {}
+    for joint in serials:
+        found, why = _of_joint(recording, serials, heard_of[joint], axes)
+        observations |= {(joint, observer): seen_again(many) for observer, many in found.items()}
+        if not found:
+            unmoved[joint] = why
+    return observations, unmoved
+
+
+def _of_joint(
+    recording: Recording, serials: Sequence[str], motions: Sequence[_Heard], axes: Axes
+) -> tuple[dict[str, list[MotionSeen]], str]:
     """Return what everyone saw of all motions of a joint; without any, why not."""
     found: dict[str, list[MotionSeen]] = {}
     why = "it was never told to move, or never came to the end of its motion"
-    for event in slow_motions(ear.recording, joint):
-        assert event.motion is not None
+    for heard in motions:
+        assert heard.event.motion is not None
         try:
-            by_feedback = _by_feedback(ear, event)
+            by_feedback = _by_feedback(heard, axes)
         except NotMoved as error:
             why = str(error)
             continue
         for observer in serials:
-            seen = _checked(by_feedback.get(observer), _finding(ear.recording, event.motion, joint, observer))
+            finding = _finding(recording, heard.event.motion, heard.event.serial, observer)
+            seen = _checked(by_feedback.get(observer), finding)
             if seen is not None:
                 found.setdefault(observer, []).append(seen)
         why = "nobody saw its motion"
     return found, why
 
 
-def _by_feedback(ear: _Ear, event: JournalEvent) -> dict[str, MotionSeen]:
+def _by_feedback(heard: _Heard, axes: Axes) -> dict[str, MotionSeen]:
     """Return what the feedback of all modules says of one motion; nothing without that of the joint.
 
     Raises:
         NotMoved: the joint hardly moved.
     """
-    watchers = _watchers(ear, event)
-    if event.serial not in watchers:
+    names = heard.watchers
+    if not names:
         return {}
-    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
-    one = window(ear.recording, ear.clocks, watchers, event, edge / RATE_HZ)
-    q, gyro = (zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ) for signal in (one.q_rad, one.gyro_rad_s))
-    kept = slice(edge, len(one.t_ns) - edge, KEEP_EVERY)
-    offset = np.array([ear.offsets[s] for s in watchers])
-    seen = motion_evidence(watchers.index(event.serial), differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
-    return {s: _motion_seen(seen, k) for k, s in enumerate(watchers)}
+    unknown = np.full(3, np.nan)
+    known = np.array([[_or(axes.get((o, k)), unknown) for k in names] for o in names])
+    joint = names.index(heard.event.serial)
+    seen = motion_evidence(joint, heard.qd_rad_s, heard.gyro_rad_s, heard.offset_rad_s, known)
+    return {s: _motion_seen(seen, k) for k, s in enumerate(names)}
+
+
+def _or(axis: Array | None, other: Array) -> Array:
+    return axis if axis is not None else other
 
 
 def _watchers(ear: _Ear, event: JournalEvent) -> list[str]:
@@ -140,7 +196,7 @@ def _motion_seen(seen: MotionEvidence, k: int) -> MotionSeen:
     ratio = float(seen.rate_ratio[k])
     moved = ratio > 0.5
     axis = seen.coefficient[k] / ratio if moved else None
-    return MotionSeen(moved, ratio, axis, float(seen.ratio_sigma[k]), seen.give)
+    return MotionSeen(moved, ratio, axis, float(seen.ratio_sigma[k]), float(seen.give[k]))
 
 
 def _finding(recording: Recording, motion: MotionRecord, joint: str, observer: str) -> Estimate | None:

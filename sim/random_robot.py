@@ -16,7 +16,7 @@ from sim.parts import BRACKETS
 from sim.pose import Array, inverse
 from sim.rigid_body import about_origin, joined, moved
 from sim.robot_file import BASE, MOUNTS, Robot
-from sim.robot_tree import GRAVITY_M_S2, build_tree
+from sim.robot_tree import build_tree
 
 FEWEST, MOST = 3, 16
 # A held joint that carries half of what its motor can do at standstill still moves at half its free speed.
@@ -71,7 +71,7 @@ def joint_loads(robot: Robot) -> tuple[JointLoad, ...]:
         distal = [i for i in range(len(tree.serials)) if k in _way_down(tree.parent, i)]
         whole = joined([moved(tree.bodies[i], inverse(tree.home[k]) @ tree.home[i]) for i in distal])
         arm = float(np.hypot(whole.com_m[0], whole.com_m[1]))
-        loads.append(JointLoad(GRAVITY_M_S2 * whole.mass_kg * arm, float(about_origin(whole)[2, 2])))
+        loads.append(JointLoad(tree.gravity_m_s2 * whole.mass_kg * arm, float(about_origin(whole)[2, 2])))
     return tuple(loads)
 
 

@@ -127,9 +127,13 @@ class Flex(_Strict):
 
 
 class Base(_Strict):
-    """How the base frame stands in gravity: a named mount, or roll, pitch, yaw in a world with z up."""
+    """How the base frame stands in gravity: a named mount, or roll, pitch, yaw in a world with z up.
+
+    `gravity_m_s2` is how strong it is there: 9.764 to 9.834 on the Earth.
+    """
 
     mount: MountName | None = None
+    gravity_m_s2: Annotated[float, Field(ge=0.1, le=30.0)] = 9.81
     rpy_deg: tuple[Angle, Angle, Angle] | None = None
     compliance: BaseCompliance | None = None
 

@@ -15,8 +15,6 @@ from sim.pose import Array, inverse, pose, read_only
 from sim.rigid_body import RigidBody, joined, moved, negative, parameters, tensor
 from sim.robot_file import Module, Robot
 
-GRAVITY_M_S2 = 9.81
-
 _FLANGE_KG, _FLANGE_RADIUS_M, _FLANGE_HEIGHT_M = 0.030, 0.018, 0.006
 
 
@@ -45,6 +43,7 @@ class RobotTree(NamedTuple):
     way: for every module the corners of its link, (k, 3), from the parent's distal frame to its own.
     moved: for every module what its joint alone turns (flange, or housing if reversed), in the world.
     segments: for every module the segments of its link, its own held part in the last of them.
+    gravity_m_s2: how strongly it is pulled along -z of the world.
     """
 
     serials: tuple[str, ...]
@@ -62,6 +61,7 @@ class RobotTree(NamedTuple):
     way: tuple[Array, ...]
     moved: tuple[RigidBody, ...]
     segments: tuple[tuple[Segment, ...], ...]
+    gravity_m_s2: float
 
 
 def flange(kind: ModuleType) -> RigidBody:
@@ -170,6 +170,7 @@ def _tree(
         way=tuple(link.way for link in links),
         moved=tuple(own),
         segments=segments,
+        gravity_m_s2=robot.base.gravity_m_s2,
     )
 
 
@@ -186,7 +187,7 @@ def true_chain(robot: Robot) -> Chain:
         axis=read_only(joints[:, :3, 2] * tree.axis_sign[:, None]),
         point=read_only(joints[:, :3, 3]),
         imu_home=read_only(to_root @ tree.housing @ imu_in_housing),
-        gravity=read_only(to_root[:3, :3] @ np.array([0.0, 0.0, GRAVITY_M_S2])),
+        gravity=read_only(to_root[:3, :3] @ np.array([0.0, 0.0, robot.base.gravity_m_s2])),
     )
 
 

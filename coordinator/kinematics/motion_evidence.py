@@ -3,7 +3,8 @@
 An IMU that a joint carries reads gyro = j v, with the joint's rate v and |j| = 1; one that it does not carry
 reads none of v. What else moves an IMU in time with the joint makes the ratio uncertain: shaking and noise,
 which differ from one stretch of the motion to the next, and held joints that give, which their own encoders
-see.
+see. Where those joints' own motions have shown whom they carry, and about which axis, what they gave is taken
+off.
 """
 
 from typing import NamedTuple
@@ -22,6 +23,9 @@ RATIO_FLOOR = 0.05
 LEAST_RATE_RAD_S = 0.02
 # Six blocks of four samples are the least that tells how much they differ.
 FEWEST_SAMPLES = 4 * BLOCKS
+# What is left of a held joint's motion after it is taken off: its axis in the IMU's frame turns with the
+# joints between, by some tenths of a radian.
+GIVE_LEFT = 0.3
 
 
 class NotMoved(ValueError):
@@ -33,13 +37,13 @@ class MotionEvidence(NamedTuple):
 
     coefficient: (n, 3) regression of each gyro on the joint's rate, in the frame of that IMU.
     sigma: (n,) one standard deviation of its size, from how much the stretches of the motion differ.
-    give: how much the other joints moved along, relative to this one: that much more or less may an IMU have
-        turned, depending on where it sits.
+    give: (n,) how much the other joints moved along, relative to this one, less what was taken off: that much
+        more or less may an IMU have turned, depending on where it sits.
     """
 
     coefficient: Array
     sigma: Array
-    give: float
+    give: Array
 
     @property
     def rate_ratio(self) -> Array:
@@ -66,8 +70,10 @@ def carried_log_odds(rate_ratio: float, sigma: float) -> float:
     return float(np.log((fits[0] + 0.5 * ODD) / (fits[1] + 0.5 * ODD)))
 
 
-def motion_evidence(joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s: Array) -> MotionEvidence:
-    """Regress all gyros, less their offsets, on one joint's rate.
+def motion_evidence(
+    joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s: Array, axes: Array | None = None
+) -> MotionEvidence:
+    """Regress all gyros, less their offsets and what held joints gave, on one joint's rate.
 
     The spread is that of the jackknife over blocks of the motion (Efron, The Jackknife, 1982, eq. 3.13): it
     needs no model of how shaking and noise hang together in time.
@@ -77,6 +83,8 @@ def motion_evidence(joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s
         qd_rad_s: (m, n) rates of all joints.
         gyro_rad_s: (m, n, 3) of all IMUs at the same instants, each in its own frame, filtered alike.
         offset_rad_s: (n, 3) gyro offsets, from rest.
+        axes: (n joints, n IMUs, 3) of every joint in every IMU's frame, zero where it does not carry it, NaN
+            where that is not known; None if nothing is.
 
     Raises:
         NotMoved: the joint's rate is below `LEAST_RATE_RAD_S` rms.
@@ -88,16 +96,26 @@ def motion_evidence(joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s
     size = float(np.sqrt(np.mean(rate**2)))
     if size < LEAST_RATE_RAD_S:
         raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {LEAST_RATE_RAD_S} is needed")
-    gyro = gyro_rad_s - offset_rad_s
+    others = np.arange(qd_rad_s.shape[1]) != joint
+    given, left = _given(qd_rad_s[:, others], axes[others] if axes is not None else None, gyro_rad_s.shape[1])
+    gyro = gyro_rad_s - offset_rad_s - given
     blocks = np.array_split(np.arange(rate.size), BLOCKS)
     power = np.array([rate[b] @ rate[b] for b in blocks])
     moment = np.array([np.tensordot(rate[b], gyro[b], axes=1) for b in blocks])
     coefficient = moment.sum(axis=0) / power.sum()
     without = (moment.sum(axis=0) - moment) / (power.sum() - power)[:, None, None]
     scatter = ((without - without.mean(axis=0)) ** 2).sum(axis=(0, 2))
-    others = np.delete(qd_rad_s, joint, axis=1)
-    give = float(np.abs(rate @ others).sum() / power.sum())
-    return MotionEvidence(_frozen(coefficient), _frozen(np.sqrt((BLOCKS - 1) / BLOCKS * scatter)), give)
+    give = (np.abs(rate @ qd_rad_s[:, others]) / power.sum()) @ left
+    spread = np.sqrt((BLOCKS - 1) / BLOCKS * scatter)
+    return MotionEvidence(_frozen(coefficient), _frozen(spread), _frozen(give))
+
+
+def _given(rates: Array, axes: Array | None, imus: int) -> tuple[Array, Array]:
+    """Return what held joints turned every IMU by (m, n, 3), and what share of each is left (joints, n)."""
+    if axes is None:
+        return np.zeros((len(rates), imus, 3)), np.ones((rates.shape[1], imus))
+    given = np.tensordot(rates, np.nan_to_num(axes, nan=0.0), axes=1)
+    return np.asarray(given), np.where(np.isnan(axes).any(axis=2), 1.0, GIVE_LEFT)
 
 
 def _frozen(array: Array) -> Array:

@@ -28,6 +28,7 @@ from coordinator.kinematics.inertial_prediction import BodyMotion, ImuReadings, 
 from coordinator.kinematics.inertial_slopes import imu_slopes
 from coordinator.kinematics.link_flex import FlexSlopes, no_flex
 from coordinator.kinematics.sensor_data import SensorData
+from module_agent.gravity import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 
 ITERATIONS = 20
 CONVERGED = 1e-7
@@ -36,7 +37,6 @@ UNKNOWN_ABOVE = 0.1
 # A step (rad, m) along what only the motion of the base tells.
 FARTHEST = 0.3
 # From the equator to the poles, from the sea to the mountains: 9.764 to 9.834 (WGS 84).
-GRAVITY_M_S2, GRAVITY_SIGMA_M_S2 = 9.81, 0.02
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
 # Samples, 50 a second.

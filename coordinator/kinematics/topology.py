@@ -350,11 +350,13 @@ def _check_reversed(serials: list[str], observations: Observations) -> None:
     """A housing that turns about its own axis turns backwards: about -z of its IMU when the position grows.
 
     Raises:
-        TopologyError: a module turned about something else.
+        TopologyError: a module surely turned about something else.
     """
     for k in serials:
         seen = observations.get((k, k))
-        if seen is not None and seen.moved and seen.axis is not None and seen.axis[2] > -0.7:
+        if seen is None or seen.axis is None or seen.log_odds < CONTRADICTS_ABOVE:
+            continue
+        if seen.axis[2] > -0.7:
             raise TopologyError(
                 f"{k} moved with its own joint, as a reversed module does, but about "
                 f"{seen.axis.round(2).tolist()} instead of -z of its IMU: check its encoder's sign, "

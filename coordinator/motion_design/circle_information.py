@@ -20,11 +20,11 @@ from coordinator.cross_product import cross
 from coordinator.kinematics.imu_intrinsics import ImuPrior, slopes
 from coordinator.kinematics.increments import skew
 from coordinator.kinematics.inertial_prediction import turned
+from module_agent.gravity import GRAVITY_SIGMA_M_S2
 
 # Radius (2), axis (2), gravity (3): what is unknown beside the IMU's own errors.
 GEOMETRY = 7
 # Gravity's size is known where on earth one is: 9.78 to 9.83 m/s^2 everywhere. It is what calibrates scales.
-GRAVITY_SIZE_M_S2 = 0.02
 
 
 class CircleSetting(NamedTuple):
@@ -106,7 +106,7 @@ def circle_covariance(
     free = prior.sigmas > 0.0
     information = np.diag(np.concatenate([np.full(GEOMETRY, 1e-9), prior.sigmas[free] ** -2.0]))
     up = setting.gravity_m_s2 / np.linalg.norm(setting.gravity_m_s2)
-    information[4:GEOMETRY, 4:GEOMETRY] += np.outer(up, up) / GRAVITY_SIZE_M_S2**2
+    information[4:GEOMETRY, 4:GEOMETRY] += np.outer(up, up) / GRAVITY_SIGMA_M_S2**2
     weight = 1.0 / np.repeat([noise.gyro_rad_s, noise.accel_m_s2], 3)[:, None]
     for path in paths:
         ideal = circle_readings(setting, path)

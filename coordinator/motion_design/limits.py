@@ -6,6 +6,7 @@ import numpy as np
 
 from module_agent.catalogue import ModuleType
 from module_agent.firmware.waveform import duration_s, waveform
+from module_agent.gravity import GRAVITY_M_S2
 from module_agent.wire.messages import Pattern
 
 # Of the type's speed: back-EMF then leaves a third of the voltage for torque.
@@ -24,7 +25,6 @@ RANGE_SHARE = 0.9
 # Links and brackets weigh about 0.6 of the modules; a module with its link reaches about 0.12 m further.
 LINK_MASS_SHARE = 0.6
 REACH_PER_MODULE_M = 0.12
-GRAVITY_M_S2 = 9.81
 # Of the torque that holds an arm level: whoever can carry an arm has so much left to move it.
 LEVEL_SHARE = 0.05
 # Of any motion: 100 a period at 4 Hz for 15 s.

@@ -20,11 +20,11 @@ from coordinator.motion_design.circle_information import (
 )
 from coordinator.motion_design.limits import JointLimits, motion_peaks
 from module_agent.firmware.waveform import SHORTEST_GOTO_S, duration_s, waveform
+from module_agent.gravity import GRAVITY_M_S2
 from module_agent.wire.messages import ConstantMotion, Pattern, WindowedSine
 
 # Before anything has moved, a link is taken to be as long as a kit's tube.
 LIKELY_RADIUS_M = 0.3
-GRAVITY_M_S2 = 9.81
 # Links and bases that give lengthen what a motion of frequency f shows by (f / f_g)^2: by 0.6 % at 1 Hz on
 # the simulated arms. The refinement leaves a tenth of that, where it has found how they give.
 GIVE_HZ = 40.0

@@ -20,9 +20,7 @@ from module_agent.estimate.joint_model import (
     PIVOT,
 )
 from module_agent.estimate.windows import Array
-
-GRAVITY_M_S2 = 9.81
-GRAVITY_SIGMA_M_S2 = 0.015  # from the equator to 60 degrees of latitude it is 9.78 to 9.82
+from module_agent.gravity import GRAVITY_M_S2
 
 # A link bends so that it rings at 12 Hz or above: c = 1 / (2 pi f)^2.
 _COMPLIANCE_SIGMA_S2 = 2e-4

@@ -31,8 +31,6 @@ from module_agent.estimate.joint_model import (
 )
 from module_agent.estimate.joint_prior import (
     CALIBRATED,
-    GRAVITY_M_S2,
-    GRAVITY_SIGMA_M_S2,
     Beliefs,
     ImuKnowledge,
     beliefs,
@@ -40,6 +38,7 @@ from module_agent.estimate.joint_prior import (
 from module_agent.estimate.seen_motion import SeenMotion
 from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
 from module_agent.estimate.windows import Array
+from module_agent.gravity import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.wire.messages import RegressionEstimate, Vector3
 
 # The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.

@@ -22,6 +22,7 @@ from sim.chain_score import link_errors, link_length_m, tip_errors, topology_dif
 from sim.experiments.thesis_chain import thesis_chain
 from sim.gauge import tip_error
 from sim.noise_profile import NoiseProfile, noise_profile
+from sim.place import somewhere
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import true_chain
 from sim.virtual_robot import VirtualSettings
@@ -95,12 +96,12 @@ def arm_trial(
     Args:
         robot: a shipped robot, a robot file, or a robot.
         noise: its profile; the IMUs count as calibrated where it has no errors of scale and misalignment.
-        seed: of the modules, their noise and the network.
+        seed: of the modules, their noise, the network, and the place where the robot stands.
         mode: one joint after the other, or all at once.
         network: a network profile or file.
         plan: other motions than those of the mode.
     """
-    described = robot if isinstance(robot, Robot) else load_robot(robot)
+    described = somewhere(robot if isinstance(robot, Robot) else load_robot(robot), seed)
     found = noise if isinstance(noise, NoiseProfile) else noise_profile(noise)
     planned = plan or arm_plan(mode, imu_kind(found))
     settings = VirtualSettings(described, named_network(network), seed, found)

@@ -12,6 +12,7 @@ from sim.experiments.joint_bound import bound_m, imu_knowledge
 from sim.experiments.one_joint_rig import IMU, JOINT, OneJointRig, TrialRows, analyse, regress
 from sim.experiments.thesis_lengths import Alignment, ThesisLength, thesis_length
 from sim.noise_profile import NoiseProfile, noise_profile
+from sim.place import somewhere
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
 
@@ -54,7 +55,7 @@ def joint_trial(
     Args:
         length_mm, alignment: one of the thesis' eight arms (`thesis_lengths`).
         noise: profile, by name or as `switched` makes it.
-        seed: of the rig's modules and their noise.
+        seed: of the rig's modules, their noise, and the place where it stands.
         plan: the motions; those of `trial_plan` when None.
 
     Raises:
@@ -64,7 +65,8 @@ def joint_trial(
     """
     profile = noise_profile(noise) if isinstance(noise, str) else noise
     wanted = plan if plan is not None else trial_plan(thesis_length(alignment, length_mm), profile)
-    with OneJointRig(load_robot(f"thesis_{length_mm}_{alignment}"), seed, profile) as rig:
+    robot = somewhere(load_robot(f"thesis_{length_mm}_{alignment}"), seed)
+    with OneJointRig(robot, seed, profile) as rig:
         rows = rig.trial(wanted)
         return judge(rig, rows, profile)
 

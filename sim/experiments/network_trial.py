@@ -18,6 +18,7 @@ from sim.chain_score import link_errors, tip_errors, topology_differences
 from sim.experiments.arm_trial import arm_plan, imu_kind
 from sim.module_clock import ModuleClock, module_time
 from sim.noise_profile import NoiseProfile, noise_profile
+from sim.place import somewhere
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import true_chain
 from sim.virtual_robot import VirtualSettings
@@ -65,10 +66,10 @@ def network_trial(
         robot: a shipped robot or a robot file.
         network: a network profile or file.
         noise: a noise profile; `apart` gives it clocks that differ by 50 ms and 100 ppm.
-        seed: of the modules, their noise and the network.
+        seed: of the modules, their noise, the network, and the place where the robot stands.
         plan: of the session; None for that of `arm_trial`.
     """
-    described = load_robot(robot)
+    described = somewhere(load_robot(robot), seed)
     found = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or described.noise)
     settings = VirtualSettings(described, named_network(network), seed, found)
     begun = NetworkTrial(robot, network, seed, "")

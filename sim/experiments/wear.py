@@ -20,6 +20,7 @@ from coordinator.known_robot import KnownRobot
 from coordinator.plan import Plan
 from module_agent.wire.network_file import network as network_named
 from sim.parts import FreePose, Part
+from sim.place import somewhere
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import true_chain
 from sim.virtual_robot import VirtualSettings
@@ -136,7 +137,7 @@ def _known(subject: _Subject) -> KnownRobot:
 
 
 def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> KnownRobot:
-    robot = load_robot(subject.robot)
+    robot = somewhere(load_robot(subject.robot), subject.seed)
     settings = VirtualSettings(
         robot if wear is None else worn(robot, wear),
         network_named(subject.network),

@@ -10,7 +10,6 @@ from sim.physics.bullet import pybullet
 from sim.physics.skeleton import Skeleton
 from sim.physics.urdf import joint_name, urdf_text
 from sim.pose import Array
-from sim.robot_tree import GRAVITY_M_S2
 
 
 class Multibody:
@@ -22,7 +21,7 @@ class Multibody:
         self.closed = False
         self._client: int = pybullet.connect(pybullet.DIRECT)
         self._body = _load(self._client, urdf_text(name, skeleton))
-        _configure(self._client, self._body, n, dt_s)
+        _configure(self._client, self._body, skeleton, dt_s)
         _check(self._client, self._body, skeleton)
 
     def place(self, q_rad: Array) -> None:
@@ -61,8 +60,9 @@ def _load(client: int, urdf: str) -> int:
     return body
 
 
-def _configure(client: int, body: int, n: int, dt_s: float) -> None:
-    pybullet.setGravity(0.0, 0.0, -GRAVITY_M_S2, physicsClientId=client)
+def _configure(client: int, body: int, skeleton: Skeleton, dt_s: float) -> None:
+    n = len(skeleton.names)
+    pybullet.setGravity(0.0, 0.0, -skeleton.gravity_m_s2, physicsClientId=client)
     pybullet.setPhysicsEngineParameter(fixedTimeStep=dt_s, numSubSteps=0, physicsClientId=client)
     for i in range(-1, n):
         pybullet.changeDynamics(

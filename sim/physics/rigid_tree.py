@@ -10,13 +10,13 @@ import numpy as np
 from sim.physics.rigid_kernels import feel, mass_and_biases
 from sim.physics.skeleton import Skeleton
 from sim.pose import Array
-from sim.robot_tree import GRAVITY_M_S2
 
 
 class RigidTree:
     """The bodies and IMUs of a skeleton, (m,) joint coordinates in its order."""
 
     def __init__(self, skeleton: Skeleton):
+        self._gravity_m_s2 = skeleton.gravity_m_s2
         # Copies, all writable and contiguous: a kernel is compiled once for every kind of array it meets.
         self._joints = (
             np.array(skeleton.parent, dtype=np.int64),
@@ -46,8 +46,8 @@ class RigidTree:
 
     def mass_and_biases(self, q: Array, rates: Array) -> tuple[Array, Array]:
         """Return the same, with one row of biases (R, m) for each of several velocities (R, m)."""
-        return mass_and_biases(*self._joints, *self._bodies, q, rates, GRAVITY_M_S2)
+        return mass_and_biases(*self._joints, *self._bodies, q, rates, self._gravity_m_s2)
 
     def feel(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         """Return the angular rates and specific forces (n, 3) in the IMUs' frames [rad/s, m/s^2]."""
-        return feel(*self._joints, q, qd, qdd, GRAVITY_M_S2, *self._imus)
+        return feel(*self._joints, q, qd, qdd, self._gravity_m_s2, *self._imus)

@@ -31,6 +31,7 @@ class Skeleton(NamedTuple):
     module: (n,) the modules' joints. passive: (p,) the others.
     stiffness, damping: (p,) of the passive joints [N/m, N s/m] or [Nm/rad, Nm s/rad].
     imu_body: (n,) the body that carries a module's IMU, -1 for the world. imu_pose: (n, 4, 4) its pose there.
+    gravity_m_s2: along -z of the world.
     """
 
     names: tuple[str, ...]
@@ -45,6 +46,7 @@ class Skeleton(NamedTuple):
     damping: Array
     imu_body: tuple[int, ...]
     imu_pose: Array
+    gravity_m_s2: float
 
 
 def build_skeleton(robot: Robot, base_shake: float = 0.0, link_flex: float = 0.0) -> Skeleton:
@@ -159,4 +161,5 @@ class _Frame:
             damping=read_only(np.array(damping)),
             imu_body=tuple(imu_body),
             imu_pose=read_only(np.array([self._seen_from(b, h @ pose(kind.imu_xyz)) for b, h, kind in imus])),
+            gravity_m_s2=tree.gravity_m_s2,
         )

@@ -11,10 +11,11 @@ from module_agent.hardware import SensorSample
 from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import build_skeleton
 from sim.physics.urdf import urdf_text
+from sim.place import somewhere
 from sim.pose import Array, inverse
 from sim.rigid_body import RigidBody, parameters
 from sim.robot_file import Robot, load_robot
-from sim.robot_tree import GRAVITY_M_S2, build_tree, true_chain, true_inertia
+from sim.robot_tree import build_tree, true_chain, true_inertia
 from sim.world import World
 
 ROBOTS = ["arm6", "tree_y", "a2085_04"]
@@ -28,7 +29,7 @@ class Reference:
         self.skeleton = build_skeleton(robot)
         self.model = pinocchio.buildModelFromXML(urdf_text(robot.name, self.skeleton))
         self.data = self.model.createData()
-        self.model.gravity.linear[:] = [0.0, 0.0, -GRAVITY_M_S2]
+        self.model.gravity.linear[:] = [0.0, 0.0, -self.tree.gravity_m_s2]
         self.ids = [self.model.getJointId(f"joint-{s}") for s in self.tree.serials]
         self.rows = [self.model.joints[i].idx_v for i in self.ids]
 
@@ -65,7 +66,9 @@ class Reference:
             change = placement.actInv(self.data.a[joint])
             rotation = (self.data.oMi[joint] * placement).rotation
             force = (
-                change.linear + np.cross(rate.angular, rate.linear) + rotation.T @ [0.0, 0.0, GRAVITY_M_S2]
+                change.linear
+                + np.cross(rate.angular, rate.linear)
+                + rotation.T @ [0.0, 0.0, self.tree.gravity_m_s2]
             )
             rows.append(np.concatenate([rate.angular, force]))
         return np.array(rows)
@@ -85,7 +88,7 @@ def _moving(world: World, ticks: int, amplitude: float) -> Any:
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_moving_imus_feel_what_newton_and_euler_say(name: str) -> None:
-    robot = load_robot(name)
+    robot = somewhere(load_robot(name), 4)
     reference, world = Reference(robot), World(robot, seed=1, noise="ideal")
     errors = [
         _read(samples) - reference.felt(plant.q_rad, plant.qd_rad_s, plant.qdd_rad_s2)
@@ -100,7 +103,7 @@ def test_moving_imus_feel_what_newton_and_euler_say(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_springs_exert_what_the_motion_needs(name: str) -> None:
-    robot = load_robot(name)
+    robot = somewhere(load_robot(name), 4)
     reference, world = Reference(robot), World(robot, seed=1, noise="ideal")
     errors, torques = [], []
     for _, plant in _moving(world, 600, 0.15):
@@ -114,7 +117,7 @@ def test_the_springs_exert_what_the_motion_needs(name: str) -> None:
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_the_compiled_equations_have_the_same_mass_matrix_and_bias(name: str) -> None:
-    robot = load_robot(name)
+    robot = somewhere(load_robot(name), 4)
     reference = Reference(robot)
     rng = np.random.default_rng(2)
     n = len(robot.modules)
@@ -128,7 +131,7 @@ def test_the_compiled_equations_have_the_same_mass_matrix_and_bias(name: str) ->
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_the_true_chain_puts_every_imu_where_the_physics_has_it(name: str) -> None:
-    robot = load_robot(name)
+    robot = somewhere(load_robot(name), 4)
     reference, chain = Reference(robot), true_chain(robot)
     to_root = inverse(reference.tree.housing[0])
     q = np.random.default_rng(4).uniform(-2.0, 2.0, (3, len(robot.modules)))
@@ -143,7 +146,7 @@ def test_the_true_chain_puts_every_imu_where_the_physics_has_it(name: str) -> No
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_the_true_inertia_is_that_of_the_physics_at_home(name: str) -> None:
-    robot = load_robot(name)
+    robot = somewhere(load_robot(name), 4)
     reference = Reference(robot)
     to_root = inverse(reference.tree.housing[0])
     shift = pinocchio.SE3(to_root[:3, :3], to_root[:3, 3])
@@ -157,7 +160,7 @@ def test_the_true_inertia_is_that_of_the_physics_at_home(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_world_begins_with_its_springs_carrying_the_weight(name: str) -> None:
-    robot = load_robot(name)
+    robot = somewhere(load_robot(name), 4)
     reference, world = Reference(robot), World(robot, seed=1, noise="ideal")
     zero = np.zeros(len(robot.modules))
     samples = world.step(list(zero))

@@ -11,6 +11,7 @@ from module_agent.wire.network_file import network
 from sim.experiments.arm_trial import ArmTrial, arm_plan, arm_trial, expected_tip, imu_kind
 from sim.experiments.thesis_chain import thesis_chain
 from sim.noise_profile import NOISE_PROFILES
+from sim.place import somewhere
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
 from sim.score import score
@@ -30,7 +31,7 @@ def test_a_session_in_memory_is_message_for_message_that_of_a_run_with_a_folder(
     tmp_path: Path, trial: ArmTrial
 ) -> None:
     plan = arm_plan("joint", "calibrated")
-    robot = load_robot(ROBOT)
+    robot = somewhere(load_robot(ROBOT), SEED)
     result = run_virtual(
         VirtualConfig(robot, tmp_path / "run", SEED, "lan", "x5", plan), Terminal(quiet=True)
     )

@@ -84,8 +84,9 @@ def test_an_arm_with_an_imu_as_delivered_swings_about_where_gravity_can_calibrat
     assert trial_plan(thesis_length("vertical", 350), SOLID).home_rad == 0.0
     assert (imu_knowledge(delivered), imu_knowledge(SOLID)) == (AS_DELIVERED, CALIBRATED)
     found = joint_trial(350, "vertical", delivered, seed=2)
-    judged(found)
-    # The scale is wrong by 1 % rms. Gravity's strength is believed to 0.15 %.
+    # One such trial of the thesis' may be right by chance: its errors and the scale's may cancel.
+    assert abs(found.ours_error_m) < 4.0 * found.ours_sigma_m
+    # The scale is wrong by 1 % rms. Gravity's strength is believed to 0.2 %.
     assert abs(found.ours_error_m) < 0.005 * 0.350
     assert found.ours_sigma_m < 0.005 * 0.350
 

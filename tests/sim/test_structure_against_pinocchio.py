@@ -18,13 +18,13 @@ from sim.physics.skeleton import Skeleton, build_skeleton
 from sim.physics.urdf import joint_name, urdf_text
 from sim.pose import Array
 from sim.robot_file import Robot, load_robot, parse_robot
-from sim.robot_tree import GRAVITY_M_S2, build_tree
+from sim.robot_tree import build_tree
 from sim.world import TICK_S, World
 
 # Motors without friction, whose sticking no smooth integration could follow, on a structure that gives.
 GIVING = switched(NOISE_PROFILES["ideal"], ("base-shake", "link-flex"), ("friction", "gear-loss", "heat"))
 STUCK = NOISE_PROFILES["ideal"].model_copy(update={"friction": 1e4})
-UP = np.array([0.0, 0.0, GRAVITY_M_S2])
+UP = np.array([0.0, 0.0, 9.81])
 
 
 class Reference:

@@ -13,8 +13,10 @@ from coordinator.kinematics.forward import ancestors, carrier, imu_poses
 from coordinator.kinematics.initial_guess import own_line
 from coordinator.kinematics.topology import Topology
 from module_agent.catalogue import CATALOGUE, ModuleType
+from module_agent.gravity import GRAVITY_M_S2
 
-G = 9.81
+# Where the fit expects it: without noise nothing draws it elsewhere.
+G = GRAVITY_M_S2
 
 
 def build(
@@ -104,4 +106,5 @@ def robots() -> SimpleNamespace:
         rest=rest_of,
         observe=observe,
         positions=random_positions,
+        gravity_m_s2=G,
     )

@@ -44,5 +44,5 @@ def test_predictions_are_what_an_imu_sees_of_a_turning_joint(robots: Any) -> Non
     others = [p for p in pairs if p.joint != p.observer]
     np.testing.assert_allclose(found.axis, [p.axis for p in others], atol=1e-9)
     np.testing.assert_allclose(found.radial_m, [p.radial_m for p in others], atol=1e-9)
-    np.testing.assert_allclose(9.81 * found.gravity, rest.specific_force_m_s2, atol=1e-9)
+    np.testing.assert_allclose(robots.gravity_m_s2 * found.gravity, rest.specific_force_m_s2, atol=1e-9)
     np.testing.assert_allclose(residuals(chain, seen), 0.0, atol=1e-6)

@@ -5,6 +5,7 @@ import pytest
 
 from coordinator.kinematics.motion_evidence import (
     FEWEST_SAMPLES,
+    GIVE_LEFT,
     LEAST_RATE_RAD_S,
     RATIO_FLOOR,
     NotMoved,
@@ -73,11 +74,43 @@ def test_a_held_joint_that_gives_covers_the_error_that_it_makes(give: float) -> 
     rate = rates()
     rate[:, 1] = give * rate[:, 0]
     seen = motion_evidence(0, rate, gyros(rate, (1.0 + give, give, 0.0)), np.zeros((3, 3)))
-    assert seen.give == pytest.approx(abs(give))
+    np.testing.assert_allclose(seen.give, abs(give))
     error = np.abs(seen.rate_ratio - [1.0, 0.0, 0.0])
     # A uniform distribution reaches to the root of three of its sigmas.
     assert (error <= np.sqrt(3.0) * seen.ratio_sigma).all()
     assert (seen.ratio_sigma >= abs(give) / np.sqrt(3.0)).all()
+
+
+@pytest.mark.parametrize("turned_rad", [0.0, 0.3])
+def test_what_a_held_joint_gave_is_taken_off_where_it_is_known_whom_it_carries(turned_rad: float) -> None:
+    """Joint 1 carries the first two IMUs; joints between have turned its axis a little since it showed."""
+    rate, give = rates(), 0.8
+    rate[:, 1] = give * rate[:, 0]
+    carried, own = np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    across = np.cross(AXES, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    axes = np.full((3, 3, 3), np.nan)
+    axes[1] = carried[:, None] * across
+    axes[2] = 0.0
+    now = np.cos(turned_rad) * across + np.sin(turned_rad) * np.cross(AXES, across)
+    gyro = rate[:, :1, None] * (own[:, None] * AXES) + rate[:, 1:2, None] * (carried[:, None] * now)
+    seen = motion_evidence(0, rate, gyro, np.zeros((3, 3)), axes)
+    without = motion_evidence(0, rate, gyro, np.zeros((3, 3)))
+    assert np.abs(without.rate_ratio - own).max() > 0.25
+    assert (np.abs(seen.rate_ratio - own) <= np.sqrt(3.0) * seen.ratio_sigma).all()
+    np.testing.assert_allclose(seen.give, GIVE_LEFT * give)
+    if turned_rad == 0.0:
+        np.testing.assert_allclose(seen.rate_ratio, own, atol=1e-12)
+
+
+def test_of_a_joint_of_which_nothing_is_known_all_may_have_been_given() -> None:
+    rate = rates()
+    rate[:, 1] = 0.4 * rate[:, 0]
+    seen = motion_evidence(
+        0, rate, gyros(rate, (1.0, 0.0, 0.0)), np.zeros((3, 3)), np.full((3, 3, 3), np.nan)
+    )
+    np.testing.assert_allclose(seen.give, 0.4)
+    np.testing.assert_allclose(seen.rate_ratio, [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_a_joint_that_is_stuck_has_not_moved_whatever_its_encoder_jitters() -> None:

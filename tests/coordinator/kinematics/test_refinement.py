@@ -25,12 +25,11 @@ from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import imu_readings
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import (
-    GRAVITY_M_S2,
-    GRAVITY_SIGMA_M_S2,
     refine_chain,
     repeats,
 )
 from coordinator.kinematics.sensor_data import SensorData
+from module_agent.gravity import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03
 

@@ -17,6 +17,7 @@ from module_agent.catalogue import CATALOGUE, ModuleType
 from module_agent.firmware.config import catalogue_limits
 from module_agent.firmware.motion import Motion, check_motion
 from module_agent.firmware.waveform import duration_s, waveform
+from module_agent.gravity import GRAVITY_M_S2
 from module_agent.wire.messages import MultiSine
 
 TYPES = list(CATALOGUE.values())
@@ -122,7 +123,10 @@ def test_what_gravity_warms_is_what_the_copper_bears() -> None:
 
 @pytest.mark.parametrize("count", [2, 7, 16])
 def test_an_arm_that_holds_itself_level_can_always_move_a_little(count: int) -> None:
-    level_nm, inertia = 1.0, 1.0 / (0.5 * 9.81) * (0.12 * count) / 3.0  # per m g L / 2 of a uniform arm
+    level_nm, inertia = (
+        1.0,
+        1.0 / (0.5 * GRAVITY_M_S2) * (0.12 * count) / 3.0,
+    )  # per m g L / 2 of a uniform arm
     assert least_accel_rad_s2(count) * inertia == pytest.approx(0.05 * level_nm)
     # Fast enough for the slow sine's rate to stand out of a gyro's errors of some mrad/s.
     limits = JointLimits(1.0, least_accel_rad_s2(count), -3.0, 3.0)
