@@ -21,11 +21,7 @@ from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
 from coordinator.kinematics.base_motion import NoiseFloor
-from coordinator.kinematics.chain_observations import (
-    DISTANCE_FLOOR_M,
-    PairObservation,
-    RestObservation,
-)
+from coordinator.kinematics.chain_observations import PairObservation, RestObservation
 from coordinator.kinematics.free_motions import settled
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
 from coordinator.kinematics.null_space import name_null_space
@@ -189,9 +185,6 @@ def _settled(refined: Refinement, reference: Chain) -> Refinement:
 
 def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
     length, sigma = link_lengths(refined.chain, refined.covariance)
-    # What no motion can tell: the IMU's place in the housing.
-    believed = np.sqrt(sigma**2 + DISTANCE_FLOOR_M**2)
-    believed.flags.writeable = False
     return first._replace(
         chain=refined.chain,
         covariance=refined.covariance,
@@ -200,7 +193,7 @@ def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
         unresolved=name_null_space(refined.chain, refined.null_basis),
         null_basis=refined.null_basis,
         link_length_m=length,
-        link_length_sigma_m=believed,
+        link_length_sigma_m=sigma,
     )
 
 

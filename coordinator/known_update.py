@@ -16,7 +16,6 @@ import numpy as np
 from coordinator.chain import Array, Chain
 from coordinator.identify import Kinematics
 from coordinator.kinematics.assembly import ChainFit, link_lengths
-from coordinator.kinematics.chain_observations import DISTANCE_FLOOR_M
 from coordinator.kinematics.increments import adjoint, apply_increment, frozen, increments_between
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import UNKNOWN_ABOVE, Refinement
@@ -173,5 +172,5 @@ def _fit(found: ChainFit, result: Placed) -> ChainFit:
         **result._asdict(),
         unresolved=name_null_space(result.chain, result.null_basis),
         link_length_m=length,
-        link_length_sigma_m=frozen(np.hypot(sigma, DISTANCE_FLOOR_M)),
+        link_length_sigma_m=sigma,
     )

@@ -11,9 +11,7 @@ from coordinator.clock_map import map_clocks
 from coordinator.dynamics.differentiation import settling_samples
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.assembly import link_lengths
-from coordinator.kinematics.chain_observations import DISTANCE_FLOOR_M
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior
-from coordinator.kinematics.increments import frozen
 from coordinator.kinematics.link_flex import flex_slopes, joined, loads_of
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import Refinement, refine_chain
@@ -122,7 +120,7 @@ def _refined(
         unresolved=name_null_space(refined.chain, refined.null_basis),
         null_basis=refined.null_basis,
         link_length_m=length,
-        link_length_sigma_m=frozen(np.hypot(sigma, DISTANCE_FLOOR_M)),
+        link_length_sigma_m=sigma,
     )
     return found._replace(fit=fit)
 

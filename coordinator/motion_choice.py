@@ -27,11 +27,12 @@ from module_agent.catalogue import ModuleType
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import ConstantMotion, MotionRecord, MultiSine, Pattern, WindowedSine
 
-# A session of designed motions: 10 s a joint, without what it takes to find and check the modules, rest, and
-# move all joints at once.
-JOINT_S = 10.0
+# A session of designed motions: 10 s a joint and a little to spare, less what it takes to find and check the
+# modules, rest, and move all joints at once.
+JOINT_S = 9.9
 AROUND_S = 19.0
-SHORTEST_S, LONGEST_S = 5.0, 9.0
+# Below the shortest no designed motion fits: short journeys, two settlings and ramps take most of it.
+SHORTEST_S, LONGEST_S = 5.25, 9.0
 # Asking all modules for their estimates, and the module's own ticks between motions.
 ANSWERS_S = 0.3
 # A repeat that takes less than this off the predicted sigma is not worth its time.

@@ -45,9 +45,9 @@ def kinematic_cases(effort: Effort, seed: int, motions: Motions | None = None) -
     return [
         *joint_cases(effort.joints, seed),
         *arm_cases(effort.arms, seed, effort.shortened, motions),
-        *topology_cases(effort.robots, seed),
+        *topology_cases(effort.robots, seed, effort.shortened),
         *network_cases(effort.networks, seed, plan),
-        *wear_cases(effort.changed, effort.unchanged, seed),
+        *wear_cases(effort.changed, effort.unchanged, seed, effort.shortened),
     ]
 
 

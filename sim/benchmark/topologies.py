@@ -5,15 +5,27 @@ from collections.abc import Sequence
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, count, largest
 from sim.experiments.random_robots import TopologyTrial, topology_trial
+from sim.random_robot import random_robot
 
 NOISE = "x5-uncalibrated"
 _COST_S = 6.0
+AMONG = 10
 
 
-def topology_cases(robots: int, seed: int) -> list[Case]:
-    """Return the one case of random robots; their seeds follow one another from the benchmark's."""
-    work = tuple(Trial(topology_trial, (robots * seed + number, NOISE), _COST_S) for number in range(robots))
+def topology_cases(robots: int, seed: int, small: bool = False) -> list[Case]:
+    """Return the one case of random robots; their seeds follow one another from the benchmark's.
+
+    `small`: of every `AMONG` of them only the one with the fewest modules.
+    """
+    among = AMONG if small else 1
+    first = robots * among * seed
+    drawn = [range(first + among * number, first + among * (number + 1)) for number in range(robots)]
+    work = tuple(Trial(topology_trial, (_smallest(seeds), NOISE), _COST_S) for seeds in drawn)
     return [Case(f"random robots, {NOISE}", work, _summary)]
+
+
+def _smallest(seeds: Sequence[int]) -> int:
+    return seeds[0] if len(seeds) == 1 else min(seeds, key=lambda seed: len(random_robot(seed).modules))
 
 
 def _summary(trials: Sequence[TopologyTrial]) -> Summary:

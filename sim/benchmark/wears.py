@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
+from coordinator.plan import Plan
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, count, largest, scaled
 from sim.experiments.wear import DAYS, WearTrial, wear_trial
@@ -12,7 +13,10 @@ ROBOT = "a2085_06"
 CHANGE_M = 2e-3
 SIZE_MM = 0.5
 CHECK_S = 60.0
-_KNOWN_COST_S, _CHECK_COST_S = 18.0, 10.0
+_KNOWN_COST_S, _CHECK_COST_S = 11.0, 11.0
+# A quarter of that where all joints are moved at once.
+AT_ONCE = Plan(mode="whole", dynamics=False)
+_AT_ONCE_SHARE = 0.3
 
 
 class Checks(NamedTuple):
@@ -22,8 +26,11 @@ class Checks(NamedTuple):
     unchanged: tuple[WearTrial, ...]
 
 
-def wear_cases(changed: int, unchanged: int, seed: int) -> list[Case]:
-    """Return the one case; each of its trials is about one robot, recorded once for all its checks."""
+def wear_cases(changed: int, unchanged: int, seed: int, shortened: bool = False) -> list[Case]:
+    """Return the one case; each of its trials is about one robot, recorded once for all its checks.
+
+    `shortened`: the robot is known and checked by a motion of all joints at once, not joint by joint.
+    """
     robots = max(-(-unchanged // DAYS), -(-changed // DAYS), 1)
     # Another thousand robots for another seed: no benchmark makes that many.
     first = 1000 * DAYS * seed
@@ -32,16 +39,17 @@ def wear_cases(changed: int, unchanged: int, seed: int) -> list[Case]:
     for robot, own in enumerate(days):
         worn, same = own[: _share(changed, robots, robot)], own[: _share(unchanged, robots, robot)]
         cost_s = _KNOWN_COST_S + _CHECK_COST_S * (len(worn) + len(same))
-        work.append(Trial(checks_of_one_robot, (tuple(worn), tuple(same)), cost_s))
+        plan, share = (AT_ONCE, _AT_ONCE_SHARE) if shortened else (None, 1.0)
+        work.append(Trial(checks_of_one_robot, (tuple(worn), tuple(same), plan), share * cost_s))
     name = f"{ROBOT}, wear"
     return [Case(name, tuple(work), partial(_summary, name))]
 
 
-def checks_of_one_robot(changed: Sequence[int], unchanged: Sequence[int]) -> Checks:
-    """Check a robot on several days, one after the other in one process; the arguments are seeds."""
+def checks_of_one_robot(changed: Sequence[int], unchanged: Sequence[int], plan: Plan | None = None) -> Checks:
+    """Check a robot on several days, one after the other in one process; plan: see `wear_trial`."""
     return Checks(
-        tuple(wear_trial(seed, True, ROBOT, change_m=CHANGE_M) for seed in changed),
-        tuple(wear_trial(seed, False, ROBOT, change_m=CHANGE_M) for seed in unchanged),
+        tuple(wear_trial(seed, True, ROBOT, change_m=CHANGE_M, plan=plan) for seed in changed),
+        tuple(wear_trial(seed, False, ROBOT, change_m=CHANGE_M, plan=plan) for seed in unchanged),
     )
 
 

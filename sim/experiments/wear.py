@@ -63,6 +63,7 @@ class _Subject(NamedTuple):
     noise: str
     network: str
     seed: int
+    plan: Plan
 
 
 def wear_trial(
@@ -72,6 +73,7 @@ def wear_trial(
     noise: str = "x5-uncalibrated",
     network: str = "lan",
     change_m: float = 2e-3,
+    plan: Plan | None = None,
 ) -> WearTrial:
     """Check a robot that is known, with one link displaced or as it was.
 
@@ -81,8 +83,9 @@ def wear_trial(
         robot: a shipped robot, or a robot file.
         noise, network: profiles.
         change_m: by how much.
+        plan: of the session that the robot is known from, which says how it is checked.
     """
-    subject = _Subject(robot, noise, network, seed // DAYS)
+    subject = _Subject(robot, noise, network, seed // DAYS, plan or Plan(dynamics=False))
     wear = draw_wear(load_robot(robot), seed, change_m) if changed else None
     known = _known(subject)
     later = _recorded(subject, 1 + seed % DAYS, check_plan(known, Plan()), wear)
@@ -133,7 +136,7 @@ def _hidden(chain: Chain, child: int) -> Array | None:
 
 @lru_cache(maxsize=1)
 def _known(subject: _Subject) -> KnownRobot:
-    return _recorded(subject, 0, Plan(dynamics=False), None)
+    return _recorded(subject, 0, subject.plan, None)
 
 
 def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> KnownRobot:

@@ -80,6 +80,19 @@ def test_a_joint_that_carries_more_is_accelerated_less() -> None:
     assert peak(heavy) < 0.7 * peak(light)
 
 
+@pytest.mark.parametrize("joints", [1, 2, 3, 4, 16])
+def test_a_robot_of_any_size_has_the_time_for_designed_motions(joints: int) -> None:
+    serials = [chr(ord("A") + k) for k in range(joints)]
+    told = Told(0.1)
+    told.journal = [
+        SimpleNamespace(purpose="rest", serial=s, motion=record(Rest(duration_s=1.0), REST)) for s in serials
+    ]
+    recording: Any = told
+    plan = Plan(motions="designed")
+    chosen = MotionChoice(plan, recording, lambda: serials, lambda serial: CATALOGUE["X5-4"])
+    assert chosen.slow("A") != plan.constant()
+
+
 def test_where_no_designed_motion_fits_into_the_time_the_thesis_has_to_do() -> None:
     plan = Plan(motions="designed", joint_s=1.5)
     chosen = choice(plan, Told(0.1))

@@ -20,6 +20,7 @@ from sim.experiments.network_trial import NetworkTrial
 from sim.experiments.random_robots import TopologyTrial
 from sim.experiments.thesis_lengths import ALIGNMENTS, LENGTHS_MM
 from sim.experiments.wear import DAYS, WearTrial
+from sim.random_robot import random_robot
 
 
 def rows(summary: Summary) -> dict[str, Row]:
@@ -178,10 +179,14 @@ def test_shortened_motions_meet_no_bar_of_time_and_one_arm_moves_in_full_all_the
     assert plans[0] == arm_plan("joint", "calibrated")
     assert [plan.imu for plan in plans] == ["calibrated", "uncalibrated"] * 3
     assert all(plan.sine_centre_s < plans[0].sine_centre_s for plan in plans[1:])
+    # Whoever chooses the motions: those are the thesis', shortened.
+    quick = kinematic_cases(QUICK, seed=0, motions="designed")
+    motions = [c.trials[0].arguments[-1].motions for c in chosen(quick, "joint by joint")]
+    assert motions == ["designed"] + ["thesis"] * 5
 
 
 def test_other_motions_are_those_of_whole_arms_joint_by_joint() -> None:
-    cases = kinematic_cases(QUICK, seed=0, motions="designed")
+    cases = kinematic_cases(full(1), seed=0, motions="designed")
     plans = {case.name: case.trials[0].arguments[-1] for case in cases}
     assert all(plan.motions == "designed" for name, plan in plans.items() if "joint by joint" in name)
     assert plans["a2085_04, x5, clocks apart, wifi"].motions == "designed"
@@ -221,9 +226,17 @@ def test_one_wrong_robot_of_two_hundred_misses_the_bar() -> None:
     assert rows(case.summarise([right] * 200))["wrong topology or mounting, of 200"].holds
 
 
-def test_another_seed_means_other_robots() -> None:
-    first, second = ({t.arguments[0] for t in topology_cases(20, s)[0].trials} for s in (0, 1))
+@pytest.mark.parametrize("small", [False, True])
+def test_another_seed_means_other_robots(small: bool) -> None:
+    first, second = ({t.arguments[0] for t in topology_cases(5, s, small)[0].trials} for s in (0, 1))
+    assert len(first) == len(second) == 5
     assert not first & second
+
+
+def test_small_robots_are_the_smallest_of_ten() -> None:
+    (trial,) = topology_cases(1, 0, small=True)[0].trials
+    sizes = [len(random_robot(seed).modules) for seed in range(10)]
+    assert sizes[trial.arguments[0]] == min(sizes)
 
 
 def network(name: str, seed: int, error_mm: float, **changed: Any) -> NetworkTrial:
@@ -309,14 +322,14 @@ def test_a_false_alarm_misses_its_bar() -> None:
 
 def test_checks_of_one_robot_are_made_in_one_process() -> None:
     (case,) = wear_cases(13, 100, 0)
-    assert [[len(seeds) for seeds in trial.arguments] for trial in case.trials] == [
+    assert [[len(seeds) for seeds in trial.arguments[:2]] for trial in case.trials] == [
         [3, DAYS],
         [3, DAYS],
         [3, DAYS],
         [2, DAYS],
         [2, DAYS],
     ]
-    robots = [{seed // DAYS for seeds in trial.arguments for seed in seeds} for trial in case.trials]
+    robots = [{seed // DAYS for seeds in trial.arguments[:2] for seed in seeds} for trial in case.trials]
     assert all(len(each) == 1 for each in robots)
     assert len(set.union(*robots)) == 5
 
