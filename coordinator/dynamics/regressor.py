@@ -5,39 +5,23 @@ body j, and that wrench is linear in the ten parameters of the body (thesis eqs 
 coincide with the root frame at q = 0, so a body's parameters are constants in the root frame at q = 0.
 
 The screws of all the joints below a body are carried up into the body's frame, which gives every entry of the
-regressor directly; neither 6 x 6 transforms nor 6 x 10 wrench matrices are built.
+regressor directly; neither 6 x 6 transforms nor 6 x 10 wrench matrices are built. Twists and spatial
+accelerations transform as Ad(exp(-S q)), and V' = Ad V + S qd, A' = Ad A + ad(V') S qd + S qdd (Featherstone,
+Rigid Body Dynamics Algorithms, table 5.1).
 """
-
-from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.chain import Array, Chain
-from coordinator.cross_product import cross
-from coordinator.kinematics.forward import BASE, ancestors
+from coordinator.dynamics.regressor_kernel import Index, fill_regressor
+from coordinator.kinematics.forward import ancestors
 
 BODY_PARAMETERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 PER_BODY = len(BODY_PARAMETERS)
 
-# As of 2026-11-21 with 7 joints and one thread: 3.5 us a sample in blocks of 1024, 7.8 in blocks of 256
-# (calls dominate), 4.1 in one block of 5000 (the work arrays leave the cache).
-_BLOCK = 1024
-
-
-class _BodyMotion(NamedTuple):
-    """Motion of one body in its own frame, sample axis last: everything (3, m) but `screws` (2, k, 3, m).
-
-    `acceleration` is that of the frame's origin against free fall (p'' - g of thesis eq. 25); `screws` holds
-    the direction and the moment of the k joints that carry the body, root joint first, its own last.
-    """
-
-    omega: Array
-    velocity: Array
-    alpha: Array
-    acceleration: Array
-    screws: Array
+# Bounds the memory of what needs no whole regressor: 9 MB with 7 joints.
+_BLOCK = 2048
 
 
 def torque_regressor(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2: ArrayLike) -> Array:
@@ -59,9 +43,9 @@ def torque_regressor(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_ra
     q, qd, qdd = _check_motion(chain, q_rad, qd_rad_s, qdd_rad_s2)
     samples, joints = q.shape
     found = np.zeros((samples, joints, PER_BODY * joints))
-    for begin in range(0, samples, _BLOCK):
-        part = slice(begin, min(begin + _BLOCK, samples))
-        _fill(chain, q[part], qd[part], qdd[part], found[part])
+    carriers, depth = _carriers(chain)
+    axis, point, gravity = (_plain(a) for a in (chain.axis, chain.point, chain.gravity))
+    fill_regressor(carriers, depth, axis, point, gravity, _plain(q), _plain(qd), _plain(qdd), found)
     found.flags.writeable = False
     return found
 
@@ -115,80 +99,17 @@ def _check_motion(chain: Chain, *signals: ArrayLike) -> tuple[Array, ...]:
     return arrays
 
 
-def _fill(chain: Chain, q: Array, qd: Array, qdd: Array, found: Array) -> None:
-    for body, motion in enumerate(_body_motions(chain, q.T, qd.T, qdd.T)):
-        block = slice(PER_BODY * body, PER_BODY * (body + 1))
-        rows = _torque_rows(motion)
-        for joint, row in zip(ancestors(chain, body), rows, strict=True):
-            found[:, joint, block] = row.T
+def _plain(array: Array) -> Array:
+    """Return a writable copy in C order: of one kind of array only, the kernel is compiled once."""
+    return np.array(array, dtype=float, order="C")
 
 
-def _body_motions(chain: Chain, q: Array, qd: Array, qdd: Array) -> Iterator[_BodyMotion]:
-    """Carry motion and screws up the tree; `q`, `qd`, `qdd` are (n, m)."""
-    samples = q.shape[1]
-    rest = np.zeros((3, samples))
-    upward = np.broadcast_to(chain.gravity[:, None], (3, samples))
-    base = _BodyMotion(rest, rest, rest, upward, np.empty((2, 0, 3, samples)))
-    motions: list[_BodyMotion] = []
-    for i, parent in enumerate(chain.parent):
-        below = base if parent == BASE else motions[parent]
-        motions.append(_carry(below, chain.axis[i], chain.point[i], q[i], qd[i], qdd[i]))
-        yield motions[i]
-
-
-def _carry(below: _BodyMotion, axis: Array, point: Array, q: Array, qd: Array, qdd: Array) -> _BodyMotion:
-    """Return the motion beyond a joint from the motion below it.
-
-    Twists and spatial accelerations transform as Ad(exp(-S q)), and V' = Ad V + S qd,
-    A' = Ad A + ad(V') S qd + S qdd (Featherstone, Rigid Body Dynamics Algorithms, table 5.1). The
-    acceleration kept is the classical one, A_linear + omega x v.
-    """
-    turn, offset = _inverse_displacement(axis, point, q)
-    moment = -cross(axis[:, None], point[:, None])
-    stacked = np.stack([below.omega, below.alpha])
-    linear = np.stack([below.velocity, below.acceleration - cross(below.omega, below.velocity)])
-    (omega, alpha), (velocity, spatial) = _transform(turn, offset, stacked, linear)
-    omega = omega + axis[:, None] * qd
-    velocity = velocity + moment * qd
-    alpha = alpha + cross(omega, axis[:, None] * qd) + axis[:, None] * qdd
-    spatial = spatial + cross(velocity, axis[:, None] * qd) + cross(omega, moment * qd) + moment * qdd
-    carried = np.stack(_transform(turn, offset, below.screws[0], below.screws[1]))
-    own = np.broadcast_to(np.stack([axis, moment[:, 0]])[:, None, :, None], (2, 1, 3, q.size))
-    screws = np.concatenate([carried, own], axis=1)
-    return _BodyMotion(omega, velocity, alpha, spatial + cross(omega, velocity), screws)
-
-
-def _inverse_displacement(axis: Array, point: Array, q: Array) -> tuple[Array, Array]:
-    """Return R^T (3, 3, m) and p (3, m) of the turn (R, p) about the joint's axis by q (m,)."""
-    back = np.cross(axis, np.eye(3))  # its rows are axis x e_i: the transpose of [axis x]
-    # Rodrigues' formula for -q.
-    turn = (
-        np.eye(3)[:, :, None] + back[:, :, None] * np.sin(q) + (back @ back)[:, :, None] * (1.0 - np.cos(q))
-    )
-    return turn, point[:, None] - np.einsum("jim,j->im", turn, point)
-
-
-def _transform(turn: Array, offset: Array, angular: Array, linear: Array) -> tuple[Array, Array]:
-    """Bring twists (k, 3, m) into the displaced frame: w' = R^T w, v' = R^T (v + w x p)."""
-    moved = linear + cross(angular, offset)
-    return np.einsum("ijm,kjm->kim", turn, angular), np.einsum("ijm,kjm->kim", turn, moved)
-
-
-def _torque_rows(motion: _BodyMotion) -> Array:
-    """Return the regressor rows (k, 10, m) of one body for the k joints that carry it.
-
-    With the wrench (f, n) of thesis eq. 25 on the body and a joint's screw (w, v): tau = w . n + v . f.
-    Grouped by parameter that is a x w + B^T v for `mc`, with B = [alpha x] + [omega x]^2, and
-    w . (I alpha) + (w x omega) . (I omega) for the inertia.
-    """
-    w, v = motion.screws
-    omega, alpha, a = motion.omega, motion.alpha, motion.acceleration
-    rows = np.empty((w.shape[0], PER_BODY, w.shape[2]))
-    rows[:, 0] = np.einsum("kim,im->km", v, a)
-    rows[:, 1:4] = cross(a, w) + cross(v, alpha) + cross(omega, cross(omega, v))
-    u = cross(w, omega)
-    for column, (r, c) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)), start=4):
-        rows[:, column] = w[:, r] * alpha[c] + u[:, r] * omega[c]
-        if r != c:
-            rows[:, column] += w[:, c] * alpha[r] + u[:, c] * omega[r]
-    return rows
+def _carriers(chain: Chain) -> tuple[Index, Index]:
+    """Return the joints that carry every body (n, n), the root's first, and how many they are (n,)."""
+    joints = len(chain.serials)
+    carriers, depth = np.zeros((joints, joints), dtype=np.int64), np.zeros(joints, dtype=np.int64)
+    for body in range(joints):
+        way = list(ancestors(chain, body))
+        depth[body] = len(way)
+        carriers[body, : len(way)] = way
+    return carriers, depth

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.physics.compiled import compiled
+from module_agent.compiled import compiled
 from sim.pose import Array
 
 Records = np.ndarray[Any, np.dtype[np.void]]

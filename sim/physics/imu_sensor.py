@@ -21,8 +21,8 @@ from math import exp, pi, sqrt, tan
 import numpy as np
 
 from module_agent.catalogue import ModuleType
+from module_agent.compiled import compiled
 from sim.noise_profile import NoiseProfile
-from sim.physics.compiled import compiled
 from sim.physics.sensor_errors import SensorErrors
 from sim.physics.sensor_noise import StandardNormals
 from sim.pose import Array

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.physics.compiled import compiled
+from module_agent.compiled import compiled
 from sim.pose import Array
 
 Indices = np.ndarray[Any, np.dtype[np.int64]]

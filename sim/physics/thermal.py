@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim.physics.compiled import compiled
+from module_agent.compiled import compiled
 from sim.pose import Array, read_only
 
 AMBIENT_C = 25.0
