@@ -47,6 +47,16 @@ def parameters(pseudo: ArrayLike) -> Array:
     return np.concatenate([[matrix[3, 3]], matrix[:3, 3], inertia[_UPPER]])
 
 
+def parameter_transform(pose: ArrayLike) -> Array:
+    """Return the matrix (10, 10) that takes ten parameters from a frame into the one that sees it at `pose`.
+
+    The pseudo-inertia goes over by J' = T J T^T, T the pose (4, 4), which is linear in the parameters.
+    """
+    transform = np.asarray(pose, dtype=float)
+    columns = [parameters(transform @ pseudo_inertia(unit) @ transform.T) for unit in np.eye(10)]
+    return np.stack(columns, axis=1)
+
+
 def smallest_eigenvalue(pseudo: ArrayLike) -> float:
     """Return the smallest eigenvalue of a pseudo-inertia matrix [kg], lengths counted in `REACH_M`."""
     return float(np.linalg.eigvalsh(_in_kg(pseudo))[0])

@@ -1,0 +1,239 @@
+"""Base parameters: the combinations of parameters that torques show, each named in words.
+
+Least squares sees of the parameters x no more than the rows that span the regressor. r of its columns are
+chosen as independent; all others are sums of those, and so their parameters only ever appear added to those
+of the chosen columns (Gautier and Khalil 1990, Direct calculation of minimum set of inertial parameters):
+beta_i = x_i + sum_j g_ij x_j. That beta is all there is to know, in whatever way the columns are chosen.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag, qr, solve_triangular
+
+from coordinator.chain import Array
+from coordinator.dynamics.consistency import parameter_transform
+from coordinator.dynamics.identification import RANK_TOLERANCE, REACH_M
+from coordinator.dynamics.information import JointInformation
+from coordinator.dynamics.regressor import PER_BODY
+
+# A column that keeps less than this of its length beside the columns chosen before it is passed over, so that
+# no grouping coefficient is a difference of nearly equal numbers. With 1e-2 more words begin with the
+# parameter that one expects, and coefficients reach some tens.
+INDEPENDENT_ABOVE = 0.05
+
+# Of a parameter's own scale. Geometry that was itself estimated tilts the groupings by about its errors.
+NEGLIGIBLE = 2e-3
+
+_MOMENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
+# Within a body what its joint shows by itself comes first, and what moves into the body below comes last
+# (Khalil and Dombre 2002, Modeling, identification and control of robots, section 9.4.2, z along the axis):
+# Izz, first moments, the other moments, then Iyy, the first moment along the axis and the mass.
+_WITHIN_BODY = (9, 1, 2, 4, 5, 6, 8, 7, 3, 0)
+
+
+class Columns(NamedTuple):
+    """What the columns of a regressor are: their names, the common size of each parameter, and the order.
+
+    scale: (p,) by which a parameter is counted, so that those of different units have one common size: the
+        regressor's columns are multiplied by it. preferred: (p,) the order in which they are tried as the
+        independent ones.
+    """
+
+    names: tuple[str, ...]
+    scale: Array
+    preferred: NDArray[np.int64]
+
+    def beside(self, names: Sequence[str], scale: ArrayLike = 1.0) -> "Columns":
+        """Return these columns and further ones after them, which are tried first.
+
+        A friction or an offset is a parameter of its own; it is inertia that is lumped.
+        """
+        added = np.broadcast_to(np.asarray(scale, dtype=float), len(names))
+        size = len(self.names)
+        order = np.concatenate([np.arange(size, size + len(names)), self.preferred])
+        return Columns((*self.names, *names), np.concatenate([self.scale, added]), order)
+
+
+class BaseParameters(NamedTuple):
+    """The r base parameters of p columns, beta = grouping @ x; arrays are read-only.
+
+    columns: what the regressor's columns are. independent: (r,) the columns that each base parameter starts
+        with. grouping: (r, p), 1 there. value: (r,) their estimates. covariance: (r, r).
+    share: (p,) how much of a parameter by itself lies in what the data tell: 1 if it is known alone, 0 if it
+        has no effect.
+    condition: largest over smallest singular value that was kept, of the scaled regressor.
+    """
+
+    columns: Columns
+    independent: NDArray[np.int64]
+    grouping: Array
+    value: Array
+    covariance: Array
+    share: Array
+    condition: float
+
+    @property
+    def rank(self) -> int:
+        """How many there are."""
+        return len(self.independent)
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (r,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def relative_sigma(self) -> Array:
+        """Standard deviations over values (r,); infinite for a value of zero."""
+        size = np.abs(self.value)
+        return np.divide(self.sigma, size, out=np.full(self.rank, np.inf), where=size > 0.0)
+
+    def lumped(self, i: int) -> tuple[int, ...]:
+        """Return the columns whose parameters are in base parameter `i`, its own first."""
+        of_scale = self.grouping[i] * self.columns.scale / self.columns.scale[self.independent[i]]
+        others = np.flatnonzero(np.abs(of_scale) > NEGLIGIBLE)
+        return (int(self.independent[i]), *(int(j) for j in others if j != self.independent[i]))
+
+    def words(self, i: int) -> str:
+        """Return base parameter `i` as a sum of named parameters, "m2 c2x + 0.225 (m3 + m4)"."""
+        groups: dict[tuple[bool, str], list[str]] = {}
+        for j in self.lumped(i):
+            factor = float(self.grouping[i, j])
+            groups.setdefault((factor < 0.0, f"{abs(factor):.3g}"), []).append(self.columns.names[j])
+        terms = [_term(*factor, names) for factor, names in groups.items()]
+        return " ".join(terms).removeprefix("+ ")
+
+
+def inertial_columns(joints: int) -> Columns:
+    """Return the columns of `torque_regressor` for n joints; body 1 is the first of the chain.
+
+    "m2" is the mass of body 2, "m2 c2x" its first moment along x, "I2xy" its inertia about the frame's
+    origin. Lengths are counted in `REACH_M`.
+    """
+    names: list[str] = []
+    for b in range(1, joints + 1):
+        names += [f"m{b}", *(f"m{b} c{b}{x}" for x in "xyz"), *(f"I{b}{pair}" for pair in _MOMENTS)]
+    one = REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], dtype=float)
+    order = [PER_BODY * b + k for b in range(joints) for k in _WITHIN_BODY]
+    return Columns(tuple(names), np.tile(one, joints), np.array(order, dtype=np.int64))
+
+
+def into_frames(triangle: ArrayLike, homes: ArrayLike) -> Array:
+    """Return rows (k, p) over parameters in the root frame as rows over those in the bodies' own frames.
+
+    Args:
+        triangle: its first 10 n columns are `torque_regressor`'s; any further ones stay.
+        homes: (n, 4, 4) poses of the bodies' frames in the root frame at q = 0. With z along the joint's axis
+            (`urdf.link_homes`) the groupings are those that one knows from books.
+    """
+    rows = np.array(triangle, dtype=float)
+    poses = np.asarray(homes, dtype=float)
+    size = PER_BODY * len(poses)
+    rows[:, :size] = rows[:, :size] @ block_diag(*(parameter_transform(pose) for pose in poses))
+    return rows
+
+
+def whitened(
+    information: Sequence[JointInformation], sigma_nm: ArrayLike, independent_fraction: float = 1.0
+) -> tuple[Array, Array]:
+    """Return the rows (k, p) and the target (k,) of all joints, in standard deviations of their noise.
+
+    Args:
+        information: per joint.
+        sigma_nm: (n,) noise of the joints' torques, as `InertialFit.torque_sigma_nm`.
+        independent_fraction: independent samples per sample, below 1 after a low-pass.
+
+    Raises:
+        ValueError: noise that is not positive or not one per joint, or a fraction out of range.
+    """
+    sigma = np.asarray(sigma_nm, dtype=float)
+    if sigma.shape != (len(information),) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+        raise ValueError(f"sigma_nm must be {len(information)} positive numbers, one per joint; got {sigma}")
+    if not 0.0 < independent_fraction <= 1.0:
+        raise ValueError(f"independent_fraction is {independent_fraction}; it must be above 0 and at most 1")
+    weight = np.sqrt(independent_fraction) / sigma
+    rows = np.vstack([w * piece.r for w, piece in zip(weight, information, strict=True)])
+    return rows, np.concatenate([w * piece.z for w, piece in zip(weight, information, strict=True)])
+
+
+def base_parameters(
+    triangle: ArrayLike, target: ArrayLike, columns: Columns, sigma: float = 1.0, max_sigma: float = np.inf
+) -> BaseParameters:
+    """Return the base parameters of rows whose noise is white.
+
+    The rank is counted in singular values, which say how well a direction is seen whatever the columns; the
+    independent columns are found by QR with pivoting within what is left, in the order that `columns`
+    prefers as long as they are well apart.
+
+    Args:
+        triangle: (k, p) the regressor, or any rows with the same R^T R, of `whitened` for example.
+        target: (k,) what the rows give for the true parameters, with noise.
+        columns: what the p columns are.
+        sigma: standard deviation of the noise of `target`; 1 of rows that are `whitened`.
+        max_sigma: a direction known worse than this, in `columns.scale`, is not told by the data
+            (`identification.MAX_SIGMA_KG`); inf keeps all that rounding allows.
+
+    Raises:
+        ValueError: shapes that do not fit, values that are not finite, or rows that show nothing.
+    """
+    rows, seen = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
+    size = len(columns.names)
+    if rows.ndim != 2 or rows.shape[1] != size or seen.shape != rows.shape[:1]:
+        raise ValueError(f"rows {rows.shape} and target {seen.shape} do not fit {size} named columns")
+    if not (np.isfinite(rows).all() and np.isfinite(seen).all() and sigma > 0.0):
+        raise ValueError("the rows or the target hold a value that is not finite, or sigma is not positive")
+    left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
+    kept = (values > RANK_TOLERANCE * values[0]) & (values > sigma / max_sigma)
+    if not kept.any():
+        raise ValueError("the rows show no parameter: without gravity or motion the torques say nothing")
+    space = directions[kept]
+    chosen = _independent(space, columns.preferred)
+    # x = scale * y and y = space^T (space y): beta in units of scale is (space[:, chosen])^-1 space y.
+    triangular = qr(space[:, chosen])
+    back = solve_triangular(triangular[1], triangular[0].T)
+    known = back @ (left[:, kept].T @ seen / values[kept])
+    spread = back / values[kept] * sigma
+    own = columns.scale[chosen]
+    grouping = own[:, None] * (back @ space) / columns.scale
+    grouping[:, chosen] = np.eye(len(chosen))
+    found = BaseParameters(
+        columns=columns,
+        independent=chosen,
+        grouping=grouping,
+        value=own * known,
+        covariance=own[:, None] * (spread @ spread.T) * own,
+        share=np.sum(space**2, axis=0),
+        condition=float(values[kept][0] / values[kept][-1]),
+    )
+    for array in found:
+        if isinstance(array, np.ndarray):
+            array.flags.writeable = False
+    return found
+
+
+def _independent(space: Array, preferred: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return r independent columns (r,) of orthonormal rows (r, p), the preferred ones where they serve."""
+    rest = space.copy()
+    chosen: list[int] = []
+
+    def take(column: int) -> None:
+        direction = rest[:, column] / np.linalg.norm(rest[:, column])
+        rest[:] -= np.outer(direction, direction @ rest)
+        chosen.append(column)
+
+    for column in preferred:
+        if np.linalg.norm(rest[:, column]) > INDEPENDENT_ABOVE:
+            take(int(column))
+    while len(chosen) < len(space):
+        take(int(np.argmax(np.linalg.norm(rest, axis=0))))
+    return np.array(sorted(chosen), dtype=np.int64)
+
+
+def _term(negative: bool, size: str, names: Sequence[str]) -> str:
+    sign = "-" if negative else "+"
+    if size == "1":
+        return " ".join(f"{sign} {name}" for name in names)
+    return f"{sign} {size} {names[0]}" if len(names) == 1 else f"{sign} {size} ({' + '.join(names)})"
