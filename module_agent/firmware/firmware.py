@@ -195,9 +195,12 @@ class Firmware:
         self._record = self._record.model_copy(update={"outcome": outcome, "end_row": self.history.next_row})
         if outcome == "done" and self._record.pattern.kind == "rest":
             self.last_rest = self._record
-        # A motion that is broken off holds where it was then, not where it would have ended.
-        end = self._motion.last_position_rad if outcome == "done" else self._command.position_rad
-        self._command = Command(end, 0.0, None)
+        # A motion that is broken off holds where it was then, not where it would have ended; and the effort
+        # that moved it there is not the one that holds it.
+        if outcome == "done":
+            self._command = Command(self._motion.last_position_rad, 0.0, self._motion.last_effort_nm)
+        else:
+            self._command = Command(self._command.position_rad, 0.0, None)
         self._motion = None
         self._status_due_ns = 0
 
@@ -299,7 +302,7 @@ class Firmware:
         held = self._command.position_rad
         origin = held if held is not None else self._sample.position_rad
         check_duration(command.pattern, origin)
-        motion = Motion(command.pattern, origin, self._now_ns, self.config.tick_ns)
+        motion = Motion(command.pattern, origin, self._now_ns, self.config.tick_ns, command.effort)
         check_motion(motion, self.config.limits)
         self._enter("motion")
         self._motion = motion

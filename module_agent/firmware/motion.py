@@ -3,8 +3,9 @@
 import numpy as np
 
 from module_agent.firmware.controller import Command
+from module_agent.firmware.effort_profile import effort_at
 from module_agent.firmware.waveform import duration_s, waveform
-from module_agent.wire.messages import Limits, Pattern, Setpoint
+from module_agent.wire.messages import EffortProfile, Limits, Pattern, Setpoint
 from module_agent.wire.refusal import Refusal, WireError
 
 # A motion is sampled when it starts; a minute takes 3 ms.
@@ -16,19 +17,37 @@ ABSURD_SPEED = 10.0
 class Motion:
     """A pattern sampled once at its start (0.3 ms for 6 s), so that a tick only looks it up."""
 
-    __slots__ = ("_end_ns", "_position", "_start_ns", "_tick_ns", "_velocity", "last_position_rad")
+    __slots__ = (
+        "_effort",
+        "_end_ns",
+        "_position",
+        "_start_ns",
+        "_tick_ns",
+        "_velocity",
+        "last_effort_nm",
+        "last_position_rad",
+    )
 
-    def __init__(self, pattern: Pattern, origin_rad: float, start_ns: int, tick_ns: int):
+    def __init__(
+        self,
+        pattern: Pattern,
+        origin_rad: float,
+        start_ns: int,
+        tick_ns: int,
+        effort: EffortProfile | None = None,
+    ):
         total_s = duration_s(pattern, origin_rad)
         ticks = max(1, round(total_s * 1e9 / tick_ns))
         t_s = np.minimum(np.arange(ticks + 1) * (tick_ns / 1e9), total_s)
         samples = waveform(pattern, origin_rad, t_s)
         self._position: list[float] = (origin_rad + samples.offset_rad).tolist()
         self._velocity: list[float] = samples.velocity_rad_s.tolist()
+        self._effort: list[float] | None = None if effort is None else effort_at(effort, t_s).tolist()
         self._start_ns = start_ns
         self._end_ns = start_ns + ticks * tick_ns
         self._tick_ns = tick_ns
         self.last_position_rad = self._position[-1]
+        self.last_effort_nm = None if self._effort is None else self._effort[-1]
 
     @property
     def top_speed_rad_s(self) -> float:
@@ -45,7 +64,8 @@ class Motion:
         if now_ns >= self._end_ns:
             return None
         index = (now_ns - self._start_ns) // self._tick_ns
-        return Command(self._position[index], self._velocity[index], None)
+        effort_nm = None if self._effort is None else self._effort[index]
+        return Command(self._position[index], self._velocity[index], effort_nm)
 
 
 def check_duration(pattern: Pattern, origin_rad: float) -> None:

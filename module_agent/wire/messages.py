@@ -116,6 +116,17 @@ Pattern = Annotated[
 ]
 
 
+class EffortProfile(Part):
+    """The effort that a motion is fed forward: torques of the spring [Nm], at equal times from its start.
+
+    `samples` are `period_ns` apart, little-endian 4-byte floats, 2 to 800 of them; the module interpolates
+    linearly. After the last one the effort stays as that says.
+    """
+
+    period_ns: Annotated[int, Field(ge=1_000_000, le=1_000_000_000)]
+    samples: Annotated[bytes, Field(min_length=8, max_length=3200)]
+
+
 # --------------------------------------------------------------------------- gains
 
 
@@ -328,13 +339,17 @@ class LeaseRequest(Message):
 
 
 class MotionCommand(Message):
-    """Start a motion that runs on the module. The same `motion_id` again is the same command."""
+    """Start a motion that runs on the module. The same `motion_id` again is the same command.
+
+    Without an `effort` the effort loop is off, as with a `Setpoint` that leaves it unset.
+    """
 
     sender: Name
     token: Counter
     echo_ns: Nanoseconds
     motion_id: Annotated[int, Field(gt=0, lt=2**32)]
     pattern: Pattern
+    effort: EffortProfile | None = None
 
 
 class Setpoint(Message):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from module_agent.firmware.effort_profile import MOST_SAMPLES, effort_profile
 from module_agent.wire import keys
-from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import ROW, unpack
 from module_agent.wire.messages import (
     Ack,
@@ -33,6 +35,7 @@ from module_agent.wire.messages import (
     MultiSine,
     PidGains,
     RegressionEstimate,
+    Rest,
     Setpoint,
     Sine,
     Status,
@@ -176,6 +179,33 @@ def test_the_bytes_of_several_sines_at_once_are_the_committed_ones() -> None:
     assert encode(command) == golden
     assert decode(MotionCommand, golden) == command
     assert msgpack.unpackb(golden, use_list=False) == command.model_dump()
+
+
+def test_the_bytes_of_an_effort_that_is_fed_forward_are_the_committed_ones() -> None:
+    """Samples are one block of little-endian floats, as `struct` reads them."""
+    effort = effort_profile([2.25, -0.5, 1.0], 500_000_000)
+    command = MotionCommand(**COMMAND, motion_id=4, pattern=Rest(duration_s=1.0), effort=effort)
+    golden = bytes.fromhex(json.loads(GOLDEN.read_text())["MotionCommand with effort"])
+    assert encode(command) == golden
+    assert decode(MotionCommand, golden) == command
+    plain = msgpack.unpackb(golden, use_list=False)["effort"]
+    assert struct.unpack("<3f", plain["samples"]) == (2.25, -0.5, 1.0)
+
+
+def test_a_motion_of_who_knows_no_effort_is_one_without() -> None:
+    golden = bytes.fromhex(json.loads(GOLDEN.read_text())["MotionCommand without effort"])
+    assert decode(MotionCommand, golden).effort is None
+
+
+def test_the_longest_effort_and_the_longest_pattern_fit_a_command() -> None:
+    sines = (Sine(amplitude_rad=0.01, frequency_hz=1.5),) * 8
+    command = MotionCommand(
+        **COMMAND,
+        motion_id=2**32 - 1,
+        pattern=MultiSine(sines=sines, duration_s=12.0),
+        effort=effort_profile([1.0] * MOST_SAMPLES, 10_000_000),
+    )
+    assert len(encode(command)) <= MAX_COMMAND_BYTES
 
 
 def test_plain_struct_knowledge_reads_the_rows() -> None:
