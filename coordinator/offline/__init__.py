@@ -1,0 +1,1 @@
+"""Other people's robots: a URDF and recorded joint torques in, what they say of the dynamics out."""
