@@ -1,0 +1,1 @@
+"""Motions of several joints at once that tell the inertial parameters."""

@@ -1,0 +1,106 @@
+"""One stretch of excitation: all joints about a pose at the same time, each with sines of its own."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array
+from coordinator.dynamics.differentiation import differentiate
+from coordinator.motion_design.limits import JointLimits, motion_peaks
+from module_agent.firmware.waveform import waveform
+from module_agent.wire.messages import MultiSine, Sine
+
+# As many sines a joint, within the band: fast enough for inertia to show beside gravity, slow enough for
+# links that give and for the joints' own bandwidth.
+SINES = 3
+BAND_HZ = (0.2, 1.6)
+# The largest part of a sine's share of speed and acceleration: what the taper adds has room.
+SHARE = 0.8
+
+
+class Segment(NamedTuple):
+    """A pose (n,) [rad], and every joint's motion about it, in the order of the chain."""
+
+    pose_rad: Array
+    patterns: tuple[MultiSine, ...]
+
+
+class SampledMotion(NamedTuple):
+    """Samples of a motion, (m, n) each, read-only."""
+
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+
+
+def draw_segment(
+    rng: np.random.Generator,
+    limits: Sequence[JointLimits],
+    home_rad: Array,
+    reach_rad: float,
+    duration_s: float,
+) -> Segment:
+    """Draw a pose within reach of home, and motions about it within the joints' limits.
+
+    The pose takes between nothing and all of the reach, the motion what is left of it and of the range.
+
+    Raises:
+        ValueError: a joint has no room to move about its home.
+    """
+    patterns, poses = [], []
+    for home, limit in zip(home_rad, limits, strict=True):
+        room = min(reach_rad, limit.room_rad(float(home)))
+        if room <= 0.0:
+            raise ValueError(
+                f"a joint has no room about {home:.2f} rad: its range is {limit.low_rad:.2f} .. "
+                f"{limit.high_rad:.2f} rad"
+            )
+        away = float(rng.uniform(-0.8, 0.8)) * room
+        patterns.append(_draw_sines(rng, limit, room - abs(away), duration_s))
+        poses.append(float(home) + away)
+    pose = np.array(poses)
+    pose.flags.writeable = False
+    return Segment(pose, tuple(patterns))
+
+
+def _draw_sines(
+    rng: np.random.Generator, limit: JointLimits, room_rad: float, duration_s: float
+) -> MultiSine:
+    slowest, fastest = BAND_HZ
+    frequency = np.exp(rng.uniform(np.log(slowest), np.log(fastest), SINES))
+    omega = 2.0 * np.pi * frequency
+    share = rng.dirichlet(np.ones(SINES))
+    amplitude = np.maximum(share * room_rad / np.maximum(1.0, omega / omega.min()), 1e-4)
+    pattern = MultiSine(
+        sines=tuple(
+            Sine(amplitude_rad=float(a), frequency_hz=float(f))
+            for a, f in zip(amplitude, frequency, strict=True)
+        ),
+        duration_s=duration_s,
+    )
+    speed, accel = motion_peaks(pattern)
+    return _scaled(pattern, min(1.0, SHARE * limit.speed_rad_s / speed, SHARE * limit.accel_rad_s2 / accel))
+
+
+def smaller(segment: Segment, home_rad: Array, share: float) -> Segment:
+    """Return the segment with pose and motion that much nearer to home, 0 < share <= 1."""
+    pose = home_rad + share * (segment.pose_rad - home_rad)
+    pose.flags.writeable = False
+    return Segment(pose, tuple(_scaled(pattern, share) for pattern in segment.patterns))
+
+
+def _scaled(pattern: MultiSine, share: float) -> MultiSine:
+    sines = tuple(s.model_copy(update={"amplitude_rad": share * s.amplitude_rad}) for s in pattern.sines)
+    return pattern.model_copy(update={"sines": sines})
+
+
+def sampled(segment: Segment, rate_hz: float) -> SampledMotion:
+    """Return the motion as commanded, at a rate, ends included."""
+    count = int(segment.patterns[0].duration_s * rate_hz) + 1
+    t_s = np.arange(count) / rate_hz
+    waves = [waveform(pattern, 0.0, t_s) for pattern in segment.patterns]
+    q = segment.pose_rad + np.stack([wave.offset_rad for wave in waves], axis=1)
+    qd = np.stack([wave.velocity_rad_s for wave in waves], axis=1)
+    q.flags.writeable = qd.flags.writeable = False
+    return SampledMotion(q, qd, differentiate(qd, rate_hz))
