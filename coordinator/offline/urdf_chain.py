@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from coordinator.chain import Array, Chain
 from coordinator.dynamics.consistency import parameters, pseudo_inertia
-from coordinator.dynamics.regressor import PER_BODY
 from coordinator.kinematics.forward import BASE
 
 STANDARD_GRAVITY = (0.0, 0.0, 9.81)
@@ -77,15 +76,6 @@ def read_urdf(path: Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRobot:
         return _robot(root, np.array(gravity, dtype=float))
     except UrdfError as error:
         raise UrdfError(f"{path}: {error}") from None
-
-
-def to_root(home: Array) -> Array:
-    """Return the (10, 10) matrix from a body's parameters in its own frame to those in the root frame.
-
-    The pseudo-inertia of a displaced frame is T J T^T (Wensing, Kim and Slotine 2018, section III).
-    """
-    units = [parameters(home @ pseudo_inertia(unit) @ home.T) for unit in np.eye(PER_BODY)]
-    return np.stack(units, axis=1)
 
 
 def _robot(root: Element, gravity: Array) -> UrdfRobot:

@@ -8,8 +8,9 @@ import pytest
 from numpy.random import default_rng
 
 from coordinator.chain import Array
+from coordinator.dynamics.consistency import parameter_transform
 from coordinator.dynamics.regressor import PER_BODY, inverse_dynamics, torque_regressor
-from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, read_urdf, to_root
+from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, read_urdf
 
 TX40 = Path(__file__).resolve().parents[3] / ".." / "shared" / "data" / "tx40" / "tx40.urdf"
 # Pinocchio's order of a body's dynamic parameters: m, mc, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
@@ -106,7 +107,9 @@ def compare(
         matrix = np.atleast_2d(pin.computeJointTorqueRegressor(model, data, position, *rates))[at]
         for body, index in enumerate(at):
             # Theirs is in the joint's frame: the link's own, as a URDF's joint frame is.
-            block = regressor[k][:, PER_BODY * body : PER_BODY * (body + 1)] @ to_root(robot.homes[body])
+            block = regressor[k][:, PER_BODY * body : PER_BODY * (body + 1)] @ parameter_transform(
+                robot.homes[body]
+            )
             expected = matrix[:, PER_BODY * index : PER_BODY * (index + 1)][:, PIN_ORDER]
             np.testing.assert_allclose(block, expected, rtol=0, atol=1e-9 * np.abs(matrix).max())
 
