@@ -1,0 +1,86 @@
+"""A recording as the fit needs it: one low-pass over torque and motion, thinned to what that leaves."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.signal import welch
+
+from coordinator.chain import Array
+from coordinator.dynamics.differentiation import NS_PER_S, filtered_motion, settling_samples
+from coordinator.offline.data_file import JointLog
+
+# Of the speed's power in what counts as the motion, and how many times its highest frequency passes. Friction
+# at reversals has harmonics up to several times the motion's frequency; what lies above the motion is noise.
+_MOTION_POWER, _HARMONICS = 0.99, 5.0
+# Samples kept per cut-off: half of that is three cut-offs, where the low-pass leaves 2e-4 of the amplitude to
+# fold back.
+_KEPT_PER_CUTOFF = 6.0
+
+
+class FilteredLog(NamedTuple):
+    """Filtered and thinned signals (m, n) of consecutive samples, read-only.
+
+    tau_raw_nm: the torques as recorded at the same times. settling: samples over which the low-pass mixes
+        what lies before with what lies after. noise: |raw - filtered| / |raw| over all recorded samples, the
+        part of the torque that no model of this bandwidth can have.
+    """
+
+    rate_hz: float
+    cutoff_hz: float
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+    tau_nm: Array
+    tau_raw_nm: Array
+    settling: int
+    noise: float
+
+    def part(self, begin: int, end: int) -> "FilteredLog":
+        """Return the samples from `begin` up to `end`."""
+        some = slice(begin, end)
+        signals = (self.q_rad, self.qd_rad_s, self.qdd_rad_s2, self.tau_nm, self.tau_raw_nm)
+        q, qd, qdd, tau, raw = (signal[some] for signal in signals)
+        return self._replace(q_rad=q, qd_rad_s=qd, qdd_rad_s2=qdd, tau_nm=tau, tau_raw_nm=raw)
+
+
+def usual_cutoff_hz(log: JointLog) -> float:
+    """Return a cut-off that suits a motion: five times the frequency that 99 % of the speeds' power is below.
+
+    At most a fifth of the sampling rate.
+    """
+    speed = np.diff(log.q_rad, axis=0) * log.rate_hz
+    frequencies, power = welch(
+        speed, log.rate_hz, nperseg=min(len(speed), int(10.0 * log.rate_hz)), axis=0, detrend=False
+    )
+    # Joints count alike, however far they move.
+    moving = power.sum(axis=0) > 0.0
+    if not moving.any():
+        return 0.2 * log.rate_hz
+    shares = np.cumsum(power[:, moving] / power[:, moving].sum(axis=0), axis=0).mean(axis=1)
+    highest = float(frequencies[min(int(np.searchsorted(shares, _MOTION_POWER)), len(frequencies) - 1)])
+    return float(min(_HARMONICS * max(highest, frequencies[1]), 0.2 * log.rate_hz))
+
+
+def filtered_log(log: JointLog, cutoff_hz: float) -> FilteredLog:
+    """Return a recording through one low-pass (`filtered_motion`).
+
+    Raises:
+        ValueError: a cut-off out of range, or too few samples for it.
+    """
+    t_ns = np.round(np.arange(len(log.q_rad)) * (NS_PER_S / log.rate_hz)).astype(np.int64)
+    motion = filtered_motion(t_ns, log.q_rad, log.qd_rad_s, log.tau_nm, log.rate_hz, cutoff_hz)
+    edge = settling_samples(log.rate_hz, cutoff_hz)
+    raw = log.tau_nm[edge : len(log.tau_nm) - edge]
+    step = max(1, int(log.rate_hz / (_KEPT_PER_CUTOFF * cutoff_hz)))
+    size = float(np.linalg.norm(raw))
+    return FilteredLog(
+        rate_hz=log.rate_hz / step,
+        cutoff_hz=cutoff_hz,
+        q_rad=motion.q_rad[::step],
+        qd_rad_s=motion.qd_rad_s[::step],
+        qdd_rad_s2=motion.qdd_rad_s2[::step],
+        tau_nm=motion.tau_nm[::step],
+        tau_raw_nm=raw[::step],
+        settling=-(-edge // step),
+        noise=float(np.linalg.norm(raw - motion.tau_nm)) / size if size > 0.0 else float("nan"),
+    )
