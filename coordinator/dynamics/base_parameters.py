@@ -83,13 +83,13 @@ class BaseParameters(NamedTuple):
     @property
     def sigma(self) -> Array:
         """Standard deviations (r,)."""
-        return np.sqrt(np.diagonal(self.covariance))
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
 
     @property
     def relative_sigma(self) -> Array:
         """Standard deviations over values (r,); infinite for a value of zero."""
         size = np.abs(self.value)
-        return np.divide(self.sigma, size, out=np.full(self.rank, np.inf), where=size > 0.0)
+        return np.asarray(np.divide(self.sigma, size, out=np.full(self.rank, np.inf), where=size > 0.0))
 
     def lumped(self, i: int) -> tuple[int, ...]:
         """Return the columns whose parameters are in base parameter `i`, its own first."""

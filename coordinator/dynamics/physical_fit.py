@@ -1,0 +1,301 @@
+"""Real bodies that explain the torques: least squares over bodies that can exist, drawn towards a prior.
+
+A body can exist if its pseudo-inertia J is positive definite (`consistency`). Torques leave many directions
+open; there a prior J0 decides, by the entropic divergence of two mass distributions (Lee, Wensing and Park
+2020, Geometric robot dynamic identification: a convex programming approach),
+
+    d(J | J0) = -log det(J J0^-1) + tr(J J0^-1) - 4,
+
+which does not depend on frames or units and grows without bound where J ceases to be a body's. So
+
+    minimise |R x - z|^2 / 2 + w sum_i d(J_i(x) | J0_i)
+
+is convex, smooth and self-concordant, and needs no constraint: Newton's method with a line search solves it
+(Boyd and Vandenberghe 2004, Convex optimization, section 9.6).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import block_diag, qr, solve_triangular
+from scipy.optimize import brentq
+
+from coordinator.chain import Array
+from coordinator.dynamics.base_parameters import whitened
+from coordinator.dynamics.consistency import parameter_transform, pseudo_inertia
+from coordinator.dynamics.identification import RANK_TOLERANCE
+from coordinator.dynamics.information import JointInformation
+from coordinator.dynamics.regressor import PER_BODY
+
+# Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 1 is the belief that a body's distribution of
+# mass is known to its own size: rods may be twice as heavy, bodies twice as long.
+PRIOR_WEIGHT = 1.0
+# How much the relative torque error may grow from least squares' for the prior's sake: half of what is
+# promised for motions that were not fitted, because those are another sample of the same.
+MOST_COST = 5e-4
+# What is left at the weakest weight is the price of real bodies, not the prior's.
+WEAKEST_WEIGHT = 1e-6
+
+# Of the torques' rms: no torque is known better, and a simulated one without noise is not solved better.
+_FINEST = 1e-5
+
+_MOST_STEPS = 200
+# Of the prior's weight: the objective is then within 1e-7 divergences of its minimum.
+_DECREMENT = 1e-7
+# Good enough to go on from, to the next smaller barrier: tenth by tenth.
+_ROUGHLY = 0.05
+_FALL = 10.0
+# On the way bodies may grow to this many times the prior where torques are silent.
+_LARGEST = 1e3
+# A body far too small grows at most this many times over in a step.
+_LONGEST_STEP = 1e6
+_UNITS = np.stack([pseudo_inertia(unit) for unit in np.eye(PER_BODY)])
+_TRACE = np.trace(_UNITS, axis1=1, axis2=2)
+
+
+class NotSolvedError(ArithmeticError):
+    """Newton's method did not come to an end; the message says how far it came."""
+
+
+class PhysicalFit(NamedTuple):
+    """n bodies that can exist and explain the torques; arrays are read-only.
+
+    phi: (10 n,) as in `torque_regressor`. covariance: (10 n, 10 n) with the prior taken for knowledge: it is
+        small where the prior holds, so compare `InertialFit.covariance`.
+    pseudo: (n, 4, 4) the bodies' pseudo-inertias, in the root frame. divergence: (n,) from the prior.
+    weight: of the prior. steps: of Newton's method, over all weights that were tried.
+    error: relative torque error |e| / |tau| of the fit. least_squares_error: that of least squares with the
+        same weights of the joints, which no bodies can fall below.
+    """
+
+    phi: Array
+    covariance: Array
+    pseudo: Array
+    divergence: Array
+    weight: float
+    steps: int
+    error: float
+    least_squares_error: float
+
+    @property
+    def cost(self) -> float:
+        """How much more of the torque is left unexplained than by least squares, as a share of |tau|."""
+        return self.error - self.least_squares_error
+
+
+class Solution(NamedTuple):
+    """The minimum for one weight: x (p,), its covariance (p, p), the divergences (n,), Newton's steps."""
+
+    x: Array
+    covariance: Array
+    divergence: Array
+    steps: int
+
+
+def fit_physical(
+    information: Sequence[JointInformation],
+    prior: ArrayLike,
+    sigma_nm: ArrayLike,
+    independent_fraction: float = 1.0,
+    most_cost: float = MOST_COST,
+) -> PhysicalFit:
+    """Fit real bodies to the torques of all joints.
+
+    The prior has `PRIOR_WEIGHT`, or the largest power of ten below it with which the torques are explained
+    worse than by least squares by at most `most_cost`.
+
+    Args:
+        information: per joint of n.
+        prior: (n, 4, 4) pseudo-inertias in the root frame at q = 0 (`parameter_prior.module_prior`).
+        sigma_nm: (n,) noise of the torques, which weighs the joints and says how much the data outweigh the
+            prior. The same for all joints makes the error comparable to that of unweighted least squares.
+        independent_fraction: independent samples per sample, below 1 after a low-pass.
+        most_cost: see above; a share of |tau|.
+
+    Raises:
+        ValueError: shapes that do not fit, a prior that is no body's, or torques that are all zero.
+        NotSolvedError: numerical trouble.
+    """
+    bodies = np.asarray(prior, dtype=float)
+    size = float(np.sqrt(sum(piece.z @ piece.z + piece.rest for piece in information)))
+    if not size > 0.0:
+        raise ValueError("all torques are zero: no bodies explain them")
+    least = _FINEST * size / np.sqrt(sum(piece.samples for piece in information))
+    sigma = np.maximum(np.asarray(sigma_nm, dtype=float), least)
+    rows, target = whitened(information, sigma, independent_fraction)
+    best = _relative_error(information, _least_squares(rows, target, bodies), size)
+    weight, steps = PRIOR_WEIGHT, 0
+    while True:
+        found = physically_consistent(rows, target, bodies, weight)
+        steps += found.steps
+        error = _relative_error(information, found.x, size)
+        if error - best <= most_cost or weight <= WEAKEST_WEIGHT:
+            break
+        weight *= 0.1
+    pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
+    for array in (pseudo, found.x, found.covariance, found.divergence):
+        array.flags.writeable = False
+    return PhysicalFit(found.x, found.covariance, pseudo, found.divergence, weight, steps, error, best)
+
+
+def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:
+    """Minimise |R x - z|^2 / 2 + weight * divergence from the prior over bodies that can exist.
+
+    Args:
+        rows: (k, p) in standard deviations; the first 10 n columns are the bodies'. The rest are parameters
+            without constraint and without prior (friction), which the rows must determine.
+        target: (k,). prior: (n, 4, 4). weight: above 0.
+
+    Raises:
+        ValueError: shapes that do not fit, a prior that is no body's, or a weight that is not positive.
+        NotSolvedError: numerical trouble.
+    """
+    problem = _problem(rows, target, prior, weight)
+    y = problem.origin()
+    # Far from the minimum Newton's steps are many. So the logarithm alone begins with a weight beside which
+    # the misfit is small, and that falls to the prior's (the barrier method: Boyd and Vandenberghe, section
+    # 11.3). Were the whole divergence to fall with it, a prior that is far off would cost hundreds of steps.
+    high = problem.misfit(y) / (4.0 * problem.bodies)
+    times = max(0, int(np.ceil(np.log(high / weight) / np.log(_FALL)))) if high > 0.0 else 0
+    steps = 0
+    for left in range(times, 0, -1):
+        barrier = weight * _FALL**left
+        far = problem._replace(barrier=barrier, weight=max(weight, barrier / _LARGEST))
+        y, taken = _descend(far, y, _ROUGHLY)
+        steps += taken
+    y, taken = _descend(problem, y, _DECREMENT)
+    spread = problem.scale @ solve_triangular(problem.slope(y)[1], np.eye(len(y)))
+    return Solution(problem.scale @ y, spread @ spread.T, problem.divergence(y), steps + taken)
+
+
+def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, int]:
+    """Return the minimum to within `decrement` times the barrier, from `y`, and Newton's steps."""
+    fall = np.inf
+    for step in range(_MOST_STEPS):
+        gradient, triangle = problem.slope(y)
+        down = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))
+        fall = float(-gradient @ down)
+        if fall < 2.0 * decrement * problem.barrier:
+            return y, step
+        length = problem.best_length(y, down)
+        if not length > 0.0:
+            # Rounding, not descent: nothing lower can be told from here.
+            return y, step
+        y = y + length * down
+    raise NotSolvedError(f"no real bodies were found in {_MOST_STEPS} steps; the last would gain {fall:.2g}")
+
+
+class _Problem(NamedTuple):
+    """The problem in coordinates in which every prior is the identity: x = scale @ y, J_i = C_i Y_i C_i^T.
+
+    The objective is |triangle y - target|^2 / 2 + sum_i (weight tr Y_i - barrier log det Y_i).
+    """
+
+    triangle: Array
+    target: Array
+    scale: Array
+    bodies: int
+    weight: float
+    barrier: float
+
+    def origin(self) -> Array:
+        """Return the prior (p,), and zero for what has none."""
+        one = np.array([1.0, 0, 0, 0, 2.0, 0, 0, 2.0, 0, 2.0])
+        return np.concatenate([np.tile(one, self.bodies), np.zeros(len(self.scale) - PER_BODY * self.bodies)])
+
+    def matrices(self, y: Array) -> Array:
+        """Return the Y_i (n, 4, 4)."""
+        own = y[: PER_BODY * self.bodies].reshape(self.bodies, PER_BODY)
+        return np.asarray(np.einsum("na,aij->nij", own, _UNITS))
+
+    def divergence(self, y: Array) -> Array:
+        """Return the divergences (n,); infinite where a body cannot exist."""
+        matrices = self.matrices(y)
+        values = np.linalg.eigvalsh(matrices)
+        if not (values > 0.0).all():
+            return np.full(self.bodies, np.inf)
+        return np.asarray(np.sum(values - np.log(values) - 1.0, axis=1))
+
+    def misfit(self, y: Array) -> float:
+        """Return |R x - z|^2 / 2 but for what no parameters explain."""
+        error = self.triangle @ y - self.target
+        return float(0.5 * error @ error)
+
+    def best_length(self, y: Array, down: Array) -> float:
+        """Return the t that minimises the objective along y + t * down, 0 if it does not fall.
+
+        Steps that merely go down may end next to a body that cannot exist, and the next ones are then short.
+        Along a line log det(Y + t D) is the sum of log(1 + t l) over the eigenvalues l of L^-1 D L^-T.
+        """
+        lower = np.linalg.inv(np.linalg.cholesky(self.matrices(y)))
+        along = self.matrices(down)
+        rates = np.linalg.eigvalsh(lower @ along @ lower.transpose(0, 2, 1)).ravel()
+        seen = self.triangle @ down
+        curvature = float(seen @ seen)
+        pull = float(seen @ (self.triangle @ y - self.target))
+        pull += self.weight * float(np.trace(along, axis1=1, axis2=2).sum())
+
+        def grows(t: float) -> float:
+            return curvature * t + pull - self.barrier * float(np.sum(rates / (1.0 + t * rates)))
+
+        if not grows(0.0) < 0.0:
+            return 0.0
+        # The slope grows from below zero to above it before a body ceases to exist.
+        longest = 1.0 / -float(rates.min()) if rates.min() < 0.0 else np.inf
+        reach = min(1.0, 0.5 * longest)
+        while grows(reach) < 0.0 and reach < _LONGEST_STEP:
+            reach = min(2.0 * reach, 0.5 * (reach + longest))
+        return float(brentq(grows, 0.0, reach, rtol=1e-6)) if grows(reach) > 0.0 else reach
+
+    def slope(self, y: Array) -> tuple[Array, Array]:
+        """Return the gradient (p,) and the triangular square root (p, p) of the Hessian.
+
+        Of -log det Y along E: -tr(Y^-1 E); along E and F: tr(Y^-1 E Y^-1 F), the product of L^-1 E L^-T and
+        L^-1 F L^-T for Y = L L^T.
+        """
+        lower = np.linalg.inv(np.linalg.cholesky(self.matrices(y)))
+        seen = lower[:, None] @ _UNITS @ lower[:, None].transpose(0, 1, 3, 2)
+        gradient = self.triangle.T @ (self.triangle @ y - self.target)
+        pull = self.weight * _TRACE - self.barrier * np.trace(seen, axis1=2, axis2=3)
+        gradient[: pull.size] += pull.ravel()
+        roots = np.sqrt(self.barrier) * block_diag(*(one.reshape(PER_BODY, 16).T for one in seen))
+        stacked = np.zeros((len(self.triangle) + len(roots), len(y)))
+        stacked[: len(self.triangle)] = self.triangle
+        stacked[len(self.triangle) :, : roots.shape[1]] = roots
+        return gradient, qr(stacked, mode="r", check_finite=False)[0][: len(y)]
+
+
+def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> _Problem:
+    matrix, seen = np.asarray(rows, dtype=float), np.asarray(target, dtype=float)
+    bodies = np.asarray(prior, dtype=float)
+    if matrix.ndim != 2 or seen.shape != matrix.shape[:1] or bodies.shape != (len(bodies), 4, 4):
+        raise ValueError(f"rows {matrix.shape}, target {seen.shape} and prior {bodies.shape} do not fit")
+    free = matrix.shape[1] - PER_BODY * len(bodies)
+    if free < 0:
+        raise ValueError(f"rows of {matrix.shape[1]} columns for {len(bodies)} bodies of ten parameters")
+    if not weight > 0.0:
+        raise ValueError(f"the prior's weight is {weight}; it must be above 0")
+    try:
+        roots = np.linalg.cholesky(bodies)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("a body of the prior cannot exist: its pseudo-inertia is not positive") from error
+    scale = block_diag(*(parameter_transform(root) for root in roots), np.eye(free))
+    square = qr(np.column_stack([matrix @ scale, seen]), mode="r", check_finite=False)[0]
+    # The last row is what no parameters explain: dropped, so that small gains are not lost beside it.
+    square = square[: matrix.shape[1]]
+    return _Problem(square[:, :-1], square[:, -1], scale, len(bodies), weight, weight)
+
+
+def _least_squares(rows: Array, target: Array, prior: Array) -> Array:
+    """Return some parameters of the smallest misfit."""
+    problem = _problem(rows, target, prior, 1.0)
+    found = np.linalg.lstsq(problem.triangle, problem.target, rcond=RANK_TOLERANCE)[0]
+    return np.asarray(problem.scale @ found)
+
+
+def _relative_error(information: Sequence[JointInformation], phi: Array, size: float) -> float:
+    misfit = [piece.r @ phi - piece.z for piece in information]
+    total = sum(float(e @ e) + piece.rest for e, piece in zip(misfit, information, strict=True))
+    return float(np.sqrt(total)) / size
