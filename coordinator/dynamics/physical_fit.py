@@ -31,13 +31,11 @@ from coordinator.dynamics.regressor import PER_BODY
 
 # Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 1 is the belief that a body's distribution of
 # mass is known to its own size: rods may be twice as heavy, bodies twice as long.
-PRIOR_WEIGHT = 1.0
+# The weaker ones are tried where that costs too much.
+WEIGHTS = (1.0, 0.1, 0.01, 1e-3)
 # How much the relative torque error may grow from least squares' for the prior's sake: half of what is
 # promised for motions that were not fitted, because those are another sample of the same.
 MOST_COST = 5e-4
-# What is left at the weakest weight is the price of real bodies, not the prior's.
-WEAKEST_WEIGHT = 1e-6
-
 # Of the torques' rms: no torque is known better, and a simulated one without noise is not solved better.
 _FINEST = 1e-5
 
@@ -65,9 +63,8 @@ class PhysicalFit(NamedTuple):
     phi: (10 n,) as in `torque_regressor`. covariance: (10 n, 10 n) with the prior taken for knowledge: it is
         small where the prior holds, so compare `InertialFit.covariance`.
     pseudo: (n, 4, 4) the bodies' pseudo-inertias, in the root frame. divergence: (n,) from the prior.
-    weight: of the prior. steps: of Newton's method, over all weights that were tried.
-    error: relative torque error |e| / |tau| of the fit. least_squares_error: that of least squares with the
-        same weights of the joints, which no bodies can fall below.
+    weight: of the prior. error: relative torque error |e| / |tau| of the fit. least_squares_error: that of
+        least squares with the same weights of the joints, which no bodies can fall below.
     """
 
     phi: Array
@@ -75,7 +72,6 @@ class PhysicalFit(NamedTuple):
     pseudo: Array
     divergence: Array
     weight: float
-    steps: int
     error: float
     least_squares_error: float
 
@@ -103,8 +99,9 @@ def fit_physical(
 ) -> PhysicalFit:
     """Fit real bodies to the torques of all joints.
 
-    The prior has `PRIOR_WEIGHT`, or the largest power of ten below it with which the torques are explained
-    worse than by least squares by at most `most_cost`.
+    The prior has the largest of `WEIGHTS` with which the torques are explained worse than by least squares by
+    at most `most_cost`; if none is, because friction is missing in the model for example, then worse than by
+    the best real bodies.
 
     Args:
         information: per joint of n.
@@ -126,18 +123,22 @@ def fit_physical(
     sigma = np.maximum(np.asarray(sigma_nm, dtype=float), least)
     rows, target = whitened(information, sigma, independent_fraction)
     best = _relative_error(information, _least_squares(rows, target, bodies), size)
-    weight, steps = PRIOR_WEIGHT, 0
-    while True:
+    tried: list[tuple[Solution, float, float]] = []
+    for weight in WEIGHTS:
         found = physically_consistent(rows, target, bodies, weight)
-        steps += found.steps
-        error = _relative_error(information, found.x, size)
-        if error - best <= most_cost or weight <= WEAKEST_WEIGHT:
+        tried.append((found, weight, _relative_error(information, found.x, size)))
+        if tried[-1][2] - best <= most_cost:
             break
-        weight *= 0.1
+    else:
+        # No real bodies do as well as least squares: the model lacks something. What the prior adds to their
+        # price is kept small instead.
+        cheapest = min(error for _, _, error in tried)
+        tried = [one for one in tried if one[2] - cheapest <= most_cost][:1]
+    found, weight, error = tried[-1]
     pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
     for array in (pseudo, found.x, found.covariance, found.divergence):
         array.flags.writeable = False
-    return PhysicalFit(found.x, found.covariance, pseudo, found.divergence, weight, steps, error, best)
+    return PhysicalFit(found.x, found.covariance, pseudo, found.divergence, weight, error, best)
 
 
 def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:
