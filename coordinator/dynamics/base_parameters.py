@@ -121,6 +121,11 @@ def inertial_columns(joints: int) -> Columns:
     return Columns(tuple(names), np.tile(one, joints), np.array(order, dtype=np.int64))
 
 
+def inertial_units(joints: int) -> tuple[str, ...]:
+    """Return the units of the parameters of `inertial_columns`."""
+    return ("kg", *("kg m",) * 3, *("kg m^2",) * 6) * joints
+
+
 def into_frames(triangle: ArrayLike, homes: ArrayLike) -> Array:
     """Return rows (k, p) over parameters in the root frame as rows over those in the bodies' own frames.
 
