@@ -131,7 +131,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
         found = search_topology(recording, serials)
         topology = found.topology
-        types = [_type(recording, s) for s in topology.serials]
+        types = [recorded_type(recording, s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
         first = assemble(
             topology,
@@ -216,7 +216,12 @@ def _explored(recording: Recording) -> list[str]:
     return rested
 
 
-def _type(recording: Recording, serial: str) -> ModuleType:
+def recorded_type(recording: Recording, serial: str) -> ModuleType:
+    """Return a module's type, as it has told it.
+
+    Raises:
+        IdentificationError: it has not.
+    """
     info = recording.modules[serial].info
     if info is None:
         raise IdentificationError(f"module {serial} has not told its type")
@@ -307,13 +312,18 @@ def _filtered(recording: Recording, kinematics: Kinematics, event: JournalEvent)
     return filtered_motion(one.t_ns, one.q_rad, None, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)
 
 
+def _stretches(recording: Recording, purpose: Purpose) -> list[JournalEvent]:
+    """Return one event for every step of a purpose, the latest: joints that move at once share its window."""
+    return list({event.step: event for event in recording.motions(purpose)}.values())
+
+
 def _joined(motions: Sequence[JointMotion]) -> JointMotion:
     return JointMotion(*(np.concatenate(column) for column in zip(*motions, strict=True)))
 
 
 def _inertia(recording: Recording, kinematics: Kinematics) -> tuple[InertialFit, Array]:
     """Solve thesis eq. 29 over all dynamic motions; also the mean torques, a baseline."""
-    motion = _joined([_filtered(recording, kinematics, e) for e in _motions(recording, "dynamic")])
+    motion = _joined([_filtered(recording, kinematics, e) for e in _stretches(recording, "dynamic")])
     regressor = torque_regressor(kinematics.fit.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     fit = solve_pseudo_inverse(
         regressor, motion.tau_nm, independent_fraction=min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
@@ -324,7 +334,7 @@ def _inertia(recording: Recording, kinematics: Kinematics) -> tuple[InertialFit,
 def _held_out(
     recording: Recording, kinematics: Kinematics, inertia: InertialFit, means: Array
 ) -> HeldOutMotion:
-    motion = _joined([_filtered(recording, kinematics, e) for e in _motions(recording, "held_out")])
+    motion = _joined([_filtered(recording, kinematics, e) for e in _stretches(recording, "held_out")])
     predicted = inverse_dynamics(
         kinematics.fit.chain, inertia.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
     )

@@ -12,12 +12,13 @@ from coordinator.attended_run import Place, join, run_attended, sender_name
 from coordinator.check_program import check_robot
 from coordinator.command_options import Connect, Expect, Listen, Network, Robot, fail, planned
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
+from coordinator.fit_dynamics_program import fit_dynamics
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.known_robot import KnownRobotError, known_within
 from coordinator.known_update import updated
-from coordinator.plan import Mode, Motions
+from coordinator.plan import Excitation, Mode, Motions
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.run import RunConfig, write_outputs
@@ -75,6 +76,10 @@ def run(
     motions: Annotated[
         Motions | None, typer.Option(help="The thesis' motions, or designed for each joint [thesis].")
     ] = None,
+    excitation: Annotated[
+        Excitation | None,
+        typer.Option(help="What tells the inertia: the thesis' motions, or all joints at once [thesis]."),
+    ] = None,
     known: Annotated[
         Path | None,
         typer.Option(help="Folder of a former run of this robot: only what is other is looked at closely."),
@@ -112,6 +117,7 @@ def run(
             imu=imu,
             mode=mode,
             motions=motions,
+            excitation=excitation,
         ),
         expect=expect,
         resume=resume,
@@ -259,6 +265,7 @@ def screenshot(
 
 
 app.command("check")(check_robot)
+app.command("fit-dynamics")(fit_dynamics)
 
 
 if __name__ == "__main__":

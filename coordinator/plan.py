@@ -13,6 +13,7 @@ from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, 
 
 Mode = Literal["joint", "whole"]
 Motions = Literal["thesis", "designed"]
+Excitation = Literal["thesis", "designed"]
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
 
 
@@ -55,6 +56,12 @@ class Plan(BaseModel):
     # Thesis table 6 and figure 44.
     dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
     dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
+    # Joint by joint, as above, or so many motions of all joints at once, designed for what they tell of the
+    # inertia, each so long and no joint further than that from home: there must be room around the robot.
+    excitation: Excitation = "thesis"
+    excitation_motions: Annotated[int, Field(ge=2, le=50)] = 5
+    excitation_s: Annotated[float, Field(ge=3.0, le=60.0)] = 6.0
+    excitation_reach_rad: Annotated[float, Field(gt=0.0, le=3.0)] = 0.8
     dynamics: bool = True
     # Who is mounted on whom takes the slow motions alone; without the fast ones there is no chain.
     topology_only: bool = False

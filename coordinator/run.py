@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from coordinator.beside import Beside
+from coordinator.chain import Chain
 from coordinator.clock import Clock
+from coordinator.excitation.of_robot import robot_excitation
+from coordinator.excitation.segment import RobotMotion
 from coordinator.hrdf import write_hrdf
 from coordinator.identify import (
     Identified,
@@ -113,6 +116,7 @@ class Run:
         self._feed = ViewerFeed(viewer, self.recording, FILE if config.inline else LIVE, beside)
         self._looks = Looks(self.recording, config.refined_looks)
         self._looking: asyncio.Task[None] | None = None
+        self._chain: Chain | None = None
         if crashed is not None:
             self._take_over(crashed)
         self._radio = Radio(transport, config.robot, clock, post, self._record)
@@ -206,9 +210,21 @@ class Run:
         """Assemble topology and chain as soon as all joints are explored, and show them."""
         await self._looked()
         found = await self._compute(lambda: self._revised(identify_kinematics(self.recording)))
+        self._chain = found.fit.chain
         self._feed.chain(self._clock(), found.fit)
         for line in found.words():
             self._screen.note(line)
+
+    async def excitation(self) -> tuple[RobotMotion, ...]:
+        """Design motions of all joints at once for the chain that has just been found."""
+        assert self._chain is not None, "all joints are explored before any is excited"
+        chain, plan = self._chain, self._config.plan
+        types = [self._link.kind(serial) for serial in chain.serials]
+        try:
+            return await self._compute(lambda: robot_excitation(chain, types, plan))
+        except ValueError as error:
+            self._screen.note(f"{error}; exciting joint by joint instead")
+            return ()
 
     async def _closer(self) -> Sequence[str]:
         """Return the joints next to what is other about a known robot, by a glance at all of it."""

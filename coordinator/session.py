@@ -10,6 +10,7 @@ from functools import partial
 from typing import Protocol
 
 from coordinator.clock import Clock
+from coordinator.excitation.segment import RobotMotion
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.topology_advice import MOST_REPEATS, NextMotion
 from coordinator.left_out import LeftOut, left_out_event
@@ -52,6 +53,13 @@ class Reporter(Protocol):
 
     async def explored(self) -> None:
         """All joints are explored: topology and chain can be assembled. Raises if they cannot."""
+        ...
+
+    async def excitation(self) -> Sequence[RobotMotion]:
+        """Return motions of all joints at once that tell their inertia, the last to be held out.
+
+        None if there are none that the robot could run.
+        """
         ...
 
 
@@ -100,7 +108,10 @@ class Session:
         await check_link(self.link, self._clock, self._plan.link_s, self._reporter.note)
         serials = self.link.serials
         explorations = 1 if self._plan.mode == "whole" else len(serials) + (self._plan.motions == "designed")
-        self._total = 6 + explorations + (2 * len(serials) if self._plan.dynamics else 0)
+        excitations = (
+            2 * len(serials) if self._plan.excitation == "thesis" else 1 + self._plan.excitation_motions
+        )
+        self._total = 6 + explorations + (excitations if self._plan.dynamics else 0)
         self._mend_after_restart()
         starts = {s: self._position(s) for s in serials}
         try:
@@ -120,13 +131,7 @@ class Session:
             self._report("topology and chain")
             await self._reporter.explored()
             if self._plan.dynamics:
-                serials = self._left_out.movers()
-                for serial in serials:
-                    await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
-                for serial in serials:
-                    await self._step(
-                        f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial
-                    )
+                await self._show_inertia()
             await self._finish(starts)
         except BaseException as error:
             await self._abandon(error)
@@ -351,6 +356,28 @@ class Session:
             elif found.note:
                 self._reporter.note(f"{observer} on joint {serial}: {found.note}")
         return record
+
+    async def _show_inertia(self) -> None:
+        """Excite all joints together, as far as motions for that can be designed; else joint by joint."""
+        motions = await self._reporter.excitation() if self._plan.excitation == "designed" else ()
+        for number, motion in enumerate(motions):
+            last = number == len(motions) - 1
+            purpose: Purpose = "held_out" if last else "dynamic"
+            text = "held-out motion of all joints" if last else f"exciting all joints, {number + 1}"
+            work = partial(self._run_together, f"{purpose}/{number}", motion, purpose)
+            await self._step(f"{purpose}/{number}", text, work)
+        serials = self._left_out.movers() if not motions else ()
+        for serial in serials:
+            await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
+        for serial in serials:
+            await self._step(f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial)
+
+    async def _run_together(self, step: str, motion: RobotMotion, purpose: Purpose) -> None:
+        # The way between home and the pose is known to be clear, and between two poses it is not.
+        await self._go_all(motion.pose_rad)
+        for serial, record in (await self.link.run(dict(motion.patterns))).items():
+            self._note_motion(step, serial, record, purpose)
+        await self._go_all(dict.fromkeys(motion.pose_rad, self._plan.home_rad))
 
     async def _excite(self, serial: str) -> None:
         pattern = self._plan.dynamic(self.link.kind(serial))

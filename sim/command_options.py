@@ -7,6 +7,7 @@ import typer
 
 from coordinator.failure import EXIT_USAGE
 from coordinator.kinematics.imu_intrinsics import ImuKind
+from coordinator.plan import Excitation as PlanExcitation
 from coordinator.plan import Mode as PlanMode
 from coordinator.plan import Motions as PlanMotions
 from coordinator.plan import Plan, PlanFileError, load_plan
@@ -41,6 +42,12 @@ Mode = Annotated[
 Motions = Annotated[
     PlanMotions | None,
     typer.Option("--motions", help="The thesis' motions, or designed for each joint [thesis]."),
+]
+Excitation = Annotated[
+    PlanExcitation | None,
+    typer.Option(
+        "--excitation", help="What tells the inertia: the thesis' motions, or all joints at once [thesis]."
+    ),
 ]
 Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
 Processes = Annotated[
@@ -107,5 +114,6 @@ def motions(path: Path | None, **given: object) -> Plan:
 def motion_arguments(path: Path | None, plan: Plan) -> tuple[str, ...]:
     """Return a plan as arguments for the coordinator."""
     dynamics = "--dynamics" if plan.dynamics else "--no-dynamics"
-    options = (dynamics, "--imu", plan.imu, "--mode", plan.mode, "--motions", plan.motions)
+    chosen = ("--mode", plan.mode, "--motions", plan.motions, "--excitation", plan.excitation)
+    options = (dynamics, "--imu", plan.imu, *chosen)
     return options if path is None else ("--plan", str(path), *options)

@@ -19,6 +19,7 @@ from sim.bus_server import BusServer
 from sim.command_options import (
     Dynamics,
     Endpoint,
+    Excitation,
     Imu,
     Mode,
     Motions,
@@ -121,6 +122,7 @@ def run(
     imu: Imu = None,
     mode: Mode = None,
     how: Motions = None,
+    excitation: Excitation = None,
     speed: Speed = 1.0,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
@@ -130,7 +132,7 @@ def run(
     found = load(robot)
     check(network, speed, endpoint)
     choice = noise_choice(found, noise, with_effects, without_effects)
-    planned = motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how)
+    planned = motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how, excitation=excitation)
     folder = free_folder(out, found)
     if virtual:
         _run_virtual(
@@ -271,6 +273,7 @@ def launch(
     imu: Imu = None,
     mode: Mode = None,
     how: Motions = None,
+    excitation: Excitation = None,
     processes: Processes = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
 ) -> None:
@@ -285,7 +288,9 @@ def launch(
     options = (
         "--viewer",
         viewer,
-        *motion_arguments(plan, motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how)),
+        *motion_arguments(
+            plan, motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how, excitation=excitation)
+        ),
     )
     place = _Place(free_folder(out, found), network or found.network, endpoint, processes)
     _run_processes(_launch(robot, found, place, seed, choice, speed, options))

@@ -5,6 +5,9 @@ What it records is what a run's `session.mcap` holds, for experiments that need 
 
 import asyncio
 
+from coordinator.excitation.of_robot import robot_excitation
+from coordinator.excitation.segment import RobotMotion
+from coordinator.identify import identify_kinematics, recorded_type
 from coordinator.interruption import run_to_end
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.topology_advice import NextMotion
@@ -30,7 +33,7 @@ def record_session(settings: VirtualSettings, plan: Plan) -> Recording:
     """
     loop = VirtualLoop()
     robot = VirtualRobot(settings, loop)
-    keeper = _Keeper()
+    keeper = _Keeper(plan)
     endpoint = robot.endpoint(COORDINATOR)
     radio = Radio(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
     link = RobotLink(radio, keeper.recording, lambda: loop.now_ns, COORDINATOR)
@@ -61,8 +64,9 @@ async def _to_end(session: Session, radio: Radio, robot: VirtualRobot) -> None:
 class _Keeper:
     """Keeps what is recorded; nobody watches the session."""
 
-    def __init__(self) -> None:
+    def __init__(self, plan: Plan) -> None:
         self.recording = Recording()
+        self._plan = plan
 
     def record(self, entry: Entry) -> Message | None:
         try:
@@ -89,3 +93,12 @@ class _Keeper:
 
     async def explored(self) -> None:
         """What follows from the recording is computed from it afterwards."""
+
+    async def excitation(self) -> tuple[RobotMotion, ...]:
+        """Design motions of all joints at once, as a run does; none if the robot could run none."""
+        chain = identify_kinematics(self.recording).fit.chain
+        types = [recorded_type(self.recording, serial) for serial in chain.serials]
+        try:
+            return robot_excitation(chain, types, self._plan)
+        except ValueError:
+            return ()

@@ -15,7 +15,7 @@ from coordinator.chain import Array, Chain
 from coordinator.dynamics.identification import MAX_SIGMA_KG, REACH_M
 from coordinator.dynamics.regressor import PER_BODY, inverse_dynamics, torque_regressor
 from coordinator.excitation.clearance import CLEARANCE_M, clearance_m
-from coordinator.excitation.segment import SampledMotion, Segment, draw_segment, sampled, smaller
+from coordinator.excitation.segment import SampledMotion, Segment, draw_segment, sampled, smaller, way
 from coordinator.motion_design.limits import JointLimits
 
 CANDIDATES = 150
@@ -37,7 +37,7 @@ class ExcitationTask(NamedTuple):
 
     phi: (10 n,) what is believed of the bodies; it keeps torques within the motors' and is no prior of the
         information. reach_rad: how far from home any joint may go. max_effort_nm: of the motors.
-    torque_sigma_nm: noise of a torque reading.
+    torque_sigma_nm: noise of a torque reading. travel_speed_rad_s: of the ways from home to the poses.
     """
 
     chain: Chain
@@ -49,6 +49,7 @@ class ExcitationTask(NamedTuple):
     reach_rad: float
     segments: int
     segment_s: float
+    travel_speed_rad_s: float = 1.0
 
 
 class Excitation(NamedTuple):
@@ -83,17 +84,12 @@ def design_excitation(
     pieces: list[Array] = []
     reasons = {"the robot's own links": 0, "the motors' torques": 0}
     for _ in range(candidates):
-        drawn = draw_segment(rng, task.limits, task.home_rad, task.reach_rad, task.segment_s)
-        for share in SHRINK:
-            segment = smaller(drawn, task.home_rad, share)
-            motion = sampled(segment, RATE_HZ)
-            reason = _refused(task, motion)
-            if reason is None:
-                kept.append(segment)
-                pieces.append(information(task, motion))
-                break
+        segment = draw_possible(task, rng)
+        if isinstance(segment, Segment):
+            kept.append(segment)
+            pieces.append(information(task, sampled(segment, RATE_HZ)))
         else:
-            reasons[str(reason)] += 1
+            reasons[segment] += 1
     if len(kept) < task.segments:
         worst = max(reasons, key=lambda reason: reasons[reason])
         raise NoExcitation(
@@ -114,6 +110,23 @@ def design_excitation(
     )
 
 
+def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | str:
+    """Draw one motion that the robot may run, or return what refuses it, however small it is made.
+
+    Raises:
+        ValueError: a joint has no room at all.
+    """
+    drawn = draw_segment(rng, task.limits, task.home_rad, task.reach_rad, task.segment_s)
+    reason = ""
+    for share in SHRINK:
+        segment = smaller(drawn, task.home_rad, share)
+        refused = _refused(task, segment)
+        if refused is None:
+            return segment
+        reason = refused
+    return reason
+
+
 def information(task: ExcitationTask, motion: SampledMotion) -> Array:
     """Return Y^T W Y (10 n, 10 n) of a motion, parameters in kg (see `identification.REACH_M`)."""
     regressor = torque_regressor(task.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
@@ -122,11 +135,13 @@ def information(task: ExcitationTask, motion: SampledMotion) -> Array:
     return np.asarray(rows.T @ rows)
 
 
-def _refused(task: ExcitationTask, motion: SampledMotion) -> str | None:
+def _refused(task: ExcitationTask, segment: Segment) -> str | None:
+    motion = sampled(segment, RATE_HZ)
     torque = inverse_dynamics(task.chain, task.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     if (np.abs(torque) > TORQUE_SHARE * task.max_effort_nm).any():
         return "the motors' torques"
-    if clearance_m(task.chain, motion.q_rad, task.home_rad).min() < CLEARANCE_M:
+    there = way(task.home_rad, segment.pose_rad, task.travel_speed_rad_s, RATE_HZ)
+    if clearance_m(task.chain, np.vstack([motion.q_rad, there]), task.home_rad).min() < CLEARANCE_M:
         return "the robot's own links"
     return None
 

@@ -1,6 +1,6 @@
 """One stretch of excitation: all joints about a pose at the same time, each with sines of its own."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,8 +8,8 @@ import numpy as np
 from coordinator.chain import Array
 from coordinator.dynamics.differentiation import differentiate
 from coordinator.motion_design.limits import JointLimits, motion_peaks
-from module_agent.firmware.waveform import waveform
-from module_agent.wire.messages import MultiSine, Sine
+from module_agent.firmware.waveform import duration_s, waveform
+from module_agent.wire.messages import GoTo, MultiSine, Sine
 
 # As many sines a joint, within the band: fast enough for inertia to show beside gravity, slow enough for
 # links that give and for the joints' own bandwidth.
@@ -24,6 +24,13 @@ class Segment(NamedTuple):
 
     pose_rad: Array
     patterns: tuple[MultiSine, ...]
+
+
+class RobotMotion(NamedTuple):
+    """A segment by serials: where every joint begins [rad], and what it does from there."""
+
+    pose_rad: Mapping[str, float]
+    patterns: Mapping[str, MultiSine]
 
 
 class SampledMotion(NamedTuple):
@@ -93,6 +100,22 @@ def smaller(segment: Segment, home_rad: Array, share: float) -> Segment:
 def _scaled(pattern: MultiSine, share: float) -> MultiSine:
     sines = tuple(s.model_copy(update={"amplitude_rad": share * s.amplitude_rad}) for s in pattern.sines)
     return pattern.model_copy(update={"sines": sines})
+
+
+def way(home_rad: Array, pose_rad: Array, max_speed_rad_s: float, rate_hz: float) -> Array:
+    """Return positions (m, n) from home to a pose, every joint in its own time as `GoTo` takes it."""
+    goals = [GoTo(target_rad=float(q), max_speed_rad_s=max_speed_rad_s) for q in pose_rad]
+    lasting = [duration_s(goal, float(q)) for goal, q in zip(goals, home_rad, strict=True)]
+    t_s = np.arange(int(max(lasting) * rate_hz) + 2) / rate_hz
+    found = np.stack(
+        [
+            q + waveform(goal, float(q), np.minimum(t_s, end)).offset_rad
+            for goal, q, end in zip(goals, home_rad, lasting, strict=True)
+        ],
+        axis=1,
+    )
+    found.flags.writeable = False
+    return found
 
 
 def sampled(segment: Segment, rate_hz: float) -> SampledMotion:

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from coordinator.excitation.segment import RobotMotion
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.topology_advice import NextMotion
 from coordinator.plan import Plan
@@ -74,6 +75,9 @@ class Watcher:
 
     async def explored(self) -> None:
         """What follows is computed afterwards."""
+
+    async def excitation(self) -> Sequence[RobotMotion]:
+        return ()
 
     def journal(self, event: JournalEvent) -> None:
         self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))

@@ -1,0 +1,88 @@
+"""Excitation of a robot whose chain has just been found, by what its bodies are likely to be."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from coordinator.chain import Array, Chain
+from coordinator.dynamics.consistency import parameters
+from coordinator.dynamics.parameter_prior import module_prior
+from coordinator.dynamics.regressor import inverse_dynamics
+from coordinator.excitation.design import ExcitationTask, NoExcitation, design_excitation, draw_possible
+from coordinator.excitation.segment import RobotMotion, Segment
+from coordinator.motion_design.limits import JointLimits, joint_limits
+from coordinator.plan import Plan
+from module_agent.catalogue import ModuleType
+
+# Of its largest torque, what a module's sensor scatters: its spring turns by that much within an encoder's
+# counts.
+SIGMA_SHARE = 2e-3
+# The held-out motion is any that the robot may run: so many draws find one if there is one.
+DRAWS = 40
+
+
+def robot_excitation(
+    chain: Chain, types: Sequence[ModuleType], plan: Plan, seed: int = 0
+) -> tuple[RobotMotion, ...]:
+    """Return the motions to which parameters are fitted, and one more at the end that is held out.
+
+    The same robot and seed have the same motions: a run that resumes goes on with those that it began with.
+
+    Raises:
+        NoExcitation: too few motions are possible.
+        ValueError: a joint has no room at all, or there is not one type per module.
+    """
+    rng = np.random.default_rng(seed)
+    task = excitation_task(chain, types, plan)
+    chosen = design_excitation(task, rng).segments
+    for _ in range(DRAWS):
+        held_out = draw_possible(task, rng)
+        if isinstance(held_out, Segment):
+            return tuple(_by_serial(chain, segment) for segment in (*chosen, held_out))
+    raise NoExcitation(f"of {DRAWS} motions none was possible that could be held out")
+
+
+def _by_serial(chain: Chain, segment: Segment) -> RobotMotion:
+    poses = [float(q) for q in segment.pose_rad]
+    return RobotMotion(
+        dict(zip(chain.serials, poses, strict=True)), dict(zip(chain.serials, segment.patterns, strict=True))
+    )
+
+
+def excitation_task(chain: Chain, types: Sequence[ModuleType], plan: Plan) -> ExcitationTask:
+    """Return what a robot may be asked for, by its modules' types and what is likely to hang on them.
+
+    Raises:
+        ValueError: there is not one type per module.
+    """
+    phi = np.concatenate([parameters(body) for body in module_prior(chain, types)])
+    home = np.full(len(types), plan.home_rad)
+    effort = np.array([kind.max_effort_nm for kind in types])
+    inertia = _own_inertia(chain, phi, home)
+    return ExcitationTask(
+        chain=chain,
+        phi=phi,
+        limits=tuple(_limits(kind, about) for kind, about in zip(types, inertia, strict=True)),
+        max_effort_nm=effort,
+        torque_sigma_nm=SIGMA_SHARE * effort,
+        home_rad=home,
+        reach_rad=plan.excitation_reach_rad,
+        segments=plan.excitation_motions,
+        segment_s=plan.excitation_s,
+        travel_speed_rad_s=plan.travel_speed_rad_s,
+    )
+
+
+def _limits(kind: ModuleType, inertia_kg_m2: float) -> JointLimits:
+    # What gravity takes is counted with the motion's own torque, in every pose.
+    return joint_limits(kind, 0.0, inertia_kg_m2)
+
+
+def _own_inertia(chain: Chain, phi: Array, home_rad: Array) -> Array:
+    """Return every joint's own inertia at home (n,): the diagonal of the mass matrix."""
+    count = len(home_rad)
+    # A row for each joint that accelerates alone, and one in which none does.
+    q = np.tile(home_rad, (count + 1, 1))
+    qdd = np.vstack([np.eye(count), np.zeros(count)])
+    torque = inverse_dynamics(chain, phi, q, np.zeros_like(q), qdd)
+    return np.asarray(np.diagonal(torque[:count] - torque[count]))
