@@ -153,8 +153,65 @@ class HeldOutPart(Part):
     samples: int
 
 
+class BodyPart(Part):
+    """A real body: all that the module `serial` turns, as it is in `robot.urdf`.
+
+    In the frame of the link `body_<serial>`: centre of mass and the inertia about it (3, 3).
+    """
+
+    serial: str
+    mass_kg: float
+    com_m: list[float]
+    inertia_kg_m2: list[list[float]]
+
+
+class BodiesPart(Part):
+    """Real bodies that explain the torques; what these do not tell is what modules of the type have.
+
+    relative_error is |e| / |tau| of the motions that were fitted, least_squares_error that of the best
+    parameters, be they a body's or not. prior_weight is how much the modules' make counts.
+    """
+
+    bodies: list[BodyPart]
+    relative_error: float
+    least_squares_error: float
+    prior_weight: float
+    held_out_relative_error: float | None
+
+
+class BaseParameterPart(Part):
+    """A sum of parameters that torques show, "m2 c2x + 0.225 (m3 + m4)", in SI units.
+
+    m, m c and I are of the bodies in the order of the chain, counted from 1, in the frames of the URDF's
+    links and about their origins. relative_sigma is None of a value of zero.
+    """
+
+    words: str
+    value: float
+    sigma: float
+    relative_sigma: float | None
+
+
+class VerdictPart(Part):
+    """Whether one parameter is known: `identified` by torques alone, within 10 %; `weak` if worse, or by the
+    modules' make; `not identifiable` else.
+
+    sums are the places in `base_parameters` of those that it is in: none, if torques do not depend on it.
+    """
+
+    parameter: str
+    serial: str
+    verdict: str
+    value: float | None
+    sigma: float | None
+    sums: list[int]
+
+
 class DynamicsPart(Part):
-    """The inertial parameters; see `dynamics.regressor` for their order and frame."""
+    """The inertial parameters; see `dynamics.regressor` for the order and frame of `phi`.
+
+    `phi` predicts torques but need not be of real bodies: those are `bodies`.
+    """
 
     phi: list[float]
     rank: int
@@ -164,6 +221,9 @@ class DynamicsPart(Part):
     identifiable: list[bool]
     residual_rms_nm: dict[str, float]
     held_out: HeldOutPart | None
+    bodies: BodiesPart | None = None
+    base_parameters: list[BaseParameterPart] = []
+    verdicts: list[VerdictPart] = []
 
 
 class Result(Part):

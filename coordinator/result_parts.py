@@ -5,11 +5,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coordinator.chain import Array
+from coordinator.dynamics.regressor import PER_BODY
 from coordinator.kinematics.denavit_hartenberg import dh_paths
 from coordinator.kinematics.link_transforms import PARAMETERS, LinkTransform, link_transforms
 from coordinator.kinematics.product_of_exponentials import screw_model
 from coordinator.recording import Recording
 from coordinator.result import (
+    BaseParameterPart,
+    BodiesPart,
+    BodyPart,
     DhPart,
     DhRowPart,
     DynamicsPart,
@@ -24,6 +28,7 @@ from coordinator.result import (
     TransformPart,
     UnknownPart,
     UnresolvedPart,
+    VerdictPart,
     chain_part,
 )
 from module_agent.catalogue import ModuleType, module_type
@@ -34,6 +39,7 @@ if TYPE_CHECKING:
     from coordinator.kinematics.assembly import ChainFit
     from coordinator.kinematics.null_space import Unresolved
     from coordinator.kinematics.topology import Topology
+    from coordinator.robot_bodies import RobotBodies
 
 
 def build_result(
@@ -41,6 +47,7 @@ def build_result(
     kinematics: "Kinematics",
     inertia: "InertialFit | None",
     held_out: "HeldOutMotion | None",
+    bodies: "RobotBodies | None" = None,
 ) -> Result:
     """Return the result of a session."""
     fit, topology = kinematics.fit, kinematics.topology
@@ -67,8 +74,8 @@ def build_result(
         product_of_exponentials=_exponentials(fit, types),
         pairs=_pairs(recording),
         denavit_hartenberg=_dh(kinematics),
-        dynamics=_dynamics(kinematics, inertia, held_out),
-        notes=list(kinematics.notes),
+        dynamics=_dynamics(kinematics, inertia, held_out, bodies),
+        notes=[*kinematics.notes, *([bodies.note] if bodies is not None and bodies.note else [])],
         robot_time_s=(max(times) - min(times)) / 1e9 if times else 0.0,
         wall_time_s=finished[-1].wall_time_s if finished else None,
         trace_hash=recording.trace_hash,
@@ -222,7 +229,10 @@ def _dh(kinematics: "Kinematics") -> list[DhPart]:
 
 
 def _dynamics(
-    kinematics: "Kinematics", inertia: "InertialFit | None", held_out: "HeldOutMotion | None"
+    kinematics: "Kinematics",
+    inertia: "InertialFit | None",
+    held_out: "HeldOutMotion | None",
+    bodies: "RobotBodies | None",
 ) -> DynamicsPart | None:
     if inertia is None:
         return None
@@ -236,7 +246,58 @@ def _dynamics(
         identifiable=inertia.identifiable.tolist(),
         residual_rms_nm=dict(zip(serials, inertia.residual_rms_nm.tolist(), strict=True)),
         held_out=_held_out(serials, held_out) if held_out is not None else None,
+        bodies=_bodies(bodies) if bodies is not None else None,
+        base_parameters=_base_parameters(bodies) if bodies is not None else [],
+        verdicts=_verdicts(bodies) if bodies is not None else [],
     )
+
+
+def _bodies(found: "RobotBodies") -> BodiesPart | None:
+    if found.fit is None:
+        return None
+    return BodiesPart(
+        bodies=[
+            BodyPart(
+                serial=serial,
+                mass_kg=one.mass_kg,
+                com_m=one.com_m.tolist(),
+                inertia_kg_m2=one.inertia_kg_m2.tolist(),
+            )
+            for serial, one in zip(found.serials, found.bodies, strict=True)
+        ],
+        relative_error=found.fit.error,
+        least_squares_error=found.fit.least_squares_error,
+        prior_weight=found.fit.weight,
+        held_out_relative_error=found.held_out_error,
+    )
+
+
+def _base_parameters(found: "RobotBodies") -> list[BaseParameterPart]:
+    base = found.base
+    columns = zip(base.value.tolist(), base.sigma.tolist(), base.relative_sigma.tolist(), strict=True)
+    return [
+        BaseParameterPart(
+            words=base.words(i),
+            value=value,
+            sigma=sigma,
+            relative_sigma=ratio if np.isfinite(ratio) else None,
+        )
+        for i, (value, sigma, ratio) in enumerate(columns)
+    ]
+
+
+def _verdicts(found: "RobotBodies") -> list[VerdictPart]:
+    return [
+        VerdictPart(
+            parameter=one.name,
+            serial=found.serials[k // PER_BODY],
+            verdict=one.kind,
+            value=one.value,
+            sigma=one.sigma,
+            sums=list(one.sums),
+        )
+        for k, one in enumerate(found.verdicts)
+    ]
 
 
 def _held_out(serials: tuple[str, ...], held_out: "HeldOutMotion") -> HeldOutPart:

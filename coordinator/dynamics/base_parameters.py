@@ -182,7 +182,7 @@ def base_parameters(
             (`identification.MAX_SIGMA_KG`); inf keeps all that rounding allows.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, or rows that show nothing.
+        ValueError: shapes that do not fit, values that are not finite, or rows of zeros.
     """
     rows, seen = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
     size = len(columns.names)
@@ -192,7 +192,7 @@ def base_parameters(
         raise ValueError("the rows or the target hold a value that is not finite, or sigma is not positive")
     left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
     kept = (values > RANK_TOLERANCE * values[0]) & (values > sigma / max_sigma)
-    if not kept.any():
+    if not values.any():
         raise ValueError("the rows show no parameter: without gravity or motion the torques say nothing")
     space = directions[kept]
     chosen = _independent(space, columns.preferred)
@@ -211,7 +211,7 @@ def base_parameters(
         value=own * known,
         covariance=own[:, None] * (spread @ spread.T) * own,
         share=np.sum(space**2, axis=0),
-        condition=float(values[kept][0] / values[kept][-1]),
+        condition=float(values[0] / values[kept][-1]) if kept.any() else float("inf"),
     )
     for array in found:
         if isinstance(array, np.ndarray):

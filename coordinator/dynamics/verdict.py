@@ -18,19 +18,23 @@ Kind = Literal["identified", "weak", "not identifiable"]
 # Relative standard deviation: the limit that identification of robots is used to (Khalil and Dombre 2002,
 # section 12.4).
 WEAK_ABOVE = 0.1
+# Of the parameters that a sum shares: as many are named as one reads.
+_NAMED = 6
 
 
 class Verdict(NamedTuple):
     """What is known of one parameter.
 
     value, sigma: from torques alone if it is known alone, with the prior's help if that settles it, else
-    None. lumped_with: the parameters in whose sums it appears. words: kind, value and reason, to read.
+    None. sums: the base parameters that it is in. lumped_with: the other parameters in those. words: kind,
+    value and reason, to read.
     """
 
     name: str
     kind: Kind
     value: float | None
     sigma: float | None
+    sums: tuple[int, ...]
     lumped_with: tuple[str, ...]
     words: str
 
@@ -63,17 +67,20 @@ def verdicts(
     )
     if values.shape != (count,) or sigmas.shape != (count,):
         raise ValueError(f"{values.shape} values and {sigmas.shape} deviations for {count} parameters")
-    sums = [base.lumped(i) for i in range(base.rank)]
-    alone = {members[0]: i for i, members in enumerate(sums) if len(members) == 1}
+    members = [base.lumped(i) for i in range(base.rank)]
+    sums: list[list[int]] = [[] for _ in range(count)]
+    for i, some in enumerate(members):
+        for j in some:
+            sums[j].append(i)
     found = []
     for j, (name, unit) in enumerate(zip(base.columns.names, units, strict=True)):
-        if j in alone:
-            i = alone[j]
-            found.append(_known_alone(name, unit, float(base.value[i]), float(base.sigma[i])))
+        if len(sums[j]) == 1 and len(members[sums[j][0]]) == 1:
+            i = sums[j][0]
+            found.append(_known_alone(name, unit, i, float(base.value[i]), float(base.sigma[i])))
             continue
-        others = sorted({k for members in sums if j in members for k in members} - {j})
+        others = sorted({k for i in sums[j] for k in members[i]} - {j})
         names = tuple(base.columns.names[k] for k in others)
-        found.append(_in_sums(name, unit, names, float(values[j]), float(sigmas[j])))
+        found.append(_in_sums(name, unit, tuple(sums[j]), names, float(values[j]), float(sigmas[j])))
     return tuple(found)
 
 
@@ -83,7 +90,7 @@ def words_of_body(some: Sequence[Verdict]) -> str:
     for verdict in some:
         group: str = verdict.kind
         if group == "not identifiable":
-            group = "only in sums" if verdict.lumped_with else "without effect"
+            group = "only in sums" if verdict.sums else "without effect"
         groups.setdefault(group, []).append(verdict.name)
     order = ("identified", "weak", "only in sums", "without effect")
     return "; ".join(f"{group}: {', '.join(groups[group])}" for group in order if group in groups)
@@ -98,22 +105,24 @@ def words_of_base(base: BaseParameters) -> str:
     )
 
 
-def _known_alone(name: str, unit: str, value: float, sigma: float) -> Verdict:
+def _known_alone(name: str, unit: str, place: int, value: float, sigma: float) -> Verdict:
     ratio = sigma / abs(value) if value else np.inf
     kind: Kind = "identified" if ratio <= WEAK_ABOVE else "weak"
-    return Verdict(name, kind, value, sigma, (), f"{kind}: {_figures(value, sigma, unit)}")
+    return Verdict(name, kind, value, sigma, (place,), (), f"{kind}: {_figures(value, sigma, unit)}")
 
 
-def _in_sums(name: str, unit: str, others: tuple[str, ...], value: float, sigma: float) -> Verdict:
-    if not others:
-        return Verdict(
-            name, "not identifiable", None, None, (), "not identifiable: without effect on torques"
-        )
-    sums = f"in sums with {', '.join(others)}"
+def _in_sums(
+    name: str, unit: str, sums: tuple[int, ...], others: tuple[str, ...], value: float, sigma: float
+) -> Verdict:
+    if not sums:
+        words = "not identifiable: without effect on torques"
+        return Verdict(name, "not identifiable", None, None, (), (), words)
+    more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+    where = f"in sums with {', '.join(others[:_NAMED])}{more}"
     if sigma <= WEAK_ABOVE * abs(value):
-        figures = _figures(value, sigma, unit)
-        return Verdict(name, "weak", value, sigma, others, f"weak: {figures} by the prior, only {sums}")
-    return Verdict(name, "not identifiable", None, None, others, f"not identifiable: only {sums}")
+        words = f"weak: {_figures(value, sigma, unit)} by the prior, only {where}"
+        return Verdict(name, "weak", value, sigma, sums, others, words)
+    return Verdict(name, "not identifiable", None, None, sums, others, f"not identifiable: only {where}")
 
 
 def _figures(value: float, sigma: float, unit: str) -> str:

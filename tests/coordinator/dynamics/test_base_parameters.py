@@ -176,6 +176,15 @@ def test_a_direction_in_the_noise_is_none_of_the_base_parameters(rng: Generator)
     assert base_parameters(*rows, inertial_columns(2), max_sigma=0.3).rank == 6
 
 
+def test_noise_may_leave_no_base_parameter_at_all(rng: Generator) -> None:
+    signals = motion(rng, 200, 1)
+    pieces = gather(random_tree(rng, 1), *signals, rng.normal(size=(200, 1)))
+    found = base_parameters(*whitened(pieces, [1e6]), inertial_columns(1), max_sigma=0.3)
+    assert found.rank == 0
+    assert found.grouping.shape == (0, 10)
+    assert (found.share == 0.0).all()
+
+
 def test_friction_beside_inertia_stays_a_parameter_of_its_own(rng: Generator) -> None:
     chain = random_tree(rng, 2)
     signals = motion(rng, 200, 2)

@@ -1,0 +1,101 @@
+"""What torques and modules' make say together of a robot's bodies: real ones, and what is known of each.
+
+Base parameters and verdicts are from torques alone; the bodies explain the torques as well, and have the
+modules' known make where torques are silent. All parameters are in the links' frames of `urdf`.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from coordinator.chain import Array, Chain
+from coordinator.dynamics.base_parameters import (
+    BaseParameters,
+    base_parameters,
+    inertial_columns,
+    inertial_units,
+    into_frames,
+    whitened,
+)
+from coordinator.dynamics.consistency import Body, body, parameter_transform
+from coordinator.dynamics.identification import MAX_SIGMA_KG, InertialFit
+from coordinator.dynamics.information import JointInformation
+from coordinator.dynamics.parameter_prior import module_prior
+from coordinator.dynamics.physical_fit import NotSolvedError, PhysicalFit, fit_physical
+from coordinator.dynamics.regressor import PER_BODY
+from coordinator.dynamics.verdict import Verdict, verdicts, words_of_base, words_of_body
+from coordinator.urdf import link_homes
+from module_agent.catalogue import ModuleType
+
+# Torques without noise, as a simulation may have them, would weigh infinitely.
+_LEAST_SIGMA_NM = 1e-9
+
+
+class RobotBodies(NamedTuple):
+    """The bodies of a robot of n joints.
+
+    base: the base parameters. verdicts: (10 n,) of every parameter. fit: the real bodies, None if none were
+    found. bodies: (n,) the same as masses, in the links' frames; empty if none were found. note: why.
+    held_out_error: relative torque error of `fit` on motions that were not fitted, None without any.
+    """
+
+    serials: tuple[str, ...]
+    base: BaseParameters
+    verdicts: tuple[Verdict, ...]
+    fit: PhysicalFit | None
+    bodies: tuple[Body, ...]
+    note: str
+    held_out_error: float | None = None
+
+    def words(self) -> list[str]:
+        """Return what is known in lines to read: the sums, then body by body."""
+        lines = [words_of_base(self.base)]
+        for i, serial in enumerate(self.serials):
+            own = self.verdicts[PER_BODY * i : PER_BODY * (i + 1)]
+            lines.append(f"body {i + 1}, turned by {serial}: {words_of_body(own)}")
+        return lines
+
+
+def robot_bodies(
+    information: Sequence[JointInformation],
+    chain: Chain,
+    types: Sequence[ModuleType],
+    least_squares: InertialFit,
+    independent_fraction: float,
+) -> RobotBodies:
+    """Return the bodies that a robot's joints turn.
+
+    Args:
+        information: per joint of n.
+        chain, types: of the same n.
+        least_squares: its noise weighs the joints.
+        independent_fraction: independent samples per sample, below 1 after a low-pass.
+
+    Raises:
+        ValueError: shapes that do not fit, or torques that say nothing.
+    """
+    joints = len(chain.serials)
+    homes = link_homes(chain)
+    sigma = np.maximum(least_squares.torque_sigma_nm, _LEAST_SIGMA_NM)
+    rows, target = whitened(information, sigma, independent_fraction)
+    base = base_parameters(into_frames(rows, homes), target, inertial_columns(joints), max_sigma=MAX_SIGMA_KG)
+    fit, note = None, ""
+    try:
+        # One noise for all joints: least squares weighs them alike too, so that their errors compare.
+        common = np.full(joints, np.sqrt(np.mean(sigma**2)))
+        fit = fit_physical(information, module_prior(chain, types), common, independent_fraction)
+    except NotSolvedError as error:
+        note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
+    if fit is None:
+        return RobotBodies(chain.serials, base, verdicts(base, inertial_units(joints)), None, (), note)
+    into = block_diag(*(parameter_transform(np.linalg.inv(home)) for home in homes))
+    informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
+    judged = verdicts(base, inertial_units(joints), into @ fit.phi, informed_sigma)
+    return RobotBodies(chain.serials, base, judged, fit, _in_links(fit.pseudo, homes), note)
+
+
+def _in_links(pseudo: Array, homes: Array) -> tuple[Body, ...]:
+    into = np.linalg.inv(homes)
+    return tuple(body(one @ matrix @ one.T) for one, matrix in zip(into, pseudo, strict=True))
