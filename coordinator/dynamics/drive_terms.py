@@ -19,6 +19,9 @@ TERMS: tuple[Term, ...] = get_args(Term)
 # Everything but `curved`, which is close to a sum of Coulomb and viscous friction in short recordings.
 USUAL_TERMS: tuple[Term, ...] = ("inertia", "viscous", "coulomb", "offset")
 
+# Not linear in the motion: of a filtered motion these are not what the filter makes of those of the motion.
+NONLINEAR: tuple[Term, ...] = ("coulomb", "curved")
+
 _SYMBOL = {"inertia": "Ia", "viscous": "Fv", "coulomb": "Fc", "curved": "Fr", "offset": "offset"}
 _UNIT = {
     "inertia": "kg m^2",
@@ -70,10 +73,13 @@ def drive_columns(
     return (*alone, *shared)
 
 
-def drive_regressor(
+def drive_signals(
     columns: Sequence[DriveColumn], qd_rad_s: ArrayLike, qdd_rad_s2: ArrayLike, slow_rad_s: ArrayLike
 ) -> Array:
-    """Return the matrix D (m, n, k), read-only, of which the drives' torques are D @ parameters.
+    """Return what each column is for the joints that it loads, (m, k), read-only.
+
+    Where torques went through a low-pass, so must the `NONLINEAR` ones of these before they are used: a sign
+    that turns within a sample becomes a slope.
 
     Args:
         columns: k of them.
@@ -91,11 +97,29 @@ def drive_regressor(
             f"speeds {qd.shape}, accelerations {qdd.shape} and slow speeds {slow} do not fit: "
             "(m, n) twice and n positive numbers are needed"
         )
-    found = np.zeros((*qd.shape, len(columns)))
+    found = np.empty((len(qd), len(columns)))
     for k, (term, joints) in enumerate(columns):
         at = list(joints)
-        signal = _signal(term, qd[:, at].sum(axis=1), qdd[:, at].sum(axis=1), float(slow[at].max()))
-        found[:, at, k] = signal[:, None]
+        found[:, k] = _signal(term, qd[:, at].sum(axis=1), qdd[:, at].sum(axis=1), float(slow[at].max()))
+    found.flags.writeable = False
+    return found
+
+
+def drive_regressor(columns: Sequence[DriveColumn], signals: ArrayLike, joints: int) -> Array:
+    """Return the matrix D (m, n, k), read-only, of which the drives' torques are D @ parameters.
+
+    Args:
+        columns: k of them. signals: (m, k) of `drive_signals`. joints: n.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+    values = np.asarray(signals, dtype=float)
+    if values.ndim != 2 or values.shape[1] != len(columns):
+        raise ValueError(f"signals {values.shape} do not fit {len(columns)} columns: (m, k) is needed")
+    found = np.zeros((len(values), joints, len(columns)))
+    for k, column in enumerate(columns):
+        found[:, list(column.joints), k] = values[:, k, None]
     found.flags.writeable = False
     return found
 

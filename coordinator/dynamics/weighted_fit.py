@@ -1,8 +1,9 @@
 """Weighted and robust least squares of joint torques, with residuals that are not independent.
 
 A joint's rows count by its residual's standard deviation, so that a large noisy joint does not drown a small
-quiet one, and by how many of them are independent: a low-pass, and every effect that no column has, leave
-residuals that resemble their neighbours. Weights, noise and fit are found in turn.
+quiet one; weights, noise and fit are found in turn. What the fit claims to know counts how many of the rows
+are independent: a low-pass, and every effect that no column has, leave residuals that resemble their
+neighbours.
 """
 
 from typing import NamedTuple
@@ -28,8 +29,8 @@ class WeightedFit(NamedTuple):
 
     parameters: (p,) the smallest ones that fit best, counted in the columns' scale; only their projection
         onto what the rows show is known (see `base_parameters`).
-    rows, target: (k, p) and (k,) square-root information with noise of standard deviation 1: the input of
-        `base_parameters`.
+    covariance: (p, p) of what the rows show; zero along all else, which is not certainty.
+    rows, target: (k, p) and (k,) square-root information, weighted: the input of `base_parameters`.
     rank, condition: of the scaled rows.
     sigma_nm: (n,) noise of the torques. correlation: (n,) samples that hold as much as one independent one.
     samples: (n,) that were used. downweighted: (n,) fraction of them beyond Huber's limit, zero if not
@@ -37,6 +38,7 @@ class WeightedFit(NamedTuple):
     """
 
     parameters: Array
+    covariance: Array
     rows: Array
     target: Array
     rank: int
@@ -52,12 +54,27 @@ class WeightedFit(NamedTuple):
         return float(np.sum(self.samples / self.correlation))
 
 
+class _Solution(NamedTuple):
+    """Of weighted rows: the solution (p,), inverse (p, rank) with the rows' own directions, U (m, n, rank).
+
+    rows, target: the triangle and what belongs to it. condition: of the scaled rows.
+    """
+
+    parameters: Array
+    inverse: Array
+    hat: Array
+    rows: Array
+    target: Array
+    condition: float
+
+
 def fit_weighted(
     regressor: ArrayLike,
     tau_nm: ArrayLike,
     scale: ArrayLike,
     used: ArrayLike | None = None,
     robust: bool = False,
+    least_correlation: float = 1.0,
 ) -> WeightedFit:
     """Fit the parameters of a regressor.
 
@@ -66,6 +83,8 @@ def fit_weighted(
         tau_nm: (m, n).
         scale: (p,) by which parameters are counted (`base_parameters.Columns`).
         used: (m, n) samples to fit to, None for all. robust: Huber's weights instead of plain squares.
+        least_correlation: samples that count as one at least, rate / (2 cut-off) behind a low-pass; a fit to
+            few samples leaves residuals that look more independent than they are.
 
     Raises:
         ValueError: shapes that do not fit, values that are not finite, or a joint with too few samples.
@@ -73,23 +92,36 @@ def fit_weighted(
     y, tau = np.asarray(regressor, dtype=float), np.asarray(tau_nm, dtype=float)
     counted, size = np.ones(tau.shape, bool) if used is None else np.asarray(used, bool), np.asarray(scale)
     _check(y, tau, size, counted)
-    weights = counted.astype(float)
-    sigma, correlation = np.ones(tau.shape[1]), np.ones(tau.shape[1])
+    weights, sigma = counted.astype(float), np.ones(tau.shape[1])
     for _ in range(_MOST_ROUNDS):
-        rows, target = _reduced(y, tau, weights / (sigma * np.sqrt(correlation)))
-        parameters, rank, condition = _solved(rows, target, size)
-        before, residual = sigma * np.sqrt(correlation), tau - y @ parameters
-        sigma = _noise(residual, counted, _taken(y, rows, size, rank, weights / before), robust)
-        correlation = correlation_times(np.where(counted, residual, np.nan))
+        solution = _solution(y, tau, weights / sigma, size)
+        before, residual = sigma, tau - y @ solution.parameters
+        sigma = _noise(residual, counted, np.sum(solution.hat**2, axis=(0, 2)), robust)
         if robust:
-            off = np.abs(residual) / sigma
-            weights = counted * np.sqrt(np.minimum(1.0, HUBER_LIMIT / np.maximum(off, HUBER_LIMIT)))
-        if np.abs(sigma * np.sqrt(correlation) / before - 1.0).max() < _SETTLED:
+            weights = counted * _huber(residual / sigma)
+        if np.abs(sigma / before - 1.0).max() < _SETTLED:
             break
-    samples = counted.sum(axis=0, dtype=np.int64)
-    light = np.sum(counted & (weights < 1.0), axis=0) / samples
+    correlation = np.maximum(correlation_times(np.where(counted, residual, np.nan)), least_correlation)
+    return _fit(solution, counted, weights, sigma, correlation)
+
+
+def _fit(
+    solution: _Solution, used: NDArray[np.bool_], weights: Array, sigma: Array, correlation: Array
+) -> WeightedFit:
+    # The rows' noise is 1, but so many of them count as one.
+    along = np.einsum("mni,mnj,n->ij", solution.hat, solution.hat, correlation, optimize=True)
+    samples = used.sum(axis=0, dtype=np.int64)
     fit = WeightedFit(
-        parameters, rows, target, rank, condition, sigma, correlation, samples, light.astype(float)
+        parameters=solution.parameters,
+        covariance=solution.inverse @ along @ solution.inverse.T,
+        rows=solution.rows,
+        target=solution.target,
+        rank=solution.inverse.shape[1],
+        condition=solution.condition,
+        sigma_nm=sigma,
+        correlation=correlation,
+        samples=samples,
+        downweighted=np.sum(used & (weights < 1.0), axis=0) / samples,
     )
     for array in fit:
         if isinstance(array, np.ndarray):
@@ -131,19 +163,22 @@ def _reduced(y: Array, tau: Array, weights: Array) -> tuple[Array, Array]:
     return whole[:, :-1], whole[:, -1]
 
 
-def _solved(rows: Array, target: Array, scale: Array) -> tuple[Array, int, float]:
-    left, values, right = np.linalg.svd(rows * scale, full_matrices=False)
-    kept = values > RANK_TOLERANCE * values[0]
-    found = scale * (right[kept].T @ (left[:, kept].T @ target / values[kept]))
-    return found, int(kept.sum()), float(values[0] / values[kept][-1])
-
-
-def _taken(y: Array, rows: Array, scale: Array, rank: int, weights: Array) -> Array:
-    """Return how many degrees of freedom the fit takes from each joint: the trace of its part of U U^T."""
+def _solution(y: Array, tau: Array, weights: Array, scale: Array) -> _Solution:
+    rows, target = _reduced(y, tau, weights)
     _, values, right = np.linalg.svd(rows * scale, full_matrices=False)
-    inverse = scale[:, None] * right[:rank].T / values[:rank]
-    taken: Array = np.sum(((y @ inverse) * weights[..., None]) ** 2, axis=(0, 2))
-    return taken
+    if not values[0] > 0.0:
+        raise ValueError("the regressor is zero: without gravity or motion the torques say nothing")
+    kept = values > RANK_TOLERANCE * values[0]
+    inverse = scale[:, None] * right[kept].T / values[kept]
+    parameters = inverse @ ((rows @ inverse).T @ target)
+    hat = (y @ inverse) * weights[..., None]
+    return _Solution(parameters, inverse, hat, rows, target, float(values[0] / values[kept][-1]))
+
+
+def _huber(off: Array) -> Array:
+    """Return the square roots of Huber's weights of residuals in standard deviations."""
+    found: Array = np.sqrt(HUBER_LIMIT / np.maximum(np.abs(off), HUBER_LIMIT))
+    return found
 
 
 def _noise(residual: Array, used: NDArray[np.bool_], taken: Array, robust: bool) -> Array:

@@ -6,7 +6,12 @@ import numpy as np
 from scipy.signal import welch
 
 from coordinator.chain import Array
-from coordinator.dynamics.differentiation import NS_PER_S, filtered_motion, settling_samples
+from coordinator.dynamics.differentiation import (
+    NS_PER_S,
+    filtered_motion,
+    settling_samples,
+    zero_phase_low_pass,
+)
 from coordinator.offline.data_file import JointLog
 
 # Of the speed's power in what counts as the motion, and how many times its highest frequency passes. Friction
@@ -23,6 +28,8 @@ class FilteredLog(NamedTuple):
     tau_raw_nm: the torques as recorded at the same times. settling: samples over which the low-pass mixes
         what lies before with what lies after. noise: |raw - filtered| / |raw| over all recorded samples, the
         part of the torque that no model of this bandwidth can have.
+    fine_qd_rad_s, fine_qdd_rad_s2: filtered at the recording's own rate, for what changes within a kept
+        sample; see `low_passed`.
     """
 
     rate_hz: float
@@ -34,13 +41,14 @@ class FilteredLog(NamedTuple):
     tau_raw_nm: Array
     settling: int
     noise: float
+    fine_rate_hz: float
+    fine_qd_rad_s: Array
+    fine_qdd_rad_s2: Array
 
-    def part(self, begin: int, end: int) -> "FilteredLog":
-        """Return the samples from `begin` up to `end`."""
-        some = slice(begin, end)
-        signals = (self.q_rad, self.qd_rad_s, self.qdd_rad_s2, self.tau_nm, self.tau_raw_nm)
-        q, qd, qdd, tau, raw = (signal[some] for signal in signals)
-        return self._replace(q_rad=q, qd_rad_s=qd, qdd_rad_s2=qdd, tau_nm=tau, tau_raw_nm=raw)
+    def low_passed(self, fine: Array) -> Array:
+        """Return a function (m', k) of the fine signals, low-passed as the torque is, at the kept samples."""
+        rate_hz, cutoff_hz = self.fine_rate_hz, self.cutoff_hz
+        return _thinned(zero_phase_low_pass(fine, rate_hz, cutoff_hz), rate_hz, cutoff_hz)
 
 
 def usual_cutoff_hz(log: JointLog) -> float:
@@ -71,16 +79,38 @@ def filtered_log(log: JointLog, cutoff_hz: float) -> FilteredLog:
     motion = filtered_motion(t_ns, log.q_rad, log.qd_rad_s, log.tau_nm, log.rate_hz, cutoff_hz)
     edge = settling_samples(log.rate_hz, cutoff_hz)
     raw = log.tau_nm[edge : len(log.tau_nm) - edge]
-    step = max(1, int(log.rate_hz / (_KEPT_PER_CUTOFF * cutoff_hz)))
     size = float(np.linalg.norm(raw))
+    q, qd, qdd, tau, tau_raw = (
+        _thinned(signal, log.rate_hz, cutoff_hz)
+        for signal in (motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm, raw)
+    )
+    step = _step(log.rate_hz, cutoff_hz)
     return FilteredLog(
         rate_hz=log.rate_hz / step,
         cutoff_hz=cutoff_hz,
-        q_rad=motion.q_rad[::step],
-        qd_rad_s=motion.qd_rad_s[::step],
-        qdd_rad_s2=motion.qdd_rad_s2[::step],
-        tau_nm=motion.tau_nm[::step],
-        tau_raw_nm=raw[::step],
+        q_rad=q,
+        qd_rad_s=qd,
+        qdd_rad_s2=qdd,
+        tau_nm=tau,
+        tau_raw_nm=tau_raw,
         settling=-(-edge // step),
         noise=float(np.linalg.norm(raw - motion.tau_nm)) / size if size > 0.0 else float("nan"),
+        fine_rate_hz=log.rate_hz,
+        fine_qd_rad_s=motion.qd_rad_s,
+        fine_qdd_rad_s2=motion.qdd_rad_s2,
     )
+
+
+def _thinned(fine: Array, rate_hz: float, cutoff_hz: float) -> Array:
+    """Return some of the samples, without the ends, where what is filtered once more has not settled."""
+    edge = settling_samples(rate_hz, cutoff_hz)
+    if len(fine) <= 2 * edge:
+        raise ValueError(
+            f"{len(fine) / rate_hz:.3g} s are left, of which a cut-off of {cutoff_hz:.3g} Hz unsettles "
+            f"{2 * edge / rate_hz:.3g} s"
+        )
+    return fine[edge : len(fine) - edge : _step(rate_hz, cutoff_hz)]
+
+
+def _step(rate_hz: float, cutoff_hz: float) -> int:
+    return max(1, int(rate_hz / (_KEPT_PER_CUTOFF * cutoff_hz)))

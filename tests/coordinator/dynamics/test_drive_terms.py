@@ -1,16 +1,30 @@
 """Columns of the drives: what each adds to a joint's torque, and nothing to the others'."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from numpy.random import Generator
+from numpy.typing import ArrayLike
 
-from coordinator.dynamics.drive_terms import TERMS, DriveColumn, drive_columns, drive_regressor
+from coordinator.chain import Array
+from coordinator.dynamics.drive_terms import (
+    TERMS,
+    DriveColumn,
+    drive_columns,
+    drive_regressor,
+    drive_signals,
+)
+
+
+def matrix(columns: Sequence[DriveColumn], qd: Array, qdd: Array, slow: ArrayLike) -> Array:
+    return drive_regressor(columns, drive_signals(columns, qd, qdd, slow), qd.shape[1])
 
 
 def test_a_motor_that_turns_with_the_sum_of_two_joints_takes_the_power_that_it_loses(rng: Generator) -> None:
     columns = (DriveColumn("viscous", (1, 2)), DriveColumn("coulomb", (1, 2)))
     qd = rng.normal(size=(50, 3))
-    torque = drive_regressor(columns, qd, np.zeros_like(qd), np.full(3, 1e-3)) @ np.array([0.3, 0.7])
+    torque = matrix(columns, qd, np.zeros_like(qd), np.full(3, 1e-3)) @ np.array([0.3, 0.7])
     speed = qd[:, 1] + qd[:, 2]
     # Speeds are thousands of times the slow one: the hyperbolic tangent is the sign but for a few samples.
     lost = 0.3 * speed**2 + 0.7 * np.abs(speed)
@@ -21,14 +35,14 @@ def test_a_motor_that_turns_with_the_sum_of_two_joints_takes_the_power_that_it_l
 def test_a_joint_at_rest_has_no_friction_however_its_encoder_shivers(rng: Generator) -> None:
     shiver = 1e-4 * rng.normal(size=(100, 1))
     columns = drive_columns(1, ["viscous", "coulomb", "curved"])
-    torque = drive_regressor(columns, shiver, np.zeros_like(shiver), [0.05])
+    torque = matrix(columns, shiver, np.zeros_like(shiver), [0.05])
     # tanh(4 sigma of shiver / slow) is below 0.01, and each parameter is one.
     assert np.abs(torque).max() < 0.01
 
 
 def test_reflected_inertia_is_torque_per_acceleration_and_an_offset_is_constant(rng: Generator) -> None:
     qd, qdd = rng.normal(size=(2, 9, 2))
-    found = drive_regressor(drive_columns(2, ["inertia", "offset"]), qd, qdd, [0.1, 0.1])
+    found = matrix(drive_columns(2, ["inertia", "offset"]), qd, qdd, [0.1, 0.1])
     np.testing.assert_array_equal(found[:, 0, 0], qdd[:, 0])
     np.testing.assert_array_equal(found[:, 1, 2], qdd[:, 1])
     np.testing.assert_array_equal(found[:, 0, 1], np.ones(9))
@@ -62,4 +76,6 @@ def test_terms_and_pairs_that_do_not_exist_are_refused(
 def test_a_slow_speed_of_zero_is_refused(rng: Generator) -> None:
     qd = rng.normal(size=(5, 2))
     with pytest.raises(ValueError, match="n positive numbers are needed"):
-        drive_regressor(drive_columns(2), qd, qd, [0.1, 0.0])
+        drive_signals(drive_columns(2), qd, qd, [0.1, 0.0])
+    with pytest.raises(ValueError, match=r"signals \(5, 2\) do not fit 8 columns"):
+        drive_regressor(drive_columns(2), qd, 2)

@@ -62,7 +62,7 @@ def test_the_claimed_scatter_is_that_of_repetitions_with_coloured_noise() -> Non
     for _ in range(120):
         fit = fit_weighted(y, y @ TRUTH + coloured(rng, (1500, 2), 0.8), np.ones(3))
         found.append(fit.parameters)
-        claimed.append(np.sqrt(np.diagonal(np.linalg.inv(fit.rows.T @ fit.rows))))
+        claimed.append(np.sqrt(np.diagonal(fit.covariance)))
     # Noise counted as independent would claim a third. 120 repetitions tell a scatter to 6.5 %, the motion
     # is a little faster than the noise's correlation, and its time is itself estimated: 25 %.
     np.testing.assert_allclose(np.mean(claimed, axis=0), np.std(found, axis=0), rtol=0.25)

@@ -48,11 +48,16 @@ def test_the_noise_that_the_low_pass_takes_is_stated() -> None:
     assert np.std(found.tau_raw_nm - found.tau_nm) == pytest.approx(0.5, rel=0.1)
 
 
-def test_a_part_is_some_samples_of_everything() -> None:
-    found = filtered_log(waving(1.0), 10.0)
-    part = found.part(10, 30)
-    np.testing.assert_array_equal(part.qdd_rad_s2, found.qdd_rad_s2[10:30])
-    assert {len(a) for a in part if isinstance(a, np.ndarray)} == {20}
+def test_what_is_made_of_the_fine_signals_is_filtered_as_the_torque_is() -> None:
+    log = waving(1.0)
+    square = np.sign(np.diff(log.q_rad, axis=0, append=log.q_rad[-1:]))
+    found = filtered_log(log._replace(tau_nm=square), 10.0)
+    again = found.low_passed(np.sign(found.fine_qd_rad_s))
+    # The sign of a forward difference turns up to a sample of 1 ms early, on a slope of about 40 a second.
+    inner = slice(found.settling, -found.settling)
+    np.testing.assert_allclose(again[inner], found.tau_nm[inner], atol=0.05)
+    # Without the low-pass the sign is off by all of its height at the reversals.
+    assert np.abs(np.sign(found.qd_rad_s) - found.tau_nm)[inner].max() > 0.5
 
 
 def test_a_recording_too_short_for_its_cut_off_is_refused() -> None:

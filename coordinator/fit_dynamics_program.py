@@ -1,0 +1,133 @@
+"""`x5-coordinator fit-dynamics`: what recorded torques say of the dynamics of anybody's robot."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coordinator.command_options import fail
+from coordinator.dynamics.drive_terms import TERMS, USUAL_TERMS, Term
+from coordinator.failure import EXIT_FAILED, EXIT_USAGE
+from coordinator.offline.data_file import DataFileError, JointLog, read_data
+from coordinator.offline.filtered_log import filtered_log, usual_cutoff_hz
+from coordinator.offline.fit_report import write_report
+from coordinator.offline.fit_tables import notes, tables
+from coordinator.offline.identification import report_of
+from coordinator.offline.problem import ModelChoice, Problem, problem
+from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, UrdfRobot, read_urdf
+from coordinator.terminal import Terminal, print_table
+
+_UP = ",".join(f"{part:g}" for part in STANDARD_GRAVITY)
+
+
+def fit_dynamics(
+    urdf: Annotated[Path, typer.Option(help="URDF file: revolute, continuous and fixed joints.")],
+    data: Annotated[
+        Path,
+        typer.Option(
+            help="CSV with t_s, q_JOINT_rad, tau_JOINT_nm and, if measured, qd_JOINT_rad_s; or npz with "
+            "position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s and joint_names."
+        ),
+    ],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="JSON file to write the report to.")
+    ] = None,
+    terms: Annotated[
+        str, typer.Option(help=f"Terms of the drives, of {', '.join(TERMS)}; or none.")
+    ] = ",".join(USUAL_TERMS),
+    coupled: Annotated[
+        list[str] | None,
+        typer.Option(help="Two joints that share a drive, by number or name: 5,6. Repeat for several."),
+    ] = None,
+    robust: Annotated[bool, typer.Option("--robust", help="Huber's weights: outliers count little.")] = False,
+    cutoff: Annotated[
+        float | None, typer.Option(help="Low-pass over motion and torque [Hz]; by the motion if not given.")
+    ] = None,
+    gravity: Annotated[
+        str, typer.Option(help="Specific force of rest in the root link's frame [m/s^2]: upwards, 9.81 long.")
+    ] = _UP,
+    mask: Annotated[
+        float, typer.Option(help="Part of a joint's top speed below which samples are masked.")
+    ] = ModelChoice().mask_part,
+    slow: Annotated[
+        float, typer.Option(help="Part of a joint's top speed below which Coulomb friction fades.")
+    ] = ModelChoice().slow_part,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Identify inertia, friction and motors from a recording, and test what comes out on what was held out.
+
+    Exit codes: 0 done, 1 the recording does not tell enough, 2 a file or an option is wrong.
+    """
+    robot, log = _read(urdf, data, gravity)
+    choice = ModelChoice(_terms(terms), _pairs(robot, coupled or ()), robust, slow, mask)
+    with Terminal(quiet) as terminal:
+        posed = _posed(robot, log, choice, cutoff)
+        try:
+            report = report_of(urdf, data, log, posed, terminal.step)
+        except ValueError as error:
+            fail(f"{data}: {error}", EXIT_FAILED)
+    for line in notes(report):
+        terminal.note(line)
+    for table in tables(report):
+        print_table(table)
+    if json_file is not None:
+        try:
+            write_report(json_file, report)
+        except OSError as error:
+            fail(f"{json_file}: {error.strerror}", EXIT_USAGE)
+
+
+def _read(urdf: Path, data: Path, gravity: str) -> tuple[UrdfRobot, JointLog]:
+    try:
+        robot = read_urdf(urdf, _gravity(gravity))
+        return robot, read_data(data, robot.chain.serials)
+    except (UrdfError, DataFileError) as error:
+        fail(error, EXIT_USAGE)
+    except OSError as error:
+        fail(f"{error.filename}: {error.strerror}", EXIT_USAGE)
+
+
+def _posed(robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff: float | None) -> Problem:
+    try:
+        return problem(robot, filtered_log(log, usual_cutoff_hz(log) if cutoff is None else cutoff), choice)
+    except ValueError as error:
+        fail(error, EXIT_USAGE)
+
+
+def _gravity(text: str) -> list[float]:
+    try:
+        found = [float(word) for word in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) != 3 or not all(abs(part) < 100.0 for part in found):
+        fail(f"gravity {text!r}: it must be three numbers below 100, like {_UP}", EXIT_USAGE)
+    return found
+
+
+def _terms(text: str) -> tuple[Term, ...]:
+    words = [word.strip() for word in text.split(",")]
+    known = tuple(term for term in TERMS if term in words)
+    if words == ["none"]:
+        return ()
+    if len(known) != len(words):
+        fail(f"terms {text!r}: known are {', '.join(TERMS)}, each once, or none", EXIT_USAGE)
+    return known
+
+
+def _pairs(robot: UrdfRobot, texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    found = []
+    for text in texts:
+        joints = [_joint(robot, word.strip()) for word in text.split(",")]
+        if len(joints) != 2 or joints[0] == joints[1]:
+            fail(f"coupled {text!r}: it must be two different joints, like 5,6", EXIT_USAGE)
+        found.append((joints[0], joints[1]))
+    return tuple(found)
+
+
+def _joint(robot: UrdfRobot, word: str) -> int:
+    names = robot.chain.serials
+    numbers = {str(i + 1): i for i in range(len(names))} | {name: i for i, name in enumerate(names)}
+    if word not in numbers:
+        fail(f"coupled: no joint {word!r}; the joints are 1 to {len(names)}: {', '.join(names)}", EXIT_USAGE)
+    return numbers[word]

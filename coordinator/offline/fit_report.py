@@ -1,0 +1,165 @@
+"""What a recording says of a robot's dynamics, in a versioned schema; written whole or not at all."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+SCHEMA = 1
+
+Model = Literal["fitted", "urdf", "drives_only", "mean"]
+Verdict = Literal["identified", "weak", "not told from zero"]
+
+
+class Part(BaseModel):
+    """A piece of the report."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class DataPart(Part):
+    """The recording and what was made of it.
+
+    noise: |raw - filtered| / |raw| of the torque, which no model of this bandwidth can predict. mask_rad_s:
+    per joint the speed below which a sample is masked, and not fitted to.
+    """
+
+    joints: list[str]
+    duration_s: float
+    recorded_hz: float
+    resampled: bool
+    cutoff_hz: float
+    kept_hz: float
+    samples: int
+    noise: float
+    mask_rad_s: list[float]
+
+
+class ErrorPart(Part):
+    """A relative torque error |e| / |tau| on samples that were not fitted to; null where |tau| is zero.
+
+    model: `fitted`, `urdf` (the inertias that the URDF claims, no friction), `drives_only` (friction, offset
+    and motors without bodies), `mean` (the constant mean of the other half).
+    """
+
+    model: Model
+    tried_on: Literal["second half", "first half", "both"]
+    torque: Literal["filtered", "raw"]
+    samples: Literal["all", "masked"]
+    overall: float | None
+    per_joint: list[float | None]
+
+
+class LengthPart(Part):
+    """The held-out error, both ways together, filtered, after fitting to `seconds` of a half."""
+
+    seconds: float
+    all: float
+    masked: float
+
+
+class TermGainPart(Part):
+    """The held-out error, both ways together, filtered, of the model without something."""
+
+    without: str
+    all: float
+    masked: float
+
+
+class TermPart(Part):
+    """A parameter of a drive, and whether it earns its place.
+
+    f: (value / sigma)^2, the F-test of the model without it, by residuals of which only `independent_samples`
+    count. chance: of an F as large if the parameter were zero. lumped_with: the bodies' parameters that
+    cannot be told from it; then the test is of all of them together.
+    """
+
+    name: str
+    term: str
+    joints: list[str]
+    unit: str
+    value: float
+    sigma: float
+    f: float
+    chance: float
+    earns_its_place: bool
+    lumped_with: str
+
+
+class BaseParameterPart(Part):
+    """A combination of parameters that the torques show, in words.
+
+    Bodies are numbered as the joints are, their frames are those of the URDF's links behind the joints, and
+    their inertias are about the frames' origins. urdf: what the URDF claims for it, the drives' part left
+    out; null of a drive alone. verdict: identified with a standard deviation of up to a tenth of the value,
+    weak up to the value.
+    """
+
+    words: str
+    value: float
+    sigma: float
+    relative_sigma: float | None
+    urdf: float | None
+    verdict: Verdict
+
+
+class JointNoisePart(Part):
+    """The residual of a joint: rms by its degrees of freedom, samples that count as one, samples fitted to.
+
+    downweighted: the fraction of them that a robust fit held for outliers.
+    """
+
+    joint: str
+    sigma_nm: float
+    correlation: float
+    samples: int
+    downweighted: float
+
+
+class FitPart(Part):
+    """The fit to the whole recording: rank and condition of the weighted regressor, parameters, residuals."""
+
+    parameters: int
+    rank: int
+    condition: float
+    robust: bool
+    terms: list[str]
+    coupled: list[list[str]]
+    independent_samples: float
+    base_parameters: list[BaseParameterPart]
+    drives: list[TermPart]
+    residuals: list[JointNoisePart]
+
+
+class FitReport(Part):
+    """Everything that `x5-coordinator fit-dynamics` finds; errors are fractions, SI units."""
+
+    schema_version: int = SCHEMA
+    urdf: str
+    data: str
+    recording: DataPart
+    held_out: list[ErrorPart]
+    lengths: list[LengthPart]
+    gains: list[TermGainPart]
+    fit: FitPart
+
+    def errors(self, model: Model, torque: str = "filtered") -> list[ErrorPart]:
+        """Return a model's errors, in the order of the report."""
+        return [e for e in self.held_out if e.model == model and e.torque == torque]
+
+    def models(self) -> Sequence[Model]:
+        """Return the models that were tried, the fitted one first."""
+        return list(dict.fromkeys(e.model for e in self.held_out))
+
+
+def write_report(path: Path, report: FitReport) -> None:
+    """Write the report as JSON; the file is the complete old or the complete new one.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    os.replace(temporary, path)

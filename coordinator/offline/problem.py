@@ -1,0 +1,109 @@
+"""The least-squares problem of a recording: every column that the model has, for every kept sample."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.chain import Array
+from coordinator.dynamics.base_parameters import Columns, inertial_columns
+from coordinator.dynamics.drive_terms import (
+    NONLINEAR,
+    USUAL_TERMS,
+    DriveColumn,
+    Term,
+    drive_columns,
+    drive_regressor,
+    drive_signals,
+)
+from coordinator.dynamics.regressor import PER_BODY, torque_regressor
+from coordinator.offline.filtered_log import FilteredLog
+from coordinator.offline.urdf_chain import UrdfRobot
+
+
+class ModelChoice(NamedTuple):
+    """What the model has.
+
+    terms, coupled: see `drive_columns`. robust: Huber's weights. slow_part, mask_part: the speed below which
+    the sign of friction fades, and that below which a sample is masked, in parts of the joint's top speed.
+    """
+
+    terms: tuple[Term, ...] = USUAL_TERMS
+    coupled: tuple[tuple[int, int], ...] = ()
+    robust: bool = False
+    slow_part: float = 0.01
+    mask_part: float = 0.05
+
+
+class Problem(NamedTuple):
+    """m samples of n joints and p columns, the inertial ones first; arrays are read-only.
+
+    moving: (m, n) samples whose joint turns fast enough that friction has a direction. Only these are
+        fitted to: what holds a joint that stands is decided by how it came to a stop.
+    """
+
+    robot: UrdfRobot
+    log: FilteredLog
+    choice: ModelChoice
+    drives: tuple[DriveColumn, ...]
+    columns: Columns
+    regressor: Array
+    moving: NDArray[np.bool_]
+
+    @property
+    def inertial(self) -> int:
+        """How many of the columns are the bodies'."""
+        return PER_BODY * len(self.robot.bodies)
+
+    def with_drives(self, kept: Callable[[DriveColumn], bool], bodies: bool = True) -> "Problem":
+        """Return the problem with some of the drives' columns, and with or without the bodies'."""
+        some = np.array(
+            [bodies] * self.inertial + [kept(drive) for drive in self.drives],
+            dtype=bool,
+        )
+        at = np.flatnonzero(some)
+        order = {int(column): i for i, column in enumerate(at)}
+        preferred = [order[int(c)] for c in self.columns.preferred if some[c]]
+        return self._replace(
+            drives=tuple(drive for drive in self.drives if kept(drive)),
+            columns=Columns(
+                tuple(self.columns.names[i] for i in at),
+                self.columns.scale[at],
+                np.array(preferred, dtype=np.int64),
+            ),
+            regressor=self.regressor[..., at],
+        )
+
+
+def problem(robot: UrdfRobot, log: FilteredLog, choice: ModelChoice) -> Problem:
+    """Return the columns of all samples of a recording.
+
+    Raises:
+        ValueError: terms or pairs that do not exist, parts of speed out of range, or a joint that never
+            moves.
+    """
+    for name, part in (("slow", choice.slow_part), ("mask", choice.mask_part)):
+        if not 0.0 < part < 1.0:
+            raise ValueError(f"the {name} part of the top speed is {part}; it must be between 0 and 1")
+    top_rad_s = np.abs(log.qd_rad_s).max(axis=0)
+    if (still := np.flatnonzero(top_rad_s < 1e-6)).size:
+        raise ValueError(f"joint {robot.chain.serials[still[0]]!r} never moves; nothing shows its friction")
+    drives = drive_columns(len(robot.bodies), choice.terms, choice.coupled)
+    inertial = torque_regressor(robot.chain, log.q_rad, log.qd_rad_s, log.qdd_rad_s2)
+    further = drive_regressor(drives, _signals(drives, log, choice.slow_part * top_rad_s), len(robot.bodies))
+    regressor = np.concatenate([inertial, further], axis=2)
+    moving = np.abs(log.qd_rad_s) > choice.mask_part * top_rad_s
+    regressor.flags.writeable = moving.flags.writeable = False
+    columns = inertial_columns(len(robot.bodies)).beside([drive.name for drive in drives])
+    return Problem(robot, log, choice, drives, columns, regressor, moving)
+
+
+def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
+    """Return the drives' signals (m, k) as they are behind the torque's low-pass."""
+    found = drive_signals(drives, log.qd_rad_s, log.qdd_rad_s2, slow_rad_s).copy()
+    at = [k for k, drive in enumerate(drives) if drive.term in NONLINEAR]
+    fine = drive_signals([drives[k] for k in at], log.fine_qd_rad_s, log.fine_qdd_rad_s2, slow_rad_s)
+    if at:
+        found[:, at] = log.low_passed(fine)
+    return found
