@@ -1,6 +1,7 @@
 """`x5-coordinator fit-dynamics`: what recorded torques say of the dynamics of anybody's robot."""
 
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,7 @@ from coordinator.offline.data_file import DataFileError, JointLog, read_data
 from coordinator.offline.filtered_log import filtered_log, usual_cutoff_hz
 from coordinator.offline.fit_report import write_report
 from coordinator.offline.fit_tables import notes, tables
-from coordinator.offline.identification import report_of
+from coordinator.offline.identification import STEPS, report_of
 from coordinator.offline.problem import ModelChoice, Problem, problem
 from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, UrdfRobot, read_urdf
 from coordinator.terminal import Terminal, print_table
@@ -59,12 +60,19 @@ def fit_dynamics(
 
     Exit codes: 0 done, 1 the recording does not tell enough, 2 a file or an option is wrong.
     """
-    robot, log = _read(urdf, data, gravity)
-    choice = ModelChoice(_terms(terms), _pairs(robot, coupled or ()), robust, slow, mask)
     with Terminal(quiet) as terminal:
+        numbers = count(1)
+
+        def step(text: str) -> None:
+            terminal.step(next(numbers), STEPS + 2, text)
+
+        step(f"read {urdf} and {data}")
+        robot, log = _read(urdf, data, gravity)
+        choice = ModelChoice(_terms(terms), _pairs(robot, coupled or ()), robust, slow, mask)
+        step("low-pass, and every column of every sample")
         posed = _posed(robot, log, choice, cutoff)
         try:
-            report = report_of(urdf, data, log, posed, terminal.step)
+            report = report_of(urdf, data, log, posed, step)
         except ValueError as error:
             fail(f"{data}: {error}", EXIT_FAILED)
     for line in notes(report):

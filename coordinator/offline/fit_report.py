@@ -105,6 +105,14 @@ class BaseParameterPart(Part):
     verdict: Verdict
 
 
+class BodyPart(Part):
+    """Which parameters of a body are identified, weak, known only in sums with others, or without effect."""
+
+    link: str
+    joint: str
+    words: str
+
+
 class JointNoisePart(Part):
     """The residual of a joint: rms by its degrees of freedom, samples that count as one, samples fitted to.
 
@@ -129,6 +137,7 @@ class FitPart(Part):
     coupled: list[list[str]]
     independent_samples: float
     base_parameters: list[BaseParameterPart]
+    bodies: list[BodyPart]
     drives: list[TermPart]
     residuals: list[JointNoisePart]
 

@@ -23,6 +23,7 @@ def tables(report: FitReport) -> Iterator[Table]:
     yield _gains(report)
     yield _drives(report)
     yield _base(report)
+    yield _bodies(report)
 
 
 def notes(report: FitReport) -> Iterator[str]:
@@ -140,6 +141,13 @@ def _base(report: FitReport) -> Table:
             _claim(part),
             part.verdict,
         )
+    return table
+
+
+def _bodies(report: FitReport) -> Table:
+    table = _table("Body by body", ("body", "turned by", "its parameters"), ())
+    for i, body in enumerate(report.fit.bodies, start=1):
+        table.add_row(f"{i}: {body.link}", body.joint, body.words)
     return table
 
 

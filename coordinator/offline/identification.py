@@ -7,11 +7,19 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from coordinator.chain import Array
-from coordinator.dynamics.base_parameters import BaseParameters, base_parameters, into_frames
+from coordinator.dynamics.base_parameters import (
+    BaseParameters,
+    base_parameters,
+    inertial_units,
+    into_frames,
+)
+from coordinator.dynamics.regressor import PER_BODY
+from coordinator.dynamics.verdict import WEAK_ABOVE, verdicts, words_of_body
 from coordinator.dynamics.weighted_fit import WeightedFit
 from coordinator.offline.data_file import JointLog
 from coordinator.offline.fit_report import (
     BaseParameterPart,
+    BodyPart,
     DataPart,
     ErrorPart,
     FitPart,
@@ -36,30 +44,31 @@ from coordinator.offline.held_out import (
 )
 from coordinator.offline.problem import Problem
 
-IDENTIFIED_BELOW, WEAK_BELOW = 0.1, 1.0
+_TOLD_BELOW = 1.0
 # A term of no use passes a test at this level once in a hundred.
 EARNS_BELOW = 0.01
 _LARGEST_F = 1e12
 _ROUNDING = 1e-9
 
-Step = Callable[[int, int, str], None]
+Step = Callable[[str], None]
+STEPS = 4
 
 
 def report_of(urdf: Path, data: Path, log: JointLog, problem: Problem, step: Step) -> FitReport:
-    """Return the report of a recording; `step` is told of every part of the work (index, total, text).
+    """Return the report of a recording; `step` is told of each of the `STEPS` before it begins.
 
     Raises:
         ValueError: too few samples for the parameters.
     """
-    step(1, 4, "fit to the whole recording")
+    step("fit to the whole recording")
     fit = fit_part(problem, slice(0, len(problem.log.tau_nm)))
-    step(2, 4, "fit to each half, tried on the other")
+    step("fit to each half, tried on the other")
     held_out = [_error_part(name, e) for name, tried in _predictors(problem) for e in held_out_errors(*tried)]
-    step(3, 4, "fit to ever longer parts")
+    step("fit to ever longer parts")
     lengths = [
         LengthPart(seconds=p.seconds, all=p.all_samples, masked=p.masked) for p in length_curve(problem)
     ]
-    step(4, 4, "fit without each kind of term")
+    step("fit without each kind of term")
     gains = [
         TermGainPart(without=g.without, all=g.all_samples, masked=g.masked) for g in gain_of_terms(problem)
     ]
@@ -135,6 +144,7 @@ def _fit_part(problem: Problem, fit: WeightedFit) -> FitPart:
         coupled=[[names[i], names[j]] for i, j in problem.choice.coupled],
         independent_samples=fit.independent_samples,
         base_parameters=_base_parts(problem, found),
+        bodies=_bodies(problem, found),
         drives=[_term_part(problem, fit, found, k) for k in range(len(problem.drives))],
         residuals=[
             JointNoisePart(
@@ -147,6 +157,16 @@ def _fit_part(problem: Problem, fit: WeightedFit) -> FitPart:
             for i, name in enumerate(names)
         ],
     )
+
+
+def _bodies(problem: Problem, found: BaseParameters) -> list[BodyPart]:
+    robot = problem.robot
+    units = (*inertial_units(len(robot.bodies)), *(drive.unit for drive in problem.drives))
+    judged = verdicts(found, units)
+    return [
+        BodyPart(link=link, joint=joint, words=words_of_body(judged[PER_BODY * i : PER_BODY * (i + 1)]))
+        for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True))
+    ]
 
 
 def _base_parts(problem: Problem, found: BaseParameters) -> list[BaseParameterPart]:
@@ -181,9 +201,9 @@ def _claims(problem: Problem, found: BaseParameters) -> Array | None:
 
 
 def _verdict(relative_sigma: float) -> Verdict:
-    if relative_sigma < IDENTIFIED_BELOW:
+    if relative_sigma <= WEAK_ABOVE:
         return "identified"
-    return "weak" if relative_sigma < WEAK_BELOW else "not told from zero"
+    return "weak" if relative_sigma < _TOLD_BELOW else "not told from zero"
 
 
 def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int) -> TermPart:

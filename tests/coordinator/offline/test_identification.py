@@ -88,6 +88,19 @@ def test_the_sums_that_the_torques_show_are_those_of_the_true_bodies(three: FitR
     assert sum(part.words.startswith("Ia1 + I1zz") for part in bodies) == 1
 
 
+def test_every_body_is_spoken_of_in_words(three: FitReport) -> None:
+    assert [(body.link, body.joint) for body in three.fit.bodies] == [
+        ("upper", "waist"),
+        ("fore", "elbow"),
+        ("hand", "wrist"),
+    ]
+    # All that an upright first joint shows of its body is one moment, and that only with its motor.
+    first, _, last = (body.words for body in three.fit.bodies)
+    assert first.startswith("only in sums: I1zz; without effect: m1, ")
+    assert "identified: " in last
+    assert "m3 c3x" in last
+
+
 def test_what_was_held_out_is_predicted_and_the_baselines_are_far_behind(three: FitReport) -> None:
     # 0.05 Nm of noise on torques of some 4 Nm, of which the low-pass leaves about a sixth: 0.2 %.
     assert overall(three) < 0.005
