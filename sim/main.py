@@ -16,6 +16,7 @@ from sim.effects import EFFECTS
 from sim.effects_page import OFF, default_size, page, sizes
 from sim.experiments.estimator_program import estimators
 from sim.experiments.program import amplitudes
+from sim.experiments.torque_assistance_program import assistance
 from sim.log_program import compare_log
 from sim.noise_profile import NOISE_PROFILES
 from sim.robot_file import load_robot, shipped_robots
@@ -92,6 +93,7 @@ app.command()(launch)
 app.command("score")(score_run)
 app.command()(amplitudes)
 app.command()(estimators)
+app.command()(assistance)
 app.command()(compare_log)
 app.add_typer(benchmark, name="benchmark")
 

@@ -1,16 +1,28 @@
-"""One module's firmware and who commands it: a lease held and motions started, with no network in between.
+"""One module's firmware and who commands it: a lease held, gains set and motions started, with no network.
 
 All that is sent goes through the firmware's inbox, encoded, as it would come from a network.
 """
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
-from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
+from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, Publication
 from module_agent.hardware import SensorSample
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.keys import Leaf
-from module_agent.wire.messages import Ack, LeaseRequest, MotionCommand, MotionRecord, Pattern, Status
+from module_agent.wire.messages import (
+    Ack,
+    EffortProfile,
+    GainsCommand,
+    GainSet,
+    LeaseRequest,
+    MotionCommand,
+    MotionRecord,
+    Pattern,
+    Setpoint,
+    Status,
+)
 
 SENDER = "experiment"
 # As often as the coordinator does; a lease without it lapses.
@@ -29,14 +41,17 @@ class ModuleBench:
         self.firmware = firmware
         self.serial = firmware.config.serial
         self.now_ns = 0
+        self.published_rows = False
         self._record: MotionRecord | None = None
         self._waiting: list[Incoming] = []
         self._motions = 0
         self._seq = 0
         self._renewed_ns: int | None = None
 
-    def step(self, sample: SensorSample) -> float:
-        """Run one tick of the firmware and return its PWM.
+    def step(self, sample: SensorSample, arrived: Sequence[Incoming] = ()) -> float:
+        """Run one tick of the firmware and return its PWM; `arrived` has come from elsewhere.
+
+        `published_rows` says afterwards whether feedback went out in this tick.
 
         Raises:
             ExperimentFailed: the module refused what it was told since the last tick.
@@ -44,27 +59,34 @@ class ModuleBench:
         self.now_ns = sample.t_ns
         self._keep_alive()
         waiting, self._waiting = self._waiting, []
-        pwm, out = self.firmware.step(sample.t_ns, sample, waiting)
+        pwm, out = self.firmware.step(sample.t_ns, sample, [*waiting, *arrived])
+        self.published_rows = any(isinstance(one, Publication) and one.leaf is Leaf.FEEDBACK for one in out)
         for outgoing in out:
             self._hear(outgoing)
         return pwm
 
-    def start(self, pattern: Pattern) -> None:
-        """Start a motion in the next tick."""
+    def start(self, pattern: Pattern, effort: EffortProfile | None = None) -> None:
+        """Start a motion in the next tick, with the efforts that it is fed forward if there are any."""
         self._motions += 1
-        self._seq += 1
-        command = MotionCommand(
-            serial=self.serial,
-            boot=self.firmware.config.boot,
-            seq=self._seq,
-            sender=SENDER,
-            token=self.firmware.lease.token,
-            echo_ns=self.now_ns,
-            motion_id=self._motions,
-            pattern=pattern,
-        )
+        command = MotionCommand(**self._head(), motion_id=self._motions, pattern=pattern, effort=effort)
         self._record = None
         self._waiting.append(Incoming(Leaf.MOTION, encode(command), _ASKED))
+
+    def set_gains(self, gains: GainSet) -> None:
+        """Replace the gains in the next tick."""
+        self._waiting.append(Incoming(Leaf.GAINS, encode(GainsCommand(**self._head(), gains=gains)), _ASKED))
+
+    def setpoint(
+        self, position_rad: float | None, velocity_rad_s: float | None, effort_nm: float | None, echo_ns: int
+    ) -> Incoming:
+        """Return a set-point to hand to `step` when it arrives; `echo_ns` is what its sender knew."""
+        message = Setpoint(
+            **self._head() | {"echo_ns": echo_ns},
+            position_rad=position_rad,
+            velocity_rad_s=velocity_rad_s,
+            effort_nm=effort_nm,
+        )
+        return Incoming(Leaf.SETPOINT, encode(message), None)
 
     def finished(self) -> MotionRecord | None:
         """Return the record of the last motion that was started, None while it runs.
@@ -90,18 +112,21 @@ class ModuleBench:
             self._send_lease("renew", None)
 
     def _send_lease(self, action: Literal["acquire", "renew"], request: int | None) -> None:
-        self._seq += 1
-        lease = LeaseRequest(
-            serial=self.serial,
-            boot=self.firmware.config.boot,
-            seq=self._seq,
-            sender=SENDER,
-            action=action,
-            token=self.firmware.lease.token,
-            echo_ns=self.now_ns,
-        )
+        lease = LeaseRequest(**self._head(), action=action)
         self._waiting.append(Incoming(Leaf.LEASE, encode(lease), request))
         self._renewed_ns = self.now_ns
+
+    def _head(self) -> dict[str, Any]:
+        """Return what every command carries."""
+        self._seq += 1
+        return {
+            "serial": self.serial,
+            "boot": self.firmware.config.boot,
+            "seq": self._seq,
+            "sender": SENDER,
+            "token": self.firmware.lease.token,
+            "echo_ns": self.now_ns,
+        }
 
     def _hear(self, outgoing: Outgoing) -> None:
         if isinstance(outgoing, Answer):

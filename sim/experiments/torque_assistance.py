@@ -1,0 +1,253 @@
+"""Torque assistance (thesis 6.3.2, 6.3.3): how joints follow a motion with and without calculated torque.
+
+The efforts come from chain and parameters as the system identifies them on the same modules on another day.
+The true motion of the joints is held against the motion that was asked for.
+"""
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from coordinator.chain import Array, Chain
+from coordinator.feed_forward import (
+    Reference,
+    SetPoints,
+    feed_forward,
+    joint_reference,
+    on_module,
+    standing,
+)
+from coordinator.identify import identify
+from coordinator.plan import Plan
+from module_agent.catalogue import ModuleType
+from module_agent.firmware.gains import default_gains
+from module_agent.wire.messages import GainSet, GoTo, Pattern, Rest
+from module_agent.wire.network_file import network
+from sim.experiments.arm_trial import imu_kind
+from sim.experiments.bench_robot import BenchRobot, Streaming, Track
+from sim.experiments.module_bench import ExperimentFailed
+from sim.experiments.thesis_gains import Reading, setting, thesis_gains, without_velocity
+from sim.noise_profile import NoiseProfile
+from sim.place import somewhere
+from sim.pose import read_only
+from sim.robot_file import Robot, load_robot
+from sim.virtual_robot import VirtualSettings
+from sim.virtual_session import record_session
+
+# What a set-point holds: position; position and velocity; position, velocity and calculated torque.
+InputMode = Literal[1, 2, 3]
+MODES: tuple[InputMode, ...] = (1, 2, 3)
+
+# The day of the identification is 0, that of the trial another one.
+TRIAL_DAY = 1
+TRAVEL_RAD_S = 1.0
+# How long a joint is given to settle under new gains, and to come to rest after the motion.
+SETTLE_S = 1.5
+_STILL_S = 0.5
+# A joint that still moves by so much half a second before the end of its rest is unstable: 1 mm rms at the
+# end of the thesis' arm of 484 mm. What settles is below 0.8 mrad, what goes on in a cycle above 3.
+MOST_RINGING_RAD = 2e-3
+# So is one whose bridge is at its limit for more than this share of the motion: no loop is closed then.
+MOST_SATURATED = 0.25
+_SATURATED_DUTY = 0.98
+
+
+class Delivery(NamedTuple):
+    """How set-points come to the loops: in the module itself, or streamed by a host through a network."""
+
+    name: str
+    network: str | None = None
+    rate_hz: float = 0.0
+
+
+ON_MODULE = Delivery("on the module")
+
+
+class Gains(NamedTuple):
+    """Which gains: the factory's of a strategy, or one of the thesis' settings in one reading of it."""
+
+    strategy: int
+    setting: str | None = None
+    reading: Reading | None = None
+
+    @property
+    def name(self) -> str:
+        """The setting in a word."""
+        return f"factory S{self.strategy}" if self.setting is None else self.setting
+
+
+class Model(NamedTuple):
+    """What is known of a robot: chain and inertial parameters (10 n,), as identified."""
+
+    chain: Chain
+    phi: Array
+
+
+class Stage(NamedTuple):
+    """A robot and the motion that it is asked for; joints without a pattern hold where they start."""
+
+    robot: Robot
+    start_rad: Mapping[str, float]
+    patterns: Mapping[str, Pattern]
+
+
+class Follow(NamedTuple):
+    """How a motion was followed, over the joints that were asked to move.
+
+    rms_error_rad: of the true position, over the whole motion. motion_rms_rad: of the motion about its mean.
+    ringing_rad: the largest standard deviation of a joint at the end of its rest afterwards. saturated: the
+    largest share of the motion that a bridge was at its limit. unstable: why it counts as such, empty if not.
+    asked_rad, done_rad: (m, k) of the joints that moved, at 250 Hz; empty if the motion was broken off.
+    """
+
+    rms_error_rad: float
+    motion_rms_rad: float
+    ringing_rad: float
+    saturated: float
+    unstable: str
+    asked_rad: Array
+    done_rad: Array
+
+
+def identified_model(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> Model:
+    """Run one whole session on a simulated robot, and return what the coordinator makes of it.
+
+    Raises:
+        what `record_session` and `identify` raise.
+    """
+    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
+    found = identify(record_session(settings, plan or Plan(imu=imu_kind(noise))))
+    if found.inertia is None:
+        raise ValueError(
+            f"the plan leaves out the dynamics of {robot.name}: there is nothing to calculate from"
+        )
+    return Model(found.kinematics.fit.chain, found.inertia.phi)
+
+
+def standing_robot(name: str, seed: int) -> Robot:
+    """Return a shipped robot at the place that the seed draws."""
+    return somewhere(load_robot(name), seed)
+
+
+def follow(
+    stage: Stage,
+    gains: Gains,
+    mode: InputMode,
+    delivery: Delivery,
+    model: Model,
+    noise: NoiseProfile,
+    seed: int,
+) -> Follow:
+    """Let a robot follow a motion, and judge how it does.
+
+    The joints go to the start under the factory's gains and settle under those of the trial, in the same
+    input mode; then comes the motion, and a rest after it.
+    """
+    movers = list(stage.patterns)
+    points = _phases(stage, model)
+    try:
+        with BenchRobot(stage.robot, seed, noise, noise_seed=TRIAL_DAY) as bench:
+            bench.run(
+                {s: GoTo(target_rad=q, max_speed_rad_s=TRAVEL_RAD_S) for s, q in stage.start_rad.items()}
+            )
+            kinds = {s: bench.by_serial[s].firmware.config.kind for s in movers}
+            bench.set_gains({s: _gain_set(kinds[s], gains, mode) for s in movers})
+            if delivery.network is None:
+                tracks = _on_module(bench, stage, points, mode)
+            else:
+                tracks = _streamed(bench, movers, points, mode, delivery, seed)
+    except ExperimentFailed as error:
+        return _broken_off(points[1].reference, str(error))
+    columns = [stage.robot.serials.index(serial) for serial in movers]
+    return judge(points[1].reference, *(_of(track, columns) for track in tracks[1:]))
+
+
+def judge(asked: Reference, moving: Track, after: Track) -> Follow:
+    """Return how a motion was followed; columns are the joints that moved, `after` is the rest behind it."""
+    q = asked.q_rad
+    error = moving.q_rad[: len(q)] - q
+    still = round(_STILL_S * 1e3)
+    ringing = float(after.q_rad[-still:].std(axis=0).max())
+    saturated = float(np.mean(np.abs(moving.duty) > _SATURATED_DUTY, axis=0).max())
+    return Follow(
+        rms_error_rad=_rms(error),
+        motion_rms_rad=_rms(q - q.mean(axis=0)),
+        ringing_rad=ringing,
+        saturated=saturated,
+        unstable=_unstable(ringing, saturated),
+        asked_rad=read_only(q[::4].copy()),
+        done_rad=read_only(moving.q_rad[: len(q) : 4].copy()),
+    )
+
+
+def _unstable(ringing_rad: float, saturated: float) -> str:
+    found = []
+    if ringing_rad > MOST_RINGING_RAD:
+        found.append(f"rings by {1e3 * ringing_rad:.1f} mrad")
+    if saturated > MOST_SATURATED:
+        found.append(f"saturates {100.0 * saturated:.0f} % of the time")
+    return ", ".join(found)
+
+
+def _broken_off(asked: Reference, why: str) -> Follow:
+    nothing = read_only(np.empty((0, asked.q_rad.shape[1])))
+    motion = _rms(asked.q_rad - asked.q_rad.mean(axis=0))
+    return Follow(np.inf, motion, np.inf, 1.0, f"broken off: {why}", nothing, nothing)
+
+
+def _phases(stage: Stage, model: Model) -> list[SetPoints]:
+    """Return the set-points of the joints that move: settling, the motion, the rest after it."""
+    serials = model.chain.serials
+    motion = joint_reference(serials, stage.patterns, stage.start_rad)
+    phases = (standing(motion, 0, SETTLE_S), motion, standing(motion, -1, SETTLE_S))
+    columns = [serials.index(serial) for serial in stage.patterns]
+    return [_picked(feed_forward(model.chain, model.phi, each), columns) for each in phases]
+
+
+def _picked(points: SetPoints, columns: list[int]) -> SetPoints:
+    t_s, *motion = points.reference
+    chosen = Reference(t_s, *(read_only(signal[:, columns].copy()) for signal in motion))
+    return SetPoints(chosen, read_only(points.effort_nm[:, columns].copy()))
+
+
+def _gain_set(kind: ModuleType, gains: Gains, mode: InputMode) -> GainSet:
+    if gains.setting is None or gains.reading is None:
+        chosen = default_gains(kind, gains.strategy)
+    else:
+        chosen = thesis_gains(kind, setting(gains.setting), gains.reading)
+    return without_velocity(chosen) if mode == 1 else chosen
+
+
+def _on_module(bench: BenchRobot, stage: Stage, points: list[SetPoints], mode: InputMode) -> list[Track]:
+    rest = dict.fromkeys(stage.patterns, Rest(duration_s=SETTLE_S))
+    tracks = []
+    for patterns, phase in zip((rest, stage.patterns, rest), points, strict=True):
+        efforts = dict(zip(stage.patterns, on_module(phase), strict=True)) if mode == 3 else None
+        tracks.append(bench.run(patterns, efforts))
+    return tracks
+
+
+def _streamed(
+    bench: BenchRobot,
+    movers: list[str],
+    points: list[SetPoints],
+    mode: InputMode,
+    delivery: Delivery,
+    seed: int,
+) -> list[Track]:
+    assert delivery.network is not None
+    how = Streaming(network(delivery.network), delivery.rate_hz, velocity=mode > 1, effort=mode == 3)
+    joined = [np.concatenate(signal) for signal in zip(*(phase.reference for phase in points), strict=True)]
+    effort = np.concatenate([phase.effort_nm for phase in points])
+    track = bench.stream(movers, SetPoints(Reference(*joined), effort), how, seed)
+    ends = np.cumsum([len(phase.effort_nm) for phase in points])[:-1]
+    return [Track(*part) for part in zip(*(np.split(signal, ends) for signal in track), strict=True)]
+
+
+def _of(track: Track, columns: list[int]) -> Track:
+    return Track(*(signal[:, columns] for signal in track))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
