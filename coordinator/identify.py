@@ -15,9 +15,9 @@ from coordinator.chain import Array, Chain
 from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.clock_refinement import refine_clocks
 from coordinator.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
-from coordinator.dynamics.identification import InertialFit, solve_pseudo_inverse
-from coordinator.dynamics.prediction import TorqueError, torque_error
-from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
+from coordinator.dynamics.identification import InertialFit, solve_information
+from coordinator.dynamics.information import JointInformation, gather
+from coordinator.dynamics.prediction import TorqueError, check_held_out
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
 from coordinator.kinematics.base_motion import NoiseFloor
@@ -34,6 +34,7 @@ from coordinator.motion_window import RATE_HZ, Window, noise_floor, window
 from coordinator.recording import Recording
 from coordinator.result import Result
 from coordinator.result_parts import build_result
+from coordinator.robot_bodies import RobotBodies, robot_bodies
 from coordinator.robot_refinement import CUTOFF_HZ, refine_robot
 from coordinator.topology_search import search_topology
 from coordinator.whole_exploration import respond, whole_motion
@@ -43,6 +44,8 @@ from module_agent.wire.messages import Estimate
 # Of some 30 errors an IMU the largest is below this in 99 of 100.
 STRANGE_ABOVE = 3.5
 DYNAMIC_CUTOFF_HZ = 12.0
+# The low-pass leaves so many independent samples a sample.
+INDEPENDENT_FRACTION = min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
 
 
 class IdentificationError(ValueError):
@@ -96,8 +99,16 @@ class Identified(NamedTuple):
 
     kinematics: Kinematics
     inertia: InertialFit | None
+    bodies: RobotBodies | None
     held_out: HeldOutMotion | None
     result: Result
+
+    @property
+    def real_phi(self) -> Array | None:
+        """The inertial parameters for files that other programs read: of real bodies, if any were found."""
+        if self.bodies is not None and self.bodies.fit is not None:
+            return self.bodies.fit.phi
+        return self.inertia.phi if self.inertia is not None else None
 
 
 def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | None = None) -> Identified:
@@ -109,12 +120,18 @@ def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | 
     kinematics = identify_kinematics(recording)
     if revise is not None:
         kinematics = revise(kinematics)
-    inertia, held_out = None, None
+    inertia, bodies, held_out = None, None, None
     if _motions(recording, "dynamic"):
-        inertia, means = _inertia(recording, kinematics)
+        information, means = _torques(recording, kinematics)
+        inertia = solve_information(information, independent_fraction=INDEPENDENT_FRACTION)
+        types = [recorded_type(recording, s) for s in kinematics.topology.serials]
+        bodies = robot_bodies(information, kinematics.fit.chain, types, inertia, INDEPENDENT_FRACTION)
         if _motions(recording, "held_out"):
-            held_out = _held_out(recording, kinematics, inertia, means)
-    return Identified(kinematics, inertia, held_out, build_result(recording, kinematics, inertia, held_out))
+            motion = _joined([_filtered(recording, kinematics, e) for e in _stretches(recording, "held_out")])
+            held_out = _held_out(kinematics, motion, inertia.phi, means)
+            bodies = _checked(bodies, kinematics, motion, means)
+    result = build_result(recording, kinematics, inertia, held_out, bodies)
+    return Identified(kinematics, inertia, bodies, held_out, result)
 
 
 # ---------------------------------------------------------------------- kinematics
@@ -321,23 +338,15 @@ def _joined(motions: Sequence[JointMotion]) -> JointMotion:
     return JointMotion(*(np.concatenate(column) for column in zip(*motions, strict=True)))
 
 
-def _inertia(recording: Recording, kinematics: Kinematics) -> tuple[InertialFit, Array]:
-    """Solve thesis eq. 29 over all dynamic motions; also the mean torques, a baseline."""
+def _torques(recording: Recording, kinematics: Kinematics) -> tuple[tuple[JointInformation, ...], Array]:
+    """Return what all dynamic motions say of the inertial parameters; also the mean torques, a baseline."""
     motion = _joined([_filtered(recording, kinematics, e) for e in _stretches(recording, "dynamic")])
-    regressor = torque_regressor(kinematics.fit.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
-    fit = solve_pseudo_inverse(
-        regressor, motion.tau_nm, independent_fraction=min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
-    )
-    return fit, motion.tau_nm.mean(axis=0)
+    signals = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm
+    return gather(kinematics.fit.chain, *signals), motion.tau_nm.mean(axis=0)
 
 
-def _held_out(
-    recording: Recording, kinematics: Kinematics, inertia: InertialFit, means: Array
-) -> HeldOutMotion:
-    motion = _joined([_filtered(recording, kinematics, e) for e in _stretches(recording, "held_out")])
-    predicted = inverse_dynamics(
-        kinematics.fit.chain, inertia.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
-    )
+def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Array) -> HeldOutMotion:
+    found = check_held_out(kinematics.fit.chain, phi, motion, means)
     serials = kinematics.topology.serials
     return HeldOutMotion(
         serials,
@@ -345,9 +354,17 @@ def _held_out(
         np.stack([kinematics.clocks[s].to_module(motion.t_ns) for s in serials], axis=1),
         motion.q_rad,
         motion.tau_nm,
-        predicted,
-        torque_error(motion.tau_nm, predicted, means),
+        found.tau_predicted_nm,
+        found.error,
     )
+
+
+def _checked(bodies: RobotBodies, kinematics: Kinematics, motion: JointMotion, means: Array) -> RobotBodies:
+    """Return the bodies with how well they predict held-out torques."""
+    if bodies.fit is None:
+        return bodies
+    found = check_held_out(kinematics.fit.chain, bodies.fit.phi, motion, means)
+    return bodies._replace(held_out_error=found.error.overall)
 
 
 def write_held_out(path: Path, held_out: HeldOutMotion) -> None:

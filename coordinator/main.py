@@ -20,7 +20,7 @@ from coordinator.known_robot import KnownRobotError, known_within
 from coordinator.known_update import updated
 from coordinator.plan import Excitation, Mode, Motions
 from coordinator.recording import Recording
-from coordinator.result import Result
+from coordinator.result import DynamicsPart, Result
 from coordinator.run import RunConfig, write_outputs
 from coordinator.run_folder import load_recording
 from coordinator.scaled_loop import check_speed
@@ -161,12 +161,22 @@ def _print(result: Result, terminal: Terminal) -> None:
     terminal.console.print(table)
     for item in result.unresolved:
         terminal.note(f"not identifiable: {item.words}")
-    if result.dynamics is not None and result.dynamics.held_out is not None:
-        terminal.note(
-            f"inertia: {result.dynamics.rank} of {result.dynamics.parameters} parameters; torque on held-out "
-            f"motions predicted to {100 * result.dynamics.held_out.relative_error:.1f} %"
-        )
+    if result.dynamics is not None:
+        _print_inertia(result.dynamics, terminal)
     terminal.note(f"trace hash {result.trace_hash}")
+
+
+def _print_inertia(dynamics: DynamicsPart, terminal: Terminal) -> None:
+    for line in dynamics.words:
+        terminal.note(line)
+    if dynamics.held_out is None:
+        return
+    real = dynamics.bodies.held_out_relative_error if dynamics.bodies is not None else None
+    terminal.note(
+        f"inertia: {dynamics.rank} of {dynamics.parameters} parameters; torque on held-out "
+        f"motions predicted to {100 * dynamics.held_out.relative_error:.1f} %"
+        + ("" if real is None else f", by the real bodies in the URDF to {100 * real:.1f} %")
+    )
 
 
 @app.command()

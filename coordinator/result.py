@@ -210,7 +210,8 @@ class VerdictPart(Part):
 class DynamicsPart(Part):
     """The inertial parameters; see `dynamics.regressor` for the order and frame of `phi`.
 
-    `phi` predicts torques but need not be of real bodies: those are `bodies`.
+    `phi` predicts torques but need not be of real bodies: those are `bodies`. words say what is known, body
+    by body.
     """
 
     phi: list[float]
@@ -224,6 +225,7 @@ class DynamicsPart(Part):
     bodies: BodiesPart | None = None
     base_parameters: list[BaseParameterPart] = []
     verdicts: list[VerdictPart] = []
+    words: list[str] = []
 
 
 class Result(Part):

@@ -249,6 +249,7 @@ def _dynamics(
         bodies=_bodies(bodies) if bodies is not None else None,
         base_parameters=_base_parameters(bodies) if bodies is not None else [],
         verdicts=_verdicts(bodies) if bodies is not None else [],
+        words=bodies.words() if bodies is not None else [],
     )
 
 

@@ -83,9 +83,7 @@ def robot_bodies(
     base = base_parameters(into_frames(rows, homes), target, inertial_columns(joints), max_sigma=MAX_SIGMA_KG)
     fit, note = None, ""
     try:
-        # One noise for all joints: least squares weighs them alike too, so that their errors compare.
-        common = np.full(joints, np.sqrt(np.mean(sigma**2)))
-        fit = fit_physical(information, module_prior(chain, types), common, independent_fraction)
+        fit = fit_physical(information, module_prior(chain, types), least_squares, independent_fraction)
     except NotSolvedError as error:
         note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
     if fit is None:

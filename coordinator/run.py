@@ -300,7 +300,7 @@ class Run:
 def write_outputs(out: Path, found: Identified) -> None:
     """Write everything that follows from a recording into a folder, each file whole or not at all."""
     write_result(out / RESULT, found.result)
-    phi = found.inertia.phi if found.inertia is not None else None
+    phi = found.real_phi
     types = [module_type(found.result.types[s]) for s in found.result.serials]
     write_urdf(out / URDF, found.kinematics.fit.chain, phi, found.result.robot, types)
     write_hrdf(out / HRDF, found.kinematics.fit.chain, types, phi, found.result.robot)

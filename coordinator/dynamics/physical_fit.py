@@ -25,14 +25,15 @@ from scipy.optimize import brentq
 from coordinator.chain import Array
 from coordinator.dynamics.base_parameters import whitened
 from coordinator.dynamics.consistency import parameter_transform, pseudo_inertia
-from coordinator.dynamics.identification import RANK_TOLERANCE
+from coordinator.dynamics.identification import InertialFit
 from coordinator.dynamics.information import JointInformation
 from coordinator.dynamics.regressor import PER_BODY
 
-# Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 1 is the belief that a body's distribution of
-# mass is known to its own size: rods may be twice as heavy, bodies twice as long.
-# The weaker ones are tried where that costs too much.
-WEIGHTS = (1.0, 0.1, 0.01, 1e-3)
+# Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 10 is the belief that a body's distribution of
+# mass is known to about 30 %: modules better, links worse. What no model has, friction and springs, is no
+# white noise, and a weaker prior buys it off with bodies of tons: weaker ones are for where this one costs
+# too much.
+WEIGHTS = (10.0, 1.0, 0.1, 0.01)
 # How much the relative torque error may grow from least squares' for the prior's sake: half of what is
 # promised for motions that were not fitted, because those are another sample of the same.
 MOST_COST = 5e-4
@@ -64,7 +65,7 @@ class PhysicalFit(NamedTuple):
         small where the prior holds, so compare `InertialFit.covariance`.
     pseudo: (n, 4, 4) the bodies' pseudo-inertias, in the root frame. divergence: (n,) from the prior.
     weight: of the prior. error: relative torque error |e| / |tau| of the fit. least_squares_error: that of
-        least squares with the same weights of the joints, which no bodies can fall below.
+        least squares, which leaves alone what the noise hides.
     """
 
     phi: Array
@@ -77,7 +78,10 @@ class PhysicalFit(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """How much more of the torque is left unexplained than by least squares, as a share of |tau|."""
+        """How much more of the torque is left unexplained than by least squares, as a share of |tau|.
+
+        Negative where the prior gives directions a say that least squares leaves to the noise.
+        """
         return self.error - self.least_squares_error
 
 
@@ -93,21 +97,22 @@ class Solution(NamedTuple):
 def fit_physical(
     information: Sequence[JointInformation],
     prior: ArrayLike,
-    sigma_nm: ArrayLike,
+    least_squares: InertialFit,
     independent_fraction: float = 1.0,
     most_cost: float = MOST_COST,
 ) -> PhysicalFit:
     """Fit real bodies to the torques of all joints.
 
     The prior has the largest of `WEIGHTS` with which the torques are explained worse than by least squares by
-    at most `most_cost`; if none is, because friction is missing in the model for example, then worse than by
-    the best real bodies.
+    at most `most_cost`, or by no more than the noise that least squares fits; if none is, because friction is
+    missing in the model for example, then worse than by the best real bodies by at most `most_cost`.
 
     Args:
         information: per joint of n.
         prior: (n, 4, 4) pseudo-inertias in the root frame at q = 0 (`parameter_prior.module_prior`).
-        sigma_nm: (n,) noise of the torques, which weighs the joints and says how much the data outweigh the
-            prior. The same for all joints makes the error comparable to that of unweighted least squares.
+        least_squares: what is fitted without bodies to the same information. Its noise says how much the data
+            outweigh the prior; all joints count alike, as in unweighted least squares, so that the errors of
+            the two compare.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         most_cost: see above; a share of |tau|.
 
@@ -119,15 +124,20 @@ def fit_physical(
     size = float(np.sqrt(sum(piece.z @ piece.z + piece.rest for piece in information)))
     if not size > 0.0:
         raise ValueError("all torques are zero: no bodies explain them")
-    least = _FINEST * size / np.sqrt(sum(piece.samples for piece in information))
-    sigma = np.maximum(np.asarray(sigma_nm, dtype=float), least)
+    rows, target = whitened(
+        information, _common_sigma(information, least_squares, size), independent_fraction
+    )
+    best = _relative_error(information, least_squares.phi, size)
+    # Least squares fits its own noise too: by so much the true bodies themselves would be worse.
+    sigma = _common_sigma(information, least_squares, size)
     rows, target = whitened(information, sigma, independent_fraction)
-    best = _relative_error(information, _least_squares(rows, target, bodies), size)
+    own = least_squares.rank * float(sigma[0]) ** 2 / independent_fraction
+    allowed = max(best + most_cost, float(np.hypot(best, np.sqrt(own) / size)))
     tried: list[tuple[Solution, float, float]] = []
     for weight in WEIGHTS:
         found = physically_consistent(rows, target, bodies, weight)
         tried.append((found, weight, _relative_error(information, found.x, size)))
-        if tried[-1][2] - best <= most_cost:
+        if tried[-1][2] <= allowed:
             break
     else:
         # No real bodies do as well as least squares: the model lacks something. What the prior adds to their
@@ -289,11 +299,10 @@ def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float
     return _Problem(square[:, :-1], square[:, -1], scale, len(bodies), weight, weight)
 
 
-def _least_squares(rows: Array, target: Array, prior: Array) -> Array:
-    """Return some parameters of the smallest misfit."""
-    problem = _problem(rows, target, prior, 1.0)
-    found = np.linalg.lstsq(problem.triangle, problem.target, rcond=RANK_TOLERANCE)[0]
-    return np.asarray(problem.scale @ found)
+def _common_sigma(information: Sequence[JointInformation], fit: InertialFit, size: float) -> Array:
+    least = _FINEST * size / np.sqrt(sum(piece.samples for piece in information))
+    common = max(float(np.sqrt(np.mean(fit.torque_sigma_nm**2))), least)
+    return np.full(len(information), common)
 
 
 def _relative_error(information: Sequence[JointInformation], phi: Array, size: float) -> float:

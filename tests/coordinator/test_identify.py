@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ import pytest
 from coordinator.identify import IdentificationError, identify, identify_kinematics, write_held_out
 from coordinator.journal import JournalEvent
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
+from coordinator.run import write_outputs
 from coordinator.session_file import read_session
 from module_agent.wire.keys import Leaf, parse
 from sim.robot_file import load_robot
-from sim.robot_tree import true_chain
+from sim.robot_tree import true_chain, true_inertia
 
 BASE, TIP = "X-00009", "X-00010"
 # One process makes the recording that all tests here work on.
@@ -74,6 +76,43 @@ def test_the_arm_is_found_with_its_inertia_and_predicts_what_it_was_not_fitted_t
             ("serials", "t_ns", "session_ns", "q_rad", "tau_measured_nm", "tau_predicted_nm")
         )
         assert file["t_ns"].shape == file["tau_measured_nm"].shape
+
+
+def test_the_bodies_in_the_files_are_real_and_predict_as_well(run: list[Entry], tmp_path: Path) -> None:
+    found = identify(_recorded(run))
+    assert found.bodies is not None
+    assert found.bodies.held_out_error is not None
+    assert found.held_out is not None
+    assert found.bodies.held_out_error < found.held_out.error.overall + 1e-3
+    write_outputs(tmp_path, found)
+    assert "nearest real body" not in (tmp_path / "robot.urdf").read_text()
+    model = ElementTree.parse(tmp_path / "robot.urdf")
+    masses = [float(mass.get("value", "nan")) for mass in model.iter("mass")]
+    assert found.result.dynamics is not None
+    assert found.result.dynamics.bodies is not None
+    assert masses == pytest.approx([body.mass_kg for body in found.result.dynamics.bodies.bodies])
+    # Torques show no mass of an arm on one moving joint; what modules weigh is near all the same.
+    for mass, true in zip(masses, true_inertia(load_robot("thesis_171_vertical"))[:, 0], strict=True):
+        assert 0.3 < mass / true < 3.0
+
+
+def test_the_result_says_what_is_known_of_every_parameter(run: list[Entry]) -> None:
+    dynamics = identify(_recorded(run)).result.dynamics
+    assert dynamics is not None
+    assert len(dynamics.base_parameters) == dynamics.rank
+    assert len(dynamics.verdicts) == dynamics.parameters == 20
+    sums = dynamics.base_parameters
+    alone = [v for v in dynamics.verdicts if any(sums[place].words == v.parameter for place in v.sums)]
+    assert alone
+    for verdict in alone:
+        # Known by itself: the one sum that it is in is it.
+        (place,) = verdict.sums
+        assert (sums[place].value, sums[place].sigma) == (verdict.value, verdict.sigma)
+        relative = sums[place].relative_sigma
+        assert relative is not None
+        assert verdict.verdict == ("identified" if relative <= 0.1 else "weak")
+    assert {v.serial for v in dynamics.verdicts} == {BASE, TIP}
+    assert len(dynamics.words) == 3
 
 
 def test_the_axis_of_the_joint_and_gravity_stand_as_in_the_robot(run: list[Entry]) -> None:
