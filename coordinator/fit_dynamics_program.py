@@ -10,7 +10,7 @@ import typer
 from coordinator.command_options import fail
 from coordinator.dynamics.drive_terms import TERMS, USUAL_TERMS, Term
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
-from coordinator.offline.data_file import DataFileError, JointLog, read_data
+from coordinator.offline.data_file import DataFileError, JointLog, in_two, read_data
 from coordinator.offline.filtered_log import filtered_log, usual_cutoff_hz
 from coordinator.offline.fit_report import write_report
 from coordinator.offline.fit_tables import notes, tables
@@ -42,6 +42,14 @@ def fit_dynamics(
         typer.Option(help="Two joints that share a drive, by number or name: 5,6. Repeat for several."),
     ] = None,
     robust: Annotated[bool, typer.Option("--robust", help="Huber's weights: outliers count little.")] = False,
+    instruments: Annotated[
+        bool,
+        typer.Option(
+            "--instruments",
+            help="Instrumental variables: every other sample judges the rest, so that the noise of encoders "
+            "does not make inertias too small. Uses half of the samples.",
+        ),
+    ] = False,
     cutoff: Annotated[
         float | None, typer.Option(help="Low-pass over motion and torque [Hz]; by the motion if not given.")
     ] = None,
@@ -70,7 +78,7 @@ def fit_dynamics(
         robot, log = _read(urdf, data, gravity)
         choice = ModelChoice(_terms(terms), _pairs(robot, coupled or ()), robust, slow, mask)
         step("low-pass, and every column of every sample")
-        posed = _posed(robot, log, choice, cutoff)
+        posed = _posed(robot, log, choice, cutoff, instruments)
         try:
             report = report_of(urdf, data, log, posed, step)
         except ValueError as error:
@@ -96,9 +104,15 @@ def _read(urdf: Path, data: Path, gravity: str) -> tuple[UrdfRobot, JointLog]:
         fail(f"{error.filename}: {error.strerror}", EXIT_USAGE)
 
 
-def _posed(robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff: float | None) -> Problem:
+def _posed(
+    robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff: float | None, instruments: bool
+) -> Problem:
     try:
-        return problem(robot, filtered_log(log, usual_cutoff_hz(log) if cutoff is None else cutoff), choice)
+        cutoff_hz = usual_cutoff_hz(log) if cutoff is None else cutoff
+        if not instruments:
+            return problem(robot, filtered_log(log, cutoff_hz), choice)
+        one, again = (filtered_log(half, cutoff_hz) for half in in_two(log))
+        return problem(robot, one, choice, again)
     except ValueError as error:
         fail(error, EXIT_USAGE)
 

@@ -55,6 +55,37 @@ class _Table(NamedTuple):
     row: Callable[[int], str]
 
 
+def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
+    """Return the recording by every other sample, and the same motion at the same times by the others.
+
+    White noise of an encoder in the one is independent of that in the other. The others are interpolated to
+    the times of the first, which at their rate is exact for what a low-pass well below it leaves.
+    """
+    count = (len(log.q_rad) - 1) // 2
+    step_ns = NS_PER_S / log.rate_hz
+    odd_ns = np.round(np.arange(0, 2 * count + 1, 2) * step_ns).astype(np.int64)
+    even_ns = np.round(np.arange(1, 2 * count, 2) * step_ns).astype(np.int64)
+    signals = [log.q_rad, log.tau_nm, *([] if log.qd_rad_s is None else [log.qd_rad_s])]
+    first = [_frozen(signal[1 : 2 * count : 2]) for signal in signals]
+    gap_ns = int(np.ceil(3.0 * step_ns))
+    others = [
+        _frozen(resample([odd_ns], [signal[0 : 2 * count + 1 : 2]], even_ns, max_gap_ns=gap_ns)[:, 0])
+        for signal in signals
+    ]
+    return _half(log, first), _half(log, others)
+
+
+def _half(log: JointLog, signals: Sequence[Array]) -> JointLog:
+    velocity = signals[2] if len(signals) > 2 else None
+    return JointLog(0.5 * log.rate_hz, signals[0], velocity, signals[1], log.resampled)
+
+
+def _frozen(signal: Array) -> Array:
+    copy = np.array(signal)
+    copy.flags.writeable = False
+    return copy
+
+
 def read_data(path: Path, joints: Sequence[str]) -> JointLog:
     """Return the recording in a file, its columns in the order of `joints`.
 

@@ -127,12 +127,16 @@ class JointNoisePart(Part):
 
 
 class FitPart(Part):
-    """The fit to the whole recording: rank and condition of the weighted regressor, parameters, residuals."""
+    """The fit to the whole recording: rank and condition of the weighted regressor, parameters, residuals.
+
+    robust: by Huber's weights. instruments: by instrumental variables, see `WeightedFit`.
+    """
 
     parameters: int
     rank: int
     condition: float
     robust: bool
+    instruments: bool
     terms: list[str]
     coupled: list[list[str]]
     independent_samples: float

@@ -76,6 +76,7 @@ def fit_part(problem: Problem, some: slice) -> WeightedFit:
         problem.moving[some],
         problem.choice.robust,
         problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
+        None if problem.instruments is None else problem.instruments[some],
     )
 
 

@@ -140,6 +140,7 @@ def _fit_part(problem: Problem, fit: WeightedFit) -> FitPart:
         rank=fit.rank,
         condition=fit.condition,
         robust=problem.choice.robust,
+        instruments=problem.instruments is not None,
         terms=list(problem.choice.terms),
         coupled=[[names[i], names[j]] for i, j in problem.choice.coupled],
         independent_samples=fit.independent_samples,

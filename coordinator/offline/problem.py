@@ -40,7 +40,8 @@ class Problem(NamedTuple):
     """m samples of n joints and p columns, the inertial ones first; arrays are read-only.
 
     moving: (m, n) samples whose joint turns fast enough that friction has a direction. Only these are
-        fitted to: what holds a joint that stands is decided by how it came to a stop.
+        fitted to: what holds a joint that stands is decided by how it came to a stop. instruments: (m, n, p)
+        the regressor by other measurements of the same motion, None for least squares.
     """
 
     robot: UrdfRobot
@@ -50,6 +51,7 @@ class Problem(NamedTuple):
     columns: Columns
     regressor: Array
     moving: NDArray[np.bool_]
+    instruments: Array | None
 
     @property
     def inertial(self) -> int:
@@ -73,11 +75,18 @@ class Problem(NamedTuple):
                 np.array(preferred, dtype=np.int64),
             ),
             regressor=self.regressor[..., at],
+            instruments=None if self.instruments is None else self.instruments[..., at],
         )
 
 
-def problem(robot: UrdfRobot, log: FilteredLog, choice: ModelChoice) -> Problem:
+def problem(
+    robot: UrdfRobot, log: FilteredLog, choice: ModelChoice, again: FilteredLog | None = None
+) -> Problem:
     """Return the columns of all samples of a recording.
+
+    Args:
+        robot, log, choice: what moved, what was recorded, and what the model has.
+        again: the same motion at the same times by other measurements, for instruments (`in_two`).
 
     Raises:
         ValueError: terms or pairs that do not exist, parts of speed out of range, or a joint that never
@@ -90,13 +99,27 @@ def problem(robot: UrdfRobot, log: FilteredLog, choice: ModelChoice) -> Problem:
     if (still := np.flatnonzero(top_rad_s < 1e-6)).size:
         raise ValueError(f"joint {robot.chain.serials[still[0]]!r} never moves; nothing shows its friction")
     drives = drive_columns(len(robot.bodies), choice.terms, choice.coupled)
-    inertial = torque_regressor(robot.chain, log.q_rad, log.qd_rad_s, log.qdd_rad_s2)
-    further = drive_regressor(drives, _signals(drives, log, choice.slow_part * top_rad_s), len(robot.bodies))
-    regressor = np.concatenate([inertial, further], axis=2)
+    slow_rad_s = choice.slow_part * top_rad_s
     moving = np.abs(log.qd_rad_s) > choice.mask_part * top_rad_s
-    regressor.flags.writeable = moving.flags.writeable = False
-    columns = inertial_columns(len(robot.bodies)).beside([drive.name for drive in drives])
-    return Problem(robot, log, choice, drives, columns, regressor, moving)
+    moving.flags.writeable = False
+    return Problem(
+        robot=robot,
+        log=log,
+        choice=choice,
+        drives=drives,
+        columns=inertial_columns(len(robot.bodies)).beside([drive.name for drive in drives]),
+        regressor=_regressor(robot, drives, log, slow_rad_s),
+        moving=moving,
+        instruments=None if again is None else _regressor(robot, drives, again, slow_rad_s),
+    )
+
+
+def _regressor(robot: UrdfRobot, drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
+    inertial = torque_regressor(robot.chain, log.q_rad, log.qd_rad_s, log.qdd_rad_s2)
+    further = drive_regressor(drives, _signals(drives, log, slow_rad_s), len(robot.bodies))
+    found = np.concatenate([inertial, further], axis=2)
+    found.flags.writeable = False
+    return found
 
 
 def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:

@@ -104,6 +104,16 @@ def test_the_tables_say_what_the_file_says(tmp_path: Path) -> None:
     assert [gain["without"] for gain in report["gains"]] == ["viscous"]
 
 
+def test_instruments_are_used_when_asked_for(tmp_path: Path) -> None:
+    files = write_files(tmp_path)
+    done = called(*files, "--instruments", "--json", str(tmp_path / "fit.json"))
+    assert done.exit_code == 0, done.output
+    found = FitReport.model_validate_json((tmp_path / "fit.json").read_text())
+    assert found.fit.instruments
+    hanging = next(part for part in found.fit.base_parameters if part.words == "m2 c2z")
+    assert hanging.value == pytest.approx(-0.1, abs=4.0 * hanging.sigma)
+
+
 def test_gravity_is_what_one_says(tmp_path: Path) -> None:
     files = write_files(tmp_path)
     found = []

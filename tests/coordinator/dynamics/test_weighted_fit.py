@@ -101,6 +101,33 @@ def test_what_no_row_shows_stays_zero_and_is_not_counted(rng: Generator) -> None
     assert fit.parameters[0] + fit.parameters[3] == pytest.approx(TRUTH[0])
 
 
+def test_instruments_have_no_bias_where_noise_in_the_regressor_makes_everything_too_small() -> None:
+    rng = default_rng(6)
+    true = np.sqrt(0.5) * rng.normal(size=(4000, 2, 3))
+    # Noise as large as the motion: least squares finds the share of the motion's power, one half.
+    one, other = true + np.sqrt(0.5) * rng.normal(size=(2, *true.shape))
+    tau = true @ TRUTH + 0.01 * rng.normal(size=true.shape[:2])
+    plain = fit_weighted(one, tau, np.ones(3))
+    tooled = fit_weighted(one, tau, np.ones(3), instruments=other)
+    np.testing.assert_allclose(plain.parameters / TRUTH, 0.5, atol=0.06)
+    sigma = np.sqrt(np.diagonal(tooled.covariance))
+    assert (np.abs(tooled.parameters - TRUTH) < 4.0 * sigma).all()
+    # 8000 rows with noise of about 1.6 on columns of power one half: 1.6 / sqrt(8000 / 2) = 2.5 %.
+    assert (sigma < 0.05).all()
+    # What is handed on holds the same answer.
+    np.testing.assert_allclose(np.linalg.solve(tooled.rows, tooled.target), tooled.parameters, rtol=1e-9)
+
+
+def test_instruments_that_are_the_regressor_are_least_squares(rng: Generator) -> None:
+    y = smooth_columns(rng, 300)
+    tau = y @ TRUTH + 0.1 * rng.normal(size=(300, 2))
+    plain, tooled = (fit_weighted(y, tau, np.ones(3), instruments=z) for z in (None, y))
+    np.testing.assert_allclose(tooled.parameters, plain.parameters, rtol=1e-9)
+    np.testing.assert_allclose(tooled.covariance, plain.covariance, rtol=1e-6)
+    with pytest.raises(ValueError, match="must be finite and of the regressor's shape"):
+        fit_weighted(y, tau, np.ones(3), instruments=y[:10])
+
+
 def test_too_little_to_fit_is_said_joint_by_joint(rng: Generator) -> None:
     y = smooth_columns(rng, 50)
     used = np.ones((50, 2), bool)

@@ -7,7 +7,7 @@ import pytest
 from numpy.random import Generator, default_rng
 
 from coordinator.chain import Array
-from coordinator.offline.data_file import DataFileError, read_data
+from coordinator.offline.data_file import DataFileError, JointLog, in_two, read_data
 
 JOINTS = ("shoulder", "elbow")
 HEADER = "t_s,q_elbow_rad,q_shoulder_rad,note,tau_elbow_nm,tau_shoulder_nm"
@@ -72,6 +72,24 @@ def test_a_motion_on_jittering_times_is_that_on_even_ones(tmp_path: Path, rng: G
     expected = np.sin(2.0 * np.pi * 1.5 * (times[0] + np.arange(400) / log.rate_hz))
     # A cubic spline at 130 samples a period: 1e-6 inside, worse at the ends, where it is one-sided.
     np.testing.assert_allclose(log.q_rad[5:-5, 0], expected[5:-5], atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [401, 400])
+def test_every_other_sample_shows_the_same_motion_with_noise_of_its_own(rng: Generator, count: int) -> None:
+    t = np.arange(count) / 400.0
+    wave = np.stack([np.sin(2.0 * np.pi * 3.0 * t), np.cos(2.0 * np.pi * 3.0 * t)], axis=1)
+    noise = 0.01 * rng.normal(size=wave.shape)
+    clean = in_two(JointLog(400.0, wave, 2.0 * wave, wave, False))
+    noisy = in_two(JointLog(400.0, wave + noise, None, wave, False))
+    assert clean[0].rate_hz == 200.0
+    assert len(clean[0].q_rad) == len(clean[1].q_rad) == (count - 1) // 2
+    # A cubic spline at 67 samples a period: (2 pi / 67)^4 / 384 inside, some ten times that at the ends.
+    np.testing.assert_allclose(clean[0].q_rad, clean[1].q_rad, atol=1e-5)
+    assert clean[1].qd_rad_s is not None
+    np.testing.assert_allclose(clean[1].qd_rad_s, 2.0 * clean[1].q_rad, rtol=1e-9, atol=1e-12)
+    one, other = (found.q_rad - first.q_rad for found, first in zip(noisy, clean, strict=True))
+    # Correlation of 400 pairs of independent numbers: 1 / sqrt(400), times four.
+    assert abs(np.corrcoef(one.ravel(), other.ravel())[0, 1]) < 0.2
 
 
 @pytest.mark.parametrize(

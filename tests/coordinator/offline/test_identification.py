@@ -4,13 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from coordinator.dynamics.drive_terms import USUAL_TERMS
-from coordinator.offline.data_file import JointLog, read_data
+from coordinator.offline.data_file import JointLog, in_two, read_data
 from coordinator.offline.filtered_log import filtered_log, usual_cutoff_hz
 from coordinator.offline.fit_report import ErrorPart, FitReport
 from coordinator.offline.held_out import fit_part, fitted, halves, held_out_errors
-from coordinator.offline.identification import report_of
+from coordinator.offline.identification import named, report_of
 from coordinator.offline.problem import ModelChoice, Problem, problem
 from coordinator.offline.urdf_chain import read_urdf
 
@@ -32,6 +33,7 @@ TRUE_DRIVES = {
     "Fc2+3": 0.4,
     "Ia2+3": 0.01,
 }
+RATE_HZ = 400.0
 SHARED = ModelChoice(coupled=((1, 2),))
 
 
@@ -141,6 +143,31 @@ def test_terms_left_out_are_left_out_of_everything(recording) -> None:  # type: 
     assert overall(bare) > 0.2
 
 
+def test_instruments_find_the_inertia_that_a_noisy_encoder_hides(recording) -> None:  # type: ignore[no-untyped-def]
+    robot = read_urdf(recording.urdf)
+    # 0.1 mrad is an encoder of 14 bits; the cut-off is far above the motion, which nobody knows beforehand.
+    shaken = recording.q_rad + 1e-4 * default_rng(5).normal(size=recording.q_rad.shape)
+    log, cutoff_hz = JointLog(RATE_HZ, shaken, None, recording.tau_nm, False), 60.0
+    one, again = (filtered_log(half, cutoff_hz) for half in in_two(log))
+    plain, tooled = (
+        problem(robot, filtered_log(log, cutoff_hz), SHARED),
+        problem(robot, one, SHARED, again),
+    )
+    turned = []
+    for some in (plain, tooled):
+        found = named(some, fit_part(some, slice(0, len(some.log.tau_nm))))
+        i = next(i for i in range(found.rank) if found.words(i).startswith("Ia1 + I1zz"))
+        turned.append((float(found.value[i]), float(found.sigma[i])))
+    # What stands upright turns with 0.15 of the motor, 0.025 of its own and the forearm and hand: the same
+    # fit at 10 Hz.
+    _, slow = posed(recording.urdf, recording.npz, SHARED)
+    known = named(slow, fit_part(slow, slice(0, len(slow.log.tau_nm))))
+    truth = next(float(known.value[i]) for i in range(known.rank) if known.words(i).startswith("Ia1 + I1zz"))
+    assert turned[0][0] < 0.85 * truth
+    assert turned[1][0] == pytest.approx(truth, abs=4.0 * turned[1][1])
+    assert turned[1][0] == pytest.approx(truth, rel=0.05)
+
+
 def test_no_torque_of_the_held_out_half_reaches_its_own_prediction(recording) -> None:  # type: ignore[no-untyped-def]
     _, found = posed(recording.urdf, recording.npz, SHARED)
     first, second = halves(len(found.log.tau_nm), found.log.settling)
@@ -178,7 +205,7 @@ def test_a_joint_that_never_moves_is_named(recording) -> None:  # type: ignore[n
     robot = read_urdf(recording.urdf)
     still = recording.q_rad.copy()
     still[:, 1] = 0.3
-    log = JointLog(400.0, still, None, recording.tau_nm, False)
+    log = JointLog(RATE_HZ, still, None, recording.tau_nm, False)
     with pytest.raises(ValueError, match="joint 'elbow' never moves"):
         problem(robot, filtered_log(log, 10.0), SHARED)
 
