@@ -27,6 +27,7 @@ _MAD_TO_SIGMA = 1.4826
 # The window of the autocorrelation's sum, in correlation times (Sokal 1997, Monte Carlo methods, eq. 3.19).
 _WINDOW_TIMES = 5.0
 _MOST_ROUNDS, _SETTLED = 30, 1e-4
+_LEAST_NM = 1e-75
 
 
 class WeightedFit(NamedTuple):
@@ -59,18 +60,26 @@ class WeightedFit(NamedTuple):
         return float(np.sum(self.samples / self.correlation))
 
 
-class _Solution(NamedTuple):
-    """Of weighted rows: the solution (p,), inverse (p, rank) with the rows' own directions, U (m, n, rank).
+class _JointRows(NamedTuple):
+    """Rows that stand for all samples of a joint: regressor (k, p), torque (k,), instruments (k, p)."""
 
-    spread: (m, n, rank) what each row's noise adds to the solution along those directions: U, or what the
-        instruments make of it.
+    y: Array
+    tau: Array
+    z: Array
+
+
+class _Solution(NamedTuple):
+    """The solution (p,) of weighted rows, and its inverse (p, rank): their own directions, over their size.
+
+    hat: per joint (k, rank), orthonormal columns together. spread: per joint (k, rank) what the noise of a
+        row adds to the solution along those directions: `hat`, or what the instruments make of it.
     rows, target: the triangle and what belongs to it. condition: of the scaled rows.
     """
 
     parameters: Array
     inverse: Array
-    hat: Array
-    spread: Array
+    hat: list[Array]
+    spread: list[Array]
     rows: Array
     target: Array
     condition: float
@@ -107,15 +116,21 @@ def fit_weighted(
     if other is not None and (other.shape != y.shape or not np.isfinite(other).all()):
         raise ValueError(f"instruments {other.shape} must be finite and of the regressor's shape {y.shape}")
     weights, sigma = counted.astype(float), np.ones(tau.shape[1])
+    joints = _joint_rows(y, tau, other, weights)
     for _ in range(_MOST_ROUNDS):
-        solution = _solution(y, tau, weights / sigma, size, other)
-        before, residual = sigma, tau - y @ solution.parameters
-        sigma = _noise(residual, counted, np.sum(solution.hat**2, axis=(0, 2)), robust)
+        solution = _solution(joints, sigma, size, other is not None)
+        before = sigma
         if robust:
+            residual = tau - y @ solution.parameters
+            sigma = _robust_noise(residual, counted) * _freedom(solution, counted)
             weights = counted * _huber(residual / sigma)
+            joints = _joint_rows(y, tau, other, weights)
+        else:
+            sigma = _noise(joints, solution, counted) * _freedom(solution, counted)
         if np.abs(sigma / before - 1.0).max() < _SETTLED:
             break
-    correlation = np.maximum(correlation_times(np.where(counted, residual, np.nan)), least_correlation)
+    residual = np.where(counted, tau - y @ solution.parameters, np.nan)
+    correlation = np.maximum(correlation_times(residual), least_correlation)
     return _fit(solution, counted, weights, sigma, correlation)
 
 
@@ -123,7 +138,10 @@ def _fit(
     solution: _Solution, used: NDArray[np.bool_], weights: Array, sigma: Array, correlation: Array
 ) -> WeightedFit:
     # The rows' noise is 1, but so many of them count as one.
-    along = np.einsum("mni,mnj,n->ij", solution.spread, solution.spread, correlation, optimize=True)
+    along = sum(
+        (time * rows.T @ rows for time, rows in zip(correlation, solution.spread, strict=True)),
+        start=np.zeros((solution.inverse.shape[1],) * 2),
+    )
     samples = used.sum(axis=0, dtype=np.int64)
     fit = WeightedFit(
         parameters=solution.parameters,
@@ -166,35 +184,40 @@ def _correlation_time(residual: Array) -> float:
     return max(1.0, float(times[np.argmax(enough)] if enough.any() else times.max()))
 
 
-def _reduced(y: Array, tau: Array, weights: Array) -> tuple[Array, Array]:
-    """Return the triangle and the target of the weighted rows of all joints."""
-    triangles = []
+def _joint_rows(y: Array, tau: Array, other: Array | None, weights: Array) -> list[_JointRows]:
+    """Compress each joint's samples into the triangle of their QR, which keeps all products of columns."""
+    size = y.shape[2]
+    found = []
     for i in range(y.shape[1]):
         kept = weights[:, i] > 0.0
-        block = np.column_stack([y[kept, i], tau[kept, i]]) * weights[kept, i, None]
-        triangles.append(qr(block, mode="r", check_finite=False)[0][: block.shape[1]])
-    whole = qr(np.vstack(triangles), mode="r", check_finite=False)[0][: y.shape[2]]
-    return whole[:, :-1], whole[:, -1]
+        blocks = [y[kept, i], tau[kept, i, None], *([] if other is None else [other[kept, i]])]
+        rows = qr(np.hstack(blocks) * weights[kept, i, None], mode="r", check_finite=False)[0]
+        rows = rows[: rows.shape[1]]
+        found.append(_JointRows(rows[:, :size], rows[:, size], rows[:, size + 1 :]))
+    return found
 
 
-def _solution(y: Array, tau: Array, weights: Array, scale: Array, other: Array | None) -> _Solution:
-    rows, target = _reduced(y, tau, weights)
+def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool) -> _Solution:
+    stacked = [np.column_stack([joint.y, joint.tau]) / own for joint, own in zip(joints, sigma, strict=True)]
+    whole = qr(np.vstack(stacked), mode="r", check_finite=False)[0][: len(scale)]
+    rows, target = whole[:, :-1], whole[:, -1]
     _, values, right = np.linalg.svd(rows * scale, full_matrices=False)
     if not values[0] > 0.0:
         raise ValueError("the regressor is zero: without gravity or motion the torques say nothing")
     kept = values > RANK_TOLERANCE * values[0]
     inverse = scale[:, None] * right[kept].T / values[kept]
-    hat = (y @ inverse) * weights[..., None]
     condition = float(values[0] / values[kept][-1])
-    if other is None:
+    hat = [joint.y @ inverse / own for joint, own in zip(joints, sigma, strict=True)]
+    if not tooled:
         parameters = inverse @ ((rows @ inverse).T @ target)
         return _Solution(parameters, inverse, hat, hat, rows, target, condition)
     # Along the regressor's own directions, so that what it does not show stays zero: Z^T U c = Z^T tau.
-    tool = (other @ inverse) * weights[..., None]
-    seen = np.einsum("mni,mnj->ij", tool, hat, optimize=True)
-    spread = np.einsum("ij,mnj->mni", np.linalg.inv(seen), tool, optimize=True)
-    parameters = inverse @ np.einsum("mni,mn->i", spread, tau * weights, optimize=True)
-    return _Solution(parameters, inverse, hat, spread, rows, rows @ parameters, condition)
+    tools = np.vstack([joint.z @ inverse / own for joint, own in zip(joints, sigma, strict=True)])
+    torques = np.concatenate([joint.tau / own for joint, own in zip(joints, sigma, strict=True)])
+    spread = np.linalg.solve(tools.T @ np.vstack(hat), tools.T).T
+    parameters = inverse @ (spread.T @ torques)
+    ends = np.cumsum([len(joint.tau) for joint in joints])[:-1]
+    return _Solution(parameters, inverse, hat, np.split(spread, ends), rows, rows @ parameters, condition)
 
 
 def _huber(off: Array) -> Array:
@@ -203,19 +226,34 @@ def _huber(off: Array) -> Array:
     return found
 
 
-def _noise(residual: Array, used: NDArray[np.bool_], taken: Array, robust: bool) -> Array:
+def _noise(joints: list[_JointRows], solution: _Solution, used: NDArray[np.bool_]) -> Array:
+    """Return the rms of each joint's residual (n,)."""
+    left = [float(np.sum((joint.tau - joint.y @ solution.parameters) ** 2)) for joint in joints]
+    # Torques without noise leave rounding; weights must stay finite.
+    found: Array = np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _LEAST_NM)
+    return found
+
+
+def _robust_noise(residual: Array, used: NDArray[np.bool_]) -> Array:
+    """Return each joint's noise (n,) by the median of its residuals."""
+    middle = np.nanmedian(np.where(used, np.abs(residual), np.nan), axis=0)
+    found: Array = np.maximum(_MAD_TO_SIGMA * middle, _LEAST_NM)
+    return found
+
+
+def _freedom(solution: _Solution, used: NDArray[np.bool_]) -> Array:
+    """Return per joint what makes the standard deviation of the rms: the fit has taken degrees of freedom.
+
+    Those are the trace of the joint's part of the hat matrix U U^T.
+    """
     count = used.sum(axis=0)
+    taken = np.array([float(np.sum(rows**2)) for rows in solution.hat])
     if (short := np.flatnonzero(count - taken < 1.0)).size:
         raise ValueError(
             f"joint {short[0] + 1} has {count[short[0]]} samples for {taken[short[0]]:.0f} parameters; "
             "nothing is left to tell the noise from"
         )
-    if robust:
-        spread = np.nanmedian(np.where(used, np.abs(residual), np.nan), axis=0) * _MAD_TO_SIGMA
-    else:
-        spread = np.sqrt(np.sum(np.where(used, residual, 0.0) ** 2, axis=0) / count)
-    # Torques without noise leave rounding; weights must stay finite.
-    found: Array = np.maximum(spread * np.sqrt(count / (count - taken)), np.finfo(float).tiny ** 0.25)
+    found: Array = np.sqrt(count / (count - taken))
     return found
 
 
