@@ -11,7 +11,7 @@ from coordinator.command_options import fail
 from coordinator.dynamics.drive_terms import TERMS, USUAL_TERMS, Term
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
 from coordinator.offline.data_file import DataFileError, JointLog, in_two, read_data
-from coordinator.offline.filtered_log import filtered_log, usual_cutoff_hz
+from coordinator.offline.filtered_log import filtered_log, most_samples, usual_cutoff_hz
 from coordinator.offline.fit_report import write_report
 from coordinator.offline.fit_tables import notes, tables
 from coordinator.offline.identification import STEPS, report_of
@@ -109,9 +109,10 @@ def _posed(
 ) -> Problem:
     try:
         cutoff_hz = usual_cutoff_hz(log) if cutoff is None else cutoff
+        most = most_samples(len(robot.bodies))
         if not instruments:
-            return problem(robot, filtered_log(log, cutoff_hz), choice)
-        one, again = (filtered_log(half, cutoff_hz) for half in in_two(log))
+            return problem(robot, filtered_log(log, cutoff_hz, most), choice)
+        one, again = (filtered_log(half, cutoff_hz, most) for half in in_two(log))
         return problem(robot, one, choice, again)
     except ValueError as error:
         fail(error, EXIT_USAGE)

@@ -20,6 +20,10 @@ _MOTION_POWER, _HARMONICS = 0.99, 5.0
 # Samples kept per cut-off: half of that is three cut-offs, where the low-pass leaves 2e-4 of the amplitude to
 # fold back.
 _KEPT_PER_CUTOFF = 6.0
+# A regressor of so many entries has 120 MB, and a fit holds some copies; a joint brings about so many
+# columns. Of a longer recording neighbours are left out that say nearly the same.
+_MOST_ENTRIES = 1.5e7
+_COLUMNS_PER_JOINT = 15
 
 
 class FilteredLog(NamedTuple):
@@ -47,8 +51,9 @@ class FilteredLog(NamedTuple):
 
     def low_passed(self, fine: Array) -> Array:
         """Return a function (m', k) of the fine signals, low-passed as the torque is, at the kept samples."""
-        rate_hz, cutoff_hz = self.fine_rate_hz, self.cutoff_hz
-        return _thinned(zero_phase_low_pass(fine, rate_hz, cutoff_hz), rate_hz, cutoff_hz)
+        edge = settling_samples(self.fine_rate_hz, self.cutoff_hz)
+        filtered = zero_phase_low_pass(fine, self.fine_rate_hz, self.cutoff_hz)
+        return _thinned(filtered, edge, round(self.fine_rate_hz / self.rate_hz))
 
 
 def usual_cutoff_hz(log: JointLog) -> float:
@@ -69,8 +74,13 @@ def usual_cutoff_hz(log: JointLog) -> float:
     return float(min(_HARMONICS * max(highest, frequencies[1]), 0.2 * log.rate_hz))
 
 
-def filtered_log(log: JointLog, cutoff_hz: float) -> FilteredLog:
-    """Return a recording through one low-pass (`filtered_motion`).
+def most_samples(joints: int) -> int:
+    """Return how many samples of n joints a fit takes, so that their columns fit into memory."""
+    return int(_MOST_ENTRIES / (_COLUMNS_PER_JOINT * joints**2))
+
+
+def filtered_log(log: JointLog, cutoff_hz: float, most: int | None = None) -> FilteredLog:
+    """Return a recording through one low-pass (`filtered_motion`), with at most `most` samples.
 
     Raises:
         ValueError: a cut-off out of range, or too few samples for it.
@@ -80,11 +90,13 @@ def filtered_log(log: JointLog, cutoff_hz: float) -> FilteredLog:
     edge = settling_samples(log.rate_hz, cutoff_hz)
     raw = log.tau_nm[edge : len(log.tau_nm) - edge]
     size = float(np.linalg.norm(raw))
+    step = max(1, int(log.rate_hz / (_KEPT_PER_CUTOFF * cutoff_hz)))
+    if most is not None:
+        step = max(step, -(-len(raw) // most))
     q, qd, qdd, tau, tau_raw = (
-        _thinned(signal, log.rate_hz, cutoff_hz)
+        _thinned(signal, edge, step)
         for signal in (motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm, raw)
     )
-    step = _step(log.rate_hz, cutoff_hz)
     return FilteredLog(
         rate_hz=log.rate_hz / step,
         cutoff_hz=cutoff_hz,
@@ -101,16 +113,11 @@ def filtered_log(log: JointLog, cutoff_hz: float) -> FilteredLog:
     )
 
 
-def _thinned(fine: Array, rate_hz: float, cutoff_hz: float) -> Array:
+def _thinned(fine: Array, edge: int, step: int) -> Array:
     """Return some of the samples, without the ends, where what is filtered once more has not settled."""
-    edge = settling_samples(rate_hz, cutoff_hz)
     if len(fine) <= 2 * edge:
         raise ValueError(
-            f"{len(fine) / rate_hz:.3g} s are left, of which a cut-off of {cutoff_hz:.3g} Hz unsettles "
-            f"{2 * edge / rate_hz:.3g} s"
+            f"{len(fine) + 2 * edge} samples, of which the low-pass unsettles {4 * edge}; a longer recording "
+            "or a higher cut-off is needed"
         )
-    return fine[edge : len(fine) - edge : _step(rate_hz, cutoff_hz)]
-
-
-def _step(rate_hz: float, cutoff_hz: float) -> int:
-    return max(1, int(rate_hz / (_KEPT_PER_CUTOFF * cutoff_hz)))
+    return fine[edge : len(fine) - edge : step]

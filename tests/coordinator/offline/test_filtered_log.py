@@ -5,7 +5,7 @@ import pytest
 from numpy.random import default_rng
 
 from coordinator.offline.data_file import JointLog
-from coordinator.offline.filtered_log import filtered_log, usual_cutoff_hz
+from coordinator.offline.filtered_log import filtered_log, most_samples, usual_cutoff_hz
 
 RATE_HZ = 1000.0
 
@@ -58,6 +58,18 @@ def test_what_is_made_of_the_fine_signals_is_filtered_as_the_torque_is() -> None
     np.testing.assert_allclose(again[inner], found.tau_nm[inner], atol=0.05)
     # Without the low-pass the sign is off by all of its height at the reversals.
     assert np.abs(np.sign(found.qd_rad_s) - found.tau_nm)[inner].max() > 0.5
+
+
+def test_a_long_recording_is_thinned_until_it_fits() -> None:
+    whole, some = (filtered_log(waving(1.0), 10.0, most) for most in (None, 100))
+    assert len(whole.q_rad) > 400
+    assert 90 <= len(some.q_rad) <= 100
+    # It is the same motion, at the stated rate.
+    speed = np.gradient(some.q_rad[:, 0]) * some.rate_hz
+    assert np.abs(speed).max() == pytest.approx(np.abs(some.qd_rad_s[:, 0]).max(), rel=0.2)
+    square = np.sign(some.fine_qd_rad_s)
+    assert len(some.low_passed(square)) == len(some.q_rad)
+    assert most_samples(7) > 10_000
 
 
 def test_a_recording_too_short_for_its_cut_off_is_refused() -> None:
