@@ -182,8 +182,8 @@ class BodiesPart(Part):
 class BaseParameterPart(Part):
     """A sum of parameters that torques show, "m2 c2x + 0.225 (m3 + m4)", in SI units.
 
-    m, m c and I are of the bodies in the order of the chain, counted from 1, in the frames of the URDF's
-    links and about their origins. relative_sigma is None of a value of zero.
+    m, m c and I are of the bodies in the order of the chain, counted from 1, each in its own of
+    `DynamicsPart.frames` and about that frame's origin. relative_sigma is None of a value of zero.
     """
 
     words: str
@@ -211,7 +211,8 @@ class DynamicsPart(Part):
     """The inertial parameters; see `dynamics.regressor` for the order and frame of `phi`.
 
     `phi` predicts torques but need not be of real bodies: those are `bodies`. words say what is known, body
-    by body.
+    by body. frames are the poses (4, 4) at q = 0 in the root frame in which base parameters and verdicts are
+    worded: z along the joint's axis, x towards the next joint (`dynamics.joint_frames`).
     """
 
     phi: list[float]
@@ -226,6 +227,7 @@ class DynamicsPart(Part):
     base_parameters: list[BaseParameterPart] = []
     verdicts: list[VerdictPart] = []
     words: list[str] = []
+    frames: list[list[list[float]]] = []
 
 
 class Result(Part):

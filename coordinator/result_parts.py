@@ -250,6 +250,7 @@ def _dynamics(
         base_parameters=_base_parameters(bodies) if bodies is not None else [],
         verdicts=_verdicts(bodies) if bodies is not None else [],
         words=bodies.words() if bodies is not None else [],
+        frames=bodies.frames.tolist() if bodies is not None else [],
     )
 
 

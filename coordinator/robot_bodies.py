@@ -1,7 +1,8 @@
 """What torques and modules' make say together of a robot's bodies: real ones, and what is known of each.
 
 Base parameters and verdicts are from torques alone; the bodies explain the torques as well, and have the
-modules' known make where torques are silent. All parameters are in the links' frames of `urdf`.
+modules' known make where torques are silent. Parameters are worded in `joint_frames`, where they lump least;
+the bodies are in the links' frames of `urdf`.
 """
 
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from coordinator.dynamics.base_parameters import (
 from coordinator.dynamics.consistency import Body, body, parameter_transform
 from coordinator.dynamics.identification import MAX_SIGMA_KG, InertialFit
 from coordinator.dynamics.information import JointInformation
+from coordinator.dynamics.joint_frames import joint_frames
 from coordinator.dynamics.parameter_prior import module_prior
 from coordinator.dynamics.physical_fit import NotSolvedError, PhysicalFit, fit_physical
 from coordinator.dynamics.regressor import PER_BODY
@@ -36,12 +38,14 @@ _LEAST_SIGMA_NM = 1e-9
 class RobotBodies(NamedTuple):
     """The bodies of a robot of n joints.
 
-    base: the base parameters. verdicts: (10 n,) of every parameter. fit: the real bodies, None if none were
-    found. bodies: (n,) the same as masses, in the links' frames; empty if none were found. note: why.
+    frames: (n, 4, 4) of the words, in the root frame at q = 0. base: the base parameters. verdicts: (10 n,)
+    of every parameter. fit: the real bodies, None if none were found. bodies: (n,) the same as masses, in the
+    links' frames; empty if none were found. note: why.
     held_out_error: relative torque error of `fit` on motions that were not fitted, None without any.
     """
 
     serials: tuple[str, ...]
+    frames: Array
     base: BaseParameters
     verdicts: tuple[Verdict, ...]
     fit: PhysicalFit | None
@@ -77,21 +81,25 @@ def robot_bodies(
         ValueError: shapes that do not fit, or torques that say nothing.
     """
     joints = len(chain.serials)
-    homes = link_homes(chain)
+    frames = joint_frames(chain)
     sigma = np.maximum(least_squares.torque_sigma_nm, _LEAST_SIGMA_NM)
     rows, target = whitened(information, sigma, independent_fraction)
-    base = base_parameters(into_frames(rows, homes), target, inertial_columns(joints), max_sigma=MAX_SIGMA_KG)
+    base = base_parameters(
+        into_frames(rows, frames), target, inertial_columns(joints), max_sigma=MAX_SIGMA_KG
+    )
     fit, note = None, ""
     try:
         fit = fit_physical(information, module_prior(chain, types), least_squares, independent_fraction)
     except NotSolvedError as error:
         note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
     if fit is None:
-        return RobotBodies(chain.serials, base, verdicts(base, inertial_units(joints)), None, (), note)
-    into = block_diag(*(parameter_transform(np.linalg.inv(home)) for home in homes))
+        judged = verdicts(base, inertial_units(joints))
+        return RobotBodies(chain.serials, frames, base, judged, None, (), note)
+    into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
     informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
     judged = verdicts(base, inertial_units(joints), into @ fit.phi, informed_sigma)
-    return RobotBodies(chain.serials, base, judged, fit, _in_links(fit.pseudo, homes), note)
+    bodies = _in_links(fit.pseudo, link_homes(chain))
+    return RobotBodies(chain.serials, frames, base, judged, fit, bodies, note)
 
 
 def _in_links(pseudo: Array, homes: Array) -> tuple[Body, ...]:

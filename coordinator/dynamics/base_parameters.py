@@ -20,9 +20,9 @@ from coordinator.dynamics.information import JointInformation
 from coordinator.dynamics.regressor import PER_BODY
 
 # A column that keeps less than this of its length beside the columns chosen before it is passed over, so that
-# no grouping coefficient is a difference of nearly equal numbers. With 1e-2 more words begin with the
-# parameter that one expects, and coefficients reach some tens.
-INDEPENDENT_ABOVE = 0.05
+# coefficients do not exceed its reciprocal: a sum is named by what it mostly is. With motions that show all
+# that can be shown, any value between 0.05 and 0.25 chooses the same columns.
+INDEPENDENT_ABOVE = 0.25
 
 # Of a parameter's own scale. Geometry that was itself estimated tilts the groupings by about its errors.
 NEGLIGIBLE = 2e-3

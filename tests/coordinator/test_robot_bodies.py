@@ -9,7 +9,6 @@ from coordinator.dynamics.identification import solve_information
 from coordinator.dynamics.information import gather
 from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.robot_bodies import RobotBodies, robot_bodies
-from coordinator.urdf import link_homes
 from sim.robot_file import load_robot
 from sim.robot_tree import build_tree, true_chain, true_inertia
 
@@ -27,10 +26,8 @@ def found() -> RobotBodies:
 
 
 def test_base_parameters_are_within_their_deviations_of_the_built_robots(found: RobotBodies) -> None:
-    homes = link_homes(true_chain(ROBOT))
-    truth = np.concatenate(
-        [in_frame(home, phi) for home, phi in zip(homes, true_inertia(ROBOT), strict=True)]
-    )
+    pairs = zip(found.frames, true_inertia(ROBOT), strict=True)
+    truth = np.concatenate([in_frame(frame, phi) for frame, phi in pairs])
     pulls = (found.base.value - found.base.grouping @ truth) / found.base.sigma
     assert found.base.rank == 22
     assert np.abs(pulls).max() < 4.0
