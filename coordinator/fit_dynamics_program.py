@@ -14,8 +14,10 @@ from coordinator.offline.data_file import DataFileError, JointLog, in_two, read_
 from coordinator.offline.filtered_log import filtered_log, most_samples, usual_cutoff_hz
 from coordinator.offline.fit_report import write_report
 from coordinator.offline.fit_tables import notes, tables
-from coordinator.offline.identification import STEPS, report_of
+from coordinator.offline.fitted_urdf import friction_of, write_fitted_urdf
+from coordinator.offline.identification import STEPS, Identified, identified
 from coordinator.offline.problem import ModelChoice, Problem, problem
+from coordinator.offline.real_bodies import USUAL_TRUST
 from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, UrdfRobot, read_urdf
 from coordinator.terminal import Terminal, print_table
 
@@ -34,6 +36,13 @@ def fit_dynamics(
     json_file: Annotated[
         Path | None, typer.Option("--json", help="JSON file to write the report to.")
     ] = None,
+    fitted_urdf: Annotated[
+        Path | None,
+        typer.Option(help="File to write the URDF to with the real bodies and friction that were found."),
+    ] = None,
+    trust: Annotated[
+        float, typer.Option(help="How much the URDF's own inertias count for the real bodies.")
+    ] = USUAL_TRUST,
     terms: Annotated[
         str, typer.Option(help=f"Terms of the drives, of {', '.join(TERMS)}; or none.")
     ] = ",".join(USUAL_TERMS),
@@ -68,6 +77,12 @@ def fit_dynamics(
 
     Exit codes: 0 done, 1 the recording does not tell enough, 2 a file or an option is wrong.
     """
+    if not 0.0 < trust < float("inf"):
+        fail(f"trust {trust}: it must be a number above 0", EXIT_USAGE)
+    for path in (json_file, fitted_urdf):
+        # Said before the work, not after it.
+        if path is not None and not path.parent.is_dir():
+            fail(f"{path}: there is no folder {path.parent}", EXIT_USAGE)
     with Terminal(quiet) as terminal:
         numbers = count(1)
 
@@ -80,18 +95,27 @@ def fit_dynamics(
         step("low-pass, and every column of every sample")
         posed = _posed(robot, log, choice, cutoff, instruments)
         try:
-            report = report_of(urdf, data, log, posed, step)
+            found = identified(urdf, data, log, posed, step, trust)
         except ValueError as error:
             fail(f"{data}: {error}", EXIT_FAILED)
-    for line in notes(report):
+    for line in notes(found.report):
         terminal.note(line)
-    for table in tables(report):
+    for table in tables(found.report):
         print_table(table)
-    if json_file is not None:
-        try:
-            write_report(json_file, report)
-        except OSError as error:
-            fail(f"{json_file}: {error.strerror}", EXIT_USAGE)
+    try:
+        if json_file is not None:
+            write_report(json_file, found.report)
+        if fitted_urdf is not None:
+            _write_urdf(fitted_urdf, urdf, posed, found)
+    except OSError as error:
+        fail(f"{error.filename}: {error.strerror}", EXIT_USAGE)
+
+
+def _write_urdf(path: Path, given: Path, posed: Problem, found: Identified) -> None:
+    if found.real is None:
+        fail(f"{path}: not written, no real bodies: {found.report.fit.bodies_note}", EXIT_FAILED)
+    friction = friction_of(posed.drives, found.real.drives.tolist(), len(posed.robot.bodies))
+    write_fitted_urdf(path, given, posed.robot, found.real.bodies, friction)
 
 
 def _read(urdf: Path, data: Path, gravity: str) -> tuple[UrdfRobot, JointLog]:

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 SCHEMA = 1
 
-Model = Literal["fitted", "urdf", "drives_only", "mean"]
+Model = Literal["fitted", "bodies", "urdf", "drives_only", "mean"]
 Verdict = Literal["identified", "weak", "not told from zero"]
 
 
@@ -40,8 +40,9 @@ class DataPart(Part):
 class ErrorPart(Part):
     """A relative torque error |e| / |tau| on samples that were not fitted to; null where |tau| is zero.
 
-    model: `fitted`, `urdf` (the inertias that the URDF claims, no friction), `drives_only` (friction, offset
-    and motors without bodies), `mean` (the constant mean of the other half).
+    model: `fitted` (least squares), `bodies` (real bodies near the URDF's, and drives), `urdf` (the inertias
+    that the URDF claims, no friction), `drives_only` (friction, offset and motors without bodies), `mean`
+    (the constant mean of the other half).
     """
 
     model: Model
@@ -106,11 +107,21 @@ class BaseParameterPart(Part):
 
 
 class BodyPart(Part):
-    """Which parameters of a body are identified, weak, known only in sums with others, or without effect."""
+    """A body, the link right behind a joint and all that is fixed to it, in the link's frame.
+
+    words: which of its parameters are identified, weak, known only in sums with others, or without effect.
+    mass_kg, com_m, inertia_kg_m2: the real body that explains the torques; where these say nothing, it is as
+    the URDF claims. The inertia is about the centre of mass. null if no real bodies were fitted.
+    urdf_mass_kg: what the URDF claims.
+    """
 
     link: str
     joint: str
     words: str
+    mass_kg: float | None
+    com_m: list[float] | None
+    inertia_kg_m2: list[list[float]] | None
+    urdf_mass_kg: float | None
 
 
 class JointNoisePart(Part):
@@ -129,7 +140,8 @@ class JointNoisePart(Part):
 class FitPart(Part):
     """The fit to the whole recording: rank and condition of the weighted regressor, parameters, residuals.
 
-    robust: by Huber's weights. instruments: by instrumental variables, see `WeightedFit`.
+    bodies_note: why there are no real bodies, if there are none. robust: by Huber's weights. instruments: by
+    instrumental variables (`fit_weighted`).
     """
 
     parameters: int
@@ -142,6 +154,7 @@ class FitPart(Part):
     independent_samples: float
     base_parameters: list[BaseParameterPart]
     bodies: list[BodyPart]
+    bodies_note: str
     drives: list[TermPart]
     residuals: list[JointNoisePart]
 

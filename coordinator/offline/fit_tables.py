@@ -7,7 +7,8 @@ from rich.table import Table
 from coordinator.offline.fit_report import BaseParameterPart, ErrorPart, FitReport, Model, TermPart
 
 _MODEL_WORDS: dict[Model, str] = {
-    "fitted": "fitted",
+    "fitted": "least squares",
+    "bodies": "real bodies near the URDF's",
     "urdf": "the URDF's inertias, no friction",
     "drives_only": "friction and motors only",
     "mean": "constant mean",
@@ -41,8 +42,8 @@ def notes(report: FitReport) -> Iterator[str]:
         f"rank {fit.rank} of {fit.parameters} parameters, condition {fit.condition:.3g}; "
         f"{fit.independent_samples:.0f} independent samples"
     )
-    if not report.errors("urdf"):
-        yield "the URDF has no inertias; nothing is compared with them"
+    if fit.bodies_note:
+        yield f"no real bodies: {fit.bodies_note}"
 
 
 def _held_out(report: FitReport) -> Table:
@@ -145,10 +146,15 @@ def _base(report: FitReport) -> Table:
 
 
 def _bodies(report: FitReport) -> Table:
-    table = _table("Body by body", ("body", "turned by", "its parameters"), ())
+    table = _table("Body by body", ("body", "turned by", "its parameters"), ("mass [kg]", "URDF"))
     for i, body in enumerate(report.fit.bodies, start=1):
-        table.add_row(f"{i}: {body.link}", body.joint, body.words)
+        masses = (_mass(body.mass_kg), _mass(body.urdf_mass_kg))
+        table.add_row(f"{i}: {body.link}", body.joint, body.words, *masses)
     return table
+
+
+def _mass(mass_kg: float | None) -> str:
+    return "-" if mass_kg is None else f"{mass_kg:.3g}"
 
 
 def _both(report: FitReport, model: Model, torque: str, samples: str) -> ErrorPart:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -13,6 +14,7 @@ from coordinator.dynamics.base_parameters import (
     inertial_units,
     into_frames,
 )
+from coordinator.dynamics.physical_fit import NotSolvedError
 from coordinator.dynamics.regressor import PER_BODY
 from coordinator.dynamics.verdict import WEAK_ABOVE, verdicts, words_of_body
 from coordinator.dynamics.weighted_fit import WeightedFit
@@ -43,6 +45,13 @@ from coordinator.offline.held_out import (
     mean_torque,
 )
 from coordinator.offline.problem import Problem
+from coordinator.offline.real_bodies import (
+    USUAL_TRUST,
+    RealBodies,
+    by_real_bodies,
+    claimed_bodies,
+    real_bodies,
+)
 
 _TOLD_BELOW = 1.0
 # A term of no use passes a test at this level once in a hundred.
@@ -54,16 +63,29 @@ Step = Callable[[str], None]
 STEPS = 4
 
 
-def report_of(urdf: Path, data: Path, log: JointLog, problem: Problem, step: Step) -> FitReport:
-    """Return the report of a recording; `step` is told of each of the `STEPS` before it begins.
+class Identified(NamedTuple):
+    """The report, and the real bodies with the drives beside them; None where there are none."""
+
+    report: FitReport
+    real: RealBodies | None
+
+
+def identified(
+    urdf: Path, data: Path, log: JointLog, problem: Problem, step: Step, trust: float = USUAL_TRUST
+) -> Identified:
+    """Return what a recording tells; `step` is told of each of the `STEPS` before it begins.
+
+    `trust` is how much the URDF's own inertias count where real bodies are fitted (`physical_fit`).
 
     Raises:
         ValueError: too few samples for the parameters.
     """
     step("fit to the whole recording")
     fit = fit_part(problem, slice(0, len(problem.log.tau_nm)))
+    real, note = _real(problem, fit, trust)
     step("fit to each half, tried on the other")
-    held_out = [_error_part(name, e) for name, tried in _predictors(problem) for e in held_out_errors(*tried)]
+    models = _predictors(problem, trust if real is not None else None)
+    held_out = [_error_part(name, e) for name, tried in models for e in held_out_errors(*tried)]
     step("fit to ever longer parts")
     lengths = [
         LengthPart(seconds=p.seconds, all=p.all_samples, masked=p.masked) for p in length_curve(problem)
@@ -72,15 +94,16 @@ def report_of(urdf: Path, data: Path, log: JointLog, problem: Problem, step: Ste
     gains = [
         TermGainPart(without=g.without, all=g.all_samples, masked=g.masked) for g in gain_of_terms(problem)
     ]
-    return FitReport(
+    report = FitReport(
         urdf=str(urdf),
         data=str(data),
         recording=_data_part(log, problem),
         held_out=held_out,
         lengths=lengths,
         gains=gains,
-        fit=_fit_part(problem, fit),
+        fit=_fit_part(problem, fit, real, note),
     )
+    return Identified(report, real)
 
 
 def named(problem: Problem, fit: WeightedFit) -> BaseParameters:
@@ -96,8 +119,18 @@ def named(problem: Problem, fit: WeightedFit) -> BaseParameters:
     return found._replace(covariance=covariance)
 
 
-def _predictors(problem: Problem) -> list[tuple[Model, tuple[Problem, Predictor]]]:
+def _real(problem: Problem, fit: WeightedFit, trust: float) -> tuple[RealBodies | None, str]:
+    try:
+        return real_bodies(problem, fit, claimed_bodies(problem.robot), trust), ""
+    except (ValueError, NotSolvedError) as error:
+        return None, str(error)
+
+
+def _predictors(problem: Problem, trust: float | None) -> list[tuple[Model, tuple[Problem, Predictor]]]:
     tried: list[tuple[Model, tuple[Problem, Predictor]]] = [("fitted", (problem, fitted(problem)))]
+    if trust is not None:
+        prior = claimed_bodies(problem.robot)
+        tried.append(("bodies", (problem, by_real_bodies(problem, prior, trust))))
     if problem.robot.phi is not None:
         tried.append(("urdf", (problem, claimed(problem, problem.robot.phi))))
     if problem.drives:
@@ -132,7 +165,7 @@ def _data_part(log: JointLog, problem: Problem) -> DataPart:
     )
 
 
-def _fit_part(problem: Problem, fit: WeightedFit) -> FitPart:
+def _fit_part(problem: Problem, fit: WeightedFit, real: RealBodies | None, note: str) -> FitPart:
     found = named(problem, fit)
     names = problem.robot.chain.serials
     return FitPart(
@@ -145,7 +178,8 @@ def _fit_part(problem: Problem, fit: WeightedFit) -> FitPart:
         coupled=[[names[i], names[j]] for i, j in problem.choice.coupled],
         independent_samples=fit.independent_samples,
         base_parameters=_base_parts(problem, found),
-        bodies=_bodies(problem, found),
+        bodies=_bodies(problem, found, real),
+        bodies_note=note,
         drives=[_term_part(problem, fit, found, k) for k in range(len(problem.drives))],
         residuals=[
             JointNoisePart(
@@ -160,14 +194,24 @@ def _fit_part(problem: Problem, fit: WeightedFit) -> FitPart:
     )
 
 
-def _bodies(problem: Problem, found: BaseParameters) -> list[BodyPart]:
+def _bodies(problem: Problem, found: BaseParameters, real: RealBodies | None) -> list[BodyPart]:
     robot = problem.robot
     units = (*inertial_units(len(robot.bodies)), *(drive.unit for drive in problem.drives))
     judged = verdicts(found, units)
-    return [
-        BodyPart(link=link, joint=joint, words=words_of_body(judged[PER_BODY * i : PER_BODY * (i + 1)]))
-        for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True))
-    ]
+    parts = []
+    for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True)):
+        own = None if real is None else real.bodies[i]
+        part = BodyPart(
+            link=link,
+            joint=joint,
+            words=words_of_body(judged[PER_BODY * i : PER_BODY * (i + 1)]),
+            mass_kg=None if own is None else own.mass_kg,
+            com_m=None if own is None else own.com_m.tolist(),
+            inertia_kg_m2=None if own is None else own.inertia_kg_m2.tolist(),
+            urdf_mass_kg=None if robot.phi is None else float(robot.phi[PER_BODY * i]),
+        )
+        parts.append(part)
+    return parts
 
 
 def _base_parts(problem: Problem, found: BaseParameters) -> list[BaseParameterPart]:

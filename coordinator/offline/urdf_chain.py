@@ -32,6 +32,7 @@ class UrdfRobot(NamedTuple):
         before its children.
     bodies: names of the links right behind the joints.
     homes: (n, 4, 4) pose of every such link's frame at q = 0 in the root frame.
+    carried: all links that move with some joint.
     phi: (10 n,) the inertias of the file, as in `torque_regressor`: in the root frame at q = 0, of all
         links of a body together. None if no moving link has one.
     """
@@ -39,6 +40,7 @@ class UrdfRobot(NamedTuple):
     chain: Chain
     bodies: tuple[str, ...]
     homes: Array
+    carried: frozenset[str]
     phi: Array | None
 
 
@@ -101,7 +103,11 @@ def _robot(root: Element, gravity: Array) -> UrdfRobot:
         gravity=gravity,
     )
     return UrdfRobot(
-        chain, tuple(joint.child for joint in moving), homes, _inertias(links, placed, len(moving))
+        chain,
+        tuple(joint.child for joint in moving),
+        homes,
+        frozenset(link for link, (_, body) in placed.items() if body != BASE),
+        _inertias(links, placed, len(moving)),
     )
 
 

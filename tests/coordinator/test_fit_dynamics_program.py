@@ -114,6 +114,19 @@ def test_instruments_are_used_when_asked_for(tmp_path: Path) -> None:
     assert hanging.value == pytest.approx(-0.1, abs=4.0 * hanging.sigma)
 
 
+def test_a_urdf_without_masses_is_fitted_in_sums_and_not_written(tmp_path: Path) -> None:
+    files = write_files(tmp_path)
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text(urdf.read_text().replace('<mass value="1"/>', '<mass value="0"/>'))
+    out = tmp_path / "fitted.urdf"
+    done = called(*files, "--fitted-urdf", str(out))
+    assert done.exit_code == 1, done.output
+    said = " ".join(done.output.split())
+    assert "no real bodies: the URDF gives no mass to 'lower'; only sums of parameters are fitted" in said
+    assert "m2 c2z" in said
+    assert not out.exists()
+
+
 def test_gravity_is_what_one_says(tmp_path: Path) -> None:
     files = write_files(tmp_path)
     found = []
@@ -138,10 +151,11 @@ def test_gravity_is_what_one_says(tmp_path: Path) -> None:
         (("--gravity", "down"), "gravity 'down': it must be three numbers"),
         (("--gravity", "0,0,nan"), "gravity '0,0,nan': it must be three numbers"),
         (("--cutoff", "500"), "cutoff_hz 500.0 is outside 0 to 100.0"),
+        (("--trust", "0"), "trust 0.0: it must be a number above 0"),
         (("--mask", "2"), "the mask part of the top speed is 2.0; it must be between 0 and 1"),
         (("--data", "nowhere.csv"), "nowhere.csv: No such file or directory"),
         (("--urdf", "nowhere.urdf"), "nowhere.urdf: No such file or directory"),
-        (("--json", "/nowhere/fit.json"), "/nowhere/fit.json: No such file or directory"),
+        (("--json", "/nowhere/fit.json"), "/nowhere/fit.json: there is no folder /nowhere"),
     ],
 )
 def test_wrong_options_and_files_are_answered_with_what_is_right(
