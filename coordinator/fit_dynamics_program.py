@@ -22,67 +22,69 @@ from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, UrdfRobo
 from coordinator.terminal import Terminal, print_table
 
 _UP = ",".join(f"{part:g}" for part in STANDARD_GRAVITY)
+_USUAL_TERMS = ",".join(USUAL_TERMS)
+_USUAL = ModelChoice()
+
+
+_Urdf = Annotated[Path, typer.Option(help="URDF file: revolute, continuous and fixed joints.")]
+_Data = Annotated[
+    Path,
+    typer.Option(
+        help="CSV with t_s, q_JOINT_rad, tau_JOINT_nm and, if measured, qd_JOINT_rad_s; or npz with "
+        "position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s and joint_names."
+    ),
+]
+_Json = Annotated[Path | None, typer.Option("--json", help="JSON file to write the report to.")]
+_FittedUrdf = Annotated[
+    Path | None,
+    typer.Option(help="File to write the URDF to with the real bodies and friction that were found."),
+]
+_Trust = Annotated[float, typer.Option(help="How much the URDF's own inertias count for the real bodies.")]
+_Terms = Annotated[str, typer.Option(help=f"Terms of the drives, of {', '.join(TERMS)}; or none.")]
+_Coupled = Annotated[
+    list[str] | None,
+    typer.Option(help="Two joints that share a drive, by number or name: 5,6. Repeat for several."),
+]
+_Robust = Annotated[bool, typer.Option("--robust", help="Huber's weights: outliers count little.")]
+_Instruments = Annotated[
+    bool,
+    typer.Option(
+        "--instruments",
+        help="Instrumental variables: every other sample judges the rest, so that the noise of encoders "
+        "does not make inertias too small. Uses half of the samples.",
+    ),
+]
+_Cutoff = Annotated[
+    float | None, typer.Option(help="Low-pass over motion and torque [Hz]; by the motion if not given.")
+]
+_Gravity = Annotated[
+    str, typer.Option(help="Specific force of rest in the root link's frame [m/s^2]: upwards, 9.81 long.")
+]
+_Mask = Annotated[float, typer.Option(help="Part of a joint's top speed below which samples are masked.")]
+_Slow = Annotated[float, typer.Option(help="Part of a joint's top speed below which Coulomb friction fades.")]
 
 
 def fit_dynamics(
-    urdf: Annotated[Path, typer.Option(help="URDF file: revolute, continuous and fixed joints.")],
-    data: Annotated[
-        Path,
-        typer.Option(
-            help="CSV with t_s, q_JOINT_rad, tau_JOINT_nm and, if measured, qd_JOINT_rad_s; or npz with "
-            "position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s and joint_names."
-        ),
-    ],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="JSON file to write the report to.")
-    ] = None,
-    fitted_urdf: Annotated[
-        Path | None,
-        typer.Option(help="File to write the URDF to with the real bodies and friction that were found."),
-    ] = None,
-    trust: Annotated[
-        float, typer.Option(help="How much the URDF's own inertias count for the real bodies.")
-    ] = USUAL_TRUST,
-    terms: Annotated[
-        str, typer.Option(help=f"Terms of the drives, of {', '.join(TERMS)}; or none.")
-    ] = ",".join(USUAL_TERMS),
-    coupled: Annotated[
-        list[str] | None,
-        typer.Option(help="Two joints that share a drive, by number or name: 5,6. Repeat for several."),
-    ] = None,
-    robust: Annotated[bool, typer.Option("--robust", help="Huber's weights: outliers count little.")] = False,
-    instruments: Annotated[
-        bool,
-        typer.Option(
-            "--instruments",
-            help="Instrumental variables: every other sample judges the rest, so that the noise of encoders "
-            "does not make inertias too small. Uses half of the samples.",
-        ),
-    ] = False,
-    cutoff: Annotated[
-        float | None, typer.Option(help="Low-pass over motion and torque [Hz]; by the motion if not given.")
-    ] = None,
-    gravity: Annotated[
-        str, typer.Option(help="Specific force of rest in the root link's frame [m/s^2]: upwards, 9.81 long.")
-    ] = _UP,
-    mask: Annotated[
-        float, typer.Option(help="Part of a joint's top speed below which samples are masked.")
-    ] = ModelChoice().mask_part,
-    slow: Annotated[
-        float, typer.Option(help="Part of a joint's top speed below which Coulomb friction fades.")
-    ] = ModelChoice().slow_part,
+    urdf: _Urdf,
+    data: _Data,
+    json_file: _Json = None,
+    fitted_urdf: _FittedUrdf = None,
+    trust: _Trust = USUAL_TRUST,
+    terms: _Terms = _USUAL_TERMS,
+    coupled: _Coupled = None,
+    robust: _Robust = False,
+    instruments: _Instruments = False,
+    cutoff: _Cutoff = None,
+    gravity: _Gravity = _UP,
+    mask: _Mask = _USUAL.mask_part,
+    slow: _Slow = _USUAL.slow_part,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Identify inertia, friction and motors from a recording, and test what comes out on what was held out.
 
     Exit codes: 0 done, 1 the recording does not tell enough, 2 a file or an option is wrong.
     """
-    if not 0.0 < trust < float("inf"):
-        fail(f"trust {trust}: it must be a number above 0", EXIT_USAGE)
-    for path in (json_file, fitted_urdf):
-        # Said before the work, not after it.
-        if path is not None and not path.parent.is_dir():
-            fail(f"{path}: there is no folder {path.parent}", EXIT_USAGE)
+    _check(trust, json_file, fitted_urdf)
     with Terminal(quiet) as terminal:
         numbers = count(1)
 
@@ -109,6 +111,15 @@ def fit_dynamics(
             _write_urdf(fitted_urdf, urdf, posed, found)
     except OSError as error:
         fail(f"{error.filename}: {error.strerror}", EXIT_USAGE)
+
+
+def _check(trust: float, *outputs: Path | None) -> None:
+    """Say before the work what would be wrong after it."""
+    if not 0.0 < trust < float("inf"):
+        fail(f"trust {trust}: it must be a number above 0", EXIT_USAGE)
+    for path in outputs:
+        if path is not None and not path.parent.is_dir():
+            fail(f"{path}: there is no folder {path.parent}", EXIT_USAGE)
 
 
 def _write_urdf(path: Path, given: Path, posed: Problem, found: Identified) -> None:

@@ -21,8 +21,9 @@ def tables(report: FitReport) -> Iterator[Table]:
     yield _held_out(report)
     yield _joints(report)
     yield _lengths(report)
-    yield _gains(report)
-    yield _drives(report)
+    if report.fit.drives:
+        yield _gains(report)
+        yield _drives(report)
     yield _base(report)
     yield _bodies(report)
 
@@ -54,16 +55,8 @@ def _held_out(report: FitReport) -> Table:
     )
     for model in report.models():
         for tried_on in ("second half", "first half", "both"):
-            some = {
-                (e.torque, e.samples): e
-                for e in report.held_out
-                if (e.model, e.tried_on) == (model, tried_on)
-            }
-            table.add_row(
-                _MODEL_WORDS[model],
-                tried_on,
-                *(_percent(some[kind].overall) for kind in _KINDS),  # type: ignore[index]
-            )
+            errors = [_error(report, model, tried_on, *kind).overall for kind in _KINDS]
+            table.add_row(_MODEL_WORDS[model], tried_on, *(_percent(error) for error in errors))
         table.add_section()
     return table
 
@@ -158,7 +151,11 @@ def _mass(mass_kg: float | None) -> str:
 
 
 def _both(report: FitReport, model: Model, torque: str, samples: str) -> ErrorPart:
-    return next(e for e in report.errors(model, torque) if (e.tried_on, e.samples) == ("both", samples))
+    return _error(report, model, "both", torque, samples)
+
+
+def _error(report: FitReport, model: Model, tried_on: str, torque: str, samples: str) -> ErrorPart:
+    return next(e for e in report.errors(model, torque) if (e.tried_on, e.samples) == (tried_on, samples))
 
 
 def _place(part: TermPart) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.chain import Array
+from coordinator.dynamics.drive_terms import Term
 from coordinator.dynamics.prediction import TorqueError, torque_error
 from coordinator.dynamics.weighted_fit import WeightedFit, fit_weighted
 from coordinator.offline.problem import Problem
@@ -133,11 +134,15 @@ def gain_of_terms(problem: Problem) -> Iterator[TermGain]:
         ValueError: too few samples.
     """
     for term in problem.choice.terms:
-        lacking = problem.with_drives(lambda drive, term=term: drive.term != term)  # type: ignore[misc]
+        lacking = _without(problem, term)
         yield TermGain(term, *overall(held_out_errors(lacking, fitted(lacking))))
     if problem.choice.coupled:
         lacking = problem.with_drives(lambda drive: len(drive.joints) == 1)
         yield TermGain("coupling", *overall(held_out_errors(lacking, fitted(lacking))))
+
+
+def _without(problem: Problem, term: Term) -> Problem:
+    return problem.with_drives(lambda drive: drive.term != term)
 
 
 def overall(errors: tuple[HeldOutError, ...]) -> tuple[float, float]:

@@ -70,7 +70,7 @@ def test_terms_and_pairs_that_do_not_exist_are_refused(
     terms: list[str], coupled: list[tuple[int, int]], words: str
 ) -> None:
     with pytest.raises(ValueError, match=words):
-        drive_columns(3, terms, coupled)  # type: ignore[arg-type]
+        drive_columns(3, terms, coupled)
 
 
 def test_a_slow_speed_of_zero_is_refused(rng: Generator) -> None:

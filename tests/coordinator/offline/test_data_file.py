@@ -35,7 +35,7 @@ def csv_text(found: dict[str, Array], rate_hz: float, velocity: bool = False) ->
 def test_a_csv_and_an_npz_of_the_same_motion_are_read_alike(tmp_path: Path, rng: Generator) -> None:
     found = signals(rng)
     (tmp_path / "a.csv").write_text(csv_text(found, 500.0, velocity=True))
-    np.savez(tmp_path / "a.npz", sample_rate_hz=500.0, **found)  # type: ignore[arg-type]
+    np.savez(tmp_path / "a.npz", sample_rate_hz=500.0, **found)
     one, other = (read_data(tmp_path / name, JOINTS) for name in ("a.csv", "a.npz"))
     assert one.qd_rad_s is not None
     assert other.qd_rad_s is not None
@@ -50,7 +50,7 @@ def test_a_csv_and_an_npz_of_the_same_motion_are_read_alike(tmp_path: Path, rng:
 def test_named_columns_of_an_npz_are_put_into_the_robots_order(tmp_path: Path, rng: Generator) -> None:
     found = signals(rng)
     t_s = np.arange(40) / 100.0
-    np.savez(tmp_path / "a.npz", t_s=t_s, joint_names=np.array(JOINTS[::-1]), **found)  # type: ignore[arg-type]
+    np.savez(tmp_path / "a.npz", t_s=t_s, joint_names=np.array(JOINTS[::-1]), **found)
     log = read_data(tmp_path / "a.npz", JOINTS)
     np.testing.assert_array_equal(log.tau_nm, found["torque"][:, ::-1])
     assert log.rate_hz == pytest.approx(100.0)
@@ -143,7 +143,7 @@ def npz_with(rng: Generator, **changed: object) -> dict[str, object]:
 def test_an_npz_that_cannot_be_used_is_answered_with_the_array(
     tmp_path: Path, rng: Generator, changed: dict[str, object], words: str
 ) -> None:
-    np.savez(tmp_path / "a.npz", **npz_with(rng, **changed))  # type: ignore[arg-type]
+    np.savez(tmp_path / "a.npz", **npz_with(rng, **changed))
     with pytest.raises(DataFileError, match=words):
         read_data(tmp_path / "a.npz", JOINTS)
 

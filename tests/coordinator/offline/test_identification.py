@@ -1,6 +1,7 @@
 """The whole of an offline identification: a robot whose truth is known, and a real one whose bar is."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,7 +67,7 @@ def overall(found: FitReport, **which: str) -> float:
 
 
 @pytest.fixture(scope="module")
-def three(recording) -> FitReport:  # type: ignore[no-untyped-def]
+def three(recording: Any) -> FitReport:
     return report(recording.urdf, recording.npz, SHARED)
 
 
@@ -85,7 +86,7 @@ def test_the_sums_that_the_torques_show_are_those_of_the_true_bodies(three: FitR
     assert len(bodies) == 15
     for part in bodies:
         # The first motor's inertia turns with the first body: they only show together.
-        truth = part.urdf + (0.15 if part.words.startswith("Ia1 + I1zz") else 0.0)  # type: ignore[operator]
+        truth = part.urdf + (0.15 if part.words.startswith("Ia1 + I1zz") else 0.0)
         assert abs(part.value - truth) < 4.0 * part.sigma, part
     assert sum(part.words.startswith("Ia1 + I1zz") for part in bodies) == 1
 
@@ -116,7 +117,7 @@ def test_what_was_held_out_is_predicted_and_the_baselines_are_far_behind(three: 
     assert overall(three, model="mean") > 0.5
 
 
-def test_every_term_that_is_there_earns_its_place_and_one_that_is_not_does_not(recording) -> None:  # type: ignore[no-untyped-def]
+def test_every_term_that_is_there_earns_its_place_and_one_that_is_not_does_not(recording: Any) -> None:
     more = report(recording.urdf, recording.npz, SHARED._replace(terms=(*USUAL_TERMS, "curved")))
     whole = overall(more)
     gains = {gain.without: gain.all for gain in more.gains}
@@ -134,7 +135,7 @@ def test_every_term_that_is_there_earns_its_place_and_one_that_is_not_does_not(r
     assert "I1zz" in motors["Ia1"].lumped_with
 
 
-def test_terms_left_out_are_left_out_of_everything(recording) -> None:  # type: ignore[no-untyped-def]
+def test_terms_left_out_are_left_out_of_everything(recording: Any) -> None:
     bare = report(recording.urdf, recording.npz, ModelChoice(terms=()))
     assert bare.fit.drives == []
     assert bare.gains == []
@@ -143,7 +144,7 @@ def test_terms_left_out_are_left_out_of_everything(recording) -> None:  # type: 
     assert overall(bare) > 0.2
 
 
-def test_instruments_find_the_inertia_that_a_noisy_encoder_hides(recording) -> None:  # type: ignore[no-untyped-def]
+def test_instruments_find_the_inertia_that_a_noisy_encoder_hides(recording: Any) -> None:
     robot = read_urdf(recording.urdf)
     # 0.1 mrad is an encoder of 14 bits; the cut-off is far above the motion, which nobody knows beforehand.
     shaken = recording.q_rad + 1e-4 * default_rng(5).normal(size=recording.q_rad.shape)
@@ -168,7 +169,7 @@ def test_instruments_find_the_inertia_that_a_noisy_encoder_hides(recording) -> N
     assert turned[1][0] == pytest.approx(truth, rel=0.05)
 
 
-def test_no_torque_of_the_held_out_half_reaches_its_own_prediction(recording) -> None:  # type: ignore[no-untyped-def]
+def test_no_torque_of_the_held_out_half_reaches_its_own_prediction(recording: Any) -> None:
     _, found = posed(recording.urdf, recording.npz, SHARED)
     first, second = halves(len(found.log.tau_nm), found.log.settling)
     changed = found.log.tau_nm.copy()
@@ -178,7 +179,7 @@ def test_no_torque_of_the_held_out_half_reaches_its_own_prediction(recording) ->
     assert second.start - first.stop >= found.log.settling
 
 
-def test_samples_of_a_joint_at_rest_are_not_fitted_to(recording) -> None:  # type: ignore[no-untyped-def]
+def test_samples_of_a_joint_at_rest_are_not_fitted_to(recording: Any) -> None:
     _, found = posed(recording.urdf, recording.npz, SHARED)
     held = np.where(found.moving, found.log.tau_nm, 77.0)
     other = found._replace(log=found.log._replace(tau_nm=held))
@@ -194,14 +195,14 @@ def test_a_fit_to_more_predicts_better(three: FitReport) -> None:
     assert three.lengths[-1].all == overall(three)
 
 
-def test_a_recording_too_short_to_halve_is_refused(recording) -> None:  # type: ignore[no-untyped-def]
+def test_a_recording_too_short_to_halve_is_refused(recording: Any) -> None:
     _, found = posed(recording.urdf, recording.npz, SHARED)
     short = found.log._replace(tau_nm=found.log.tau_nm[: found.log.settling])
     with pytest.raises(ValueError, match="cannot be halved"):
         held_out_errors(found._replace(log=short), fitted(found))
 
 
-def test_a_joint_that_never_moves_is_named(recording) -> None:  # type: ignore[no-untyped-def]
+def test_a_joint_that_never_moves_is_named(recording: Any) -> None:
     robot = read_urdf(recording.urdf)
     still = recording.q_rad.copy()
     still[:, 1] = 0.3

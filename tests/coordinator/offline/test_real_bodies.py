@@ -1,6 +1,7 @@
 """Real bodies from a recording, and the URDF that has them: both predict what the torques were."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -26,7 +27,7 @@ SHARED = ModelChoice(coupled=((1, 2),))
 
 
 @pytest.fixture
-def wrong(recording, tmp_path: Path) -> Path:  # type: ignore[no-untyped-def]
+def wrong(recording: Any, tmp_path: Path) -> Path:
     """The robot's URDF with masses that are half as large again, a comment, and a plate fixed to the hand."""
     text: str = recording.urdf.read_text()
     for mass in ("3.0", "2.0"):
@@ -49,7 +50,7 @@ def found_in(urdf: Path, npz: Path) -> tuple[Problem, RealBodies]:
     return posed, real_bodies(posed, fit, claimed_bodies(robot), USUAL_TRUST)
 
 
-def test_bodies_from_wrong_masses_can_exist_and_explain_the_torques(recording, wrong: Path) -> None:  # type: ignore[no-untyped-def]
+def test_bodies_from_wrong_masses_can_exist_and_explain_the_torques(recording: Any, wrong: Path) -> None:
     posed, found = found_in(wrong, recording.npz)
     for phi in found.phi.reshape(-1, 10):
         assert is_consistent(pseudo_inertia(phi))
@@ -66,7 +67,7 @@ def test_bodies_from_wrong_masses_can_exist_and_explain_the_torques(recording, w
 
 def test_the_fitted_urdf_gives_another_program_the_same_torques(
     recording, wrong: Path, tmp_path: Path
-) -> None:  # type: ignore[no-untyped-def]
+) -> None:
     posed, found = found_in(wrong, recording.npz)
     out = tmp_path / "fitted.urdf"
     friction = friction_of(posed.drives, found.drives.tolist(), 3)
@@ -94,7 +95,7 @@ def test_the_fitted_urdf_gives_another_program_the_same_torques(
     np.testing.assert_allclose(again.phi, found.phi, atol=1e-9)
 
 
-def test_where_torques_are_silent_a_body_is_as_claimed(recording) -> None:  # type: ignore[no-untyped-def]
+def test_where_torques_are_silent_a_body_is_as_claimed(recording: Any) -> None:
     posed, found = found_in(recording.urdf, recording.npz)
     assert posed.robot.phi is not None
     # The first joint stands upright: its body's mass and centre have no effect on any torque.
@@ -103,7 +104,7 @@ def test_where_torques_are_silent_a_body_is_as_claimed(recording) -> None:  # ty
     assert found.divergence.max() < 0.1
 
 
-def test_a_claim_of_bodies_that_cannot_exist_is_made_real(recording, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_claim_of_bodies_that_cannot_exist_is_made_real(recording: Any, tmp_path: Path) -> None:
     text: str = recording.urdf.read_text()
     path = tmp_path / "thin.urdf"
     # No triangle of moments: 0.9 is more than the sum of the others.
@@ -115,7 +116,7 @@ def test_a_claim_of_bodies_that_cannot_exist_is_made_real(recording, tmp_path: P
         assert is_consistent(pseudo)
 
 
-def test_a_body_without_mass_is_named(recording, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_a_body_without_mass_is_named(recording: Any, tmp_path: Path) -> None:
     text: str = recording.urdf.read_text()
     path = tmp_path / "light.urdf"
     path.write_text(text.replace('<mass value="2.0"/>', '<mass value="0"/>'))
