@@ -29,7 +29,7 @@ from module_agent.wire.messages import ConstantMotion, MotionRecord, MultiSine, 
 
 # A session of designed motions: 10 s a joint and a little to spare, less what it takes to find and check the
 # modules, rest, and move all joints at once.
-JOINT_S = 9.9
+JOINT_S = 9.8
 AROUND_S = 19.0
 # Below the shortest no designed motion fits: short journeys, two settlings and ramps take most of it.
 SHORTEST_S, LONGEST_S = 5.25, 9.0
