@@ -185,8 +185,14 @@ def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, in
     """Return the minimum to within `decrement` times the barrier, from `y`, and Newton's steps."""
     fall = np.inf
     for step in range(_MOST_STEPS):
-        gradient, triangle = problem.slope(y)
-        down = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))
+        try:
+            gradient, triangle = problem.slope(y)
+            down = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))
+        except np.linalg.LinAlgError as error:
+            raise NotSolvedError(
+                f"no real bodies were found, after {step} steps: {error}; parameters without a prior may be "
+                "such that the rows do not determine them"
+            ) from error
         fall = float(-gradient @ down)
         if fall < 2.0 * decrement * problem.barrier:
             return y, step

@@ -7,6 +7,7 @@ from numpy.random import default_rng
 from coordinator.dynamics.consistency import body, pseudo_inertia
 from coordinator.dynamics.identification import solve_information
 from coordinator.dynamics.information import gather
+from coordinator.dynamics.physical_fit import NotSolvedError
 from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.robot_bodies import RobotBodies, robot_bodies
 from sim.robot_file import load_robot
@@ -15,14 +16,18 @@ from sim.robot_tree import build_tree, true_chain, true_inertia
 ROBOT = load_robot("a2085_04")
 
 
-@pytest.fixture(scope="module")
-def found() -> RobotBodies:
-    """The bodies by 2000 samples of positions and rates at random, with 0.05 Nm of noise."""
+def made() -> RobotBodies:
+    """Return the bodies by 2000 samples of positions and rates at random, with 0.05 Nm of noise."""
     chain, rng = true_chain(ROBOT), default_rng(8)
     signals = rng.uniform(-1.0, 1.0, (3, 2000, 4)) * np.array([3.0, 2.0, 10.0])[:, None, None]
     tau = inverse_dynamics(chain, true_inertia(ROBOT), *signals) + 0.05 * rng.normal(size=(2000, 4))
     information = gather(chain, *signals, tau)
     return robot_bodies(information, chain, build_tree(ROBOT).types, solve_information(information), 1.0)
+
+
+@pytest.fixture(scope="module")
+def found() -> RobotBodies:
+    return made()
 
 
 def test_base_parameters_are_within_their_deviations_of_the_built_robots(found: RobotBodies) -> None:
@@ -71,3 +76,20 @@ def test_a_line_says_how_many_sums_are_known_and_one_a_body_which(found: RobotBo
     ]
     # Each of the 40 parameters is named once.
     assert sum(line.count(",") - 1 + len(line.split(";")) for line in lines[1:]) == 40
+
+
+def test_without_real_bodies_the_rest_is_said_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise NotSolvedError("no real bodies were found")
+
+    monkeypatch.setattr("coordinator.robot_bodies.fit_physical", fails)
+    one = made()
+    assert one.fit is None
+    assert one.bodies == ()
+    assert one.note.startswith("no real bodies were found; the bodies in the files are the nearest real ones")
+    assert one.base.rank == 22
+    # Nothing is settled by a prior that was not used.
+    assert all(
+        verdict.sums == () or verdict.value is not None or verdict.lumped_with for verdict in one.verdicts
+    )
+    assert not any("by the prior" in verdict.words for verdict in one.verdicts)

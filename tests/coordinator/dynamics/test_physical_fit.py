@@ -18,6 +18,7 @@ from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.parameter_prior import module_prior
 from coordinator.dynamics.physical_fit import (
     WEIGHTS,
+    NotSolvedError,
     PhysicalFit,
     fit_physical,
     physically_consistent,
@@ -259,6 +260,8 @@ def test_what_does_not_fit_is_named(arm: Case) -> None:
         physically_consistent(np.zeros((3, 40)), np.zeros(3), arm.prior, 0.0)
     with pytest.raises(ValueError, match="a body of the prior cannot exist"):
         physically_consistent(np.zeros((3, 40)), np.zeros(3), -arm.prior, 1.0)
+    with pytest.raises(NotSolvedError, match="the rows do not determine them"):
+        physically_consistent(np.zeros((3, 41)), np.zeros(3), arm.prior, 1.0)
     still = tuple(JointInformation(p.r, np.zeros_like(p.z), 0.0, p.samples) for p in arm.information)
     with pytest.raises(ValueError, match="all torques are zero"):
         fit_physical(still, arm.prior, arm.least_squares)
