@@ -15,7 +15,7 @@ from coordinator.offline.filtered_log import filtered_log, most_samples, usual_c
 from coordinator.offline.fit_report import write_report
 from coordinator.offline.fit_tables import notes, tables
 from coordinator.offline.fitted_urdf import friction_of, write_fitted_urdf
-from coordinator.offline.identification import STEPS, Identified, identified
+from coordinator.offline.identification import STEPS, Elsewhere, Identified, identified
 from coordinator.offline.problem import ModelChoice, Problem, problem
 from coordinator.offline.real_bodies import USUAL_TRUST
 from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, UrdfRobot, read_urdf
@@ -32,6 +32,12 @@ _Data = Annotated[
     typer.Option(
         help="CSV with t_s, q_JOINT_rad, tau_JOINT_nm and, if measured, qd_JOINT_rad_s; or npz with "
         "position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s and joint_names."
+    ),
+]
+_HeldOut = Annotated[
+    Path | None,
+    typer.Option(
+        help="Another recording of the robot, CSV or npz, to try on what is fitted to the whole of --data."
     ),
 ]
 _Json = Annotated[Path | None, typer.Option("--json", help="JSON file to write the report to.")]
@@ -67,6 +73,7 @@ _Slow = Annotated[float, typer.Option(help="Part of a joint's top speed below wh
 def fit_dynamics(
     urdf: _Urdf,
     data: _Data,
+    held_out: _HeldOut = None,
     json_file: _Json = None,
     fitted_urdf: _FittedUrdf = None,
     trust: _Trust = USUAL_TRUST,
@@ -96,8 +103,9 @@ def fit_dynamics(
         choice = ModelChoice(_terms(terms), _pairs(robot, coupled or ()), robust, slow, mask)
         step("low-pass, and every column of every sample")
         posed = _posed(robot, log, choice, cutoff, instruments)
+        elsewhere = None if held_out is None else Elsewhere(held_out, _elsewhere(posed, held_out))
         try:
-            found = identified(urdf, data, log, posed, step, trust)
+            found = identified(urdf, data, log, posed, step, trust, elsewhere)
         except ValueError as error:
             fail(f"{data}: {error}", EXIT_FAILED)
     for line in notes(found.report):
@@ -151,6 +159,20 @@ def _posed(
         return problem(robot, one, choice, again)
     except ValueError as error:
         fail(error, EXIT_USAGE)
+
+
+def _elsewhere(posed: Problem, data: Path) -> Problem:
+    """Pose another recording as the first one was, with its cut-off and its top speeds."""
+    try:
+        log = read_data(data, posed.robot.chain.serials)
+        some = filtered_log(log, posed.log.cutoff_hz, most_samples(len(posed.robot.bodies)))
+        return problem(posed.robot, some, posed.choice, top_rad_s=posed.log.top_rad_s)
+    except OSError as error:
+        fail(f"{error.filename}: {error.strerror}", EXIT_USAGE)
+    except DataFileError as error:
+        fail(error, EXIT_USAGE)
+    except ValueError as error:
+        fail(f"{data}: {error}", EXIT_USAGE)
 
 
 def _gravity(text: str) -> list[float]:

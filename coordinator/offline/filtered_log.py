@@ -49,6 +49,11 @@ class FilteredLog(NamedTuple):
     fine_qd_rad_s: Array
     fine_qdd_rad_s2: Array
 
+    @property
+    def top_rad_s(self) -> Array:
+        """The joints' top speeds (n,)."""
+        return np.asarray(np.abs(self.qd_rad_s).max(axis=0))
+
     def low_passed(self, fine: Array) -> Array:
         """Return a function (m', k) of the fine signals, low-passed as the torque is, at the kept samples."""
         edge = settling_samples(self.fine_rate_hz, self.cutoff_hz)

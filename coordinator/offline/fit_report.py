@@ -46,7 +46,7 @@ class ErrorPart(Part):
     """
 
     model: Model
-    tried_on: Literal["second half", "first half", "both"]
+    tried_on: Literal["second half", "first half", "both", "other recording"]
     torque: Literal["filtered", "raw"]
     samples: Literal["all", "masked"]
     overall: float | None
@@ -165,6 +165,7 @@ class FitReport(Part):
     schema_version: int = SCHEMA
     urdf: str
     data: str
+    held_out_data: str | None
     recording: DataPart
     held_out: list[ErrorPart]
     lengths: list[LengthPart]

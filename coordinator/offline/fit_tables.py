@@ -49,12 +49,13 @@ def notes(report: FitReport) -> Iterator[str]:
 
 def _held_out(report: FitReport) -> Table:
     table = _table(
-        "Held-out torque error |e| / |tau| [%]: fitted to one half, tried on the other",
+        "Held-out torque error |e| / |tau| [%]: fitted to one half, tried on the other"
+        + (", and to the whole" if report.held_out_data else ""),
         ("model", "tried on"),
         [f"{torque}, {samples}" for torque, samples in _KINDS],
     )
     for model in report.models():
-        for tried_on in ("second half", "first half", "both"):
+        for tried_on in dict.fromkeys(e.tried_on for e in report.errors(model)):
             errors = [_error(report, model, tried_on, *kind).overall for kind in _KINDS]
             table.add_row(_MODEL_WORDS[model], tried_on, *(_percent(error) for error in errors))
         table.add_section()

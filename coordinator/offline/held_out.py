@@ -5,7 +5,7 @@ mixes them. What is masked and what is not, raw and filtered, stand beside each 
 flatters something: masking hides friction at reversals, filtering hides noise.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from typing import Literal, NamedTuple
 
@@ -19,7 +19,7 @@ from coordinator.dynamics.weighted_fit import WeightedFit, fit_weighted
 from coordinator.offline.problem import Problem
 
 Index = NDArray[np.int64]
-Tried = Literal["second half", "first half", "both"]
+Tried = Literal["second half", "first half", "both", "other recording"]
 # From the samples that a model may see, and those that it is tried on, to what it says of the latter.
 Predictor = Callable[[slice, slice], Array]
 
@@ -107,6 +107,21 @@ def held_out_errors(problem: Problem, predictor: Predictor) -> tuple[HeldOutErro
     parts.append(
         ("both", np.concatenate([at for _, at, _ in parts]), np.concatenate([said for *_, said in parts]))
     )
+    return _errors(problem, parts)
+
+
+def errors_elsewhere(both: Problem, predictor: Predictor, seen: int) -> tuple[HeldOutError, ...]:
+    """Try a predictor that saw the first `seen` samples of two recordings (`joined`) on the second one.
+
+    Raises:
+        ValueError: too few samples, see `fit_part`.
+    """
+    samples = len(both.log.tau_nm)
+    predicted = predictor(slice(0, seen), slice(seen, samples))
+    return _errors(both, [("other recording", np.arange(seen, samples), predicted)])
+
+
+def _errors(problem: Problem, parts: Sequence[tuple[Tried, Index, Array]]) -> tuple[HeldOutError, ...]:
     return tuple(
         HeldOutError(name, masked, raw, _error(problem, at, predicted, masked, raw))
         for (name, at, predicted), masked, raw in product(parts, (False, True), (False, True))

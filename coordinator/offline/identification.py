@@ -37,6 +37,7 @@ from coordinator.offline.held_out import (
     HeldOutError,
     Predictor,
     claimed,
+    errors_elsewhere,
     fit_part,
     fitted,
     gain_of_terms,
@@ -44,7 +45,7 @@ from coordinator.offline.held_out import (
     length_curve,
     mean_torque,
 )
-from coordinator.offline.problem import Problem
+from coordinator.offline.problem import Problem, joined
 from coordinator.offline.real_bodies import (
     USUAL_TRUST,
     RealBodies,
@@ -70,12 +71,29 @@ class Identified(NamedTuple):
     real: RealBodies | None
 
 
-def identified(
-    urdf: Path, data: Path, log: JointLog, problem: Problem, step: Step, trust: float = USUAL_TRUST
-) -> Identified:
-    """Return what a recording tells; `step` is told of each of the `STEPS` before it begins.
+class Elsewhere(NamedTuple):
+    """Another recording of the same robot, which is only predicted."""
 
-    `trust` is how much the URDF's own inertias count where real bodies are fitted (`physical_fit`).
+    data: Path
+    problem: Problem
+
+
+def identified(
+    urdf: Path,
+    data: Path,
+    log: JointLog,
+    problem: Problem,
+    step: Step,
+    trust: float = USUAL_TRUST,
+    elsewhere: Elsewhere | None = None,
+) -> Identified:
+    """Return what a recording tells.
+
+    Args:
+        urdf, data: the files' names. log, problem: the recording, as read and as posed.
+        step: told of each of the `STEPS` before it begins.
+        trust: how much the URDF's own inertias count where real bodies are fitted (`physical_fit`).
+        elsewhere: another recording to predict, posed with the top speeds of this one.
 
     Raises:
         ValueError: too few samples for the parameters.
@@ -84,8 +102,11 @@ def identified(
     fit = fit_part(problem, slice(0, len(problem.log.tau_nm)))
     real, note = _real(problem, fit, trust)
     step("fit to each half, tried on the other")
-    models = _predictors(problem, trust if real is not None else None)
-    held_out = [_error_part(name, e) for name, tried in models for e in held_out_errors(*tried)]
+    try:
+        held_out = _held_out(problem, elsewhere, None if real is None else trust)
+    except NotSolvedError as error:
+        real, note = None, str(error)
+        held_out = _held_out(problem, elsewhere, None)
     step("fit to ever longer parts")
     lengths = [
         LengthPart(seconds=p.seconds, all=p.all_samples, masked=p.masked) for p in length_curve(problem)
@@ -97,6 +118,7 @@ def identified(
     report = FitReport(
         urdf=str(urdf),
         data=str(data),
+        held_out_data=None if elsewhere is None else str(elsewhere.data),
         recording=_data_part(log, problem),
         held_out=held_out,
         lengths=lengths,
@@ -139,6 +161,14 @@ def _predictors(problem: Problem, trust: float | None) -> list[tuple[Model, tupl
     return [*tried, ("mean", (problem, mean_torque(problem)))]
 
 
+def _held_out(problem: Problem, elsewhere: Elsewhere | None, trust: float | None) -> list[ErrorPart]:
+    found = [(name, held_out_errors(*tried)) for name, tried in _predictors(problem, trust)]
+    if elsewhere is not None:
+        both, seen = joined(problem, elsewhere.problem), len(problem.log.tau_nm)
+        found += [(name, errors_elsewhere(*tried, seen)) for name, tried in _predictors(both, trust)]
+    return [_error_part(name, error) for name, errors in found for error in errors]
+
+
 def _error_part(model: Model, found: HeldOutError) -> ErrorPart:
     return ErrorPart(
         model=model,
@@ -151,7 +181,6 @@ def _error_part(model: Model, found: HeldOutError) -> ErrorPart:
 
 
 def _data_part(log: JointLog, problem: Problem) -> DataPart:
-    top = np.abs(problem.log.qd_rad_s).max(axis=0)
     return DataPart(
         joints=list(problem.robot.chain.serials),
         duration_s=log.duration_s,
@@ -161,7 +190,7 @@ def _data_part(log: JointLog, problem: Problem) -> DataPart:
         kept_hz=problem.log.rate_hz,
         samples=len(problem.log.tau_nm),
         noise=problem.log.noise,
-        mask_rad_s=[float(v) for v in problem.choice.mask_part * top],
+        mask_rad_s=[float(v) for v in problem.choice.mask_part * problem.log.top_rad_s],
     )
 
 

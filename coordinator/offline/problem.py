@@ -80,13 +80,18 @@ class Problem(NamedTuple):
 
 
 def problem(
-    robot: UrdfRobot, log: FilteredLog, choice: ModelChoice, again: FilteredLog | None = None
+    robot: UrdfRobot,
+    log: FilteredLog,
+    choice: ModelChoice,
+    again: FilteredLog | None = None,
+    top_rad_s: Array | None = None,
 ) -> Problem:
     """Return the columns of all samples of a recording.
 
     Args:
         robot, log, choice: what moved, what was recorded, and what the model has.
         again: the same motion at the same times by other measurements, for instruments (`in_two`).
+        top_rad_s: (n,) top speeds that count, of another recording that this one is compared with.
 
     Raises:
         ValueError: terms or pairs that do not exist, parts of speed out of range, or a joint that never
@@ -95,7 +100,7 @@ def problem(
     for name, part in (("slow", choice.slow_part), ("mask", choice.mask_part)):
         if not 0.0 < part < 1.0:
             raise ValueError(f"the {name} part of the top speed is {part}; it must be between 0 and 1")
-    top_rad_s = np.abs(log.qd_rad_s).max(axis=0)
+    top_rad_s = log.top_rad_s if top_rad_s is None else top_rad_s
     if (still := np.flatnonzero(top_rad_s < 1e-6)).size:
         raise ValueError(f"joint {robot.chain.serials[still[0]]!r} never moves; nothing shows its friction")
     drives = drive_columns(len(robot.bodies), choice.terms, choice.coupled)
@@ -111,6 +116,32 @@ def problem(
         regressor=_regressor(robot, drives, log, slow_rad_s),
         moving=moving,
         instruments=None if again is None else _regressor(robot, drives, again, slow_rad_s),
+    )
+
+
+def joined(one: Problem, other: Problem) -> Problem:
+    """Return the samples of both recordings, those of `one` first; for what is fitted to either but not both.
+
+    Raises:
+        ValueError: the two have different columns.
+    """
+    if one.columns.names != other.columns.names:
+        raise ValueError("two recordings with different columns cannot be joined")
+    log, more = one.log, other.log
+    return one._replace(
+        log=log._replace(
+            q_rad=np.concatenate([log.q_rad, more.q_rad]),
+            qd_rad_s=np.concatenate([log.qd_rad_s, more.qd_rad_s]),
+            qdd_rad_s2=np.concatenate([log.qdd_rad_s2, more.qdd_rad_s2]),
+            tau_nm=np.concatenate([log.tau_nm, more.tau_nm]),
+            tau_raw_nm=np.concatenate([log.tau_raw_nm, more.tau_raw_nm]),
+        ),
+        regressor=np.concatenate([one.regressor, other.regressor]),
+        moving=np.concatenate([one.moving, other.moving]),
+        instruments=None
+        if one.instruments is None
+        # Only fitted to in `one`; what is tried needs none.
+        else np.concatenate([one.instruments, other.regressor]),
     )
 
 

@@ -114,6 +114,26 @@ def test_instruments_are_used_when_asked_for(tmp_path: Path) -> None:
     assert hanging.value == pytest.approx(-0.1, abs=4.0 * hanging.sigma)
 
 
+def test_another_recording_may_be_held_out(tmp_path: Path) -> None:
+    files = write_files(tmp_path)
+    other = tmp_path / "other.csv"
+    rows = (tmp_path / "log.csv").read_text().splitlines()
+    other.write_text("\n".join([rows[0], *rows[1200:]]))
+    done = called(*files, "--held-out", str(other), "--json", str(tmp_path / "fit.json"))
+    assert done.exit_code == 0, done.output
+    assert "other recording" in done.output
+    found = FitReport.model_validate_json((tmp_path / "fit.json").read_text())
+    assert found.held_out_data == str(other)
+    elsewhere = [e for e in found.errors("fitted") if e.tried_on == "other recording"]
+    assert [e.samples for e in elsewhere] == ["all", "masked"]
+    assert elsewhere[0].overall is not None
+    assert elsewhere[0].overall < 0.005
+    other.write_text(rows[0] + "\n")
+    done = called(*files, "--held-out", str(other))
+    assert done.exit_code == 2
+    assert "0 samples are no recording" in done.output
+
+
 def test_a_urdf_without_masses_is_fitted_in_sums_and_not_written(tmp_path: Path) -> None:
     files = write_files(tmp_path)
     urdf = tmp_path / "robot.urdf"

@@ -65,6 +65,12 @@ def recorded(folder: Path, seconds: float = 24.0, noise_nm: float = 0.05, seed: 
     return Recorded(q, tau, folder / "three.urdf", folder / "motion.npz")
 
 
+@pytest.fixture(scope="session")
+def another(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Another motion of the same robot."""
+    return recorded(tmp_path_factory.mktemp("another"), seconds=10.0, seed=9)
+
+
 def _bodies(urdf: Path, q: Array, qd: Array, qdd: Array) -> Array:
     urdf.write_text(URDF)
     model = pin.buildModelFromUrdf(str(urdf))

@@ -12,7 +12,7 @@ from coordinator.offline.data_file import JointLog, in_two, read_data
 from coordinator.offline.filtered_log import filtered_log, usual_cutoff_hz
 from coordinator.offline.fit_report import ErrorPart, FitReport
 from coordinator.offline.held_out import fit_part, fitted, halves, held_out_errors
-from coordinator.offline.identification import identified, named
+from coordinator.offline.identification import Elsewhere, identified, named
 from coordinator.offline.problem import ModelChoice, Problem, problem
 from coordinator.offline.urdf_chain import read_urdf
 
@@ -193,6 +193,28 @@ def test_a_fit_to_more_predicts_better(three: FitReport) -> None:
     assert lengths[-1] == pytest.approx(three.recording.duration_s / 2, rel=0.1)
     assert three.lengths[-1].all < three.lengths[0].all
     assert three.lengths[-1].all == overall(three)
+
+
+def test_another_recording_is_predicted_by_what_the_first_one_told(recording: Any, another: Any) -> None:
+    log, first = posed(recording.urdf, recording.npz, SHARED)
+    robot = read_urdf(another.urdf)
+    more = filtered_log(read_data(another.npz, robot.chain.serials), first.log.cutoff_hz)
+    second = problem(robot, more, SHARED, top_rad_s=first.log.top_rad_s)
+    found = identified(
+        recording.urdf, recording.npz, log, first, lambda _: None, elsewhere=Elsewhere(another.npz, second)
+    ).report
+    # As for the halves: 0.2 % of noise, and a little for reversals.
+    assert overall(found, tried_on="other recording") < 0.006
+    assert overall(found, tried_on="other recording", model="bodies") < 0.006
+    assert overall(found, tried_on="other recording", model="urdf") > 0.1
+    # By an independent way: the parameters of the whole first recording, applied to the second.
+    fit = fit_part(first, slice(0, len(first.log.tau_nm)))
+    off = second.regressor @ fit.parameters - second.log.tau_nm
+    expected = np.linalg.norm(off) / np.linalg.norm(second.log.tau_nm)
+    assert overall(found, tried_on="other recording") == pytest.approx(expected, rel=1e-6)
+    # The halves know nothing of it.
+    alone = report(recording.urdf, recording.npz, SHARED)
+    assert overall(alone) == overall(found)
 
 
 def test_a_recording_too_short_to_halve_is_refused(recording: Any) -> None:
