@@ -14,7 +14,8 @@ import numpy as np
 from coordinator.chain import Array, Chain
 from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.clock_refinement import refine_clocks
-from coordinator.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
+from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
+from coordinator.dynamics.differentiation import JointMotion, settling_samples
 from coordinator.dynamics.identification import InertialFit, solve_information
 from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.prediction import TorqueError, check_held_out
@@ -43,9 +44,6 @@ from module_agent.wire.messages import Estimate
 
 # Of some 30 errors an IMU the largest is below this in 99 of 100.
 STRANGE_ABOVE = 3.5
-DYNAMIC_CUTOFF_HZ = 12.0
-# The low-pass leaves so many independent samples a sample.
-INDEPENDENT_FRACTION = min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
 
 
 class IdentificationError(ValueError):
@@ -127,7 +125,8 @@ def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | 
         types = [recorded_type(recording, s) for s in kinematics.topology.serials]
         bodies = robot_bodies(information, kinematics.fit.chain, types, inertia, INDEPENDENT_FRACTION)
         if _motions(recording, "held_out"):
-            motion = _joined([_filtered(recording, kinematics, e) for e in _stretches(recording, "held_out")])
+            serials = kinematics.topology.serials
+            motion = dynamic_motion(recording, kinematics.clocks, serials, "held_out")
             held_out = _held_out(kinematics, motion, inertia.phi, means)
             bodies = _checked(bodies, kinematics, motion, means)
     result = build_result(recording, kinematics, inertia, held_out, bodies)
@@ -322,25 +321,9 @@ def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Seq
 # ---------------------------------------------------------------------- dynamics
 
 
-def _filtered(recording: Recording, kinematics: Kinematics, event: JournalEvent) -> JointMotion:
-    margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
-    one = window(recording, kinematics.clocks, kinematics.topology.serials, event, margin)
-    # No velocity: that of the modules is late by their filter.
-    return filtered_motion(one.t_ns, one.q_rad, None, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)
-
-
-def _stretches(recording: Recording, purpose: Purpose) -> list[JournalEvent]:
-    """Return one event for every step of a purpose, the latest: joints that move at once share its window."""
-    return list({event.step: event for event in recording.motions(purpose)}.values())
-
-
-def _joined(motions: Sequence[JointMotion]) -> JointMotion:
-    return JointMotion(*(np.concatenate(column) for column in zip(*motions, strict=True)))
-
-
 def _torques(recording: Recording, kinematics: Kinematics) -> tuple[tuple[JointInformation, ...], Array]:
     """Return what all dynamic motions say of the inertial parameters; also the mean torques, a baseline."""
-    motion = _joined([_filtered(recording, kinematics, e) for e in _stretches(recording, "dynamic")])
+    motion = dynamic_motion(recording, kinematics.clocks, kinematics.topology.serials, "dynamic")
     signals = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm
     return gather(kinematics.fit.chain, *signals), motion.tau_nm.mean(axis=0)
 

@@ -18,6 +18,7 @@ from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.known_robot import KnownRobotError, known_within
 from coordinator.known_update import updated
+from coordinator.payload_program import find_payload
 from coordinator.plan import Excitation, Mode, Motions
 from coordinator.recording import Recording
 from coordinator.result import DynamicsPart, Result
@@ -275,6 +276,7 @@ def screenshot(
 
 
 app.command("check")(check_robot)
+app.command("payload")(find_payload)
 app.command("fit-dynamics")(fit_dynamics)
 
 

@@ -26,7 +26,7 @@ from module_agent.toml_lines import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.network_file import network, network_beside
 from sim.noise_profile import DEFAULT_PROFILE, noise_profile
-from sim.parts import Angle, Moment, Part, Xyz, check_inertia
+from sim.parts import Angle, FreePose, Moment, Part, Xyz, check_inertia
 from sim.pose import Array, pose
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -153,7 +153,8 @@ class Base(_Strict):
 class Module(_Strict):
     """One module and the link that holds it: a list of parts, from the parent on.
 
-    Without `flex` tubes give by beam theory, and all else is rigid.
+    Without `flex` tubes give by beam theory, and all else is rigid. `payload` is carried by what the module's
+    joint turns: mass, centre and inertia in its output's frame, or the housing's if it is mounted reversed.
     """
 
     serial: str
@@ -162,6 +163,7 @@ class Module(_Strict):
     mounted: Literal["forward", "reversed"] = "forward"
     start_rad: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
     link: Annotated[tuple[Part, ...], BeforeValidator(_in_a_list)] = ()
+    payload: FreePose | None = None
     flex: Flex | None = None
 
     @field_validator("serial")

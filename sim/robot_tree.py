@@ -10,7 +10,7 @@ import numpy as np
 
 from coordinator.chain import Chain
 from module_agent.catalogue import ModuleType, module_type
-from sim.parts import Hinge, placed
+from sim.parts import Hinge, Part, placed
 from sim.pose import Array, inverse, pose, read_only
 from sim.rigid_body import RigidBody, joined, moved, negative, parameters, tensor
 from sim.robot_file import Module, Robot
@@ -97,7 +97,9 @@ def build_tree(robot: Robot) -> RobotTree:
         outputs.append(here if backwards else here @ across)
         both = moved(housing(kind), housings[-1]), moved(flange(kind), outputs[-1])
         link.add(both[1] if backwards else both[0])
-        own.append(both[0] if backwards else both[1])
+        carried = [] if module.payload is None else [placed(Part(pose=module.payload)).body]
+        end = housings[-1] if backwards else outputs[-1]
+        own.append(joined([both[0] if backwards else both[1], *(moved(body, end) for body in carried)]))
         links.append(link)
     return _tree(robot, np.array(housings), np.array(outputs), own, links)
 

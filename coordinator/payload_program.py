@@ -1,0 +1,85 @@
+"""`x5-coordinator payload`: what does a known robot carry?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coordinator.attended_run import Place, run_attended, sender_name
+from coordinator.command_options import Connect, Expect, Listen, Network, Robot, fail, planned
+from coordinator.failure import EXIT_FAILED, EXIT_USAGE
+from coordinator.known_robot import KnownRobot, KnownRobotError, load_known
+from coordinator.payload_report import PayloadReport, write_payload
+from coordinator.payload_search import PayloadError, payload_plan, search_payload
+from coordinator.run import RunConfig
+from coordinator.scaled_loop import check_speed
+from coordinator.terminal import Terminal
+from module_agent.wire.endpoint import DEFAULT_ENDPOINT
+from module_agent.wire.keys import check_chunk
+from module_agent.wire.network_file import network as network_named
+
+PAYLOAD = "payload.json"
+
+
+def find_payload(
+    known: Annotated[
+        Path, typer.Argument(help="Folder of the run that the robot is known from, inertia and all.")
+    ],
+    out: Annotated[Path | None, typer.Option(help="Folder, made new: a short run, and payload.json.")] = None,
+    measured: Annotated[
+        Path | None, typer.Option(help="Compare with a run that is there already, without a robot.")
+    ] = None,
+    robot: Robot | None = None,
+    listen: Listen = DEFAULT_ENDPOINT,
+    connect: Connect = None,
+    network: Network = "none",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0,
+    expect: Expect = None,
+    plan: Annotated[Path | None, typer.Option(help="TOML file with settings of the motion.")] = None,
+    speed: Annotated[float, typer.Option(help="Speed of a simulated world.")] = 1.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print payload.json instead of words.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Move a known robot for some ten seconds, and say what it carries: mass, centre, inertia, and where.
+
+    Exit codes: 0 also if it carries nothing, others as of `run`.
+    """
+    if (out is None) == (measured is None):
+        fail("give either --out, to move the robot, or --measured, a run to compare with", EXIT_USAGE)
+    before = _load(known)
+    folder = measured
+    if out is not None:
+        folder = out
+        try:
+            check_chunk("robot", robot or before.name)
+            check_speed(speed)
+            place = Place(listen, tuple(connect or ()), network_named(network), seed)
+        except ValueError as error:
+            fail(error, EXIT_USAGE)
+        config = RunConfig(
+            robot=robot or before.name,
+            out=out,
+            sender=sender_name(),
+            plan=payload_plan(before, planned(plan)),
+            expect=expect,
+        )
+        with Terminal(quiet) as terminal:
+            run_attended(config, place, speed, terminal, "")
+    assert folder is not None
+    report = _searched(before, _load(folder))
+    write_payload(folder / PAYLOAD, report)
+    typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.words))
+
+
+def _load(folder: Path) -> KnownRobot:
+    try:
+        return load_known(folder)
+    except KnownRobotError as error:
+        fail(error, EXIT_USAGE)
+
+
+def _searched(before: KnownRobot, after: KnownRobot) -> PayloadReport:
+    try:
+        return search_payload(before, after)
+    except PayloadError as error:
+        fail(error, EXIT_FAILED)

@@ -1,0 +1,85 @@
+"""What a known robot carries: one short motion of all joints, against the run that it is known from."""
+
+import numpy as np
+
+from coordinator.chain import Array, Chain
+from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
+from coordinator.dynamics.differentiation import JointMotion
+from coordinator.dynamics.identification import solve_information
+from coordinator.dynamics.information import JointInformation, gather
+from coordinator.dynamics.payload import find_payload
+from coordinator.dynamics.physical_fit import NotSolvedError
+from coordinator.journal import Purpose
+from coordinator.known_robot import KnownRobot
+from coordinator.payload_report import PayloadReport, payload_report
+from coordinator.plan import Plan
+
+# A check of all joints at once takes some 11 s for six of them, and all around it 5 s.
+_MOVING: tuple[Purpose, ...] = ("dynamic", "whole")
+
+
+class PayloadError(ValueError):
+    """The two runs cannot be compared; the message says which of them lacks what."""
+
+
+def payload_plan(known: KnownRobot, plan: Plan) -> Plan:
+    """Return a plan of one short motion of all joints at once, with all around it as short as it takes."""
+    return plan.model_copy(
+        update={
+            "mode": "whole",
+            "dynamics": False,
+            "imu": known.imu,
+            "discover_s": min(plan.discover_s, 0.5),
+            "link_s": min(plan.link_s, 0.5),
+            "settle_s": min(plan.settle_s, 0.3),
+            "travel_speed_rad_s": max(plan.travel_speed_rad_s, 1.5),
+        }
+    )
+
+
+def search_payload(known: KnownRobot, later: KnownRobot) -> PayloadReport:
+    """Say what a robot carries in a later run and did not in the one that it is known from.
+
+    The chain is the known one. The torques' noise is what is left of them in the known run, so that springs
+    and friction, which the model has not, count as noise.
+
+    Raises:
+        PayloadError: other modules or links, no motion for inertia in the known run, or no motion in the
+            later one.
+    """
+    chain = known.chain
+    serials = later.kinematics.topology.serials
+    if serials != chain.serials or later.kinematics.topology.parent != chain.parent:
+        raise PayloadError(
+            f"{later.folder} is of another robot than {known.folder}: modules {', '.join(serials)} in place "
+            f"of {', '.join(chain.serials)}, or mounted otherwise; identify it again"
+        )
+    if not known.recording.motions("dynamic"):
+        raise PayloadError(f"{known.folder} has no motions for inertia: it was run with --no-dynamics")
+    try:
+        before, moved = _motion(known, chain), _motion(later, chain)
+        information = _information(chain, before)
+        sigma = solve_information(information, independent_fraction=INDEPENDENT_FRACTION).torque_sigma_nm
+        found = find_payload(
+            information, _information(chain, moved), _places(chain), sigma, INDEPENDENT_FRACTION
+        )
+    except (ValueError, NotSolvedError) as error:
+        raise PayloadError(f"{later.folder} cannot be compared with {known.folder}: {error}") from error
+    # All joints at once: one stretch without a gap.
+    spent_s = 1e-9 * float(moved.t_ns[-1] - moved.t_ns[0])
+    return payload_report(found, chain, later.name, str(known.folder), spent_s)
+
+
+def _motion(run: KnownRobot, chain: Chain) -> JointMotion:
+    return dynamic_motion(run.recording, run.kinematics.clocks, chain.serials, *_MOVING)
+
+
+def _information(chain: Chain, motion: JointMotion) -> tuple[JointInformation, ...]:
+    return gather(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
+
+
+def _places(chain: Chain) -> Array:
+    """Return the point of every axis that is nearest to the module's own IMU: the module is there."""
+    off = chain.imu_home[:, :3, 3] - chain.point
+    along = np.einsum("ni,ni->n", off, chain.axis)
+    return np.asarray(chain.point + along[:, None] * chain.axis)

@@ -1,0 +1,94 @@
+"""A known arm is handed something, and says what it is from one short motion."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from coordinator.chain import Array, Chain
+from coordinator.known_robot import KnownRobot, load_known
+from coordinator.main import app
+from coordinator.payload_program import PAYLOAD
+from coordinator.payload_search import PayloadError, payload_plan, search_payload
+from coordinator.plan import Plan
+from coordinator.terminal import Terminal
+from coordinator.urdf import link_homes
+from sim.loaded import loaded
+from sim.parts import FreePose
+from sim.robot_file import Robot, load_robot
+from sim.robot_tree import true_chain, true_inertia
+from sim.virtual_run import VirtualConfig, run_virtual
+
+ARM = "a2085_03"
+HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
+PLAN = Plan(excitation="designed", excitation_motions=3, excitation_s=4.0, imu="calibrated")
+
+
+def lived(robot: Robot, out: Path, day: int, plan: Plan) -> KnownRobot:
+    config = VirtualConfig(robot, out, seed=6, noise_seed=day, network="lan", noise="x5", plan=plan)
+    run_virtual(config, Terminal(True))
+    return load_known(out)
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> KnownRobot:
+    return lived(load_robot(ARM), tmp_path_factory.mktemp("payload") / "known", 0, PLAN)
+
+
+@pytest.fixture(scope="module")
+def later(known: KnownRobot, tmp_path_factory: pytest.TempPathFactory) -> KnownRobot:
+    robot = loaded(load_robot(ARM), known.chain.serials[-1], HELD)
+    return lived(robot, tmp_path_factory.mktemp("payload") / "later", 1, payload_plan(known, Plan()))
+
+
+def test_mass_and_centre_are_found_from_one_motion(known: KnownRobot, later: KnownRobot) -> None:
+    report = search_payload(known, later)
+    assert report.found
+    assert report.carrier == known.chain.serials[-1]
+    assert report.motion_s < 15.0
+    # 3 %, as a springy arm's torque sensors allow.
+    assert report.mass_kg == pytest.approx(0.2, abs=0.006)
+    found = (link_homes(known.chain)[-1] @ np.append(1e-3 * np.array(report.com_mm), 1.0))[:3]
+    # Across the axis and along it, from the module's own IMU: the true root frame is turned against ours.
+    added = true_inertia(loaded(load_robot(ARM), report.carrier, HELD)) - true_inertia(load_robot(ARM))
+    truth = from_axis(true_chain(load_robot(ARM)), added[-1, 1:4] / added[-1, 0])
+    across, along = from_axis(known.chain, found) - truth
+    assert abs(across) < 5e-3
+    # The joints that hold this arm up are all parallel to its last axis: gravity tells nothing along it.
+    assert abs(along) < 4e-3 * report.com_sigma_mm[2]
+
+
+def from_axis(chain: Chain, place_m: Array) -> Array:
+    """How far from the last axis, and how far along it from the last IMU."""
+    axis, imu = chain.axis[-1], chain.imu_home[-1, :3, 3]
+    off = place_m - chain.point[-1]
+    return np.array([np.linalg.norm(off - axis * (axis @ off)), axis @ (place_m - imu)])
+
+
+def test_the_command_writes_what_it_says(known: KnownRobot, later: KnownRobot) -> None:
+    done = CliRunner().invoke(app, ["payload", str(known.folder), "--measured", str(later.folder)])
+    assert done.exit_code == 0, done.output
+    assert "kg were added" in done.output
+    written = json.loads((later.folder / PAYLOAD).read_text())
+    assert written["found"] is True
+    assert not list(later.folder.glob("*.part"))
+
+
+def test_a_run_without_inertia_is_no_robot_to_compare_with(known: KnownRobot, later: KnownRobot) -> None:
+    with pytest.raises(PayloadError, match="no motions for inertia"):
+        search_payload(later, known)
+    done = CliRunner().invoke(app, ["payload", str(later.folder), "--measured", str(known.folder)])
+    assert done.exit_code == 1
+    assert CliRunner().invoke(app, ["payload", str(known.folder)]).exit_code == 2
+
+
+def test_the_load_is_where_the_file_says() -> None:
+    robot = load_robot(ARM)
+    bare, full = true_inertia(robot), true_inertia(loaded(robot, robot.serials[-1], HELD))
+    assert full[-1, 0] - bare[-1, 0] == pytest.approx(0.2)
+    np.testing.assert_allclose(full[:-1], bare[:-1], atol=1e-15)
+    with pytest.raises(ValueError, match="has no module nobody"):
+        loaded(robot, "nobody", HELD)
+    assert true_chain(robot).serials == robot.serials
