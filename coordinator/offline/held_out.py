@@ -53,7 +53,7 @@ class TermGain(NamedTuple):
 
 
 def halves(samples: int, settling: int) -> tuple[slice, slice]:
-    """Return both halves of `samples`, with a gap of as many as the low-pass mixes on either side.
+    """Return both halves of `samples`, with a gap of `settling` between them, over which the low-pass mixes.
 
     Raises:
         ValueError: too few samples to divide.
