@@ -18,6 +18,7 @@ from coordinator.dynamics.base_parameters import (
     inertial_columns,
     inertial_units,
     into_frames,
+    scale_errors,
     whitened,
 )
 from coordinator.dynamics.consistency import Body, body, parameter_transform
@@ -30,6 +31,10 @@ from coordinator.dynamics.regressor import PER_BODY
 from coordinator.dynamics.verdict import Verdict, verdicts, words_of_base, words_of_body
 from coordinator.urdf import link_homes
 from module_agent.catalogue import ModuleType
+
+# Of a module's torque sensor, a spring whose stiffness is known to a few percent. That is a guess: no figure
+# is published.
+TORQUE_SCALE_SIGMA = 0.05
 
 # Torques without noise, as a simulation may have them, would weigh infinitely.
 _LEAST_SIGMA_NM = 1e-9
@@ -85,11 +90,18 @@ def robot_bodies(
     sigma = np.maximum(least_squares.torque_sigma_nm, _LEAST_SIGMA_NM)
     rows, target = whitened(information, sigma, independent_fraction)
     base = base_parameters(
-        into_frames(rows, frames), target, inertial_columns(joints), max_sigma=MAX_SIGMA_KG
+        into_frames(rows, frames),
+        target,
+        inertial_columns(joints),
+        max_sigma=MAX_SIGMA_KG,
+        common_errors=scale_errors(information, target, TORQUE_SCALE_SIGMA),
     )
     fit, note = None, ""
     try:
-        fit = fit_physical(information, module_prior(chain, types), least_squares, independent_fraction)
+        prior = module_prior(chain, types)
+        fit = fit_physical(
+            information, prior, least_squares, independent_fraction, scale_sigma=TORQUE_SCALE_SIGMA
+        )
     except NotSolvedError as error:
         note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
     if fit is None:

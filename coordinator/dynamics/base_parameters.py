@@ -164,8 +164,29 @@ def whitened(
     return rows, np.concatenate([w * piece.z for w, piece in zip(weight, information, strict=True)])
 
 
+def scale_errors(information: Sequence[JointInformation], target: ArrayLike, scale_sigma: float) -> Array:
+    """Return what torque sensors of a wrong scale add to the target (k,) of `whitened`, (k, n).
+
+    A sensor that shows (1 + s) of the torque makes all that its joint shows as much too large, which no
+    motion tells from heavier bodies. Column i is that of joint i, s one standard deviation `scale_sigma`.
+    """
+    seen = np.asarray(target, dtype=float)
+    found = np.zeros((len(seen), len(information)))
+    begin = 0
+    for i, piece in enumerate(information):
+        end = begin + len(piece.z)
+        found[begin:end, i] = scale_sigma * seen[begin:end]
+        begin = end
+    return found
+
+
 def base_parameters(
-    triangle: ArrayLike, target: ArrayLike, columns: Columns, sigma: float = 1.0, max_sigma: float = np.inf
+    triangle: ArrayLike,
+    target: ArrayLike,
+    columns: Columns,
+    sigma: float = 1.0,
+    max_sigma: float = np.inf,
+    common_errors: ArrayLike | None = None,
 ) -> BaseParameters:
     """Return the base parameters of rows whose noise is white.
 
@@ -180,14 +201,19 @@ def base_parameters(
         sigma: standard deviation of the noise of `target`; 1 of rows that are `whitened`.
         max_sigma: a direction known worse than this, in `columns.scale`, is not told by the data
             (`identification.MAX_SIGMA_KG`); inf keeps all that rounding allows.
+        common_errors: (k, j) errors of the target that are not independent from row to row: each column is
+            one that comes as a whole, of one standard deviation (`scale_errors`). They widen the covariance.
 
     Raises:
         ValueError: shapes that do not fit, values that are not finite, or rows of zeros.
     """
     rows, seen = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
+    common = np.zeros((len(rows), 0)) if common_errors is None else np.asarray(common_errors, dtype=float)
     size = len(columns.names)
     if rows.ndim != 2 or rows.shape[1] != size or seen.shape != rows.shape[:1]:
         raise ValueError(f"rows {rows.shape} and target {seen.shape} do not fit {size} named columns")
+    if common.ndim != 2 or len(common) != len(rows) or not np.isfinite(common).all():
+        raise ValueError(f"common errors {common.shape} must be finite, {len(rows)} rows of them")
     if not (np.isfinite(rows).all() and np.isfinite(seen).all() and sigma > 0.0):
         raise ValueError("the rows or the target hold a value that is not finite, or sigma is not positive")
     left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
@@ -199,8 +225,9 @@ def base_parameters(
     # x = scale * y and y = space^T (space y): beta in units of scale is (space[:, chosen])^-1 space y.
     triangular = qr(space[:, chosen])
     back = solve_triangular(triangular[1], triangular[0].T)
-    known = back @ (left[:, kept].T @ seen / values[kept])
-    spread = back / values[kept] * sigma
+    inverse = back / values[kept] @ left[:, kept].T
+    # Both kinds of error side by side: their squares add.
+    spread = np.hstack([back / values[kept] * sigma, inverse @ common])
     own = columns.scale[chosen]
     grouping = own[:, None] * (back @ space) / columns.scale
     grouping[:, chosen] = np.eye(len(chosen))
@@ -208,7 +235,7 @@ def base_parameters(
         columns=columns,
         independent=chosen,
         grouping=grouping,
-        value=own * known,
+        value=own * (inverse @ seen),
         covariance=own[:, None] * (spread @ spread.T) * own,
         share=np.sum(space**2, axis=0),
         condition=float(values[0] / values[kept][-1]) if kept.any() else float("inf"),

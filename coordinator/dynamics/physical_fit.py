@@ -23,7 +23,7 @@ from scipy.linalg import block_diag, qr, solve_triangular
 from scipy.optimize import brentq
 
 from coordinator.chain import Array
-from coordinator.dynamics.base_parameters import whitened
+from coordinator.dynamics.base_parameters import scale_errors, whitened
 from coordinator.dynamics.consistency import parameter_transform, pseudo_inertia
 from coordinator.dynamics.identification import InertialFit
 from coordinator.dynamics.information import JointInformation
@@ -100,6 +100,7 @@ def fit_physical(
     least_squares: InertialFit,
     independent_fraction: float = 1.0,
     most_cost: float = MOST_COST,
+    scale_sigma: float = 0.0,
 ) -> PhysicalFit:
     """Fit real bodies to the torques of all joints.
 
@@ -115,6 +116,7 @@ def fit_physical(
             the two compare.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         most_cost: see above; a share of |tau|.
+        scale_sigma: standard deviation of the scale of a joint's torques, relative; it widens the covariance.
 
     Raises:
         ValueError: shapes that do not fit, a prior that is no body's, or torques that are all zero.
@@ -145,10 +147,12 @@ def fit_physical(
         cheapest = min(error for _, _, error in tried)
         tried = [one for one in tried if one[2] - cheapest <= most_cost][:1]
     found, weight, error = tried[-1]
+    shifts = found.covariance @ (rows.T @ scale_errors(information, target, scale_sigma))
+    covariance = found.covariance + shifts @ shifts.T
     pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
-    for array in (pseudo, found.x, found.covariance, found.divergence):
+    for array in (pseudo, found.x, covariance, found.divergence):
         array.flags.writeable = False
-    return PhysicalFit(found.x, found.covariance, pseudo, found.divergence, weight, error, best)
+    return PhysicalFit(found.x, covariance, pseudo, found.divergence, weight, error, best)
 
 
 def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:

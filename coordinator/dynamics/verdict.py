@@ -128,5 +128,6 @@ def _in_sums(
 def _figures(value: float, sigma: float, unit: str) -> str:
     """Return a value with the digits that its deviation leaves, "0.2550 +- 0.0012 kg m (0.5 %)"."""
     places = max(0, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0.0 else 6
-    share = f" ({100.0 * sigma / abs(value):.2g} %)" if value else ""
+    known = sigma < abs(value)
+    share = f" ({100.0 * sigma / abs(value):.2g} %)" if known else ", may be zero"
     return f"{value:.{places}f} +- {sigma:.{places}f} {unit}{share}"

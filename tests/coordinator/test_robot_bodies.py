@@ -17,10 +17,10 @@ ROBOT = load_robot("a2085_04")
 
 
 def made() -> RobotBodies:
-    """Return the bodies by 2000 samples of positions and rates at random, with 0.05 Nm of noise."""
+    """Return the bodies by 2000 samples of positions and rates at random, with 5 mNm of noise."""
     chain, rng = true_chain(ROBOT), default_rng(8)
     signals = rng.uniform(-1.0, 1.0, (3, 2000, 4)) * np.array([3.0, 2.0, 10.0])[:, None, None]
-    tau = inverse_dynamics(chain, true_inertia(ROBOT), *signals) + 0.05 * rng.normal(size=(2000, 4))
+    tau = inverse_dynamics(chain, true_inertia(ROBOT), *signals) + 0.005 * rng.normal(size=(2000, 4))
     information = gather(chain, *signals, tau)
     return robot_bodies(information, chain, build_tree(ROBOT).types, solve_information(information), 1.0)
 
@@ -79,7 +79,7 @@ def test_a_line_says_how_many_sums_are_known_and_one_a_body_which(found: RobotBo
 
 
 def test_without_real_bodies_the_rest_is_said_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
+    def fails(*_: object, **__: object) -> None:
         raise NotSolvedError("no real bodies were found")
 
     monkeypatch.setattr("coordinator.robot_bodies.fit_physical", fails)

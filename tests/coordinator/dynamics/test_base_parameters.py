@@ -12,6 +12,7 @@ from coordinator.dynamics.base_parameters import (
     base_parameters,
     inertial_columns,
     into_frames,
+    scale_errors,
     whitened,
 )
 from coordinator.dynamics.consistency import parameter_transform
@@ -210,6 +211,27 @@ def test_samples_that_are_not_independent_widen_the_deviations(rng: Generator) -
     np.testing.assert_allclose(filtered.sigma, 2.0 * plain.sigma)
 
 
+def test_torque_sensors_of_unknown_scale_widen_what_is_claimed_as_much_as_they_err(rng: Generator) -> None:
+    chain, sigma = random_tree(rng, 3), np.full(3, 0.02)
+    truth = bodies(rng, 3)
+    signals = motion(rng, 200, 3)
+    tau = inverse_dynamics(chain, truth, *signals)
+    found = []
+    for _ in range(300):
+        sensed = tau * (1.0 + 0.05 * rng.normal(size=3)) + sigma * rng.normal(size=tau.shape)
+        pieces = gather(chain, *signals, sensed)
+        rows, target = whitened(pieces, sigma)
+        errors = scale_errors(pieces, target, 0.05)
+        found.append(base_parameters(rows, target, inertial_columns(3), common_errors=errors))
+    scatter = np.std([one.value for one in found], axis=0)
+    claimed = np.mean([one.sigma for one in found], axis=0)
+    # A deviation out of 300 trials has a standard error of 4 %: five of them.
+    np.testing.assert_allclose(claimed, scatter, rtol=0.2)
+    noise = base_parameters(*whitened(pieces, sigma), inertial_columns(3)).sigma
+    assert (claimed > 5.0 * noise).any()
+    np.testing.assert_allclose(found[-1].value, base_parameters(rows, target, inertial_columns(3)).value)
+
+
 def test_what_does_not_fit_is_named_and_results_cannot_be_written_to(rng: Generator) -> None:
     columns = inertial_columns(1)
     with pytest.raises(ValueError, match=r"rows \(5, 9\) and target \(5,\) do not fit 10 named columns"):
@@ -218,6 +240,8 @@ def test_what_does_not_fit_is_named_and_results_cannot_be_written_to(rng: Genera
         base_parameters(np.zeros((5, 10)), np.ones(5), columns)
     with pytest.raises(ValueError, match="not finite"):
         base_parameters(np.full((5, 10), np.nan), np.ones(5), columns)
+    with pytest.raises(ValueError, match=r"common errors \(4, 1\) must be finite, 5 rows"):
+        base_parameters(np.ones((5, 10)), np.ones(5), columns, common_errors=np.ones((4, 1)))
     pieces = gather(random_tree(rng, 1), *motion(rng, 20, 1), np.ones((20, 1)))
     with pytest.raises(ValueError, match="sigma_nm must be 1 positive numbers, one per joint"):
         whitened(pieces, [0.0])

@@ -251,6 +251,20 @@ def test_the_covariance_is_that_of_least_squares_where_the_data_rule(arm: Case) 
     assert (np.diagonal(arm.fit.covariance) > 0.0).all()
 
 
+def test_a_torque_sensor_of_unknown_scale_makes_the_bodies_as_uncertain(arm: Case) -> None:
+    columns = inertial_columns(4)
+    wide = fit_physical(arm.information, arm.prior, arm.least_squares, scale_sigma=0.05)
+    np.testing.assert_array_equal(wide.phi, arm.fit.phi)
+    found = base_parameters(*whitened(arm.information, arm.sigma), columns, max_sigma=0.3)
+    spread = found.grouping @ wide.covariance @ found.grouping.T
+    relative = np.sqrt(np.diagonal(spread)) / np.abs(found.value)
+    # What a joint feels by itself is off by as much as its sensor; the noise is far less.
+    largest = np.argsort(-np.abs(found.value))[:3]
+    assert (relative[largest] > 0.02).all()
+    assert (relative[largest] < 0.1).all()
+    assert (np.diagonal(wide.covariance) >= np.diagonal(arm.fit.covariance)).all()
+
+
 def test_what_does_not_fit_is_named(arm: Case) -> None:
     with pytest.raises(ValueError, match=r"rows \(3, 40\), target \(2,\)"):
         physically_consistent(np.zeros((3, 40)), np.zeros(2), arm.prior, 1.0)

@@ -98,6 +98,10 @@ def test_more_noise_makes_weak_what_was_identified(rng: Generator) -> None:
     quiet, loud = (named(verdicts(base_of(rng, noise), inertial_units(2))) for noise in (0.01, 5.0))
     assert quiet["m1 c1y"].kind == "identified"
     assert loud["m1 c1y"].kind == "weak"
+    for verdict in loud.values():
+        if verdict.value is not None and verdict.sigma is not None:
+            assert verdict.words.endswith("may be zero") == (verdict.sigma >= abs(verdict.value))
+    assert any(verdict.words.endswith("may be zero") for verdict in loud.values())
 
 
 def test_a_body_is_summed_up_in_a_line(rng: Generator) -> None:
