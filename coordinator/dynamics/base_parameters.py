@@ -207,15 +207,7 @@ def base_parameters(
     Raises:
         ValueError: shapes that do not fit, values that are not finite, or rows of zeros.
     """
-    rows, seen = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
-    common = np.zeros((len(rows), 0)) if common_errors is None else np.asarray(common_errors, dtype=float)
-    size = len(columns.names)
-    if rows.ndim != 2 or rows.shape[1] != size or seen.shape != rows.shape[:1]:
-        raise ValueError(f"rows {rows.shape} and target {seen.shape} do not fit {size} named columns")
-    if common.ndim != 2 or len(common) != len(rows) or not np.isfinite(common).all():
-        raise ValueError(f"common errors {common.shape} must be finite, {len(rows)} rows of them")
-    if not (np.isfinite(rows).all() and np.isfinite(seen).all() and sigma > 0.0):
-        raise ValueError("the rows or the target hold a value that is not finite, or sigma is not positive")
+    rows, seen, common = _rows(triangle, target, len(columns.names), sigma, common_errors)
     left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
     kept = (values > RANK_TOLERANCE * values[0]) & (values > sigma / max_sigma)
     if not values.any():
@@ -244,6 +236,20 @@ def base_parameters(
         if isinstance(array, np.ndarray):
             array.flags.writeable = False
     return found
+
+
+def _rows(
+    triangle: ArrayLike, target: ArrayLike, size: int, sigma: float, common_errors: ArrayLike | None
+) -> tuple[Array, Array, Array]:
+    rows, seen = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
+    common = np.zeros((len(rows), 0)) if common_errors is None else np.asarray(common_errors, dtype=float)
+    if rows.ndim != 2 or rows.shape[1] != size or seen.shape != rows.shape[:1]:
+        raise ValueError(f"rows {rows.shape} and target {seen.shape} do not fit {size} named columns")
+    if common.ndim != 2 or len(common) != len(rows) or not np.isfinite(common).all():
+        raise ValueError(f"common errors {common.shape} must be finite, {len(rows)} rows of them")
+    if not (np.isfinite(rows).all() and np.isfinite(seen).all() and sigma > 0.0):
+        raise ValueError("the rows or the target hold a value that is not finite, or sigma is not positive")
+    return rows, seen, common
 
 
 def _independent(space: Array, preferred: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -14,7 +14,7 @@ is convex, smooth and self-concordant, and needs no constraint: Newton's method 
 (Boyd and Vandenberghe 2004, Convex optimization, section 9.6).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -126,33 +126,44 @@ def fit_physical(
     size = float(np.sqrt(sum(piece.z @ piece.z + piece.rest for piece in information)))
     if not size > 0.0:
         raise ValueError("all torques are zero: no bodies explain them")
-    rows, target = whitened(
-        information, _common_sigma(information, least_squares, size), independent_fraction
-    )
     best = _relative_error(information, least_squares.phi, size)
     # Least squares fits its own noise too: by so much the true bodies themselves would be worse.
     sigma = _common_sigma(information, least_squares, size)
     rows, target = whitened(information, sigma, independent_fraction)
     own = least_squares.rank * float(sigma[0]) ** 2 / independent_fraction
     allowed = max(best + most_cost, float(np.hypot(best, np.sqrt(own) / size)))
-    tried: list[tuple[Solution, float, float]] = []
-    for weight in WEIGHTS:
-        found = physically_consistent(rows, target, bodies, weight)
-        tried.append((found, weight, _relative_error(information, found.x, size)))
-        if tried[-1][2] <= allowed:
-            break
-    else:
-        # No real bodies do as well as least squares: the model lacks something. What the prior adds to their
-        # price is kept small instead.
-        cheapest = min(error for _, _, error in tried)
-        tried = [one for one in tried if one[2] - cheapest <= most_cost][:1]
-    found, weight, error = tried[-1]
+
+    def error_of(phi: Array) -> float:
+        return _relative_error(information, phi, size)
+
+    found, weight, error = _strongest_prior(rows, target, bodies, error_of, allowed, most_cost)
     shifts = found.covariance @ (rows.T @ scale_errors(information, target, scale_sigma))
     covariance = found.covariance + shifts @ shifts.T
     pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
     for array in (pseudo, found.x, covariance, found.divergence):
         array.flags.writeable = False
     return PhysicalFit(found.x, covariance, pseudo, found.divergence, weight, error, best)
+
+
+def _strongest_prior(
+    rows: Array,
+    target: Array,
+    prior: Array,
+    error_of: Callable[[Array], float],
+    allowed: float,
+    most_cost: float,
+) -> tuple[Solution, float, float]:
+    """Return the solution with the largest weight whose error is allowed, the weight, and the error."""
+    tried: list[tuple[Solution, float, float]] = []
+    for weight in WEIGHTS:
+        found = physically_consistent(rows, target, prior, weight)
+        tried.append((found, weight, error_of(found.x)))
+        if tried[-1][2] <= allowed:
+            return tried[-1]
+    # No real bodies do as well as least squares: the model lacks something. What the prior adds to their
+    # price is kept small instead.
+    cheapest = min(error for _, _, error in tried)
+    return next(one for one in tried if one[2] - cheapest <= most_cost)
 
 
 def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:
