@@ -132,10 +132,21 @@ def test_a_joint_that_goes_on_in_a_cycle_is_unstable() -> None:
 
 
 def test_a_bridge_that_is_at_its_limit_most_of_the_time_is_unstable() -> None:
-    duty = np.where(np.arange(1500) % 2 == 0, -1.0, 1.0)[:, None]
+    duty = np.ones((1500, 1))
     assert judge(ASKED, still()._replace(duty=duty), still()).unstable == "saturates 100 % of the time"
     rare = duty * (np.arange(1500) < 0.9 * MOST_SATURATED * 1500)[:, None]
     assert judge(ASKED, still()._replace(duty=rare), still()).unstable == ""
+
+
+def test_loops_that_throw_the_motor_to_and_fro_at_every_count_are_unstable() -> None:
+    tick = np.arange(1500)[:, None]
+    # Below the limit, so that nothing saturates; 1.2 of the range of 2 from one tick to the next.
+    duty = np.where(tick % 2 == 0, -0.6, 0.6)
+    words = judge(ASKED, still()._replace(duty=duty), still()).unstable
+    assert words == "is thrown to and fro in 100 % of the ticks"
+    # A square wave of 5 Hz reverses as hard, but seldom.
+    slow = np.where(tick // 100 % 2 == 0, -0.6, 0.6)
+    assert judge(ASKED, still()._replace(duty=slow), still()).unstable == ""
 
 
 # --------------------------------------------------------------------------- gains
@@ -167,7 +178,7 @@ def test_an_unknown_setting_is_answered_with_those_that_there_are() -> None:
 
 def result(rms_rad: float, unstable: str = "") -> Follow:
     nothing = np.empty((0, 1))
-    return Follow(rms_rad, 0.1, 0.0, 0.0, unstable, nothing, nothing)
+    return Follow(rms_rad, 0.1, 0.0, 0.0, 0.0, unstable, nothing, nothing)
 
 
 def combination(case: Case, *rms_rad: float, unstable: str = "") -> Combination:
@@ -191,15 +202,17 @@ def test_a_bar_is_kept_by_the_stable_ones_and_names_all_others() -> None:
         combination(CASE_4, 0.3, 0.2, 0.1),
         combination(CASE_4._replace(motion="sine"), 0.3, 0.05, 0.1),
         combination(CASE_4._replace(motion="pattern"), 0.3, 0.2, 0.4, unstable="rings by 9.0 mrad"),
+        combination(CASE_4._replace(gains=Gains(3)), 0.3, 0.2, 0.1),
         combination(arm, 0.3, 0.29, 0.1),
     ]
-    one, six = bars(found)
+    one, factory, six = bars(found)
     assert (one.holds, one.stable, one.kept) == (False, 2, 1)
     assert one.missed == ("vertical, #4 per tick, sine",)
     assert one.unstable == ("vertical, #4 per tick, pattern: rings by 9.0 mrad",)
+    assert (factory.holds, factory.stable) == (True, 1)
     # 2.9 times is not three times.
     assert (six.holds, six.missed) == (False, ("arm6 home, factory S4, all joints",))
-    assert assistance_table(found).row_count == 4
+    assert assistance_table(found).row_count == 5
 
 
 def test_what_was_broken_off_is_written_without_a_number(tmp_path: Path) -> None:
@@ -240,7 +253,7 @@ def test_the_command_identifies_follows_prints_and_draws(
     done = CliRunner().invoke(app, ["assistance", "--json", str(file), "--picture", str(picture)])
     assert done.exit_code == 0, done.output
     assert asked == [(VERTICAL, 0)]
-    assert "one joint: mode 3 has the lowest rms error: holds, in 1 of 1 stable combinations" in done.output
+    assert "the thesis' gains: mode 3 has the lowest rms error: holds, in 1 of 1 stable" in done.output
     written = json.loads(file.read_text(encoding="utf-8"))
     assert written["settings"] == {"seed": 0, "noise": "x5", "with": [], "without": [], "quick": False}
     (row,) = written["rows"]
