@@ -16,7 +16,7 @@ from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.clock_refinement import refine_clocks
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
 from coordinator.dynamics.differentiation import JointMotion, settling_samples
-from coordinator.dynamics.identification import InertialFit, solve_information
+from coordinator.dynamics.identification import InertialFit, solve_weighted
 from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.prediction import TorqueError, check_held_out
 from coordinator.journal import JournalEvent, Purpose
@@ -121,7 +121,7 @@ def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | 
     inertia, bodies, held_out = None, None, None
     if _motions(recording, "dynamic"):
         information, means = _torques(recording, kinematics)
-        inertia = solve_information(information, independent_fraction=INDEPENDENT_FRACTION)
+        inertia = solve_weighted(information, INDEPENDENT_FRACTION)
         types = [recorded_type(recording, s) for s in kinematics.topology.serials]
         bodies = robot_bodies(information, kinematics.fit.chain, types, inertia, INDEPENDENT_FRACTION)
         if _motions(recording, "held_out"):

@@ -5,7 +5,7 @@ import numpy as np
 from coordinator.chain import Array, Chain
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
 from coordinator.dynamics.differentiation import JointMotion
-from coordinator.dynamics.identification import solve_information
+from coordinator.dynamics.identification import solve_weighted
 from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.payload import find_payload
 from coordinator.dynamics.physical_fit import NotSolvedError
@@ -59,7 +59,7 @@ def search_payload(known: KnownRobot, later: KnownRobot) -> PayloadReport:
     try:
         before, moved = _motion(known, chain), _motion(later, chain)
         information = _information(chain, before)
-        sigma = solve_information(information, independent_fraction=INDEPENDENT_FRACTION).torque_sigma_nm
+        sigma = solve_weighted(information, INDEPENDENT_FRACTION).torque_sigma_nm
         found = find_payload(
             information, _information(chain, moved), _places(chain), sigma, INDEPENDENT_FRACTION
         )

@@ -139,6 +139,22 @@ def solve_information(
     return _fit(information, system, spectrum, kept, independent_fraction)
 
 
+def solve_weighted(information: Sequence[JointInformation], independent_fraction: float = 1.0) -> InertialFit:
+    """Fit `phi`, each joint's torque weighed by the noise that a first fit without weights leaves in it.
+
+    Without weights the noise of joints that carry much is taken for torque of those that carry little.
+
+    Raises:
+        ValueError: shapes that do not fit, values out of range, or fewer samples than parameters.
+    """
+    first = solve_information(information, independent_fraction=independent_fraction)
+    # Torques without noise weigh no more than a thousand times the others.
+    sigma = np.maximum(first.torque_sigma_nm, 1e-3 * first.torque_sigma_nm.max())
+    if not sigma.max() > 0.0:
+        return first
+    return solve_information(information, 1.0 / sigma, independent_fraction=independent_fraction)
+
+
 def _system(
     information: Sequence[JointInformation], weights: ArrayLike | None, prior_phi: ArrayLike | None
 ) -> _System:

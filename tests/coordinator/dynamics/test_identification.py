@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 
 from coordinator.chain import Array, Chain
-from coordinator.dynamics.identification import REACH_M, solve_information, solve_pseudo_inverse
+from coordinator.dynamics.identification import (
+    REACH_M,
+    solve_information,
+    solve_pseudo_inverse,
+    solve_weighted,
+)
 from coordinator.dynamics.information import compress, gather, merge
 from coordinator.dynamics.regressor import torque_regressor
 
@@ -173,6 +178,31 @@ def test_information_merges_exactly_in_any_order_and_does_not_grow(rng: Generato
         np.testing.assert_allclose(fit.phi, together.phi, atol=1e-9 * together.condition)
         np.testing.assert_allclose(fit.residual_rms_nm, together.residual_rms_nm, rtol=1e-9)
         assert fit.samples.tolist() == [247] * 3
+
+
+def test_the_noise_of_a_strong_joint_is_not_taken_for_torque_of_a_weak_one(rng: Generator) -> None:
+    """The first of two joints has a hundred times the noise of the second."""
+    chain, sigma = tree(rng, (-1, 0)), np.array([1.0, 0.01])
+    truth, others = bodies(rng, 2), motion(rng, 200, 2)
+    right = torque_regressor(chain, *others) @ truth
+    alike, weighed = [], []
+    for _ in range(10):
+        signals = motion(rng, 300, 2)
+        tau = torque_regressor(chain, *signals) @ truth + sigma * rng.normal(size=(300, 2))
+        information = gather(chain, *signals, tau)
+        for fit, off in ((solve_information(information), alike), (solve_weighted(information), weighed)):
+            off.append((torque_regressor(chain, *others) @ fit.phi - right)[:, 1])
+    # Ten parameters from 300 samples: the weak joint's own noise leaves a fifth of itself in a prediction.
+    assert np.std(weighed) < 0.01
+    assert np.std(weighed) < 0.2 * np.std(alike)
+
+
+def test_torques_without_noise_are_fitted_all_the_same(rng: Generator) -> None:
+    chain, signals = tree(rng, (-1, 0)), motion(rng, 100, 2)
+    truth = bodies(rng, 2)
+    y = torque_regressor(chain, *signals)
+    fit = solve_weighted(gather(chain, *signals, y @ truth))
+    assert np.abs(y @ (fit.phi - truth)).max() < 1e-8 * np.abs(y @ truth).max()
 
 
 def test_correlated_samples_widen_the_covariance(rng: Generator) -> None:
