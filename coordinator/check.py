@@ -4,7 +4,7 @@ from coordinator.check_change import find_changes
 from coordinator.check_fit import tied_fits
 from coordinator.check_report import CheckReport, Session, compared, other_robot
 from coordinator.kinematics.topology import Topology
-from coordinator.known_robot import KnownRobot
+from coordinator.known_robot import KnownRobot, hurried
 from coordinator.plan import Plan
 from module_agent.wire.messages import WindowedSine
 
@@ -25,13 +25,7 @@ def check_plan(known: KnownRobot, plan: Plan) -> Plan:
     motion of all joints at once is checked by that motion.
     """
     last = {e.purpose: e.motion.pattern for e in known.recording.journal if e.what == "motion" and e.motion}
-    short: dict[str, object] = {
-        "dynamics": False,
-        "imu": known.imu,
-        "discover_s": min(plan.discover_s, 0.5),
-        "link_s": min(plan.link_s, 0.5),
-        "settle_s": min(plan.settle_s, 0.3),
-        "travel_speed_rad_s": max(plan.travel_speed_rad_s, 1.5),
+    short = hurried(plan, known) | {
         "sine_centre_s": min(plan.sine_centre_s, LONGEST_CENTRE_S),
         "sine_sigma_s": min(plan.sine_sigma_s, LONGEST_SIGMA_S),
     }

@@ -5,18 +5,14 @@ from typing import Annotated
 
 import typer
 
-from coordinator.attended_run import Place, run_attended, sender_name
 from coordinator.check import CheckError, check, check_plan
 from coordinator.check_report import CheckReport, table, write_check
 from coordinator.command_options import Connect, Expect, Listen, Network, Robot, fail, planned
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
-from coordinator.known_robot import KnownRobot, KnownRobotError, load_known
-from coordinator.run import RunConfig
-from coordinator.scaled_loop import check_speed
+from coordinator.known_robot import KnownRobot
+from coordinator.run_again import known_or_fail, run_again
 from coordinator.terminal import Terminal
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
-from module_agent.wire.keys import check_chunk
-from module_agent.wire.network_file import network as network_named
 
 CHECK = "check.json"
 # Not a failure of the program, and not the robot's silence either.
@@ -50,38 +46,17 @@ def check_robot(
     """
     if (out is None) == (measured is None):
         fail("give either --out, to measure the robot, or --measured, a run to compare with", EXIT_USAGE)
-    before = _load(known)
+    before = known_or_fail(known)
     folder = measured
     if out is not None:
-        folder = out
-        try:
-            check_chunk("robot", robot or before.name)
-            check_speed(speed)
-            place = Place(listen, tuple(connect or ()), network_named(network), seed)
-        except ValueError as error:
-            fail(error, EXIT_USAGE)
-        config = RunConfig(
-            robot=robot or before.name,
-            out=out,
-            sender=sender_name(),
-            plan=check_plan(before, planned(plan)),
-            expect=expect,
-        )
-        with Terminal(quiet) as terminal:
-            run_attended(config, place, speed, terminal, "")
+        folder, short = out, check_plan(before, planned(plan))
+        run_again(robot or before.name, out, short, listen, connect, network, seed, expect, speed, quiet)
     assert folder is not None
-    report = _compared(before, _load(folder))
+    report = _compared(before, known_or_fail(folder))
     write_check(folder / CHECK, report)
     _print(report, as_json)
     if report.changed:
         raise typer.Exit(EXIT_CHANGED)
-
-
-def _load(folder: Path) -> KnownRobot:
-    try:
-        return load_known(folder)
-    except KnownRobotError as error:
-        fail(error, EXIT_USAGE)
 
 
 def _compared(before: KnownRobot, after: KnownRobot) -> CheckReport:

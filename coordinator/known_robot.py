@@ -8,6 +8,7 @@ from coordinator.chain import Chain
 from coordinator.identify import IdentificationError, Kinematics, identify_kinematics
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.known_update import updated
+from coordinator.plan import Plan
 from coordinator.recording import Recording
 from coordinator.run_folder import SESSION, load_recording
 from coordinator.session_file import SessionFileError
@@ -83,3 +84,15 @@ def keep_known(known: KnownRobot, folder: Path) -> None:
         here.mkdir()
         shutil.copyfile(there / SESSION, here / SESSION)
         there, here = there / KNOWN, here / KNOWN
+
+
+def hurried(plan: Plan, known: KnownRobot) -> dict[str, object]:
+    """Return settings with which a robot that is known is moved again: only what for, and fast about it."""
+    return {
+        "dynamics": False,
+        "imu": known.imu,
+        "discover_s": min(plan.discover_s, 0.5),
+        "link_s": min(plan.link_s, 0.5),
+        "settle_s": min(plan.settle_s, 0.3),
+        "travel_speed_rad_s": max(plan.travel_speed_rad_s, 1.5),
+    }

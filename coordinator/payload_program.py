@@ -5,18 +5,13 @@ from typing import Annotated
 
 import typer
 
-from coordinator.attended_run import Place, run_attended, sender_name
 from coordinator.command_options import Connect, Expect, Listen, Network, Robot, fail, planned
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
-from coordinator.known_robot import KnownRobot, KnownRobotError, load_known
+from coordinator.known_robot import KnownRobot
 from coordinator.payload_report import PayloadReport, write_payload
 from coordinator.payload_search import PayloadError, payload_plan, search_payload
-from coordinator.run import RunConfig
-from coordinator.scaled_loop import check_speed
-from coordinator.terminal import Terminal
+from coordinator.run_again import known_or_fail, run_again
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
-from module_agent.wire.keys import check_chunk
-from module_agent.wire.network_file import network as network_named
 
 PAYLOAD = "payload.json"
 
@@ -46,36 +41,15 @@ def find_payload(
     """
     if (out is None) == (measured is None):
         fail("give either --out, to move the robot, or --measured, a run to compare with", EXIT_USAGE)
-    before = _load(known)
+    before = known_or_fail(known)
     folder = measured
     if out is not None:
-        folder = out
-        try:
-            check_chunk("robot", robot or before.name)
-            check_speed(speed)
-            place = Place(listen, tuple(connect or ()), network_named(network), seed)
-        except ValueError as error:
-            fail(error, EXIT_USAGE)
-        config = RunConfig(
-            robot=robot or before.name,
-            out=out,
-            sender=sender_name(),
-            plan=payload_plan(before, planned(plan)),
-            expect=expect,
-        )
-        with Terminal(quiet) as terminal:
-            run_attended(config, place, speed, terminal, "")
+        folder, short = out, payload_plan(before, planned(plan))
+        run_again(robot or before.name, out, short, listen, connect, network, seed, expect, speed, quiet)
     assert folder is not None
-    report = _searched(before, _load(folder))
+    report = _searched(before, known_or_fail(folder))
     write_payload(folder / PAYLOAD, report)
     typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.words))
-
-
-def _load(folder: Path) -> KnownRobot:
-    try:
-        return load_known(folder)
-    except KnownRobotError as error:
-        fail(error, EXIT_USAGE)
 
 
 def _searched(before: KnownRobot, after: KnownRobot) -> PayloadReport:

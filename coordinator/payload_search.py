@@ -10,7 +10,7 @@ from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.payload import find_payload
 from coordinator.dynamics.physical_fit import NotSolvedError
 from coordinator.journal import Purpose
-from coordinator.known_robot import KnownRobot
+from coordinator.known_robot import KnownRobot, hurried
 from coordinator.payload_report import PayloadReport, payload_report
 from coordinator.plan import Plan
 
@@ -24,17 +24,7 @@ class PayloadError(ValueError):
 
 def payload_plan(known: KnownRobot, plan: Plan) -> Plan:
     """Return a plan of one short motion of all joints at once, with all around it as short as it takes."""
-    return plan.model_copy(
-        update={
-            "mode": "whole",
-            "dynamics": False,
-            "imu": known.imu,
-            "discover_s": min(plan.discover_s, 0.5),
-            "link_s": min(plan.link_s, 0.5),
-            "settle_s": min(plan.settle_s, 0.3),
-            "travel_speed_rad_s": max(plan.travel_speed_rad_s, 1.5),
-        }
-    )
+    return plan.model_copy(update=hurried(plan, known) | {"mode": "whole"})
 
 
 def search_payload(known: KnownRobot, later: KnownRobot) -> PayloadReport:
