@@ -20,9 +20,9 @@ class CheckError(ValueError):
 def check_plan(known: KnownRobot, plan: Plan) -> Plan:
     """Return a plan as short as a check takes, with the motions that the robot is known from.
 
-    What a model leaves out of a motion cancels where the same motion is compared. A joint takes 8 s, or what
-    motions that are designed take (`Plan.joint_s` must be as it was then); a robot that is known from a
-    motion of all joints at once is checked by that motion.
+    What a model leaves out of a motion cancels where the same motion is compared. A joint takes 8 s; motions
+    that are designed take what they took (`joint_s`, `settle_s` and `travel_speed_rad_s` of the plan must be
+    as they were then); a robot that is known from a motion of all joints at once is checked by that motion.
     """
     last = {e.purpose: e.motion.pattern for e in known.recording.journal if e.what == "motion" and e.motion}
     short = hurried(plan, known) | {
@@ -31,8 +31,9 @@ def check_plan(known: KnownRobot, plan: Plan) -> Plan:
     }
     sine = last.get("windowed_sine")
     if _designed(known):
-        # The same are designed again, for the same robot.
-        short |= {"mode": "joint", "motions": "designed"}
+        # The same are designed again, if they are given the same time for journeys and settling.
+        same = {"settle_s": plan.settle_s, "travel_speed_rad_s": plan.travel_speed_rad_s}
+        short |= same | {"mode": "joint", "motions": "designed"}
     elif isinstance(sine, WindowedSine):
         short |= {
             "mode": "joint",

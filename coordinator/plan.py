@@ -57,11 +57,12 @@ class Plan(BaseModel):
     dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
     dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
     # Joint by joint, as above, or so many motions of all joints at once, designed for what they tell of the
-    # inertia, each so long and no joint further than that from home: there must be room around the robot.
+    # inertia, each so long and no joint further than that from home: there must be room around the robot. A
+    # joint that went further could fold a link onto its neighbour, which nothing here would see.
     excitation: Excitation = "thesis"
     excitation_motions: Annotated[int, Field(ge=2, le=50)] = 5
     excitation_s: Annotated[float, Field(ge=3.0, le=60.0)] = 6.0
-    excitation_reach_rad: Annotated[float, Field(gt=0.0, le=3.0)] = 0.8
+    excitation_reach_rad: Annotated[float, Field(gt=0.0, le=1.2)] = 0.8
     dynamics: bool = True
     # Who is mounted on whom takes the slow motions alone; without the fast ones there is no chain.
     topology_only: bool = False

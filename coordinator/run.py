@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 from coordinator.beside import Beside
 from coordinator.chain import Chain
 from coordinator.clock import Clock
-from coordinator.excitation.of_robot import robot_excitation
+from coordinator.excitation.of_robot import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.hrdf import write_hrdf
 from coordinator.identify import (
@@ -219,9 +219,9 @@ class Run:
         """Design motions of all joints at once for the chain that has just been found."""
         assert self._chain is not None, "all joints are explored before any is excited"
         chain, plan = self._chain, self._config.plan
-        types = [self._link.kind(serial) for serial in chain.serials]
+        modules = [RobotModule(self._link.kind(s), self._link.info(s).limits) for s in chain.serials]
         try:
-            return await self._compute(lambda: robot_excitation(chain, types, plan))
+            return await self._compute(lambda: robot_excitation(chain, modules, plan))
         except ValueError as error:
             self._screen.note(f"{error}; exciting joint by joint instead")
             return ()

@@ -58,7 +58,7 @@ class Reporter(Protocol):
     async def excitation(self) -> Sequence[RobotMotion]:
         """Return motions of all joints at once that tell their inertia, the last to be held out.
 
-        None if there are none that the robot could run.
+        Empty if there are none that the robot could run.
         """
         ...
 
@@ -358,8 +358,8 @@ class Session:
         return record
 
     async def _show_inertia(self) -> None:
-        """Excite all joints together, as far as motions for that can be designed; else joint by joint."""
-        motions = await self._reporter.excitation() if self._plan.excitation == "designed" else ()
+        """Excite all joints together, if all of them move and motions for that can be designed."""
+        motions = await self._reporter.excitation() if self._together() else ()
         for number, motion in enumerate(motions):
             last = number == len(motions) - 1
             purpose: Purpose = "held_out" if last else "dynamic"
@@ -372,8 +372,16 @@ class Session:
         for serial in serials:
             await self._step(f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial)
 
+    def _together(self) -> bool:
+        if self._plan.excitation != "designed":
+            return False
+        if self._left_out.why:
+            # Its links are where they are, and it is not to be told to move again.
+            self._reporter.note("exciting joint by joint: not all joints take part")
+        return not self._left_out.why
+
     async def _run_together(self, step: str, motion: RobotMotion, purpose: Purpose) -> None:
-        # The way between home and the pose is known to be clear, and between two poses it is not.
+        # The ways between home and the pose are known to be clear, and between two poses they are not.
         await self._go_all(motion.pose_rad)
         for serial, record in (await self.link.run(dict(motion.patterns))).items():
             self._note_motion(step, serial, record, purpose)

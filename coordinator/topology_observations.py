@@ -24,6 +24,9 @@ from module_agent.wire.messages import Estimate, MotionRecord
 # Joints that give ring at 3 to 20 Hz; the slow motion itself is over in about a second.
 CUTOFF_HZ = 10.0
 KEEP_EVERY = 5
+# An axis that joints between have turned by less is still where it was seen: what is left of it is some
+# tenths (`motion_evidence.GIVE_LEFT`).
+TURNED_RAD = 0.3
 # Of a module's own finding nobody knows how far it may be wrong: held joints give by 20 to 30 %.
 OWN_SIGMA = 0.2
 
@@ -51,11 +54,21 @@ def observe(recording: Recording, serials: Sequence[str]) -> Seen:
     clocks = map_clocks({s: recording.modules[s].round_trips for s in heard}) if heard else {}
     ear = _Ear(recording, clocks, {s: _gyro_offset(recording, s) for s in heard})
     heard_of = {joint: _heard(ear, joint) for joint in serials}
-    first, _ = _look(recording, serials, heard_of, {})
+    first, _ = _look(recording, serials, heard_of, None)
     surely = {pair: _axis(seen) for pair, seen in first.items() if abs(seen.log_odds) > DOUBTFUL_BELOW}
-    observations, unmoved = _look(recording, serials, heard_of, surely)
+    axes = _Axes(surely, _usual_pose(heard_of))
+    observations, unmoved = _look(recording, serials, heard_of, axes)
     watching = {observer for _, observer in observations}
     return Seen(observations, unmoved, tuple(s for s in serials if s not in watching))
+
+
+def _usual_pose(heard_of: Mapping[str, Sequence["_Heard"]]) -> dict[str, float]:
+    """Return where every joint was in the median of all motions."""
+    places: dict[str, list[float]] = {}
+    for heard in (heard for motions in heard_of.values() for heard in motions):
+        for serial, q in zip(heard.watchers, heard.q_mean_rad, strict=True):
+            places.setdefault(serial, []).append(float(q))
+    return {serial: float(np.median(found)) for serial, found in places.items()}
 
 
 def _axis(seen: MotionSeen) -> Array | None:
@@ -91,6 +104,7 @@ class _Heard(NamedTuple):
 
     event: JournalEvent
     watchers: tuple[str, ...]
+    q_mean_rad: Array
     qd_rad_s: Array
     gyro_rad_s: Array
     offset_rad_s: Array
@@ -104,21 +118,40 @@ def _heard(ear: _Ear, joint: str) -> list[_Heard]:
 def _of_motion(ear: _Ear, event: JournalEvent) -> _Heard:
     watchers = _watchers(ear, event)
     if event.serial not in watchers:
-        return _Heard(event, (), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
+        return _Heard(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
     edge = settling_samples(RATE_HZ, CUTOFF_HZ)
     one = window(ear.recording, ear.clocks, watchers, event, edge / RATE_HZ)
     q, gyro = (zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ) for signal in (one.q_rad, one.gyro_rad_s))
     kept = slice(edge, len(one.t_ns) - edge, KEEP_EVERY)
     offset = np.array([ear.offsets[s] for s in watchers])
-    return _Heard(event, tuple(watchers), differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
+    mean = q[kept].mean(axis=0)
+    return _Heard(event, tuple(watchers), mean, differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
 
 
-# Of (joint, observer): the axis in the observer's frame, zero if it is not carried.
-Axes = Mapping[tuple[str, str], Array | None]
+class _Axes(NamedTuple):
+    """What a first look is sure of: {(joint, observer): axis in the observer's frame, zero if not carried}.
+
+    pose_rad: where the joints were, in the median of all motions.
+    """
+
+    found: Mapping[tuple[str, str], Array | None]
+    pose_rad: Mapping[str, float]
+
+    def of(self, names: Sequence[str]) -> Array:
+        """Return (n, n, 3) of all pairs, NaN where nothing is sure."""
+        unknown = np.full(3, np.nan)
+        rows = [[self.found.get((o, k)) for k in names] for o in names]
+        return np.array([[unknown if axis is None else axis for axis in row] for row in rows])
+
+    def turned_away(self, heard: _Heard) -> bool:
+        """Return whether joints were elsewhere than where the axes were seen, so that these are others."""
+        pairs = zip(heard.watchers, heard.q_mean_rad, strict=True)
+        others = [abs(q - self.pose_rad[s]) for s, q in pairs if s != heard.event.serial]
+        return bool(sum(others) > TURNED_RAD)
 
 
 def _look(
-    recording: Recording, serials: Sequence[str], heard_of: Mapping[str, list[_Heard]], axes: Axes
+    recording: Recording, serials: Sequence[str], heard_of: Mapping[str, list[_Heard]], axes: "_Axes | None"
 ) -> tuple[dict[tuple[str, str], MotionSeen], dict[str, str]]:
     """Return what was seen of all joints, and of those of which nothing was, why not."""
     observations: dict[tuple[str, str], MotionSeen] = {}
@@ -132,7 +165,7 @@ def _look(
 
 
 def _of_joint(
-    recording: Recording, serials: Sequence[str], motions: Sequence[_Heard], axes: Axes
+    recording: Recording, serials: Sequence[str], motions: Sequence[_Heard], axes: "_Axes | None"
 ) -> tuple[dict[str, list[MotionSeen]], str]:
     """Return what everyone saw of all motions of a joint; without any, why not."""
     found: dict[str, list[MotionSeen]] = {}
@@ -153,7 +186,7 @@ def _of_joint(
     return found, why
 
 
-def _by_feedback(heard: _Heard, axes: Axes) -> dict[str, MotionSeen]:
+def _by_feedback(heard: _Heard, axes: "_Axes | None") -> dict[str, MotionSeen]:
     """Return what the feedback of all modules says of one motion; nothing without that of the joint.
 
     Raises:
@@ -162,15 +195,10 @@ def _by_feedback(heard: _Heard, axes: Axes) -> dict[str, MotionSeen]:
     names = heard.watchers
     if not names:
         return {}
-    unknown = np.full(3, np.nan)
-    known = np.array([[_or(axes.get((o, k)), unknown) for k in names] for o in names])
     joint = names.index(heard.event.serial)
+    known = axes.of(names) if axes is not None and not axes.turned_away(heard) else None
     seen = motion_evidence(joint, heard.qd_rad_s, heard.gyro_rad_s, heard.offset_rad_s, known)
     return {s: _motion_seen(seen, k) for k, s in enumerate(names)}
-
-
-def _or(axis: Array | None, other: Array) -> Array:
-    return axis if axis is not None else other
 
 
 def _watchers(ear: _Ear, event: JournalEvent) -> list[str]:

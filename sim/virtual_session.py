@@ -5,9 +5,9 @@ What it records is what a run's `session.mcap` holds, for experiments that need 
 
 import asyncio
 
-from coordinator.excitation.of_robot import robot_excitation
+from coordinator.excitation.of_robot import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
-from coordinator.identify import identify_kinematics, recorded_type
+from coordinator.identify import identify_kinematics
 from coordinator.interruption import run_to_end
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.topology_advice import NextMotion
@@ -17,6 +17,7 @@ from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.robot_link import RobotLink
 from coordinator.session import Session
 from coordinator.topology_search import doubtful_motions
+from module_agent.catalogue import module_type
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
 from sim.virtual_loop import VirtualLoop
@@ -97,8 +98,9 @@ class _Keeper:
     async def excitation(self) -> tuple[RobotMotion, ...]:
         """Design motions of all joints at once, as a run does; none if the robot could run none."""
         chain = identify_kinematics(self.recording).fit.chain
-        types = [recorded_type(self.recording, serial) for serial in chain.serials]
+        told = [self.recording.modules[serial].info for serial in chain.serials]
+        modules = [RobotModule(module_type(one.module_type), one.limits) for one in told if one is not None]
         try:
-            return robot_excitation(chain, types, self._plan)
+            return robot_excitation(chain, modules, self._plan)
         except ValueError:
             return ()

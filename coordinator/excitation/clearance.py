@@ -1,8 +1,9 @@
 """How far a robot stays clear of itself: its links as capsules, of which only the axes are known.
 
 A link is the straight way from a joint to the next module's housing, as the chain has it; what hangs on the
-last module nobody knows. Links that are as near to each other where the robot stands say nothing: they are
-neighbours, or built that close.
+last module nobody knows. Links that are near to each other where the robot stands are built that close, and
+may come only a little nearer. Neighbours meet in the joint between them, and are not watched: it takes a turn
+of more than 2 rad to fold one onto the other.
 """
 
 from typing import NamedTuple
@@ -15,6 +16,10 @@ from coordinator.kinematics.forward import BASE, body_displacements
 
 # An X5's housing is 31 mm deep and 110 mm long, its tubes are of 32 mm; two of them, and the cables.
 CLEARANCE_M = 0.10
+# Links that stand nearer than that may come nearer still by so much: cables give.
+NEARER_M = 0.02
+# Nearer than that they meet.
+TOUCHING_M = 0.01
 # The last module's own output reaches about that far beyond its axis' nearest point to its IMU.
 TIP_M = 0.06
 
@@ -46,15 +51,19 @@ def clearance_m(chain: Chain, q_rad: Array, home_rad: Array) -> Array:
     Args:
         chain: n joints.
         q_rad: (m, n) positions.
-        home_rad: (n,) where the robot is known to stand clear of itself: pairs that are nearer than
-            `CLEARANCE_M` there are left out.
+        home_rad: (n,) where the robot is known to stand clear of itself: for pairs that are nearer than
+            `CLEARANCE_M` there, coming `NEARER_M` nearer counts as `CLEARANCE_M`; those that meet are left
+            out.
     """
     axes = link_axes(chain)
     first, second = np.triu_indices(len(axes.body), 1)
-    apart = _distances(chain, axes, home_rad[None], first, second)[0] > CLEARANCE_M
+    at_home = _distances(chain, axes, home_rad[None], first, second)[0]
+    apart = at_home > TOUCHING_M
     if not apart.any():
         return np.full(len(q_rad), np.inf)
-    return np.asarray(_distances(chain, axes, q_rad, first[apart], second[apart]).min(axis=1))
+    allowed = np.minimum(CLEARANCE_M, at_home[apart] - NEARER_M)
+    spare = _distances(chain, axes, q_rad, first[apart], second[apart]) - allowed
+    return np.asarray(CLEARANCE_M + spare.min(axis=1))
 
 
 def _nearest_on_axis(chain: Chain, k: int) -> Array:

@@ -140,8 +140,10 @@ def _refused(task: ExcitationTask, segment: Segment) -> str | None:
     torque = inverse_dynamics(task.chain, task.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     if (np.abs(torque) > TORQUE_SHARE * task.max_effort_nm).any():
         return "the motors' torques"
-    there = way(task.home_rad, segment.pose_rad, task.travel_speed_rad_s, RATE_HZ)
-    if clearance_m(task.chain, np.vstack([motion.q_rad, there]), task.home_rad).min() < CLEARANCE_M:
+    # The way back is another: short journeys end first on both.
+    ends = task.home_rad, segment.pose_rad
+    ways = [way(*pair, task.travel_speed_rad_s, RATE_HZ) for pair in (ends, ends[::-1])]
+    if clearance_m(task.chain, np.vstack([motion.q_rad, *ways]), task.home_rad).min() < CLEARANCE_M:
         return "the robot's own links"
     return None
 

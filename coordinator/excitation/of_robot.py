@@ -1,6 +1,7 @@
 """Excitation of a robot whose chain has just been found, by what its bodies are likely to be."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,16 +14,26 @@ from coordinator.excitation.segment import RobotMotion, Segment
 from coordinator.motion_design.limits import JointLimits, joint_limits
 from coordinator.plan import Plan
 from module_agent.catalogue import ModuleType
+from module_agent.wire.messages import Limits
 
 # Of its largest torque, what a module's sensor scatters: its spring turns by that much within an encoder's
 # counts.
 SIGMA_SHARE = 2e-3
+# Of a module's own limit of position: held joints give, and a motion is refused that touches it.
+END_RAD = 0.03
 # The held-out motion is any that the robot may run: so many draws find one if there is one.
 DRAWS = 40
 
 
+class RobotModule(NamedTuple):
+    """What a module is, and what it says that it does not exceed."""
+
+    kind: ModuleType
+    limits: Limits
+
+
 def robot_excitation(
-    chain: Chain, types: Sequence[ModuleType], plan: Plan, seed: int = 0
+    chain: Chain, modules: Sequence[RobotModule], plan: Plan, seed: int = 0
 ) -> tuple[RobotMotion, ...]:
     """Return the motions to which parameters are fitted, and one more at the end that is held out.
 
@@ -30,10 +41,10 @@ def robot_excitation(
 
     Raises:
         NoExcitation: too few motions are possible.
-        ValueError: a joint has no room at all, or there is not one type per module.
+        ValueError: a joint has no room at all, or there is not one module per joint.
     """
     rng = np.random.default_rng(seed)
-    task = excitation_task(chain, types, plan)
+    task = excitation_task(chain, modules, plan)
     chosen = design_excitation(task, rng).segments
     for _ in range(DRAWS):
         held_out = draw_possible(task, rng)
@@ -49,20 +60,21 @@ def _by_serial(chain: Chain, segment: Segment) -> RobotMotion:
     )
 
 
-def excitation_task(chain: Chain, types: Sequence[ModuleType], plan: Plan) -> ExcitationTask:
-    """Return what a robot may be asked for, by its modules' types and what is likely to hang on them.
+def excitation_task(chain: Chain, modules: Sequence[RobotModule], plan: Plan) -> ExcitationTask:
+    """Return what a robot may be asked for, by its modules and what is likely to hang on them.
 
     Raises:
-        ValueError: there is not one type per module.
+        ValueError: there is not one module per joint.
     """
+    types = [module.kind for module in modules]
     phi = np.concatenate([parameters(body) for body in module_prior(chain, types)])
     home = np.full(len(types), plan.home_rad)
-    effort = np.array([kind.max_effort_nm for kind in types])
+    effort = np.array([min(module.kind.max_effort_nm, module.limits.max_effort_nm) for module in modules])
     inertia = _own_inertia(chain, phi, home)
     return ExcitationTask(
         chain=chain,
         phi=phi,
-        limits=tuple(_limits(kind, about) for kind, about in zip(types, inertia, strict=True)),
+        limits=tuple(_limits(module, about) for module, about in zip(modules, inertia, strict=True)),
         max_effort_nm=effort,
         torque_sigma_nm=SIGMA_SHARE * effort,
         home_rad=home,
@@ -73,9 +85,15 @@ def excitation_task(chain: Chain, types: Sequence[ModuleType], plan: Plan) -> Ex
     )
 
 
-def _limits(kind: ModuleType, inertia_kg_m2: float) -> JointLimits:
+def _limits(module: RobotModule, inertia_kg_m2: float) -> JointLimits:
     # What gravity takes is counted with the motion's own torque, in every pose.
-    return joint_limits(kind, 0.0, inertia_kg_m2)
+    found, told = joint_limits(module.kind, 0.0, inertia_kg_m2), module.limits
+    low, high = told.min_position_rad, told.max_position_rad
+    return found._replace(
+        speed_rad_s=min(found.speed_rad_s, told.max_speed_rad_s),
+        low_rad=found.low_rad if low is None else max(found.low_rad, low + END_RAD),
+        high_rad=found.high_rad if high is None else min(found.high_rad, high - END_RAD),
+    )
 
 
 def _own_inertia(chain: Chain, phi: Array, home_rad: Array) -> Array:

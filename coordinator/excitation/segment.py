@@ -102,15 +102,15 @@ def _scaled(pattern: MultiSine, share: float) -> MultiSine:
     return pattern.model_copy(update={"sines": sines})
 
 
-def way(home_rad: Array, pose_rad: Array, max_speed_rad_s: float, rate_hz: float) -> Array:
-    """Return positions (m, n) from home to a pose, every joint in its own time as `GoTo` takes it."""
-    goals = [GoTo(target_rad=float(q), max_speed_rad_s=max_speed_rad_s) for q in pose_rad]
-    lasting = [duration_s(goal, float(q)) for goal, q in zip(goals, home_rad, strict=True)]
+def way(from_rad: Array, to_rad: Array, max_speed_rad_s: float, rate_hz: float) -> Array:
+    """Return positions (m, n) from one pose to another, every joint in its own time as `GoTo` takes it."""
+    goals = [GoTo(target_rad=float(q), max_speed_rad_s=max_speed_rad_s) for q in to_rad]
+    lasting = [duration_s(goal, float(q)) for goal, q in zip(goals, from_rad, strict=True)]
     t_s = np.arange(int(max(lasting) * rate_hz) + 2) / rate_hz
     found = np.stack(
         [
             q + waveform(goal, float(q), np.minimum(t_s, end)).offset_rad
-            for goal, q, end in zip(goals, home_rad, lasting, strict=True)
+            for goal, q, end in zip(goals, from_rad, lasting, strict=True)
         ],
         axis=1,
     )

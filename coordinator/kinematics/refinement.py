@@ -36,7 +36,6 @@ CONVERGED = 1e-7
 UNKNOWN_ABOVE = 0.1
 # A step (rad, m) along what only the motion of the base tells.
 FARTHEST = 0.3
-# From the equator to the poles, from the sea to the mountains: 9.764 to 9.834 (WGS 84).
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
 # Samples, 50 a second.

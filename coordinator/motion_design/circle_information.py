@@ -24,7 +24,6 @@ from module_agent.gravity import GRAVITY_SIGMA_M_S2
 
 # Radius (2), axis (2), gravity (3): what is unknown beside the IMU's own errors.
 GEOMETRY = 7
-# Gravity's size is known where on earth one is: 9.78 to 9.83 m/s^2 everywhere. It is what calibrates scales.
 
 
 class CircleSetting(NamedTuple):

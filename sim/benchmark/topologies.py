@@ -1,6 +1,7 @@
 """Random robots: who is mounted on whom, and how, must be right on every one."""
 
 from collections.abc import Sequence
+from functools import partial
 
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, count, largest
@@ -21,15 +22,15 @@ def topology_cases(robots: int, seed: int, small: bool = False) -> list[Case]:
     first = robots * among * seed
     drawn = [range(first + among * number, first + among * (number + 1)) for number in range(robots)]
     work = tuple(Trial(topology_trial, (_smallest(seeds), NOISE), _COST_S) for seeds in drawn)
-    return [Case(f"random robots, {NOISE}", work, _summary)]
+    case = f"random robots, {NOISE}" + (f", the smallest of {AMONG}" if small else "")
+    return [Case(case, work, partial(_summary, case))]
 
 
 def _smallest(seeds: Sequence[int]) -> int:
     return seeds[0] if len(seeds) == 1 else min(seeds, key=lambda seed: len(random_robot(seed).modules))
 
 
-def _summary(trials: Sequence[TopologyTrial]) -> Summary:
-    case = f"random robots, {NOISE}"
+def _summary(case: str, trials: Sequence[TopologyTrial]) -> Summary:
     wrong = [bool(trial.differences) for trial in trials]
     least = min((trial.confidence for trial in trials), default=None)
     return Summary(

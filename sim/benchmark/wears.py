@@ -41,7 +41,7 @@ def wear_cases(changed: int, unchanged: int, seed: int, shortened: bool = False)
         cost_s = _KNOWN_COST_S + _CHECK_COST_S * (len(worn) + len(same))
         plan, share = (AT_ONCE, _AT_ONCE_SHARE) if shortened else (None, 1.0)
         work.append(Trial(checks_of_one_robot, (tuple(worn), tuple(same), plan), share * cost_s))
-    name = f"{ROBOT}, wear"
+    name = f"{ROBOT}, wear" + (", by all joints at once" if shortened else "")
     return [Case(name, tuple(work), partial(_summary, name))]
 
 
