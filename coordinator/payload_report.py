@@ -21,6 +21,8 @@ Triple = tuple[float, float, float]
 class PayloadReport(BaseModel):
     """What was added, and on which body: that of the module whose joint turns it.
 
+    taken_off: the same was there when the robot was identified, and is not any more. explained: whether a
+    payload on one body is all that has changed; the other figures mean nothing if it is not.
     com_mm and inertia_kg_m2 (ixx, ixy, ixz, iyy, iyz, izz, about the centre) are in that body's link frame of
     `robot.urdf`. rival: another module that may as well carry it, if one may. gain: by how much the payload
     makes the misfit of the torques smaller, in variances of their noise.
@@ -31,6 +33,8 @@ class PayloadReport(BaseModel):
     robot: str
     known: str
     found: bool
+    taken_off: bool
+    explained: bool
     carrier: str
     rival: str | None
     mass_kg: float
@@ -44,7 +48,9 @@ class PayloadReport(BaseModel):
     schema_version: int = SCHEMA
 
 
-def payload_report(found: Payload, chain: Chain, robot: str, known: str, motion_s: float) -> PayloadReport:
+def payload_report(
+    found: Payload, chain: Chain, robot: str, known: str, motion_s: float, taken_off: bool = False
+) -> PayloadReport:
     """Put a payload into figures and words; `known` names the run that the robot is known from."""
     into = np.linalg.inv(link_homes(chain)[found.carrier])
     own = body(into @ found.pseudo @ into.T)
@@ -57,6 +63,8 @@ def payload_report(found: Payload, chain: Chain, robot: str, known: str, motion_
         robot=robot,
         known=known,
         found=found.found,
+        taken_off=taken_off,
+        explained=found.explains,
         carrier=carrier,
         rival=rival,
         mass_kg=found.mass_kg,
@@ -79,15 +87,21 @@ def write_payload(path: Path, report: PayloadReport) -> None:
 
 
 def _words(report: PayloadReport) -> list[str]:
+    if not report.explained:
+        return [
+            "the torques are others than when the robot was identified, in a way that no payload on one body "
+            "explains: several were added, a link has changed, or something holds the robot"
+        ]
     if not report.found:
         return [
             f"nothing was added that the torques show: the best guess, {1e3 * report.mass_kg:.0f} g on what "
             f"{report.carrier} turns, explains no more of them than chance does"
         ]
     x, y, z = report.com_mm
+    done = "taken off" if report.taken_off else "added to"
     sx, sy, sz = report.com_sigma_mm
     words = [
-        f"{report.mass_kg:.3f} +- {report.mass_sigma_kg:.3f} kg were added to what {report.carrier} turns",
+        f"{report.mass_kg:.3f} +- {report.mass_sigma_kg:.3f} kg were {done} what {report.carrier} turns",
         f"centre at ({x:.1f}, {y:.1f}, {z:.1f}) +- ({sx:.1f}, {sy:.1f}, {sz:.1f}) mm in its link's frame",
     ]
     if report.rival is not None:

@@ -1,8 +1,6 @@
 """What a known robot carries: one short motion of all joints, against the run that it is known from."""
 
-import numpy as np
-
-from coordinator.chain import Array, Chain
+from coordinator.chain import Chain
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
 from coordinator.dynamics.differentiation import JointMotion
 from coordinator.dynamics.identification import solve_weighted
@@ -10,6 +8,7 @@ from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.payload import find_payload
 from coordinator.dynamics.physical_fit import NotSolvedError
 from coordinator.journal import Purpose
+from coordinator.kinematics.forward import places_on_axes
 from coordinator.known_robot import KnownRobot, hurried
 from coordinator.payload_report import PayloadReport, payload_report
 from coordinator.plan import Plan
@@ -50,14 +49,17 @@ def search_payload(known: KnownRobot, later: KnownRobot) -> PayloadReport:
         before, moved = _motion(known, chain), _motion(later, chain)
         information = _information(chain, before)
         sigma = solve_weighted(information, INDEPENDENT_FRACTION).torque_sigma_nm
-        found = find_payload(
-            information, _information(chain, moved), _places(chain), sigma, INDEPENDENT_FRACTION
-        )
+        later_said, places = _information(chain, moved), places_on_axes(chain)
+        found, taken_off = find_payload(information, later_said, places, sigma, INDEPENDENT_FRACTION), False
+        if not found.explains:
+            # The other way round: with it before, and without it later.
+            lost = find_payload(later_said, information, places, sigma, INDEPENDENT_FRACTION)
+            found, taken_off = (lost, True) if lost.found else (found, False)
     except (ValueError, NotSolvedError) as error:
         raise PayloadError(f"{later.folder} cannot be compared with {known.folder}: {error}") from error
     # All joints at once: one stretch without a gap.
     spent_s = 1e-9 * float(moved.t_ns[-1] - moved.t_ns[0])
-    return payload_report(found, chain, later.name, str(known.folder), spent_s)
+    return payload_report(found, chain, later.name, str(known.folder), spent_s, taken_off)
 
 
 def _motion(run: KnownRobot, chain: Chain) -> JointMotion:
@@ -66,10 +68,3 @@ def _motion(run: KnownRobot, chain: Chain) -> JointMotion:
 
 def _information(chain: Chain, motion: JointMotion) -> tuple[JointInformation, ...]:
     return gather(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
-
-
-def _places(chain: Chain) -> Array:
-    """Return the point of every axis that is nearest to the module's own IMU: the module is there."""
-    off = chain.imu_home[:, :3, 3] - chain.point
-    along = np.einsum("ni,ni->n", off, chain.axis)
-    return np.asarray(chain.point + along[:, None] * chain.axis)

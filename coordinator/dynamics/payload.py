@@ -32,6 +32,9 @@ LIKELY_KG, LIKELY_SIZE_M = 0.2, 0.05
 PRIOR_WEIGHT = 1.0
 # Of the rows' misfit: ten parameters in noise alone take some 10 off, and models err by more than noise.
 FOUND_ABOVE = 50.0
+# What a payload leaves of the misfit is one variance a row, and a little more where springs give; several
+# times that is another change.
+EXPLAINED_BELOW = 10.0
 
 
 class PayloadOn(NamedTuple):
@@ -45,19 +48,32 @@ class PayloadOn(NamedTuple):
 class Payload(NamedTuple):
     """What was added; arrays are read-only, in the root frame at q = 0.
 
-    carrier: index of the body that carries it. found: whether there is anything. phi: (10,) its parameters.
-    covariance: (10, 10). gain: by how much it makes the misfit smaller, in variances of the torques' noise;
-    rival: the same of the next best, `rival_carrier`, None if no other body may carry it. pseudo: (4, 4).
+    carrier: index of the body that carries it. changed: whether the torques are others at all. phi: (10,) its
+    parameters. covariance: (10, 10). gain: by how much it makes the misfit smaller, in variances of the
+    torques' noise; rival: the same of the next best, `rival_carrier`, None if no other body may carry it.
+    left: the misfit that it leaves, for one degree of freedom: about 1 if it is all that has changed. pseudo:
+    (4, 4).
     """
 
     carrier: int
-    found: bool
+    changed: bool
     phi: Array
     covariance: Array
     pseudo: Array
+    left: float
     gain: float
     rival: float
     rival_carrier: int | None
+
+    @property
+    def explains(self) -> bool:
+        """Whether a payload on one body is all that has changed."""
+        return self.left < EXPLAINED_BELOW
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a payload."""
+        return self.changed and self.explains
 
     @property
     def mass_kg(self) -> float:
@@ -134,7 +150,8 @@ def find_payload(
         array.flags.writeable = False
     return Payload(
         carrier=best,
-        found=gains[best] > FOUND_ABOVE,
+        changed=float(none @ none) > FOUND_ABOVE + EXPLAINED_BELOW * len(none) or gains[best] > FOUND_ABOVE,
+        left=one.misfit / max(len(none) - PER_BODY, 1),
         phi=one.phi,
         covariance=one.covariance,
         pseudo=pseudo,

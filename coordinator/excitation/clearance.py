@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.chain import Array, Chain
-from coordinator.kinematics.forward import BASE, body_displacements
+from coordinator.kinematics.forward import BASE, body_displacements, places_on_axes
 
 # An X5's housing is 31 mm deep and 110 mm long, its tubes are of 32 mm; two of them, and the cables.
 CLEARANCE_M = 0.10
@@ -33,12 +33,12 @@ class LinkAxes(NamedTuple):
 
 def link_axes(chain: Chain) -> LinkAxes:
     """Return the axes of all links; the modules on the base stand on links that do not move."""
-    bodies, ends = [], []
+    bodies, ends, places = [], [], places_on_axes(chain)
     for k, parent in enumerate(chain.parent):
-        near = _nearest_on_axis(chain, k)
+        near = places[k]
         if parent != BASE:
             bodies.append(parent)
-            ends.append((_nearest_on_axis(chain, parent), near))
+            ends.append((places[parent], near))
         if k not in chain.parent:
             bodies.append(k)
             ends.append((near, near + TIP_M * chain.axis[k]))
@@ -64,12 +64,6 @@ def clearance_m(chain: Chain, q_rad: Array, home_rad: Array) -> Array:
     allowed = np.minimum(CLEARANCE_M, at_home[apart] - NEARER_M)
     spare = _distances(chain, axes, q_rad, first[apart], second[apart]) - allowed
     return np.asarray(CLEARANCE_M + spare.min(axis=1))
-
-
-def _nearest_on_axis(chain: Chain, k: int) -> Array:
-    """Return the point of joint k's axis that is nearest to its own IMU: the module is there."""
-    axis, point = chain.axis[k], chain.point[k]
-    return np.asarray(point + axis * (axis @ (chain.imu_home[k, :3, 3] - point)))
 
 
 def _distances(

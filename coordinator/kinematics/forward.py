@@ -89,6 +89,17 @@ def ancestors(chain: Chain, body: int) -> tuple[int, ...]:
     return tuple(reversed(path))
 
 
+def places_on_axes(chain: Chain) -> Array:
+    """Return the point (n, 3) of every axis that is nearest to the module's own IMU, at q = 0; read-only.
+
+    A chain's `point` may be anywhere on the axis; the module is there.
+    """
+    off = chain.imu_home[:, :3, 3] - chain.point
+    found = chain.point + np.einsum("ni,ni->n", off, chain.axis)[:, None] * chain.axis
+    found.flags.writeable = False
+    return np.asarray(found)
+
+
 def _positions(chain: Chain, q_rad: ArrayLike) -> NDArray[np.float64]:
     q = np.asarray(q_rad, dtype=float)
     joints = len(chain.serials)

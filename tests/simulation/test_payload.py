@@ -67,6 +67,27 @@ def from_axis(chain: Chain, place_m: Array) -> Array:
     return np.array([np.linalg.norm(off - axis * (axis @ off)), axis @ (place_m - imu)])
 
 
+def test_an_arm_that_was_handed_nothing_says_so(known: KnownRobot, tmp_path: Path) -> None:
+    same = lived(load_robot(ARM), tmp_path / "same", 2, payload_plan(known, Plan()))
+    report = search_payload(known, same)
+    assert not report.found
+    assert report.explained
+    assert "nothing was added" in report.words[0]
+
+
+def test_what_was_taken_off_is_not_taken_for_something_added(known: KnownRobot, tmp_path: Path) -> None:
+    """The robot is known with a load, and bare later: the same two runs the other way round."""
+    full = loaded(load_robot(ARM), known.chain.serials[-1], HELD)
+    carrying = lived(full, tmp_path / "carrying", 3, PLAN)
+    bare = lived(load_robot(ARM), tmp_path / "bare", 4, payload_plan(carrying, Plan()))
+    report = search_payload(carrying, bare)
+    assert report.found
+    assert report.taken_off
+    assert report.carrier == known.chain.serials[-1]
+    assert report.mass_kg == pytest.approx(0.2, abs=0.006)
+    assert "taken off" in report.words[0]
+
+
 def test_the_command_writes_what_it_says(known: KnownRobot, later: KnownRobot) -> None:
     done = CliRunner().invoke(app, ["payload", str(known.folder), "--measured", str(later.folder)])
     assert done.exit_code == 0, done.output

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from coordinator.chain import Array, Chain
+from coordinator.chain import Array
 from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.payload import Payload, find_payload
 from coordinator.dynamics.regressor import inverse_dynamics
+from coordinator.kinematics.forward import places_on_axes
 from sim.loaded import loaded
 from sim.parts import FreePose
 from sim.robot_file import Robot, load_robot
@@ -40,11 +41,6 @@ def said(robot: Robot, seed: int, duration_s: float) -> tuple[JointInformation, 
     return gather(CHAIN, *moved, torque)
 
 
-def places(chain: Chain) -> Array:
-    along = np.einsum("ni,ni->n", chain.imu_home[:, :3, 3] - chain.point, chain.axis)
-    return np.asarray(chain.point + along[:, None] * chain.axis)
-
-
 def carrying(serial: str, mass_kg: float) -> Robot:
     inertia = mass_kg * 5e-4
     payload = FreePose(
@@ -54,7 +50,7 @@ def carrying(serial: str, mass_kg: float) -> Robot:
 
 
 def found(robot: Robot, seed: int = 0) -> Payload:
-    return find_payload(said(ROBOT, seed, 30.0), said(robot, seed + 1, 10.0), places(CHAIN), SIGMA_NM)
+    return find_payload(said(ROBOT, seed, 30.0), said(robot, seed + 1, 10.0), places_on_axes(CHAIN), SIGMA_NM)
 
 
 def truth(robot: Robot, carrier: int) -> Array:
@@ -96,6 +92,32 @@ def test_where_nothing_was_added_nothing_is_found() -> None:
         assert one.gain < 30.0
 
 
+def test_two_loads_are_not_taken_for_one() -> None:
+    inertia = (1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0)
+    far = FreePose(mass_kg=0.3, com_xyz_m=(0.0, 0.2, 0.0), inertia=inertia)
+    one = found(loaded(carrying("wrist-3", 0.2), "shoulder-lift", far))
+    assert one.changed
+    assert not one.explains
+    assert not one.found
+
+
+def test_a_load_that_was_taken_off_is_no_payload() -> None:
+    before, later = said(carrying("wrist-3", 0.2), 0, 30.0), said(ROBOT, 1, 10.0)
+    one = find_payload(before, later, places_on_axes(CHAIN), SIGMA_NM)
+    assert one.changed
+    assert not one.found
+    back = find_payload(later, before, places_on_axes(CHAIN), SIGMA_NM)
+    assert back.found
+    assert back.mass_kg == pytest.approx(0.2, abs=0.006)
+
+
+@pytest.mark.parametrize("mass_kg", [0.03, 0.1, 0.8])
+def test_what_is_likely_beforehand_does_not_draw_the_mass(mass_kg: float) -> None:
+    one = found(carrying("wrist-3", mass_kg))
+    assert one.found
+    assert abs(one.mass_kg - mass_kg) < 4.0 * one.mass_sigma_kg
+
+
 def test_a_payload_is_a_body_that_can_exist_however_light() -> None:
     for mass in (0.001, 0.01, 0.2):
         one = found(carrying("wrist-3", mass), 7)
@@ -106,8 +128,8 @@ def test_more_than_the_robot_told_before_is_not_needed() -> None:
     """Motions before that leave some of the robot open do not make the payload wrong, only less certain."""
     robot = carrying("wrist-3", 0.2)
     later = said(robot, 1, 10.0)
-    little = find_payload(said(ROBOT, 0, 2.0), later, places(CHAIN), SIGMA_NM)
-    much = find_payload(said(ROBOT, 0, 60.0), later, places(CHAIN), SIGMA_NM)
+    little = find_payload(said(ROBOT, 0, 2.0), later, places_on_axes(CHAIN), SIGMA_NM)
+    much = find_payload(said(ROBOT, 0, 60.0), later, places_on_axes(CHAIN), SIGMA_NM)
     assert little.mass_sigma_kg > much.mass_sigma_kg
     assert abs(little.mass_kg - 0.2) < 4.0 * little.mass_sigma_kg
 
@@ -115,6 +137,6 @@ def test_more_than_the_robot_told_before_is_not_needed() -> None:
 def test_shapes_that_do_not_fit_are_named() -> None:
     known = said(ROBOT, 0, 2.0)
     with pytest.raises(ValueError, match="do not fit"):
-        find_payload(known, known, places(CHAIN)[:-1], SIGMA_NM)
+        find_payload(known, known, places_on_axes(CHAIN)[:-1], SIGMA_NM)
     with pytest.raises(ValueError, match="no body"):
-        find_payload(known, known, places(CHAIN), SIGMA_NM, carriers=[])
+        find_payload(known, known, places_on_axes(CHAIN), SIGMA_NM, carriers=[])

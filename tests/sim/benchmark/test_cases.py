@@ -39,7 +39,13 @@ def case_named(cases: list[Case], name: str) -> Case:
 
 def test_the_quick_benchmark_has_every_case_of_the_full_one_and_fewer_trials() -> None:
     quick, whole = kinematic_cases(QUICK, seed=0), kinematic_cases(full(), seed=0)
-    assert [case.name for case in quick] == [case.name for case in whole]
+    # Where the quick one does less of a case than its name says, its name says so.
+    for few, many in zip(quick, whole, strict=True):
+        assert few.name.startswith(many.name)
+    assert [few.name for few in quick if few.name not in {many.name for many in whole}] == [
+        "random robots, x5-uncalibrated, the smallest of 10",
+        "a2085_06, wear, by all joints at once",
+    ]
     assert len({case.name for case in whole}) == len(whole)
     assert all(few.trials for few in quick)
     assert all(len(few.trials) < len(many.trials) for few, many in zip(quick, whole, strict=True))
