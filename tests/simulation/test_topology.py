@@ -77,6 +77,7 @@ class Watcher:
         """What follows is computed afterwards."""
 
     async def excitation(self) -> Sequence[RobotMotion]:
+        self.notes.append("asked for motions of all joints")
         return ()
 
     def journal(self, event: JournalEvent) -> None:
@@ -173,12 +174,29 @@ def test_a_module_that_sends_no_feedback_is_left_out_by_name(
     assert any("module wrist answers, but sends no feedback" in note for note in watcher.notes)
 
 
-def test_a_joint_whose_limits_forbid_the_motion_is_named_and_all_else_is_explored(arm: Any) -> None:
+def narrow_elbow(arm: Any) -> None:
+    """Let the elbow allow less than exploring it takes."""
     module = arm.world.modules[arm.serials.index("elbow")]
     limits = config_of(module, 1).limits
     narrow = limits.model_copy(update={"min_position_rad": -0.1, "max_position_rad": 0.1})
     arm.kill("elbow")
     arm.boot("elbow", limits=narrow)
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+def test_all_joints_are_excited_together_only_if_all_take_part(arm: Any, narrow: bool) -> None:
+    if narrow:
+        narrow_elbow(arm)
+    update = {"dynamics": True, "excitation": "designed", "dynamic_repeats": 1}
+    recording, watcher = explore(arm, PLAN.model_copy(update=update))
+    assert ("asked for motions of all joints" in watcher.notes) != narrow
+    excited = {e.serial for e in recording.journal if e.purpose == "dynamic"}
+    # Nothing was designed here, or nothing asked for: joint by joint, without who is left out.
+    assert excited == set(arm.serials) - ({"elbow"} if narrow else set())
+
+
+def test_a_joint_whose_limits_forbid_the_motion_is_named_and_all_else_is_explored(arm: Any) -> None:
+    narrow_elbow(arm)
     recording, watcher = explore(arm)
     found = search_topology(recording, rested(recording))
     assert found.topology.unmoved == ("elbow",)
