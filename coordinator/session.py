@@ -108,10 +108,7 @@ class Session:
         await check_link(self.link, self._clock, self._plan.link_s, self._reporter.note)
         serials = self.link.serials
         explorations = 1 if self._plan.mode == "whole" else len(serials) + (self._plan.motions == "designed")
-        excitations = (
-            2 * len(serials) if self._plan.excitation == "thesis" else 1 + self._plan.excitation_motions
-        )
-        self._total = 6 + explorations + (excitations if self._plan.dynamics else 0)
+        self._total = 6 + explorations + (self._excitations(len(serials)) if self._plan.dynamics else 0)
         self._mend_after_restart()
         starts = {s: self._position(s) for s in serials}
         try:
@@ -360,17 +357,22 @@ class Session:
     async def _show_inertia(self) -> None:
         """Excite all joints together, if all of them move and motions for that can be designed."""
         motions = await self._reporter.excitation() if self._together() else ()
+        serials = self._left_out.movers() if not motions else ()
+        self._total += (len(motions) or 2 * len(serials)) - self._excitations(len(self.link.serials))
         for number, motion in enumerate(motions):
             last = number == len(motions) - 1
             purpose: Purpose = "held_out" if last else "dynamic"
             text = "held-out motion of all joints" if last else f"exciting all joints, {number + 1}"
             work = partial(self._run_together, f"{purpose}/{number}", motion, purpose)
             await self._step(f"{purpose}/{number}", text, work)
-        serials = self._left_out.movers() if not motions else ()
         for serial in serials:
             await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
         for serial in serials:
             await self._step(f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial)
+
+    def _excitations(self, joints: int) -> int:
+        """Return how many steps the plan takes to excite so many joints."""
+        return 1 + self._plan.excitation_motions if self._plan.excitation == "designed" else 2 * joints
 
     def _together(self) -> bool:
         if self._plan.excitation != "designed":
