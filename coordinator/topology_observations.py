@@ -56,13 +56,13 @@ def observe(recording: Recording, serials: Sequence[str]) -> Seen:
     heard_of = {joint: _heard(ear, joint) for joint in serials}
     first, _ = _look(recording, serials, heard_of, None)
     surely = {pair: _axis(seen) for pair, seen in first.items() if abs(seen.log_odds) > DOUBTFUL_BELOW}
-    axes = _Axes(surely, _usual_pose(heard_of))
+    axes = Axes(surely, _usual_pose(heard_of))
     observations, unmoved = _look(recording, serials, heard_of, axes)
     watching = {observer for _, observer in observations}
     return Seen(observations, unmoved, tuple(s for s in serials if s not in watching))
 
 
-def _usual_pose(heard_of: Mapping[str, Sequence["_Heard"]]) -> dict[str, float]:
+def _usual_pose(heard_of: Mapping[str, Sequence["Heard"]]) -> dict[str, float]:
     """Return where every joint was in the median of all motions."""
     places: dict[str, list[float]] = {}
     for heard in (heard for motions in heard_of.values() for heard in motions):
@@ -99,7 +99,7 @@ class _Ear(NamedTuple):
     offsets: Mapping[str, Array]
 
 
-class _Heard(NamedTuple):
+class Heard(NamedTuple):
     """One motion of one joint, as all that have feedback of it read it: kept samples (m, n) and (m, n, 3)."""
 
     event: JournalEvent
@@ -110,25 +110,25 @@ class _Heard(NamedTuple):
     offset_rad_s: Array
 
 
-def _heard(ear: _Ear, joint: str) -> list[_Heard]:
+def _heard(ear: _Ear, joint: str) -> list[Heard]:
     """Return the slow motions of a joint; without watchers, those of which its own feedback is missing."""
     return [_of_motion(ear, event) for event in slow_motions(ear.recording, joint)]
 
 
-def _of_motion(ear: _Ear, event: JournalEvent) -> _Heard:
+def _of_motion(ear: _Ear, event: JournalEvent) -> Heard:
     watchers = _watchers(ear, event)
     if event.serial not in watchers:
-        return _Heard(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
+        return Heard(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
     edge = settling_samples(RATE_HZ, CUTOFF_HZ)
     one = window(ear.recording, ear.clocks, watchers, event, edge / RATE_HZ)
     q, gyro = (zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ) for signal in (one.q_rad, one.gyro_rad_s))
     kept = slice(edge, len(one.t_ns) - edge, KEEP_EVERY)
     offset = np.array([ear.offsets[s] for s in watchers])
     mean = q[kept].mean(axis=0)
-    return _Heard(event, tuple(watchers), mean, differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
+    return Heard(event, tuple(watchers), mean, differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
 
 
-class _Axes(NamedTuple):
+class Axes(NamedTuple):
     """What a first look is sure of: {(joint, observer): axis in the observer's frame, zero if not carried}.
 
     pose_rad: where the joints were, in the median of all motions.
@@ -143,7 +143,7 @@ class _Axes(NamedTuple):
         rows = [[self.found.get((o, k)) for k in names] for o in names]
         return np.array([[unknown if axis is None else axis for axis in row] for row in rows])
 
-    def turned_away(self, heard: _Heard) -> bool:
+    def turned_away(self, heard: Heard) -> bool:
         """Return whether joints were elsewhere than where the axes were seen, so that these are others."""
         pairs = zip(heard.watchers, heard.q_mean_rad, strict=True)
         others = [abs(q - self.pose_rad[s]) for s, q in pairs if s != heard.event.serial]
@@ -151,7 +151,7 @@ class _Axes(NamedTuple):
 
 
 def _look(
-    recording: Recording, serials: Sequence[str], heard_of: Mapping[str, list[_Heard]], axes: "_Axes | None"
+    recording: Recording, serials: Sequence[str], heard_of: Mapping[str, list[Heard]], axes: Axes | None
 ) -> tuple[dict[tuple[str, str], MotionSeen], dict[str, str]]:
     """Return what was seen of all joints, and of those of which nothing was, why not."""
     observations: dict[tuple[str, str], MotionSeen] = {}
@@ -165,7 +165,7 @@ def _look(
 
 
 def _of_joint(
-    recording: Recording, serials: Sequence[str], motions: Sequence[_Heard], axes: "_Axes | None"
+    recording: Recording, serials: Sequence[str], motions: Sequence[Heard], axes: Axes | None
 ) -> tuple[dict[str, list[MotionSeen]], str]:
     """Return what everyone saw of all motions of a joint; without any, why not."""
     found: dict[str, list[MotionSeen]] = {}
@@ -173,20 +173,20 @@ def _of_joint(
     for heard in motions:
         assert heard.event.motion is not None
         try:
-            by_feedback = _by_feedback(heard, axes)
+            seen_by = by_feedback(heard, axes)
         except NotMoved as error:
             why = str(error)
             continue
         for observer in serials:
             finding = _finding(recording, heard.event.motion, heard.event.serial, observer)
-            seen = _checked(by_feedback.get(observer), finding)
+            seen = _checked(seen_by.get(observer), finding)
             if seen is not None:
                 found.setdefault(observer, []).append(seen)
         why = "nobody saw its motion"
     return found, why
 
 
-def _by_feedback(heard: _Heard, axes: "_Axes | None") -> dict[str, MotionSeen]:
+def by_feedback(heard: Heard, axes: Axes | None) -> dict[str, MotionSeen]:
     """Return what the feedback of all modules says of one motion; nothing without that of the joint.
 
     Raises:

@@ -15,7 +15,7 @@ from scipy.linalg import block_diag, qr, solve_triangular
 
 from coordinator.chain import Array
 from coordinator.dynamics.consistency import parameter_transform
-from coordinator.dynamics.identification import RANK_TOLERANCE, REACH_M
+from coordinator.dynamics.identification import RANK_TOLERANCE, parameter_scale
 from coordinator.dynamics.information import JointInformation
 from coordinator.dynamics.regressor import PER_BODY
 
@@ -111,14 +111,13 @@ def inertial_columns(joints: int) -> Columns:
     """Return the columns of `torque_regressor` for n joints; body 1 is the first of the chain.
 
     "m2" is the mass of body 2, "m2 c2x" its first moment along x, "I2xy" its inertia about the frame's
-    origin. Lengths are counted in `REACH_M`.
+    origin. Sizes are those of `parameter_scale`.
     """
     names: list[str] = []
     for b in range(1, joints + 1):
         names += [f"m{b}", *(f"m{b} c{b}{x}" for x in "xyz"), *(f"I{b}{pair}" for pair in _MOMENTS)]
-    one = REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], dtype=float)
     order = [PER_BODY * b + k for b in range(joints) for k in _WITHIN_BODY]
-    return Columns(tuple(names), np.tile(one, joints), np.array(order, dtype=np.int64))
+    return Columns(tuple(names), parameter_scale(joints), np.array(order, dtype=np.int64))
 
 
 def inertial_units(joints: int) -> tuple[str, ...]:

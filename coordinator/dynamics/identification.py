@@ -155,6 +155,14 @@ def solve_weighted(information: Sequence[JointInformation], independent_fraction
     return solve_information(information, 1.0 / sigma, independent_fraction=independent_fraction)
 
 
+def parameter_scale(bodies: int) -> Array:
+    """Return the sizes (10 n,) in which parameters are counted: phi = scale * (parameters in kg).
+
+    The columns of the regressor are multiplied by it.
+    """
+    return np.tile(REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], dtype=float), bodies)
+
+
 def _system(
     information: Sequence[JointInformation], weights: ArrayLike | None, prior_phi: ArrayLike | None
 ) -> _System:
@@ -166,8 +174,7 @@ def _system(
         raise ValueError(f"weights must be {joints} positive numbers, one per joint; got {weight}")
     if prior.shape != (size,) or not np.isfinite(prior).all():
         raise ValueError(f"prior_phi must be {size} finite numbers; got {prior.size}")
-    # phi = scale * (parameters in kg), so the columns of the regressor are multiplied by it.
-    scale = np.tile(REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], dtype=float), joints)
+    scale = parameter_scale(joints)
     blocks = [w * piece.r * scale for w, piece in zip(weight, information, strict=True)]
     targets = [w * (piece.z - piece.r @ prior) for w, piece in zip(weight, information, strict=True)]
     return _System(blocks, targets, scale, prior, weight)

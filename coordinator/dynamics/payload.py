@@ -21,7 +21,7 @@ from scipy.linalg import qr
 from coordinator.chain import Array
 from coordinator.dynamics.base_parameters import whitened
 from coordinator.dynamics.consistency import Body, body, pseudo_inertia
-from coordinator.dynamics.identification import RANK_TOLERANCE, REACH_M
+from coordinator.dynamics.identification import RANK_TOLERANCE, parameter_scale
 from coordinator.dynamics.information import JointInformation
 from coordinator.dynamics.physical_fit import physically_consistent
 from coordinator.dynamics.regressor import PER_BODY
@@ -164,9 +164,7 @@ def find_payload(
 def _complement(rows: Array, target: Array) -> tuple[Array, Array]:
     """Return what no parameters of the robot explain: of the target (j,), and of any rows, an orthonormal
     basis (k, j) of the complement of the rows' range."""
-    scale = np.tile(
-        REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], dtype=float), rows.shape[1] // PER_BODY
-    )
+    scale = parameter_scale(rows.shape[1] // PER_BODY)
     left, values, _ = np.linalg.svd(rows * scale)
     rank = int((values > RANK_TOLERANCE * values[0]).sum())
     beyond = left[:, rank:]

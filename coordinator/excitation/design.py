@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.chain import Array, Chain
-from coordinator.dynamics.identification import MAX_SIGMA_KG, REACH_M
-from coordinator.dynamics.regressor import PER_BODY, inverse_dynamics, torque_regressor
+from coordinator.dynamics.identification import MAX_SIGMA_KG, parameter_scale
+from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
 from coordinator.excitation.clearance import CLEARANCE_M, clearance_m
 from coordinator.excitation.segment import SampledMotion, Segment, draw_segment, sampled, smaller, way
 from coordinator.motion_design.limits import JointLimits
@@ -128,10 +128,10 @@ def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | s
 
 
 def information(task: ExcitationTask, motion: SampledMotion) -> Array:
-    """Return Y^T W Y (10 n, 10 n) of a motion, parameters in kg (see `identification.REACH_M`)."""
+    """Return Y^T W Y (10 n, 10 n) of a motion, parameters in kg (see `identification.parameter_scale`)."""
     regressor = torque_regressor(task.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
-    scale = np.tile(REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], dtype=float), len(task.limits))
-    rows = (regressor / task.torque_sigma_nm[:, None]).reshape(-1, PER_BODY * len(task.limits)) * scale
+    scale = parameter_scale(len(task.limits))
+    rows = (regressor / task.torque_sigma_nm[:, None]).reshape(-1, scale.size) * scale
     return np.asarray(rows.T @ rows)
 
 

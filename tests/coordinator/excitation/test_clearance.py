@@ -70,6 +70,18 @@ def test_neighbours_are_no_obstacle_to_each_other() -> None:
     assert len(axes.body) == 2
 
 
+def test_links_that_are_built_close_may_come_only_a_little_nearer() -> None:
+    """A link of 6 cm between two of 30 cm: the long ones stand 6 cm apart, and fold onto each other."""
+    chain, home = planar_arm((0.3, 0.06, 0.3, 0.1)), np.zeros(4)
+    q = np.zeros((3, 4))
+    q[1, 1], q[2, 1] = 0.5, 2.6
+    found = clearance_m(chain, q, home)
+    assert found[0] > CLEARANCE_M
+    assert found[1] > CLEARANCE_M
+    # At 2.6 rad the third link begins 0.06 sin(2.6) = 3 cm beside the first; 4 cm are allowed.
+    assert found[2] < CLEARANCE_M
+
+
 def test_links_move_with_the_bodies_that_they_belong_to() -> None:
     chain = true_chain(load_robot("a2085_06"))
     axes = link_axes(chain)

@@ -18,7 +18,7 @@ from coordinator.excitation.design import (
     design_excitation,
     information,
 )
-from coordinator.excitation.segment import SampledMotion, sampled
+from coordinator.excitation.segment import SampledMotion, sampled, way
 from coordinator.motion_design.limits import JointLimits, joint_limits, motion_peaks
 from coordinator.plan import Plan
 from module_agent.catalogue import module_type
@@ -124,6 +124,24 @@ def test_two_chosen_motions_are_the_best_of_all_pairs() -> None:
     chosen = log_det([information(task, sampled(s, RATE_HZ)) for s in found.segments])
     # Exchanging one at a time may end beside the best pair, but not far from it.
     assert sum(value > chosen + 1e-9 for value in pairs) <= 0.05 * len(pairs)
+
+
+def test_ways_are_looked_at_in_both_directions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every joint takes its own time, so that the way back leads elsewhere than the way there."""
+    task, looked = task_of("a2085_04", segments=2), []
+
+    def heard(from_rad: Array, to_rad: Array, *others: float) -> Array:
+        looked.append((tuple(from_rad), tuple(to_rad)))
+        return way(from_rad, to_rad, *others)
+
+    monkeypatch.setattr("coordinator.excitation.design.way", heard)
+    found = design_excitation(task, np.random.default_rng(5), candidates=6)
+    home = tuple(task.home_rad)
+    for segment in found.segments:
+        assert {(home, tuple(segment.pose_rad)), (tuple(segment.pose_rad), home)} <= set(looked)
+    there = way(np.zeros(2), np.array([0.2, 1.0]), 1.0, RATE_HZ)
+    back = way(np.array([0.2, 1.0]), np.zeros(2), 1.0, RATE_HZ)
+    assert np.abs(there - back[::-1]).max() > 0.1
 
 
 def test_the_same_seed_designs_the_same_motions() -> None:
