@@ -2,9 +2,9 @@
 
 from typing import Protocol
 
-from coordinator.chain import Chain
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.viewer.viewer import Viewer
+from module_agent.dynamics.chain import Chain
 
 
 class Beside(Protocol):

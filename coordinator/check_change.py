@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from coordinator.chain import Array, Chain
 from coordinator.check_fit import TiedFits
 from coordinator.kinematics.forward import descendants
 from coordinator.kinematics.increments import adjoint, frozen, increments_between
 from coordinator.kinematics.refinement import UNKNOWN_ABOVE
+from module_agent.dynamics.chain import Array, Chain
 
 # What two sessions of unlike motions leave between them for each link, of the same robot: links and springs
 # that give, filters. Measured: up to 0.2 mm and 0.45 mrad where the sessions' motions have other lengths.

@@ -11,14 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.differentiation import settling_samples
 from coordinator.journal import Purpose
 from coordinator.kinematics.imu_intrinsics import UNCALIBRATED, ImuIntrinsics
 from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.known_robot import KnownRobot
 from coordinator.motion_window import RATE_HZ, Window, sensor_data, window
 from coordinator.robot_refinement import CUTOFF_HZ, KEEP_EVERY, MOST_IMU_SAMPLES
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import settling_samples
 
 # Scale and axes of an IMU that has been corrected for them: for the two sessions they are the same.
 TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5)

@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.table import Table
 from scipy.stats import norm
 
-from coordinator.chain import Chain
 from coordinator.check_change import Findings, LinkChange
+from module_agent.dynamics.chain import Chain
 
 SCHEMA = 1
 BASE_NAME = "base"

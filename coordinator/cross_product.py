@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from coordinator.chain import Array
+from module_agent.dynamics.chain import Array
 
 
 def cross(a: Array, b: Array) -> Array:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.differentiation import differentiate
-from coordinator.dynamics.regressor import inverse_dynamics
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import differentiate
+from module_agent.dynamics.regressor import inverse_dynamics
 from module_agent.firmware.effort_profile import effort_profile, profile_period_ns
 from module_agent.firmware.waveform import duration_s, waveform
 from module_agent.wire.messages import EffortProfile, Pattern

@@ -18,13 +18,13 @@ from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, ind
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.consistency import body, is_consistent, nearest_consistent, pseudo_inertia
-from coordinator.dynamics.regressor import PER_BODY, check_phi
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.module_frames import distal_homes, housing_homes
 from coordinator.urdf import link_homes, upright_pose
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import PER_BODY, check_phi
 
 VERSION = "1.6.0"
 ACTUATORS = ("X5-1", "X5-4", "X5-9")

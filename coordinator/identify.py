@@ -11,13 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.clock_map import ClockMap, map_clocks
 from coordinator.clock_refinement import refine_clocks
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
-from coordinator.dynamics.differentiation import JointMotion, settling_samples
 from coordinator.dynamics.identification import InertialFit, solve_weighted
-from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.prediction import TorqueError, check_held_out
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
@@ -40,6 +37,9 @@ from coordinator.robot_refinement import CUTOFF_HZ, refine_robot
 from coordinator.topology_search import search_topology
 from coordinator.whole_exploration import respond, whole_motion
 from module_agent.catalogue import ModuleType, module_type
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import JointMotion, settling_samples
+from module_agent.dynamics.information import JointInformation, gather
 from module_agent.wire.messages import Estimate
 
 # Of some 30 errors an IMU the largest is below this in 99 of 100.

@@ -4,7 +4,6 @@ import shutil
 from pathlib import Path
 from typing import NamedTuple
 
-from coordinator.chain import Chain
 from coordinator.identify import IdentificationError, Kinematics, identify_kinematics
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.known_update import updated
@@ -13,6 +12,7 @@ from coordinator.recording import Recording
 from coordinator.run_folder import SESSION, load_recording
 from coordinator.session_file import SessionFileError
 from module_agent.catalogue import UnknownModuleType
+from module_agent.dynamics.chain import Chain
 
 # In the folder of a run that brought a known robot up to date: the recording of the run that the robot was
 # known from, so that the folder tells the robot by itself.

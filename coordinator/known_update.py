@@ -13,13 +13,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.identify import Kinematics
 from coordinator.kinematics.assembly import ChainFit, link_lengths
 from coordinator.kinematics.increments import adjoint, apply_increment, frozen, increments_between
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.refinement import UNKNOWN_ABOVE, Refinement
 from coordinator.known_difference import difference
+from module_agent.dynamics.chain import Array, Chain
 
 # A direction that a known part does not tell is this uncertain, in rad or in m.
 UNTOLD = 1.0

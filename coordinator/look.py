@@ -8,7 +8,6 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from coordinator.clock_map import map_clocks
-from coordinator.dynamics.differentiation import settling_samples
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.assembly import link_lengths
 from coordinator.kinematics.imu_intrinsics import IMU_PRIORS, ImuPrior
@@ -20,6 +19,7 @@ from coordinator.motion_window import RATE_HZ, filtered, thinned, window
 from coordinator.recording import Recording
 from coordinator.robot_so_far import RobotSoFar, robot_so_far
 from module_agent.catalogue import ModuleType, module_type
+from module_agent.dynamics.differentiation import settling_samples
 
 CUTOFF_HZ = 12.0
 # 50 samples a second are kept of every motion, for the loads of its links; the refinement has a quarter of

@@ -7,18 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from coordinator.chain import Array
 from coordinator.clock_map import ClockMap
-from coordinator.dynamics.differentiation import (
+from coordinator.journal import JournalEvent
+from coordinator.kinematics.base_motion import NoiseFloor, outstanding
+from coordinator.kinematics.sensor_data import SensorData
+from coordinator.recording import Recording
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.differentiation import (
     differentiate,
     resample,
     settling_samples,
     zero_phase_low_pass,
 )
-from coordinator.journal import JournalEvent
-from coordinator.kinematics.base_motion import NoiseFloor, outstanding
-from coordinator.kinematics.sensor_data import SensorData
-from coordinator.recording import Recording
 
 RATE_HZ = 250.0
 STEP_NS = 4_000_000

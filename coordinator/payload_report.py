@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from coordinator.chain import Chain
 from coordinator.dynamics.consistency import Body, body
 from coordinator.dynamics.payload import Payload
 from coordinator.urdf import link_homes
+from module_agent.dynamics.chain import Chain
 
 SCHEMA = 1
 # The next best carrier must explain that much less, in variances of the torques' noise, to be ruled out.

@@ -1,10 +1,7 @@
 """What a known robot carries: one short motion of all joints, against the run that it is known from."""
 
-from coordinator.chain import Chain
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
-from coordinator.dynamics.differentiation import JointMotion
 from coordinator.dynamics.identification import solve_weighted
-from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.payload import find_payload
 from coordinator.dynamics.physical_fit import NotSolvedError
 from coordinator.journal import Purpose
@@ -12,6 +9,9 @@ from coordinator.kinematics.forward import places_on_axes
 from coordinator.known_robot import KnownRobot, hurried
 from coordinator.payload_report import PayloadReport, payload_report
 from coordinator.plan import Plan
+from module_agent.dynamics.chain import Chain
+from module_agent.dynamics.differentiation import JointMotion
+from module_agent.dynamics.information import JointInformation, gather
 
 # A check of all joints at once takes some 11 s for six of them, and all around it 5 s.
 _MOVING: tuple[Purpose, ...] = ("dynamic", "whole")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from coordinator.chain import Chain
+from module_agent.dynamics.chain import Chain
 
 SCHEMA = 1
 

@@ -4,8 +4,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coordinator.chain import Array
-from coordinator.dynamics.regressor import PER_BODY
 from coordinator.kinematics.denavit_hartenberg import dh_paths
 from coordinator.kinematics.link_transforms import PARAMETERS, LinkTransform, link_transforms
 from coordinator.kinematics.product_of_exponentials import screw_model
@@ -32,6 +30,8 @@ from coordinator.result import (
     chain_part,
 )
 from module_agent.catalogue import ModuleType, module_type
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.regressor import PER_BODY
 
 if TYPE_CHECKING:
     from coordinator.dynamics.identification import InertialFit

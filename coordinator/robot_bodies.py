@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.base_parameters import (
     BaseParameters,
     base_parameters,
@@ -23,14 +22,15 @@ from coordinator.dynamics.base_parameters import (
 )
 from coordinator.dynamics.consistency import Body, body, parameter_transform
 from coordinator.dynamics.identification import MAX_SIGMA_KG, InertialFit
-from coordinator.dynamics.information import JointInformation
 from coordinator.dynamics.joint_frames import joint_frames
 from coordinator.dynamics.parameter_prior import module_prior
 from coordinator.dynamics.physical_fit import NotSolvedError, PhysicalFit, fit_physical
-from coordinator.dynamics.regressor import PER_BODY
 from coordinator.dynamics.verdict import Verdict, verdicts, words_of_base, words_of_body
 from coordinator.urdf import link_homes
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.information import JointInformation
+from module_agent.dynamics.regressor import PER_BODY
 
 # Of a module's torque sensor, a spring whose stiffness is known to a few percent. That is a guess: no figure
 # is published.

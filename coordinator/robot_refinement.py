@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.base_heading import faced
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.imu_intrinsics import DELAY, ImuPrior
@@ -25,6 +24,7 @@ from coordinator.kinematics.refinement import Refinement, refine_chain
 from coordinator.kinematics.sensor_data import SensorData
 from coordinator.motion_window import RATE_HZ, Window, encoder_steps, filtered, thinned
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
 
 # Six times the 2 Hz of the windowed sine, and above the resonance of a base that is worth the name.
 CUTOFF_HZ = 12.0

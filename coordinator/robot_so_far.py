@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.assembly import ChainFit, assemble
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation
@@ -19,6 +18,7 @@ from coordinator.kinematics.pair_estimate import circle_observation
 from coordinator.kinematics.topology import MotionSeen, Topology, likely_topology
 from coordinator.recording import Recording
 from module_agent.catalogue import module_type
+from module_agent.dynamics.chain import Array, Chain
 from module_agent.wire.messages import Estimate
 
 # Of the weighted squares: far less than their noise.

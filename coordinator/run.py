@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from coordinator.beside import Beside
-from coordinator.chain import Chain
 from coordinator.clock import Clock
 from coordinator.excitation.of_robot import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
@@ -41,6 +40,7 @@ from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from coordinator.viewer_feed import FILE, LIVE, Screen, ViewerFeed
 from module_agent.catalogue import module_type
+from module_agent.dynamics.chain import Chain
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Transport

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.consistency import (
     body,
     is_consistent,
@@ -22,9 +21,10 @@ from coordinator.dynamics.consistency import (
     pseudo_inertia,
     smallest_eigenvalue,
 )
-from coordinator.dynamics.regressor import PER_BODY, check_phi
 from coordinator.kinematics.forward import BASE, carrier
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import PER_BODY, check_phi
 
 
 def write_urdf(

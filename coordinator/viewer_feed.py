@@ -5,7 +5,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from coordinator.beside import Beside
-from coordinator.chain import Array
 from coordinator.clock_map import ClockMap, map_clock
 from coordinator.identify import HeldOutMotion
 from coordinator.kinematics.assembly import ChainFit
@@ -16,6 +15,7 @@ from coordinator.robot_so_far import RobotSoFar
 from coordinator.viewer.blueprint import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.side_by_side import side_by_side
 from coordinator.viewer.viewer import Viewer
+from module_agent.dynamics.chain import Array
 from module_agent.wire.messages import Feedback, Message, Status
 
 MAP_PERIOD_NS = 1_000_000_000

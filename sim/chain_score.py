@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
+from module_agent.dynamics.chain import Array, Chain
 from sim.gauge import align_gauge, move_root, reorder, reorder_basis, tip_error
 
 POSES = 1000

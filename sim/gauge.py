@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import imu_poses
 from coordinator.kinematics.increments import adjoint, apply_increment, frozen
+from module_agent.dynamics.chain import Array, Chain
 
 # What a wrong orientation counts against a wrong position: the displacement at a usual module's reach.
 REACH_M = 0.3

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Chain
 from module_agent.catalogue import ModuleType, module_type
+from module_agent.dynamics.chain import Chain
 from sim.parts import Hinge, Part, placed
 from sim.pose import Array, inverse, pose, read_only
 from sim.rigid_body import RigidBody, joined, moved, negative, parameters, tensor

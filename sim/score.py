@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from rich.table import Table
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.differentiation import resample
 from coordinator.kinematics.increments import frozen
 from coordinator.result import SCHEMA, ChainPart, LinkPart, UnresolvedPart
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import resample
 from sim.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.truth import Motion, read_motion, read_truth
 

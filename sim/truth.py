@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Chain
+from module_agent.dynamics.chain import Chain
 from sim.module_clock import ModuleClock, module_time
 from sim.physics.sensor_errors import SensorErrors
 from sim.pose import Array, read_only

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Chain
 from coordinator.clock_map import map_clocks
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.recording import Recording
@@ -20,6 +19,7 @@ from coordinator.run_folder import RESULT, SESSION, VIEW, load_recording
 from coordinator.viewer.merge import MergeFailed, merge_into
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
+from module_agent.dynamics.chain import Chain
 from sim.pose import Array
 from sim.truth import Motion, read_motion, read_truth
 from sim.truth_view import TruthView

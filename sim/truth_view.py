@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.chain import Chain
 from coordinator.kinematics.assembly import link_lengths
 from coordinator.kinematics.axis_angles import axis_angles
 from coordinator.kinematics.forward import BASE
@@ -16,6 +15,7 @@ from coordinator.kinematics.free_motions import free_motions, moved, nearest
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.viewer.blueprint import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.viewer import Viewer
+from module_agent.dynamics.chain import Chain
 from sim.gauge import move_root
 
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, qr, solve_triangular
 
-from coordinator.chain import Array
 from coordinator.dynamics.consistency import parameter_transform
 from coordinator.dynamics.identification import RANK_TOLERANCE, parameter_scale
-from coordinator.dynamics.information import JointInformation
-from coordinator.dynamics.regressor import PER_BODY
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.information import JointInformation
+from module_agent.dynamics.regressor import PER_BODY
 
 # A column that keeps less than this of its length beside the columns chosen before it is passed over, so that
 # coefficients do not exceed its reciprocal: a sum is named by what it mostly is. With motions that show all

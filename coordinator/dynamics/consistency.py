@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array
 from coordinator.dynamics.identification import REACH_M
+from module_agent.dynamics.chain import Array
 
 # Half a gram at 0.3 m, 5e-5 kg m^2: below every module's inertia, and still far enough from singular for
 # simulators that invert it.

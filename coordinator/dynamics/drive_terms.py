@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array
+from module_agent.dynamics.chain import Array
 
 Term = Literal["inertia", "viscous", "coulomb", "curved", "offset"]
 TERMS: tuple[Term, ...] = get_args(Term)

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
-from coordinator.chain import Array
-from coordinator.dynamics.information import JointInformation, compress
-from coordinator.dynamics.regressor import PER_BODY
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.information import JointInformation, compress
+from module_agent.dynamics.regressor import PER_BODY
 
 # Parameters in kg, kg m and kg m^2 have no common size. First moments are measured per 0.3 m and inertias per
 # (0.3 m)^2, a usual reach of a module with its link, so that all are in kg. A scale per column of the

@@ -7,7 +7,7 @@ the distance that lumps the masses beyond.
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
+from module_agent.dynamics.chain import Array, Chain
 
 # Axes closer to parallel have a common normal that an estimate turns anywhere.
 _PARALLEL_BELOW = np.sin(np.radians(10.0))

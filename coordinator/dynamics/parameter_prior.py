@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.module_frames import distal_homes, housing_homes, output_homes, proximal_homes
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
 
 # What turns with a module's output: a flange and the last wheel of the gear. Not published; a flange of
 # aluminium of 36 mm by 6 mm has 16 g, the wheel and its bearing about as much.

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import qr
 
-from coordinator.chain import Array
 from coordinator.dynamics.base_parameters import whitened
 from coordinator.dynamics.consistency import Body, body, pseudo_inertia
 from coordinator.dynamics.identification import RANK_TOLERANCE, parameter_scale
-from coordinator.dynamics.information import JointInformation
 from coordinator.dynamics.physical_fit import physically_consistent
-from coordinator.dynamics.regressor import PER_BODY
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.information import JointInformation
+from module_agent.dynamics.regressor import PER_BODY
 
 # Before anything moved: some hundred grams, about as large as a fist, near the module that carries it. It
 # counts as much as one torque reading.

@@ -22,12 +22,12 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, qr, solve_triangular
 from scipy.optimize import brentq
 
-from coordinator.chain import Array
 from coordinator.dynamics.base_parameters import scale_errors, whitened
 from coordinator.dynamics.consistency import parameter_transform, pseudo_inertia
 from coordinator.dynamics.identification import InertialFit
-from coordinator.dynamics.information import JointInformation
-from coordinator.dynamics.regressor import PER_BODY
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.information import JointInformation
+from module_agent.dynamics.regressor import PER_BODY
 
 # Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 10 is the belief that a body's distribution of
 # mass is known to about 30 %: modules better, links worse. What no model has, friction and springs, is no

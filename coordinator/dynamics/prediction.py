@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.differentiation import JointMotion
-from coordinator.dynamics.regressor import inverse_dynamics
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import JointMotion
+from module_agent.dynamics.regressor import inverse_dynamics
 
 
 class TorqueError(NamedTuple):

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
-from coordinator.chain import Array
 from coordinator.dynamics.identification import RANK_TOLERANCE
+from module_agent.dynamics.chain import Array
 
 # 95 % as efficient as least squares on normal noise (Huber and Ronchetti 2009, Robust statistics, table 4.1).
 HUBER_LIMIT = 1.345

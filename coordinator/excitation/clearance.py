@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE, body_displacements, places_on_axes
+from module_agent.dynamics.chain import Array, Chain
 
 # An X5's housing is 31 mm deep and 110 mm long, its tubes are of 32 mm; two of them, and the cables.
 CLEARANCE_M = 0.10

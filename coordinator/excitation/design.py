@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.identification import MAX_SIGMA_KG, parameter_scale
-from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
 from coordinator.excitation.clearance import CLEARANCE_M, clearance_m
 from coordinator.excitation.segment import SampledMotion, Segment, draw_segment, sampled, smaller, way
 from coordinator.motion_design.limits import JointLimits
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import inverse_dynamics, torque_regressor
 
 CANDIDATES = 150
 # Faster than the sines by ten: each period of the fastest is seen in a dozen samples.

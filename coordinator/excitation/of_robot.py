@@ -5,15 +5,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.consistency import parameters
 from coordinator.dynamics.parameter_prior import module_prior
-from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.excitation.design import ExcitationTask, NoExcitation, design_excitation, draw_possible
 from coordinator.excitation.segment import RobotMotion, Segment
 from coordinator.motion_design.limits import JointLimits, joint_limits
 from coordinator.plan import Plan
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import inverse_dynamics
 from module_agent.wire.messages import Limits
 
 # Of its largest torque, what a module's sensor scatters: its spring turns by that much within an encoder's

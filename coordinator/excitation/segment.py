@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
-from coordinator.dynamics.differentiation import differentiate
 from coordinator.motion_design.limits import JointLimits, motion_peaks
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.differentiation import differentiate
 from module_agent.firmware.waveform import duration_s, waveform
 from module_agent.wire.messages import GoTo, MultiSine, Sine
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.chain_observations import (
     ChainObservations,
     PairObservation,
@@ -28,6 +27,7 @@ from coordinator.kinematics.initial_guess import initial_chain
 from coordinator.kinematics.null_space import Unresolved, name_null_space
 from coordinator.kinematics.topology import Topology
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
 
 # A direction counts as resolved if its one sigma is below this (rad or m). A parallel pair of axes is never
 # parallel to the last digit: the noise of the axes would "resolve" the offset along them to half a metre.

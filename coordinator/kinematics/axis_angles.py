@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.increments import frozen
+from module_agent.dynamics.chain import Array, Chain
 
 # Of the sine: below this two axes are parallel, and any tilt makes the angle grow.
 PARALLEL_BELOW = 1e-6

@@ -7,11 +7,11 @@ needed to subtract the shake; how well it is known is not claimed.
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import body_motions, readings_on
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.sensor_data import SensorData
+from module_agent.dynamics.chain import Array, Chain
 
 
 def faced(chain: Chain, data: SensorData, null_basis: Array) -> Chain:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
+from module_agent.dynamics.chain import Array
 
 # A mean of three bins of nothing but noise exceeds its expectation by this factor once in 2000 times.
 STANDS_OUT = 4.0

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import body_displacements, carrier
 from coordinator.kinematics.increments import adjoint, skew
+from module_agent.dynamics.chain import Array, Chain
 
 # Floors of what is believed, added in squares to the stated sigmas, which know nothing of the sensors' own
 # errors: an accelerometer's scale is good to 0.5 %, its place in the housing to 0.3 mm, a gyro's axes to 2

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import ancestors
 from coordinator.kinematics.increments import frozen
+from module_agent.dynamics.chain import Array, Chain
 
 PARALLEL_BELOW_RAD = 1e-7
 MEETING_BELOW_M = 1e-9

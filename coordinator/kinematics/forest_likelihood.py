@@ -12,8 +12,8 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from coordinator.chain import Array
 from coordinator.kinematics.forward import BASE
+from module_agent.dynamics.chain import Array
 
 # (n,) the index of every module's parent, BASE on the base; parents need not come first.
 Parents = tuple[int, ...]

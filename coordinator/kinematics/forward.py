@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
+from module_agent.dynamics.chain import Array, Chain
 
 BASE = -1
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE, ancestors, descendants
 from coordinator.kinematics.increments import adjoint, apply_increment, frozen
 from coordinator.kinematics.null_space import Kind, Unresolved, name_null_space
+from module_agent.dynamics.chain import Array, Chain
 
 # What a wrong orientation counts against a wrong place: the displacement at a usual module's reach.
 REACH_M = 0.3

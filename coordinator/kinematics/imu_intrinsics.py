@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array
+from module_agent.dynamics.chain import Array
 
 # One IMU's errors as one vector: E of the gyro and of the accelerometer row by row, their biases, the delay,
 # and the gyro's sensitivity to specific force row by row.

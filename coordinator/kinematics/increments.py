@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from coordinator.chain import Array, Chain
+from module_agent.dynamics.chain import Array, Chain
 
 
 def apply_increment(chain: Chain, delta: ArrayLike) -> Chain:

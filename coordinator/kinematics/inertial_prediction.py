@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array, Chain
 from coordinator.cross_product import cross
 from coordinator.kinematics.base_motion import BaseMotion
 from coordinator.kinematics.forward import BASE, carrier
 from coordinator.kinematics.increments import skew
+from module_agent.dynamics.chain import Array, Chain
 
 
 class ImuReadings(NamedTuple):

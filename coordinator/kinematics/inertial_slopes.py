@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.cross_product import cross
 from coordinator.kinematics.forward import ancestors, carrier
 from coordinator.kinematics.inertial_prediction import BodyMotion, acceleration_at, turned
+from module_agent.dynamics.chain import Array, Chain
 
 
 class ImuSlopes(NamedTuple):

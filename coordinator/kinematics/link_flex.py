@@ -12,9 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.cross_product import cross
-from coordinator.dynamics.differentiation import differentiate
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.inertial_prediction import (
     BodyMotion,
@@ -29,6 +27,8 @@ from coordinator.kinematics.inertial_prediction import (
 )
 from coordinator.kinematics.sensor_data import SensorData
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import differentiate
 
 # Where the hinge is, as a share of the length: 0 for a clamp that gives, 0.15 for a clamped beam (Howell,
 # section 5), up to a third where the end's slope counts more than its place.

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.increments import adjoint, frozen, skew
 from coordinator.kinematics.module_frames import distal_homes, proximal_homes
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
 
 Face = Literal["output", "housing"]
 PARAMETERS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.increments import frozen
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
 
 
 def housing_homes(chain: Chain, types: Sequence[ModuleType]) -> Array:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
+from module_agent.dynamics.chain import Array
 
 BLOCKS = 6
 # Of a thousand observations, one has gone wrong in a way that is in no model: it tells nothing.

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from coordinator.chain import Array
 from coordinator.kinematics.chain_observations import PairObservation
+from module_agent.dynamics.chain import Array
 from module_agent.wire.messages import Estimate
 
 

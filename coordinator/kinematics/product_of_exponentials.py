@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import ancestors
 from coordinator.kinematics.increments import frozen, skew
 from coordinator.kinematics.module_frames import distal_homes
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
 
 
 class Tip(NamedTuple):

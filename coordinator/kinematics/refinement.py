@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.imu_intrinsics import (
     BIASES_ONLY,
     ImuIntrinsics,
@@ -28,6 +27,7 @@ from coordinator.kinematics.inertial_prediction import BodyMotion, ImuReadings, 
 from coordinator.kinematics.inertial_slopes import imu_slopes
 from coordinator.kinematics.link_flex import FlexSlopes, no_flex
 from coordinator.kinematics.sensor_data import SensorData
+from module_agent.dynamics.chain import Array, Chain
 from module_agent.gravity import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 
 ITERATIONS = 20

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array
 from coordinator.kinematics.base_motion import BaseMotion
+from module_agent.dynamics.chain import Array
 
 
 class SensorData(NamedTuple):

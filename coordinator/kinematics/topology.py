@@ -13,7 +13,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
 from coordinator.kinematics.forest_likelihood import (
     Parents,
     ancestors,
@@ -23,6 +22,7 @@ from coordinator.kinematics.forest_likelihood import (
 )
 from coordinator.kinematics.forward import BASE
 from coordinator.kinematics.motion_evidence import carried_log_odds
+from module_agent.dynamics.chain import Array
 
 # What is less likely than this (log-odds) to be right is worth another motion: 1 in 100 may be wrong.
 DOUBTFUL_BELOW = float(np.log(99.0))

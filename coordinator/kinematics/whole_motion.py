@@ -19,10 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array
 from coordinator.kinematics.chain_observations import PairObservation
 from coordinator.kinematics.increments import frozen
 from coordinator.kinematics.topology import MotionSeen
+from module_agent.dynamics.chain import Array
 
 MOVED_ABOVE = 0.5
 # What is left of taking the axes as constant, per square of the joints' swing [1 / rad^2]: joints between

@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
 from coordinator.cross_product import cross
 from coordinator.kinematics.imu_intrinsics import ImuPrior, slopes
 from coordinator.kinematics.increments import skew
 from coordinator.kinematics.inertial_prediction import turned
+from module_agent.dynamics.chain import Array
 from module_agent.gravity import GRAVITY_SIGMA_M_S2
 
 # Radius (2), axis (2), gravity (3): what is unknown beside the IMU's own errors.

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
-from coordinator.dynamics.differentiation import differentiate, settling_samples, zero_phase_low_pass
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.differentiation import differentiate, settling_samples, zero_phase_low_pass
 
 # Below what a held spring rings at; the ramps of a slow motion last 0.15 s and more.
 CUTOFF_HZ = 6.0

@@ -16,8 +16,8 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array
-from coordinator.dynamics.differentiation import NS_PER_S, resample
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.differentiation import NS_PER_S, resample
 
 # Of a sampling interval; a fiftieth at 0.1 of the sampling rate is 1.3 % of the amplitude, between samples.
 _JITTER = 0.02

@@ -5,14 +5,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import welch
 
-from coordinator.chain import Array
-from coordinator.dynamics.differentiation import (
+from coordinator.offline.data_file import JointLog
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.differentiation import (
     NS_PER_S,
     filtered_motion,
     settling_samples,
     zero_phase_low_pass,
 )
-from coordinator.offline.data_file import JointLog
 
 # Of the speed's power in what counts as the motion, and how many times its highest frequency passes. Friction
 # at reversals has harmonics up to several times the motion's frequency; what lies above the motion is noise.

@@ -12,11 +12,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array
 from coordinator.dynamics.drive_terms import Term
 from coordinator.dynamics.prediction import TorqueError, torque_error
 from coordinator.dynamics.weighted_fit import WeightedFit, fit_weighted
 from coordinator.offline.problem import Problem
+from module_agent.dynamics.chain import Array
 
 Index = NDArray[np.int64]
 Tried = Literal["second half", "first half", "both", "other recording"]

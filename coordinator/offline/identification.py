@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from coordinator.chain import Array
 from coordinator.dynamics.base_parameters import (
     BaseParameters,
     base_parameters,
@@ -15,7 +14,6 @@ from coordinator.dynamics.base_parameters import (
     into_frames,
 )
 from coordinator.dynamics.physical_fit import NotSolvedError
-from coordinator.dynamics.regressor import PER_BODY
 from coordinator.dynamics.verdict import WEAK_ABOVE, verdicts, words_of_body
 from coordinator.dynamics.weighted_fit import WeightedFit
 from coordinator.offline.data_file import JointLog
@@ -53,6 +51,8 @@ from coordinator.offline.real_bodies import (
     claimed_bodies,
     real_bodies,
 )
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.regressor import PER_BODY
 
 _TOLD_BELOW = 1.0
 # A term of no use passes a test at this level once in a hundred.

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array
 from coordinator.dynamics.base_parameters import Columns, inertial_columns
 from coordinator.dynamics.drive_terms import (
     NONLINEAR,
@@ -17,9 +16,10 @@ from coordinator.dynamics.drive_terms import (
     drive_regressor,
     drive_signals,
 )
-from coordinator.dynamics.regressor import PER_BODY, torque_regressor
 from coordinator.offline.filtered_log import FilteredLog
 from coordinator.offline.urdf_chain import UrdfRobot
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.regressor import PER_BODY, torque_regressor
 
 
 class ModelChoice(NamedTuple):

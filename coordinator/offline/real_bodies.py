@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array
 from coordinator.dynamics.consistency import (
     Body,
     body,
@@ -14,11 +13,12 @@ from coordinator.dynamics.consistency import (
     pseudo_inertia,
 )
 from coordinator.dynamics.physical_fit import physically_consistent
-from coordinator.dynamics.regressor import PER_BODY
 from coordinator.dynamics.weighted_fit import WeightedFit
 from coordinator.offline.held_out import Predictor, fit_part
 from coordinator.offline.problem import Problem
 from coordinator.offline.urdf_chain import UrdfRobot
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.regressor import PER_BODY
 
 # The belief that a link's distribution of mass is as claimed to about 30 % (`physical_fit.WEIGHTS`).
 USUAL_TRUST = 10.0

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.consistency import parameters, pseudo_inertia
 from coordinator.kinematics.forward import BASE
+from module_agent.dynamics.chain import Array, Chain
 
 STANDARD_GRAVITY = (0.0, 0.0, 9.81)
 _MOVING, _FIXED = ("revolute", "continuous"), "fixed"

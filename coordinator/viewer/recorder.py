@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from coordinator.chain import Array, Chain
 from coordinator.viewer import blueprint, layout, progress, robot_geometry, robot_scene, time_series
 from coordinator.viewer import topology_graph as graphs
 from coordinator.viewer.parameter import Estimate, with_estimate
 from coordinator.viewer.time_series import Batch, IntArray
+from module_agent.dynamics.chain import Array, Chain
 
 # Times the reach that the eye was set for.
 OUTGROWN = 1.25

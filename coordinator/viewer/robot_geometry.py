@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE, carrier
 from module_agent.catalogue import module_type
+from module_agent.dynamics.chain import Array, Chain
 
 
 class Box(NamedTuple):

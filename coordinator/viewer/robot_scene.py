@@ -7,12 +7,12 @@ import numpy as np
 import rerun as rr
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE, body_displacements
 from coordinator.viewer import layout
 from coordinator.viewer.parameter import NINETY_FIVE_SIGMAS
 from coordinator.viewer.robot_geometry import Link, Module, from_z, links, modules, upright
 from coordinator.viewer.time_series import IntArray, time_column
+from module_agent.dynamics.chain import Array, Chain
 
 LINK_RADIUS_M = 0.009
 OUTPUT_RADIUS_M = 0.024

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import BASE, descendants
 from coordinator.kinematics.increments import apply_increment
+from module_agent.dynamics.chain import Array, Chain
 
 GAP_M = 0.25
 

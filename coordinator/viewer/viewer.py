@@ -8,7 +8,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Chain
 from coordinator.viewer import blueprint, layout, robot_scene, viewer_process
 from coordinator.viewer.logging_thread import Job, LoggingThread
 from coordinator.viewer.parameter import Estimate
@@ -16,6 +15,7 @@ from coordinator.viewer.recorder import Recorder
 from coordinator.viewer.targets import ViewerTargets, open_targets
 from coordinator.viewer.time_series import Batch, IntArray
 from coordinator.viewer.topology_graph import as_topology
+from module_agent.dynamics.chain import Chain
 from module_agent.wire.feedback_rows import Rows
 
 POSE_PERIOD_NS = 33_333_333

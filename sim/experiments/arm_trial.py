@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.failure import explain
 from coordinator.identify import Kinematics, identify_kinematics
 from coordinator.kinematics.assembly import link_lengths
@@ -17,6 +16,7 @@ from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.kinematics.increments import apply_increment
 from coordinator.plan import Mode, Motions, Plan
 from coordinator.recording import Recording
+from module_agent.dynamics.chain import Array, Chain
 from module_agent.wire.network_file import network as named_network
 from sim.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.experiments.thesis_chain import thesis_chain

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.chain import Array
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation
@@ -16,6 +15,7 @@ from coordinator.kinematics.pair_estimate import circle_observation
 from coordinator.kinematics.topology import Topology
 from coordinator.recording import Recording
 from module_agent.catalogue import ModuleType, module_type
+from module_agent.dynamics.chain import Array
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import Estimate
 

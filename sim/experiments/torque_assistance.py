@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array, Chain
 from coordinator.feed_forward import (
     Reference,
     SetPoints,
@@ -22,6 +21,7 @@ from coordinator.feed_forward import (
 from coordinator.identify import identify
 from coordinator.plan import Plan
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
 from module_agent.firmware.gains import default_gains
 from module_agent.wire.messages import GainSet, GoTo, Pattern, Rest
 from module_agent.wire.network_file import network

@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.chain import Array, Chain
 from coordinator.check import check, check_plan
 from coordinator.check_report import CheckReport, LinkCheck
 from coordinator.identify import identify_kinematics
 from coordinator.kinematics.forward import BASE, ancestors
 from coordinator.known_robot import KnownRobot
 from coordinator.plan import Plan
+from module_agent.dynamics.chain import Array, Chain
 from module_agent.wire.network_file import network as network_named
 from sim.parts import FreePose, Part
 from sim.place import somewhere

@@ -8,12 +8,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from coordinator.chain import Chain
-from coordinator.dynamics.regressor import torque_regressor
 from coordinator.kinematics.inertial_prediction import imu_readings
 from coordinator.plan import Plan
 from coordinator.terminal import Terminal
 from module_agent.catalogue import CATALOGUE
+from module_agent.dynamics.chain import Chain
+from module_agent.dynamics.regressor import torque_regressor
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits
 from module_agent.firmware.firmware import Firmware
 from module_agent.hardware import SensorSample

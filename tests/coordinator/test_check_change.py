@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from coordinator.chain import Chain
 from coordinator.check_change import FLOOR_M, FLOOR_RAD, find_changes
 from coordinator.check_fit import TiedFits
 from coordinator.kinematics.increments import adjoint, apply_increment, increments_between
 from coordinator.kinematics.refinement import Refinement
+from module_agent.dynamics.chain import Chain
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from coordinator.chain import Array, Chain
 from coordinator.feed_forward import feed_forward, joint_reference, on_module, standing
+from module_agent.dynamics.chain import Array, Chain
 from module_agent.firmware.effort_profile import effort_at
 from module_agent.wire.messages import GoTo, MultiSine, Pattern, Rest, Sine, WindowedSine
 

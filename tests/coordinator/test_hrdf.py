@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.hrdf import hrdf_element, joint_order, write_hrdf
 from coordinator.kinematics.forward import body_displacements
 from coordinator.kinematics.module_frames import distal_homes
 from coordinator.urdf import upright_pose
 from module_agent.catalogue import CATALOGUE, ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import inverse_dynamics
 from sim.robot_file import load_robot
 from sim.robot_tree import build_tree, true_chain, true_inertia
 

@@ -6,13 +6,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from coordinator.chain import Chain
 from coordinator.kinematics.forward import descendants
 from coordinator.kinematics.increments import adjoint, apply_increment, increments_between
 from coordinator.kinematics.refinement import Refinement
 from coordinator.kinematics.topology import Topology
 from coordinator.known_difference import difference, joints_to_explore
 from coordinator.known_update import placed
+from module_agent.dynamics.chain import Chain
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import true_chain
 

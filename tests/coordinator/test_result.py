@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from coordinator.chain import Chain
 from coordinator.result import SCHEMA, ExponentialsPart, LinkPart, Result, chain_part, write_result
+from module_agent.dynamics.chain import Chain
 
 
 def _chain() -> Chain:

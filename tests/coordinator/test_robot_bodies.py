@@ -6,10 +6,10 @@ from numpy.random import default_rng
 
 from coordinator.dynamics.consistency import body, pseudo_inertia
 from coordinator.dynamics.identification import solve_information
-from coordinator.dynamics.information import gather
 from coordinator.dynamics.physical_fit import NotSolvedError
-from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.robot_bodies import RobotBodies, robot_bodies
+from module_agent.dynamics.information import gather
+from module_agent.dynamics.regressor import inverse_dynamics
 from sim.robot_file import load_robot
 from sim.robot_tree import build_tree, true_chain, true_inertia
 

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.kinematics.forward import body_displacements, imu_poses
 from coordinator.urdf import link_homes, robot_element, write_urdf
 from module_agent.catalogue import CATALOGUE
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import inverse_dynamics
 
 
 def random_tree(rng: Generator, joints: int) -> Chain:

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.chain import Chain
 from coordinator.kinematics.assembly import ChainFit
 from coordinator.recording import Entry, Recording
 from coordinator.viewer_feed import FILE, LIVE, Pace, ViewerFeed
+from module_agent.dynamics.chain import Chain
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Message
 

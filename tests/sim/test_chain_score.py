@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Chain
 from coordinator.kinematics.increments import apply_increment
+from module_agent.dynamics.chain import Chain
 from sim.chain_score import LinkErrors, link_errors, link_length_m
 from sim.gauge import reorder
 from sim.robot_file import load_robot

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import descendants, imu_poses
 from coordinator.kinematics.increments import apply_increment
+from module_agent.dynamics.chain import Array, Chain
 from sim.gauge import align_gauge, leaves, move_root, reorder, reorder_basis, tip_error
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain

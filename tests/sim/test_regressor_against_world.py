@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from coordinator.dynamics.differentiation import filtered_motion
 from coordinator.dynamics.prediction import check_held_out
+from module_agent.dynamics.differentiation import filtered_motion
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain, true_inertia
 from sim.truth import TruthLog

@@ -9,9 +9,9 @@ import pytest
 from numpy.random import default_rng
 from rich.console import Console
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.increments import apply_increment
 from coordinator.result import chain_part
+from module_agent.dynamics.chain import Array, Chain
 from sim.chain_score import tip_errors
 from sim.gauge import reorder
 from sim.robot_file import load_robot

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from coordinator.chain import Chain
 from coordinator.kinematics.forward import BASE, ancestors, descendants
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.null_space import Unresolved, name_null_space
 from coordinator.plan import Plan
 from coordinator.terminal import Terminal
+from module_agent.dynamics.chain import Chain
 from sim.gauge import move_root, reorder
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain

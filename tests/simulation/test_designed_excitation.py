@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from coordinator.chain import Chain
-from coordinator.dynamics.regressor import torque_regressor
 from coordinator.identify import Identified, identify
 from coordinator.plan import Plan
 from coordinator.recording import Recording
+from module_agent.dynamics.chain import Chain
+from module_agent.dynamics.regressor import torque_regressor
 from module_agent.wire.network_file import network
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.chain import Chain
 from coordinator.known_robot import KNOWN, KnownRobot, load_known
 from coordinator.main import app
 from coordinator.plan import Plan
 from coordinator.run_folder import RESULT
+from module_agent.dynamics.chain import Chain
 from sim.robot_file import Robot, load_robot
 from sim.score import score
 from sim.virtual_run import VirtualConfig, run_virtual

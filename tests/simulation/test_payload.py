@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.chain import Array, Chain
 from coordinator.known_robot import KnownRobot, load_known
 from coordinator.main import app
 from coordinator.payload_program import PAYLOAD
@@ -15,6 +14,7 @@ from coordinator.payload_search import PayloadError, payload_plan, search_payloa
 from coordinator.plan import Plan
 from coordinator.terminal import Terminal
 from coordinator.urdf import link_homes
+from module_agent.dynamics.chain import Array, Chain
 from sim.loaded import loaded
 from sim.parts import FreePose
 from sim.robot_file import Robot, load_robot

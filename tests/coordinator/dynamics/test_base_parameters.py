@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.base_parameters import (
     BaseParameters,
     base_parameters,
@@ -17,9 +16,10 @@ from coordinator.dynamics.base_parameters import (
 )
 from coordinator.dynamics.consistency import parameter_transform
 from coordinator.dynamics.identification import REACH_M, solve_information
-from coordinator.dynamics.information import gather
-from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
 from coordinator.urdf import link_homes
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.information import gather
+from module_agent.dynamics.regressor import inverse_dynamics, torque_regressor
 
 SCALE = REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
 

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
-from coordinator.chain import Array
 from coordinator.dynamics.consistency import (
     body,
     is_consistent,
@@ -15,6 +14,7 @@ from coordinator.dynamics.consistency import (
     pseudo_inertia,
 )
 from coordinator.dynamics.identification import REACH_M
+from module_agent.dynamics.chain import Array
 
 UPPER = np.triu_indices(3)
 

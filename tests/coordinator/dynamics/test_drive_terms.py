@@ -7,7 +7,6 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array
 from coordinator.dynamics.drive_terms import (
     TERMS,
     DriveColumn,
@@ -15,6 +14,7 @@ from coordinator.dynamics.drive_terms import (
     drive_regressor,
     drive_signals,
 )
+from module_agent.dynamics.chain import Array
 
 
 def matrix(columns: Sequence[DriveColumn], qd: Array, qdd: Array, slow: ArrayLike) -> Array:

@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.identification import (
     REACH_M,
     solve_information,
     solve_pseudo_inverse,
     solve_weighted,
 )
-from coordinator.dynamics.information import compress, gather, merge
-from coordinator.dynamics.regressor import torque_regressor
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.information import compress, gather, merge
+from module_agent.dynamics.regressor import torque_regressor
 
 SCALE = REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2])
 

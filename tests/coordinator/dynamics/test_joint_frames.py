@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.joint_frames import joint_frames
+from module_agent.dynamics.chain import Array, Chain
 from sim.random_robot import random_robot
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain

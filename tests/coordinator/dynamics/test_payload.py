@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from coordinator.chain import Array
-from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.payload import Payload, find_payload
-from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.kinematics.forward import places_on_axes
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.information import JointInformation, gather
+from module_agent.dynamics.regressor import inverse_dynamics
 from sim.loaded import loaded
 from sim.parts import FreePose
 from sim.robot_file import Robot, load_robot

@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 from scipy.optimize import minimize
 
-from coordinator.chain import Array
 from coordinator.dynamics.base_parameters import base_parameters, inertial_columns, whitened
 from coordinator.dynamics.consistency import is_consistent, parameter_transform, parameters, pseudo_inertia
 from coordinator.dynamics.identification import InertialFit, solve_information
-from coordinator.dynamics.information import JointInformation, gather
 from coordinator.dynamics.parameter_prior import module_prior
 from coordinator.dynamics.physical_fit import (
     WEIGHTS,
@@ -23,8 +21,10 @@ from coordinator.dynamics.physical_fit import (
     fit_physical,
     physically_consistent,
 )
-from coordinator.dynamics.regressor import inverse_dynamics, torque_regressor
 from coordinator.urdf import write_urdf
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.information import JointInformation, gather
+from module_agent.dynamics.regressor import inverse_dynamics, torque_regressor
 from sim.random_robot import random_robot
 from sim.robot_file import Robot, load_robot
 from sim.robot_tree import build_tree, true_chain, true_inertia

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from coordinator.chain import Chain
-from coordinator.dynamics.differentiation import JointMotion, filtered_motion
 from coordinator.dynamics.identification import solve_information
-from coordinator.dynamics.information import gather
 from coordinator.dynamics.prediction import check_held_out, torque_error
-from coordinator.dynamics.regressor import inverse_dynamics
+from module_agent.dynamics.chain import Chain
+from module_agent.dynamics.differentiation import JointMotion, filtered_motion
+from module_agent.dynamics.information import gather
+from module_agent.dynamics.regressor import inverse_dynamics
 
 
 def test_the_error_is_the_ratio_of_norms() -> None:

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 
-from coordinator.chain import Array, Chain
 from coordinator.dynamics.base_parameters import (
     BaseParameters,
     base_parameters,
@@ -12,9 +11,10 @@ from coordinator.dynamics.base_parameters import (
     inertial_units,
     into_frames,
 )
-from coordinator.dynamics.regressor import torque_regressor
 from coordinator.dynamics.verdict import Verdict, verdicts, words_of_base, words_of_body
 from coordinator.urdf import link_homes
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import torque_regressor
 
 
 def pendulum() -> Chain:

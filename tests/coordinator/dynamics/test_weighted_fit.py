@@ -5,8 +5,8 @@ import pytest
 from numpy.random import Generator, default_rng
 from scipy.signal import lfilter
 
-from coordinator.chain import Array
 from coordinator.dynamics.weighted_fit import correlation_times, fit_weighted
+from module_agent.dynamics.chain import Array
 
 TRUTH = np.array([1.0, -2.0, 0.5])
 

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from coordinator.chain import Chain
 from coordinator.excitation.clearance import CLEARANCE_M, clearance_m, link_axes, segment_distances
 from coordinator.kinematics.forward import body_displacements
+from module_agent.dynamics.chain import Chain
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
 

@@ -5,9 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from coordinator.chain import Array
-from coordinator.dynamics.differentiation import differentiate
-from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.excitation.clearance import CLEARANCE_M, clearance_m
 from coordinator.excitation.design import (
     RATE_HZ,
@@ -22,6 +19,9 @@ from coordinator.excitation.segment import SampledMotion, sampled, way
 from coordinator.motion_design.limits import JointLimits, joint_limits, motion_peaks
 from coordinator.plan import Plan
 from module_agent.catalogue import module_type
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.differentiation import differentiate
+from module_agent.dynamics.regressor import inverse_dynamics
 from module_agent.firmware.waveform import duration_s, waveform
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain, true_inertia

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Chain
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation
 from coordinator.kinematics.forward import ancestors, carrier, imu_poses
 from coordinator.kinematics.initial_guess import own_line
 from coordinator.kinematics.topology import Topology
 from module_agent.catalogue import CATALOGUE, ModuleType
+from module_agent.dynamics.chain import Chain
 from module_agent.gravity import GRAVITY_M_S2
 
 # Where the fit expects it: without noise nothing draws it elsewhere.

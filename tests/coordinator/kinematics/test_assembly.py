@@ -7,7 +7,6 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from coordinator.chain import Chain
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble
 from coordinator.kinematics.chain_observations import (
     AXIS_FLOOR_RAD,
@@ -18,6 +17,7 @@ from coordinator.kinematics.chain_observations import (
 from coordinator.kinematics.forward import imu_poses
 from coordinator.kinematics.increments import apply_increment
 from module_agent.catalogue import CATALOGUE
+from module_agent.dynamics.chain import Chain
 
 X5 = CATALOGUE["X5-4"]
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.base_heading import faced
 from coordinator.kinematics.base_motion import BaseMotion, outstanding
 from coordinator.kinematics.imu_intrinsics import BIASES_ONLY
@@ -14,6 +13,7 @@ from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import body_motions, readings_on
 from coordinator.kinematics.refinement import refine_chain
 from coordinator.kinematics.sensor_data import SensorData
+from module_agent.dynamics.chain import Array, Chain
 
 RATE_HZ, CUTOFF_HZ = 250.0, 12.0
 SAMPLES = 1400

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.chain import Chain
 from coordinator.kinematics.denavit_hartenberg import DhPath, dh_path, dh_paths, dh_poses, dh_transform
 from coordinator.kinematics.forward import ancestors, body_displacements
+from module_agent.dynamics.chain import Chain
 
 
 def displaced(chain: Chain, path: DhPath, q: np.ndarray) -> np.ndarray:

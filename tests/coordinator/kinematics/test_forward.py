@@ -5,8 +5,8 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Chain
 from coordinator.kinematics.forward import ancestors, body_displacements, carrier, descendants, imu_poses
+from module_agent.dynamics.chain import Chain
 
 
 def random_chain(seed: int, joints: int) -> Chain:

@@ -6,9 +6,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import carrier, imu_poses
 from coordinator.kinematics.inertial_prediction import imu_readings
+from module_agent.dynamics.chain import Array, Chain
 
 
 class Reference:

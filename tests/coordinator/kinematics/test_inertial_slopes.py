@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.inertial_prediction import body_motions, imu_readings
 from coordinator.kinematics.inertial_slopes import imu_slopes
+from module_agent.dynamics.chain import Array, Chain
 
 STEP = 1e-5
 

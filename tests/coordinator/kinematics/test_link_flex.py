@@ -5,8 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.regressor import inverse_dynamics
 from coordinator.kinematics.inertial_prediction import (
     LinkTurn,
     acceleration_at,
@@ -28,6 +26,8 @@ from coordinator.kinematics.link_flex import (
 from coordinator.kinematics.refinement import refine_chain
 from coordinator.kinematics.sensor_data import SensorData
 from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import inverse_dynamics
 
 RATE_HZ = 250.0
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from coordinator.chain import Array
 from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.link_transforms import LinkTransform, link_transforms, parameter_slope
+from module_agent.dynamics.chain import Array
 from sim.robot_file import load_robot
 from sim.robot_tree import build_tree, true_chain
 

@@ -8,7 +8,6 @@ import pinocchio as pin
 import pytest
 from scipy.linalg import expm
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics.forward import body_displacements
 from coordinator.kinematics.increments import apply_increment, skew
 from coordinator.kinematics.module_frames import (
@@ -19,6 +18,7 @@ from coordinator.kinematics.module_frames import (
 )
 from coordinator.kinematics.product_of_exponentials import screw_axes, screw_model, tip_poses
 from coordinator.urdf import write_urdf
+from module_agent.dynamics.chain import Array, Chain
 from sim.robot_file import load_robot
 from sim.robot_tree import build_tree, true_chain
 

@@ -9,7 +9,6 @@ from scipy.linalg import orth
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from coordinator.chain import Array, Chain
 from coordinator.kinematics import refinement
 from coordinator.kinematics.imu_intrinsics import (
     BIASES_ONLY,
@@ -29,6 +28,7 @@ from coordinator.kinematics.refinement import (
     repeats,
 )
 from coordinator.kinematics.sensor_data import SensorData
+from module_agent.dynamics.chain import Array, Chain
 from module_agent.gravity import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03

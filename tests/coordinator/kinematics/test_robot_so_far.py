@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.chain import Chain
 from coordinator.kinematics.assembly import link_lengths
 from coordinator.kinematics.forward import ancestors, carrier
 from coordinator.robot_so_far import beside, robot_so_far
+from module_agent.dynamics.chain import Chain
 from module_agent.wire.feedback_rows import ROW
 
 RESTED, MOVED = 100, 200

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from coordinator.chain import Chain
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.forward import ancestors, carrier
 from coordinator.kinematics.inertial_prediction import imu_readings
@@ -19,6 +18,7 @@ from coordinator.kinematics.whole_motion import (
     seen_by_all,
     whole_response,
 )
+from module_agent.dynamics.chain import Chain
 
 RATE_HZ = 250.0
 DURATION_S = 12.0

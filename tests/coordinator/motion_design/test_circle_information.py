@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from coordinator.chain import Chain
 from coordinator.kinematics.imu_intrinsics import BIASES_ONLY, CALIBRATED, UNCALIBRATED, ImuPrior
 from coordinator.kinematics.inertial_prediction import imu_readings
 from coordinator.motion_design.circle_information import (
@@ -15,6 +14,7 @@ from coordinator.motion_design.circle_information import (
     circle_slopes,
     radial_directions,
 )
+from module_agent.dynamics.chain import Chain
 
 RATE_HZ = 250.0
 NOTHING_UNKNOWN = ImuPrior(0.0, 0.0, 1e-9, 1e-9, 0.0)

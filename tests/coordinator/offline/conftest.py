@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 from numpy.random import default_rng
 
-from coordinator.chain import Array
+from module_agent.dynamics.chain import Array
 
 _BODY = (
     '<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="{centre}"/>'

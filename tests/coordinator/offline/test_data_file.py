@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.chain import Array
 from coordinator.offline.data_file import DataFileError, JointLog, in_two, read_data
+from module_agent.dynamics.chain import Array
 
 JOINTS = ("shoulder", "elbow")
 HEADER = "t_s,q_elbow_rad,q_shoulder_rad,note,tau_elbow_nm,tau_shoulder_nm"

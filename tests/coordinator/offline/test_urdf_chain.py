@@ -7,10 +7,10 @@ import pinocchio as pin
 import pytest
 from numpy.random import default_rng
 
-from coordinator.chain import Array
 from coordinator.dynamics.consistency import parameter_transform
-from coordinator.dynamics.regressor import PER_BODY, inverse_dynamics, torque_regressor
 from coordinator.offline.urdf_chain import STANDARD_GRAVITY, UrdfError, read_urdf
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.regressor import PER_BODY, inverse_dynamics, torque_regressor
 
 TX40 = Path(__file__).resolve().parents[3] / ".." / "shared" / "data" / "tx40" / "tx40.urdf"
 # Pinocchio's order of a body's dynamic parameters: m, mc, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from coordinator.chain import Chain
 from coordinator.kinematics.forward import imu_poses
 from coordinator.viewer.side_by_side import side_by_side
+from module_agent.dynamics.chain import Chain
 
 
 def three(arm: Chain) -> Chain:

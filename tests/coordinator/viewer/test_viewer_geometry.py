@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.chain import Chain
 from coordinator.kinematics.forward import body_displacements
 from coordinator.viewer import robot_scene
 from coordinator.viewer.robot_geometry import from_z, links, modules, reach_m, upright
 from coordinator.viewer.topology_graph import as_topology, extent, positions
+from module_agent.dynamics.chain import Chain
 
 directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)
 

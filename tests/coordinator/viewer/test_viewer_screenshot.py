@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from coordinator.chain import Chain
 from coordinator.viewer import layout
 from coordinator.viewer.screenshot import ScreenshotFailed, screenshot, with_active_tab
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
+from module_agent.dynamics.chain import Chain
 
 BLUEPRINT = {
     "/container/1": {

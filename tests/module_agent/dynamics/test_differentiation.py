@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 
-from coordinator.dynamics.differentiation import (
+from module_agent.dynamics.differentiation import (
     differentiate,
     filtered_motion,
     resample,

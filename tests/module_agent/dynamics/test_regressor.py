@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.regressor import PER_BODY, inverse_dynamics, torque_regressor
 from coordinator.kinematics.forward import body_displacements, descendants
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import PER_BODY, inverse_dynamics, torque_regressor
 
 # Pinocchio's order of a body's dynamic parameters: m, mc, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
 PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]

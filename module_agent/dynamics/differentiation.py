@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import butter, sosfiltfilt
 
-from coordinator.chain import Array
+from module_agent.dynamics.chain import Array
 
 FILTER_ORDER = 4
 NS_PER_S = 1_000_000_000

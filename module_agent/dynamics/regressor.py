@@ -13,9 +13,8 @@ Rigid Body Dynamics Algorithms, table 5.1).
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.regressor_kernel import Index, fill_regressor
-from coordinator.kinematics.forward import ancestors
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor_kernel import Index, fill_regressor
 
 BODY_PARAMETERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 PER_BODY = len(BODY_PARAMETERS)
@@ -108,8 +107,9 @@ def _carriers(chain: Chain) -> tuple[Index, Index]:
     """Return the joints that carry every body (n, n), the root's first, and how many they are (n,)."""
     joints = len(chain.serials)
     carriers, depth = np.zeros((joints, joints), dtype=np.int64), np.zeros(joints, dtype=np.int64)
-    for body in range(joints):
-        way = list(ancestors(chain, body))
-        depth[body] = len(way)
-        carriers[body, : len(way)] = way
+    for body, parent in enumerate(chain.parent):
+        if parent >= 0:
+            carriers[body], depth[body] = carriers[parent], depth[parent]
+        carriers[body, depth[body]] = body
+        depth[body] += 1
     return carriers, depth

@@ -10,8 +10,8 @@ from math import cos, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.chain import Array
 from module_agent.compiled import compiled
+from module_agent.dynamics.chain import Array
 
 Index = NDArray[np.int64]
 Vector = tuple[float, float, float]

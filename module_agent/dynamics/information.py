@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
-from coordinator.chain import Array, Chain
-from coordinator.dynamics.regressor import PER_BODY, torque_regressor
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import PER_BODY, torque_regressor
 
 # Bounds the memory: a block of 64 joints is 0.7 GB at most, one of 7 joints 8 MB.
 _BLOCK = 2048

@@ -1,0 +1,1 @@
+"""What agents and coordinator compute alike of dynamics: chain, derivatives, regressor, information."""
