@@ -18,6 +18,7 @@ from module_agent.wire.network_file import network as network_named
 from module_agent.wire.network_profile import PROFILES
 from sim.noise_choice import NoiseChoice
 from sim.noise_profile import NOISE_PROFILES
+from sim.push import Push, check_pushed, parse_push
 from sim.robot_file import Robot, RobotFileError, load_robot
 
 RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
@@ -27,6 +28,10 @@ With = Annotated[
     list[str] | None, typer.Option("--with", help="Switch an effect on; repeat. `x5-sim effects` lists them.")
 ]
 Without = Annotated[list[str] | None, typer.Option("--without", help="Switch an effect off; repeat.")]
+Pushed = Annotated[
+    list[str] | None,
+    typer.Option("--push", help="Push a module: serial=S,force_n=[0,0,-10],from_s=2,for_s=0.5; repeat."),
+]
 Network = Annotated[
     str | None, typer.Option(help=f"Network: {', '.join(PROFILES)}, or a TOML file [the robot's].")
 ]
@@ -89,6 +94,17 @@ def noise_choice(robot: Robot, noise: str | None, on: list[str] | None, off: lis
     except (KeyError, ValueError) as error:
         fail(error.args[0], EXIT_USAGE)
     return choice
+
+
+def pushes(robot: Robot, texts: list[str] | None) -> tuple[Push, ...]:
+    """Return the pushes asked for, or end the command if one is none, or on no module of the robot."""
+    try:
+        found = tuple(parse_push(text) for text in texts or ())
+        for push in found:
+            check_pushed(push, robot.serials)
+    except ValueError as error:
+        fail(error, EXIT_USAGE)
+    return found
 
 
 def free_folder(out: Path | None, robot: Robot) -> Path:

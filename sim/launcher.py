@@ -35,6 +35,7 @@ def _nowhere_else(process: str) -> tuple[str, ...]:
 class LaunchConfig(NamedTuple):
     """What is started; `processes` is how many agent processes share the modules (None: one each).
 
+    `pushes` are on the world, as its option `--push` takes them.
     `within` is told the name of a process ("world", "coordinator", or "agent" and its serials) and returns
     the words that go before its command, such as `nsenter` and a network namespace.
     """
@@ -52,6 +53,7 @@ class LaunchConfig(NamedTuple):
     coordinator_options: tuple[str, ...] = ()
     agent_options: tuple[str, ...] = ()
     within: Callable[[str], tuple[str, ...]] = _nowhere_else
+    pushes: tuple[str, ...] = ()
 
 
 class Child(NamedTuple):
@@ -97,6 +99,8 @@ class Launcher:
         arguments = ["sim.main", "world", config.robot_file, "--bus", self.bus, "--seed", str(config.seed)]
         arguments += ["--speed", str(config.speed), "--truth", str(config.out)]
         arguments += config.noise.arguments
+        for push in config.pushes:
+            arguments += ["--push", push]
         world = self._start("world", arguments)
         self._wait(lambda: os.path.exists(self.bus), world, "its bus")
         self._say("world: bus open")

@@ -28,6 +28,7 @@ from sim.command_options import (
     Out,
     PlanFile,
     Processes,
+    Pushed,
     RobotArgument,
     Seed,
     Speed,
@@ -40,6 +41,7 @@ from sim.command_options import (
     motion_arguments,
     motions,
     noise_choice,
+    pushes,
 )
 from sim.launcher import LOGS, LaunchConfig, Launcher, LaunchError
 from sim.logged_world import LoggedWorld
@@ -67,6 +69,7 @@ def world(
     noise: Noise = None,
     with_effects: With = None,
     without_effects: Without = None,
+    push: Pushed = None,
     speed: Speed = 1.0,
     truth: Annotated[
         Path | None, typer.Option(help="Folder for truth.json and truth.npz at the end.")
@@ -76,6 +79,7 @@ def world(
     found = load(robot)
     check(speed=speed)
     choice = noise_choice(found, noise, with_effects, without_effects)
+    pushed = pushes(found, push)
     stopping: list[int] = []
 
     def stop(number: int, _frame: FrameType | None) -> None:
@@ -84,7 +88,7 @@ def world(
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     try:
-        plant = World(found, seed, choice.of(found))
+        plant = World(found, seed, choice.of(found), pushes=pushed)
     except RobotFileError as error:
         fail(error, EXIT_USAGE)
     logged = LoggedWorld(plant)
@@ -116,6 +120,7 @@ def run(
     noise: Noise = None,
     with_effects: With = None,
     without_effects: Without = None,
+    push: Pushed = None,
     out: Out = None,
     plan: PlanFile = None,
     dynamics: Dynamics = None,
@@ -132,6 +137,7 @@ def run(
     found = load(robot)
     check(network, speed, endpoint)
     choice = noise_choice(found, noise, with_effects, without_effects)
+    pushed = pushes(found, push)
     planned = motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how, excitation=excitation)
     folder = free_folder(out, found)
     if virtual:
@@ -144,12 +150,13 @@ def run(
                 choice.of(found),
                 planned,
                 refined_looks=REFINED_LOOKS,
+                pushes=pushed,
             ),
             quiet,
         )
     else:
         options = (*motion_arguments(plan, planned), *(("--quiet",) if quiet else ()))
-        place = _Place(folder, network or found.network, endpoint, processes)
+        place = _Place(folder, network or found.network, endpoint, processes, tuple(push or ()))
         _run_processes(_launch(robot, found, place, seed, choice, speed, options))
         _add_truth(folder, None)
     print_score(folder)
@@ -167,12 +174,13 @@ def _address(viewer: str) -> str | None:
 
 
 class _Place(NamedTuple):
-    """Where the processes of a run meet, and where they write."""
+    """Where the processes of a run meet, where they write, and what pushes their world."""
 
     out: Path
     network: str
     endpoint: str
     processes: int | None
+    pushes: tuple[str, ...]
 
 
 def _launch(
@@ -195,6 +203,7 @@ def _launch(
         speed=speed,
         endpoint=place.endpoint,
         processes=place.processes,
+        pushes=place.pushes,
         # The robot ends with this run, so that nothing is left to go on with.
         coordinator_options=("--no-advise", *options),
     )
@@ -265,6 +274,7 @@ def launch(
     noise: Noise = None,
     with_effects: With = None,
     without_effects: Without = None,
+    push: Pushed = None,
     out: Out = None,
     plan: PlanFile = None,
     speed: Speed = 1.0,
@@ -281,6 +291,7 @@ def launch(
     found = load(robot)
     check(network, speed, endpoint)
     choice = noise_choice(found, noise, with_effects, without_effects)
+    pushes(found, push)
     try:
         viewer_choice(viewer)
     except ValueError as error:
@@ -292,7 +303,7 @@ def launch(
             plan, motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how, excitation=excitation)
         ),
     )
-    place = _Place(free_folder(out, found), network or found.network, endpoint, processes)
+    place = _Place(free_folder(out, found), network or found.network, endpoint, processes, tuple(push or ()))
     _run_processes(_launch(robot, found, place, seed, choice, speed, options))
     _add_truth(place.out, _address(viewer))
     print_score(place.out)

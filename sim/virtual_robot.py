@@ -12,6 +12,7 @@ from module_agent.wire.impaired_transport import ImpairedTransport
 from module_agent.wire.network_profile import NetworkProfile
 from module_agent.wire.transport import Transport
 from sim.noise_profile import NoiseProfile
+from sim.push import Push
 from sim.robot_file import Robot
 from sim.truth import TruthLog
 from sim.virtual_loop import LoopScheduler, VirtualLoop
@@ -23,6 +24,7 @@ class VirtualSettings(NamedTuple):
     """What a virtual robot is told; every seed in it follows from `seed`.
 
     `noise_seed` makes it another day of the same robot: other noise and network, the same modules.
+    `pushes` act on the world from outside.
     """
 
     robot: Robot
@@ -31,6 +33,7 @@ class VirtualSettings(NamedTuple):
     noise: str | NoiseProfile | None = None
     feedback_rate_hz: float = 250.0
     noise_seed: int | None = None
+    pushes: tuple[Push, ...] = ()
 
 
 class _Wires:
@@ -61,7 +64,13 @@ class VirtualRobot:
         day = settings.seed if settings.noise_seed is None else (settings.seed, settings.noise_seed)
         seeds = np.random.SeedSequence(day).spawn(2)
         self.loop = loop
-        self.world = World(settings.robot, settings.seed, settings.noise, noise_seed=settings.noise_seed)
+        self.world = World(
+            settings.robot,
+            settings.seed,
+            settings.noise,
+            noise_seed=settings.noise_seed,
+            pushes=settings.pushes,
+        )
         self.network = VirtualNetwork(loop)
         self.truth = TruthLog(self.world)
         self.pwm = [0.0] * len(self.world.modules)

@@ -12,6 +12,7 @@ from coordinator.run import Run, RunConfig
 from coordinator.viewer_feed import Screen
 from module_agent.wire.network_file import network
 from sim.noise_profile import NoiseProfile
+from sim.push import Push
 from sim.robot_file import Robot
 from sim.robot_tree import true_chain
 from sim.truth import write_truth
@@ -26,6 +27,7 @@ class VirtualConfig(NamedTuple):
     """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given.
 
     `known` and `refined_looks` as in `RunConfig`: nobody watches a virtual run, so that none is the rule.
+    `pushes` act on the robot from outside.
     """
 
     robot: Robot
@@ -39,6 +41,7 @@ class VirtualConfig(NamedTuple):
     noise_seed: int | None = None
     refined_looks: int = 0
     known: Path | None = None
+    pushes: tuple[Push, ...] = ()
 
 
 def run_virtual(
@@ -60,6 +63,7 @@ def run_virtual(
         config.noise,
         config.feedback_rate_hz,
         config.noise_seed,
+        config.pushes,
     )
     robot = VirtualRobot(settings, loop)
     try:

@@ -20,6 +20,7 @@ from sim.physics.skeleton import build_skeleton
 from sim.physics.thermal import Windings
 from sim.physics.variation import draw_variation
 from sim.pose import Array, read_only
+from sim.push import Push, check_pushed
 from sim.robot_file import Robot
 from sim.robot_tree import build_tree
 
@@ -31,8 +32,8 @@ class Plant(NamedTuple):
     """The true state of the modules' joints at the instant of the last samples, (n,) each, read-only.
 
     duty is what the bridges apply for `pwm`; motor positions and rates are seen at the output;
-    spring_torque_nm is what the springs exert on the outputs; with q, qd and qdd it fulfils the equations of
-    motion.
+    spring_torque_nm is what the springs exert on the outputs; with q, qd, qdd and what pushes from outside it
+    fulfils the equations of motion.
     structure (p,) is how far the base and the links give: the positions [m, rad] of the passive joints.
     """
 
@@ -57,11 +58,11 @@ class World:
 
     The world begins at rest, the modules' joints where the robot file has them and everything that gives
     sagged under its weight. `noise_seed` draws the sensors' noise and drift anew for the same modules, as on
-    another day; what the modules are hangs on `seed` alone.
+    another day; what the modules are hangs on `seed` alone. `pushes` act from outside, each in its time.
 
     Raises:
-        ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number, or the robot's base or links are
-            too soft to carry it.
+        ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number, a push is on no module, or the
+            robot's base or links are too soft to carry it.
         KeyError: unknown noise profile.
     """
 
@@ -73,6 +74,7 @@ class World:
         imu_rate_hz: float = 250.0,
         voltage_v: float = BUS_VOLTAGE_V,
         noise_seed: int | None = None,
+        pushes: Sequence[Push] = (),
     ):
         self.robot = robot
         wanted = robot.noise if noise is None else noise
@@ -92,6 +94,9 @@ class World:
         self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
         self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
         self._rates = np.zeros((2, len(self._q)))
+        self._pushes: list[Push] = []
+        for push in pushes:
+            self.push(push)
         self._actuators.reset(robot.start_rad, load)
         self._rehearse(Sensors(*drawn))
         self._body = Multibody(robot.name, self._skeleton, TICK_S)
@@ -133,6 +138,15 @@ class World:
         """Set the modules' temperatures above the ambient: rows winding, housing, body, (3, n) [K]."""
         self._windings.above_k[:] = above_ambient_k
 
+    def push(self, push: Push) -> None:
+        """Push from outside, in its time; may be called between any two steps.
+
+        Raises:
+            ValueError: on no module of this robot.
+        """
+        check_pushed(push, self.robot.serials)
+        self._pushes.append(push)
+
     def step(self, pwm: Sequence[float]) -> list[SensorSample]:
         """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.
 
@@ -148,6 +162,8 @@ class World:
         # velocity that the last acceleration predicts for this instant.
         self._rates[0], self._rates[1] = qd + self._ahead, qd
         mass, biases = self._tree.mass_and_biases(q, self._rates)
+        if self._pushes:
+            biases[0] -= self._pushed(q)
         force = actuators.step(u, q, qd, mass, biases[0], self._windings.resistance_factor)
         self._q, self._qd = self._body.step((force - biases[0] + biases[1]).tolist())
         # The velocity at this instant is the mean of the two around it, the acceleration their difference.
@@ -178,11 +194,22 @@ class World:
                 raise ValueError(f"PWM of module {module.serial} is {value}; it must be a number in [-1, 1]")
         return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
 
+    def _pushed(self, q: Array) -> Array:
+        """Return what the pushes of this instant do to all joints (m,), and forget those that are over."""
+        self._pushes = [push for push in self._pushes if not push.is_over(self.t_ns)]
+        load = np.zeros_like(q)
+        for push in (one for one in self._pushes if one.acts(self.t_ns)):
+            body = int(self._joints[self.robot.serials.index(push.serial)])
+            wrench = np.array(push.at_m), np.array(push.force_n), np.array(push.torque_nm)
+            load += self._tree.reach(q, body, *wrench)
+        return load
+
     def _rehearse(self, sensors: Sensors) -> None:
         """Call all that is compiled at its first call, which would take seconds out of real time."""
         still, idle = np.zeros_like(self._q), np.zeros(len(self._joints))
         self._felt = self._tree.feel(self._q, still, still)
         mass, biases = self._tree.mass_and_biases(self._q, self._rates)
+        self._tree.reach(self._q, 0, *np.zeros((3, 3)))
         actuators = copy(self._actuators)
         actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
         copy(self._windings).step(actuators.copper_w)

@@ -173,6 +173,39 @@ def mass_and_biases(
 
 
 @compiled
+def reach(
+    parent: Indices,
+    prismatic: Indices,
+    sign: Array,
+    rotation: Array,
+    offset: Array,
+    q: Array,
+    body: int,
+    point: Array,
+    force: Array,
+    moment: Array,
+) -> Array:
+    """Return what a wrench on a body does to the joints (m,), J^T w.
+
+    The force acts at `point` in the body's frame; force and moment are in world axes.
+    """
+    where, arm = _place(parent, prismatic, sign, rotation, offset, q)
+    spin, travel, place = _twists(parent, prismatic, sign, where, arm)
+    at, about = np.empty(3), np.empty(3)
+    _into(where[body], point, at)
+    for k in range(3):
+        at[k] += place[body, k]
+    _cross(at, force, about)
+    loads = np.zeros(len(q))
+    i = body
+    while i >= 0:
+        for k in range(3):
+            loads[i] += spin[i, k] * (about[k] + moment[k]) + travel[i, k] * force[k]
+        i = parent[i]
+    return loads
+
+
+@compiled
 def _twists(
     parent: Indices, prismatic: Indices, sign: Array, where: Array, arm: Array
 ) -> tuple[Array, Array, Array]:

@@ -7,7 +7,7 @@ specific force is wrong by 3e-2 m/s^2 on a 2 Hz motion, paired so by less than 1
 
 import numpy as np
 
-from sim.physics.rigid_kernels import feel, mass_and_biases
+from sim.physics.rigid_kernels import feel, mass_and_biases, reach
 from sim.physics.skeleton import Skeleton
 from sim.pose import Array
 
@@ -51,3 +51,10 @@ class RigidTree:
     def feel(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         """Return the angular rates and specific forces (n, 3) in the IMUs' frames [rad/s, m/s^2]."""
         return feel(*self._joints, q, qd, qdd, self._gravity_m_s2, *self._imus)
+
+    def reach(self, q: Array, body: int, point_m: Array, force_n: Array, moment_nm: Array) -> Array:
+        """Return the forces or torques (m,) on the joints of a wrench on one body.
+
+        The force acts at `point_m` in the body's frame; force and moment are in world axes, (3,) each.
+        """
+        return reach(*self._joints, q, body, point_m, force_n, moment_nm)

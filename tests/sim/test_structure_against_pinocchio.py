@@ -133,6 +133,23 @@ def test_a_random_tree_that_gives_has_pinocchios_mass_bias_and_imu_readings(seed
 
 
 @pytest.mark.parametrize("seed", range(4))
+def test_a_wrench_on_any_body_reaches_the_joints_as_pinocchios_jacobian_has_it(seed: int) -> None:
+    skeleton = build_skeleton(random_robot(seed), 1.0, 1.0)
+    reference, tree = Reference(skeleton), RigidTree(skeleton)
+    rng = np.random.default_rng(200 + seed)
+    for body, joint in enumerate(reference.ids):
+        q = rng.uniform(-2.0, 2.0, len(skeleton.names))
+        point, force, moment = rng.uniform(-3.0, 3.0, (3, 3))
+        placed = reference.configuration(q)
+        pinocchio.forwardKinematics(reference.model, reference.data, placed)
+        jacobian = pinocchio.computeJointJacobian(reference.model, reference.data, placed, joint)
+        axes = reference.data.oMi[joint].rotation
+        wrench = np.concatenate([axes.T @ force, axes.T @ moment + np.cross(point, axes.T @ force)])
+        wanted = (jacobian.T @ wrench)[reference.rows]
+        np.testing.assert_allclose(tree.reach(q, body, point, force, moment), wanted, atol=1e-11)
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_the_physics_engine_steps_a_random_tree_that_gives_as_pinocchio_accelerates_it(seed: int) -> None:
     skeleton = build_skeleton(random_robot(seed), 1.0, 1.0)
     reference = Reference(skeleton)
