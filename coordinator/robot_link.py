@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Container, Coroutine, Mapping, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from coordinator.clock import Clock
 from coordinator.link_errors import ModuleLost, MotionInterrupted, RobotStopped
@@ -18,6 +18,7 @@ from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
     Ack,
     Ask,
+    EffortProfile,
     Estimate,
     EstimateRequest,
     GainsCommand,
@@ -52,6 +53,14 @@ UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.v
 T = TypeVar("T")
 
 
+class _Started(NamedTuple):
+    """A motion that a module has been told to begin."""
+
+    number: int
+    pattern: Pattern
+    effort: EffortProfile | None
+
+
 class RobotLink:
     """Commands to the modules of one robot under this sender's leases."""
 
@@ -68,7 +77,7 @@ class RobotLink:
         self._last_id = 0
         self._renewals: set[asyncio.Task[None]] = set()
         self._taken_by: dict[str, str] = {}
-        self._running: dict[str, tuple[int, Pattern]] = {}
+        self._running: dict[str, _Started] = {}
         self._poor_until_ns = 0
 
     # ------------------------------------------------------------------ knowing them
@@ -254,7 +263,7 @@ class RobotLink:
         running = self._running.get(serial)
         if running is None:
             return
-        motion = self._motion(serial, *running)
+        motion = self._motion(serial, running)
         # Lost or refused: the next renewal follows.
         with contextlib.suppress(NoAnswer, Refused):
             await self._radio.command(serial, Leaf.MOTION, motion, timeout_s=0.3)
@@ -310,16 +319,28 @@ class RobotLink:
         self._last_id = max(self._last_id + 1, clock_ms)
         return self._last_id
 
-    async def run(self, patterns: Mapping[str, Pattern]) -> dict[str, MotionRecord]:
+    async def run(
+        self, patterns: Mapping[str, Pattern], efforts: Mapping[str, EffortProfile] | None = None
+    ) -> dict[str, MotionRecord]:
         """Run one motion on each of the given modules at the same time; return how they went.
 
+        `efforts` are fed forward along the motions of the modules that they name; the effort loops of the
+        others are off.
+
         Raises:
+            KeyError: efforts of a module that has no motion.
             MotionInterrupted: one of them expired or was stopped, or another module that this sender holds
             expired meanwhile and let go of its joint.
             ModuleLost: see `check`.
         """
-        numbers = {serial: self._next_id() for serial in patterns}
-        await together(self._start(serial, numbers[serial], pattern) for serial, pattern in patterns.items())
+        fed = efforts or {}
+        if idle := [serial for serial in fed if serial not in patterns]:
+            raise KeyError(
+                f"efforts for {idle[0]}, which has no motion; of those that have one: {', '.join(patterns)}"
+            )
+        started = {s: _Started(self._next_id(), pattern, fed.get(s)) for s, pattern in patterns.items()}
+        numbers = {serial: motion.number for serial, motion in started.items()}
+        await together(self._start(serial, motion) for serial, motion in started.items())
         longest = max(duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items())
         ended = await self.wait(
             lambda: (
@@ -365,17 +386,18 @@ class RobotLink:
             return status.state in ("expired", "stopped", "fault", "idle")
         return motion.outcome != "running"
 
-    def _motion(self, serial: str, number: int, pattern: Pattern) -> MotionCommand:
-        return MotionCommand.model_validate({**self._head(serial), "motion_id": number, "pattern": pattern})
+    def _motion(self, serial: str, motion: _Started) -> MotionCommand:
+        what = {"motion_id": motion.number, "pattern": motion.pattern, "effort": motion.effort}
+        return MotionCommand.model_validate({**self._head(serial), **what})
 
-    async def _start(self, serial: str, number: int, pattern: Pattern) -> None:
+    async def _start(self, serial: str, motion: _Started) -> None:
         async def attempt() -> Ack:
-            return await self._radio.command(serial, Leaf.MOTION, self._motion(serial, number, pattern))
+            return await self._radio.command(serial, Leaf.MOTION, self._motion(serial, motion))
 
         self._running.pop(serial, None)
         try:
             await self._persist(serial, attempt)
-            self._running[serial] = number, pattern
+            self._running[serial] = motion
         except Refused as refused:
             if refused.ack.reason in UNSTARTED:
                 raise MotionInterrupted(serial, f"refused: {refused.ack.detail}") from refused

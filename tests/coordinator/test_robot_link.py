@@ -10,6 +10,7 @@ import pytest
 from coordinator.link_errors import ModuleLost, MotionInterrupted
 from coordinator.radio import NoAnswer, Radio, Refused
 from coordinator.robot_link import RobotLink
+from module_agent.firmware.effort_profile import effort_profile
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest
 from module_agent.wire.network_profile import NetworkProfile
@@ -366,6 +367,62 @@ def _commands(monkeypatch: pytest.MonkeyPatch, radio: Radio) -> list[MotionComma
 
     monkeypatch.setattr(radio, "command", command)
     return sent
+
+
+def _fed(recording: Any, record: Any, serial: str) -> np.ndarray:
+    """Return the effort commands of a motion's rows, NaN where the effort loop was off."""
+    rows = recording.rows(serial, record.start_row, record.end_row)
+    return np.asarray(rows["effort_command_nm"], dtype=float)
+
+
+@pytest.mark.parametrize("network", ["none", NetworkProfile(name="slow", delay_ms=52.0)])
+def test_efforts_go_with_the_motion_they_are_for_and_with_no_other(
+    rigs: Callable[..., Any], network: str | NetworkProfile
+) -> None:
+    rig = rigs(ARM, network)
+    _, recording, link = rig.link()
+    # 0 to 1.2 Nm in 0.6 s, and so until the end of 0.8 s.
+    ramp = effort_profile(np.linspace(0.0, 1.2, 61), 10_000_000)
+    rest = Rest(duration_s=0.8)
+
+    async def work() -> None:
+        await _met(link)
+        # First, as in a session: what is armed must hear renewals while the next answers slowly.
+        keeper = asyncio.create_task(link.keep_alive())
+        for serial in link.serials:
+            await link.acquire(serial)
+        both = await link.run({BASE: rest, TIP: rest}, {BASE: ramp})
+        after = await link.run({BASE: rest, TIP: rest})
+        await link.complete_rows()
+        t_s = 4e-3 * np.arange(len(_fed(recording, both[BASE], BASE)))
+        # A row tells of the last tick before it.
+        wanted = np.minimum(2.0 * t_s, 1.2)
+        np.testing.assert_allclose(_fed(recording, both[BASE], BASE)[1:], wanted[1:], atol=2.0 * 4e-3)
+        for record, serial in ((both[TIP], TIP), (after[BASE], BASE), (after[TIP], TIP)):
+            assert np.isnan(_fed(recording, record, serial)[1:]).all()
+        keeper.cancel()
+        await link.release_all()
+
+    rig.run(work())
+
+
+def test_efforts_for_a_module_without_a_motion_are_refused_before_anything_moves(
+    rigs: Callable[..., Any],
+) -> None:
+    rig = rigs(ARM)
+    _, _, link = rig.link()
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        with pytest.raises(
+            KeyError, match=f"efforts for {TIP}, which has no motion; of those that have one: {BASE}"
+        ):
+            await link.run({BASE: SLOW}, {TIP: effort_profile([0.0, 1.0], 10_000_000)})
+        keeper.cancel()
+        await link.release_all()
+
+    rig.run(work())
+    assert abs(rig.world.plant.q_rad[0]) < 1e-2
 
 
 @pytest.mark.parametrize(("delay_ms", "is_poor"), [(5.0, False), (52.0, True)])
