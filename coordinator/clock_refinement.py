@@ -13,12 +13,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.clock_map import ClockMap
 from coordinator.cross_product import cross
 from coordinator.kinematics.forward import BASE, carrier
 from coordinator.kinematics.increments import frozen
 from coordinator.kinematics.inertial_prediction import turned
 from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import differentiate, settling_samples, zero_phase_low_pass
 
 RATE_HZ = 250.0

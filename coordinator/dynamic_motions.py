@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from coordinator.clock_map import ClockMap
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.motion_window import RATE_HZ, window
 from coordinator.recording import Recording
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
 
 DYNAMIC_CUTOFF_HZ = 12.0

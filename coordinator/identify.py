@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.clock_map import ClockMap, map_clocks
+from coordinator.clock_map import map_clocks
 from coordinator.clock_refinement import refine_clocks
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
 from coordinator.dynamics.identification import InertialFit, solve_weighted
@@ -38,6 +38,7 @@ from coordinator.topology_search import search_topology
 from coordinator.whole_exploration import respond, whole_motion
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import JointMotion, settling_samples
 from module_agent.dynamics.information import JointInformation, gather
 from module_agent.wire.messages import Estimate

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from coordinator.clock_map import ClockMap
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.base_motion import NoiseFloor, outstanding
 from coordinator.kinematics.sensor_data import SensorData
 from coordinator.recording import Recording
 from module_agent.dynamics.chain import Array
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import (
     differentiate,
     resample,

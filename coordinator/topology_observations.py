@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.clock_map import ClockMap, map_clocks
+from coordinator.clock_map import map_clocks
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.motion_evidence import MotionEvidence, NotMoved, motion_evidence
 from coordinator.kinematics.topology import DOUBTFUL_BELOW, MotionSeen, Observations, seen_again
 from coordinator.motion_window import RATE_HZ, window
 from coordinator.recording import Recording
 from module_agent.dynamics.chain import Array
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import differentiate, settling_samples, zero_phase_low_pass
 from module_agent.wire.messages import Estimate, MotionRecord
 

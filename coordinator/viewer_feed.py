@@ -5,7 +5,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from coordinator.beside import Beside
-from coordinator.clock_map import ClockMap, map_clock
+from coordinator.clock_map import map_clock
 from coordinator.identify import HeldOutMotion
 from coordinator.kinematics.assembly import ChainFit
 from coordinator.kinematics.axis_angles import axis_angles
@@ -16,6 +16,7 @@ from coordinator.viewer.blueprint import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.side_by_side import side_by_side
 from coordinator.viewer.viewer import Viewer
 from module_agent.dynamics.chain import Array
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.wire.messages import Feedback, Message, Status
 
 MAP_PERIOD_NS = 1_000_000_000

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from coordinator.clock_map import ClockMap
 from coordinator.journal import JournalEvent
 from coordinator.kinematics.whole_motion import (
     StillReading,
@@ -14,6 +13,7 @@ from coordinator.kinematics.whole_motion import (
 )
 from coordinator.motion_window import RATE_HZ, Window, window
 from coordinator.recording import Recording
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import differentiate, settling_samples, zero_phase_low_pass
 
 # Six times the fastest sine.

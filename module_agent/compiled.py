@@ -13,10 +13,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function when it is first called; IEEE arithmetic in the order written, as in Python."""
+    """Compile a function when it is first called; IEEE arithmetic in the order written, as in Python.
+
+    Other threads go on while it runs.
+    """
     try:
-        kernel = numba.njit(cache=True)(function)
+        kernel = numba.njit(cache=True, nogil=True)(function)
     except RuntimeError:
         # No folder to keep the code in (a read-only installation without a home): compiled in each process.
-        kernel = numba.njit(function)
+        kernel = numba.njit(nogil=True)(function)
     return cast(Function, kernel)

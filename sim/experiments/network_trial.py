@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.clock_map import ClockMap
 from coordinator.failure import explain
 from coordinator.identify import Kinematics, identify_kinematics
 from coordinator.plan import Plan
 from coordinator.recording import Recording
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.wire.network_file import network as named_network
 from sim.chain_score import link_errors, tip_errors, topology_differences
 from sim.experiments.arm_trial import arm_plan, imu_kind

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.clock_map import ClockMap, map_clock, map_clocks
+from coordinator.clock_map import map_clock, map_clocks
 from coordinator.recording import RoundTrip
+from module_agent.dynamics.clock_map import ClockMap
 
 MS = 1_000_000
 

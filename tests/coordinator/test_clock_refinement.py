@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator.clock_map import ClockMap
 from coordinator.clock_refinement import LAG_FLOOR_S, RATE_HZ, refine_clocks
 from coordinator.kinematics.inertial_prediction import imu_readings
 from module_agent.dynamics.chain import Chain
+from module_agent.dynamics.clock_map import ClockMap
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
 

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from coordinator.clock_map import ClockMap
 from coordinator.journal import JournalEvent
 from coordinator.motion_window import (
     RATE_HZ,
@@ -17,6 +16,7 @@ from coordinator.motion_window import (
     window,
 )
 from coordinator.recording import Recording
+from module_agent.dynamics.clock_map import ClockMap
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Rest

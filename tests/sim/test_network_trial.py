@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.clock_map import ClockMap
 from coordinator.plan import Plan
+from module_agent.dynamics.clock_map import ClockMap
 from sim.experiments.network_trial import OFFSET_S, apart, clock_error_s, network_trial
 from sim.module_clock import ModuleClock
 from sim.noise_profile import noise_profile
