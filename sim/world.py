@@ -147,6 +147,37 @@ class World:
         check_pushed(push, self.robot.serials)
         self._pushes.append(push)
 
+    def become(self, robot: Robot) -> None:
+        """Go on as a robot with the same modules and joints but other links or payloads, moving as before.
+
+        Whatever is added is taken to move along already: it comes on without a blow.
+
+        Raises:
+            ValueError: other modules, or another number of joints that give.
+        """
+        skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
+        if robot.serials != self.robot.serials or skeleton.names != self._skeleton.names:
+            raise ValueError(
+                f"robot {robot.name} has joints {', '.join(skeleton.names)}; those of {self.robot.name} are "
+                f"{', '.join(self._skeleton.names)}, and a world keeps its joints"
+            )
+        body = Multibody(robot.name, skeleton, TICK_S)
+        body.place(self._q, self._qd)
+        self._body.close()
+        self.robot, self._skeleton, self._body, self._tree = robot, skeleton, body, RigidTree(skeleton)
+
+    def change_friction(self, serial: str, factor: float) -> None:
+        """Multiply the friction of a module's motor and gear, Coulomb and viscous, from the next tick on.
+
+        Raises:
+            ValueError: no such module, or a factor that is negative or not finite.
+        """
+        if serial not in self.robot.serials:
+            raise ValueError(f"no module {serial} here; there are {', '.join(self.robot.serials)}")
+        if not (math.isfinite(factor) and factor >= 0.0):
+            raise ValueError(f"friction times {factor} is no friction; a number from 0 on is needed")
+        self._actuators.change_friction(self.robot.serials.index(serial), factor)
+
     def step(self, pwm: Sequence[float]) -> list[SensorSample]:
         """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.
 

@@ -102,6 +102,11 @@ class Actuators:
         self._state[kernel.DEFLECTION_RAD] = -self.springs.deflection(stretch)
         self._state[kernel.ELASTIC_NM] = load_nm
 
+    def change_friction(self, module: int, factor: float) -> None:
+        """Multiply the Coulomb and viscous friction of one motor and its gear."""
+        self._modules["coulomb_nm"][module] *= factor
+        self._modules["viscous_nm_s_rad"][module] *= factor
+
     def step(
         self,
         pwm: Array,

@@ -24,10 +24,13 @@ class Multibody:
         _configure(self._client, self._body, skeleton, dt_s)
         _check(self._client, self._body, skeleton)
 
-    def place(self, q_rad: Array) -> None:
-        """Put the joints, at rest, to the given positions (m,)."""
+    def place(self, q_rad: Array, qd_rad_s: Array | None = None) -> None:
+        """Put the joints to the given positions (m,), at rest or with the given velocities (m,)."""
+        rates = np.zeros_like(q_rad) if qd_rad_s is None else qd_rad_s
         for i in self._indices:
-            pybullet.resetJointState(self._body, i, float(q_rad[i]), 0.0, physicsClientId=self._client)
+            pybullet.resetJointState(
+                self._body, i, float(q_rad[i]), float(rates[i]), physicsClientId=self._client
+            )
 
     def step(self, torque_nm: Sequence[float]) -> tuple[Array, Array]:
         """Apply joint torques (m,) for one step; return the new positions and velocities (m,)."""
