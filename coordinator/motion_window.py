@@ -58,7 +58,7 @@ def window(
     Raises:
         ValueError: a hole in the recording, with the module or its column.
     """
-    start_ns, end_ns = _span(recording, clocks, event, margin_s)
+    start_ns, end_ns = span(recording, clocks, event, margin_s)
     tracks = [_track(recording, clocks[s], s, event, start_ns, end_ns) for s in serials]
     start_ns = max(start_ns, *(int(t[0]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
     end_ns = min(end_ns, *(int(t[-1]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
@@ -81,8 +81,7 @@ class _Track(NamedTuple):
 def _track(
     recording: Recording, clock: ClockMap, serial: str, event: JournalEvent, start_ns: int, end_ns: int
 ) -> _Track:
-    around = np.array([start_ns - 10 * STEP_NS, end_ns + 10 * STEP_NS])
-    first_ns, last_ns = (int(t) for t in clock.to_module(around))
+    first_ns, last_ns = clock.module_span(start_ns, end_ns, STEP_NS)
     rows = recording.modules[serial].rows.between(first_ns, last_ns)
     if not len(rows):
         raise ValueError(_no_row(serial, event))
@@ -102,9 +101,14 @@ def _step(position: Array) -> float:
     return float(apart.min()) if apart.size else 0.0
 
 
-def _span(
+def span(
     recording: Recording, clocks: Mapping[str, ClockMap], event: JournalEvent, margin_s: float
 ) -> tuple[int, int]:
+    """Return from when to when a motion lasted in session time, with a margin on either side.
+
+    Raises:
+        ValueError: no row of the motion is recorded.
+    """
     assert event.motion is not None
     assert event.motion.end_row is not None
     log = recording.modules[event.serial].rows

@@ -5,15 +5,19 @@ virtual time inside the simulator; only hardware, transport and worker differ.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
+from module_agent.firmware.history import History
 from module_agent.hardware import Hardware, SensorSample
 from module_agent.inbox import Inbox
+from module_agent.information_service import InformationService, Worker
+from module_agent.motion_collection import MotionCollection
 from module_agent.neighbours import AskHistory, JointMotion, Listen, Neighbours
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import (
     Ack,
@@ -26,30 +30,19 @@ from module_agent.wire.messages import (
 from module_agent.wire.refusal import Refusal, WireError
 from module_agent.wire.transport import Event, Liveness, Reply, Request, Sample, Sink, Transport, Undeclare
 
-SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.STOP, Leaf.GAINS, Leaf.ESTIMATE)
+BESIDE = (Leaf.ESTIMATE, Leaf.COLLECT, Leaf.INFORMATION)  # answered here, not by the firmware
+SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.STOP, Leaf.GAINS, *BESIDE)
 HEARD = (Leaf.SETPOINT, Leaf.STOP)
 HISTORY_TIMEOUT_S = 0.4
 
-Job = Callable[[], Finding]
+T = TypeVar("T")
 M = TypeVar("M", Status, Feedback)
-
-
-class Worker(Protocol):
-    """Runs estimates: a thread in real time, at once in virtual time."""
-
-    def submit(self, job: Job, done: Callable[[Finding], None]) -> None:
-        """Run a job and hand its result to `done`, from any thread."""
-        ...
-
-    def check(self) -> None:
-        """Raise what a job raised."""
-        ...
 
 
 class InlineWorker:
     """Runs a job at once, for virtual time."""
 
-    def submit(self, job: Job, done: Callable[[Finding], None]) -> None:
+    def submit(self, job: Callable[[], T], done: Callable[[T], None]) -> None:
         """Run the job now."""
         done(job())
 
@@ -60,8 +53,10 @@ class InlineWorker:
 class HostedModule:
     """One module of this process: its firmware, its observer, and what waits for them."""
 
-    def __init__(self, robot: str, config: FirmwareConfig):
+    def __init__(self, robot: str, config: FirmwareConfig, shared: "Shared"):
         self.robot = robot
+        self._shared = shared
+        self._information = InformationService(config.serial, shared.collection, shared.worker)
         self.serial = config.serial
         self.firmware = Firmware(config)
         self.observer = Observer(config.serial, config.boot)
@@ -72,7 +67,7 @@ class HostedModule:
         self.requests: dict[int, Request] = {}
         self._request_id = 0
         self._arrived: list[Event] = []
-        self._estimate_seq = 0
+        self._seq = 0
         self._keys = {leaf: key(robot, config.serial, leaf) for leaf in Leaf}
         self._leaves = {text: leaf for leaf, text in self._keys.items()}
 
@@ -112,34 +107,58 @@ class HostedModule:
             self._request_id += 1
             number = self._request_id
             self.requests[number] = event
-        if leaf is Leaf.ESTIMATE and number is not None:
-            answers.append(Answer(number, self._answer_estimate(event.payload)))
+        if leaf in BESIDE and number is not None:
+            answers.append(Answer(number, self._answer(leaf, event.payload)))
         else:
             incoming.append(Incoming(leaf, event.payload, number))
 
-    def _answer_estimate(self, payload: bytes) -> bytes:
-        admission = self.firmware.admission
+    def _answer(self, leaf: Leaf, payload: bytes) -> bytes:
         try:
-            request = admission.read(EstimateRequest, payload, any_boot=True)
-            finding = self.observer.findings.get(request.joint)
-            if finding is None:
-                raise WireError(Refusal.GONE, f"{self.serial} has no estimate of joint {request.joint}")
-            return encode(self.estimate(finding))
+            if leaf is Leaf.ESTIMATE:
+                return encode(self._answer_estimate(payload))
+            if leaf is Leaf.COLLECT:
+                return encode(self._answer_collect(payload))
+            return encode(self._answer_information(payload))
         except WireError as error:
-            admission.count(error.reason)
-            return encode(self._refusal(error))
+            # What is not ready yet is asked for again; nobody has done anything wrong.
+            if error.reason is not Refusal.BUSY:
+                self.firmware.admission.count(error.reason)
+            return encode(self._ack(False, 0, error.reason.value, error.detail[:512]))
 
-    def _refusal(self, error: WireError) -> Ack:
+    def _answer_estimate(self, payload: bytes) -> Estimate:
+        request = self.firmware.admission.read(EstimateRequest, payload, any_boot=True)
+        finding = self.observer.findings.get(request.joint)
+        if finding is None:
+            raise WireError(Refusal.GONE, f"{self.serial} has no estimate of joint {request.joint}")
+        return self.estimate(finding)
+
+    def _answer_collect(self, payload: bytes) -> Ack:
+        request = self.firmware.admission.read(CollectRequest, payload, max_bytes=MAX_MESSAGE_BYTES)
+        shared = self._shared
+        self._information.collect(request, shared.histories, shared.clock_ns())
+        return self._ack(True, request.seq)
+
+    def _answer_information(self, payload: bytes) -> Information:
+        request = self.firmware.admission.read(InformationRequest, payload, max_bytes=MAX_MESSAGE_BYTES)
+        answer = self._information.answer(request)
+        return Information(
+            serial=self.serial, boot=self.firmware.config.boot, seq=self._next_seq(), **answer._asdict()
+        )
+
+    def _next_seq(self) -> int:
+        self._seq += 1
+        return self._seq
+
+    def _ack(self, accepted: bool, re: int, reason: str = "", detail: str = "") -> Ack:
         lease = self.firmware.lease
-        self._estimate_seq += 1
         return Ack(
             serial=self.serial,
             boot=self.firmware.config.boot,
-            seq=self._estimate_seq,
-            re=0,
-            accepted=False,
-            reason=error.reason.value,
-            detail=error.detail[:512],
+            seq=self._next_seq(),
+            re=re,
+            accepted=accepted,
+            reason=reason,
+            detail=detail,
             t_ns=self.now_ns,
             holder=lease.holder,
             lease_left_ns=lease.left_ns(self.now_ns),
@@ -148,11 +167,10 @@ class HostedModule:
 
     def estimate(self, finding: Finding) -> Estimate:
         """Return the message that publishes a finding."""
-        self._estimate_seq += 1
         return Estimate(
             serial=self.serial,
             boot=self.firmware.config.boot,
-            seq=self._estimate_seq,
+            seq=self._next_seq(),
             joint=finding.joint,
             motion_ids=finding.motion_ids,
             moved=finding.moved,
@@ -162,6 +180,24 @@ class HostedModule:
             regression=finding.regression,
             note=finding.note,
         )
+
+
+class Shared:
+    """What the modules of one process have in common."""
+
+    def __init__(self, worker: Worker) -> None:
+        self.worker = worker
+        self.collection = MotionCollection()
+        self.modules: list[HostedModule] = []
+
+    @property
+    def histories(self) -> dict[str, History]:
+        """The rows of the process's own modules."""
+        return {module.serial: module.firmware.history for module in self.modules}
+
+    def clock_ns(self) -> int:
+        """Return the time of one steady clock of the process: that of its first module."""
+        return self.modules[0].now_ns
 
 
 class AgentHost:
@@ -175,7 +211,9 @@ class AgentHost:
         configs: Sequence[FirmwareConfig],
         worker: Worker,
     ):
-        self.modules = [HostedModule(robot, config) for config in configs]
+        self._shared = Shared(worker)
+        self.modules = self._shared.modules
+        self.modules += [HostedModule(robot, config, self._shared) for config in configs]
         self._robot = robot
         self._hardware = hardware
         self._transport = transport
@@ -223,6 +261,9 @@ class AgentHost:
         self._pwm = list(map(self._step, self.modules, samples))
         if self._neighbours.restless:
             self._attend_to_motions()
+        if self._shared.collection.restless:
+            for wish in self._shared.collection.poll(self.modules[0].now_ns):
+                self._ask_history(wish)
         self._worker.check()
         if self._found:
             self._publish_findings()
@@ -273,9 +314,12 @@ class AgentHost:
         try:
             feedback = decode(Feedback, payload, MAX_MESSAGE_BYTES)
         except WireError:
-            decode(Ack, payload)  # a refusal (rows gone) is an answer too; anything else is malformed
+            refused = decode(Ack, payload)  # an answer too; anything else is malformed
+            if refused.reason in (Refusal.GONE.value, Refusal.WRONG_BOOT.value):
+                self._shared.collection.on_gone(refused.serial)
             return
         self._neighbours.on_feedback(feedback, clocks, live=False)
+        self._shared.collection.on_feedback(feedback)
 
     def _attend_to_motions(self) -> None:
         now_ns = self.modules[0].now_ns

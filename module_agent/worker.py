@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
-from module_agent.estimate.observer import Finding
+T = TypeVar("T")
 
 
 class ThreadWorker:
@@ -13,11 +14,11 @@ class ThreadWorker:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="estimate")
         self._failure: BaseException | None = None
 
-    def submit(self, job: Callable[[], Finding], done: Callable[[Finding], None]) -> None:
+    def submit(self, job: Callable[[], T], done: Callable[[T], None]) -> None:
         """Queue a job; `done` is called on the worker's thread."""
         self._pool.submit(self._run, job, done)
 
-    def _run(self, job: Callable[[], Finding], done: Callable[[Finding], None]) -> None:
+    def _run(self, job: Callable[[], T], done: Callable[[T], None]) -> None:
         try:
             done(job())
         except BaseException as error:  # kept for `check`: the pool would only log it

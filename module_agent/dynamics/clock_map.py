@@ -40,6 +40,14 @@ class ClockMap(NamedTuple):
         mapped: Times = session_ns - whole - np.rint(rest + self.drift * since).astype(np.int64)
         return mapped
 
+    def module_span(self, start_ns: int, end_ns: int, step_ns: int) -> tuple[int, int]:
+        """Return the module times between which rows count for session times from `start_ns` to `end_ns`.
+
+        Ten steps lie to either side, from which a spline through them is settled.
+        """
+        first, last = self.to_module(np.array([start_ns - 10 * step_ns, end_ns + 10 * step_ns]))
+        return int(first), int(last)
+
     def _split(self) -> tuple[int, float]:
         whole = round(self.offset_ns)
         return whole, self.offset_ns - whole

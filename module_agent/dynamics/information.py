@@ -17,12 +17,15 @@ from module_agent.dynamics.regressor import PER_BODY, torque_regressor
 
 # Bounds the memory: a block of 64 joints is 0.7 GB at most, one of 7 joints 8 MB.
 _BLOCK = 2048
+# Of one joint alone: values in a block of the whole regressor, of which only that joint's are kept.
+_VALUES = 2_000_000
 
 
 class JointInformation(NamedTuple):
     """Rows equivalent to all samples of one joint, read-only: |Y phi - tau|^2 = |r phi - z|^2 + rest.
 
-    r: (k, 10 n), zero at the bodies that the joint does not carry; z: (k,) [Nm].
+    r: (k, p), upper triangular in the columns that are not zero; the first 10 n are those of the bodies, zero
+    where the joint does not carry one. z: (k,) [Nm].
     rest: the part of |tau|^2 that no parameters explain [Nm^2]. samples: how many went in.
     """
 
@@ -33,17 +36,19 @@ class JointInformation(NamedTuple):
 
 
 def compress(regressor: ArrayLike, tau_nm: ArrayLike) -> tuple[JointInformation, ...]:
-    """Return the information of every joint from a regressor (m, n, 10 n) and torques (m, n) [Nm].
+    """Return the information of every joint from a regressor (m, n, p) and torques (m, n) [Nm].
+
+    The columns are the 10 n of `torque_regressor`, and any further ones behind them.
 
     Raises:
         ValueError: shapes that do not fit, no samples, or values that are not finite.
     """
     y = np.asarray(regressor, dtype=float)
     tau = np.asarray(tau_nm, dtype=float)
-    if y.ndim != 3 or tau.shape != y.shape[:2] or y.shape[2] != PER_BODY * y.shape[1] or not y.shape[0]:
+    if y.ndim != 3 or tau.shape != y.shape[:2] or y.shape[2] < PER_BODY * y.shape[1] or not y.shape[0]:
         raise ValueError(
             f"regressor {y.shape} and torques {tau.shape} do not fit: "
-            "(m, n, 10 n) and (m, n) with m > 0 are needed"
+            "(m, n, 10 n or more) and (m, n) with m > 0 are needed"
         )
     if not (np.isfinite(y).all() and np.isfinite(tau).all()):
         raise ValueError("the regressor or a torque holds a value that is not finite")
@@ -68,18 +73,71 @@ def gather(
     return total
 
 
+def gather_joint(
+    chain: Chain,
+    joint: int,
+    q_rad: ArrayLike,
+    qd_rad_s: ArrayLike,
+    qdd_rad_s2: ArrayLike,
+    tau_nm: ArrayLike,
+) -> JointInformation:
+    """Return the information of one joint: what `gather` returns for it, from its torques (m,) alone.
+
+    The motion is (m, n). That of joints which neither carry it nor are carried by it has no effect.
+
+    Raises:
+        ValueError: shapes that do not fit, no samples, or values that are not finite.
+    """
+    signals = [np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2)]
+    tau = np.asarray(tau_nm, dtype=float)
+    if tau.ndim != 1 or not tau.size or tau.shape != signals[0].shape[:1] or not np.isfinite(tau).all():
+        raise ValueError(
+            f"torques {tau.shape} do not fit a motion {signals[0].shape}, are none or not finite"
+        )
+    total: JointInformation | None = None
+    for begin in range(0, tau.size, _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        own = _own_rows(chain, joint, [signal[part] for signal in signals])
+        found = _triangular(own, tau[part], 0.0, len(own))
+        total = found if total is None else merge_joint(total, found)
+    assert total is not None
+    return total
+
+
+def _own_rows(chain: Chain, joint: int, signals: Sequence[Array]) -> Array:
+    joints = len(chain.serials)
+    step = max(32, _VALUES // (PER_BODY * joints**2))
+    starts = range(0, len(signals[0]), step)
+    parts = [
+        torque_regressor(chain, *(signal[start : start + step] for signal in signals))[:, joint]
+        for start in starts
+    ]
+    return np.concatenate(parts)
+
+
 def merge(one: Sequence[JointInformation], other: Sequence[JointInformation]) -> tuple[JointInformation, ...]:
     """Return the information of both, joint by joint: as if all their samples had been taken together.
 
     Raises:
-        ValueError: the two are of robots with different numbers of joints.
+        ValueError: the two are of robots with different numbers of joints, or of different columns.
     """
     if len(one) != len(other):
         raise ValueError(f"information of {len(one)} joints cannot be merged with that of {len(other)}")
-    return tuple(
-        _triangular(np.vstack([a.r, b.r]), np.concatenate([a.z, b.z]), a.rest + b.rest, a.samples + b.samples)
-        for a, b in zip(one, other, strict=True)
-    )
+    return tuple(merge_joint(a, b) for a, b in zip(one, other, strict=True))
+
+
+def merge_joint(one: JointInformation, other: JointInformation) -> JointInformation:
+    """Return the information of both, of one joint.
+
+    Raises:
+        ValueError: they have different columns.
+    """
+    if one.r.shape[1] != other.r.shape[1]:
+        raise ValueError(
+            f"information in {one.r.shape[1]} columns cannot be merged with that in {other.r.shape[1]}"
+        )
+    rows, target = np.vstack([one.r, other.r]), np.concatenate([one.z, other.z])
+    return _triangular(rows, target, one.rest + other.rest, one.samples + other.samples)
 
 
 def _triangular(y: Array, tau: NDArray[np.float64], rest: float, samples: int) -> JointInformation:

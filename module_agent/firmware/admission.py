@@ -8,7 +8,7 @@ commands are refused without any clock in common.
 from typing import TypeVar
 
 from module_agent.firmware.lease import Lease
-from module_agent.wire.codec import decode
+from module_agent.wire.codec import MAX_COMMAND_BYTES, decode
 from module_agent.wire.messages import (
     GainsCommand,
     LeaseRequest,
@@ -36,13 +36,15 @@ class Admission:
         """Count one refusal."""
         self.refusals[reason.value] = self.refusals.get(reason.value, 0) + 1
 
-    def read(self, kind: type[M], payload: bytes, any_boot: bool = False) -> M:
+    def read(
+        self, kind: type[M], payload: bytes, any_boot: bool = False, max_bytes: int = MAX_COMMAND_BYTES
+    ) -> M:
         """Decode a message that is meant for this module in this boot.
 
         Raises:
             WireError: with the reason.
         """
-        message = decode(kind, payload)
+        message = decode(kind, payload, max_bytes)
         if message.serial != self._serial:
             raise WireError(Refusal.WRONG_SERIAL, f"for {message.serial}, this is {self._serial}")
         if message.boot != self._boot and not (any_boot and message.boot == 0):

@@ -26,6 +26,8 @@ class Leaf(StrEnum):
     LEASE = "lease"
     STOP = "stop"
     GAINS = "gains"
+    COLLECT = "collect"
+    INFORMATION = "information"
 
 
 class KeyParts(NamedTuple):

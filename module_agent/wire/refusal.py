@@ -22,6 +22,7 @@ class Refusal(StrEnum):
     BUSY = "busy"
     LIMIT = "limit"
     GONE = "gone"
+    UNFIT = "unfit"
 
 
 class WireError(ValueError):

@@ -16,6 +16,17 @@ from module_agent.firmware.effort_profile import MOST_SAMPLES, effort_profile
 from module_agent.wire import keys
 from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import ROW, unpack
+from module_agent.wire.information_messages import (
+    MOST_MODULES,
+    MOST_PART_BYTES,
+    ChainPart,
+    ClockPart,
+    CollectRequest,
+    Information,
+    InformationRequest,
+    RowRange,
+    SpanPart,
+)
 from module_agent.wire.messages import (
     Ack,
     Ask,
@@ -154,6 +165,36 @@ EXAMPLES: list[Message] = [
         lease_left_ns=0,
         token=3,
     ),
+    CollectRequest(
+        **HEAD,
+        sender="coordinator-1@host",
+        motion_id=4,
+        rows=(RowRange(serial="J1", boot=9, first_row=10, end_row=20),),
+    ),
+    InformationRequest(
+        **HEAD,
+        sender="coordinator-1@host",
+        chain=ChainPart(
+            serials=("J1",),
+            parent=(-1,),
+            reversed=(False,),
+            geometry=struct.pack("<22d", *range(22)),
+            gravity_m_s2=(0.0, 0.0, 9.81),
+        ),
+        clocks=(ClockPart(origin_ns=5, offset_ns=-1.5, drift=1e-5),),
+        motions=(SpanPart(motion_id=4, start_ns=-1, end_ns=90, first_ns=0, samples=20),),
+        step_ns=4_000_000,
+        cutoff_hz=12.0,
+        offset=8,
+    ),
+    Information(
+        **HEAD,
+        digest=bytes(range(32)),
+        motion_ids=(4,),
+        total_bytes=16,
+        offset=8,
+        part=struct.pack("<d", 0.5),
+    ),
 ]
 
 
@@ -206,6 +247,43 @@ def test_the_longest_effort_and_the_longest_pattern_fit_a_command() -> None:
         effort=effort_profile([1.0] * MOST_SAMPLES, 10_000_000),
     )
     assert len(encode(command)) <= MAX_COMMAND_BYTES
+
+
+def test_what_is_asked_of_64_modules_and_the_longest_answer_fit_a_message() -> None:
+    names = tuple(f"{'X' * 60}-{number:03d}" for number in range(MOST_MODULES))
+    chain = ChainPart(
+        serials=names,
+        parent=tuple(range(-1, MOST_MODULES - 1)),
+        reversed=(False,) * MOST_MODULES,
+        geometry=bytes(MOST_MODULES * 22 * 8),
+        gravity_m_s2=(0.1, 0.2, 9.81),
+    )
+    clock = ClockPart(origin_ns=2**63 - 1, offset_ns=-1e18, drift=1e-4)
+    span = SpanPart(motion_id=2**62, start_ns=2**62, end_ns=2**62, first_ns=2**62, samples=9999)
+    rows = tuple(RowRange(serial=s, boot=2**64 - 1, first_row=2**40, end_row=2**40 + 9) for s in names)
+    head = {**HEAD, "sender": "s" * 64}
+    for message in (
+        CollectRequest(**head, motion_id=2**62, rows=rows),
+        InformationRequest(
+            **head, chain=chain, clocks=(clock,) * 64, motions=(span,) * 64, step_ns=4_000_000, cutoff_hz=12.0
+        ),
+        Information(
+            **HEAD,
+            digest=bytes(32),
+            motion_ids=(2**62,) * 64,
+            total_bytes=MOST_PART_BYTES,
+            offset=0,
+            part=bytes(MOST_PART_BYTES),
+        ),
+    ):
+        assert decode(type(message), encode(message), MAX_MESSAGE_BYTES) == message
+
+
+def test_a_question_has_the_same_digest_whoever_is_asked_and_for_whichever_part() -> None:
+    request = next(m for m in EXAMPLES if isinstance(m, InformationRequest))
+    again = request.model_copy(update={"serial": "J2", "boot": 1, "seq": 99, "offset": 0, "sender": "b"})
+    assert again.digest() == request.digest()
+    assert request.model_copy(update={"cutoff_hz": 11.0}).digest() != request.digest()
 
 
 def test_plain_struct_knowledge_reads_the_rows() -> None:

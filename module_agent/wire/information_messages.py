@@ -1,0 +1,100 @@
+"""What is said of the information in torques (`dynamics.information`): which rows a module is to keep for it,
+what it is to be computed with, and the answer. Sizes are bounded for 64 modules.
+"""
+
+import hashlib
+from typing import Annotated
+
+from pydantic import Field
+
+from module_agent.wire.codec import encode
+from module_agent.wire.messages import Counter, Message, Name, Nanoseconds, Part, Vector3
+
+MOST_MODULES = 64
+MOST_PART_BYTES = 65_536
+# A module's part in `ChainPart.geometry`: axis, point and IMU's pose, row by row.
+GEOMETRY_BYTES = 8 * (3 + 3 + 16)
+
+Instant = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+
+
+class RowRange(Part):
+    """Feedback rows `first_row` up to and without `end_row` of one boot of a module."""
+
+    serial: Name
+    boot: Annotated[int, Field(ge=0, lt=2**64)]
+    first_row: Counter
+    end_row: Counter
+
+
+class CollectRequest(Message):
+    """Ask a module to keep the rows of a motion, its own and those of other modules, which it fetches.
+
+    The same motion again is the same request; with other rows it takes the place of the former one.
+    """
+
+    sender: Name
+    motion_id: Counter
+    rows: Annotated[tuple[RowRange, ...], Field(min_length=1, max_length=MOST_MODULES)]
+
+
+class ChainPart(Part):
+    """A `dynamics.chain.Chain` of n modules; `geometry` is one block of little-endian doubles, (n, 22)."""
+
+    serials: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST_MODULES)]
+    parent: tuple[Annotated[int, Field(ge=-1, lt=MOST_MODULES)], ...]
+    reversed: tuple[bool, ...]
+    geometry: Annotated[bytes, Field(max_length=MOST_MODULES * GEOMETRY_BYTES)]
+    gravity_m_s2: Vector3
+
+
+class ClockPart(Part):
+    """How a module's clock maps to the session's (`dynamics.clock_map.ClockMap`)."""
+
+    origin_ns: Nanoseconds
+    offset_ns: Annotated[float, Field(ge=-1e19, le=1e19)]
+    drift: Annotated[float, Field(ge=-0.1, le=0.1)]
+
+
+class SpanPart(Part):
+    """A motion in session time: rows from `start_ns` to `end_ns` count; `samples` from `first_ns` on."""
+
+    motion_id: Counter
+    start_ns: Instant
+    end_ns: Instant
+    first_ns: Instant
+    samples: Annotated[int, Field(gt=0, le=65_536)]
+
+
+class InformationRequest(Message):
+    """Ask what a module's own torques say in some motions, computed with this chain and these clocks.
+
+    `clocks` in the order of the chain's serials. Samples are `step_ns` apart and low-passed at `cutoff_hz`.
+    The answer comes in parts; `offset` is where in the block it is to begin.
+    """
+
+    sender: Name
+    chain: ChainPart
+    clocks: Annotated[tuple[ClockPart, ...], Field(min_length=1, max_length=MOST_MODULES)]
+    motions: Annotated[tuple[SpanPart, ...], Field(min_length=1, max_length=64)]
+    step_ns: Annotated[int, Field(ge=1_000_000, le=1_000_000_000)]
+    cutoff_hz: Annotated[float, Field(gt=0.0, le=500.0)]
+    offset: Counter = 0
+
+    def digest(self) -> bytes:
+        """Return a SHA-256 of what is to be computed, whoever is asked and however often."""
+        question = {"serial": "", "boot": 0, "seq": 0, "sender": "", "offset": 0}
+        return hashlib.sha256(encode(self.model_copy(update=question))).digest()
+
+
+class Information(Message):
+    """Part of a module's answer: `total_bytes` of `information_block`, here those from `offset` on.
+
+    `digest` is the request's; `motion_ids` are the motions that it holds, each once.
+    """
+
+    digest: Annotated[bytes, Field(min_length=32, max_length=32)]
+    motion_ids: Annotated[tuple[Counter, ...], Field(max_length=64)]
+    total_bytes: Annotated[int, Field(gt=0, le=4_194_304)]
+    offset: Counter
+    part: Annotated[bytes, Field(max_length=MOST_PART_BYTES)]

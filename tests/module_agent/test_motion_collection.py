@@ -1,0 +1,135 @@
+"""The rows of motions that an agent keeps: fetched until all are there, each motion once, a boot apart."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from module_agent.firmware.history import History
+from module_agent.motion_collection import GIVE_UP_NS, LONGEST_ROWS, MotionCollection
+from module_agent.neighbours import ANSWER_TIMEOUT_NS, AskHistory
+from module_agent.wire.information_messages import CollectRequest, RowRange
+from module_agent.wire.messages import Feedback
+from module_agent.wire.refusal import Refusal, WireError
+
+OWN, OTHER = "J1", "J2"
+
+
+def history(rows: int, slope: float = 0.001) -> History:
+    found = History(1000)
+    for number in range(rows):
+        found.append((4_000_000 * number, 4_000_000 * number, 0, 0, slope * number, *[0.5] * 17))
+    return found
+
+
+def request(
+    motion_id: int = 1, first: int = 10, end: int = 600, boot: int = 7, sender: str = "c"
+) -> CollectRequest:
+    rows = tuple(RowRange(serial=s, boot=boot, first_row=first, end_row=end) for s in (OWN, OTHER))
+    return CollectRequest(serial=OWN, boot=boot, seq=1, sender=sender, motion_id=motion_id, rows=rows)
+
+
+def served(wish: AskHistory, of: History, boot: int = 7) -> Feedback:
+    block = of.rows(wish.first_row, wish.end_row).tobytes()
+    count = wish.end_row - wish.first_row
+    return Feedback(serial=wish.serial, boot=boot, seq=1, first_row=wish.first_row, count=count, rows=block)
+
+
+def refused(collection: MotionCollection, motion_id: int = 1, sender: str = "c") -> Refusal:
+    with pytest.raises(WireError) as caught:
+        collection.tracks(sender, motion_id)
+    return caught.value.reason
+
+
+def test_own_rows_are_copied_and_others_are_asked_for_until_they_have_come() -> None:
+    collection, other = MotionCollection(), history(700, 0.002)
+    collection.collect(request(), {OWN: history(700)}, 0)
+    asked = 0
+    assert refused(collection) is Refusal.BUSY
+    while collection.restless:
+        for wish in collection.poll(0):
+            asked += 1
+            assert wish.serial == OTHER
+            collection.on_feedback(served(wish, other))
+    # 590 rows, 256 to a question.
+    assert asked == 3
+    tracks = collection.tracks("c", 1)
+    assert np.allclose(tracks[OTHER].position_rad, 0.002 * np.arange(10, 600))
+    assert np.allclose(tracks[OWN].position_rad, 0.001 * np.arange(10, 600))
+    assert list(tracks[OWN].t_ns[:2]) == [40_000_000, 44_000_000]
+
+
+def test_a_question_that_is_lost_is_asked_again_and_not_before_its_time() -> None:
+    collection = MotionCollection()
+    collection.collect(request(), {OWN: history(700)}, 0)
+    (first,) = collection.poll(0)
+    assert collection.poll(ANSWER_TIMEOUT_NS - 1) == []
+    assert collection.poll(ANSWER_TIMEOUT_NS) == [first]
+
+
+def test_the_same_motion_again_is_kept_once_and_fetched_once() -> None:
+    collection = MotionCollection()
+    own = {OWN: history(700), OTHER: history(700)}
+    collection.collect(request(), own, 0)
+    before = collection.tracks("c", 1)
+    collection.collect(request(), {}, 0)
+    assert collection.tracks("c", 1) == before
+    assert collection.poll(0) == []
+
+
+def test_a_motion_that_was_done_again_takes_the_place_of_the_former_one() -> None:
+    collection = MotionCollection()
+    own = {OWN: history(700), OTHER: history(700)}
+    collection.collect(request(), own, 0)
+    collection.collect(request(first=100, end=200), own, 0)
+    assert len(collection.tracks("c", 1)[OWN].t_ns) == 100
+
+
+def test_rows_of_another_boot_do_not_count() -> None:
+    collection = MotionCollection()
+    collection.collect(request(first=10, end=20), {OWN: history(700)}, 0)
+    (wish,) = collection.poll(0)
+    collection.on_feedback(served(wish, history(700), boot=8))
+    assert refused(collection) is Refusal.BUSY
+    collection.on_feedback(served(wish, history(700)))
+    assert len(collection.tracks("c", 1)[OTHER].t_ns) == 10
+
+
+@pytest.mark.parametrize("end", ["refused", "silent"])
+def test_rows_that_never_come_are_said_to_be_gone(end: str) -> None:
+    collection = MotionCollection()
+    collection.collect(request(), {OWN: history(700)}, 0)
+    collection.poll(0)
+    if end == "refused":
+        collection.on_gone(OTHER)
+    else:
+        collection.poll(GIVE_UP_NS)
+    assert refused(collection) is Refusal.GONE
+    assert collection.poll(GIVE_UP_NS) == []
+    assert not collection.restless
+
+
+def test_a_motion_of_somebody_else_or_of_another_number_is_not_known() -> None:
+    collection = MotionCollection()
+    collection.collect(request(), {OWN: history(700), OTHER: history(700)}, 0)
+    assert refused(collection, 2) is Refusal.GONE
+    assert refused(collection, 1, "another") is Refusal.GONE
+
+
+def test_own_rows_that_are_gone_or_too_many_rows_are_refused() -> None:
+    collection = MotionCollection()
+    for wrong, reason in ((request(end=701), Refusal.GONE), (request(end=LONGEST_ROWS + 11), Refusal.RANGE)):
+        with pytest.raises(WireError) as caught:
+            collection.collect(wrong, {OWN: history(700)}, 0)
+        assert caught.value.reason is reason
+
+
+def test_the_oldest_motions_make_room(monkeypatch: Any) -> None:
+    monkeypatch.setattr("module_agent.motion_collection.MOST_ROWS", 3000)
+    collection = MotionCollection()
+    own = {OWN: history(700), OTHER: history(700)}
+    for number in range(4):
+        collection.collect(request(number), own, 0)
+    assert refused(collection, 0) is Refusal.GONE
+    assert refused(collection, 1) is Refusal.GONE
+    assert set(collection.tracks("c", 3)) == {OWN, OTHER}
