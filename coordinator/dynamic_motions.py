@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from coordinator.journal import JournalEvent, Purpose
-from coordinator.motion_window import RATE_HZ, window
+from coordinator.journal import Purpose
+from coordinator.motion_window import RATE_HZ, Window, window
 from coordinator.recording import Recording
 from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import JointMotion, filtered_motion, settling_samples
@@ -15,10 +15,10 @@ DYNAMIC_CUTOFF_HZ = 12.0
 INDEPENDENT_FRACTION = min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
 
 
-def dynamic_motion(
+def dynamic_windows(
     recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], *purposes: Purpose
-) -> JointMotion:
-    """Return all motions of some purposes one after the other, columns in the order of `serials`.
+) -> list[Window]:
+    """Return all motions of some purposes, columns in the order of `serials`, with the low-pass' margins.
 
     Of a step that was done again the latest counts.
 
@@ -29,14 +29,28 @@ def dynamic_motion(
     steps = {event.step: event for event in recording.motions(*purposes)}
     if not steps:
         raise ValueError(f"the recording holds no motion for {' or '.join(purposes)}")
-    motions = [_filtered(recording, clocks, serials, event) for event in steps.values()]
+    margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
+    return [window(recording, clocks, serials, event, margin) for event in steps.values()]
+
+
+def dynamic_motion(
+    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], *purposes: Purpose
+) -> JointMotion:
+    """Return all motions of some purposes one after the other, filtered; see `dynamic_windows`.
+
+    Raises:
+        ValueError: as there.
+    """
+    motions = [filtered_window(one) for one in dynamic_windows(recording, clocks, serials, *purposes)]
+    return joined_motions(motions)
+
+
+def joined_motions(motions: Sequence[JointMotion]) -> JointMotion:
+    """Return motions one after the other."""
     return JointMotion(*(np.concatenate(column) for column in zip(*motions, strict=True)))
 
 
-def _filtered(
-    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], event: JournalEvent
-) -> JointMotion:
-    margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
-    one = window(recording, clocks, serials, event, margin)
+def filtered_window(one: Window) -> JointMotion:
+    """Return a window as the regressor needs it, without its margins."""
     # No velocity: that of the modules is late by their filter.
     return filtered_motion(one.t_ns, one.q_rad, None, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)

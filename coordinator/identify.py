@@ -13,9 +13,9 @@ import numpy as np
 
 from coordinator.clock_map import map_clocks
 from coordinator.clock_refinement import refine_clocks
-from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion
-from coordinator.dynamics.identification import InertialFit, solve_weighted
+from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_windows, joined_motions
 from coordinator.dynamics.prediction import TorqueError, check_held_out
+from coordinator.inertia import Inertia, Robot, find_inertia, without_terms
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
 from coordinator.kinematics.base_motion import NoiseFloor
@@ -40,7 +40,6 @@ from module_agent.catalogue import ModuleType, module_type
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import JointMotion, settling_samples
-from module_agent.dynamics.information import JointInformation, gather
 from module_agent.wire.messages import Estimate
 
 # Of some 30 errors an IMU the largest is below this in 99 of 100.
@@ -97,7 +96,7 @@ class Identified(NamedTuple):
     """Everything that follows from a recording."""
 
     kinematics: Kinematics
-    inertia: InertialFit | None
+    inertia: Inertia | None
     bodies: RobotBodies | None
     held_out: HeldOutMotion | None
     result: Result
@@ -107,7 +106,7 @@ class Identified(NamedTuple):
         """The inertial parameters for files that other programs read: of real bodies, if any were found."""
         if self.bodies is not None and self.bodies.fit is not None:
             return self.bodies.fit.phi
-        return self.inertia.phi if self.inertia is not None else None
+        return self.inertia.seen.fit.phi if self.inertia is not None else None
 
 
 def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | None = None) -> Identified:
@@ -121,14 +120,20 @@ def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | 
         kinematics = revise(kinematics)
     inertia, bodies, held_out = None, None, None
     if _motions(recording, "dynamic"):
-        information, means = _torques(recording, kinematics)
-        inertia = solve_weighted(information, INDEPENDENT_FRACTION)
-        types = [recorded_type(recording, s) for s in kinematics.topology.serials]
-        bodies = robot_bodies(information, kinematics.fit.chain, types, inertia, INDEPENDENT_FRACTION)
+        chain, serials = kinematics.fit.chain, kinematics.topology.serials
+        types = [recorded_type(recording, s) for s in serials]
+        robot = Robot(
+            chain, types, kinematics.refinement, base_floor(recording, kinematics.clocks, kinematics.topology)
+        )
+        windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
+        inertia = find_inertia(robot, windows)
+        seen = inertia.seen
+        bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION)
         if _motions(recording, "held_out"):
-            serials = kinematics.topology.serials
-            motion = dynamic_motion(recording, kinematics.clocks, serials, "held_out")
-            held_out = _held_out(kinematics, motion, inertia.phi, means)
+            means = joined_motions([without_terms(one, seen.terms) for one in windows]).tau_nm.mean(axis=0)
+            windows = dynamic_windows(recording, kinematics.clocks, serials, "held_out")
+            motion = joined_motions([without_terms(one, seen.terms) for one in windows])
+            held_out = _held_out(kinematics, motion, seen.fit.phi, means)
             bodies = _checked(bodies, kinematics, motion, means)
     result = build_result(recording, kinematics, inertia, held_out, bodies)
     return Identified(kinematics, inertia, bodies, held_out, result)
@@ -159,7 +164,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         clocks |= refine_clocks(first.chain, clocks, windows).clocks
         windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
-        floor = _base_floor(recording, clocks, topology)
+        floor = base_floor(recording, clocks, topology)
         refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
     except (TopologyError, AssemblyError, ValueError) as error:
         raise IdentificationError(str(error)) from error
@@ -297,7 +302,7 @@ def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
     return RestObservation(np.array(force), max(scatter), np.array(position))
 
 
-def _base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topology) -> NoiseFloor | None:
+def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topology) -> NoiseFloor | None:
     """Return the noise of the IMU that rides on the base, if the first module's does."""
     if topology.reversed[0]:
         return None
@@ -320,13 +325,6 @@ def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Seq
 
 
 # ---------------------------------------------------------------------- dynamics
-
-
-def _torques(recording: Recording, kinematics: Kinematics) -> tuple[tuple[JointInformation, ...], Array]:
-    """Return what all dynamic motions say of the inertial parameters; also the mean torques, a baseline."""
-    motion = dynamic_motion(recording, kinematics.clocks, kinematics.topology.serials, "dynamic")
-    signals = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm
-    return gather(kinematics.fit.chain, *signals), motion.tau_nm.mean(axis=0)
 
 
 def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Array) -> HeldOutMotion:

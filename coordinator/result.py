@@ -207,12 +207,29 @@ class VerdictPart(Part):
     sums: list[int]
 
 
+class TorqueTermPart(Part):
+    """What one joint's torque reading holds beside the bodies' torque (`dynamics.torque_terms`).
+
+    used: it earns its place; else value and sigma are zero. gain: by how many variances of the torque's noise
+    it makes the joint's misfit smaller.
+    """
+
+    serial: str
+    term: str
+    unit: str
+    used: bool
+    value: float
+    sigma: float
+    gain: float
+
+
 class DynamicsPart(Part):
     """The inertial parameters; see `dynamics.regressor` for the order and frame of `phi`.
 
     `phi` predicts torques but need not be of real bodies: those are `bodies`. words say what is known, body
     by body. frames are the poses (4, 4) at q = 0 in the root frame in which base parameters and verdicts are
-    worded: z along the joint's axis, x towards the next joint (`dynamics.joint_frames`).
+    worded: z along the joint's axis, x towards the next joint (`dynamics.joint_frames`). seen_by: by what the
+    bodies' motion was seen (`inertia`); noise_nm: what each way of seeing it leaves in the torques.
     """
 
     phi: list[float]
@@ -228,6 +245,9 @@ class DynamicsPart(Part):
     verdicts: list[VerdictPart] = []
     words: list[str] = []
     frames: list[list[list[float]]] = []
+    seen_by: str = "encoders"
+    noise_nm: dict[str, dict[str, float]] = {}
+    torque_terms: list[TorqueTermPart] = []
 
 
 class Result(Part):

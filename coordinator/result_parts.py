@@ -23,6 +23,7 @@ from coordinator.result import (
     Result,
     ScrewPart,
     TipPart,
+    TorqueTermPart,
     TransformPart,
     UnknownPart,
     UnresolvedPart,
@@ -32,10 +33,12 @@ from coordinator.result import (
 from module_agent.catalogue import ModuleType, module_type
 from module_agent.dynamics.chain import Array
 from module_agent.dynamics.regressor import PER_BODY
+from module_agent.dynamics.torque_terms import TERMS, UNITS
 
 if TYPE_CHECKING:
-    from coordinator.dynamics.identification import InertialFit
+    from coordinator.dynamics.seen_information import TermsFit
     from coordinator.identify import HeldOutMotion, Kinematics
+    from coordinator.inertia import Inertia
     from coordinator.kinematics.assembly import ChainFit
     from coordinator.kinematics.null_space import Unresolved
     from coordinator.kinematics.topology import Topology
@@ -45,7 +48,7 @@ if TYPE_CHECKING:
 def build_result(
     recording: Recording,
     kinematics: "Kinematics",
-    inertia: "InertialFit | None",
+    inertia: "Inertia | None",
     held_out: "HeldOutMotion | None",
     bodies: "RobotBodies | None" = None,
 ) -> Result:
@@ -230,13 +233,13 @@ def _dh(kinematics: "Kinematics") -> list[DhPart]:
 
 def _dynamics(
     kinematics: "Kinematics",
-    inertia: "InertialFit | None",
+    found: "Inertia | None",
     held_out: "HeldOutMotion | None",
     bodies: "RobotBodies | None",
 ) -> DynamicsPart | None:
-    if inertia is None:
+    if found is None:
         return None
-    serials = kinematics.topology.serials
+    serials, inertia = kinematics.topology.serials, found.seen.fit
     return DynamicsPart(
         phi=inertia.phi.tolist(),
         rank=inertia.rank,
@@ -251,7 +254,28 @@ def _dynamics(
         verdicts=_verdicts(bodies) if bodies is not None else [],
         words=bodies.words() if bodies is not None else [],
         frames=bodies.frames.tolist() if bodies is not None else [],
+        seen_by=found.eyes,
+        noise_nm={
+            eyes: dict(zip(serials, noise.tolist(), strict=True)) for eyes, noise in found.noise_nm.items()
+        },
+        torque_terms=_torque_terms(serials, found.seen.terms),
     )
+
+
+def _torque_terms(serials: tuple[str, ...], terms: "TermsFit") -> list[TorqueTermPart]:
+    return [
+        TorqueTermPart(
+            serial=serial,
+            term=term,
+            unit=UNITS[term],
+            used=bool(terms.used[i, k]),
+            value=float(terms.value[i, k]),
+            sigma=float(terms.sigma[i, k]),
+            gain=float(terms.gain[i, k]),
+        )
+        for i, serial in enumerate(serials)
+        for k, term in enumerate(TERMS)
+    ]
 
 
 def _bodies(found: "RobotBodies") -> BodiesPart | None:

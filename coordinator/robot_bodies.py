@@ -21,7 +21,7 @@ from coordinator.dynamics.base_parameters import (
     whitened,
 )
 from coordinator.dynamics.consistency import Body, body, parameter_transform
-from coordinator.dynamics.identification import MAX_SIGMA_KG, InertialFit
+from coordinator.dynamics.identification import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG, InertialFit
 from coordinator.dynamics.joint_frames import joint_frames
 from coordinator.dynamics.parameter_prior import module_prior
 from coordinator.dynamics.physical_fit import NotSolvedError, PhysicalFit, fit_physical
@@ -95,6 +95,7 @@ def robot_bodies(
         inertial_columns(joints),
         max_sigma=MAX_SIGMA_KG,
         common_errors=scale_errors(information, target, TORQUE_SCALE_SIGMA),
+        tolerance=ESTIMATED_CHAIN_TOLERANCE,
     )
     fit, note = None, ""
     try:

@@ -10,6 +10,7 @@ import numpy as np
 from coordinator.kinematics.base_heading import faced
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.imu_intrinsics import DELAY, ImuPrior
+from coordinator.kinematics.increments import frozen
 from coordinator.kinematics.link_flex import (
     FlexSlopes,
     LinkLoad,
@@ -65,7 +66,7 @@ def refine_robot(
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
     giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
     if not giving.compliance.size:
-        return refine_chain(giving.chain, thinned(parts, keep), prior)
+        return refine_chain(giving.chain, thinned(parts, keep), prior)._replace(late_s=late_s)
     # Where the hinges are changes what turns them: once roughly, then for good.
     coarse = thinned(parts, COARSE * keep)
     flex = _hinged(giving.chain, coarse, joined(loads, COARSE * keep), giving.compliance)
@@ -78,7 +79,9 @@ def refine_robot(
     loads = with_hinges_moved(loads, joints, moved)
     fine = thinned(parts, keep)
     flex = _hinged(hinged.chain, fine, joined(loads, keep), hinged.compliance[:links], moved)
-    return refine_chain(hinged.chain, fine, prior, flex)
+    found = refine_chain(hinged.chain, fine, prior, flex)
+    # Of the hinges the last step finds by how much more they are elsewhere.
+    return found._replace(compliance=frozen(found.compliance + flex.taken), late_s=late_s)
 
 
 def _hinged(

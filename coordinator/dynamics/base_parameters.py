@@ -186,6 +186,7 @@ def base_parameters(
     sigma: float = 1.0,
     max_sigma: float = np.inf,
     common_errors: ArrayLike | None = None,
+    tolerance: float = RANK_TOLERANCE,
 ) -> BaseParameters:
     """Return the base parameters of rows whose noise is white.
 
@@ -202,13 +203,14 @@ def base_parameters(
             (`identification.MAX_SIGMA_KG`); inf keeps all that rounding allows.
         common_errors: (k, j) errors of the target that are not independent from row to row: each column is
             one that comes as a whole, of one standard deviation (`scale_errors`). They widen the covariance.
+        tolerance: singular values that are smaller shares of the largest count as zero.
 
     Raises:
         ValueError: shapes that do not fit, values that are not finite, or rows of zeros.
     """
     rows, seen, common = _rows(triangle, target, len(columns.names), sigma, common_errors)
     left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
-    kept = (values > RANK_TOLERANCE * values[0]) & (values > sigma / max_sigma)
+    kept = (values > tolerance * values[0]) & (values > sigma / max_sigma)
     if not values.any():
         raise ValueError("the rows show no parameter: without gravity or motion the torques say nothing")
     space = directions[kept]

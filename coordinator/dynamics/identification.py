@@ -26,6 +26,10 @@ REACH_M = 0.3
 # weakest motion that an encoder of 14 bits resolves is above 1e-8. Nothing real lies between.
 RANK_TOLERANCE = 1e-11
 
+# The same where the chain was itself estimated: axes that are wrong by 1e-5 to 1e-4 rad show, by as much of
+# the largest singular value, parameters that the true ones do not. An arm's weakest real one is above 1e-3.
+ESTIMATED_CHAIN_TOLERANCE = 1e-4
+
 # A direction with a larger standard deviation is not identified: the mass of one module is about 0.3 kg, so
 # that the parameter's zero (or the prior) is nearer to the truth than the estimate.
 MAX_SIGMA_KG = 0.3
@@ -118,8 +122,11 @@ def solve_information(
     prior_phi: ArrayLike | None = None,
     max_sigma_kg: float = MAX_SIGMA_KG,
     independent_fraction: float = 1.0,
+    tolerance: float = RANK_TOLERANCE,
 ) -> InertialFit:
     """Fit `phi` to the collected information of all joints; for the arguments see `solve_pseudo_inverse`.
+
+    tolerance: singular values that are smaller shares of the largest count as zero.
 
     Raises:
         ValueError: shapes that do not fit, values out of range, or fewer samples than parameters.
@@ -128,7 +135,7 @@ def solve_information(
         raise ValueError(f"independent_fraction is {independent_fraction}; it must be above 0 and at most 1")
     system = _system(information, weights, prior_phi)
     spectrum = _spectrum(system)
-    kept = spectrum.values > RANK_TOLERANCE * spectrum.values[0]
+    kept = spectrum.values > tolerance * spectrum.values[0]
     # First with all directions that rounding allows: what is lost in the noise can only be said with the
     # noise.
     inverse = _inverse(spectrum, kept)
@@ -139,7 +146,11 @@ def solve_information(
     return _fit(information, system, spectrum, kept, independent_fraction)
 
 
-def solve_weighted(information: Sequence[JointInformation], independent_fraction: float = 1.0) -> InertialFit:
+def solve_weighted(
+    information: Sequence[JointInformation],
+    independent_fraction: float = 1.0,
+    tolerance: float = RANK_TOLERANCE,
+) -> InertialFit:
     """Fit `phi`, each joint's torque weighed by the noise that a first fit without weights leaves in it.
 
     Without weights the noise of joints that carry much is taken for torque of those that carry little.
@@ -147,12 +158,14 @@ def solve_weighted(information: Sequence[JointInformation], independent_fraction
     Raises:
         ValueError: shapes that do not fit, values out of range, or fewer samples than parameters.
     """
-    first = solve_information(information, independent_fraction=independent_fraction)
+    first = solve_information(information, independent_fraction=independent_fraction, tolerance=tolerance)
     # Torques without noise weigh no more than a thousand times the others.
     sigma = np.maximum(first.torque_sigma_nm, 1e-3 * first.torque_sigma_nm.max())
     if not sigma.max() > 0.0:
         return first
-    return solve_information(information, 1.0 / sigma, independent_fraction=independent_fraction)
+    return solve_information(
+        information, 1.0 / sigma, independent_fraction=independent_fraction, tolerance=tolerance
+    )
 
 
 def parameter_scale(bodies: int) -> Array:

@@ -51,7 +51,8 @@ class Refinement(NamedTuple):
     all, without what the model leaves out, which two sessions with the same motions share. null_basis:
     (6 n, k) orthonormal directions that the data does not know. residual_gyro_rad_s, residual_accel_m_s2:
     (n,) rms per axis. intrinsics: the IMUs' own errors; where nothing tells them, they are those expected.
-    compliance: of the links, in the order and units of `FlexSlopes`.
+    compliance: of the links, in the order and units of `FlexSlopes`. late_s: how late all IMUs are alike,
+    beside their own delays in `intrinsics`.
     """
 
     chain: Chain
@@ -65,6 +66,7 @@ class Refinement(NamedTuple):
     intrinsics: ImuIntrinsics
     compliance: Array
     iterations: int
+    late_s: float = 0.0
 
 
 class _State(NamedTuple):

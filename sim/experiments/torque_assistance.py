@@ -130,7 +130,7 @@ def identified_model(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | 
         raise ValueError(
             f"the plan leaves out the dynamics of {robot.name}: there is nothing to calculate from"
         )
-    return Model(found.kinematics.fit.chain, found.inertia.phi)
+    return Model(found.kinematics.fit.chain, found.inertia.seen.fit.phi)
 
 
 def standing_robot(name: str, seed: int) -> Robot:

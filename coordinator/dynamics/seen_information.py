@@ -1,0 +1,175 @@
+"""Inertial parameters where bodies were seen to move, and readings hold more than the bodies' torque.
+
+The rows of a joint have the columns [Z | T | Y - Z]: Z the regressor from encoders alone, on a rigid chain;
+T what its reading holds beside the bodies' torque (`torque_terms`); Y the regressor of the motion as it was
+seen (`body_tracks`). The parameters solve
+
+    Z^T (tau - Y phi - T theta) = 0,
+
+instrumental variables with Z for instruments (Young 2011, Recursive estimation and time-series analysis,
+section 6.2): the noise of IMUs in Y does not make inertias come out small, and parameters that a rigid robot
+does not show are not taken from noise. They come from what is known of modules beforehand: a base that shakes
+makes a little torque of them. It is solved by turns: with phi known, the torque of Y - Z is taken off.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import qr
+
+from coordinator.dynamics.identification import (
+    ESTIMATED_CHAIN_TOLERANCE,
+    RANK_TOLERANCE,
+    InertialFit,
+    parameter_scale,
+    solve_information,
+    solve_weighted,
+)
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.information import JointInformation
+from module_agent.dynamics.regressor import PER_BODY
+from module_agent.dynamics.torque_terms import TERMS
+
+# In variances: a term that is none exceeds it once in two million. Readings err by more than noise.
+EARNS_ABOVE = 25.0
+# The torque of Y - Z is a few percent: every round leaves as much of the error.
+_ROUNDS, _SETTLED = 8, 1e-9
+# A column that keeps less of its length beside the bodies' is one of theirs.
+_ALIKE = 1e-6
+_LEAST_NM = 1e-9
+
+
+class TermsFit(NamedTuple):
+    """The parameters of `TERMS` of n joints, (n, 4) each; zero where a term does not earn its place.
+
+    sigma: one standard deviation. gain: by how many variances of the torque's noise a term makes the misfit
+    of its joint smaller, whether it is used or not.
+    """
+
+    value: Array
+    sigma: Array
+    gain: Array
+    used: NDArray[np.bool_]
+
+
+class SeenFit(NamedTuple):
+    """Inertial parameters, and what else was in the readings.
+
+    information: what is left of every joint when terms and the torque of Y - Z are taken off, in the 10 n
+    columns of the bodies.
+    """
+
+    fit: InertialFit
+    terms: TermsFit
+    information: tuple[JointInformation, ...]
+
+
+def solve_seen(
+    information: Sequence[JointInformation], prior_phi: Array, independent_fraction: float
+) -> SeenFit:
+    """Fit inertial parameters and terms to the rows of n joints.
+
+    Args:
+        information: per joint, in the columns [Z | T], or [Z | T | Y - Z].
+        prior_phi: (10 n,) bodies as they are likely to be; they count where Z shows nothing.
+        independent_fraction: independent samples per sample, below 1 after a low-pass.
+
+    Raises:
+        ValueError: columns that are neither, or as `solve_information`.
+    """
+    size = PER_BODY * len(information)
+    widths = {piece.r.shape[1] for piece in information}
+    seen = widths == {2 * size + len(TERMS)}
+    if not seen and widths != {size + len(TERMS)}:
+        raise ValueError(f"rows of {sorted(widths)} columns are no rows of {len(information)} joints")
+    phi = np.asarray(prior_phi, dtype=float)
+    for _ in range(_ROUNDS if seen else 1):
+        rigid = [_without_departure(piece, size, phi) for piece in information]
+        earned = [_earned(piece, size, independent_fraction) for piece in rigid]
+        left = tuple(_eliminated(piece, size, one.used) for piece, one in zip(rigid, earned, strict=True))
+        fit = solve_weighted(left, independent_fraction, ESTIMATED_CHAIN_TOLERANCE)
+        sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _LEAST_NM))
+        informed = solve_information(
+            left,
+            1.0 / sigma,
+            prior_phi,
+            independent_fraction=independent_fraction,
+            tolerance=ESTIMATED_CHAIN_TOLERANCE,
+        )
+        moved = np.abs((informed.phi - phi) / parameter_scale(len(information))).max()
+        phi = informed.phi
+        if moved < _SETTLED:
+            break
+    return SeenFit(fit, _terms(rigid, earned, fit, independent_fraction), left)
+
+
+class _Earned(NamedTuple):
+    """By how much each term of a joint makes its misfit smaller, and whether it is used, (4,) each."""
+
+    gain: Array
+    used: NDArray[np.bool_]
+
+
+def _without_departure(piece: JointInformation, size: int, phi: Array) -> JointInformation:
+    """Return the rows in [Z | T], with the torque of Y - Z taken off."""
+    kept = size + len(TERMS)
+    if piece.r.shape[1] == kept:
+        return piece
+    return piece._replace(r=piece.r[:, :kept], z=piece.z - piece.r[:, kept:] @ phi)
+
+
+def _earned(piece: JointInformation, size: int, independent_fraction: float) -> _Earned:
+    """Drop the weakest term until all that are left earn their place; bodies explain what they can."""
+    bodies = piece.r[:, :size] * parameter_scale(size // PER_BODY)
+    left, values, _ = np.linalg.svd(bodies, full_matrices=False)
+    space = left[:, values > RANK_TOLERANCE * values[0]]
+    terms = piece.r[:, size:]
+    columns, target = (part - space @ (space.T @ part) for part in (terms, piece.z))
+    gain = np.zeros(len(TERMS))
+    used = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
+    freedom = max(piece.samples - space.shape[1] - len(TERMS), 1)
+    while used.any():
+        inverse = np.linalg.pinv(columns[:, used])
+        value = inverse @ target
+        misfit = target - columns[:, used] @ value
+        variance = (float(misfit @ misfit) + piece.rest) / freedom / independent_fraction
+        gain[used] = value**2 / np.maximum(np.sum(inverse**2, axis=1) * variance, _LEAST_NM**2)
+        weakest = np.flatnonzero(used)[np.argmin(gain[used])]
+        if gain[weakest] > EARNS_ABOVE:
+            break
+        used[weakest] = False
+    return _Earned(gain, used)
+
+
+def _eliminated(piece: JointInformation, size: int, used: NDArray[np.bool_]) -> JointInformation:
+    """Return the rows in the bodies' columns alone: what they say whatever the terms in use are."""
+    terms = piece.r[:, size:][:, used]
+    count = terms.shape[1]
+    if not count:
+        return piece._replace(r=piece.r[:, :size])
+    rows = qr(np.column_stack([terms, piece.r[:, :size], piece.z]), mode="r", check_finite=False)[0]
+    return piece._replace(r=rows[count:, count:-1], z=rows[count:, -1], samples=piece.samples - count)
+
+
+def _terms(
+    rigid: Sequence[JointInformation],
+    earned: Sequence[_Earned],
+    fit: InertialFit,
+    independent_fraction: float,
+) -> TermsFit:
+    """Return the terms that the rows of every joint leave once the bodies are known."""
+    size = len(fit.phi)
+    value, sigma = np.zeros((len(rigid), len(TERMS))), np.zeros((len(rigid), len(TERMS)))
+    for i, (piece, one) in enumerate(zip(rigid, earned, strict=True)):
+        inverse = np.linalg.pinv(piece.r[:, size:][:, one.used])
+        bodies = piece.r[:, :size]
+        value[i, one.used] = inverse @ (piece.z - bodies @ fit.phi)
+        through = inverse @ bodies
+        noise = fit.torque_sigma_nm[i] ** 2 / independent_fraction * (inverse @ inverse.T)
+        sigma[i, one.used] = np.sqrt(np.diagonal(noise + through @ fit.covariance @ through.T))
+    gain, used = (np.array([one[k] for one in earned]) for k in range(2))
+    for array in (value, sigma, gain, used):
+        array.flags.writeable = False
+    return TermsFit(value, sigma, gain, used)

@@ -1,0 +1,114 @@
+"""The inertial parameters from a recording, with as much of the robot's motion as anybody has seen.
+
+Three ways to see the motion are tried: by encoders on a rigid chain at rest, with the base and the links that
+give, and with what every IMU reads beyond that. Whichever leaves the least in the torques is used.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, get_args
+
+import numpy as np
+
+from coordinator.dynamic_motions import (
+    DYNAMIC_CUTOFF_HZ,
+    INDEPENDENT_FRACTION,
+    filtered_window,
+)
+from coordinator.dynamics.body_tracks import track_regressor
+from coordinator.dynamics.consistency import parameters
+from coordinator.dynamics.parameter_prior import module_prior
+from coordinator.dynamics.seen_information import SeenFit, TermsFit, solve_seen
+from coordinator.kinematics.base_motion import NoiseFloor
+from coordinator.kinematics.refinement import Refinement
+from coordinator.motion_window import RATE_HZ, Window
+from coordinator.seen_motion import Eyes, readings, seen_tracks
+from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import JointMotion
+from module_agent.dynamics.information import JointInformation, compress, merge
+from module_agent.dynamics.regressor import torque_regressor
+from module_agent.dynamics.torque_terms import term_columns
+
+EYES: tuple[Eyes, ...] = get_args(Eyes)
+# Of the torques' noise, in the mean over the joints: less is chance.
+BETTER_BY = 0.01
+
+
+class Robot(NamedTuple):
+    """What is known of a robot when its inertia is asked for.
+
+    chain: n joints. kinds: (n,) their modules' types. refined: what the refinement has found of links and
+    IMUs. floor: noise of the IMU that rides on the base at rest, None if none does.
+    """
+
+    chain: Chain
+    kinds: Sequence[ModuleType]
+    refined: Refinement
+    floor: NoiseFloor | None
+
+
+class Inertia(NamedTuple):
+    """Inertial parameters of n bodies.
+
+    seen: parameters, terms and information, of the way of seeing that was best, `eyes`.
+    noise_nm: (n,) of every way, what it leaves in the torques.
+    """
+
+    seen: SeenFit
+    eyes: Eyes
+    noise_nm: Mapping[Eyes, Array]
+
+    @property
+    def gain(self) -> float:
+        """By how much the torques' noise is smaller than with encoders alone, in the mean over the joints."""
+        return float(np.exp(_level(self.noise_nm["encoders"]) - _level(self.noise_nm[self.eyes])))
+
+
+def find_inertia(robot: Robot, windows: Sequence[Window]) -> Inertia:
+    """Find the inertial parameters from windows of motion.
+
+    Raises:
+        ValueError: too few samples, or motions that say nothing of inertia.
+    """
+    pieces = [_information(robot, one) for one in windows]
+    prior = np.concatenate([parameters(one) for one in module_prior(robot.chain, robot.kinds)])
+    found: dict[Eyes, SeenFit] = {}
+    for eyes in EYES:
+        total = pieces[0][eyes]
+        for piece in pieces[1:]:
+            total = merge(total, piece[eyes])
+        found[eyes] = solve_seen(total, prior, INDEPENDENT_FRACTION)
+    noise = {eyes: fit.fit.torque_sigma_nm for eyes, fit in found.items()}
+    best: Eyes = "encoders"
+    for eyes in EYES[1:]:
+        if _level(noise[eyes]) < _level(noise[best]) - BETTER_BY:
+            best = eyes
+    return Inertia(found[best], best, noise)
+
+
+def without_terms(one: Window, terms: TermsFit) -> JointMotion:
+    """Return the motion of a window as encoders see it, with the torque of the bodies alone."""
+    motion = filtered_window(one)
+    columns = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
+    torque = motion.tau_nm - np.einsum("mnk,nk->mn", columns, terms.value)
+    torque.flags.writeable = False
+    return motion._replace(tau_nm=torque)
+
+
+def _information(robot: Robot, one: Window) -> dict[Eyes, tuple[JointInformation, ...]]:
+    motion = filtered_window(one)
+    rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+    terms = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
+    found: dict[Eyes, tuple[JointInformation, ...]] = {
+        "encoders": compress(np.concatenate([rigid, terms], axis=2), motion.tau_nm)
+    }
+    seen = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
+    for eyes in EYES[1:]:
+        tracks = seen_tracks(robot.chain, robot.kinds, robot.refined, robot.floor, seen, eyes == "imus")
+        apart = track_regressor(tracks) - rigid
+        found[eyes] = compress(np.concatenate([rigid, terms, apart], axis=2), motion.tau_nm)
+    return found
+
+
+def _level(noise_nm: Array) -> float:
+    return float(np.log(np.maximum(noise_nm, 1e-9)).mean())
