@@ -17,14 +17,15 @@ Purpose = Literal["rest", "constant", "windowed_sine", "repeat", "whole", "dynam
 class JournalEvent(BaseModel):
     """One line of the journal; `what` says which of the other fields are set.
 
-    `deaf` are the modules that did not confirm to have stopped, of a session that failed; None in an older
-    journal, which names them in its text.
+    `settled`: what follows is asked of the modules with what is known by then, and no later round trip may
+    change that. `deaf` are the modules that did not confirm to have stopped, of a session that failed; None
+    in an older journal, which names them in its text.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     t_ns: int
-    what: Literal["session", "begin", "done", "motion", "note", "failed", "finished"]
+    what: Literal["session", "begin", "done", "motion", "note", "settled", "failed", "finished"]
     step: str = ""
     serial: str = ""
     boot: Annotated[int, Field(ge=0)] = 0

@@ -12,6 +12,7 @@ from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import (
     Ack,
@@ -50,12 +51,15 @@ ASKED: dict[Leaf, type[Message]] = {
     Leaf.MOTION: MotionCommand,
     Leaf.STOP: Stop,
     Leaf.GAINS: GainsCommand,
+    Leaf.COLLECT: CollectRequest,
+    Leaf.INFORMATION: InformationRequest,
 }
 ANSWERED: dict[Leaf, type[Message]] = {
     Leaf.INFO: Info,
     Leaf.STATUS: Status,
     Leaf.HISTORY: Feedback,
     Leaf.ESTIMATE: Estimate,
+    Leaf.INFORMATION: Information,
 }
 
 
@@ -86,8 +90,15 @@ class ModuleRecord:
         self.info: Info | None = None
         self.status: Status | None = None
         self.round_trips: list[RoundTrip] = []
+        self.settled_trips: int | None = None
+        self.information: dict[bytes, dict[int, Information]] = {}
         self.arrivals: list[tuple[int, int]] = []
         self.newest_ns = 0
+
+    @property
+    def trips(self) -> list[RoundTrip]:
+        """The round trips that clocks are mapped by: all, until it is settled what is known."""
+        return self.round_trips[: self.settled_trips]
 
     def see(self, t_ns: int) -> None:
         """Note a module time that was heard."""
@@ -102,6 +113,7 @@ class Recording:
         self.past: dict[tuple[str, int], ModuleRecord] = {}
         self.estimates: dict[tuple[str, str], dict[tuple[int, ...], Estimate]] = {}
         self.journal: list[JournalEvent] = []
+        self.questions: dict[bytes, InformationRequest] = {}
         self.refused: dict[str, int] = {}
         self._hash = hashlib.sha256()
         self._sent: dict[tuple[str, int], int] = {}
@@ -128,6 +140,9 @@ class Recording:
         if entry.kind == "journal":
             event = JournalEvent.model_validate_json(entry.payload)
             self.journal.append(event)
+            if event.what in ("session", "settled"):
+                for module in self.modules.values():
+                    module.settled_trips = len(module.round_trips) if event.what == "settled" else None
             return event
         head = f"{entry.kind} {entry.topic} {len(entry.payload)} ".encode()
         self._hash.update(head + struct.pack("<q", entry.t_ns) + entry.payload)
@@ -144,6 +159,8 @@ class Recording:
             raise WireError(Refusal.WRONG_SERIAL, f"{message.serial} speaks on the key of {parts.serial}")
         if entry.kind == "request":
             self._sent[entry.topic, message.seq] = entry.t_ns
+            if isinstance(message, InformationRequest):
+                self.questions.setdefault(message.digest(), message)
             return message
         if isinstance(message, Setpoint):
             return message
@@ -191,6 +208,8 @@ class Recording:
             case Estimate():
                 found = self.estimates.setdefault((message.joint, message.serial), {})
                 found[message.motion_ids] = message
+            case Information():
+                module.information.setdefault(message.digest, {})[message.offset] = message
             case _:
                 pass
 

@@ -71,6 +71,7 @@ class Session:
     """Runs the steps on a robot. `journal` records an event; `reporter` hears of progress.
 
     `closer` is asked after a motion of all joints at once which of them to explore by themselves as well.
+    `share` is called after every motion that tells the inertia, while the modules still have its rows.
     """
 
     def __init__(
@@ -83,8 +84,10 @@ class Session:
         journal: Callable[[JournalEvent], None],
         reporter: Reporter,
         closer: Callable[[], Awaitable[Sequence[str]]] | None = None,
+        share: Callable[[], Awaitable[None]] | None = None,
     ):
         self.link = link
+        self._share = share
         self._closer = closer
         self._radio = radio
         self._recording = recording
@@ -365,10 +368,16 @@ class Session:
             text = "held-out motion of all joints" if last else f"exciting all joints, {number + 1}"
             work = partial(self._run_together, f"{purpose}/{number}", motion, purpose)
             await self._step(f"{purpose}/{number}", text, work)
+            await self._shared()
         for serial in serials:
             await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
+            await self._shared()
         for serial in serials:
             await self._step(f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial)
+
+    async def _shared(self) -> None:
+        if self._share is not None:
+            await self._share()
 
     def _excitations(self, joints: int) -> int:
         """Return how many steps the plan takes to excite so many joints."""

@@ -80,10 +80,12 @@ def gather_joint(
     qd_rad_s: ArrayLike,
     qdd_rad_s2: ArrayLike,
     tau_nm: ArrayLike,
+    further: ArrayLike | None = None,
 ) -> JointInformation:
     """Return the information of one joint: what `gather` returns for it, from its torques (m,) alone.
 
-    The motion is (m, n). That of joints which neither carry it nor are carried by it has no effect.
+    The motion is (m, n). That of joints which neither carry it nor are carried by it has no effect. `further`
+    are columns (m, k) of this joint beside the bodies'.
 
     Raises:
         ValueError: shapes that do not fit, no samples, or values that are not finite.
@@ -94,10 +96,12 @@ def gather_joint(
         raise ValueError(
             f"torques {tau.shape} do not fit a motion {signals[0].shape}, are none or not finite"
         )
+    beside = np.zeros((tau.size, 0)) if further is None else np.asarray(further, dtype=float)
     total: JointInformation | None = None
     for begin in range(0, tau.size, _BLOCK):
         part = slice(begin, begin + _BLOCK)
-        own = _own_rows(chain, joint, [signal[part] for signal in signals])
+        bodies = _own_rows(chain, joint, [signal[part] for signal in signals])
+        own = np.column_stack([bodies, beside[part]])
         found = _triangular(own, tau[part], 0.0, len(own))
         total = found if total is None else merge_joint(total, found)
     assert total is not None

@@ -94,6 +94,18 @@ class RowLog:
         t_ns = self._rows["t_ns"][arrived]
         return self._rows[arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]]
 
+    def range_between(self, start_ns: int, end_ns: int) -> tuple[int, int]:
+        """Return the row numbers, first and one past the last, of a span of module time; (0, 0) if none came.
+
+        Rows within it that have not arrived are counted.
+        """
+        arrived = np.flatnonzero(self._have)
+        t_ns = self._rows["t_ns"][arrived]
+        found = arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]
+        if self._base is None or not len(found):
+            return 0, 0
+        return self._base + int(found[0]), self._base + int(found[-1]) + 1
+
     def forget_before(self, row: int) -> None:
         """Drop rows below `row`, for listeners with little memory."""
         if self._base is None or row <= self._base:

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from coordinator.recording import Entry, Recording, RoundTrip
+from coordinator.journal import JournalEvent
+from coordinator.recording import JOURNAL_TOPIC, Entry, Recording, RoundTrip
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, Rest, Status, Stop
@@ -59,6 +60,29 @@ def test_a_round_trip_joins_a_question_to_its_answer_by_key_and_number(
     heard.add(wire.reply(Leaf.STATUS, wire.status(re=9, t_ns=78), t_ns=302))  # nobody asked
     assert heard.modules["A"].round_trips == [RoundTrip(200, 300, 77)]
     assert "B" not in heard.modules
+
+
+def test_once_it_is_settled_what_is_known_no_later_round_trip_counts(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    def trip(number: int, t_ns: int) -> None:
+        heard.add(wire.request(Leaf.STATUS, wire.ask(seq=number), t_ns=t_ns))
+        heard.add(wire.reply(Leaf.STATUS, wire.status(re=number, t_ns=77), t_ns=t_ns + 10))
+
+    def journal(what: str) -> None:
+        event = JournalEvent.model_validate({"t_ns": 500, "what": what})
+        heard.add(Entry("journal", JOURNAL_TOPIC, 500, event.encode()))
+
+    trip(1, 100)
+    journal("settled")
+    # At the very same time: what counts is the order of the recording.
+    trip(2, 490)
+    module = heard.modules["A"]
+    assert [t.sent_ns for t in module.trips] == [100]
+    assert [t.sent_ns for t in module.round_trips] == [100, 490]
+    # A session that goes on after a crash settles anew.
+    journal("session")
+    assert module.trips == module.round_trips
 
 
 def test_a_published_status_is_no_answer(heard: Recording, wire: SimpleNamespace) -> None:

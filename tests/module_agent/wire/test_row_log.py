@@ -33,6 +33,17 @@ def test_a_row_log_agrees_with_a_set_of_row_numbers(blocks: list[tuple[int, int]
     assert log.end_row == max(model, default=-1) + 1
 
 
+def test_rows_are_numbered_by_their_times_whatever_is_missing_between() -> None:
+    log = RowLog(1)
+    assert log.range_between(0, 10**9) == (0, 0)
+    log.add(block(50, 10))
+    log.add(block(70, 10))
+    # The times of these rows are their numbers.
+    assert log.range_between(55, 74) == (55, 75)
+    assert log.range_between(60, 69) == (0, 0)
+    assert log.range_between(0, 1000) == (50, 80)
+
+
 def test_forgetting_keeps_what_is_newer() -> None:
     log = RowLog(1)
     log.add(block(0, 100))
