@@ -143,7 +143,7 @@ def gathered(
         elif theirs.r.shape[1] == own[k].r.shape[1]:
             joints[k] = theirs
             by_agents.append(serial)
-    note = f"by the coordinator's rows instead of the agent's: {'; '.join(reasons)}" if reasons else ""
+    note = f"torques by the rows of the coordinator, not the agent: {'; '.join(reasons)}" if reasons else ""
     return Gathered(tuple(joints), tuple(by_agents), max(apart, default=None), note)
 
 

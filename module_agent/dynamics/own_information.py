@@ -14,6 +14,7 @@ from module_agent.dynamics.chain_message import chain_of, clocks_of
 from module_agent.dynamics.clock_map import ClockMap
 from module_agent.dynamics.differentiation import NS_PER_S, JointMotion, filtered_motion, resample
 from module_agent.dynamics.information import JointInformation, gather_joint, merge_joint
+from module_agent.dynamics.torque_terms import term_columns
 from module_agent.motion_collection import Track
 from module_agent.wire.information_messages import InformationRequest, SpanPart
 
@@ -37,6 +38,8 @@ def own_information(
 ) -> JointInformation:
     """Return the information of a module's torques in all motions of a request.
 
+    Its columns are those of the bodies of the chain, and behind them its own of `torque_terms`.
+
     Args:
         serial: of the module.
         request: which motions, and what to compute with.
@@ -56,7 +59,9 @@ def own_information(
     total: JointInformation | None = None
     for span in {motion.motion_id: motion for motion in request.motions}.values():
         own = _motion(chain, joint, clocks, request, span, tracks[span.motion_id])
-        found = gather_joint(chain, joint, own.q_rad, own.qd_rad_s, own.qdd_rad_s2, own.tau_nm[:, joint])
+        terms = term_columns(own, NS_PER_S / request.step_ns, request.cutoff_hz)[:, joint]
+        motion = own.q_rad, own.qd_rad_s, own.qdd_rad_s2
+        found = gather_joint(chain, joint, *motion, own.tau_nm[:, joint], terms)
         total = found if total is None else merge_joint(total, found)
     assert total is not None
     return total
