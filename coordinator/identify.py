@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.agents_information import gathered
 from coordinator.clock_map import map_clocks
 from coordinator.clock_refinement import refine_clocks
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_windows, joined_motions
@@ -109,15 +110,21 @@ class Identified(NamedTuple):
         return self.inertia.seen.fit.phi if self.inertia is not None else None
 
 
-def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | None = None) -> Identified:
+def identify(
+    recording: Recording,
+    revise: Callable[[Kinematics], Kinematics] | None = None,
+    kinematics: Kinematics | None = None,
+) -> Identified:
     """Compute everything from a recording; `revise` is what is known beforehand put into the kinematics.
+
+    `kinematics` is what was computed already of this recording, `revise` included.
 
     Raises:
         IdentificationError: what is needed is not there, or contradicts itself.
     """
-    kinematics = identify_kinematics(recording)
-    if revise is not None:
-        kinematics = revise(kinematics)
+    if kinematics is None:
+        kinematics = identify_kinematics(recording)
+        kinematics = revise(kinematics) if revise is not None else kinematics
     inertia, bodies, held_out = None, None, None
     if _motions(recording, "dynamic"):
         chain, serials = kinematics.fit.chain, kinematics.topology.serials
@@ -126,7 +133,8 @@ def identify(recording: Recording, revise: Callable[[Kinematics], Kinematics] | 
             chain, types, kinematics.refinement, base_floor(recording, kinematics.clocks, kinematics.topology)
         )
         windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
-        inertia = find_inertia(robot, windows)
+        clocks = kinematics.clocks
+        inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
         seen = inertia.seen
         bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION)
         if _motions(recording, "held_out"):
@@ -150,7 +158,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     """
     serials = _explored(recording)
     try:
-        clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
+        clocks = map_clocks({s: recording.modules[s].trips for s in serials})
         found = search_topology(recording, serials)
         topology = found.topology
         types = [recorded_type(recording, s) for s in topology.serials]

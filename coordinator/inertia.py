@@ -4,11 +4,12 @@ Three ways to see the motion are tried: by encoders on a rigid chain at rest, wi
 give, and with what every IMU reads beyond that. Whichever leaves the least in the torques is used.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, get_args
 
 import numpy as np
 
+from coordinator.agents_information import Gathered
 from coordinator.dynamic_motions import (
     DYNAMIC_CUTOFF_HZ,
     INDEPENDENT_FRACTION,
@@ -33,6 +34,8 @@ EYES: tuple[Eyes, ...] = get_args(Eyes)
 # Of the torques' noise, in the mean over the joints: less is chance.
 BETTER_BY = 0.01
 
+Agents = Callable[[tuple[JointInformation, ...]], Gathered]
+
 
 class Robot(NamedTuple):
     """What is known of a robot when its inertia is asked for.
@@ -51,12 +54,14 @@ class Inertia(NamedTuple):
     """Inertial parameters of n bodies.
 
     seen: parameters, terms and information, of the way of seeing that was best, `eyes`.
-    noise_nm: (n,) of every way, what it leaves in the torques.
+    noise_nm: (n,) of every way, what it leaves in the torques. gathered: whose the information from encoders
+    is, None if no agent can have been asked.
     """
 
     seen: SeenFit
     eyes: Eyes
     noise_nm: Mapping[Eyes, Array]
+    gathered: Gathered | None = None
 
     @property
     def gain(self) -> float:
@@ -64,8 +69,10 @@ class Inertia(NamedTuple):
         return float(np.exp(_level(self.noise_nm["encoders"]) - _level(self.noise_nm[self.eyes])))
 
 
-def find_inertia(robot: Robot, windows: Sequence[Window]) -> Inertia:
+def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None = None) -> Inertia:
     """Find the inertial parameters from windows of motion.
+
+    `agents` puts what the modules have gathered in the place of the coordinator's rows from encoders.
 
     Raises:
         ValueError: too few samples, or motions that say nothing of inertia.
@@ -73,17 +80,21 @@ def find_inertia(robot: Robot, windows: Sequence[Window]) -> Inertia:
     pieces = [_information(robot, one) for one in windows]
     prior = np.concatenate([parameters(one) for one in module_prior(robot.chain, robot.kinds)])
     found: dict[Eyes, SeenFit] = {}
+    shared: Gathered | None = None
     for eyes in EYES:
         total = pieces[0][eyes]
         for piece in pieces[1:]:
             total = merge(total, piece[eyes])
+        if eyes == "encoders" and agents is not None:
+            shared = agents(total)
+            total = shared.joints
         found[eyes] = solve_seen(total, prior, INDEPENDENT_FRACTION)
     noise = {eyes: fit.fit.torque_sigma_nm for eyes, fit in found.items()}
     best: Eyes = "encoders"
     for eyes in EYES[1:]:
         if _level(noise[eyes]) < _level(noise[best]) - BETTER_BY:
             best = eyes
-    return Inertia(found[best], best, noise)
+    return Inertia(found[best], best, noise, shared)
 
 
 def without_terms(one: Window, terms: TermsFit) -> JointMotion:

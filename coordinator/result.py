@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -230,6 +231,9 @@ class DynamicsPart(Part):
     by body. frames are the poses (4, 4) at q = 0 in the root frame in which base parameters and verdicts are
     worded: z along the joint's axis, x towards the next joint (`dynamics.joint_frames`). seen_by: by what the
     bodies' motion was seen (`inertia`); noise_nm: what each way of seeing it leaves in the torques.
+
+    gathered_by: whose rows the information from encoders is made of; by_agents are the modules that gathered
+    their own. gathered_difference: how far those and the coordinator's are apart at most, relative.
     """
 
     phi: list[float]
@@ -248,6 +252,9 @@ class DynamicsPart(Part):
     seen_by: str = "encoders"
     noise_nm: dict[str, dict[str, float]] = {}
     torque_terms: list[TorqueTermPart] = []
+    gathered_by: Literal["agents", "coordinator", "both"] = "coordinator"
+    by_agents: list[str] = []
+    gathered_difference: float | None = None
 
 
 class Result(Part):

@@ -1,6 +1,6 @@
 """Putting what was identified into the schema of `result.json`."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from module_agent.dynamics.regressor import PER_BODY
 from module_agent.dynamics.torque_terms import TERMS, UNITS
 
 if TYPE_CHECKING:
+    from coordinator.agents_information import Gathered
     from coordinator.dynamics.seen_information import TermsFit
     from coordinator.identify import HeldOutMotion, Kinematics
     from coordinator.inertia import Inertia
@@ -78,11 +79,18 @@ def build_result(
         pairs=_pairs(recording),
         denavit_hartenberg=_dh(kinematics),
         dynamics=_dynamics(kinematics, inertia, held_out, bodies),
-        notes=[*kinematics.notes, *([bodies.note] if bodies is not None and bodies.note else [])],
+        notes=[*kinematics.notes, *_notes(inertia, bodies)],
         robot_time_s=(max(times) - min(times)) / 1e9 if times else 0.0,
         wall_time_s=finished[-1].wall_time_s if finished else None,
         trace_hash=recording.trace_hash,
     )
+
+
+def _notes(inertia: "Inertia | None", bodies: "RobotBodies | None") -> list[str]:
+    said = [bodies.note] if bodies is not None else []
+    if inertia is not None and inertia.gathered is not None:
+        said.append(inertia.gathered.note)
+    return [note for note in said if note]
 
 
 def _mountings(topology: "Topology") -> list[MountingPart]:
@@ -255,11 +263,20 @@ def _dynamics(
         words=bodies.words() if bodies is not None else [],
         frames=bodies.frames.tolist() if bodies is not None else [],
         seen_by=found.eyes,
+        gathered_by=_gathered_by(found.gathered, len(serials)),
+        by_agents=list(found.gathered.by_agents) if found.gathered is not None else [],
+        gathered_difference=found.gathered.difference if found.gathered is not None else None,
         noise_nm={
             eyes: dict(zip(serials, noise.tolist(), strict=True)) for eyes, noise in found.noise_nm.items()
         },
         torque_terms=_torque_terms(serials, found.seen.terms),
     )
+
+
+def _gathered_by(shared: "Gathered | None", joints: int) -> Literal["agents", "coordinator", "both"]:
+    if shared is None or not shared.by_agents:
+        return "coordinator"
+    return "agents" if len(shared.by_agents) == joints else "both"
 
 
 def _torque_terms(serials: tuple[str, ...], terms: "TermsFit") -> list[TorqueTermPart]:

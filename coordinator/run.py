@@ -1,18 +1,21 @@
 """A whole identification run: session, recording, estimates, viewer and files, on any transport and clock."""
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+from coordinator.agents_information import dynamic_steps
 from coordinator.beside import Beside
 from coordinator.clock import Clock
 from coordinator.excitation.of_robot import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.hrdf import write_hrdf
 from coordinator.identify import (
+    IdentificationError,
     Identified,
     Kinematics,
     identify,
@@ -24,9 +27,10 @@ from coordinator.kinematics.topology_advice import NextMotion
 from coordinator.known_difference import difference, joints_to_explore
 from coordinator.known_robot import keep_known, known_within, load_known
 from coordinator.known_update import updated
+from coordinator.link_errors import ModuleLost
 from coordinator.look import Looks
 from coordinator.plan import Plan
-from coordinator.radio import Post, Radio
+from coordinator.radio import NoAnswer, Post, Radio, Refused
 from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.result import Result, write_result
 from coordinator.robot_link import RobotLink
@@ -35,6 +39,7 @@ from coordinator.run_folder import HELD_OUT, HRDF, RESULT, SESSION, URDF, VIEW, 
 from coordinator.session import Session
 from coordinator.session_file import SessionWriter, read_session
 from coordinator.topology_search import doubtful_motions
+from coordinator.torque_questions import TorqueQuestions
 from coordinator.urdf import write_urdf
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
@@ -121,6 +126,7 @@ class Run:
             self._take_over(crashed)
         self._radio = Radio(transport, config.robot, clock, post, self._record)
         self._link = RobotLink(self._radio, self.recording, clock, config.sender)
+        self._torques = TorqueQuestions(self._radio, self.recording, clock, config.sender, self.note)
 
     def _take_over(self, crashed: Path) -> None:
         try:
@@ -251,9 +257,18 @@ class Run:
             )
             closer = self._closer if self._known is not None else None
             session = Session(
-                self._link, self._radio, self.recording, config.plan, self._clock, self._journal, self, closer
+                self._link,
+                self._radio,
+                self.recording,
+                config.plan,
+                self._clock,
+                self._journal,
+                self,
+                closer,
+                lambda: self._torques.collect(self._link.serials),
             )
             await session.run(config.expect)
+            kinematics = await self._ask_torques()
             self._journal(
                 JournalEvent(
                     t_ns=self._clock(), what="finished", wall_time_s=time.monotonic() - self._started_s
@@ -263,7 +278,7 @@ class Run:
             self._radio.close()
             self._writer.close()
             self._screen.note("estimating")
-            found = await self._compute(lambda: identify(self.recording, self._revised))
+            found = await self._compute(lambda: identify(self.recording, self._revised, kinematics))
             self._write(found)
             if self._crashed is not None:
                 self._crashed.unlink()
@@ -277,6 +292,23 @@ class Run:
                 self._screen.note(
                     f"{self._radio.dropped} messages were dropped unread: this machine is too slow"
                 )
+
+    async def _ask_torques(self) -> Kinematics | None:
+        """Ask the agents what their torques say, of the robot as it is known at last; return that robot.
+
+        Nothing moves any more, and whatever does not come is computed from the recording instead.
+        """
+        if not dynamic_steps(self.recording):
+            return None
+        self._journal(JournalEvent(t_ns=self._clock(), what="settled"))
+        try:
+            found = await self._compute(lambda: self._revised(identify_kinematics(self.recording)))
+        except IdentificationError:
+            return None  # said when everything is identified, and the recording is whole
+        await self._torques.ask(found.fit.chain, found.clocks)
+        with contextlib.suppress(NoAnswer, Refused, ModuleLost):
+            await self._link.close_gaps()
+        return found
 
     @property
     def standstill(self) -> str:
