@@ -129,18 +129,18 @@ def identify(
     if _motions(recording, "dynamic"):
         chain, serials = kinematics.fit.chain, kinematics.topology.serials
         types = [recorded_type(recording, s) for s in serials]
-        robot = Robot(
-            chain, types, kinematics.refinement, base_floor(recording, kinematics.clocks, kinematics.topology)
-        )
+        floor = base_floor(recording, kinematics.clocks, kinematics.topology)
+        covariance = kinematics.fit.covariance
+        robot = Robot(chain, types, kinematics.refinement, covariance, floor, recording.torque)
         windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
         clocks = kinematics.clocks
         inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
         seen = inertia.seen
-        bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION)
+        bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION, inertia.effects)
         if _motions(recording, "held_out"):
-            means = joined_motions([without_terms(one, seen.terms) for one in windows]).tau_nm.mean(axis=0)
+            means = joined_motions([without_terms(one, seen) for one in windows]).tau_nm.mean(axis=0)
             windows = dynamic_windows(recording, kinematics.clocks, serials, "held_out")
-            motion = joined_motions([without_terms(one, seen.terms) for one in windows])
+            motion = joined_motions([without_terms(one, seen) for one in windows])
             held_out = _held_out(kinematics, motion, seen.fit.phi, means)
             bodies = _checked(bodies, kinematics, motion, means)
     result = build_result(recording, kinematics, inertia, held_out, bodies)

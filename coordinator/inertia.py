@@ -16,13 +16,15 @@ from coordinator.dynamic_motions import (
     filtered_window,
 )
 from coordinator.dynamics.body_tracks import track_regressor
+from coordinator.dynamics.common_errors import chain_effects, scale_effects
 from coordinator.dynamics.consistency import parameters
 from coordinator.dynamics.parameter_prior import module_prior
-from coordinator.dynamics.seen_information import SeenFit, TermsFit, solve_seen
+from coordinator.dynamics.seen_information import SeenFit, solve_seen, without_used
+from coordinator.dynamics.torque_scale import SCALE_SIGMA, TorqueKind
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.refinement import Refinement
 from coordinator.motion_window import RATE_HZ, Window
-from coordinator.seen_motion import Eyes, readings, seen_tracks
+from coordinator.seen_motion import Eyes, Readings, readings, seen_tracks
 from module_agent.catalogue import ModuleType
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.dynamics.differentiation import JointMotion
@@ -41,26 +43,31 @@ class Robot(NamedTuple):
     """What is known of a robot when its inertia is asked for.
 
     chain: n joints. kinds: (n,) their modules' types. refined: what the refinement has found of links and
-    IMUs. floor: noise of the IMU that rides on the base at rest, None if none does.
+    IMUs. covariance: (6 n, 6 n) of the chain's increments. floor: noise of the IMU that rides on the base at
+    rest, None if none does. torque: how well the torque sensors are known.
     """
 
     chain: Chain
     kinds: Sequence[ModuleType]
     refined: Refinement
+    covariance: Array
     floor: NoiseFloor | None
+    torque: TorqueKind = "uncalibrated"
 
 
 class Inertia(NamedTuple):
     """Inertial parameters of n bodies.
 
     seen: parameters, terms and information, of the way of seeing that was best, `eyes`.
-    noise_nm: (n,) of every way, what it leaves in the torques. gathered: whose the information from encoders
-    is, None if no agent can have been asked.
+    noise_nm: (n,) of every way, what it leaves in the torques. effects: (k_i, j) of every joint: what errors
+    of the chain and of the torques' scale do to its rows of `seen.information`. gathered: whose the
+    information from encoders is, None if no agent can have been asked.
     """
 
     seen: SeenFit
     eyes: Eyes
     noise_nm: Mapping[Eyes, Array]
+    effects: tuple[Array, ...]
     gathered: Gathered | None = None
 
     @property
@@ -88,20 +95,21 @@ def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None 
         if eyes == "encoders" and agents is not None:
             shared = agents(total)
             total = shared.joints
-        found[eyes] = solve_seen(total, prior, INDEPENDENT_FRACTION)
+        found[eyes] = solve_seen(total, prior, INDEPENDENT_FRACTION, SCALE_SIGMA[robot.torque])
     noise = {eyes: fit.fit.torque_sigma_nm for eyes, fit in found.items()}
     best: Eyes = "encoders"
     for eyes in EYES[1:]:
         if _level(noise[eyes]) < _level(noise[best]) - BETTER_BY:
             best = eyes
-    return Inertia(found[best], best, noise, shared)
+    seen, effects = _considered(robot, windows, found[best], best)
+    return Inertia(seen, best, noise, effects, shared)
 
 
-def without_terms(one: Window, terms: TermsFit) -> JointMotion:
+def without_terms(one: Window, seen: SeenFit) -> JointMotion:
     """Return the motion of a window as encoders see it, with the torque of the bodies alone."""
     motion = filtered_window(one)
     columns = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
-    torque = motion.tau_nm - np.einsum("mnk,nk->mn", columns, terms.value)
+    torque = (1.0 + seen.scale.value) * motion.tau_nm - np.einsum("mnk,nk->mn", columns, seen.terms.value)
     torque.flags.writeable = False
     return motion._replace(tau_nm=torque)
 
@@ -115,10 +123,38 @@ def _information(robot: Robot, one: Window) -> dict[Eyes, tuple[JointInformation
     }
     seen = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
     for eyes in EYES[1:]:
-        tracks = seen_tracks(robot.chain, robot.kinds, robot.refined, robot.floor, seen, eyes == "imus")
-        apart = track_regressor(tracks) - rigid
+        apart = _regressor(robot, seen, eyes) - rigid
         found[eyes] = compress(np.concatenate([rigid, terms, apart], axis=2), motion.tau_nm)
     return found
+
+
+def _considered(
+    robot: Robot, windows: Sequence[Window], seen: SeenFit, eyes: Eyes
+) -> tuple[SeenFit, tuple[Array, ...]]:
+    """Return the fit with its rows beside what errors of chain and scale do to them."""
+    size = seen.informed_phi.size
+    total: tuple[JointInformation, ...] = ()
+    for one in windows:
+        motion = filtered_window(one)
+        rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+        terms = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
+        effects = chain_effects(robot.chain, robot.covariance, seen.informed_phi, motion)
+        torque = (1.0 + seen.scale.value) * motion.tau_nm
+        if eyes != "encoders":
+            seen_to = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
+            torque -= (_regressor(robot, seen_to, eyes) - rigid) @ seen.informed_phi
+        found = compress(np.concatenate([rigid, terms, effects], axis=2), torque)
+        total = merge(total, found) if total else found
+    left = [without_used(piece, size, used) for piece, used in zip(total, seen.terms.used, strict=True)]
+    rows = tuple(piece._replace(r=piece.r[:, :size]) for piece in left)
+    scale = scale_effects(rows, seen.scale)
+    chain = [piece.r[:, size:] for piece in left]
+    return seen._replace(information=rows), tuple(map(np.hstack, zip(scale, chain, strict=True)))
+
+
+def _regressor(robot: Robot, seen: Readings, eyes: Eyes) -> Array:
+    tracks = seen_tracks(robot.chain, robot.kinds, robot.refined, robot.floor, seen, eyes == "imus")
+    return track_regressor(tracks)
 
 
 def _level(noise_nm: Array) -> float:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from coordinator.dynamics.torque_scale import TorqueKind
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.wire.messages import MotionRecord
 
@@ -35,6 +36,7 @@ class JournalEvent(BaseModel):
     deaf: tuple[str, ...] | None = None
     robot: str = ""
     imu: ImuKind = "uncalibrated"
+    torque: TorqueKind = "uncalibrated"
     wall_time_s: float | None = None
 
     def encode(self) -> bytes:

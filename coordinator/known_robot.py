@@ -91,6 +91,7 @@ def hurried(plan: Plan, known: KnownRobot) -> dict[str, object]:
     return {
         "dynamics": False,
         "imu": known.imu,
+        "torque": known.recording.torque,
         "discover_s": min(plan.discover_s, 0.5),
         "link_s": min(plan.link_s, 0.5),
         "settle_s": min(plan.settle_s, 0.3),

@@ -11,8 +11,10 @@ from rich.table import Table
 from coordinator.attended_run import Place, join, run_attended, sender_name
 from coordinator.check_program import check_robot
 from coordinator.command_options import Connect, Expect, Listen, Network, Robot, fail, planned
+from coordinator.dynamics.torque_scale import TorqueKind
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
 from coordinator.fit_dynamics_program import fit_dynamics
+from coordinator.float_program import float_robot
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
@@ -71,6 +73,10 @@ def run(
     imu: Annotated[
         ImuKind | None, typer.Option(help="How well the IMUs are known [uncalibrated, as delivered].")
     ] = None,
+    torque: Annotated[
+        TorqueKind | None,
+        typer.Option(help="How well the torque sensors' scales are known [uncalibrated, as delivered]."),
+    ] = None,
     mode: Annotated[
         Mode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
     ] = None,
@@ -116,6 +122,7 @@ def run(
             sine_amplitude_rad=amplitude,
             home_rad=home,
             imu=imu,
+            torque=torque,
             mode=mode,
             motions=motions,
             excitation=excitation,
@@ -278,6 +285,7 @@ def screenshot(
 app.command("check")(check_robot)
 app.command("payload")(find_payload)
 app.command("fit-dynamics")(fit_dynamics)
+app.command("float")(float_robot)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from coordinator.dynamics.torque_scale import TorqueKind
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.catalogue import ModuleType
 from module_agent.firmware.gains import default_gains
@@ -68,6 +69,8 @@ class Plan(BaseModel):
     topology_only: bool = False
     # How well the modules' IMUs are known beforehand: `kinematics.imu_intrinsics`.
     imu: ImuKind = "uncalibrated"
+    # And how well the scales of their torque sensors: `dynamics.torque_scale`.
+    torque: TorqueKind = "uncalibrated"
     hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
     retries: Annotated[int, Field(ge=0, le=5)] = 2
 

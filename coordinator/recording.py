@@ -8,6 +8,7 @@ import hashlib
 import struct
 from typing import Literal, NamedTuple
 
+from coordinator.dynamics.torque_scale import TorqueKind
 from coordinator.journal import JournalEvent, Purpose
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
@@ -222,6 +223,12 @@ class Recording:
     def imu(self) -> ImuKind:
         """How well the IMUs are known beforehand, as the session was told last."""
         told = [event.imu for event in list(self.journal) if event.what == "session"]
+        return told[-1] if told else "uncalibrated"
+
+    @property
+    def torque(self) -> TorqueKind:
+        """How well the torque sensors' scales are known beforehand, as the session was told last."""
+        told = [event.torque for event in list(self.journal) if event.what == "session"]
         return told[-1] if told else "uncalibrated"
 
     def motions(self, *purposes: Purpose) -> list[JournalEvent]:

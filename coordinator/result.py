@@ -212,7 +212,8 @@ class TorqueTermPart(Part):
     """What one joint's torque reading holds beside the bodies' torque (`dynamics.torque_terms`).
 
     used: it earns its place; else value and sigma are zero. gain: by how many variances of the torque's noise
-    it makes the joint's misfit smaller.
+    it makes the joint's misfit smaller; None of the scale of the sensor, which the joints together tell
+    (`dynamics.torque_scale`).
     """
 
     serial: str
@@ -221,7 +222,7 @@ class TorqueTermPart(Part):
     used: bool
     value: float
     sigma: float
-    gain: float
+    gain: float | None = None
 
 
 class DynamicsPart(Part):

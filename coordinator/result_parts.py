@@ -37,7 +37,7 @@ from module_agent.dynamics.torque_terms import TERMS, UNITS
 
 if TYPE_CHECKING:
     from coordinator.agents_information import Gathered
-    from coordinator.dynamics.seen_information import TermsFit
+    from coordinator.dynamics.seen_information import SeenFit
     from coordinator.identify import HeldOutMotion, Kinematics
     from coordinator.inertia import Inertia
     from coordinator.kinematics.assembly import ChainFit
@@ -269,7 +269,7 @@ def _dynamics(
         noise_nm={
             eyes: dict(zip(serials, noise.tolist(), strict=True)) for eyes, noise in found.noise_nm.items()
         },
-        torque_terms=_torque_terms(serials, found.seen.terms),
+        torque_terms=_torque_terms(serials, found.seen),
     )
 
 
@@ -279,7 +279,8 @@ def _gathered_by(shared: "Gathered | None", joints: int) -> Literal["agents", "c
     return "agents" if len(shared.by_agents) == joints else "both"
 
 
-def _torque_terms(serials: tuple[str, ...], terms: "TermsFit") -> list[TorqueTermPart]:
+def _torque_terms(serials: tuple[str, ...], seen: "SeenFit") -> list[TorqueTermPart]:
+    terms, scale = seen.terms, seen.scale
     return [
         TorqueTermPart(
             serial=serial,
@@ -292,6 +293,16 @@ def _torque_terms(serials: tuple[str, ...], terms: "TermsFit") -> list[TorqueTer
         )
         for i, serial in enumerate(serials)
         for k, term in enumerate(TERMS)
+    ] + [
+        TorqueTermPart(
+            serial=serial,
+            term="scale",
+            unit="",
+            used=bool(scale.sigma[i] > 0.0),
+            value=float(scale.value[i]),
+            sigma=float(scale.sigma[i]),
+        )
+        for i, serial in enumerate(serials)
     ]
 
 

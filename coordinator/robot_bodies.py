@@ -17,9 +17,9 @@ from coordinator.dynamics.base_parameters import (
     inertial_columns,
     inertial_units,
     into_frames,
-    scale_errors,
     whitened,
 )
+from coordinator.dynamics.common_errors import whitened_effects
 from coordinator.dynamics.consistency import Body, body, parameter_transform
 from coordinator.dynamics.identification import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG, InertialFit
 from coordinator.dynamics.joint_frames import joint_frames
@@ -31,10 +31,6 @@ from module_agent.catalogue import ModuleType
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.dynamics.information import JointInformation
 from module_agent.dynamics.regressor import PER_BODY
-
-# Of a module's torque sensor, a spring whose stiffness is known to a few percent. That is a guess: no figure
-# is published.
-TORQUE_SCALE_SIGMA = 0.05
 
 # Torques without noise, as a simulation may have them, would weigh infinitely.
 _LEAST_SIGMA_NM = 1e-9
@@ -73,6 +69,7 @@ def robot_bodies(
     types: Sequence[ModuleType],
     least_squares: InertialFit,
     independent_fraction: float,
+    effects: Sequence[Array] | None = None,
 ) -> RobotBodies:
     """Return the bodies that a robot's joints turn.
 
@@ -81,6 +78,7 @@ def robot_bodies(
         chain, types: of the same n.
         least_squares: its noise weighs the joints.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
+        effects: (k_i, j) of every joint: what errors that come as a whole do to its rows (`common_errors`).
 
     Raises:
         ValueError: shapes that do not fit, or torques that say nothing.
@@ -89,19 +87,24 @@ def robot_bodies(
     frames = joint_frames(chain)
     sigma = np.maximum(least_squares.torque_sigma_nm, _LEAST_SIGMA_NM)
     rows, target = whitened(information, sigma, independent_fraction)
+    common = None if effects is None else whitened_effects(effects, sigma, independent_fraction)
     base = base_parameters(
         into_frames(rows, frames),
         target,
         inertial_columns(joints),
         max_sigma=MAX_SIGMA_KG,
-        common_errors=scale_errors(information, target, TORQUE_SCALE_SIGMA),
+        common_errors=common,
         tolerance=ESTIMATED_CHAIN_TOLERANCE,
     )
     fit, note = None, ""
     try:
         prior = module_prior(chain, types)
         fit = fit_physical(
-            information, prior, least_squares, independent_fraction, scale_sigma=TORQUE_SCALE_SIGMA
+            information,
+            prior,
+            least_squares,
+            independent_fraction,
+            effects=effects,
         )
     except NotSolvedError as error:
         note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"

@@ -253,7 +253,13 @@ class Run:
         try:
             self._radio.start()
             self._journal(
-                JournalEvent(t_ns=self._clock(), what="session", robot=config.robot, imu=config.plan.imu)
+                JournalEvent(
+                    t_ns=self._clock(),
+                    what="session",
+                    robot=config.robot,
+                    imu=config.plan.imu,
+                    torque=config.plan.torque,
+                )
             )
             closer = self._closer if self._known is not None else None
             session = Session(

@@ -5,6 +5,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from coordinator.dynamics.torque_scale import TorqueKind
 from coordinator.failure import EXIT_USAGE
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.plan import Excitation as PlanExcitation
@@ -41,6 +42,10 @@ Dynamics = Annotated[
     bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
 ]
 Imu = Annotated[ImuKind | None, typer.Option(help="How well the IMUs are known beforehand [uncalibrated].")]
+Torque = Annotated[
+    TorqueKind | None,
+    typer.Option(help="How well the torque sensors' scales are known beforehand [uncalibrated]."),
+]
 Mode = Annotated[
     PlanMode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
 ]
@@ -131,5 +136,5 @@ def motion_arguments(path: Path | None, plan: Plan) -> tuple[str, ...]:
     """Return a plan as arguments for the coordinator."""
     dynamics = "--dynamics" if plan.dynamics else "--no-dynamics"
     chosen = ("--mode", plan.mode, "--motions", plan.motions, "--excitation", plan.excitation)
-    options = (dynamics, "--imu", plan.imu, *chosen)
+    options = (dynamics, "--imu", plan.imu, "--torque", plan.torque, *chosen)
     return options if path is None else ("--plan", str(path), *options)

@@ -32,6 +32,7 @@ from sim.command_options import (
     RobotArgument,
     Seed,
     Speed,
+    Torque,
     With,
     Without,
     check,
@@ -125,6 +126,7 @@ def run(
     plan: PlanFile = None,
     dynamics: Dynamics = None,
     imu: Imu = None,
+    torque: Torque = None,
     mode: Mode = None,
     how: Motions = None,
     excitation: Excitation = None,
@@ -138,7 +140,15 @@ def run(
     check(network, speed, endpoint)
     choice = noise_choice(found, noise, with_effects, without_effects)
     pushed = pushes(found, push)
-    planned = motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how, excitation=excitation)
+    planned = motions(
+        plan,
+        dynamics=dynamics,
+        imu=imu,
+        torque=torque,
+        mode=mode,
+        motions=how,
+        excitation=excitation,
+    )
     folder = free_folder(out, found)
     if virtual:
         _run_virtual(
@@ -281,6 +291,7 @@ def launch(
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
     dynamics: Dynamics = None,
     imu: Imu = None,
+    torque: Torque = None,
     mode: Mode = None,
     how: Motions = None,
     excitation: Excitation = None,
@@ -300,7 +311,16 @@ def launch(
         "--viewer",
         viewer,
         *motion_arguments(
-            plan, motions(plan, dynamics=dynamics, imu=imu, mode=mode, motions=how, excitation=excitation)
+            plan,
+            motions(
+                plan,
+                dynamics=dynamics,
+                imu=imu,
+                torque=torque,
+                mode=mode,
+                motions=how,
+                excitation=excitation,
+            ),
         ),
     )
     place = _Place(free_folder(out, found), network or found.network, endpoint, processes, tuple(push or ()))

@@ -42,7 +42,13 @@ def record_session(settings: VirtualSettings, plan: Plan) -> Recording:
     robot.start()
     try:
         keeper.journal(
-            JournalEvent(t_ns=loop.now_ns, what="session", robot=settings.robot.name, imu=plan.imu)
+            JournalEvent(
+                t_ns=loop.now_ns,
+                what="session",
+                robot=settings.robot.name,
+                imu=plan.imu,
+                torque=plan.torque,
+            )
         )
         run_to_end(loop, loop.create_task(_to_end(session, radio, robot)))
         keeper.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))

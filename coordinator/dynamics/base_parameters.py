@@ -163,22 +163,6 @@ def whitened(
     return rows, np.concatenate([w * piece.z for w, piece in zip(weight, information, strict=True)])
 
 
-def scale_errors(information: Sequence[JointInformation], target: ArrayLike, scale_sigma: float) -> Array:
-    """Return what torque sensors of a wrong scale add to the target (k,) of `whitened`, (k, n).
-
-    A sensor that shows (1 + s) of the torque makes all that its joint shows as much too large, which no
-    motion tells from heavier bodies. Column i is that of joint i, s one standard deviation `scale_sigma`.
-    """
-    seen = np.asarray(target, dtype=float)
-    found = np.zeros((len(seen), len(information)))
-    begin = 0
-    for i, piece in enumerate(information):
-        end = begin + len(piece.z)
-        found[begin:end, i] = scale_sigma * seen[begin:end]
-        begin = end
-    return found
-
-
 def base_parameters(
     triangle: ArrayLike,
     target: ArrayLike,
@@ -202,7 +186,7 @@ def base_parameters(
         max_sigma: a direction known worse than this, in `columns.scale`, is not told by the data
             (`identification.MAX_SIGMA_KG`); inf keeps all that rounding allows.
         common_errors: (k, j) errors of the target that are not independent from row to row: each column is
-            one that comes as a whole, of one standard deviation (`scale_errors`). They widen the covariance.
+            one that comes as a whole, of one standard deviation (`common_errors`). They widen the covariance.
         tolerance: singular values that are smaller shares of the largest count as zero.
 
     Raises:

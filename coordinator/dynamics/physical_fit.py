@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, qr, solve_triangular
 from scipy.optimize import brentq
 
-from coordinator.dynamics.base_parameters import scale_errors, whitened
+from coordinator.dynamics.base_parameters import whitened
+from coordinator.dynamics.common_errors import whitened_effects
 from coordinator.dynamics.consistency import parameter_transform, pseudo_inertia
 from coordinator.dynamics.identification import InertialFit
 from module_agent.dynamics.chain import Array
@@ -100,7 +101,7 @@ def fit_physical(
     least_squares: InertialFit,
     independent_fraction: float = 1.0,
     most_cost: float = MOST_COST,
-    scale_sigma: float = 0.0,
+    effects: Sequence[Array] | None = None,
 ) -> PhysicalFit:
     """Fit real bodies to the torques of all joints.
 
@@ -116,7 +117,8 @@ def fit_physical(
             the two compare.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         most_cost: see above; a share of |tau|.
-        scale_sigma: standard deviation of the scale of a joint's torques, relative; it widens the covariance.
+        effects: (k_i, j) of every joint, of errors that come as a whole (`common_errors`); they widen the
+            covariance.
 
     Raises:
         ValueError: shapes that do not fit, a prior that is no body's, or torques that are all zero.
@@ -137,8 +139,10 @@ def fit_physical(
         return _relative_error(information, phi, size)
 
     found, weight, error = _strongest_prior(rows, target, bodies, error_of, allowed, most_cost)
-    shifts = found.covariance @ (rows.T @ scale_errors(information, target, scale_sigma))
-    covariance = found.covariance + shifts @ shifts.T
+    covariance = found.covariance
+    if effects is not None:
+        shifts = covariance @ (rows.T @ whitened_effects(effects, sigma, independent_fraction))
+        covariance = covariance + shifts @ shifts.T
     pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
     for array in (pseudo, found.x, covariance, found.divergence):
         array.flags.writeable = False

@@ -27,6 +27,7 @@ from coordinator.dynamics.identification import (
     solve_information,
     solve_weighted,
 )
+from coordinator.dynamics.torque_scale import TorqueScale, known_scale, refine_scale, scaled
 from module_agent.dynamics.chain import Array
 from module_agent.dynamics.information import JointInformation
 from module_agent.dynamics.regressor import PER_BODY
@@ -58,16 +59,22 @@ class SeenFit(NamedTuple):
     """Inertial parameters, and what else was in the readings.
 
     information: what is left of every joint when terms and the torque of Y - Z are taken off, in the 10 n
-    columns of the bodies.
+    columns of the bodies, its torques in their true scale as far as it is known. scale: of the sensors.
+    informed_phi: (10 n,) the parameters where torques tell them, and else those that are likely.
     """
 
     fit: InertialFit
     terms: TermsFit
+    scale: TorqueScale
+    informed_phi: Array
     information: tuple[JointInformation, ...]
 
 
 def solve_seen(
-    information: Sequence[JointInformation], prior_phi: Array, independent_fraction: float
+    information: Sequence[JointInformation],
+    prior_phi: Array,
+    independent_fraction: float,
+    scale_sigma: float = 0.0,
 ) -> SeenFit:
     """Fit inertial parameters and terms to the rows of n joints.
 
@@ -75,6 +82,7 @@ def solve_seen(
         information: per joint, in the columns [Z | T], or [Z | T | Y - Z].
         prior_phi: (10 n,) bodies as they are likely to be; they count where Z shows nothing.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
+        scale_sigma: how well the torque sensors' scales are known beforehand; zero means exactly.
 
     Raises:
         ValueError: columns that are neither, or as `solve_information`.
@@ -85,10 +93,12 @@ def solve_seen(
     if not seen and widths != {size + len(TERMS)}:
         raise ValueError(f"rows of {sorted(widths)} columns are no rows of {len(information)} joints")
     phi = np.asarray(prior_phi, dtype=float)
-    for _ in range(_ROUNDS if seen else 1):
-        rigid = [_without_departure(piece, size, phi) for piece in information]
+    scale = known_scale(len(information))
+    for _ in range(_ROUNDS if seen or scale_sigma else 1):
+        true = [scaled(piece, one) for piece, one in zip(information, scale.value, strict=True)]
+        rigid = [_without_departure(piece, size, phi) for piece in true]
         earned = [_earned(piece, size, independent_fraction) for piece in rigid]
-        left = tuple(_eliminated(piece, size, one.used) for piece, one in zip(rigid, earned, strict=True))
+        left = tuple(without_used(piece, size, one.used) for piece, one in zip(rigid, earned, strict=True))
         fit = solve_weighted(left, independent_fraction, ESTIMATED_CHAIN_TOLERANCE)
         sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _LEAST_NM))
         informed = solve_information(
@@ -99,10 +109,14 @@ def solve_seen(
             tolerance=ESTIMATED_CHAIN_TOLERANCE,
         )
         moved = np.abs((informed.phi - phi) / parameter_scale(len(information))).max()
-        phi = informed.phi
-        if moved < _SETTLED:
+        phi, before = informed.phi, scale
+        if scale_sigma:
+            scale = refine_scale(
+                left, fit.phi, sigma, scale_sigma, scale, independent_fraction, ESTIMATED_CHAIN_TOLERANCE
+            )
+        if max(moved, np.abs(scale.value - before.value).max()) < _SETTLED:
             break
-    return SeenFit(fit, _terms(rigid, earned, fit, independent_fraction), left)
+    return SeenFit(fit, _terms(rigid, earned, fit, independent_fraction), scale, phi, left)
 
 
 class _Earned(NamedTuple):
@@ -143,13 +157,18 @@ def _earned(piece: JointInformation, size: int, independent_fraction: float) -> 
     return _Earned(gain, used)
 
 
-def _eliminated(piece: JointInformation, size: int, used: NDArray[np.bool_]) -> JointInformation:
-    """Return the rows in the bodies' columns alone: what they say whatever the terms in use are."""
-    terms = piece.r[:, size:][:, used]
+def without_used(piece: JointInformation, size: int, used: NDArray[np.bool_]) -> JointInformation:
+    """Return rows in [Z | T | any others] without T: what they say whatever the terms in use are.
+
+    Args:
+        size: of Z, 10 n. used: (4,) which of `TERMS` are; the others are left out.
+    """
+    kept = np.delete(piece.r, np.s_[size : size + len(TERMS)], axis=1)
+    terms = piece.r[:, size : size + len(TERMS)][:, used]
     count = terms.shape[1]
     if not count:
-        return piece._replace(r=piece.r[:, :size])
-    rows = qr(np.column_stack([terms, piece.r[:, :size], piece.z]), mode="r", check_finite=False)[0]
+        return piece._replace(r=kept)
+    rows = qr(np.column_stack([terms, kept, piece.z]), mode="r", check_finite=False)[0]
     return piece._replace(r=rows[count:, count:-1], z=rows[count:, -1], samples=piece.samples - count)
 
 

@@ -11,11 +11,12 @@ from coordinator.dynamics.base_parameters import (
     base_parameters,
     inertial_columns,
     into_frames,
-    scale_errors,
     whitened,
 )
+from coordinator.dynamics.common_errors import scale_effects, whitened_effects
 from coordinator.dynamics.consistency import parameter_transform
 from coordinator.dynamics.identification import REACH_M, solve_information
+from coordinator.dynamics.torque_scale import TorqueScale
 from coordinator.urdf import link_homes
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.dynamics.information import gather
@@ -221,7 +222,8 @@ def test_torque_sensors_of_unknown_scale_widen_what_is_claimed_as_much_as_they_e
         sensed = tau * (1.0 + 0.05 * rng.normal(size=3)) + sigma * rng.normal(size=tau.shape)
         pieces = gather(chain, *signals, sensed)
         rows, target = whitened(pieces, sigma)
-        errors = scale_errors(pieces, target, 0.05)
+        scale = TorqueScale(np.zeros(3), 0.05**2 * np.eye(3))
+        errors = whitened_effects(scale_effects(pieces, scale), sigma)
         found.append(base_parameters(rows, target, inertial_columns(3), common_errors=errors))
     scatter = np.std([one.value for one in found], axis=0)
     claimed = np.mean([one.sigma for one in found], axis=0)

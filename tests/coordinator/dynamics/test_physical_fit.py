@@ -11,6 +11,7 @@ from numpy.random import Generator, default_rng
 from scipy.optimize import minimize
 
 from coordinator.dynamics.base_parameters import base_parameters, inertial_columns, whitened
+from coordinator.dynamics.common_errors import scale_effects
 from coordinator.dynamics.consistency import is_consistent, parameter_transform, parameters, pseudo_inertia
 from coordinator.dynamics.identification import InertialFit, solve_information
 from coordinator.dynamics.parameter_prior import module_prior
@@ -21,6 +22,7 @@ from coordinator.dynamics.physical_fit import (
     fit_physical,
     physically_consistent,
 )
+from coordinator.dynamics.torque_scale import TorqueScale
 from coordinator.urdf import write_urdf
 from module_agent.dynamics.chain import Array
 from module_agent.dynamics.information import JointInformation, gather
@@ -253,7 +255,9 @@ def test_the_covariance_is_that_of_least_squares_where_the_data_rule(arm: Case) 
 
 def test_a_torque_sensor_of_unknown_scale_makes_the_bodies_as_uncertain(arm: Case) -> None:
     columns = inertial_columns(4)
-    wide = fit_physical(arm.information, arm.prior, arm.least_squares, scale_sigma=0.05)
+    scale = TorqueScale(np.zeros(len(arm.information)), 0.05**2 * np.eye(len(arm.information)))
+    effects = scale_effects(arm.information, scale)
+    wide = fit_physical(arm.information, arm.prior, arm.least_squares, effects=effects)
     np.testing.assert_array_equal(wide.phi, arm.fit.phi)
     found = base_parameters(*whitened(arm.information, arm.sigma), columns, max_sigma=0.3)
     spread = found.grouping @ wide.covariance @ found.grouping.T
