@@ -15,6 +15,7 @@ from coordinator.dynamics.torque_scale import TorqueKind
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
 from coordinator.fit_dynamics_program import fit_dynamics
 from coordinator.float_program import float_robot
+from coordinator.float_program import float_robot
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
@@ -285,6 +286,7 @@ def screenshot(
 app.command("check")(check_robot)
 app.command("payload")(find_payload)
 app.command("fit-dynamics")(fit_dynamics)
+app.command("float")(float_robot)
 app.command("float")(float_robot)
 
 

@@ -29,6 +29,7 @@ from module_agent.wire.messages import (
     MotionCommand,
     MotionRecord,
     Pattern,
+    Setpoint,
     Status,
     Stop,
 )
@@ -232,14 +233,18 @@ class RobotLink:
         all behind it; on two keys that seldom happens at the same time.
         """
         while True:
-            for serial in list(self._tokens):
-                self._send(self._renew(serial))
+            self.renew()
             await asyncio.sleep(0.5 * KEEP_ALIVE_S)
             if self.is_poor:
                 for serial in list(self._tokens):
                     again = self._repeat if serial in self._running else self._renew
                     self._send(again(serial))
             await asyncio.sleep(0.5 * KEEP_ALIVE_S)
+
+    def renew(self) -> None:
+        """Renew all leases once; whoever commands without `keep_alive` does so every `KEEP_ALIVE_S`."""
+        for serial in list(self._tokens):
+            self._send(self._renew(serial))
 
     def _send(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.create_task(work)
@@ -312,6 +317,17 @@ class RobotLink:
             return await self._radio.command(serial, Leaf.GAINS, command)
 
         await self._persist(serial, attempt)
+
+    def stream(
+        self,
+        serial: str,
+        position_rad: float | None,
+        velocity_rad_s: float | None,
+        effort_nm: float | None,
+    ) -> None:
+        """Send one set-point, which nobody answers; what is None switches its loop off."""
+        point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
+        self._radio.publish(serial, Leaf.SETPOINT, Setpoint.model_validate({**self._head(serial), **point}))
 
     def _next_id(self) -> int:
         # Numbers grow over coordinators too, so that a new one does not repeat an old one's.

@@ -1,0 +1,324 @@
+"""A known robot floats: it is taken, set free, held again, led back to where it stood, and let go.
+
+Set-points and the renewals of the leases come from one loop: if it stalls both end, and the modules' motors
+are off when their commands' life is over.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from coordinator.clock import Clock
+from coordinator.feed_forward import feed_forward, joint_reference, on_module
+from coordinator.float_summary import FloatSummary, FloatTally
+from coordinator.floating import (
+    Floater,
+    FloatSettings,
+    Phase,
+    Reading,
+    Targets,
+    floating_gains,
+    holding_gains,
+)
+from coordinator.known_presence import Felt, check_mounting, find_known
+from coordinator.known_weight import KnownWeight
+from coordinator.link_errors import ModuleLost, RobotStopped
+from coordinator.radio import Post, Radio
+from coordinator.recording import Entry, Recording
+from coordinator.robot_link import KEEP_ALIVE_S, POLL_S, RobotLink
+from coordinator.together import together
+from module_agent.dynamics.chain import Array
+from module_agent.firmware.waveform import duration_s
+from module_agent.wire.feedback_rows import STATE_NAMES, Rows
+from module_agent.wire.messages import EffortProfile, GoTo, Message, Pattern, Rest
+from module_agent.wire.refusal import WireError
+from module_agent.wire.transport import Transport
+
+BACK_RAD_S = 0.5
+# Nearer than this a joint is where it shall be.
+_THERE_RAD = 1e-3
+# Gravity is felt for a tenth of a second.
+_FELT_ROWS = 25
+# Rows that are kept; older ones are dropped every so often.
+_KEPT_ROWS, _FORGET_EVERY_S = 250, 2.0
+_LET_GO = ("idle", "expired", "stopped", "fault")
+_READ = ("position_rad", "velocity_rad_s", "effort_nm")
+
+
+class FloatPlan(NamedTuple):
+    """What a float is told. rate_hz: of the set-points. for_s: None until it is asked to end.
+
+    then_hold_s: how long it is held still before it is led back to where it stood; is_led_back: whether it
+    is, or let go where it is.
+    """
+
+    settings: FloatSettings = FloatSettings()
+    rate_hz: float = 200.0
+    for_s: float | None = None
+    then_hold_s: float = 1.0
+    is_led_back: bool = True
+
+
+class Moment(NamedTuple):
+    """What is to be seen of a float at one moment."""
+
+    phase: Phase
+    floated_s: float
+    missed: int
+    reading: Reading
+    effort_nm: Array
+
+
+class Watcher(Protocol):
+    """Hears how a float goes; a terminal implements it."""
+
+    def note(self, text: str) -> None:
+        """Something worth a line."""
+        ...
+
+    def moment(self, now: Moment) -> None:
+        """Set-points have been sent; called at their rate."""
+        ...
+
+
+class FloatSession:
+    """One float of the robot `name`, whose modules nobody holds yet, by `sender`; on any transport and clock.
+
+    `post` runs a function on the event loop from any thread.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        name: str,
+        weight: KnownWeight,
+        plan: FloatPlan,
+        clock: Clock,
+        post: Post,
+        watcher: Watcher,
+        sender: str,
+    ):
+        self._recording = Recording()
+        self._radio = Radio(transport, name, clock, post, self._record)
+        self._link = RobotLink(self._radio, self._recording, clock, sender)
+        self._weight, self._plan, self._clock, self._watcher = weight, plan, clock, watcher
+        self._serials = weight.chain.serials
+        self._tally = FloatTally(self._serials)
+        self._asked = ""
+        self._held_all = False
+        self._is_under_torque = False
+
+    @property
+    def is_asked_to_end(self) -> bool:
+        """Whether somebody has asked for the end."""
+        return bool(self._asked)
+
+    def end(self, why: str = "asked to end") -> None:
+        """Ask for the end: the robot is held, led back and let go. To be called from the loop's thread."""
+        self._asked = self._asked or why
+
+    async def run(self) -> FloatSummary:
+        """Float until the plan's time is over, the end is asked for, or a limit is met; say how it went.
+
+        Raises:
+            NotTheKnownRobot, FloatRefused: nothing has moved.
+            StaleFeedback, ModuleLost, RobotStopped, NoAnswer, Refused: the robot has been told to stop.
+        """
+        self._radio.start()
+        try:
+            return await self._run()
+        finally:
+            self._radio.close()
+
+    def _record(self, entry: Entry) -> Message | None:
+        try:
+            message = self._recording.add(entry)
+        except WireError:
+            return None  # counted by the recording, by reason
+        return message if isinstance(message, Message) else None
+
+    async def _run(self) -> FloatSummary:
+        await find_known(self._link, self._radio, self._weight, self._clock)
+        limits = tuple(self._link.info(serial).limits for serial in self._serials)
+        floater = Floater(self._weight, limits, self._plan.settings)
+        stood = self._reading()
+        floater.check_start(stood)
+        streaming: asyncio.Task[None] | None = None
+        try:
+            await together(self._link.acquire(serial) for serial in self._serials)
+            streaming = asyncio.create_task(self._stream(floater))
+            await self._float(floater, streaming)
+            end_s = self._now_s() + self._plan.then_hold_s
+            await self._until(lambda: self._now_s() >= end_s, streaming)
+            await _cancelled(streaming)
+            await self._leave(stood.q_rad)
+        except BaseException as error:
+            if streaming is not None:
+                await _cancelled(streaming)
+            await self._abandon(error)
+            raise
+        return self._tally.summary(floater.why, floater.is_fault)
+
+    # ------------------------------------------------------------------ floating
+
+    async def _float(self, floater: Floater, streaming: "asyncio.Task[None]") -> None:
+        """Set the robot free once its motors bear it, and take hold of it in the end."""
+        await self._until(lambda: not floater.is_in("loading") or bool(self._asked), streaming)
+        if floater.is_in("loaded") and not self._asked:
+            # Not before it is held: what falls feels no gravity.
+            check_mounting(self._weight.chain, self._felt())
+            damping = self._plan.settings.damping_nm_s_rad
+            await together(
+                self._link.set_gains(s, floating_gains(self._link.kind(s), damping)) for s in self._serials
+            )
+            self._is_under_torque = True
+            floater.let_go(self._now_s())
+            await self._until(lambda: not floater.is_in("freeing") or bool(self._asked), streaming)
+            if floater.is_in("floating"):
+                self._watcher.note("it floats: lead it by hand")
+            await self._until(lambda: self._is_over(floater), streaming)
+        floater.hold(self._now_s(), self._asked or "its time is over")
+        self._watcher.note(f"it is held: {floater.why}")
+        await self._until(lambda: floater.is_in("held"), streaming)
+        if self._is_under_torque:
+            await together(self._link.set_gains(s, holding_gains(self._link.kind(s))) for s in self._serials)
+
+    def _is_over(self, floater: Floater) -> bool:
+        over = self._plan.for_s is not None and self._tally.floated_s >= self._plan.for_s
+        return over or bool(self._asked) or not floater.is_in("floating")
+
+    async def _until(self, condition: Callable[[], bool], streaming: "asyncio.Task[None]") -> None:
+        while not condition():
+            if streaming.done():
+                streaming.result()
+            self._link.check()
+            await asyncio.sleep(POLL_S)
+
+    async def _stream(self, floater: Floater) -> None:
+        """Send set-points at their rate, renew the leases, and keep no more of the past than it takes."""
+        period_s = 1.0 / self._plan.rate_hz
+        due_s = forgot_s = self._now_s()
+        renewed_s = due_s - KEEP_ALIVE_S
+        while True:
+            now_s = self._now_s()
+            self._check_states()
+            self._step(floater, now_s)
+            if now_s - renewed_s >= KEEP_ALIVE_S:
+                self._link.renew()
+                renewed_s = now_s
+            if now_s - forgot_s >= _FORGET_EVERY_S:
+                self._forget()
+                forgot_s = now_s
+            due_s += period_s
+            if (late_s := self._now_s() - due_s) > period_s:
+                self._tally.missed += int(late_s / period_s)
+                due_s += late_s
+            await asyncio.sleep(max(0.0, due_s - self._now_s()))
+
+    def _step(self, floater: Floater, now_s: float) -> None:
+        reading = self._reading()
+        targets = floater.step(now_s, reading)
+        self._send(targets)
+        if floater.phase == "floating":
+            self._tally.add(now_s, reading.q_rad, reading.qd_rad_s, targets.effort_nm)
+        tally = self._tally
+        self._watcher.moment(Moment(floater.phase, tally.floated_s, tally.missed, reading, targets.effort_nm))
+
+    def _send(self, targets: Targets) -> None:
+        for k, serial in enumerate(self._serials):
+            place = None if targets.position_rad is None else float(targets.position_rad[k])
+            self._link.stream(serial, place, 0.0, float(targets.effort_nm[k]))
+        self._tally.sent += 1
+
+    def _check_states(self) -> None:
+        """Check that no module has let go of its joint, once all have taken set-points.
+
+        Raises:
+            RobotStopped, ModuleLost: one has.
+        """
+        states = {s: STATE_NAMES[int(self._newest(s)["state"][0])] for s in self._serials}
+        self._held_all = self._held_all or set(states.values()) == {"streaming"}
+        for serial, state in states.items():
+            if self._held_all and state in _LET_GO:
+                status = self._link.module(serial).status
+                note = status.note if status is not None and status.state == state else ""
+                if state == "stopped":
+                    raise RobotStopped(serial, note or "stopped")
+                raise ModuleLost(serial, f"its motor is off, {state}" + (f": {note}" if note else ""))
+
+    # ------------------------------------------------------------------ the end
+
+    async def _leave(self, stood_rad: Array) -> None:
+        """Lead the robot back to where it stood, where its motors were off before, and let go of it."""
+        keeper = asyncio.create_task(self._link.keep_alive())
+        try:
+            if self._plan.is_led_back:
+                held = {s: float(self._newest(s)["position_command_rad"][0]) for s in self._serials}
+                patterns = _together_to(held, dict(zip(self._serials, stood_rad.tolist(), strict=True)))
+                await self._link.run(patterns, self._efforts(patterns, held))
+            await self._link.release_all()
+        finally:
+            await _cancelled(keeper)
+
+    def _efforts(
+        self, patterns: Mapping[str, Pattern], origins_rad: Mapping[str, float]
+    ) -> dict[str, EffortProfile]:
+        reference = joint_reference(self._serials, patterns, origins_rad)
+        points = feed_forward(self._weight.chain, self._weight.phi, reference)
+        return dict(zip(self._serials, on_module(points), strict=True))
+
+    async def _abandon(self, error: BaseException) -> None:
+        why = str(error) or type(error).__name__
+        deaf = await self._link.stop_all(why[:200])
+        self._watcher.note(f"stopped: {why}" + (f"; no confirmation from {', '.join(deaf)}" if deaf else ""))
+
+    # ------------------------------------------------------------------ what is known of the robot
+
+    def _now_s(self) -> float:
+        return 1e-9 * self._clock()
+
+    def _newest(self, serial: str, count: int = 1) -> Rows:
+        log = self._link.module(serial).rows
+        return log.rows(log.end_row - count, log.end_row)
+
+    def _reading(self) -> Reading:
+        now_ns = self._clock()
+        rows = np.concatenate([self._newest(serial) for serial in self._serials])
+        ages = [1e-9 * (now_ns - self._link.module(s).arrivals[-1][0]) for s in self._serials]
+        return Reading(np.array(ages), *(rows[name].astype(float) for name in _READ))
+
+    def _felt(self) -> Felt:
+        rows = [self._newest(serial, _FELT_ROWS) for serial in self._serials]
+        q = [float(row["position_rad"].mean()) for row in rows]
+        return Felt(np.array(q), np.array([row["accel_m_s2"].astype(float).mean(axis=0) for row in rows]))
+
+    def _forget(self) -> None:
+        for serial in self._serials:
+            record = self._link.module(serial)
+            record.rows.forget_before(record.rows.end_row - _KEPT_ROWS)
+            del record.arrivals[:-1]
+            record.round_trips.clear()
+
+
+def _together_to(origins_rad: Mapping[str, float], targets_rad: Mapping[str, float]) -> dict[str, Pattern]:
+    """Return paths that end at the same time, the longest at `BACK_RAD_S`."""
+    ways = {serial: abs(target - origins_rad[serial]) for serial, target in targets_rad.items()}
+    longest = max(ways, key=lambda serial: ways[serial])
+    last = GoTo(target_rad=targets_rad[longest], max_speed_rad_s=BACK_RAD_S)
+    total_s = duration_s(last, origins_rad[longest])
+    found: dict[str, Pattern] = {}
+    for serial, way in ways.items():
+        # The peak of a minimum-jerk path is 15/8 of its mean speed.
+        speed = 1.875 * way / total_s
+        still = way < _THERE_RAD
+        found[serial] = (
+            Rest(duration_s=total_s) if still else GoTo(target_rad=targets_rad[serial], max_speed_rad_s=speed)
+        )
+    return found
+
+
+async def _cancelled(task: "asyncio.Task[None]") -> None:
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)

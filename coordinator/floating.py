@@ -1,0 +1,281 @@
+"""Floating: the motors of a robot bear its own weight and nothing else, so that a hand can lead it.
+
+Under torque control every spring is asked for what the bodies beyond it weigh, tau = C(q, qd) qd + g(q)
+(thesis eq. 28 without acceleration). Friction and gear loss lie before the spring, inside the effort loop,
+which makes up for them: what is left of them holds the arm where the model errs by less.
+
+    loading   factory gains; holds where it is, and goes over from the torque that it bears to the calculated
+    loaded    holds; waits for the gains of torque control
+    freeing   the position loop lets go, little by little
+    floating  the weight is borne, nothing else
+    holding   the position loop takes hold again, where the robot is
+    held      holds
+
+A robot floats until it is told to hold, or a joint goes too fast, nears the end of its range or would have to
+bear more than it can. It is never set free if it bears another load than the model says. Pure: time is an
+argument, and nothing is sent from here.
+"""
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from coordinator.known_weight import KnownWeight
+from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array
+from module_agent.firmware.gains import default_gains
+from module_agent.wire.messages import GainSet, Limits
+
+Phase = Literal["loading", "loaded", "freeing", "floating", "holding", "held"]
+
+# Under this strategy all three loops speak newton metres, so that a position or a velocity loop that is off
+# leaves pure torque control, and the velocity loop is a damper, on the module and at its rate.
+STRATEGY = 2
+# The factory's position control gives under this strategy: it has the weight to bear by itself. Where the
+# weight is borne already it can be so much stiffer. At 16 times arms of four and six joints ring.
+HOLDING_TIMES = 6.0
+# How far from the calculated torque a joint may be that holds still, as a share of its type's largest: scale
+# errors of the torque sensor and of the model stay below, a tool in the gripper does not.
+MOST_UNKNOWN = 0.15
+
+
+class FloatRefused(RuntimeError):
+    """The robot is not set free; the message names the joint, what is wrong and what would be right."""
+
+
+class StaleFeedback(RuntimeError):
+    """A module has not been heard of for too long to say what its joints bear."""
+
+    def __init__(self, serial: str, age_s: float, most_s: float):
+        super().__init__(
+            f"module {serial} was last heard {1e3 * age_s:.0f} ms ago, at most {1e3 * most_s:.0f} ms are "
+            "taken: check the network"
+        )
+        self.serial = serial
+
+
+class FloatSettings(NamedTuple):
+    """How a robot floats.
+
+    damping_nm_s_rad: of every joint against its motion. max_speed_rad_s: a joint that goes faster is held.
+    ramp_s: from holding to floating, in each of the two ramps. hold_s: the ramp back. stale_s: the oldest
+    feedback to act on. margin_rad: how near a joint may come to the ends of its range.
+    velocity_forces: whether C(q, qd) qd is borne too.
+    """
+
+    damping_nm_s_rad: float = 0.0
+    max_speed_rad_s: float = 1.5
+    ramp_s: float = 0.8
+    hold_s: float = 0.3
+    stale_s: float = 0.12
+    margin_rad: float = 0.1
+    velocity_forces: bool = False
+
+
+class Reading(NamedTuple):
+    """The newest that is known of n joints, (n,) each: how old it is, and what it says."""
+
+    age_s: Array
+    q_rad: Array
+    qd_rad_s: Array
+    effort_nm: Array
+
+
+class Targets(NamedTuple):
+    """Set-points of n joints, (n,) each, at velocity zero; without positions the position loops are off."""
+
+    position_rad: Array | None
+    effort_nm: Array
+
+
+class Floater:
+    """The course of one float; `step` is called at the rate of the set-points.
+
+    phase: as above. why: why it holds or is held, empty before.
+    """
+
+    def __init__(self, weight: KnownWeight, limits: tuple[Limits, ...], settings: FloatSettings):
+        self.phase: Phase = "loading"
+        self.why = ""
+        self.is_fault = False
+        self._weight = weight
+        self._serials = weight.chain.serials
+        self._settings = settings
+        self._most_nm = np.array([one.max_effort_nm for one in limits])
+        self._low = _ends([one.min_position_rad for one in limits], -np.inf) + settings.margin_rad
+        self._high = _ends([one.max_position_rad for one in limits], np.inf) - settings.margin_rad
+        self._since_s = 0.0
+        self._place: Array | None = None
+        self._borne = np.zeros(len(limits))
+
+    def check_start(self, reading: Reading) -> None:
+        """Check that the robot may be set free where it is; to be called before it is taken.
+
+        Raises:
+            FloatRefused: its weight is too much for a joint, or a joint stands at the end of its range.
+        """
+        weight = self._weight.effort_nm(reading.q_rad, np.zeros_like(reading.q_rad))
+        reason = self._overload(weight) or self._at_an_end(reading.q_rad)
+        if reason:
+            raise FloatRefused(reason)
+
+    def step(self, t_s: float, reading: Reading) -> Targets:
+        """Return the set-points of this moment.
+
+        Raises:
+            StaleFeedback: what is known of a joint is too old.
+        """
+        self._check_age(reading.age_s)
+        if self._place is None:
+            self._since_s, self._place, self._borne = t_s, reading.q_rad.copy(), reading.effort_nm.copy()
+        rate = reading.qd_rad_s if self._settings.velocity_forces else np.zeros_like(reading.q_rad)
+        weight = self._weight.effort_nm(reading.q_rad, rate)
+        self._guard(t_s, reading, weight)
+        self._go_on(t_s, reading, weight)
+        # What is too much is held by the position loop as far as the motor can.
+        effort = np.clip(weight, -self._most_nm, self._most_nm)
+        if self.phase == "loading":
+            share = self._share(t_s, self._settings.ramp_s)
+            return Targets(self._place, self._borne + share * (effort - self._borne))
+        return Targets(self._held(t_s, reading.q_rad), effort)
+
+    def is_in(self, *phases: Phase) -> bool:
+        """Whether it is in one of these phases."""
+        return self.phase in phases
+
+    def let_go(self, t_s: float) -> None:
+        """Set the robot free: the gains of torque control are in force. Only from `loaded`."""
+        if self.phase == "loaded":
+            self._enter("freeing", t_s)
+
+    def hold(self, t_s: float, why: str) -> None:
+        """Take hold of the robot where it is at the next step, if it is not held already."""
+        if self.phase not in ("holding", "held"):
+            self.why = why
+            if self.phase in ("freeing", "floating"):
+                self._place = None
+            self._enter("holding", t_s)
+
+    def _enter(self, phase: Phase, t_s: float) -> None:
+        self.phase, self._since_s = phase, t_s
+
+    def _share(self, t_s: float, length_s: float) -> float:
+        return min(max((t_s - self._since_s) / length_s, 0.0), 1.0)
+
+    def _held(self, t_s: float, q_rad: Array) -> Array | None:
+        """Return where the position loops are to pull to, None when they are off.
+
+        They pull with a share of their stiffness: to a place so much nearer than the one that they hold.
+        """
+        assert self._place is not None
+        if self.phase == "floating":
+            return None
+        if self.phase == "freeing":
+            grip = 1.0 - self._share(t_s, self._settings.ramp_s)
+        elif self.phase == "holding":
+            grip = self._share(t_s, self._settings.hold_s)
+        else:
+            grip = 1.0
+        return q_rad + grip * (self._place - q_rad)
+
+    # ------------------------------------------------------------------ what ends it
+
+    def _go_on(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
+        settings = self._settings
+        length_s = settings.hold_s if self.phase == "holding" else settings.ramp_s
+        if self._share(t_s, length_s) < 1.0:
+            return
+        if self.phase == "loading":
+            strange = self._strange(reading.effort_nm, weight_nm)
+            if strange:
+                self._fault(t_s, reading, strange)
+            else:
+                self._enter("loaded", t_s)
+        elif self.phase == "freeing":
+            self._enter("floating", t_s)
+        elif self.phase == "holding":
+            self._enter("held", t_s)
+
+    def _guard(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
+        if self.phase not in ("freeing", "floating"):
+            return
+        reason = (
+            self._too_fast(reading.qd_rad_s) or self._at_an_end(reading.q_rad) or self._overload(weight_nm)
+        )
+        if reason:
+            self._fault(t_s, reading, reason)
+
+    def _fault(self, t_s: float, reading: Reading, why: str) -> None:
+        self.is_fault = True
+        self.hold(t_s, why)
+        if self._place is None:
+            self._place = reading.q_rad.copy()
+
+    def _check_age(self, age_s: Array) -> None:
+        worst = int(np.argmax(age_s))
+        if age_s[worst] > self._settings.stale_s:
+            raise StaleFeedback(self._serials[worst], float(age_s[worst]), self._settings.stale_s)
+
+    def _overload(self, weight_nm: Array) -> str:
+        over = np.abs(weight_nm) - self._most_nm
+        worst = int(np.argmax(over))
+        if over[worst] <= 0.0:
+            return ""
+        return (
+            f"joint {self._serials[worst]} would have to bear {weight_nm[worst]:.2f} Nm here, it can bear "
+            f"{self._most_nm[worst]:.2f} Nm; bring the arm to a lighter pose"
+        )
+
+    def _strange(self, effort_nm: Array, weight_nm: Array) -> str:
+        over = np.abs(effort_nm - weight_nm) - MOST_UNKNOWN * self._most_nm
+        worst = int(np.argmax(over))
+        if over[worst] <= 0.0:
+            return ""
+        return (
+            f"joint {self._serials[worst]} bears {effort_nm[worst]:.2f} Nm, the robot that is known would be "
+            f"{weight_nm[worst]:.2f} Nm there: it carries something, leans on something, or stands otherwise "
+            "than when it was identified; identify it again as it is"
+        )
+
+    def _too_fast(self, rate_rad_s: Array) -> str:
+        worst = int(np.argmax(np.abs(rate_rad_s)))
+        if abs(rate_rad_s[worst]) <= self._settings.max_speed_rad_s:
+            return ""
+        return (
+            f"joint {self._serials[worst]} went {abs(rate_rad_s[worst]):.2f} rad/s, at most "
+            f"{self._settings.max_speed_rad_s:.2f} rad/s are allowed"
+        )
+
+    def _at_an_end(self, q_rad: Array) -> str:
+        beyond = np.maximum(q_rad - self._high, self._low - q_rad)
+        worst = int(np.argmax(beyond))
+        if beyond[worst] <= 0.0:
+            return ""
+        margin = self._settings.margin_rad
+        return (
+            f"joint {self._serials[worst]} is at {q_rad[worst]:.2f} rad, within {margin:.2f} rad of the end "
+            f"of its range, {self._low[worst] - margin:.2f} to {self._high[worst] + margin:.2f} rad"
+        )
+
+
+def floating_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
+    """Return the gains under which a module floats: the factory's effort loop, and a damper."""
+    return _torque_gains(kind, damping_nm_s_rad)
+
+
+def holding_gains(kind: ModuleType) -> GainSet:
+    """Return the gains under which a module holds still what it bears."""
+    return _torque_gains(kind, HOLDING_TIMES * default_gains(kind, STRATEGY).velocity.kp)
+
+
+def _torque_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
+    factory = default_gains(kind, STRATEGY)
+    damper = factory.velocity.model_copy(
+        update={"kp": damping_nm_s_rad, "ki": 0.0, "kd": 0.0, "feed_forward": 0.0}
+    )
+    stiff = factory.position.model_copy(update={"kp": HOLDING_TIMES * factory.position.kp})
+    return factory.model_copy(update={"position": stiff, "velocity": damper})
+
+
+def _ends(values: list[float | None], otherwise: float) -> Array:
+    return np.array([otherwise if value is None else value for value in values])

@@ -1,0 +1,258 @@
+"""A simulated robot floats: it stays where it is left, a hand leads it, and limits hold it."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.float_session import FloatPlan, FloatSession, Moment
+from coordinator.floating import FloatRefused, FloatSettings, StaleFeedback
+from coordinator.known_presence import NotTheKnownRobot
+from coordinator.known_weight import KnownWeight
+from coordinator.link_errors import RobotStopped
+from coordinator.radio import Refused
+from module_agent.wire.network_profile import NetworkProfile
+from module_agent.wire.transport import TransportError
+from sim.experiments.floating import FloatTrial, Pose, float_robot, float_trial, posed, true_weight
+from sim.noise_profile import NOISE_PROFILES, switched
+from sim.parts import FreePose
+from sim.push import Push
+from sim.robot_file import load_robot
+
+ARM = "a2085_03"
+LIFT, ELBOW = "shoulder-lift", "elbow"
+BENT = Pose("bent", {LIFT: 0.7, ELBOW: -0.8})
+LONG = FloatPlan(for_s=5.0)
+SHORT = FloatPlan(for_s=1.0, then_hold_s=0.2)
+IDEAL = NOISE_PROFILES["ideal"]
+LOSSLESS = switched(IDEAL, (), ("friction", "gear-loss"))
+
+
+def weight() -> KnownWeight:
+    return true_weight(load_robot(ARM))
+
+
+# --------------------------------------------------------------------------- floating
+
+
+@cache
+def tried() -> FloatTrial:
+    return float_trial(1, load_robot(ARM), weight(), "x5", drift_s=5.0, poses=(Pose("level", {}), BENT))
+
+
+def test_left_alone_an_arm_stays_where_it_is() -> None:
+    # Measured 0.5 degrees in 10 s: sensors and springs err by some percent of a weight that friction holds.
+    assert tried().drift_deg < 1.5
+
+
+def test_a_light_hand_leads_it_and_where_it_is_left_it_stays() -> None:
+    # 4 N for 0.6 s.
+    assert tried().led_deg > 15.0
+    assert tried().rest_deg < 1.5
+
+
+def test_a_hand_that_leads_a_free_arm_does_not_move_one_that_is_held() -> None:
+    assert tried().guiding_n < 2.0
+    assert tried().held_n > 5.0 * tried().guiding_n
+
+
+def test_without_friction_it_creeps_by_what_the_feed_forward_takes_the_gear_to_lose() -> None:
+    # The modules' feed-forward counts on 65 % of the motor's torque; of a gear without loss it gets all, and
+    # the effort loop leaves a tenth of that error. With the motors' friction the same arm stands still.
+    start = posed(load_robot(ARM), BENT.start_rad)
+    plan = FloatPlan(for_s=2.5, then_hold_s=0.0, is_led_back=False)
+    creeping, standing = (
+        float_robot(start, weight(), plan, 1, noise).floating() for noise in (LOSSLESS, IDEAL)
+    )
+    rate = np.abs(creeping.q_rad[-1] - creeping.q_rad[0]).max() / np.ptp(creeping.t_s)
+    # Measured 2.9 degrees a second.
+    assert 0.5 < np.degrees(rate) < 5.0
+    assert np.degrees(np.ptp(standing.q_rad, axis=0).max()) < 0.05
+
+
+def test_a_damper_makes_the_arm_follow_a_hand_more_slowly() -> None:
+    start = posed(load_robot(ARM), BENT.start_rad)
+    push = Push(serial=ELBOW, force_n=(0.0, 0.0, 2.0), from_s=3.0, for_s=0.3)
+    gone = []
+    for damping in (0.0, 3.0):
+        plan = FloatPlan(FloatSettings(damping), for_s=2.0, then_hold_s=0.0, is_led_back=False)
+        free = float_robot(start, weight(), plan, 1, IDEAL, pushes=(push,)).floating()
+        gone.append(np.ptp(free.q_rad[free.t_s > 2.9], axis=0).max())
+    # Without it the motors' own friction and back-EMF are what brakes.
+    assert np.degrees(gone[0]) > 5.0
+    assert gone[1] < 0.6 * gone[0]
+
+
+def test_it_floats_over_a_network_that_loses_and_delays() -> None:
+    poor = float_robot(posed(load_robot(ARM), BENT.start_rad), weight(), SHORT, 2, "x5", "wifi")
+    assert not poor.summary.is_fault
+    assert poor.summary.floated_s == pytest.approx(1.0, abs=0.05)
+    assert np.degrees(np.ptp(poor.floating().q_rad, axis=0).max()) < 1.5
+
+
+def test_in_the_end_it_is_led_back_to_where_it_stood() -> None:
+    start = posed(load_robot(ARM), BENT.start_rad)
+    push = Push(serial=ELBOW, force_n=(0.0, 0.0, 3.0), from_s=3.0, for_s=0.4)
+    done = float_robot(start, weight(), SHORT._replace(for_s=2.0), 1, "x5", pushes=(push,))
+    joints = {joint.serial: joint for joint in done.summary.joints}
+    assert not done.summary.is_fault
+    assert abs(joints[LIFT].ended_rad - joints[LIFT].began_rad) > 0.2
+    assert joints[LIFT].farthest_rad >= abs(joints[LIFT].ended_rad - joints[LIFT].began_rad)
+    # Virtual time: no set-point is late.
+    assert done.summary.missed == 0
+
+
+# --------------------------------------------------------------------------- limits
+
+
+def test_a_push_that_is_too_fast_ends_it_and_the_arm_is_held_there() -> None:
+    start = posed(load_robot(ARM), BENT.start_rad)
+    shove = Push(serial=ELBOW, force_n=(0.0, 0.0, 25.0), from_s=3.0, for_s=0.4)
+    plan = FloatPlan(FloatSettings(max_speed_rad_s=0.6), for_s=5.0, then_hold_s=1.0, is_led_back=False)
+    done = float_robot(start, weight(), plan, 1, "x5", pushes=(shove,))
+    assert done.summary.is_fault
+    assert "rad/s, at most 0.60 rad/s are allowed" in done.summary.why
+    held = done.q_rad[np.array([phase == "held" for phase in done.phases])]
+    # The shove goes on a little; then it stands.
+    assert np.ptp(held[-100:], axis=0).max() < 0.01
+
+
+def test_an_arm_with_a_tool_that_is_not_known_is_not_set_free() -> None:
+    bare = load_robot(ARM)
+    tool = FreePose(mass_kg=1.0, com_xyz_m=(0.0, 0.0, 0.05), inertia=(1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0))
+    last = bare.modules[-1].model_copy(update={"payload": tool})
+    laden = posed(bare.model_copy(update={"modules": (*bare.modules[:-1], last)}), BENT.start_rad)
+    done = float_robot(laden, weight(), SHORT, 1, "x5")
+    assert done.summary.is_fault
+    assert "it carries something" in done.summary.why
+    assert LIFT in done.summary.why
+    assert done.summary.joints == ()
+    assert "freeing" not in done.phases
+
+
+def test_a_base_that_stands_on_its_side_is_not_set_free() -> None:
+    robot = load_robot(ARM)
+    base = robot.base.model_copy(update={"mount": None, "rpy_deg": (0.0, 25.0, 0.0)})
+    with pytest.raises(NotTheKnownRobot, match="feels gravity 25 degrees"):
+        float_robot(robot.model_copy(update={"base": base}), weight(), SHORT, 1, "x5")
+
+
+def test_an_arm_that_is_too_heavy_where_it_stands_is_refused_before_anything_moves() -> None:
+    robot = load_robot(ARM)
+    heavy = weight()._replace(phi=40.0 * weight().phi)
+    with pytest.raises(FloatRefused, match=r"joint shoulder-lift would have to bear -?\d\d"):
+        float_robot(robot, heavy, SHORT, 1, "x5")
+
+
+# --------------------------------------------------------------------------- modules that fail
+
+
+@dataclass
+class Seen:
+    """A watcher that keeps phases and notes."""
+
+    phases: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def moment(self, now: Moment) -> None:
+        self.phases.append(now.phase)
+
+    @property
+    def floats(self) -> bool:
+        return "floating" in self.phases
+
+
+def session(rig: Any, plan: FloatPlan = LONG) -> tuple[FloatSession, Seen]:
+    seen, loop = Seen(), rig.loop
+    made = FloatSession(
+        rig.endpoint("float"), ARM, weight(), plan, lambda: loop.now_ns, loop.call_soon, seen, "float"
+    )
+    return made, seen
+
+
+def test_when_an_agent_dies_the_others_are_told_to_stop_and_it_is_named(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    floating, seen = session(rig)
+    rig.when(lambda: seen.floats, lambda: rig.kill(ELBOW))
+    with pytest.raises(StaleFeedback, match=f"module {ELBOW} was last heard 1[23]"):
+        rig.run(floating.run())
+    assert [rig.state(serial) for serial in rig.hosts] == ["stopped", "stopped"]
+    assert seen.notes[-1].startswith("stopped: module elbow was last heard")
+
+
+def test_somebody_elses_stop_ends_it_and_is_not_overruled(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    floating, seen = session(rig)
+    _, _, other = rig.link("other")
+
+    async def both() -> None:
+        work = asyncio.ensure_future(floating.run())
+        while not seen.floats:
+            await asyncio.sleep(0.05)
+        await other.meet([LIFT])
+        await other._stop(LIFT, "enough")
+        await work
+
+    with pytest.raises(RobotStopped, match=f"module {LIFT} was stopped by other: enough"):
+        rig.run(both())
+    assert {rig.state(serial) for serial in rig.serials} == {"stopped"}
+
+
+def test_when_the_host_stalls_the_modules_let_go_by_themselves(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    floating, seen = session(rig)
+    cut_s: list[float] = []
+
+    def cut() -> None:
+        rig.network.kill("float")
+        cut_s.append(rig.loop.time())
+
+    rig.when(lambda: seen.floats, cut)
+    with pytest.raises(TransportError):
+        rig.run(floating.run())
+    # The commands' life is 250 ms.
+    rig.run(_until(rig, cut_s[0] + 0.3))
+    assert {rig.state(serial) for serial in rig.serials} == {"expired"}
+
+
+async def _until(rig: Any, t_s: float) -> None:
+    await asyncio.sleep(max(0.0, t_s - rig.loop.time()))
+
+
+def test_a_module_that_somebody_holds_is_not_taken_from_him(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    floating, _ = session(rig)
+    _, _, other = rig.link("other")
+
+    async def both() -> None:
+        await asyncio.sleep(0.1)
+        await other.meet([LIFT])
+        await other.acquire(LIFT)
+        keeper = asyncio.ensure_future(other.keep_alive())
+        try:
+            await floating.run()
+        finally:
+            keeper.cancel()
+
+    with pytest.raises(Refused, match=f"module {LIFT} refused lease: HELD|held by other"):
+        rig.run(both())
+    assert rig.state(LIFT) == "armed"
+
+
+def test_asked_to_end_it_is_held_led_back_and_let_go(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, NetworkProfile(name="some", delay_ms=3.0, jitter_ms=2.0))
+    floating, seen = session(rig, FloatPlan(then_hold_s=0.2))
+    rig.when(lambda: seen.phases.count("floating") > 100, floating.end)
+    found = rig.run(floating.run())
+    assert found.why == "asked to end"
+    assert found.floated_s == pytest.approx(0.5, abs=0.1)
+    assert {rig.state(serial) for serial in rig.serials} == {"idle"}
+    order = [phase for k, phase in enumerate(seen.phases) if k == 0 or seen.phases[k - 1] != phase]
+    assert order == ["loading", "loaded", "freeing", "floating", "holding", "held"]
