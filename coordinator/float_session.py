@@ -37,6 +37,8 @@ from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Transport
 
 BACK_RAD_S = 0.5
+# The feedback that is acted on is at most so much of a command's life old: the rest is for the way back.
+STALE_SHARE = 0.5
 # Nearer than this a joint is where it shall be.
 _THERE_RAD = 1e-3
 # Gravity is felt for a tenth of a second.
@@ -141,8 +143,10 @@ class FloatSession:
 
     async def _run(self) -> FloatSummary:
         await find_known(self._link, self._radio, self._weight, self._clock)
-        limits = tuple(self._link.info(serial).limits for serial in self._serials)
-        floater = Floater(self._weight, limits, self._plan.settings)
+        told = [self._link.info(serial) for serial in self._serials]
+        stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in told)
+        settings = self._plan.settings._replace(stale_s=min(stale_s, self._plan.settings.stale_s))
+        floater = Floater(self._weight, tuple(info.limits for info in told), settings)
         stood = self._reading()
         floater.check_start(stood)
         streaming: asyncio.Task[None] | None = None

@@ -67,7 +67,7 @@ class FloatSettings(NamedTuple):
     max_speed_rad_s: float = 1.5
     ramp_s: float = 0.8
     hold_s: float = 0.3
-    stale_s: float = 0.12
+    stale_s: float = 0.5
     margin_rad: float = 0.1
     velocity_forces: bool = False
 

@@ -12,7 +12,8 @@ from coordinator.radio import Radio
 from coordinator.robot_link import POLL_S, RobotLink
 from module_agent.dynamics.chain import Array, Chain
 
-DISCOVER_S = 12.0
+# For the first module, and from one to the next.
+DISCOVER_S, QUIET_S = 12.0, 3.0
 # A new hub is found by agents within a second or so of one another; what is no part of the known robot is
 # waited for as long.
 STRANGERS_S = 0.5
@@ -42,9 +43,8 @@ async def find_known(link: RobotLink, radio: Radio, weight: KnownWeight, clock: 
     Raises:
         NotTheKnownRobot: a module is missing, of another type, mute, or no part of it.
     """
-    known, end_ns = set(weight.chain.serials), clock() + int(DISCOVER_S * 1e9)
-    while not known <= radio.alive and clock() < end_ns:
-        await asyncio.sleep(POLL_S)
+    known = set(weight.chain.serials)
+    await _gathered(radio, known, clock)
     if missing := sorted(known - radio.alive):
         there = ", ".join(sorted(radio.alive)) or "none"
         raise NotTheKnownRobot(
@@ -65,6 +65,15 @@ async def find_known(link: RobotLink, radio: Radio, weight: KnownWeight, clock: 
             )
     if not await link.wait(lambda: not _mute(link), FEEDBACK_S):
         raise NotTheKnownRobot(f"module {_mute(link)[0]} answers, but sends no feedback")
+
+
+async def _gathered(radio: Radio, known: set[str], clock: Clock) -> None:
+    """Wait until all are there, or no more come."""
+    present, end_ns = set(radio.alive), clock() + int((QUIET_S if radio.alive else DISCOVER_S) * 1e9)
+    while not known <= radio.alive and clock() < end_ns:
+        await asyncio.sleep(POLL_S)
+        if radio.alive != present:
+            present, end_ns = set(radio.alive), clock() + int(QUIET_S * 1e9)
 
 
 def check_mounting(chain: Chain, felt: Felt) -> None:

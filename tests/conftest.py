@@ -11,9 +11,10 @@ import pytest
 from coordinator.plan import Plan
 from coordinator.radio import Radio
 from coordinator.recording import Entry, Recording
-from coordinator.result import Result
+from coordinator.result import Result, chain_part, write_result
 from coordinator.robot_link import RobotLink
 from coordinator.run import Run, RunConfig
+from coordinator.run_folder import RESULT
 from module_agent.firmware.config import config_of
 from module_agent.hardware import HardwareModule, SensorSample
 from module_agent.host import AgentHost, InlineWorker
@@ -23,6 +24,7 @@ from module_agent.wire.network_profile import NetworkProfile, profile
 from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Event, Reply, Request, Sample, Transport, Undeclare
 from sim.robot_file import load_robot
+from sim.robot_tree import true_chain, true_inertia
 from sim.truth import TruthLog, write_truth
 from sim.virtual_loop import LoopScheduler, VirtualLoop
 from sim.virtual_network import VirtualNetwork
@@ -296,6 +298,54 @@ def rigs() -> Iterator[Callable[..., Rig]]:
     yield make
     for rig in reversed(made):
         rig.close()
+
+
+@pytest.fixture
+def known_folder(tmp_path: Path) -> Callable[..., Path]:
+    """Makes the folder of a run that found out without error what a robot is and weighs."""
+
+    def make(robot: str, **changes: object) -> Path:
+        folder = tmp_path / f"known-{robot}"
+        folder.mkdir(exist_ok=True)
+        known = load_robot(robot)
+        dynamics = {
+            "phi": true_inertia(known).reshape(-1).tolist(),
+            "rank": 1,
+            "parameters": 10 * len(known.modules),
+            "condition": 1.0,
+            "sigma": [],
+            "identifiable": [],
+            "residual_rms_nm": {},
+            "held_out": None,
+        }
+        document: dict[str, object] = {
+            "robot": robot,
+            "serials": known.serials,
+            "types": {module.serial: module.type for module in known.modules},
+            "topology_confidence": 1.0,
+            "chain": chain_part(true_chain(known)),
+            "rank": 1,
+            "condition": 1.0,
+            "reduced_chi2": 1.0,
+            "product_of_exponentials": {"screws": [], "tips": []},
+            "dynamics": dynamics,
+            "robot_time_s": 0.0,
+            "wall_time_s": None,
+            "trace_hash": "",
+            "unresolved": [],
+            "null_basis": [],
+            "chain_covariance": [],
+            "links": [],
+            "transforms": [],
+            "pairs": [],
+            "denavit_hartenberg": [],
+            "notes": [],
+            **changes,
+        }
+        write_result(folder / RESULT, Result.model_validate(document))
+        return folder
+
+    return make
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from module_agent.wire.messages import Limits
 X5_4 = CATALOGUE["X5-4"]
 G_M_S2, MASS_KG, REACH_M = 9.81, 0.8, 0.3
 LEVEL_NM = -MASS_KG * REACH_M * G_M_S2
-SETTINGS = FloatSettings(ramp_s=0.8, hold_s=0.4)
+SETTINGS = FloatSettings(ramp_s=0.8, hold_s=0.4, stale_s=0.12)
 
 
 def pendulum(mass_kg: float = MASS_KG) -> KnownWeight:
