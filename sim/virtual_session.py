@@ -4,6 +4,7 @@ What it records is what a run's `session.mcap` holds, for experiments that need 
 """
 
 import asyncio
+from collections.abc import Callable
 
 from coordinator.excitation.of_robot import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
@@ -26,8 +27,12 @@ from sim.virtual_robot import VirtualRobot, VirtualSettings
 COORDINATOR = "coordinator"
 
 
-def record_session(settings: VirtualSettings, plan: Plan) -> Recording:
+def record_session(
+    settings: VirtualSettings, plan: Plan, at_end: Callable[[VirtualRobot], None] | None = None
+) -> Recording:
     """Run one session from discovery to its end and return what the coordinator has recorded of it.
+
+    `at_end` is handed the robot when the session is over, for whoever compares it with the truth.
 
     Raises:
         what `coordinator.session` raises: nobody there, an unfit link, a module lost, a motion interrupted.
@@ -52,6 +57,8 @@ def record_session(settings: VirtualSettings, plan: Plan) -> Recording:
         )
         run_to_end(loop, loop.create_task(_to_end(session, radio, robot)))
         keeper.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))
+        if at_end is not None:
+            at_end(robot)
         return keeper.recording
     finally:
         robot.close()

@@ -1,0 +1,226 @@
+"""One identification of a robot's inertia in virtual time, against the truth.
+
+The thesis' way on the same recording is the pseudo-inverse of what the encoders and the torque readings say
+as they are (thesis eq. 29).
+"""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from coordinator.dynamic_motions import INDEPENDENT_FRACTION, dynamic_motion, dynamic_windows
+from coordinator.dynamics.consistency import parameter_transform
+from coordinator.dynamics.identification import parameter_scale, solve_information
+from coordinator.dynamics.joint_frames import joint_frames
+from coordinator.failure import explain
+from coordinator.identify import Identified, base_floor, identify, recorded_type
+from coordinator.inertia import Robot as SeenRobot
+from coordinator.inertia import find_inertia
+from coordinator.plan import Plan
+from coordinator.recording import Recording
+from coordinator.seen_motion import Eyes
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.differentiation import JointMotion, resample
+from module_agent.dynamics.information import gather
+from module_agent.dynamics.regressor import inverse_dynamics, torque_regressor
+from module_agent.wire.network_file import network
+from sim.noise_profile import NoiseProfile, noise_profile, switched
+from sim.place import somewhere
+from sim.robot_file import load_robot
+from sim.robot_tree import true_chain, true_inertia
+from sim.truth import Motion
+from sim.virtual_robot import VirtualRobot, VirtualSettings
+from sim.virtual_session import record_session
+
+# A base parameter is known whose standard deviation is less than this share of it.
+KNOWN_BELOW = 0.1
+LARGEST = 10
+# What makes torques other than a rigid robot's.
+GIVING = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
+
+
+class InertiaTrial(NamedTuple):
+    """What came of one trial; of one that did not come to its end only the first four fields tell.
+
+    why: what ended it, empty if nothing did. rank, most_rank: base parameters that were found, and that any
+    motion could show. known: how many of them are known to 10 %. sigmas_off: |error| / sigma of these.
+    largest: relative errors of the largest ten of them, and largest_sigma what is claimed.
+    held_out: relative torque errors on held-out motions against the torque without noise; with_true_chain
+    with the chain as it is, thesis the thesis' way; bodies: that of real bodies. not_definite: poses out of
+    `poses` where the bodies' mass matrix is not positive definite. eyes: what the motion was seen by; gain:
+    by how much that leaves less in the torques than encoders. agents_differ: by how much the agents' own
+    information differs from the coordinator's, relative; None if none was asked.
+    """
+
+    robot: str
+    noise: str
+    seed: int
+    why: str
+    rank: int = 0
+    most_rank: int = 0
+    known: int = 0
+    sigmas_off: tuple[float, ...] = ()
+    largest: tuple[float, ...] = ()
+    largest_sigma: tuple[float, ...] = ()
+    held_out: float = float("nan")
+    with_true_chain: float = float("nan")
+    thesis: float = float("nan")
+    bodies: float = float("nan")
+    poses: int = 0
+    not_definite: int = 0
+    eyes: Eyes = "encoders"
+    gain: float = 1.0
+    agents_differ: float | None = None
+    robot_time_s: float = 0.0
+    identify_s: float = 0.0
+
+
+class _Recorded(NamedTuple):
+    recording: Recording
+    truth: Motion
+
+
+def rigid_profile() -> NoiseProfile:
+    """Return the x5 profile of a robot that does not give and has no friction."""
+    return switched(noise_profile("x5"), off=GIVING)
+
+
+def inertia_trial(
+    robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, poses: int, label: str = ""
+) -> InertiaTrial:
+    """Identify a robot, somewhere on the Earth, and compare its inertia with the truth.
+
+    Args:
+        robot: name or file. noise: profile; `label` is what to call it.
+        seed: of all noise.
+        plan: of the session.
+        poses: how many poses the mass matrix is looked at in.
+    """
+    found = somewhere(load_robot(robot), seed)
+    name = label or (noise if isinstance(noise, str) else noise.name)
+    nothing = InertiaTrial(robot, name, seed, "")
+    settings = VirtualSettings(found, network("lan"), seed, noise)
+    kept: list[Motion] = []
+
+    def keep(simulated: VirtualRobot) -> None:
+        kept.append(simulated.truth.motion())
+
+    try:
+        recording = record_session(settings, plan, keep)
+        begun = time.process_time()
+        identified = identify(recording)
+        spent_s = time.process_time() - begun
+        return _compared(
+            nothing, identified, _Recorded(recording, kept[0]), true_chain(found), true_inertia(found), poses
+        )._replace(identify_s=spent_s)
+    except Exception as error:
+        failure = explain(error)
+        if failure is None:
+            raise
+        return nothing._replace(why=failure.text)
+
+
+def _compared(
+    trial: InertiaTrial, found: Identified, recorded: _Recorded, chain: Chain, phi: Array, poses: int
+) -> InertiaTrial:
+    kinematics, inertia, bodies = found.kinematics, found.inertia, found.bodies
+    serials = kinematics.topology.serials
+    if inertia is None or bodies is None or serials != chain.serials:
+        return trial._replace(why=f"no inertia was found of {', '.join(chain.serials)}")
+    base = bodies.base
+    into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in joint_frames(chain)))
+    true = base.grouping @ (into @ phi.ravel())
+    known = base.relative_sigma < KNOWN_BELOW
+    size = np.abs(true) / base.columns.scale[base.independent]
+    largest = [i for i in np.argsort(-size) if known[i]][:LARGEST]
+    motion = dynamic_motion(recorded.recording, kinematics.clocks, serials, "held_out")
+    torque = _true_torque(motion, found, recorded.truth)
+    joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
+    estimated = kinematics.fit.chain
+    seen = inertia.seen
+    real = bodies.fit.phi if bodies.fit is not None else np.full_like(seen.fit.phi, np.nan)
+    return trial._replace(
+        rank=base.rank,
+        most_rank=_most_rank(chain),
+        known=int(known.sum()),
+        sigmas_off=tuple((np.abs(base.value - true) / base.sigma)[known].tolist()),
+        largest=tuple((np.abs(base.value - true) / np.abs(true))[largest].tolist()),
+        largest_sigma=tuple(base.relative_sigma[largest].tolist()),
+        held_out=_relative(inverse_dynamics(estimated, seen.fit.phi, *joints), torque),
+        with_true_chain=_relative(_by_true_chain(found, recorded, chain, joints), torque),
+        thesis=_relative(_thesis(found, recorded, joints), torque),
+        bodies=_relative(inverse_dynamics(estimated, real, *joints), torque),
+        poses=poses,
+        not_definite=_not_definite(estimated, real, poses, trial.seed),
+        eyes=inertia.eyes,
+        gain=inertia.gain,
+        agents_differ=inertia.gathered.difference if inertia.gathered is not None else None,
+        robot_time_s=found.result.robot_time_s,
+    )
+
+
+def _true_torque(motion: JointMotion, found: Identified, truth: Motion) -> Array:
+    """Return the springs' true torques (m, n) at the instants of a motion."""
+    columns = []
+    for serial in found.kinematics.topology.serials:
+        k = truth.serials.index(serial)
+        times = found.kinematics.clocks[serial].to_module(motion.t_ns)
+        columns.append(resample([truth.clock_ns[:, k]], [truth.spring_torque_nm[:, k]], times))
+    return np.hstack(columns)
+
+
+def _by_true_chain(
+    found: Identified, recorded: _Recorded, chain: Chain, joints: tuple[Array, Array, Array]
+) -> Array:
+    """Return the torques predicted by inertia that was found with the chain as it is."""
+    kinematics, recording = found.kinematics, recorded.recording
+    serials = kinematics.topology.serials
+    robot = SeenRobot(
+        chain,
+        [recorded_type(recording, serial) for serial in serials],
+        kinematics.refinement,
+        np.zeros((6 * len(serials),) * 2),
+        base_floor(recording, kinematics.clocks, kinematics.topology),
+        recording.torque,
+    )
+    inertia = find_inertia(robot, dynamic_windows(recording, kinematics.clocks, serials, "dynamic"))
+    return inverse_dynamics(chain, inertia.seen.fit.phi, *joints)
+
+
+def _thesis(found: Identified, recorded: _Recorded, joints: tuple[Array, Array, Array]) -> Array:
+    kinematics = found.kinematics
+    motion = dynamic_motion(recorded.recording, kinematics.clocks, kinematics.topology.serials, "dynamic")
+    chain = kinematics.fit.chain
+    said = gather(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
+    fit = solve_information(said, independent_fraction=INDEPENDENT_FRACTION)
+    return inverse_dynamics(chain, fit.phi, *joints)
+
+
+def _most_rank(chain: Chain) -> int:
+    """Return the rank at positions, rates and accelerations at random: what any motion at all could show."""
+    joints = len(chain.serials)
+    motion = np.random.default_rng(0).uniform(-3.0, 3.0, (3, 60 * joints, joints))
+    regressor = torque_regressor(chain, *motion).reshape(-1, 10 * joints) * parameter_scale(joints)
+    return int(np.linalg.matrix_rank(regressor, tol=1e-9 * np.linalg.norm(regressor, 2)))
+
+
+def _not_definite(chain: Chain, phi: Array, poses: int, seed: int) -> int:
+    """Return in how many of so many random poses the mass matrix is not positive definite."""
+    if not np.isfinite(phi).all():
+        return poses
+    joints = len(chain.serials)
+    q = np.random.default_rng((seed, 7)).uniform(-np.pi, np.pi, (poses, joints))
+    still = np.zeros_like(q)
+    weight = inverse_dynamics(chain, phi, q, still, still)
+    columns = [
+        inverse_dynamics(chain, phi, q, still, np.tile(unit, (poses, 1))) - weight for unit in np.eye(joints)
+    ]
+    matrices = np.stack(columns, axis=2)
+    smallest = np.linalg.eigvalsh(0.5 * (matrices + matrices.transpose(0, 2, 1)))[:, 0]
+    return int(np.count_nonzero(smallest <= 0.0))
+
+
+def _relative(predicted: Array, true: Array) -> float:
+    return float(np.linalg.norm(predicted - true) / np.linalg.norm(true))
