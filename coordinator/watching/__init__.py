@@ -1,0 +1,1 @@
+"""Watching a known robot: what in its sensors is other than its model says, and what explains it."""

@@ -1,0 +1,73 @@
+"""What the watch holds to be so: each finding once, said again when there is more to say, and ended."""
+
+from collections.abc import Iterable
+
+from coordinator.watching.finding import Finding
+
+Key = tuple[str, str | int]
+
+# A size is said again when it moved by more than this share of itself, and by more than two sigmas.
+WORTH_SAYING = 0.1
+# A change that no window has shown for so long is over: longer than the longest window.
+OVER_NS = 8_000_000_000
+
+
+class Ledger:
+    """Findings by key; `ended` are those that were over before the watch was."""
+
+    def __init__(self) -> None:
+        self.held: dict[Key, Finding] = {}
+        self.ended: list[Finding] = []
+        self._said: dict[Key, Finding] = {}
+        self._seen_ns: dict[Key, int] = {}
+
+    @property
+    def all(self) -> tuple[Finding, ...]:
+        """All that was found and not withdrawn, in the order of time."""
+        return tuple(sorted([*self.ended, *self.held.values()], key=lambda f: f.since_ns))
+
+    def put(self, finding: Finding) -> list[Finding]:
+        """Take in a finding; return it if it is worth saying."""
+        earlier = self.held.get(finding.key)
+        if earlier is not None and earlier.kind == finding.kind:
+            known = {"since_ns": earlier.since_ns, "found_ns": earlier.found_ns}
+            finding = finding.model_copy(update=known)
+        self._seen_ns[finding.key] = finding.said_ns
+        self.held[finding.key] = finding
+        if not _news(self._said.get(finding.key), finding):
+            return []
+        self._said[finding.key] = finding
+        return [finding]
+
+    def withdraw(self, keys: Iterable[Key]) -> list[Key]:
+        """Take back findings; return the keys of those that were held."""
+        gone = [key for key in keys if key in self.held]
+        for key in gone:
+            del self.held[key]
+            self._said.pop(key, None)
+        return gone
+
+    def end_unseen(self, now_ns: int) -> list[Finding]:
+        """End the changes that have not been seen of late; return them."""
+        said = []
+        for key, finding in list(self.held.items()):
+            if finding.kind == "collision":
+                if finding.until_ns is not None and now_ns - finding.until_ns > OVER_NS:
+                    self._end(key, finding)
+            elif now_ns - self._seen_ns[key] > OVER_NS:
+                said.append(finding.model_copy(update={"until_ns": self._seen_ns[key]}))
+                self._end(key, said[-1])
+        return said
+
+    def _end(self, key: Key, finding: Finding) -> None:
+        self.ended.append(finding)
+        self.withdraw([key])
+
+
+def _news(said: Finding | None, finding: Finding) -> bool:
+    if said is None or (said.kind, said.serial) != (finding.kind, finding.serial):
+        return True
+    if (said.until_ns is None) != (finding.until_ns is None):
+        return True
+    moved = abs(finding.size - said.size)
+    return finding.kind != "collision" and moved > max(WORTH_SAYING * abs(said.size), 2.0 * said.sigma)

@@ -1,0 +1,48 @@
+"""A robot to which nothing happens is left alone, whatever the network does to its feedback."""
+
+import pytest
+
+from coordinator.watching.watcher import Heard, Watcher
+from sim.experiments.watched_robot import Happening, watched
+from sim.experiments.watching import Alarms, Subject, WatchTrial, confusion, known_subject, settings_of
+
+ARM = Subject(robot="a2085_03", seed=3)
+
+
+def notes_of(subject: Subject, for_s: float, *happenings: Happening) -> tuple[Watcher, list[str]]:
+    known = known_subject(ARM)
+    watcher = Watcher(known.reference)
+    notes: list[str] = []
+
+    def say(heard: Heard, now_ns: int) -> None:
+        notes.extend(heard.notes)
+
+    watched(settings_of(known.robot, subject, 9), known.motions, for_s, watcher, say, happenings)
+    return watcher, notes
+
+
+def test_nothing_is_found_of_a_robot_that_has_not_changed() -> None:
+    watcher, notes = notes_of(ARM, 15.0)
+    assert watcher.ledger.all == ()
+    assert notes == []
+    assert watcher.looked_s > 14.0
+
+
+def test_a_poor_network_is_named_and_nothing_is_concluded_from_what_it_leaves() -> None:
+    watcher, notes = notes_of(ARM._replace(network="bad"), 15.0)
+    assert watcher.ledger.all == ()
+    assert any("the network is slow" in note for note in notes)
+
+
+def test_rates_have_the_interval_of_poisson() -> None:
+    # Garwood's table: none counted, at most 3.69; three counted, 0.619 to 8.77.
+    low, high = Alarms(0, 3600.0).interval_per_hour()
+    assert (low, high) == pytest.approx((0.0, 3.689), abs=1e-3)
+    assert Alarms(3, 3600.0).interval_per_hour() == pytest.approx((0.6187, 8.767), abs=1e-3)
+    assert Alarms(3, 7200.0).per_hour == 1.5
+
+
+def test_a_table_counts_what_was_taken_for_what() -> None:
+    trial = WatchTrial("wear", "payload", False, None, None, 1.0, None, 0, 10.0, ())
+    table = confusion([trial, trial._replace(found="wear"), trial])
+    assert table == {"wear": {"payload": 2, "wear": 1}}

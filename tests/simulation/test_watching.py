@@ -1,0 +1,47 @@
+"""Things happen to a known arm while it moves, and the watch says what, where and how large; else nothing."""
+
+import pytest
+
+from sim.experiments.watching import Happens, Subject, WatchTrial, watch_trial
+
+# One robot for all tests of the file, recorded once.
+ARM = Subject(robot="a2085_03", seed=3)
+SOON_S = 7.0
+
+
+def tried(happens: Happens, seed: int = 1) -> WatchTrial:
+    trial = watch_trial(happens, seed, ARM, SOON_S)
+    assert trial.found == happens, trial.words
+    assert trial.false_alarms == 0, trial.words
+    return trial
+
+
+def test_a_weight_is_told_from_a_blow_and_weighed() -> None:
+    trial = tried("payload")
+    assert trial.located
+    assert trial.latency_s is not None
+    # Two samples of 4 ms, the network, and a look every 20 ms; more where the weight comes on at standstill.
+    assert trial.latency_s < 0.1
+    assert trial.named_s is not None
+    assert trial.named_s < 4.0
+    assert trial.size_error == pytest.approx(0.0, abs=0.03 * trial.size)
+
+
+def test_a_blow_is_said_within_some_hundredths_of_a_second() -> None:
+    trial = tried("collision")
+    assert trial.latency_s is not None
+    assert trial.latency_s < 0.06
+
+
+def test_stiff_gears_are_the_drives_and_of_no_other_joint() -> None:
+    trial = tried("friction")
+    assert trial.located
+    # A third of the change: at first the window holds what was before.
+    assert trial.size_error == pytest.approx(0.0, abs=0.33 * trial.size)
+
+
+def test_a_link_that_slipped_is_no_payload_as_imus_see_it_too() -> None:
+    trial = tried("wear")
+    assert trial.located
+    # Also by the length along an axis that these seconds hardly show.
+    assert trial.size_error == pytest.approx(0.0, abs=0.33 * trial.size)
