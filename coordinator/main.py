@@ -15,7 +15,6 @@ from coordinator.dynamics.torque_scale import TorqueKind
 from coordinator.failure import EXIT_FAILED, EXIT_USAGE
 from coordinator.fit_dynamics_program import fit_dynamics
 from coordinator.float_program import float_robot
-from coordinator.float_program import float_robot
 from coordinator.identify import IdentificationError, identify
 from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
@@ -31,6 +30,7 @@ from coordinator.scaled_loop import check_speed
 from coordinator.session_file import SessionFileError
 from coordinator.terminal import Terminal
 from coordinator.viewer_choice import viewer_choice
+from coordinator.watch_program import watch_robot
 from module_agent.catalogue import UnknownModuleType
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.keys import check_chunk
@@ -285,8 +285,8 @@ def screenshot(
 
 app.command("check")(check_robot)
 app.command("payload")(find_payload)
+app.command("watch")(watch_robot)
 app.command("fit-dynamics")(fit_dynamics)
-app.command("float")(float_robot)
 app.command("float")(float_robot)
 
 
