@@ -20,6 +20,7 @@ from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
 from coordinator.kinematics.imu_intrinsics import ImuKind
 from coordinator.known_robot import KnownRobotError, known_within
 from coordinator.known_update import updated
+from coordinator.merge_program import merge
 from coordinator.payload_program import find_payload
 from coordinator.plan import Excitation, Mode, Motions
 from coordinator.recording import Recording
@@ -285,6 +286,7 @@ def screenshot(
 
 app.command("check")(check_robot)
 app.command("payload")(find_payload)
+app.command("merge")(merge)
 app.command("watch")(watch_robot)
 app.command("fit-dynamics")(fit_dynamics)
 app.command("float")(float_robot)

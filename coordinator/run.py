@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 from coordinator.agents_information import dynamic_steps
 from coordinator.beside import Beside
 from coordinator.clock import Clock
+from coordinator.dynamic_motions import INDEPENDENT_FRACTION
 from coordinator.excitation.of_robot import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.hrdf import write_hrdf
@@ -22,6 +23,7 @@ from coordinator.identify import (
     identify_kinematics,
     write_held_out,
 )
+from coordinator.information_file import RunInformation, write_information
 from coordinator.journal import JournalEvent, standstill
 from coordinator.kinematics.topology_advice import NextMotion
 from coordinator.known_difference import difference, joints_to_explore
@@ -35,7 +37,16 @@ from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.result import Result, write_result
 from coordinator.robot_link import RobotLink
 from coordinator.robot_so_far import RobotSoFar
-from coordinator.run_folder import HELD_OUT, HRDF, RESULT, SESSION, URDF, VIEW, open_run_folder
+from coordinator.run_folder import (
+    HELD_OUT,
+    HRDF,
+    INFORMATION,
+    RESULT,
+    SESSION,
+    URDF,
+    VIEW,
+    open_run_folder,
+)
 from coordinator.session import Session
 from coordinator.session_file import SessionWriter, read_session
 from coordinator.topology_search import doubtful_motions
@@ -344,3 +355,16 @@ def write_outputs(out: Path, found: Identified) -> None:
     write_hrdf(out / HRDF, found.kinematics.fit.chain, types, phi, found.result.robot)
     if found.held_out is not None:
         write_held_out(out / HELD_OUT, found.held_out)
+    if found.inertia is not None:
+        seen = found.inertia.seen
+        write_information(
+            out / INFORMATION,
+            RunInformation(
+                out.name,
+                found.kinematics.fit.chain,
+                seen.information,
+                seen.fit.torque_sigma_nm,
+                INDEPENDENT_FRACTION,
+                found.inertia.effects,
+            ),
+        )

@@ -10,13 +10,14 @@ from coordinator.recording import Recording
 from coordinator.session_file import SessionFileError, read_session
 from module_agent.wire.refusal import WireError
 
-SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT = (
+SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION = (
     "session.mcap",
     "session.rrd",
     "result.json",
     "robot.urdf",
     "robot.hrdf",
     "held_out.npz",
+    "information.npz",
 )
 ASIDE = "session.crashed.mcap"
 

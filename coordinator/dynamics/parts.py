@@ -1,0 +1,83 @@
+"""A robot's bodies as sums of parts that outlive it: what a module's joint turns, and what is held by it.
+
+Body i of a robot is the part of module i that turns, and of every module k that it carries the part that is
+held, with the link that leads to it: in whatever order modules are put together, those stay as they are as
+long as every link stays with the module that it leads to. The parameters of a module's parts are counted in
+the frame of its IMU at q = 0, which a robot that has measured itself knows of every module, so that
+phi_bodies = T phi_parts. What rests on the base no torque shows.
+
+A module that is mounted the other way round holds its output with the link, and turns its housing: those are
+other parts.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from coordinator.dynamics.base_parameters import Columns, inertial_columns
+from coordinator.dynamics.consistency import parameter_transform
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.regressor import PER_BODY
+
+Role = Literal["turned", "held"]
+
+
+class Part(NamedTuple):
+    """One part of a module, mounted forward or reversed."""
+
+    serial: str
+    role: Role
+    reversed: bool
+
+    @property
+    def name(self) -> str:
+        """In words: "J1 turned", "J2 held, reversed"."""
+        return f"{self.serial} {self.role}" + (", reversed" if self.reversed else "")
+
+
+def parts_of(chains: Iterable[Chain]) -> tuple[Part, ...]:
+    """Return the parts of all these robots, each once, in whatever order the robots come."""
+    roles: tuple[Role, ...] = get_args(Role)
+    found = {
+        Part(serial, role, bool(turned))
+        for chain in chains
+        for serial, turned in zip(chain.serials, chain.reversed, strict=True)
+        for role in roles
+    }
+    return tuple(sorted(found))
+
+
+def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
+    """Return the matrix T (10 n, 10 p), read-only, by which the bodies of a chain are made of parts.
+
+    phi_bodies = T phi_parts, the bodies' in the root frame as in `torque_regressor`, a part's in the frame of
+    its module's IMU at q = 0.
+
+    Raises:
+        ValueError: a part of the chain is not among them.
+    """
+    place = {part: k for k, part in enumerate(parts)}
+    found = np.zeros((PER_BODY * len(chain.serials), PER_BODY * len(parts)))
+    for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
+        into_root = parameter_transform(chain.imu_home[k])
+        roles: tuple[tuple[Role, int], ...] = (("turned", k), ("held", parent))
+        for role, body in roles:
+            part = Part(serial, role, bool(chain.reversed[k]))
+            if part not in place:
+                raise ValueError(f"{part.name} is not among the {len(parts)} parts")
+            if body >= 0:
+                found[_ten(body), _ten(place[part])] = into_root
+    found.flags.writeable = False
+    return found
+
+
+def part_columns(parts: Sequence[Part]) -> Columns:
+    """Return what the 10 p columns of `bodies_from_parts` are: those of a body each, named by the part."""
+    columns = inertial_columns(len(parts))
+    kinds = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+    return columns._replace(names=tuple(f"{kind}({part.name})" for part in parts for kind in kinds))
+
+
+def _ten(which: int) -> slice:
+    return slice(PER_BODY * which, PER_BODY * (which + 1))

@@ -1,0 +1,111 @@
+"""`information.npz`: what a run's torques say, with the chain that it was computed with; versioned."""
+
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from module_agent.dynamics.chain import Array, Chain
+from module_agent.dynamics.information import JointInformation
+
+VERSION = 1
+
+
+class RunInformation(NamedTuple):
+    """The information in the torques of one run of a robot of n joints.
+
+    name: of the run. joints: (n,) in the columns of `torque_regressor`, whatever else was in the readings
+    taken off. sigma_nm: (n,) noise of the torques. independent_fraction: independent samples per sample.
+    effects: (k_i, j) of every joint: what errors that come as a whole, one deviation long, do to its rows, in
+    Nm (`dynamics.common_errors`).
+    """
+
+    name: str
+    chain: Chain
+    joints: tuple[JointInformation, ...]
+    sigma_nm: Array
+    independent_fraction: float
+    effects: tuple[Array, ...]
+
+
+class InformationFileError(ValueError):
+    """The file is not there, or does not hold what it should; the message names it."""
+
+
+def write_information(path: Path, run: RunInformation) -> None:
+    """Write the information of a run, whole or not at all."""
+    chain = run.chain
+    arrays: dict[str, Any] = {
+        "version": VERSION,
+        "serials": np.array(chain.serials),
+        "parent": np.array(chain.parent, dtype=np.int64),
+        "reversed": np.array(chain.reversed, dtype=bool),
+        **{name: getattr(chain, name) for name in ("axis", "point", "imu_home", "gravity")},
+        "sigma_nm": run.sigma_nm,
+        "independent_fraction": run.independent_fraction,
+        "rest_nm2": np.array([joint.rest for joint in run.joints]),
+        "samples": np.array([joint.samples for joint in run.joints], dtype=np.int64),
+    }
+    for k, joint in enumerate(run.joints):
+        arrays[f"r{k}"], arrays[f"z{k}"], arrays[f"effects{k}"] = joint.r, joint.z, run.effects[k]
+    temporary = path.with_name("information.part.npz")
+    np.savez_compressed(temporary, **arrays)
+    os.replace(temporary, path)
+
+
+def read_information(path: Path) -> RunInformation:
+    """Read the information of a run; its name is that of the folder.
+
+    Raises:
+        InformationFileError: no such file, another version, or not what it should be.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if int(file["version"]) != VERSION:
+                raise InformationFileError(f"{path} is of version {file['version']}, {VERSION} is read here")
+            return _run(path.parent.name, dict(file))
+    except OSError as error:
+        raise InformationFileError(
+            f"{path}: {error.strerror or error}; a run with dynamics writes it, and so does replaying one"
+        ) from error
+    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        if isinstance(error, InformationFileError):
+            raise
+        raise InformationFileError(f"{path} is not the information of a run: {error}") from error
+
+
+def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
+    for array in arrays.values():
+        array.flags.writeable = False
+    joints = len(arrays["serials"])
+    chain = Chain(
+        serials=tuple(str(serial) for serial in arrays["serials"]),
+        parent=tuple(int(parent) for parent in arrays["parent"]),
+        reversed=tuple(bool(turned) for turned in arrays["reversed"]),
+        axis=_checked(arrays["axis"], (joints, 3)),
+        point=_checked(arrays["point"], (joints, 3)),
+        imu_home=_checked(arrays["imu_home"], (joints, 4, 4)),
+        gravity=_checked(arrays["gravity"], (3,)),
+    )
+    rest, samples = _checked(arrays["rest_nm2"], (joints,)), arrays["samples"]
+    found = tuple(
+        JointInformation(
+            _checked(arrays[f"r{k}"], (len(arrays[f"z{k}"]), 10 * joints)),
+            _checked(arrays[f"z{k}"], (len(arrays[f"z{k}"]),)),
+            float(rest[k]),
+            int(samples[k]),
+        )
+        for k in range(joints)
+    )
+    sigma = _checked(arrays["sigma_nm"], (joints,))
+    count = arrays["effects0"].shape[-1]
+    effects = tuple(_checked(arrays[f"effects{k}"], (len(arrays[f"z{k}"]), count)) for k in range(joints))
+    return RunInformation(name, chain, found, sigma, float(arrays["independent_fraction"]), effects)
+
+
+def _checked(array: Any, shape: tuple[int, ...]) -> Array:
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"an array of shape {array.shape}, finite {shape} is needed")
+    return np.asarray(array, dtype=float)
