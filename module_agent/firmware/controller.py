@@ -36,6 +36,18 @@ UNSET = Command(None, None, None)
 Law = Callable[[Command, float, float, float], float]
 
 
+def pwm_per_rad_s(kind: ModuleType) -> float:
+    """Return what the velocity loop takes to hold a speed: the PWM of its back-EMF, by the motor's Kv."""
+    return kind.gear_ratio * 30.0 / (math.pi * kind.motor.velocity_constant_rpm_v * NOMINAL_VOLTAGE_V)
+
+
+def torque_at_full_pwm_nm(kind: ModuleType) -> float:
+    """Return what the effort loop takes full PWM to exert at rest, behind a gear of constant efficiency."""
+    motor = kind.motor
+    stalled_a = NOMINAL_VOLTAGE_V / motor.resistance_ohm
+    return stalled_a * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
+
+
 class Controller:
     """The three loops of one module under its control strategy.
 
@@ -43,20 +55,11 @@ class Controller:
     """
 
     def __init__(self, kind: ModuleType, gains: GainSet, dt_s: float):
-        motor = kind.motor
-        pwm_per_rad_s = kind.gear_ratio * 30.0 / (math.pi * motor.velocity_constant_rpm_v * NOMINAL_VOLTAGE_V)
-        torque_at_full_pwm = (
-            NOMINAL_VOLTAGE_V
-            / motor.resistance_ohm
-            * motor.torque_constant_nm_a
-            * kind.gear_ratio
-            * motor.efficiency
-        )
         self.gains = gains
         self._loops = (
             Pid(gains.position, dt_s),
-            Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s),
-            Pid(gains.effort, dt_s, 1.0 / torque_at_full_pwm),
+            Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s(kind)),
+            Pid(gains.effort, dt_s, 1.0 / torque_at_full_pwm_nm(kind)),
         )
         self.update: Law = _LAWS[gains.strategy](*self._loops)
 

@@ -1,7 +1,8 @@
 """Torque assistance (thesis 6.3.2, 6.3.3): how joints follow a motion with and without calculated torque.
 
-The efforts come from chain and parameters as the system identifies them on the same modules on another day.
-The true motion of the joints is held against the motion that was asked for.
+The efforts come from chain and parameters as the system identifies them on the same modules on another day,
+and make up for what the motors take by the catalogue (`coordinator.drive_ahead`). The true motion of the
+joints is held against the motion that was asked for.
 """
 
 from collections.abc import Mapping
@@ -10,6 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.drive_ahead import with_drive
 from coordinator.feed_forward import (
     Reference,
     SetPoints,
@@ -20,7 +22,7 @@ from coordinator.feed_forward import (
 )
 from coordinator.identify import identify
 from coordinator.plan import Plan
-from module_agent.catalogue import ModuleType
+from module_agent.catalogue import ModuleType, module_type
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.firmware.gains import default_gains
 from module_agent.wire.messages import GainSet, GoTo, Pattern, Rest
@@ -153,14 +155,16 @@ def follow(
     input mode; then comes the motion, and a rest after it.
     """
     movers = list(stage.patterns)
-    points = _phases(stage, model)
+    types = {module.serial: module_type(module.type) for module in stage.robot.modules}
+    kinds = [types[serial] for serial in movers]
+    sets = [_gain_set(kind, gains, mode) for kind in kinds]
+    points = [with_drive(phase, kinds, sets) for phase in _phases(stage, model)]
     try:
         with BenchRobot(stage.robot, seed, noise, noise_seed=TRIAL_DAY) as bench:
             bench.run(
                 {s: GoTo(target_rad=q, max_speed_rad_s=TRAVEL_RAD_S) for s, q in stage.start_rad.items()}
             )
-            kinds = {s: bench.by_serial[s].firmware.config.kind for s in movers}
-            bench.set_gains({s: _gain_set(kinds[s], gains, mode) for s in movers})
+            bench.set_gains(dict(zip(movers, sets, strict=True)))
             if delivery.network is None:
                 tracks = _on_module(bench, stage, points, mode)
             else:

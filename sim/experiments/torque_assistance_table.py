@@ -33,10 +33,10 @@ class Bar(NamedTuple):
 def bars(found: Sequence[Combination]) -> list[Bar]:
     """Judge all combinations: the thesis' arm under its gains and the factory's, and arms of six joints.
 
-    Under strategy 3 calculated torque has its limits. Friction is not in it; and an effort loop that is on
-    gives way to what it does not know: with P the position's gain, E the effort's and F its feed-forward, a
-    joint is as stiff as P / (E + F) [Nm/rad], and P / F without one. An arm that stands upright and whose
-    weight turns it over faster than that falls.
+    Under strategy 3 calculated torque has its limits: an effort loop that is on gives way to what it does
+    not know. With P the position's gain, E the effort's and F its feed-forward, a joint is as stiff as
+    P / (E + F) [Nm/rad], and P / F without one. An arm that stands upright and whose weight turns it over
+    faster than that falls, whatever it is told: it is unstable.
     """
     one = [each for each in found if each.case.alignment is not None]
     six = [each for each in found if each.case.alignment is None]

@@ -69,9 +69,9 @@ def test_under_torque_control_only_calculated_torque_comes_close_as_in_figure_55
     assert not third.unstable
     # The arm weighs 2.3 Nm, and P = 29 Nm/rad bears it only 76 mrad below where it should be.
     assert min(first.rms_error_rad, second.rms_error_rad) > 0.06
-    # Measured 7.6 mrad: friction and the gear's loss are not in the torque that is calculated.
-    assert third.rms_error_rad < 0.012
-    assert tried(CASE_4).gain > 5.0
+    # Measured 2.1 mrad: friction and winding of the single module are not quite the catalogue's.
+    assert third.rms_error_rad < 0.004
+    assert tried(CASE_4).gain > 20.0
 
 
 def test_the_factory_s_position_control_gains_by_calculated_torque_too() -> None:
@@ -79,9 +79,8 @@ def test_the_factory_s_position_control_gains_by_calculated_torque_too() -> None
         follow(stage_of(CASE_4, SEED), Gains(3), mode, ON_MODULE, vertical(), X5, SEED) for mode in (2, 3)
     )
     assert not third.unstable
-    # Measured 4.5 times. What is left is what the torque's feed-forward takes the motor for: it counts on
-    # 65 % of the motor's torque, and gets up to all of it where the gear is driven backwards.
-    assert second.rms_error_rad > 3.0 * third.rms_error_rad
+    # Measured 12.6 times; 6.9 times with the torque of the bodies alone.
+    assert second.rms_error_rad > 9.0 * third.rms_error_rad
 
 
 def test_the_thesis_settings_of_strategy_3_ring_even_with_calculated_torque() -> None:

@@ -1,0 +1,75 @@
+"""What a motor takes beside the torque of its spring, put into the torque's set-point.
+
+The effort of a module is its spring's. To exert it while it turns, the motor overcomes friction, the gear's
+loss and its own rotor's inertia, which all lie before the spring; the module's feed-forward knows of a
+constant efficiency and of the back-EMF. What it lacks is left to the loops, and shows as tracking error: of
+position control (strategy 3) as PWM / P. So the PWM that the motor will need is worked out from the
+catalogue,
+
+    X = tau + Jr thdd + b thd + Tc s(thd)        th = q + tau / k, s: the sign, smoothed about rest
+    K N i = X / eff where the motor drives, X where it is driven
+    u = (R i + K N thd) / 48 V
+
+and the set-point is raised until the effort loop puts out what is missing: its answer to a target is E + F,
+its gain and its feed-forward. Friction is a catalogue's figure that single modules miss by a tenth or more;
+the loops have what is left.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from coordinator.feed_forward import RATE_HZ, SetPoints
+from module_agent.catalogue import ModuleType
+from module_agent.dynamics.chain import Array
+from module_agent.dynamics.differentiation import differentiate
+from module_agent.firmware.controller import NOMINAL_VOLTAGE_V, pwm_per_rad_s, torque_at_full_pwm_nm
+from module_agent.wire.messages import GainSet
+
+# Friction comes up within this speed: at rest nobody knows which way it points.
+_SLOW_RAD_S = 0.02
+
+
+def with_drive(points: SetPoints, kinds: Sequence[ModuleType], gains: Sequence[GainSet]) -> SetPoints:
+    """Return set-points at 1 kHz whose efforts make up for what the motors take, one kind and gains a column.
+
+    A joint with a loop that integrates is left as it is: that finds out by itself, and what is added would
+    wind it up.
+
+    Raises:
+        ValueError: another number of kinds or gains than columns.
+    """
+    effort = points.effort_nm.copy()
+    for column, (kind, own) in enumerate(zip(kinds, gains, strict=True)):
+        integrates = own.position.ki or own.velocity.ki or own.effort.ki
+        if integrates or own.strategy not in _WITH_EFFORT:
+            continue
+        rate = points.reference.qd_rad_s[:, column]
+        tau = points.effort_nm[:, column]
+        known = own.effort.feed_forward / torque_at_full_pwm_nm(kind) * tau
+        if own.strategy != 2:
+            known = known + own.velocity.feed_forward * pwm_per_rad_s(kind) * rate
+        missing = motor_pwm(kind, tau, rate) - known
+        answer = own.effort.kp + own.effort.feed_forward / torque_at_full_pwm_nm(kind)
+        effort[:, column] += missing / answer
+    effort.flags.writeable = False
+    return SetPoints(points.reference, effort)
+
+
+_WITH_EFFORT = (2, 3, 4)
+
+
+def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array) -> Array:
+    """Return the PWM at 48 V (m,) under which a spring exerts `tau_nm` (m,) while it moves, at 1 kHz."""
+    motor = kind.motor
+    speed = qd_rad_s + differentiate(tau_nm, RATE_HZ) / kind.spring_nm_rad
+    change = differentiate(speed, RATE_HZ)
+    rotor = kind.gear_ratio**2 * motor.rotor_inertia_kg_m2
+    sign = np.tanh(speed / _SLOW_RAD_S)
+    net = tau_nm + rotor * change + motor.viscous_nm_s_rad * speed + motor.coulomb_nm * sign
+    # Between driving and being driven the loss goes over as friction does.
+    drives = 0.5 * (1.0 + np.sign(net) * sign)
+    gross = net * (1.0 + drives * (1.0 / motor.efficiency - 1.0))
+    per_amp = motor.back_emf_v_s_rad * kind.gear_ratio
+    found: Array = (motor.resistance_ohm * gross / per_amp + per_amp * speed) / NOMINAL_VOLTAGE_V
+    return found
