@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from coordinator.agents_information import AGREES_BELOW
+
 FILES = (
     "session.mcap",
     "session.rrd",
@@ -12,6 +14,7 @@ FILES = (
     "robot.urdf",
     "robot.hrdf",
     "held_out.npz",
+    "information.npz",
     "truth.json",
     "truth.npz",
     "score.json",
@@ -36,6 +39,11 @@ def test_processes_over_zenoh_find_what_virtual_time_finds_and_a_replay_finds_it
     assert score["topology_correct"]
     (scored,) = score["links"]
     assert abs(scored["link_length_error_mm"]) <= 0.05 * scored["link_length_true_mm"]
+
+    dynamics = json.loads((real / "result.json").read_text())["dynamics"]
+    # Every agent has told what its own torques say, and it is what the recording says of them.
+    assert dynamics["gathered_by"] == "agents"
+    assert dynamics["gathered_difference"] <= AGREES_BELOW
 
     done = programs.run("coordinator.main", "replay", str(real / "session.mcap"), "--out", str(again))
     assert done.returncode == 0, done.stderr
