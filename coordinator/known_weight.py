@@ -53,11 +53,22 @@ def known_weight(folder: Path) -> KnownWeight:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise KnownRobotError(f"{path} is no result of a run: {place}: {first['msg']}") from error
-    dynamics = result.dynamics
-    if dynamics is None:
+    if result.dynamics is None:
         raise KnownRobotError(
             f"{path} does not tell what the robot weighs: it was run with --no-dynamics; identify it again"
         )
+    return weight_of(result)
+
+
+def weight_of(result: Result) -> KnownWeight:
+    """Return what the robot of a result weighs.
+
+    Raises:
+        ValueError: the result is without inertia.
+    """
+    dynamics = result.dynamics
+    if dynamics is None:
+        raise ValueError("a result without dynamics does not tell what the robot weighs")
     chain = _chain(result.chain)
     phi = np.array(dynamics.phi) if dynamics.bodies is None else _phi(chain, dynamics.bodies)
     phi.flags.writeable = False

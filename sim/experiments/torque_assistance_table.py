@@ -54,8 +54,10 @@ def bars(found: Sequence[Combination]) -> list[Bar]:
 
 def _bar(asked: str, found: Sequence[Combination], keeps: Callable[[Combination], bool]) -> Bar:
     stable = [each for each in found if each.is_stable]
-    missed = tuple(_words(each) for each in stable if not keeps(each))
-    unstable = tuple(f"{_words(each)}: {each.follows[2].unstable}" for each in found if not each.is_stable)
+    missed = tuple(combination_words(each) for each in stable if not keeps(each))
+    unstable = tuple(
+        f"{combination_words(each)}: {each.follows[2].unstable}" for each in found if not each.is_stable
+    )
     return Bar(asked, len(stable), len(stable) - len(missed), missed, unstable)
 
 
@@ -154,7 +156,8 @@ def _robot(each: Combination) -> str:
     return each.case.alignment or f"{each.case.robot} {each.case.pose}"
 
 
-def _words(each: Combination) -> str:
+def combination_words(each: Combination) -> str:
+    """Return a combination in words: robot, gains, motion, and where set-points come from if from a host."""
     case = each.case
     read = f" {case.gains.reading}" if case.gains.reading else ""
     delivered = "" if case.delivery == ON_MODULE else f", {case.delivery.name}"
