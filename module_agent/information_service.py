@@ -83,10 +83,7 @@ class InformationService:
         return Answer(digest, numbers, total, request.offset, part)
 
     def _begin(self, request: InformationRequest, digest: bytes) -> None:
-        tracks = {
-            motion.motion_id: self._collection.tracks(request.sender, motion.motion_id)
-            for motion in request.motions
-        }
+        tracks = {motion.motion_id: self._collection.tracks(motion.motion_id) for motion in request.motions}
         if self._asked is not None and self._result is None:
             raise WireError(Refusal.BUSY, f"{self._serial} is computing what another request asks")
         self._asked, self._result = digest, None

@@ -56,24 +56,22 @@ class _Part:
         return self.log.missing(self.wanted.first_row, self.wanted.end_row)
 
 
-Motion = tuple[str, int]
-
-
 class MotionCollection:
-    """Keeps motions by who has asked for them and their number.
+    """Keeps motions by their number, which no two motions of a boot share, whoever has asked for them.
 
     `restless` says whether rows are still to be fetched, so that `poll` may have something to ask.
     """
 
     def __init__(self) -> None:
         self.restless = False
-        self._motions: dict[Motion, dict[str, _Part]] = {}
+        self._motions: dict[int, dict[str, _Part]] = {}
         self._open: list[_Part] = []
 
     def collect(self, request: CollectRequest, own: Mapping[str, History], now_ns: int) -> None:
         """Begin to keep a motion; rows of the process's `own` modules are copied from their histories.
 
-        `now_ns` is any one steady clock of this process.
+        What is kept of it already stays, of a module that has not booted since: the histories may have
+        forgotten it. `now_ns` is any one steady clock of this process.
 
         Raises:
             WireError: more rows than are kept, or own ones that are gone.
@@ -81,10 +79,10 @@ class MotionCollection:
         longest = max(wanted.end_row - wanted.first_row for wanted in request.rows)
         if not 0 < longest <= LONGEST_ROWS:
             raise WireError(Refusal.RANGE, f"{longest} rows of a motion, 1 to {LONGEST_ROWS} are kept")
-        parts = self._motions.setdefault((request.sender, request.motion_id), {})
+        parts = self._motions.setdefault(request.motion_id, {})
         for wanted in request.rows:
             known = parts.get(wanted.serial)
-            if known is not None and known.wanted == wanted and not known.gone:
+            if known is not None and known.wanted.boot == wanted.boot and not known.gone:
                 continue
             part = _Part(wanted, now_ns)
             if wanted.serial in own:
@@ -137,15 +135,15 @@ class MotionCollection:
                 wishes.append(AskHistory(part.wanted.serial, part.wanted.boot, first, end))
         return wishes
 
-    def tracks(self, sender: str, motion_id: int) -> dict[str, Track]:
+    def tracks(self, motion_id: int) -> dict[str, Track]:
         """Return the rows of a motion by serial.
 
         Raises:
             WireError: BUSY while some are on their way; GONE if they never come, or the motion is not known.
         """
-        parts = self._motions.get((sender, motion_id))
+        parts = self._motions.get(motion_id)
         if parts is None:
-            raise WireError(Refusal.GONE, f"motion {motion_id} of {sender} was not collected here")
+            raise WireError(Refusal.GONE, f"motion {motion_id} was not collected here")
         gone = [serial for serial, part in parts.items() if part.gone]
         if gone:
             raise WireError(Refusal.GONE, f"motion {motion_id}: rows of {', '.join(gone)[:200]} are gone")

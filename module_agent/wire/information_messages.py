@@ -30,7 +30,7 @@ class RowRange(Part):
 class CollectRequest(Message):
     """Ask a module to keep the rows of a motion, its own and those of other modules, which it fetches.
 
-    The same motion again is the same request; with other rows it takes the place of the former one.
+    The same motion again is the same request, and counts once.
     """
 
     sender: Name

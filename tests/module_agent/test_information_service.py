@@ -227,7 +227,7 @@ def test_a_motion_that_was_not_collected_is_named() -> None:
     found = InformationService("J0", MotionCollection(), worker)
     error = refusal(found, robot.request())
     assert error.reason is Refusal.GONE
-    assert "motion 1 of c was not collected here" in error.detail
+    assert "motion 1 was not collected here" in error.detail
     assert worker.jobs == []
 
 

@@ -35,9 +35,9 @@ def served(wish: AskHistory, of: History, boot: int = 7) -> Feedback:
     return Feedback(serial=wish.serial, boot=boot, seq=1, first_row=wish.first_row, count=count, rows=block)
 
 
-def refused(collection: MotionCollection, motion_id: int = 1, sender: str = "c") -> Refusal:
+def refused(collection: MotionCollection, motion_id: int = 1) -> Refusal:
     with pytest.raises(WireError) as caught:
-        collection.tracks(sender, motion_id)
+        collection.tracks(motion_id)
     return caught.value.reason
 
 
@@ -53,7 +53,7 @@ def test_own_rows_are_copied_and_others_are_asked_for_until_they_have_come() -> 
             collection.on_feedback(served(wish, other))
     # 590 rows, 256 to a question.
     assert asked == 3
-    tracks = collection.tracks("c", 1)
+    tracks = collection.tracks(1)
     assert np.allclose(tracks[OTHER].position_rad, 0.002 * np.arange(10, 600))
     assert np.allclose(tracks[OWN].position_rad, 0.001 * np.arange(10, 600))
     assert list(tracks[OWN].t_ns[:2]) == [40_000_000, 44_000_000]
@@ -71,18 +71,30 @@ def test_the_same_motion_again_is_kept_once_and_fetched_once() -> None:
     collection = MotionCollection()
     own = {OWN: history(700), OTHER: history(700)}
     collection.collect(request(), own, 0)
-    before = collection.tracks("c", 1)
+    before = collection.tracks(1)
     collection.collect(request(), {}, 0)
-    assert collection.tracks("c", 1) == before
+    assert collection.tracks(1) == before
     assert collection.poll(0) == []
 
 
-def test_a_motion_that_was_done_again_takes_the_place_of_the_former_one() -> None:
+def test_what_is_kept_stays_when_another_coordinator_goes_on_and_the_histories_have_forgotten() -> None:
+    """A session that is resumed asks again for the motions of before, by clocks that it maps anew."""
+    collection = MotionCollection()
+    collection.collect(request(), {OWN: history(700), OTHER: history(700)}, 0)
+    before = collection.tracks(1)
+    later = History(1000)
+    for number in range(2500):
+        later.append((4_000_000 * number, 4_000_000 * number, 0, 0, 0.0, *[0.5] * 17))
+    collection.collect(request(first=12, end=603, sender="another"), {OWN: later, OTHER: later}, 0)
+    assert collection.tracks(1) == before
+
+
+def test_rows_of_a_module_that_has_booted_anew_take_the_place_of_the_former_ones() -> None:
     collection = MotionCollection()
     own = {OWN: history(700), OTHER: history(700)}
     collection.collect(request(), own, 0)
-    collection.collect(request(first=100, end=200), own, 0)
-    assert len(collection.tracks("c", 1)[OWN].t_ns) == 100
+    collection.collect(request(first=100, end=200, boot=8), own, 0)
+    assert len(collection.tracks(1)[OWN].t_ns) == 100
 
 
 def test_rows_of_another_boot_do_not_count() -> None:
@@ -92,7 +104,7 @@ def test_rows_of_another_boot_do_not_count() -> None:
     collection.on_feedback(served(wish, history(700), boot=8))
     assert refused(collection) is Refusal.BUSY
     collection.on_feedback(served(wish, history(700)))
-    assert len(collection.tracks("c", 1)[OTHER].t_ns) == 10
+    assert len(collection.tracks(1)[OTHER].t_ns) == 10
 
 
 @pytest.mark.parametrize("end", ["refused", "silent"])
@@ -109,11 +121,10 @@ def test_rows_that_never_come_are_said_to_be_gone(end: str) -> None:
     assert not collection.restless
 
 
-def test_a_motion_of_somebody_else_or_of_another_number_is_not_known() -> None:
+def test_a_motion_of_another_number_is_not_known() -> None:
     collection = MotionCollection()
     collection.collect(request(), {OWN: history(700), OTHER: history(700)}, 0)
     assert refused(collection, 2) is Refusal.GONE
-    assert refused(collection, 1, "another") is Refusal.GONE
 
 
 def test_own_rows_that_are_gone_or_too_many_rows_are_refused() -> None:
@@ -132,4 +143,4 @@ def test_the_oldest_motions_make_room(monkeypatch: Any) -> None:
         collection.collect(request(number), own, 0)
     assert refused(collection, 0) is Refusal.GONE
     assert refused(collection, 1) is Refusal.GONE
-    assert set(collection.tracks("c", 3)) == {OWN, OTHER}
+    assert set(collection.tracks(3)) == {OWN, OTHER}
