@@ -64,6 +64,10 @@ def watch_robot(
 
     Moves nothing and takes no lease. Exit codes: 0 nothing was found, 4 something was, others as of `run`.
     """
+    if json_file is not None and not json_file.parent.is_dir():
+        fail(f"{json_file}: there is no folder {json_file.parent}", EXIT_USAGE)
+    if recording is not None and not recording.is_file():
+        fail(f"{recording}: there is no such file; give the session.mcap of a run", EXIT_USAGE)
     reference = _reference(known)
     watcher = Watcher(reference, alarms_per_hour)
     try:

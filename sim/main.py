@@ -17,6 +17,7 @@ from sim.effects_page import OFF, default_size, page, sizes
 from sim.experiments.estimator_program import estimators
 from sim.experiments.program import amplitudes
 from sim.experiments.torque_assistance_program import assistance
+from sim.experiments.watching_program import watching
 from sim.log_program import compare_log
 from sim.noise_profile import NOISE_PROFILES
 from sim.robot_file import load_robot, shipped_robots
@@ -94,6 +95,7 @@ app.command("score")(score_run)
 app.command()(amplitudes)
 app.command()(estimators)
 app.command()(assistance)
+app.command()(watching)
 app.command()(compare_log)
 app.add_typer(benchmark, name="benchmark")
 

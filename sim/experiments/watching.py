@@ -40,6 +40,7 @@ DAYS = 1000
 KNOWN_PLAN = Plan(
     mode="whole", excitation="designed", excitation_motions=6, excitation_s=5.0, imu="calibrated"
 )
+BRIEF = {"excitation_motions": 4, "excitation_s": 4.0}
 MOTION_S, MOTIONS = 4.0, 6
 # It happens in here; the watch goes on for so long.
 EARLIEST_S, LATEST_S, AFTER_S = 8.0, 12.0, 14.0
@@ -89,12 +90,26 @@ class Alarms(NamedTuple):
 
 
 class Subject(NamedTuple):
-    """Which robot is watched: `seed` draws its modules and the place where it stands."""
+    """Which robot is watched: `seed` draws its modules and the place where it stands.
+
+    brief: it is known from half as much motion, and things happen sooner.
+    """
 
     robot: str = "a2085_03"
     noise: str = "x5"
     network: str = "lan"
     seed: int = 0
+    brief: bool = False
+
+    @property
+    def plan(self) -> Plan:
+        """The plan of the run that it is known from."""
+        return KNOWN_PLAN.model_copy(update=BRIEF) if self.brief else KNOWN_PLAN
+
+    @property
+    def between_s(self) -> tuple[float, float]:
+        """Between which times it happens, whatever it is."""
+        return (4.0, 5.0) if self.brief else (EARLIEST_S, LATEST_S)
 
 
 ARM = Subject()
@@ -125,7 +140,8 @@ def watch_trial(happens: Happens, seed: int, subject: Subject = ARM, after_s: fl
         after_s: how long the watch goes on after it.
     """
     known = known_subject(subject)
-    event = _draw(happens, np.random.default_rng((seed, subject.seed, 0x3A7C)), known.robot)
+    rng = np.random.default_rng((seed, subject.seed, 0x3A7C))
+    event = _draw(happens, rng, known.robot, float(rng.uniform(*subject.between_s)))
     watcher = Watcher(known.reference)
     said: list[Finding] = []
 
@@ -151,7 +167,7 @@ def false_alarms(seed: int, for_s: float, subject: Subject = ARM) -> Alarms:
 def known_subject(subject: Subject) -> Watched:
     """Return a robot, what a run tells of it, and other motions than those of that run."""
     robot = somewhere(load_robot(subject.robot), subject.seed)
-    recording = record_session(settings_of(robot, subject, 0), KNOWN_PLAN)
+    recording = record_session(settings_of(robot, subject, 0), subject.plan)
     known = KnownRobot(Path("the known run"), recording, identify_kinematics(recording))
     plan = KNOWN_PLAN.model_copy(update={"excitation_s": MOTION_S, "excitation_motions": MOTIONS})
     # Other motions than those that it is known from.
@@ -170,8 +186,7 @@ def settings_of(robot: Robot, subject: Subject, day: int) -> VirtualSettings:
     )
 
 
-def _draw(happens: Happens, rng: np.random.Generator, robot: Robot) -> _Event:
-    at_s = float(rng.uniform(EARLIEST_S, LATEST_S))
+def _draw(happens: Happens, rng: np.random.Generator, robot: Robot, at_s: float) -> _Event:
     serial = str(rng.choice(robot.serials))
     match happens:
         case "nothing":

@@ -6,7 +6,7 @@ from coordinator.watching.watcher import Heard, Watcher
 from sim.experiments.watched_robot import Happening, watched
 from sim.experiments.watching import Alarms, Subject, WatchTrial, confusion, known_subject, settings_of
 
-ARM = Subject(robot="a2085_03", seed=3)
+ARM = Subject(robot="a2085_03", seed=3, brief=True)
 
 
 def notes_of(subject: Subject, for_s: float, *happenings: Happening) -> tuple[Watcher, list[str]]:
@@ -22,14 +22,14 @@ def notes_of(subject: Subject, for_s: float, *happenings: Happening) -> tuple[Wa
 
 
 def test_nothing_is_found_of_a_robot_that_has_not_changed() -> None:
-    watcher, notes = notes_of(ARM, 15.0)
+    watcher, notes = notes_of(ARM, 12.0)
     assert watcher.ledger.all == ()
     assert notes == []
-    assert watcher.looked_s > 14.0
+    assert watcher.looked_s > 11.0
 
 
 def test_a_poor_network_is_named_and_nothing_is_concluded_from_what_it_leaves() -> None:
-    watcher, notes = notes_of(ARM._replace(network="bad"), 15.0)
+    watcher, notes = notes_of(ARM._replace(network="bad"), 12.0)
     assert watcher.ledger.all == ()
     assert any("the network is slow" in note for note in notes)
 

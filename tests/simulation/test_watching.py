@@ -5,8 +5,8 @@ import pytest
 from sim.experiments.watching import Happens, Subject, WatchTrial, watch_trial
 
 # One robot for all tests of the file, recorded once.
-ARM = Subject(robot="a2085_03", seed=3)
-SOON_S = 7.0
+ARM = Subject(robot="a2085_03", seed=3, brief=True)
+SOON_S = 6.0
 
 
 def tried(happens: Happens, seed: int = 1) -> WatchTrial:

@@ -1,0 +1,70 @@
+"""The command looks at a recording as if it happened now, and says by its exit code what it found."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from coordinator.main import app
+from coordinator.terminal import Terminal
+from sim.experiments.watching import Subject
+from sim.loaded import loaded
+from sim.parts import FreePose
+from sim.robot_file import load_robot
+from sim.virtual_robot import VirtualRobot
+from sim.virtual_run import VirtualConfig, run_virtual
+
+ARM = load_robot("a2085_03")
+HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
+GRASPED_S = 20.0
+
+
+def lived(out: Path, day: int, grasps: bool, dynamics: bool = True) -> Path:
+    plan = Subject(brief=True).plan.model_copy(update={"dynamics": dynamics})
+
+    def between(robot: VirtualRobot) -> None:
+        if grasps:
+            full = loaded(ARM, ARM.serials[-1], HELD)
+            robot.loop.schedule_ns(round(GRASPED_S * 1e9), lambda: robot.world.become(full))
+
+    config = VirtualConfig(ARM, out, seed=6, noise_seed=day, network="lan", noise="x5", plan=plan)
+    run_virtual(config, Terminal(True), between)
+    return out
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return lived(tmp_path_factory.mktemp("watch") / "known", 0, False)
+
+
+def watch(*words: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["watch", *words])
+    return done.exit_code, done.output
+
+
+def test_the_run_that_a_robot_is_known_from_is_quiet(known: Path) -> None:
+    code, said = watch(str(known), "--recording", str(known / "session.mcap"))
+    assert code == 0, said
+    assert "nothing is other than it was" in said
+
+
+def test_what_the_robot_grasped_meanwhile_is_found_and_written_down(known: Path, tmp_path: Path) -> None:
+    later = lived(tmp_path / "later", 1, True)
+    file = tmp_path / "found.jsonl"
+    code, said = watch(str(known), "--recording", str(later / "session.mcap"), "--json", str(file))
+    assert code == 4, said
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    (finding,) = lines[-1]["findings"]
+    assert (finding["kind"], finding["serial"]) == ("payload", ARM.serials[-1])
+    # 3 %, as a payload that is searched for.
+    assert finding["size"] == pytest.approx(0.2, abs=0.006)
+    assert finding["since_ns"] == pytest.approx(GRASPED_S * 1e9, abs=1e9)
+
+
+def test_wrong_usage_is_answered_with_what_would_be_right(known: Path, tmp_path: Path) -> None:
+    assert watch(str(tmp_path))[0] == 2
+    code, said = watch(str(known), "--recording", str(tmp_path / "none.mcap"))
+    assert code == 2
+    assert "none.mcap" in said
+    assert watch(str(known), "--json", str(tmp_path / "no" / "file"), "--recording", "x")[0] == 2
