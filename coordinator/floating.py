@@ -190,6 +190,8 @@ class Floater:
             if strange:
                 self._fault(t_s, reading, strange)
             else:
+                # It has given meanwhile, and stiffer gains are to come: they shall not snatch it back.
+                self._place = reading.q_rad.copy()
                 self._enter("loaded", t_s)
         elif self.phase == "freeing":
             self._enter("floating", t_s)

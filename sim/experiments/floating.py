@@ -12,11 +12,14 @@ import numpy as np
 
 from coordinator.float_session import FloatPlan, FloatSession, Moment
 from coordinator.float_summary import FloatSummary
+from coordinator.identify import identify
 from coordinator.interruption import run_to_end
 from coordinator.kinematics.forward import body_displacements
-from coordinator.known_weight import KnownWeight
+from coordinator.known_weight import KnownWeight, weight_of
+from coordinator.plan import Plan
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.wire.network_file import network
+from sim.experiments.arm_trial import imu_kind
 from sim.noise_profile import NoiseProfile
 from sim.pose import read_only
 from sim.push import Push
@@ -24,6 +27,7 @@ from sim.robot_file import Robot
 from sim.robot_tree import true_chain, true_inertia
 from sim.virtual_loop import VirtualLoop
 from sim.virtual_robot import VirtualRobot, VirtualSettings
+from sim.virtual_session import record_session
 
 COORDINATOR = "coordinator"
 # From the start of the world to a robot that floats, and half a second more.
@@ -157,6 +161,17 @@ def true_weight(robot: Robot) -> KnownWeight:
     """Return what a simulated robot weighs, as if it had been identified without error."""
     types = tuple(module.type for module in robot.modules)
     return KnownWeight(robot.name, types, true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
+
+
+def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> KnownWeight:
+    """Return what a robot weighs by a whole session on it, as a run would write it down.
+
+    Raises:
+        what `record_session` and `identify` raise.
+        ValueError: the plan leaves out the dynamics.
+    """
+    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
+    return weight_of(identify(record_session(settings, plan or Plan(imu=imu_kind(noise)))).result)
 
 
 def posed(robot: Robot, start_rad: Mapping[str, float]) -> Robot:

@@ -90,6 +90,14 @@ def test_before_it_is_set_free_the_joint_goes_over_from_the_torque_that_it_bears
     assert it.phase == "loaded"
 
 
+def test_where_it_has_given_while_it_was_held_softly_it_is_not_snatched_back() -> None:
+    it = floater()
+    it.step(10.0, reading())
+    it.step(10.8, reading(q=0.2))
+    assert it.phase == "loaded"
+    assert place(it.step(10.9, reading(q=0.2))) == pytest.approx(0.2)
+
+
 def test_the_position_loop_lets_go_little_by_little_and_pulls_to_where_it_held() -> None:
     it = loaded()
     it.let_go(11.0)
