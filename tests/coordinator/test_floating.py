@@ -20,6 +20,8 @@ from module_agent.catalogue import CATALOGUE
 from module_agent.dynamics.chain import Chain
 from module_agent.firmware.config import catalogue_limits
 from module_agent.wire.messages import Limits
+from sim.experiments.floating import true_weight
+from sim.robot_file import load_robot
 
 X5_4 = CATALOGUE["X5-4"]
 G_M_S2, MASS_KG, REACH_M = 9.81, 0.8, 0.3
@@ -114,6 +116,24 @@ def test_free_it_is_asked_for_its_weight_wherever_it_is_led() -> None:
         found = it.step(12.0 + k, reading(q=q, rate=0.4, effort=0.0))
         assert found.position_rad is None
         assert found.effort_nm[0] == pytest.approx(LEVEL_NM * np.cos(q))
+
+
+@pytest.mark.parametrize("velocity_forces", [False, True])
+def test_velocity_forces_are_borne_if_asked_for(velocity_forces: bool) -> None:
+    arm = true_weight(load_robot("a2085_03"))
+    settings = SETTINGS._replace(velocity_forces=velocity_forces, max_speed_rad_s=5.0)
+    it = Floater(arm, (limits(),) * 3, settings)
+    q, rate = np.array([0.1, 0.4, -0.6]), np.array([1.0, 1.5, -1.0])
+    at_rest = arm.effort_nm(q, np.zeros(3))
+    still = Reading(np.full(3, 0.01), q, np.zeros(3), at_rest)
+    for t_s in (10.0, 10.8):
+        it.step(t_s, still)
+    it.let_go(11.0)
+    it.step(11.8, still)
+    found = it.step(12.0, still._replace(qd_rad_s=rate)).effort_nm
+    # Newton metres by the tens of milli, of a small arm at a good speed.
+    assert np.abs(arm.effort_nm(q, rate) - at_rest).max() > 5e-3
+    np.testing.assert_allclose(found, arm.effort_nm(q, rate) if velocity_forces else at_rest, atol=1e-12)
 
 
 def test_only_what_has_the_gains_of_torque_control_is_set_free() -> None:

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from coordinator.kinematics.forward import body_displacements
 from module_agent.dynamics.chain import Chain
+from sim.launcher import LaunchConfig, Launcher
 from sim.main import app
 from sim.noise_profile import NOISE_PROFILES
 from sim.parts import FreePose
@@ -18,6 +19,7 @@ from sim.pose import Array
 from sim.push import Push, parse_push
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
+from sim.virtual_run import VirtualConfig
 from sim.world import World
 
 ARM = "a2085_03"
@@ -142,3 +144,25 @@ def test_a_push_on_no_module_of_the_robot_is_wrong_usage_and_names_the_modules(
     assert "a push on 'Q', which is no module here; there are" in done.output
     assert TIP in done.output
     assert not list(tmp_path.iterdir())
+
+
+def test_a_launcher_hands_pushes_on_to_its_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pushes = ("serial=A,force_n=[0,0,1],for_s=1", "serial=B,force_n=[0,0,2],for_s=1")
+    launcher = Launcher(LaunchConfig(ARM, ARM, ("A", "B"), tmp_path, pushes=pushes), lambda text: None)
+    asked: list[str] = []
+    monkeypatch.setattr(launcher, "_start", lambda name, arguments: asked.extend(arguments))
+    monkeypatch.setattr(launcher, "_wait", lambda ready, child, what: None)
+    launcher.start_world()
+    launcher.stop()
+    assert [asked[k + 1] for k, word in enumerate(asked) if word == "--push"] == list(pushes)
+
+
+def test_a_virtual_run_is_pushed_as_its_command_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    configs: list[VirtualConfig] = []
+    monkeypatch.setattr("sim.run_program._run_virtual", lambda config, quiet: configs.append(config))
+    monkeypatch.setattr("sim.run_program.print_score", lambda folder: None)
+    text = f"serial={TIP},force_n=[0,0,1],from_s=3,for_s=1"
+    out = str(tmp_path / "run")
+    done = CliRunner().invoke(app, ["run", ARM, "--virtual", "--out", out, "--push", text])
+    assert done.exit_code == 0, done.output
+    assert configs[0].pushes == (parse_push(text),)
