@@ -53,7 +53,6 @@ class MergeReport(Piece):
     parts: list[str]
     parameters: int
     rank: int
-    identified: int
     gain: float
     runs: list[RunPart]
     sums: list[SumPart]
@@ -67,7 +66,6 @@ def merge_report(found: MergedInformation) -> MergeReport:
         parts=[part.name for part in found.parts],
         parameters=len(base.columns.names),
         rank=base.rank,
-        identified=int(np.sum(relative < IDENTIFIED_BELOW)),
         gain=found.gain,
         runs=[_run(run) for run in found.runs],
         sums=[
@@ -98,7 +96,7 @@ def table(report: MergeReport) -> Table:
     """Return the runs in rows."""
     title = f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts"
     found = Table(
-        "run", "modules", "rank", "below 10 %", "by all", "sigma by all / alone", "strain", title=title
+        "run", "modules", "rank", "below 10 %", "so by all", "sigma by all / alone", "strain", title=title
     )
     for run in report.runs:
         found.add_row(
@@ -110,7 +108,7 @@ def table(report: MergeReport) -> Table:
             f"{run.gain:.2f}",
             f"{run.strain:.1f}",
         )
-    found.add_row("together", "", str(report.rank), "", str(report.identified), f"{report.gain:.2f}", "")
+    found.add_row("together", "", str(report.rank), "", "", f"{report.gain:.2f}", "")
     return found
 
 
