@@ -37,8 +37,9 @@ from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Transport
 
 BACK_RAD_S = 0.5
-# The feedback that is acted on is at most so much of a command's life old: the rest is for the way back.
-STALE_SHARE = 0.5
+# The feedback that is acted on is at most so much of a command's life old; a little later the modules would
+# refuse what follows from it.
+STALE_SHARE = 0.8
 # Nearer than this a joint is where it shall be.
 _THERE_RAD = 1e-3
 # Gravity is felt for a tenth of a second.

@@ -181,7 +181,7 @@ def test_when_an_agent_dies_the_others_are_told_to_stop_and_it_is_named(rigs: Ca
     rig = rigs(ARM, "lan")
     floating, seen = session(rig)
     rig.when(lambda: seen.floats, lambda: rig.kill(ELBOW))
-    with pytest.raises(StaleFeedback, match=f"module {ELBOW} was last heard 1[23]"):
+    with pytest.raises(StaleFeedback, match=f"module {ELBOW} was last heard 20"):
         rig.run(floating.run())
     assert [rig.state(serial) for serial in rig.hosts] == ["stopped", "stopped"]
     assert seen.notes[-1].startswith("stopped: module elbow was last heard")
