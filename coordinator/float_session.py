@@ -158,7 +158,7 @@ class FloatSession:
             end_s = self._now_s() + self._plan.then_hold_s
             await self._until(lambda: self._now_s() >= end_s, streaming)
             await _cancelled(streaming)
-            await self._leave(stood.q_rad)
+            await self._leave(floater.place_rad, stood.q_rad)
         except BaseException as error:
             if streaming is not None:
                 await _cancelled(streaming)
@@ -255,13 +255,13 @@ class FloatSession:
 
     # ------------------------------------------------------------------ the end
 
-    async def _leave(self, stood_rad: Array) -> None:
+    async def _leave(self, held_rad: Array, stood_rad: Array) -> None:
         """Lead the robot back to where it stood, where its motors were off before, and let go of it."""
+        held, stood = (dict(zip(self._serials, q.tolist(), strict=True)) for q in (held_rad, stood_rad))
         keeper = asyncio.create_task(self._link.keep_alive())
         try:
             if self._plan.is_led_back:
-                held = {s: float(self._newest(s)["position_command_rad"][0]) for s in self._serials}
-                patterns = _together_to(held, dict(zip(self._serials, stood_rad.tolist(), strict=True)))
+                patterns = _together_to(held, stood)
                 await self._link.run(patterns, self._efforts(patterns, held))
             await self._link.release_all()
         finally:

@@ -108,6 +108,17 @@ class Floater:
         self._place: Array | None = None
         self._borne = np.zeros(len(limits))
 
+    @property
+    def place_rad(self) -> Array:
+        """Where it holds the joints, or last held them (n,).
+
+        Raises:
+            ValueError: it has not been stepped yet.
+        """
+        if self._place is None:
+            raise ValueError("it holds nothing before its first step")
+        return self._place
+
     def check_start(self, reading: Reading) -> None:
         """Check that the robot may be set free where it is; to be called before it is taken.
 
