@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from coordinator.clock import Clock
-from coordinator.feed_forward import feed_forward, joint_reference, on_module
+from coordinator.feed_forward import feed_forward, joint_reference, on_module, paths_together
 from coordinator.float_summary import FloatSummary, FloatTally
 from coordinator.floating import (
     Floater,
@@ -30,9 +30,8 @@ from coordinator.recording import Entry, Recording
 from coordinator.robot_link import KEEP_ALIVE_S, POLL_S, RobotLink
 from coordinator.together import together
 from module_agent.dynamics.chain import Array
-from module_agent.firmware.waveform import duration_s
 from module_agent.wire.feedback_rows import STATE_NAMES, Rows
-from module_agent.wire.messages import EffortProfile, GoTo, Message, Pattern, Rest
+from module_agent.wire.messages import EffortProfile, Message, Pattern
 from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Transport
 
@@ -40,8 +39,6 @@ BACK_RAD_S = 0.5
 # The feedback that is acted on is at most so much of a command's life old; a little later the modules would
 # refuse what follows from it.
 STALE_SHARE = 0.8
-# Nearer than this a joint is where it shall be.
-_THERE_RAD = 1e-3
 # Gravity is felt for a tenth of a second.
 _FELT_ROWS = 25
 # Rows that are kept; older ones are dropped every so often.
@@ -261,7 +258,7 @@ class FloatSession:
         keeper = asyncio.create_task(self._link.keep_alive())
         try:
             if self._plan.is_led_back:
-                patterns = _together_to(held, stood)
+                patterns = paths_together(held, stood, BACK_RAD_S)
                 await self._link.run(patterns, self._efforts(patterns, held))
             await self._link.release_all()
         finally:
@@ -305,23 +302,6 @@ class FloatSession:
             record.rows.forget_before(record.rows.end_row - _KEPT_ROWS)
             del record.arrivals[:-1]
             record.round_trips.clear()
-
-
-def _together_to(origins_rad: Mapping[str, float], targets_rad: Mapping[str, float]) -> dict[str, Pattern]:
-    """Return paths that end at the same time, the longest at `BACK_RAD_S`."""
-    ways = {serial: abs(target - origins_rad[serial]) for serial, target in targets_rad.items()}
-    longest = max(ways, key=lambda serial: ways[serial])
-    last = GoTo(target_rad=targets_rad[longest], max_speed_rad_s=BACK_RAD_S)
-    total_s = duration_s(last, origins_rad[longest])
-    found: dict[str, Pattern] = {}
-    for serial, way in ways.items():
-        # The peak of a minimum-jerk path is 15/8 of its mean speed.
-        speed = 1.875 * way / total_s
-        still = way < _THERE_RAD
-        found[serial] = (
-            Rest(duration_s=total_s) if still else GoTo(target_rad=targets_rad[serial], max_speed_rad_s=speed)
-        )
-    return found
 
 
 async def _cancelled(task: "asyncio.Task[None]") -> None:
