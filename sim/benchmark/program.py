@@ -12,9 +12,11 @@ from coordinator.failure import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from coordinator.interruption import SIGNALS
 from coordinator.plan import Motions
 from coordinator.terminal import Terminal
+from sim.benchmark import dynamics as dynamic
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.kinematics import QUICK, TRIALS, chosen, full, kinematic_cases, over_all
 from sim.benchmark.plot import plot
+from sim.benchmark.recorded import MOTION, URDF
 from sim.benchmark.results import Results, gathered, write_results
 from sim.benchmark.runner import run_cases
 from sim.benchmark.table import print_rows
@@ -30,14 +32,49 @@ app = typer.Typer(
 )
 
 
-@app.callback()
-def _benchmark() -> None:
-    """Keep `kinematics` a command of its own name."""
+JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file to write.")]
+Only = Annotated[str, typer.Option(help="Cases whose name holds this; * and ? stand for anything.")]
+Processes = Annotated[
+    int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
+]
+
+
+@app.command()
+def dynamics(
+    json_file: JsonFile = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Every row in a minute on two cores: one trial each, with motions cut short."
+        ),
+    ] = False,
+    trials: Annotated[int | None, typer.Option(min=1, help=f"Trials a case [{dynamic.TRIALS}].")] = None,
+    seed: Seed = 0,
+    tx40: Annotated[
+        Path | None,
+        typer.Option(help="Folder with a Staubli TX40's recording too: tx40.urdf and motion.npz."),
+    ] = None,
+    only: Only = "",
+    processes: Processes = None,
+) -> None:
+    """Measure regressor, inertia, payloads, shared work, assistance and watching, against the truth.
+
+    Exit codes as of `kinematics`.
+    """
+    if quick and trials is not None:
+        fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
+    effort = dynamic.QUICK if quick else dynamic.full(trials or dynamic.TRIALS)
+    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only} | effort._asdict()
+    for name in (URDF, MOTION):
+        if tx40 is not None and not (tx40 / name).is_file():
+            fail(f"--tx40 {tx40}: there is no {name} in it", EXIT_USAGE)
+    cases = dynamic.dynamic_cases(effort, seed, tx40)
+    _benchmark("dynamics", cases, settings, only, processes, json_file, None)
 
 
 @app.command()
 def kinematics(
-    json_file: Annotated[Path | None, typer.Option("--json", help="JSON file to write.")] = None,
+    json_file: JsonFile = None,
     plot_file: Annotated[Path | None, typer.Option("--plot", help="Picture to write: PNG, SVG, PDF.")] = None,
     quick: Annotated[
         bool,
@@ -53,10 +90,8 @@ def kinematics(
     ] = None,
     seed: Seed = 0,
     motions: Annotated[Motions, typer.Option(help="How whole arms explore joint by joint.")] = "designed",
-    only: Annotated[str, typer.Option(help="Cases whose name holds this; * and ? stand for anything.")] = "",
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
-    ] = None,
+    only: Only = "",
+    processes: Processes = None,
 ) -> None:
     """Compare the thesis' estimator, ours and the physical limit on the same recordings of simulated robots.
 
@@ -65,19 +100,32 @@ def kinematics(
     """
     if quick and trials is not None:
         fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
+    effort = QUICK if quick else full(trials or TRIALS)
+    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "motions": motions}
+    settings |= effort._asdict()
+    cases = kinematic_cases(effort, seed, motions)
+    _benchmark("kinematics", cases, settings, only, processes, json_file, plot_file)
+
+
+def _benchmark(
+    name: str,
+    cases: list[Case],
+    settings: dict[str, object],
+    only: str,
+    processes: int | None,
+    json_file: Path | None,
+    plot_file: Path | None,
+) -> None:
+    """Run the cases that are wanted, report, and end with the exit code that they earn."""
     for file in (json_file, plot_file):
         if file is not None and not file.parent.is_dir():
             fail(f"{file}: there is no folder {file.parent}", EXIT_USAGE)
-    effort = QUICK if quick else full(trials or TRIALS)
-    cases = kinematic_cases(effort, seed, motions)
     wanted = chosen(cases, only)
     if not wanted:
         fail(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases), EXIT_USAGE)
     started_s = time.monotonic()
     found = _run(wanted, processes or os.cpu_count() or 1)
-    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "motions": motions}
-    settings |= effort._asdict()
-    results = gathered("kinematics", settings, found, over_all(found), time.monotonic() - started_s)
+    results = gathered(name, settings, found, over_all(found), time.monotonic() - started_s)
     _report(results, json_file, plot_file)
     if results.missed:
         raise typer.Exit(EXIT_MISSED)

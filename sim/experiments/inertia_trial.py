@@ -50,8 +50,7 @@ class InertiaTrial(NamedTuple):
     held_out: relative torque errors on held-out motions against the torque without noise; with_true_chain
     with the chain as it is, thesis the thesis' way; bodies: that of real bodies. not_definite: poses out of
     `poses` where the bodies' mass matrix is not positive definite. eyes: what the motion was seen by; gain:
-    by how much that leaves less in the torques than encoders. agents_differ: by how much the agents' own
-    information differs from the coordinator's, relative; None if none was asked.
+    by how much that leaves less in the torques than encoders.
     """
 
     robot: str
@@ -72,7 +71,6 @@ class InertiaTrial(NamedTuple):
     not_definite: int = 0
     eyes: Eyes = "encoders"
     gain: float = 1.0
-    agents_differ: float | None = None
     robot_time_s: float = 0.0
     identify_s: float = 0.0
 
@@ -156,7 +154,6 @@ def _compared(
         not_definite=_not_definite(estimated, real, poses, trial.seed),
         eyes=inertia.eyes,
         gain=inertia.gain,
-        agents_differ=inertia.gathered.difference if inertia.gathered is not None else None,
         robot_time_s=found.result.robot_time_s,
     )
 
