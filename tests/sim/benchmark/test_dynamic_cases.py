@@ -158,7 +158,7 @@ def test_floating_that_is_as_stiff_as_holding_misses() -> None:
     light = FloatTrial(0.1, 10.0, 5.0, 0.1, 0.7, 8.0)
     assert missed(rows(name, light)) == []
     assert missed(rows(name, light._replace(guiding_n=9.0))) == [
-        "force that leads the tip over that of an arm held in position"
+        "the same over that of an arm held in position"
     ]
 
 
