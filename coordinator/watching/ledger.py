@@ -39,6 +39,10 @@ class Ledger:
         self._said[finding.key] = finding
         return [finding]
 
+    def see(self, key: Key, now_ns: int) -> None:
+        """Note that a finding still holds."""
+        self._seen_ns[key] = now_ns
+
     def withdraw(self, keys: Iterable[Key]) -> list[Key]:
         """Take back findings; return the keys of those that were held."""
         gone = [key for key in keys if key in self.held]

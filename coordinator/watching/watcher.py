@@ -43,6 +43,8 @@ WORST_CLOCK_NS = 1e6
 BEGAN_WITHIN_NS = 4_000_000_000
 # A change is called by what explains it after so many stretches in a row; if nothing does, after more.
 CONFIRMED, UNEXPLAINED_AFTER = 2, 10
+# A payload that is held for longer is weighed as seldom.
+SETTLED_AFTER = 12
 # Stretches since a change after which contacts are judged by the changed robot: at once, and for good.
 ADAPT_AFTER = (CONFIRMED, 8)
 
@@ -200,10 +202,14 @@ class Watcher:
             return []
         if verdict.kind != "wear" and any(f.kind == "wear" for f in self.ledger.held.values()):
             return []
-        finding = self._finding(verdict, now_ns)
-        if finding is None:
+        held = self.ledger.held.get(("load", 0))
+        settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == verdict.kind
+        if settled and verdict.kind == "payload" and self._agreed_for % SETTLED_AFTER:
+            # It takes a while to weigh it, and it will not be another.
+            self.ledger.see(("load", 0), now_ns)
             return []
-        return self.ledger.put(finding)
+        finding = self._finding(verdict, now_ns)
+        return [] if finding is None else self.ledger.put(finding)
 
     def _finding(self, verdict: _Verdict, now_ns: int) -> Finding | None:
         reference, link, load = self.reference, verdict.judged.link, verdict.judged.load
@@ -214,7 +220,7 @@ class Watcher:
         if verdict.kind == "unexplained":
             return unexplained_finding(reference, self.levels, load, verdict.since_ns, now_ns)
         found = weigh(reference, verdict.pieces, load)
-        if found is None:
+        if found is None or not found.explains:
             return None
         return load_finding(reference, self.levels, load, found, verdict.since_ns, now_ns)
 

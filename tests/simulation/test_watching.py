@@ -2,7 +2,11 @@
 
 import pytest
 
-from sim.experiments.watching import Happens, Subject, WatchTrial, watch_trial
+from coordinator.watching.finding import Finding
+from coordinator.watching.watcher import Heard, Watcher
+from sim.experiments.watched_robot import Happening, watched
+from sim.experiments.watching import Happens, Subject, WatchTrial, known_subject, settings_of, watch_trial
+from sim.push import Push
 
 # One robot for all tests of the file, recorded once.
 ARM = Subject(robot="a2085_03", seed=3, brief=True)
@@ -45,3 +49,20 @@ def test_a_link_that_slipped_is_no_payload_as_imus_see_it_too() -> None:
     assert trial.located
     # Also by the length along an axis that these seconds hardly show.
     assert trial.size_error == pytest.approx(0.0, abs=0.33 * trial.size)
+
+
+def test_a_hand_that_holds_the_arm_for_seconds_is_not_weighed() -> None:
+    known = known_subject(ARM)
+    watcher = Watcher(known.reference)
+    hand = Push(serial="elbow", force_n=(6.0, 8.0, -4.0), at_m=(0.1, 0.0, 0.0), from_s=5.0, for_s=3.0)
+    happening = Happening(4.0, lambda world: world.push(hand))
+    said: list[Finding] = []
+
+    def say(heard: Heard, now_ns: int) -> None:
+        said.extend(heard.findings)
+
+    watched(settings_of(known.robot, ARM, 5), known.motions, 9.0, watcher, say, (happening,))
+    # At first it is a blow like any other.
+    assert said[0].kind == "collision"
+    assert said[0].since_ns == pytest.approx(5.0e9, abs=0.1e9)
+    assert {finding.kind for finding in said} <= {"collision", "unexplained"}
