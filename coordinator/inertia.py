@@ -30,11 +30,29 @@ from module_agent.dynamics.chain import Array, Chain
 from module_agent.dynamics.differentiation import JointMotion
 from module_agent.dynamics.information import JointInformation, compress, merge
 from module_agent.dynamics.regressor import torque_regressor
-from module_agent.dynamics.torque_terms import term_columns
+from module_agent.dynamics.torque_terms import TERMS, TorqueTerm, term_columns
 
 EYES: tuple[Eyes, ...] = get_args(Eyes)
 # Of the torques' noise, in the mean over the joints: less is chance.
 BETTER_BY = 0.01
+
+_SEEN_BY: dict[Eyes, str] = {
+    "encoders": "encoders",
+    "structure": "encoders, base and springs of the links",
+    "imus": "IMUs",
+}
+_NAMES: dict[TorqueTerm, str] = {
+    "lag": "a lag",
+    "offset": "an offset",
+    "viscous": "viscous friction",
+    "coulomb": "Coulomb friction",
+}
+_SHOWN: dict[TorqueTerm, tuple[str, float]] = {
+    "lag": ("ms", 1e3),
+    "offset": ("mNm", 1e3),
+    "viscous": ("Nm s/rad", 1.0),
+    "coulomb": ("Nm", 1.0),
+}
 
 Agents = Callable[[tuple[JointInformation, ...]], Gathered]
 
@@ -69,6 +87,23 @@ class Inertia(NamedTuple):
     noise_nm: Mapping[Eyes, Array]
     effects: tuple[Array, ...]
     gathered: Gathered | None = None
+
+    def words(self) -> list[str]:
+        """Return in lines to read what the motion was seen by, and what torque readings hold besides."""
+        fit, terms = self.seen.fit, self.seen.terms
+        noise = ", ".join(f"{1e3 * value:.1f}" for value in fit.torque_sigma_nm)
+        lines = [f"torques are explained to {noise} mNm, with motion as seen by {_SEEN_BY[self.eyes]}"]
+        if self.eyes != "encoders":
+            lines[0] += f"; encoders alone leave {self.gain:.2f} times as much"
+        for k, term in enumerate(TERMS):
+            used = terms.used[:, k]
+            if used.any():
+                unit, size = _SHOWN[term]
+                values = ", ".join(f"{size * value:.3g}" for value in terms.value[used, k])
+                lines.append(
+                    f"torque readings of {int(used.sum())} joints hold {_NAMES[term]}: {values} {unit}"
+                )
+        return lines
 
     @property
     def gain(self) -> float:
