@@ -8,7 +8,7 @@ catalogue,
 
     X = tau + Jr thdd + b thd + Tc s(thd)        th = q + tau / k, s: the sign, smoothed about rest
     K N i = X / eff where the motor drives, X where it is driven
-    u = (R i + K N thd) / 48 V
+    u = (R i + K N thd) / 48 V                   R: as warm as the winding gets (`winding`)
 
 and the set-point is raised until the effort loop puts out what is missing: its answer to a target is E + F,
 its gain and its feed-forward. Friction is a catalogue's figure that single modules miss by a tenth or more;
@@ -20,6 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from coordinator.feed_forward import RATE_HZ, SetPoints
+from coordinator.winding import AMBIENT_C, resistance_factor, winding_c
 from module_agent.catalogue import ModuleType
 from module_agent.dynamics.chain import Array
 from module_agent.dynamics.differentiation import differentiate
@@ -28,11 +29,18 @@ from module_agent.wire.messages import GainSet
 
 # Friction comes up within this speed: at rest nobody knows which way it points.
 _SLOW_RAD_S = 0.02
+_WARMING_TICKS = 10
 
 
-def with_drive(points: SetPoints, kinds: Sequence[ModuleType], gains: Sequence[GainSet]) -> SetPoints:
+def with_drive(
+    points: SetPoints,
+    kinds: Sequence[ModuleType],
+    gains: Sequence[GainSet],
+    winding_start_c: Sequence[float] | None = None,
+) -> SetPoints:
     """Return set-points at 1 kHz whose efforts make up for what the motors take, one kind and gains a column.
 
+    `winding_start_c` are the windings' temperatures as the reference begins, the ambient's if not given.
     A joint with a loop that integrates is left as it is: that finds out by itself, and what is added would
     wind it up.
 
@@ -40,7 +48,8 @@ def with_drive(points: SetPoints, kinds: Sequence[ModuleType], gains: Sequence[G
         ValueError: another number of kinds or gains than columns.
     """
     effort = points.effort_nm.copy()
-    for column, (kind, own) in enumerate(zip(kinds, gains, strict=True)):
+    start_c = [AMBIENT_C] * len(kinds) if winding_start_c is None else winding_start_c
+    for column, (kind, own, begin_c) in enumerate(zip(kinds, gains, start_c, strict=True)):
         integrates = own.position.ki or own.velocity.ki or own.effort.ki
         if integrates or own.strategy not in _WITH_EFFORT:
             continue
@@ -49,7 +58,7 @@ def with_drive(points: SetPoints, kinds: Sequence[ModuleType], gains: Sequence[G
         known = own.effort.feed_forward / torque_at_full_pwm_nm(kind) * tau
         if own.strategy != 2:
             known = known + own.velocity.feed_forward * pwm_per_rad_s(kind) * rate
-        missing = motor_pwm(kind, tau, rate) - known
+        missing = motor_pwm(kind, tau, rate, begin_c) - known
         answer = own.effort.kp + own.effort.feed_forward / torque_at_full_pwm_nm(kind)
         effort[:, column] += missing / answer
     effort.flags.writeable = False
@@ -59,7 +68,7 @@ def with_drive(points: SetPoints, kinds: Sequence[ModuleType], gains: Sequence[G
 _WITH_EFFORT = (2, 3, 4)
 
 
-def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array) -> Array:
+def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array, winding_start_c: float = AMBIENT_C) -> Array:
     """Return the PWM at 48 V (m,) under which a spring exerts `tau_nm` (m,) while it moves, at 1 kHz."""
     motor = kind.motor
     speed = qd_rad_s + differentiate(tau_nm, RATE_HZ) / kind.spring_nm_rad
@@ -71,5 +80,16 @@ def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array) -> Array:
     drives = 0.5 * (1.0 + np.sign(net) * sign)
     gross = net * (1.0 + drives * (1.0 / motor.efficiency - 1.0))
     per_amp = motor.back_emf_v_s_rad * kind.gear_ratio
-    found: Array = (motor.resistance_ohm * gross / per_amp + per_amp * speed) / NOMINAL_VOLTAGE_V
+    ampere = gross / per_amp
+    ohm = motor.resistance_ohm * resistance_factor(
+        _warmth_c(motor.resistance_ohm * ampere**2, winding_start_c)
+    )
+    found: Array = (ohm * ampere + per_amp * speed) / NOMINAL_VOLTAGE_V
     return found
+
+
+def _warmth_c(cold_w: Array, start_c: float) -> Array:
+    """Return the winding's temperature (m,) at 1 kHz; it changes by far less within the steps it takes."""
+    ticks = np.arange(len(cold_w))
+    coarse = winding_c(cold_w[::_WARMING_TICKS], _WARMING_TICKS / RATE_HZ, start_c)
+    return np.interp(ticks, ticks[::_WARMING_TICKS], coarse)

@@ -42,6 +42,7 @@ class ModuleBench:
         self.serial = firmware.config.serial
         self.now_ns = 0
         self.published_rows = False
+        self.winding_c = 0.0
         self._record: MotionRecord | None = None
         self._waiting: list[Incoming] = []
         self._motions = 0
@@ -56,7 +57,7 @@ class ModuleBench:
         Raises:
             ExperimentFailed: the module refused what it was told since the last tick.
         """
-        self.now_ns = sample.t_ns
+        self.now_ns, self.winding_c = sample.t_ns, sample.winding_temperature_c
         self._keep_alive()
         waiting, self._waiting = self._waiting, []
         pwm, out = self.firmware.step(sample.t_ns, sample, [*waiting, *arrived])

@@ -158,12 +158,13 @@ def follow(
     types = {module.serial: module_type(module.type) for module in stage.robot.modules}
     kinds = [types[serial] for serial in movers]
     sets = [_gain_set(kind, gains, mode) for kind in kinds]
-    points = [with_drive(phase, kinds, sets) for phase in _phases(stage, model)]
+    points = _phases(stage, model)
     try:
         with BenchRobot(stage.robot, seed, noise, noise_seed=TRIAL_DAY) as bench:
             bench.run(
                 {s: GoTo(target_rad=q, max_speed_rad_s=TRAVEL_RAD_S) for s, q in stage.start_rad.items()}
             )
+            points = _driven(points, kinds, sets, [bench.by_serial[s].winding_c for s in movers])
             bench.set_gains(dict(zip(movers, sets, strict=True)))
             if delivery.network is None:
                 tracks = _on_module(bench, stage, points, mode)
@@ -225,6 +226,22 @@ def _phases(stage: Stage, model: Model) -> list[SetPoints]:
     return [_picked(feed_forward(model.chain, model.phi, each), columns) for each in phases]
 
 
+def _driven(
+    phases: list[SetPoints], kinds: list[ModuleType], gains: list[GainSet], winding_c: list[float]
+) -> list[SetPoints]:
+    """Return phases that follow on each other with what the motors take, as they get warm on the way."""
+    driven = with_drive(_joined(phases), kinds, gains, winding_c).effort_nm
+    ends = np.cumsum([len(phase.effort_nm) for phase in phases])[:-1]
+    parts = np.split(driven, ends)
+    return [phase._replace(effort_nm=part) for phase, part in zip(phases, parts, strict=True)]
+
+
+def _joined(phases: list[SetPoints]) -> SetPoints:
+    signals = zip(*(phase.reference for phase in phases), strict=True)
+    reference = Reference(*(np.concatenate(signal) for signal in signals))
+    return SetPoints(reference, np.concatenate([phase.effort_nm for phase in phases]))
+
+
 def _picked(points: SetPoints, columns: list[int]) -> SetPoints:
     t_s, *motion = points.reference
     chosen = Reference(t_s, *(read_only(signal[:, columns].copy()) for signal in motion))
@@ -258,9 +275,7 @@ def _streamed(
 ) -> list[Track]:
     assert delivery.network is not None
     how = Streaming(network(delivery.network), delivery.rate_hz, velocity=mode > 1, effort=mode == 3)
-    joined = [np.concatenate(signal) for signal in zip(*(phase.reference for phase in points), strict=True)]
-    effort = np.concatenate([phase.effort_nm for phase in points])
-    track = bench.stream(movers, SetPoints(Reference(*joined), effort), how, seed)
+    track = bench.stream(movers, _joined(points), how, seed)
     ends = np.cumsum([len(phase.effort_nm) for phase in points])[:-1]
     return [Track(*part) for part in zip(*(np.split(signal, ends) for signal in track), strict=True)]
 
