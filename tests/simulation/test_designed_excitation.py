@@ -2,15 +2,21 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
+from coordinator.dynamic_motions import INDEPENDENT_FRACTION
+from coordinator.dynamics.consistency import parameter_transform
+from coordinator.dynamics.joint_frames import joint_frames
 from coordinator.identify import Identified, identify
 from coordinator.plan import Plan
 from coordinator.recording import Recording
 from module_agent.dynamics.chain import Chain
 from module_agent.dynamics.regressor import torque_regressor
+from module_agent.dynamics.torque_terms import TERMS
 from module_agent.wire.network_file import network
+from sim.physics.actuator import SPRING_LOSS_S
 from sim.robot_file import load_robot
-from sim.robot_tree import true_chain
+from sim.robot_tree import build_tree, true_chain, true_inertia
 from sim.virtual_robot import VirtualSettings
 from sim.virtual_session import record_session
 
@@ -58,3 +64,43 @@ def test_the_held_out_motion_of_all_joints_is_predicted(found: Identified) -> No
     assert found.held_out.error.overall < 0.03
     # What is held constant predicts nothing of a motion that turns every link in gravity.
     assert found.held_out.error.mean_overall > 10.0 * found.held_out.error.overall
+
+
+def test_imus_explain_the_torques_better_than_encoders(found: Identified) -> None:
+    assert found.inertia is not None
+    assert found.inertia.eyes == "imus"
+    # White noise of 0.2 % of the largest torque is the limit: what the low-pass leaves of it.
+    limit = 0.002 * np.array([t.max_effort_nm for t in build_tree(load_robot(ARM)).types])
+    limit *= np.sqrt(INDEPENDENT_FRACTION)
+    np.testing.assert_allclose(found.inertia.noise_nm["imus"], limit, rtol=0.15)
+    # A short arm's; a long one's encoders, differentiated twice, leave 1.2 to 1.4 times as much.
+    assert found.inertia.gain > 1.01
+
+
+def test_readings_lag_by_the_damping_of_the_springs_and_hold_nothing_else(found: Identified) -> None:
+    assert found.inertia is not None
+    terms = found.inertia.seen.terms
+    lag = TERMS.index("lag")
+    # The last joint turns a bare output against next to nothing.
+    np.testing.assert_array_equal(terms.used[:, lag], [True, True, False])
+    error = terms.value[:2, lag] - SPRING_LOSS_S
+    assert (np.abs(error) < 4.0 * terms.sigma[:2, lag]).all()
+    assert not np.delete(terms.used, lag, axis=1).any()
+
+
+def test_base_parameters_are_as_uncertain_as_claimed(found: Identified) -> None:
+    """With all that real arms do: links that give, friction, springs, a chain that was estimated."""
+    assert found.bodies is not None
+    base, robot = found.bodies.base, load_robot(ARM)
+    frames = joint_frames(true_chain(robot))
+    into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
+    error = base.value - base.grouping @ (into @ true_inertia(robot).ravel())
+    # The scale of the torque sensors is not known: all are taken to be off by as much as they may be.
+    pulls = error / base.sigma
+    assert np.abs(pulls).max() < 3.0
+    known = base.relative_sigma < 0.1
+    assert known.sum() >= 4
+    # They are not off here: relative to each other the largest are known far better than that.
+    true = base.value - error
+    largest = np.argsort(-np.abs(true / base.columns.scale[base.independent]))[:4]
+    assert (np.abs(error[largest]) < 0.01 * np.abs(true[largest])).all()
