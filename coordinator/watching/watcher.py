@@ -43,6 +43,8 @@ WORST_CLOCK_NS = 1e6
 BEGAN_WITHIN_NS = 4_000_000_000
 # A change is called by what explains it after so many stretches in a row; if nothing does, after more.
 CONFIRMED, UNEXPLAINED_AFTER = 2, 10
+# A mass that is not known to this many standard deviations is not said to be there.
+LEAST_SIGMAS = 5.0
 # A payload that is held for longer is weighed as seldom.
 SETTLED_AFTER = 12
 # Stretches since a change after which contacts are judged by the changed robot: at once, and for good.
@@ -176,11 +178,11 @@ class Watcher:
             if found is not None and found.kind == "wear":
                 break
         if found is None:
-            loads = [(one, window) for one, window in judged if one.load is not None]
-            if not loads:
+            # What the newest stretches do not show any more was a blow too weak to be felt as one.
+            if not judged or judged[0][0].load is None:
                 self._agreed, self._agreed_for = None, 0
                 return None
-            found = _Verdict("unexplained", 0, *loads[0], 0)
+            found = _Verdict("unexplained", 0, *judged[0], 0)
         if self._agreed is None:
             self._since_ns = self._began(found.pieces[0].start_ns)
         same = self._agreed == (found.kind, found.where)
@@ -220,7 +222,7 @@ class Watcher:
         if verdict.kind == "unexplained":
             return unexplained_finding(reference, self.levels, load, verdict.since_ns, now_ns)
         found = weigh(reference, verdict.pieces, load)
-        if found is None or not found.explains:
+        if found is None or not found.explains or found.mass_kg < LEAST_SIGMAS * found.mass_sigma_kg:
             return None
         return load_finding(reference, self.levels, load, found, verdict.since_ns, now_ns)
 

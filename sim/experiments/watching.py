@@ -14,11 +14,13 @@ from scipy.stats import chi2
 
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identify import identify_kinematics
+from coordinator.kinematics.forward import ancestors
 from coordinator.known_robot import KnownRobot
 from coordinator.plan import Plan
 from coordinator.watching.finding import Finding
 from coordinator.watching.reference import Reference, build_reference
 from coordinator.watching.watcher import Heard, Watcher
+from module_agent.dynamics.chain import Chain
 from module_agent.wire.network_file import network as network_named
 from sim.experiments.watched_robot import Happening, ordinary_motions, watched
 from sim.experiments.wear import Wear, draw_wear, worn
@@ -250,7 +252,7 @@ def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Fin
     return WatchTrial(
         happened=happens,
         found=found,
-        located=own is not None and own.serial == event.serial,
+        located=own is not None and _is_there(watcher.reference.chain, own, event.serial),
         latency_s=1e-9 * (first[0] - at_ns) if first else None,
         named_s=1e-9 * (named[0] - at_ns) if named and own is not None else None,
         size=event.size or 0.0,
@@ -259,6 +261,14 @@ def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Fin
         watched_s=watcher.looked_s,
         words=tuple(f.words for f in held),
     )
+
+
+def _is_there(chain: Chain, finding: Finding, serial: str) -> bool:
+    """Return whether it happened where it was found: of a collision, at the module or beyond."""
+    if finding.kind != "collision":
+        return finding.serial == serial
+    named, where = (chain.serials.index(s) for s in (finding.serial, serial))
+    return named in ancestors(chain, where)
 
 
 def confusion(trials: Sequence[WatchTrial]) -> dict[Happens, dict[Found, int]]:
