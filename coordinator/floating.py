@@ -12,7 +12,8 @@ which makes up for them: what is left of them holds the arm where the model errs
     held      holds
 
 A robot floats until it is told to hold, or a joint goes too fast, nears the end of its range or would have to
-bear more than it can. It is never set free if it bears another load than the model says. Pure: time is an
+bear more than it can. What its torque sensors read beside the weight before it is set free counts as their
+offset; it is not set free if that is more than an offset. Pure: time is an
 argument, and nothing is sent from here.
 """
 
@@ -34,6 +35,9 @@ STRATEGY = 2
 # The factory's position control gives under this strategy: it has the weight to bear by itself. Where the
 # weight is borne already it can be so much stiffer. At 16 times arms of four and six joints ring.
 HOLDING_TIMES = 6.0
+# What a torque sensor reads beside the weight while the joint holds still, from this share of the ramp on, is
+# its offset: it is borne with the weight from then on, or the effort loop would push by it.
+TARED_FROM = 0.7
 # How far from the calculated torque a joint may be that holds still, as a share of its type's largest: scale
 # errors of the torque sensor and of the model stay below, a tool in the gripper does not.
 MOST_UNKNOWN = 0.15
@@ -106,7 +110,8 @@ class Floater:
         self._high = _ends([one.max_position_rad for one in limits], np.inf) - settings.margin_rad
         self._since_s = 0.0
         self._place: Array | None = None
-        self._borne = np.zeros(len(limits))
+        self._borne, self._tare = np.zeros((2, len(limits)))
+        self._strangers: list[Array] = []
 
     @property
     def place_rad(self) -> Array:
@@ -142,9 +147,11 @@ class Floater:
         rate = reading.qd_rad_s if self._settings.velocity_forces else np.zeros_like(reading.q_rad)
         weight = self._weight.effort_nm(reading.q_rad, rate)
         self._guard(t_s, reading, weight)
-        self._go_on(t_s, reading, weight)
+        if self.phase == "loading" and self._share(t_s, self._settings.ramp_s) >= TARED_FROM:
+            self._strangers.append(reading.effort_nm - weight)
+        self._go_on(t_s, reading)
         # What is too much is held by the position loop as far as the motor can.
-        effort = np.clip(weight, -self._most_nm, self._most_nm)
+        effort = np.clip(weight + self._tare, -self._most_nm, self._most_nm)
         if self.phase == "loading":
             share = self._share(t_s, self._settings.ramp_s)
             return Targets(self._place, self._borne + share * (effort - self._borne))
@@ -191,18 +198,19 @@ class Floater:
 
     # ------------------------------------------------------------------ what ends it
 
-    def _go_on(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
+    def _go_on(self, t_s: float, reading: Reading) -> None:
         settings = self._settings
         length_s = settings.hold_s if self.phase == "holding" else settings.ramp_s
         if self._share(t_s, length_s) < 1.0:
             return
         if self.phase == "loading":
-            strange = self._strange(reading.effort_nm, weight_nm)
+            tare = np.mean(self._strangers, axis=0)
+            strange = self._strange(reading.effort_nm, tare)
             if strange:
                 self._fault(t_s, reading, strange)
             else:
                 # It has given meanwhile, and stiffer gains are to come: they shall not snatch it back.
-                self._place = reading.q_rad.copy()
+                self._place, self._tare = reading.q_rad.copy(), tare
                 self._enter("loaded", t_s)
         elif self.phase == "freeing":
             self._enter("floating", t_s)
@@ -239,15 +247,15 @@ class Floater:
             f"{self._most_nm[worst]:.2f} Nm; bring the arm to a lighter pose"
         )
 
-    def _strange(self, effort_nm: Array, weight_nm: Array) -> str:
-        over = np.abs(effort_nm - weight_nm) - MOST_UNKNOWN * self._most_nm
+    def _strange(self, effort_nm: Array, tare_nm: Array) -> str:
+        over = np.abs(tare_nm) - MOST_UNKNOWN * self._most_nm
         worst = int(np.argmax(over))
         if over[worst] <= 0.0:
             return ""
         return (
-            f"joint {self._serials[worst]} bears {effort_nm[worst]:.2f} Nm, the robot that is known would be "
-            f"{weight_nm[worst]:.2f} Nm there: it carries something, leans on something, or stands otherwise "
-            "than when it was identified; identify it again as it is"
+            f"joint {self._serials[worst]} bears {effort_nm[worst]:.2f} Nm, {tare_nm[worst]:+.2f} Nm beside "
+            "what the robot that is known weighs there: it carries something, leans on something, or stands "
+            "otherwise than when it was identified; identify it again as it is"
         )
 
     def _too_fast(self, rate_rad_s: Array) -> str:
