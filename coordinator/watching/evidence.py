@@ -117,7 +117,8 @@ def find_change(
         raise ValueError(
             f"evidence about {before.parameters} and {later.parameters} parameters, prior of {count}"
         )
-    wide = np.column_stack(changes)
+    # A robot without links has no link that could have changed.
+    wide = np.column_stack(changes) if changes else np.zeros((count, 0))
     top = np.hstack([np.diag(1.0 / sigma), np.zeros((count, wide.shape[1] + 1))])
     middle = np.column_stack([before.rows, np.zeros((len(before.rows), wide.shape[1])), before.target])
     bottom = np.column_stack([later.rows, later.rows @ wide, later.target])

@@ -227,7 +227,7 @@ def _known(windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array
         ]
     # The largest that chance makes of so many, of which every second window's largest is below.
     expected = [chi2.isf(0.5 / len(exceeding), freedom) for _, freedom in exceeding]
-    largest = max(1.0, *(gain / level for (gain, _), level in zip(exceeding, expected, strict=True)))
+    largest = max([1.0, *(gain / level for (gain, _), level in zip(exceeding, expected, strict=True))])
     return Known(joined(windows), prior_sigma, changes, MARGIN * largest)
 
 

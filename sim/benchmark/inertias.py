@@ -8,7 +8,7 @@ from coordinator.plan import Plan
 from sim.benchmark.arms import SHORTENED
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
 from sim.benchmark.row import Row, count, largest, scaled
-from sim.experiments.inertia_trial import InertiaTrial, inertia_trial, rigid_profile
+from sim.experiments.inertia_trial import LARGEST, InertiaTrial, inertia_trial, rigid_profile
 
 ARMS = ("a2085_04", "a2085_06")
 # What is asked of held-out torques, of a rigid arm and of one with friction, springs and a base that gives.
@@ -72,7 +72,8 @@ def _largest_rows(case: str, done: Sequence[InertiaTrial]) -> list[Row]:
     """
     pairs = [pair for trial in done for pair in zip(trial.largest, trial.largest_sigma, strict=True)]
     allowed = [(error, sigma) for error, sigma in pairs if 3.0 * sigma < 0.01 * LARGEST_PERCENT]
-    rows = []
+    told = f"largest {LARGEST} that are known: noise tells to 1 %, share [%]"
+    rows = [Row(case, told, None, 100.0 * len(allowed) / len(pairs) if pairs else None)]
     for what, chosen, limit in (
         ("largest ten, of those noise tells to 1 %", allowed, LARGEST_PERCENT),
         ("largest ten that are known", pairs, None),

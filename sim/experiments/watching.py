@@ -244,8 +244,8 @@ def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Fin
     right = [f for f in later if f.kind == happens]
     found: Found = "nothing"
     if later:
-        found = right[0].kind if right else later[0].kind
-    others = [f for f in later if f.kind != found] if happens != "nothing" else later
+        found = later[0].kind
+    others = [f for f in later if f.kind != happens]
     first = [f.said_ns for f in said if f.said_ns >= at_ns]
     named = [f.said_ns for f in said if f.said_ns >= at_ns and f.kind == happens]
     own = right[0] if right else None

@@ -94,3 +94,11 @@ def test_evidence_about_other_parameters_is_refused() -> None:
         find_change(one, other, np.ones(3), (np.eye(3),))
     with pytest.raises(ValueError, match="not finite"):
         compressed([[np.nan]], [0.0])
+
+
+def test_where_nothing_could_have_changed_there_is_a_misfit_and_no_change(rng: Generator) -> None:
+    """A robot of one module has no link."""
+    evidence = compressed(*measured(rng, rng.normal(size=PARAMETERS)))
+    found = find_change(evidence, evidence, WIDE, ())
+    assert found.changes == ()
+    assert found.misfit > 0.0
