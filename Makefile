@@ -6,11 +6,12 @@ STAMP := $(VENV)/.installed
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo kinematics test check bench clean
+.PHONY: help demo kinematics dynamics test check bench clean
 
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh, one process per module, and is scored"
 	@echo "make kinematics  the thesis' estimator, ours and the physical limit, every row in about a minute"
+	@echo "make dynamics    inertia, payloads, torque that helps and watching, every row in about a minute"
 	@echo "make test    all tests"
 	@echo "make check   format, lint, types and import floors"
 	@echo "make bench   benchmarks"
@@ -30,6 +31,10 @@ demo: $(STAMP)
 kinematics: $(STAMP)
 	@mkdir -p runs
 	$(BIN)/x5-sim benchmark kinematics --quick --json runs/kinematics.json
+
+dynamics: $(STAMP)
+	@mkdir -p runs
+	$(BIN)/x5-sim benchmark dynamics --quick --json runs/dynamics.json $(if $(TX40),--tx40 $(TX40))
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup

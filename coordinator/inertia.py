@@ -20,7 +20,8 @@ from coordinator.dynamics.common_errors import chain_effects, scale_effects
 from coordinator.dynamics.consistency import parameters
 from coordinator.dynamics.parameter_prior import module_prior
 from coordinator.dynamics.seen_information import SeenFit, solve_seen, without_used
-from coordinator.dynamics.torque_scale import SCALE_SIGMA, TorqueKind
+from coordinator.dynamics.torque_scale import SCALE_SIGMA, TorqueKind, scaled
+from coordinator.gathered_rows import GatheredRows
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.refinement import Refinement
 from coordinator.motion_window import RATE_HZ, Window
@@ -114,7 +115,8 @@ class Inertia(NamedTuple):
 def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None = None) -> Inertia:
     """Find the inertial parameters from windows of motion.
 
-    `agents` puts what the modules have gathered in the place of the coordinator's rows from encoders.
+    `agents` puts what the modules have gathered in the place of the coordinator's rows from encoders; what
+    was seen beyond those the coordinator takes off.
 
     Raises:
         ValueError: too few samples, or motions that say nothing of inertia.
@@ -123,20 +125,21 @@ def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None 
     prior = np.concatenate([parameters(one) for one in module_prior(robot.chain, robot.kinds)])
     found: dict[Eyes, SeenFit] = {}
     shared: Gathered | None = None
+    gathered: tuple[JointInformation, ...] = ()
     for eyes in EYES:
         total = pieces[0][eyes]
         for piece in pieces[1:]:
             total = merge(total, piece[eyes])
-        if eyes == "encoders" and agents is not None:
-            shared = agents(total)
-            total = shared.joints
+        if eyes == "encoders":
+            shared = agents(total) if agents is not None else None
+            gathered = total = shared.joints if shared is not None else total
         found[eyes] = solve_seen(total, prior, INDEPENDENT_FRACTION, SCALE_SIGMA[robot.torque])
     noise = {eyes: fit.fit.torque_sigma_nm for eyes, fit in found.items()}
     best: Eyes = "encoders"
     for eyes in EYES[1:]:
         if _level(noise[eyes]) < _level(noise[best]) - BETTER_BY:
             best = eyes
-    seen, effects = _considered(robot, windows, found[best], best)
+    seen, effects = _considered(robot, windows, gathered, found[best], best)
     return Inertia(seen, best, noise, effects, shared)
 
 
@@ -164,27 +167,37 @@ def _information(robot: Robot, one: Window) -> dict[Eyes, tuple[JointInformation
 
 
 def _considered(
-    robot: Robot, windows: Sequence[Window], seen: SeenFit, eyes: Eyes
+    robot: Robot,
+    windows: Sequence[Window],
+    gathered: Sequence[JointInformation],
+    seen: SeenFit,
+    eyes: Eyes,
 ) -> tuple[SeenFit, tuple[Array, ...]]:
-    """Return the fit with its rows beside what errors of chain and scale do to them."""
+    """Return the fit with the rows gathered from encoders, and what errors of chain and scale do to them.
+
+    What was seen beyond encoders is taken off the torques: of the rows, its projection onto them.
+    """
     size = seen.informed_phi.size
-    total: tuple[JointInformation, ...] = ()
+    beside = [GatheredRows(scaled(piece, one)) for piece, one in zip(gathered, seen.scale.value, strict=True)]
     for one in windows:
         motion = filtered_window(one)
         rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
-        terms = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
+        rows = np.concatenate([rigid, term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)], axis=2)
         effects = chain_effects(robot.chain, robot.covariance, seen.informed_phi, motion)
-        torque = (1.0 + seen.scale.value) * motion.tau_nm
+        departure = np.zeros_like(motion.tau_nm)
         if eyes != "encoders":
-            seen_to = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
-            torque -= (_regressor(robot, seen_to, eyes) - rigid) @ seen.informed_phi
-        found = compress(np.concatenate([rigid, terms, effects], axis=2), torque)
-        total = merge(total, found) if total else found
-    left = [without_used(piece, size, used) for piece, used in zip(total, seen.terms.used, strict=True)]
-    rows = tuple(piece._replace(r=piece.r[:, :size]) for piece in left)
-    scale = scale_effects(rows, seen.scale)
+            apart = _regressor(robot, readings(one, robot.refined, DYNAMIC_CUTOFF_HZ), eyes) - rigid
+            departure = apart @ seen.informed_phi
+        torque = (1.0 + seen.scale.value) * motion.tau_nm
+        for i, joint in enumerate(beside):
+            joint.add(rows[:, i], torque[:, i], departure[:, i], effects[:, i])
+    left = [
+        without_used(joint.rows(), size, used) for joint, used in zip(beside, seen.terms.used, strict=True)
+    ]
+    bodies = tuple(piece._replace(r=piece.r[:, :size]) for piece in left)
+    scale = scale_effects(bodies, seen.scale)
     chain = [piece.r[:, size:] for piece in left]
-    return seen._replace(information=rows), tuple(map(np.hstack, zip(scale, chain, strict=True)))
+    return seen._replace(information=bodies), tuple(map(np.hstack, zip(scale, chain, strict=True)))
 
 
 def _regressor(robot: Robot, seen: Readings, eyes: Eyes) -> Array:

@@ -233,8 +233,9 @@ class DynamicsPart(Part):
     worded: z along the joint's axis, x towards the next joint (`dynamics.joint_frames`). seen_by: by what the
     bodies' motion was seen (`inertia`); noise_nm: what each way of seeing it leaves in the torques.
 
-    gathered_by: whose rows the information from encoders is made of; by_agents are the modules that gathered
-    their own. gathered_difference: how far those and the coordinator's are apart at most, relative.
+    gathered_by: whose the rows from encoders are, from which what IMUs saw beyond is taken off; by_agents are
+    the modules that gathered their own. gathered_difference: how far those and the coordinator's are apart at
+    most, relative.
     """
 
     phi: list[float]
