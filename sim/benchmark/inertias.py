@@ -21,7 +21,7 @@ PLAN = Plan(
     excitation="designed", motions="designed", imu="calibrated", torque="calibrated", excitation_s=8.0
 )
 QUICK_PLAN = PLAN.model_copy(
-    update=SHORTENED | {"mode": "whole", "excitation_motions": 4, "excitation_s": 5.0}
+    update=SHORTENED | {"mode": "whole", "excitation_motions": 3, "excitation_s": 4.0}
 )
 POSES, QUICK_POSES = 10_000, 1_000
 _COST_S = {"a2085_04": 10.0, "a2085_06": 18.0}

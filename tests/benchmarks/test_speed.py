@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from coordinator.kinematics.inertial_prediction import imu_readings
@@ -13,13 +12,13 @@ from coordinator.plan import Plan
 from coordinator.terminal import Terminal
 from module_agent.catalogue import CATALOGUE
 from module_agent.dynamics.chain import Chain
-from module_agent.dynamics.regressor import torque_regressor
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits
 from module_agent.firmware.firmware import Firmware
 from module_agent.hardware import SensorSample
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import ROW, unpack
 from module_agent.wire.messages import Feedback, LeaseRequest
+from sim.experiments.regressor_trial import CHUNK, JOINTS, regressor_trial
 from sim.robot_file import load_robot
 from sim.robot_tree import true_chain
 from sim.virtual_run import VirtualConfig, run_virtual
@@ -113,32 +112,12 @@ def _chain(joints: int) -> Chain:
 
 
 def test_regressor_against_pinocchios_loop() -> None:
-    chain, samples, chunk = _chain(7), 4000, 50
-    q, qd, qdd = np.random.default_rng(1).uniform(-1, 1, (3, samples, 7))
-    model = pin.Model()
-    for i, point in enumerate(chain.point):
-        below = chain.point[i - 1] if i else np.zeros(3)
-        joint = pin.JointModelRevoluteUnaligned(chain.axis[i])
-        model.addJoint(i, joint, pin.SE3(np.eye(3), point - below), chain.serials[i])
-    data = model.createData()
-
-    def loop() -> None:
-        for a, b, c in zip(q, qd, qdd, strict=True):
-            pin.computeJointTorqueRegressor(model, data, a, b, c)
-
-    def stream() -> None:
-        for begin in range(0, samples, chunk):
-            part = slice(begin, begin + chunk)
-            torque_regressor(chain, q[part], qd[part], qdd[part])
-
-    batch, chunks, theirs = (
-        1e6 * _seconds(work, 3) / samples
-        for work in (lambda: torque_regressor(chain, q, qd, qdd), stream, loop)
-    )
+    found = regressor_trial(1, 9)
+    assert found.loop_us is not None
     _report(
-        "torque regressor, 7 joints, a sample",
-        f"{batch:.2f} us, in chunks of {chunk} {chunks:.2f} us, pinocchio's loop {theirs:.2f} us: "
-        f"{theirs / batch:.1f} times ours",
+        f"torque regressor, {JOINTS} joints, a sample",
+        f"{found.batch_us:.2f} us, in chunks of {CHUNK} {found.chunks_us:.2f} us, pinocchio's loop "
+        f"{found.loop_us:.2f} us: {found.loop_us / found.batch_us:.1f} times ours",
     )
 
 
