@@ -11,7 +11,6 @@ from coordinator.kinematics.inertial_prediction import imu_readings
 from coordinator.plan import Plan
 from coordinator.terminal import Terminal
 from module_agent.catalogue import CATALOGUE
-from module_agent.dynamics.chain import Chain
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits
 from module_agent.firmware.firmware import Firmware
 from module_agent.hardware import SensorSample
@@ -94,21 +93,6 @@ def test_codec() -> None:
         back = _seconds(lambda kind=kind, payload=payload: decode(kind, payload, MAX_MESSAGE_BYTES), 5000)
         _report(f"codec, {name}, {len(payload)} bytes", f"{1e6 * there:.1f} us out, {1e6 * back:.1f} us in")
     _report("codec, rows unpacked and checked", f"{1e6 * _seconds(lambda: unpack(feedback), 5000):.1f} us")
-
-
-def _chain(joints: int) -> Chain:
-    rng = np.random.default_rng(0)
-    axis = rng.normal(size=(joints, 3))
-    home = np.tile(np.eye(4), (joints, 1, 1))
-    return Chain(
-        tuple(f"M{i}" for i in range(joints)),
-        tuple(range(-1, joints - 1)),
-        (False,) * joints,
-        axis / np.linalg.norm(axis, axis=1, keepdims=True),
-        rng.uniform(-1, 1, (joints, 3)),
-        home,
-        np.array([0.0, 0.0, 9.81]),
-    )
 
 
 def test_regressor_against_pinocchios_loop() -> None:
