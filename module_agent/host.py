@@ -10,11 +10,10 @@ from typing import TypeVar
 from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
-from module_agent.firmware.history import History
 from module_agent.hardware import Hardware, SensorSample
 from module_agent.inbox import Inbox
 from module_agent.information_service import InformationService, Worker
-from module_agent.motion_collection import MotionCollection
+from module_agent.motion_collection import MotionCollection, OwnRows
 from module_agent.neighbours import AskHistory, JointMotion, Listen, Neighbours
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
@@ -34,9 +33,11 @@ BESIDE = (Leaf.ESTIMATE, Leaf.COLLECT, Leaf.INFORMATION)  # answered here, not b
 SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.STOP, Leaf.GAINS, *BESIDE)
 HEARD = (Leaf.SETPOINT, Leaf.STOP)
 HISTORY_TIMEOUT_S = 0.4
+# A question whose answer is dropped on arrival would otherwise be remembered for ever.
+MOST_ASKED = 1024
 
 T = TypeVar("T")
-M = TypeVar("M", Status, Feedback)
+M = TypeVar("M", Status, Feedback, Ack)
 
 
 class InlineWorker:
@@ -135,7 +136,7 @@ class HostedModule:
     def _answer_collect(self, payload: bytes) -> Ack:
         request = self.firmware.admission.read(CollectRequest, payload, max_bytes=MAX_MESSAGE_BYTES)
         shared = self._shared
-        self._information.collect(request, shared.histories, shared.clock_ns())
+        self._information.collect(request, shared.own_rows, shared.clock_ns())
         return self._ack(True, request.seq)
 
     def _answer_information(self, payload: bytes) -> Information:
@@ -191,9 +192,12 @@ class Shared:
         self.modules: list[HostedModule] = []
 
     @property
-    def histories(self) -> dict[str, History]:
+    def own_rows(self) -> dict[str, OwnRows]:
         """The rows of the process's own modules."""
-        return {module.serial: module.firmware.history for module in self.modules}
+        return {
+            module.serial: OwnRows(module.firmware.config.boot, module.firmware.history)
+            for module in self.modules
+        }
 
     def clock_ns(self) -> int:
         """Return the time of one steady clock of the process: that of its first module."""
@@ -224,6 +228,7 @@ class AgentHost:
         self._found: list[tuple[HostedModule, Finding]] = []
         self._listening: dict[str, Undeclare] = {}
         self._declared: list[Undeclare] = []
+        self._asked: dict[int, AskHistory] = {}
         self._tag = 0
         self._seq = 0
         self._declare()
@@ -299,8 +304,9 @@ class AgentHost:
         if isinstance(event, Liveness | Request):
             return
         if isinstance(event, Reply):
-            if event.payload is not None:
-                self._hear_history(event.payload, clocks)
+            asked = self._asked.pop(event.tag, None)
+            if event.payload is not None and asked is not None:
+                self._hear_history(asked, event.payload, clocks)
             return
         parts = parse(event.key)
         if parts.leaf is Leaf.STATUS:
@@ -310,13 +316,14 @@ class AgentHost:
             feedback = _of(parts.serial, decode(Feedback, event.payload, MAX_MESSAGE_BYTES))
             self._neighbours.on_feedback(feedback, clocks)
 
-    def _hear_history(self, payload: bytes, clocks: dict[str, int]) -> None:
+    def _hear_history(self, asked: AskHistory, payload: bytes, clocks: dict[str, int]) -> None:
         try:
             feedback = decode(Feedback, payload, MAX_MESSAGE_BYTES)
         except WireError:
-            refused = decode(Ack, payload)  # an answer too; anything else is malformed
+            # An answer too; anything else is malformed.
+            refused = _of(asked.serial, decode(Ack, payload))
             if refused.reason in (Refusal.GONE.value, Refusal.WRONG_BOOT.value):
-                self._shared.collection.on_gone(refused.serial)
+                self._shared.collection.on_gone(asked)
             return
         self._neighbours.on_feedback(feedback, clocks, live=False)
         self._shared.collection.on_feedback(feedback)
@@ -355,6 +362,9 @@ class AgentHost:
     def _ask_history(self, wish: AskHistory) -> None:
         self._tag += 1
         self._seq += 1
+        self._asked[self._tag] = wish
+        if len(self._asked) > MOST_ASKED:
+            del self._asked[next(iter(self._asked))]
         question = HistoryRequest(
             serial=wish.serial,
             boot=wish.boot,

@@ -3,8 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol, TypeVar
 
-from module_agent.firmware.history import History
-from module_agent.motion_collection import MotionCollection, Track
+from module_agent.motion_collection import MotionCollection, OwnRows, Track
 from module_agent.wire.information_messages import MOST_PART_BYTES, CollectRequest, InformationRequest
 from module_agent.wire.refusal import Refusal, WireError
 
@@ -50,7 +49,7 @@ class InformationService:
         self._asked: bytes | None = None
         self._result: _Result | None = None
 
-    def collect(self, request: CollectRequest, own: Mapping[str, History], now_ns: int) -> None:
+    def collect(self, request: CollectRequest, own: Mapping[str, OwnRows], now_ns: int) -> None:
         """Begin to keep the rows of a motion.
 
         Raises:
@@ -105,3 +104,6 @@ def _compute(serial: str, request: InformationRequest, tracks: Mapping[int, Mapp
     except ValueError as error:
         # A finding too, to be told to whoever asks.
         return _Result(b"", str(error))
+    except Exception as error:
+        # A defect here, but one that a message has brought about: it must not end the modules of the process.
+        return _Result(b"", f"{serial} cannot compute this, {type(error).__name__}: {error}")

@@ -21,7 +21,7 @@ from module_agent.wire.row_log import RowLog
 GIVE_UP_NS = 30_000_000_000
 # Of all motions of all modules together: 20 bytes each.
 MOST_ROWS = 4_000_000
-LONGEST_ROWS = 100_000
+MOST_MOTIONS = 256
 QUESTIONS_AT_ONCE = 8
 
 
@@ -33,6 +33,13 @@ class Track(NamedTuple):
     effort_nm: NDArray[np.float32]
 
 
+class OwnRows(NamedTuple):
+    """The rows of a module of this process, and the boot that they are of."""
+
+    boot: int
+    history: History
+
+
 class _Part:
     """The rows of one module in one motion, complete or on their way."""
 
@@ -40,6 +47,7 @@ class _Part:
         self.wanted = wanted
         self.track: Track | None = None
         self.log = RowLog(wanted.boot)
+        self.asked: AskHistory | None = None
         self.asked_until_ns = now_ns
         self.give_up_ns = now_ns + GIVE_UP_NS
         self.gone = False
@@ -67,37 +75,36 @@ class MotionCollection:
         self._motions: dict[int, dict[str, _Part]] = {}
         self._open: list[_Part] = []
 
-    def collect(self, request: CollectRequest, own: Mapping[str, History], now_ns: int) -> None:
+    def collect(self, request: CollectRequest, own: Mapping[str, OwnRows], now_ns: int) -> None:
         """Begin to keep a motion; rows of the process's `own` modules are copied from their histories.
 
         What is kept of it already stays, of a module that has not booted since: the histories may have
-        forgotten it. `now_ns` is any one steady clock of this process.
+        forgotten it. `now_ns` is any one steady clock of this process. What is refused changes nothing.
 
         Raises:
-            WireError: more rows than are kept, or own ones that are gone.
+            WireError: GONE for own rows that are not kept, WRONG_BOOT for those of another boot.
         """
-        longest = max(wanted.end_row - wanted.first_row for wanted in request.rows)
-        if not 0 < longest <= LONGEST_ROWS:
-            raise WireError(Refusal.RANGE, f"{longest} rows of a motion, 1 to {LONGEST_ROWS} are kept")
-        parts = self._motions.setdefault(request.motion_id, {})
-        for wanted in request.rows:
-            known = parts.get(wanted.serial)
-            if known is not None and known.wanted.boot == wanted.boot and not known.gone:
-                continue
-            part = _Part(wanted, now_ns)
-            if wanted.serial in own:
-                part.keep(own[wanted.serial].rows(wanted.first_row, wanted.end_row))
-            if known is not None:
-                known.gone = True
-            parts[wanted.serial] = part
-            self._open.append(part)
+        known = self._motions.get(request.motion_id, {})
+        # All of them before any is stored: a refusal of one leaves no motion behind that lacks it.
+        parts = {
+            wanted.serial: _begun(wanted, own.get(wanted.serial), now_ns)
+            for wanted in request.rows
+            if not _is_kept(known.get(wanted.serial), wanted)
+        }
+        for serial in parts.keys() & known.keys():
+            known[serial].gone = True
+        self._motions.setdefault(request.motion_id, {}).update(parts)
+        self._open += parts.values()
         self._forget()
         self.restless = True
 
     def _forget(self) -> None:
-        """Drop the oldest motions while there are more rows than are kept."""
-        while len(self._motions) > 1 and sum(map(_rows, self._motions.values())) > MOST_ROWS:
-            for part in self._motions.pop(next(iter(self._motions))).values():
+        """Drop the oldest motions while there are more, or more rows, than are kept."""
+        rows = sum(map(_rows, self._motions.values()))
+        while len(self._motions) > MOST_MOTIONS or (len(self._motions) > 1 and rows > MOST_ROWS):
+            oldest = self._motions.pop(next(iter(self._motions)))
+            rows -= _rows(oldest)
+            for part in oldest.values():
                 part.gone = True
 
     def on_feedback(self, feedback: Feedback) -> None:
@@ -114,10 +121,13 @@ class MotionCollection:
             if not part.missing():
                 part.keep(part.log.rows(wanted.first_row, wanted.end_row))
 
-    def on_gone(self, serial: str) -> None:
-        """Take notice that a module has rows no longer that were asked of it."""
+    def on_gone(self, asked: AskHistory) -> None:
+        """Take notice that a module has rows no longer, by the question that it refused.
+
+        Motions whose rows were not in that question wait on: they are told by their own.
+        """
         for part in self._open:
-            if part.wanted.serial == serial and part.is_open:
+            if part.is_open and part.asked == asked:
                 part.gone = True
 
     def poll(self, now_ns: int) -> list[AskHistory]:
@@ -132,7 +142,8 @@ class MotionCollection:
                 first, end = part.missing()[0]
                 part.asked_until_ns = now_ns + ANSWER_TIMEOUT_NS
                 end = min(end, first + ROWS_PER_QUESTION)
-                wishes.append(AskHistory(part.wanted.serial, part.wanted.boot, first, end))
+                part.asked = AskHistory(part.wanted.serial, part.wanted.boot, first, end)
+                wishes.append(part.asked)
         return wishes
 
     def tracks(self, motion_id: int) -> dict[str, Track]:
@@ -153,6 +164,23 @@ class MotionCollection:
                 Refusal.BUSY, f"motion {motion_id}: rows of {', '.join(waiting)[:200]} are on their way"
             )
         return {serial: part.track for serial, part in parts.items() if part.track is not None}
+
+
+def _is_kept(known: _Part | None, wanted: RowRange) -> bool:
+    return known is not None and known.wanted.boot == wanted.boot and not known.gone
+
+
+def _begun(wanted: RowRange, own: OwnRows | None, now_ns: int) -> _Part:
+    part = _Part(wanted, now_ns)
+    if own is None:
+        return part
+    if own.boot != wanted.boot:
+        raise WireError(
+            Refusal.WRONG_BOOT,
+            f"rows of boot {wanted.boot:016x} of {wanted.serial}, which has booted anew as {own.boot:016x}",
+        )
+    part.keep(own.history.rows(wanted.first_row, wanted.end_row))
+    return part
 
 
 def _rows(parts: Mapping[str, _Part]) -> int:

@@ -78,7 +78,9 @@ def _reason(error: ValidationError) -> WireError:
         elif kind in _RANGE_ERRORS:
             reason = Refusal.RANGE
         where = ".".join(str(part) for part in item["loc"])
-        found.append((ranks[reason], f"{where}: {item['msg']}", reason))
+        # An array whose elements are wrong counts as too short as well: the elements say why.
+        rank = len(ranks) if kind == "too_short" else ranks[reason]
+        found.append((rank, f"{where}: {item['msg']}", reason))
     _, detail, reason = min(found, key=lambda row: row[0])
     return WireError(reason, detail[:480])
 

@@ -3,28 +3,51 @@ what it is to be computed with, and the answer. Sizes are bounded for 64 modules
 """
 
 import hashlib
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from module_agent.wire.codec import encode
-from module_agent.wire.messages import Counter, Message, Name, Nanoseconds, Part, Vector3
+from module_agent.wire.messages import Counter, Message, Name, Part, Vector3
 
 MOST_MODULES = 64
 MOST_PART_BYTES = 65_536
 # A module's part in `ChainPart.geometry`: axis, point and IMU's pose, row by row.
 GEOMETRY_BYTES = 8 * (3 + 3 + 16)
 
-Instant = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+# Of a module in one motion: 400 s at 250 Hz.
+LONGEST_ROWS = 100_000
+# Samples of all motions together, times modules squared, to which the time of computing goes: under a minute.
+MOST_WORK = 200_000_000
+# 85 years, of Unix time until 2055: sums of three such times, and a tenth for the drift, fit in 64 bits.
+FARTHEST_NS = 2_700_000_000_000_000_000
+FARTHEST_OFFSET_NS = 2.7e18
+
+Instant = Annotated[int, Field(ge=-FARTHEST_NS, le=FARTHEST_NS)]
+
+
+def out_of_range(detail: str) -> PydanticCustomError:
+    """Return the error of fields that do not fit each other, which `codec` takes for one of range."""
+    return PydanticCustomError("less_than_equal", "{detail}", {"detail": detail})
 
 
 class RowRange(Part):
-    """Feedback rows `first_row` up to and without `end_row` of one boot of a module."""
+    """Feedback rows `first_row` up to and without `end_row` of one boot of a module, at least one."""
 
     serial: Name
     boot: Annotated[int, Field(ge=0, lt=2**64)]
     first_row: Counter
     end_row: Counter
+
+    @model_validator(mode="after")
+    def _check_length(self) -> Self:
+        if not 0 < self.end_row - self.first_row <= LONGEST_ROWS:
+            raise out_of_range(
+                f"rows {self.first_row} to {self.end_row} of {self.serial}: "
+                f"1 to {LONGEST_ROWS} rows of a motion are kept"
+            )
+        return self
 
 
 class CollectRequest(Message):
@@ -36,6 +59,14 @@ class CollectRequest(Message):
     sender: Name
     motion_id: Counter
     rows: Annotated[tuple[RowRange, ...], Field(min_length=1, max_length=MOST_MODULES)]
+
+    @model_validator(mode="after")
+    def _check_serials(self) -> Self:
+        serials = [wanted.serial for wanted in self.rows]
+        twice = next((serial for serial in serials if serials.count(serial) > 1), None)
+        if twice is not None:
+            raise out_of_range(f"rows of {twice} are asked for twice in one motion")
+        return self
 
 
 class ChainPart(Part):
@@ -51,8 +82,8 @@ class ChainPart(Part):
 class ClockPart(Part):
     """How a module's clock maps to the session's (`dynamics.clock_map.ClockMap`)."""
 
-    origin_ns: Nanoseconds
-    offset_ns: Annotated[float, Field(ge=-1e19, le=1e19)]
+    origin_ns: Annotated[int, Field(ge=0, le=FARTHEST_NS)]
+    offset_ns: Annotated[float, Field(ge=-FARTHEST_OFFSET_NS, le=FARTHEST_OFFSET_NS)]
     drift: Annotated[float, Field(ge=-0.1, le=0.1)]
 
 
@@ -78,8 +109,17 @@ class InformationRequest(Message):
     clocks: Annotated[tuple[ClockPart, ...], Field(min_length=1, max_length=MOST_MODULES)]
     motions: Annotated[tuple[SpanPart, ...], Field(min_length=1, max_length=64)]
     step_ns: Annotated[int, Field(ge=1_000_000, le=1_000_000_000)]
-    cutoff_hz: Annotated[float, Field(gt=0.0, le=500.0)]
+    cutoff_hz: Annotated[float, Field(ge=0.01, le=500.0)]
     offset: Counter = 0
+
+    @model_validator(mode="after")
+    def _check_work(self) -> Self:
+        samples, modules = sum(motion.samples for motion in self.motions), len(self.chain.serials)
+        if samples * modules**2 > MOST_WORK:
+            raise out_of_range(
+                f"{samples} samples of {modules} modules: at most {MOST_WORK // modules**2} are computed with"
+            )
+        return self
 
     def digest(self) -> bytes:
         """Return a SHA-256 of what is to be computed, whoever is asked and however often."""

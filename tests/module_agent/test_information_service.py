@@ -19,7 +19,7 @@ from module_agent.dynamics.regressor import torque_regressor
 from module_agent.dynamics.torque_terms import term_columns
 from module_agent.firmware.history import History
 from module_agent.information_service import InformationService
-from module_agent.motion_collection import MotionCollection, Track
+from module_agent.motion_collection import MotionCollection, OwnRows, Track
 from module_agent.wire.information_messages import (
     MOST_PART_BYTES,
     CollectRequest,
@@ -69,12 +69,13 @@ class Robot:
         self.q = np.cumsum(rng.normal(size=(ROWS, joints)), axis=0) * 0.02
         self.tau = rng.normal(size=(ROWS, joints)).astype("<f4")
 
-    def histories(self) -> dict[str, History]:
+    def own_rows(self) -> dict[str, OwnRows]:
         found = {}
         for k, serial in enumerate(self.chain.serials):
-            found[serial] = History(ROWS)
+            history = History(ROWS)
             for t, q, tau in zip(self.t_ns[k], self.q[:, k], self.tau[:, k], strict=True):
-                found[serial].append((int(t), int(t), 0, 0, q, 0.0, tau, *[0.0] * 15))
+                history.append((int(t), int(t), 0, 0, q, 0.0, tau, *[0.0] * 15))
+            found[serial] = OwnRows(BOOT, history)
         return found
 
     def collect_requests(self) -> list[CollectRequest]:
@@ -158,7 +159,7 @@ def far(one: JointInformation, other: JointInformation) -> float:
 def service(robot: Robot, worker: Deferred) -> InformationService:
     found = InformationService("J0", MotionCollection(), worker)
     for request in robot.collect_requests():
-        found.collect(request, robot.histories(), 0)
+        found.collect(request, robot.own_rows(), 0)
     return found
 
 
@@ -252,7 +253,7 @@ def test_a_module_keeps_no_motion_without_its_own_rows() -> None:
     robot = Robot((-1, 0))
     found = InformationService("X", MotionCollection(), Deferred())
     with pytest.raises(WireError, match="own rows of X"):
-        found.collect(robot.collect_requests()[0], robot.histories(), 0)
+        found.collect(robot.collect_requests()[0], robot.own_rows(), 0)
 
 
 def test_a_chain_and_its_clocks_survive_the_message_to_the_last_bit() -> None:

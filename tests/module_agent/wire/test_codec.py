@@ -258,8 +258,8 @@ def test_what_is_asked_of_64_modules_and_the_longest_answer_fit_a_message() -> N
         geometry=bytes(MOST_MODULES * 22 * 8),
         gravity_m_s2=(0.1, 0.2, 9.81),
     )
-    clock = ClockPart(origin_ns=2**63 - 1, offset_ns=-1e18, drift=1e-4)
-    span = SpanPart(motion_id=2**62, start_ns=2**62, end_ns=2**62, first_ns=2**62, samples=9999)
+    clock = ClockPart(origin_ns=2**61, offset_ns=-1e18, drift=1e-4)
+    span = SpanPart(motion_id=2**62, start_ns=2**61, end_ns=2**61, first_ns=2**61, samples=750)
     rows = tuple(RowRange(serial=s, boot=2**64 - 1, first_row=2**40, end_row=2**40 + 9) for s in names)
     head = {**HEAD, "sender": "s" * 64}
     for message in (
@@ -277,6 +277,18 @@ def test_what_is_asked_of_64_modules_and_the_longest_answer_fit_a_message() -> N
         ),
     ):
         assert decode(type(message), encode(message), MAX_MESSAGE_BYTES) == message
+
+
+def test_what_is_wrong_with_an_element_is_said_of_the_element() -> None:
+    """Not of the array, which lacks it then."""
+    request = next(m for m in EXAMPLES if isinstance(m, InformationRequest)).model_dump()
+    request["clocks"][0]["drift"] = 0.2
+    with pytest.raises(WireError, match=r"clocks\.0\.drift: Input should be less") as caught:
+        decode(InformationRequest, msgpack.packb(request))
+    assert caught.value.reason is Refusal.RANGE
+    with pytest.raises(WireError, match="clocks: Tuple should have at least 1 item") as caught:
+        decode(InformationRequest, msgpack.packb({**request, "clocks": []}))
+    assert caught.value.reason is Refusal.TYPES
 
 
 def test_a_question_has_the_same_digest_whoever_is_asked_and_for_whichever_part() -> None:
