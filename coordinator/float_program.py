@@ -10,6 +10,7 @@ import typer
 from coordinator.attended_run import Place, join, sender_name
 from coordinator.command_options import Connect, Listen, Network, Robot, fail
 from coordinator.failure import EXIT_FAILED, EXIT_LOST, EXIT_USAGE, explain
+from coordinator.float_gains import most_damping_nm_s_rad
 from coordinator.float_session import FloatPlan, FloatSession
 from coordinator.float_summary import FloatSummary
 from coordinator.float_view import FloatView
@@ -20,12 +21,14 @@ from coordinator.known_robot import KnownRobotError
 from coordinator.known_weight import KnownWeight, known_weight
 from coordinator.scaled_loop import ScaledLoop, check_speed
 from coordinator.terminal import Terminal
+from module_agent.catalogue import module_type
 from module_agent.wire.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.network_file import network as network_named
 from module_agent.wire.transport import Transport, TransportError
 
 LEAST_RATE_HZ, MOST_RATE_HZ = 20.0, 1000.0
+MOST_HOLD_S, MOST_FLOAT_S = 600.0, 86400.0
 
 
 def float_robot(
@@ -37,20 +40,16 @@ def float_robot(
     connect: Connect = None,
     network: Network = "none",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0,
-    for_s: Annotated[
-        float | None, typer.Option("--for", help="Seconds to float [until Ctrl-C].", min=0.0)
-    ] = None,
+    for_s: Annotated[float | None, typer.Option("--for", help="Seconds to float [until Ctrl-C].")] = None,
     rate: Annotated[float, typer.Option(help="Set-points a second.")] = 200.0,
-    damping: Annotated[
-        float, typer.Option(help="Of every joint against its motion [Nm s/rad].", min=0.0)
-    ] = 0.0,
+    damping: Annotated[float, typer.Option(help="Of every joint against its motion [Nm s/rad].")] = 0.0,
     max_speed: Annotated[
         float, typer.Option("--max-speed", help="A joint that goes faster is held [rad/s].")
     ] = 1.5,
     velocity_forces: Annotated[
         bool, typer.Option("--velocity-forces", help="Bear Coriolis and centrifugal forces too.")
     ] = False,
-    hold_s: Annotated[float, typer.Option("--hold", help="Seconds to hold still in the end.", min=0.0)] = 1.0,
+    hold_s: Annotated[float, typer.Option("--hold", help="Seconds to hold still in the end.")] = 1.0,
     back: Annotated[
         bool, typer.Option("--back/--no-back", help="Go back to where it stood before letting go [yes].")
     ] = True,
@@ -60,15 +59,17 @@ def float_robot(
 ) -> None:
     """Let a known robot float: its motors bear its weight, so that a hand can lead it and it stays there.
 
-    Ctrl-C ends it: the robot is held where it is, goes back to where it stood, and is let go. A second one
-    stops it at once. Exit codes: 0 also after Ctrl-C, 1 it was not set free or a limit ended it, others as of
-    `run`.
+    Ctrl-C ends it: the robot is held where it is, goes back to where it stood, and is let go. On its way back
+    it stops there. A second one stops it at once. If a limit was met it does not go back, and is let go where
+    it is. Exit codes: 0 also after Ctrl-C, 1 it was not set free or a limit ended it, others as of `run`.
     """
     try:
         weight = known_weight(known)
         check_chunk("robot", robot or weight.robot)
         check_speed(speed)
         _check_numbers(rate, max_speed)
+        _check_times(for_s, hold_s)
+        _check_damping(damping, weight)
         place = Place(listen, tuple(connect or ()), network_named(network), seed)
     except (KnownRobotError, ValueError) as error:
         fail(error, EXIT_USAGE)
@@ -88,6 +89,20 @@ def _check_numbers(rate_hz: float, max_speed_rad_s: float) -> None:
         raise ValueError(f"--rate {rate_hz}: it must be {LEAST_RATE_HZ:.0f} to {MOST_RATE_HZ:.0f} Hz")
     if not (math.isfinite(max_speed_rad_s) and max_speed_rad_s > 0.0):
         raise ValueError(f"--max-speed {max_speed_rad_s}: it must be a positive number of rad/s")
+
+
+def _check_times(for_s: float | None, hold_s: float) -> None:
+    for option, value, most in (("--for", for_s, MOST_FLOAT_S), ("--hold", hold_s, MOST_HOLD_S)):
+        if value is not None and not 0.0 <= value <= most:
+            raise ValueError(f"{option} {value}: it must be 0 to {most:.0f} s")
+
+
+def _check_damping(damping_nm_s_rad: float, weight: KnownWeight) -> None:
+    most, name = min((most_damping_nm_s_rad(module_type(name)), name) for name in set(weight.types))
+    if not 0.0 <= damping_nm_s_rad <= most:
+        raise ValueError(
+            f"--damping {damping_nm_s_rad}: it must be 0 to {most:g} Nm s/rad, the most for type {name}"
+        )
 
 
 def _attended(

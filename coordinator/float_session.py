@@ -5,22 +5,21 @@ are off when their commands' life is over.
 """
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from coordinator.clock import Clock
-from coordinator.feed_forward import feed_forward, joint_reference, on_module, paths_together
+from coordinator.float_gains import floating_gains, holding_gains
 from coordinator.float_summary import FloatSummary, FloatTally
 from coordinator.floating import (
     Floater,
+    FloatRefused,
     FloatSettings,
     Phase,
     Reading,
     Targets,
-    floating_gains,
-    holding_gains,
 )
 from coordinator.known_presence import Felt, check_mounting, find_known
 from coordinator.known_weight import KnownWeight
@@ -31,15 +30,14 @@ from coordinator.robot_link import KEEP_ALIVE_S, POLL_S, RobotLink
 from coordinator.together import together
 from module_agent.dynamics.chain import Array
 from module_agent.wire.feedback_rows import STATE_NAMES, Rows
-from module_agent.wire.messages import EffortProfile, Message, Pattern
+from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
 from module_agent.wire.transport import Transport
 
-BACK_RAD_S = 0.5
 # The feedback that is acted on is at most so much of a command's life old; a little later the modules would
 # refuse what follows from it.
 STALE_SHARE = 0.8
-# Gravity is felt for a tenth of a second.
+# Gravity and the load are felt for a tenth of a second.
 _FELT_ROWS = 25
 # Rows that are kept; older ones are dropped every so often.
 _KEPT_ROWS, _FORGET_EVERY_S = 250, 2.0
@@ -51,7 +49,7 @@ class FloatPlan(NamedTuple):
     """What a float is told. rate_hz: of the set-points. for_s: None until it is asked to end.
 
     then_hold_s: how long it is held still before it is led back to where it stood; is_led_back: whether it
-    is, or let go where it is.
+    is, or let go where it is. After a limit was met it is let go where it is.
     """
 
     settings: FloatSettings = FloatSettings()
@@ -107,6 +105,8 @@ class FloatSession:
         self._serials = weight.chain.serials
         self._tally = FloatTally(self._serials)
         self._asked = ""
+        # How often the end was asked for, and how often as the robot was taken hold of.
+        self._asks = self._asks_heard = 0
         self._held_all = False
         self._is_under_torque = False
 
@@ -116,8 +116,12 @@ class FloatSession:
         return bool(self._asked)
 
     def end(self, why: str = "asked to end") -> None:
-        """Ask for the end: the robot is held, led back and let go. To be called from the loop's thread."""
+        """Ask for the end: the robot is held, led back and let go. To be called from the loop's thread.
+
+        Asked when it is held already, it does not set out any more; asked on its way back, it stops there.
+        """
         self._asked = self._asked or why
+        self._asks += 1
 
     async def run(self) -> FloatSummary:
         """Float until the plan's time is over, the end is asked for, or a limit is met; say how it went.
@@ -145,17 +149,23 @@ class FloatSession:
         stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in told)
         settings = self._plan.settings._replace(stale_s=min(stale_s, self._plan.settings.stale_s))
         floater = Floater(self._weight, tuple(info.limits for info in told), settings)
-        stood = self._reading()
-        floater.check_start(stood)
+        stood = self._reading(_FELT_ROWS)
+        try:
+            floater.check_start(stood)
+        except FloatRefused:
+            # A base that stands otherwise changes the weight too, and says more.
+            check_mounting(self._weight.chain, self._felt())
+            raise
+        if self._asked:
+            return self._tally.summary(self._asked, is_fault=False)
         streaming: asyncio.Task[None] | None = None
         try:
             await together(self._link.acquire(serial) for serial in self._serials)
             streaming = asyncio.create_task(self._stream(floater))
             await self._float(floater, streaming)
-            end_s = self._now_s() + self._plan.then_hold_s
-            await self._until(lambda: self._now_s() >= end_s, streaming)
+            await self._return(floater, stood.q_rad, streaming)
             await _cancelled(streaming)
-            await self._leave(floater.place_rad, stood.q_rad)
+            await self._let_go()
         except BaseException as error:
             if streaming is not None:
                 await _cancelled(streaming)
@@ -181,6 +191,7 @@ class FloatSession:
             if floater.is_in("floating"):
                 self._watcher.note("it floats: lead it by hand")
             await self._until(lambda: self._is_over(floater), streaming)
+        self._asks_heard = self._asks
         floater.hold(self._now_s(), self._asked or "its time is over")
         self._watcher.note(f"it is held: {floater.why}")
         await self._until(lambda: floater.is_in("held"), streaming)
@@ -231,7 +242,8 @@ class FloatSession:
     def _send(self, targets: Targets) -> None:
         for k, serial in enumerate(self._serials):
             place = None if targets.position_rad is None else float(targets.position_rad[k])
-            self._link.stream(serial, place, 0.0, float(targets.effort_nm[k]))
+            rate, effort = float(targets.velocity_rad_s[k]), float(targets.effort_nm[k])
+            self._link.stream(serial, place, rate, effort)
         self._tally.sent += 1
 
     def _check_states(self) -> None:
@@ -252,24 +264,40 @@ class FloatSession:
 
     # ------------------------------------------------------------------ the end
 
-    async def _leave(self, held_rad: Array, stood_rad: Array) -> None:
-        """Lead the robot back to where it stood, where its motors were off before, and let go of it."""
-        held, stood = (dict(zip(self._serials, q.tolist(), strict=True)) for q in (held_rad, stood_rad))
+    async def _return(self, floater: Floater, stood_rad: Array, streaming: "asyncio.Task[None]") -> None:
+        """Hold the robot still, and lead it back to where it stood, where its motors were off before.
+
+        A robot that met a limit met perhaps somebody, and what lies on its way back is not known: it stays.
+        """
+        await self._stand(streaming)
+        if not (self._plan.is_led_back and self._is_under_torque):
+            return
+        if not floater.is_fault and self._asks == self._asks_heard:
+            self._watcher.note("it goes back to where it stood")
+            floater.lead_back(self._now_s(), stood_rad)
+            await self._until(
+                lambda: not floater.is_in("returning") or self._asks > self._asks_heard, streaming
+            )
+            if floater.is_in("held"):
+                return
+            floater.hold(self._now_s(), self._asked)
+            self._watcher.note(
+                f"it is held on its way back: {floater.why if floater.is_fault else self._asked}"
+            )
+            await self._until(lambda: floater.is_in("held"), streaming)
+            await self._stand(streaming)
+        self._watcher.note("it does not go back, and is let go where it is: support it")
+
+    async def _stand(self, streaming: "asyncio.Task[None]") -> None:
+        end_s = self._now_s() + self._plan.then_hold_s
+        await self._until(lambda: self._now_s() >= end_s, streaming)
+
+    async def _let_go(self) -> None:
         keeper = asyncio.create_task(self._link.keep_alive())
         try:
-            if self._plan.is_led_back:
-                patterns = paths_together(held, stood, BACK_RAD_S)
-                await self._link.run(patterns, self._efforts(patterns, held))
             await self._link.release_all()
         finally:
             await _cancelled(keeper)
-
-    def _efforts(
-        self, patterns: Mapping[str, Pattern], origins_rad: Mapping[str, float]
-    ) -> dict[str, EffortProfile]:
-        reference = joint_reference(self._serials, patterns, origins_rad)
-        points = feed_forward(self._weight.chain, self._weight.phi, reference)
-        return dict(zip(self._serials, on_module(points), strict=True))
 
     async def _abandon(self, error: BaseException) -> None:
         why = str(error) or type(error).__name__
@@ -285,11 +313,19 @@ class FloatSession:
         log = self._link.module(serial).rows
         return log.rows(log.end_row - count, log.end_row)
 
-    def _reading(self) -> Reading:
+    def _reading(self, count: int = 1) -> Reading:
+        """Return what the newest rows say, the mean of `count` of each module."""
         now_ns = self._clock()
-        rows = np.concatenate([self._newest(serial) for serial in self._serials])
-        ages = [1e-9 * (now_ns - self._link.module(s).arrivals[-1][0]) for s in self._serials]
-        return Reading(np.array(ages), *(rows[name].astype(float) for name in _READ))
+        ages = [1e-9 * (now_ns - self._heard_ns(serial)) for serial in self._serials]
+        rows = [self._newest(serial, count) for serial in self._serials]
+        means = ([row[name].mean(dtype=float) for row in rows] for name in _READ)
+        return Reading(np.array(ages), *(np.array(values) for values in means))
+
+    def _heard_ns(self, serial: str) -> int:
+        """Return when the newest row of a module came; what is known of later arrivals is dropped."""
+        arrivals = self._link.module(serial).arrivals
+        arrivals[:] = [first_of_newest(arrivals)]
+        return arrivals[0][0]
 
     def _felt(self) -> Felt:
         rows = [self._newest(serial, _FELT_ROWS) for serial in self._serials]
@@ -300,8 +336,15 @@ class FloatSession:
         for serial in self._serials:
             record = self._link.module(serial)
             record.rows.forget_before(record.rows.end_row - _KEPT_ROWS)
-            del record.arrivals[:-1]
             record.round_trips.clear()
+
+
+def first_of_newest(arrivals: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Return the arrival, (session time, newest module time) [ns], that first brought the newest of all.
+
+    Messages that overtake one another, or come twice, bring nothing newer.
+    """
+    return min(arrivals, key=lambda one: (-one[1], one[0]))
 
 
 async def _cancelled(task: "asyncio.Task[None]") -> None:

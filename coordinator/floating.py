@@ -8,12 +8,14 @@ which makes up for them: what is left of them holds the arm where the model errs
     loaded    holds; waits for the gains of torque control
     freeing   the position loop lets go, little by little
     floating  the weight is borne, nothing else
-    holding   the position loop takes hold again, where the robot is
+    holding   the position loop takes hold again, where the robot is; if it had not let go yet, where it held
     held      holds
+    returning goes to where it is told, held all the way
 
 A robot floats until it is told to hold, or a joint goes too fast, nears the end of its range or would have to
-bear more than it can. What its torque sensors read beside the weight before it is set free counts as their
-offset; it is not set free if that is more than an offset. Pure: time is an
+bear more than it can. Before it is taken, and again before it is set free, its torque sensors are compared
+with the weight: what they read beside it counts as their offset, and it is not set free if that is more than
+an offset and the errors of scales. Whoever sinks while it is being set free is held too. Pure: time is an
 argument, and nothing is sent from here.
 """
 
@@ -21,26 +23,27 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from coordinator.float_way import Way
 from coordinator.known_weight import KnownWeight
-from module_agent.catalogue import ModuleType
 from module_agent.dynamics.chain import Array
-from module_agent.firmware.gains import default_gains
-from module_agent.wire.messages import GainSet, Limits
+from module_agent.wire.messages import Limits
 
-Phase = Literal["loading", "loaded", "freeing", "floating", "holding", "held"]
+Phase = Literal["loading", "loaded", "freeing", "floating", "holding", "held", "returning"]
 
-# Under this strategy all three loops speak newton metres, so that a position or a velocity loop that is off
-# leaves pure torque control, and the velocity loop is a damper, on the module and at its rate.
-STRATEGY = 2
-# The factory's position control gives under this strategy: it has the weight to bear by itself. Where the
-# weight is borne already it can be so much stiffer. At 16 times arms of four and six joints ring.
-HOLDING_TIMES = 6.0
 # What a torque sensor reads beside the weight while the joint holds still, from this share of the ramp on, is
 # its offset: it is borne with the weight from then on, or the effort loop would push by it.
 TARED_FROM = 0.7
-# How far from the calculated torque a joint may be that holds still, as a share of its type's largest: scale
-# errors of the torque sensor and of the model stay below, a tool in the gripper does not.
-MOST_UNKNOWN = 0.15
+# How far from the calculated torque a joint may be that holds still: a share of its weight, four deviations
+# of the scale of a torque sensor as delivered, and one of its type's largest torque, four of its offset.
+# Springs lie beyond the motors' friction, so that friction hides nothing from them.
+UNKNOWN_OF_WEIGHT = 0.08
+UNKNOWN_OF_LARGEST = 0.02
+# How far a joint may go while it is being loaded or set free: nobody leads it yet.
+MOST_GIVEN_RAD = float(np.radians(5.0))
+# How far a joint may lag on the way back: it is stopped by something then.
+MOST_LAG_RAD = 0.08
+# How fast the way back is gone at most, and as a share of the speed at which a joint is held.
+BACK_RAD_S, BACK_SHARE = 0.5, 0.5
 
 
 class FloatRefused(RuntimeError):
@@ -77,7 +80,10 @@ class FloatSettings(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """The newest that is known of n joints, (n,) each: how old it is, and what it says."""
+    """The newest that is known of n joints, (n,) each.
+
+    age_s: for how long nothing newer has come; how long it was on the way is not in it.
+    """
 
     age_s: Array
     q_rad: Array
@@ -86,9 +92,10 @@ class Reading(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Set-points of n joints, (n,) each, at velocity zero; without positions the position loops are off."""
+    """Set-points of n joints, (n,) each; without positions the position loops are off."""
 
     position_rad: Array | None
+    velocity_rad_s: Array
     effort_nm: Array
 
 
@@ -110,7 +117,13 @@ class Floater:
         self._high = _ends([one.max_position_rad for one in limits], np.inf) - settings.margin_rad
         self._since_s = 0.0
         self._place: Array | None = None
-        self._borne, self._tare = np.zeros((2, len(limits)))
+        self._way: Way | None = None
+        # What the position loops still pull with as it takes hold: all if they had not let go.
+        self._grip = 1.0
+        self._pull: float | None = None
+        # What was asked of it when it was held before it could be set free.
+        self._left_nm: Array | None = None
+        self._borne, self._asked, self._tare = np.zeros((3, len(limits)))
         self._strangers: list[Array] = []
 
     @property
@@ -127,11 +140,18 @@ class Floater:
     def check_start(self, reading: Reading) -> None:
         """Check that the robot may be set free where it is; to be called before it is taken.
 
+        `reading` is best the mean of some rows: its efforts are compared with the weight.
+
         Raises:
-            FloatRefused: its weight is too much for a joint, or a joint stands at the end of its range.
+            FloatRefused: its weight is too much for a joint, or a joint stands at the end of its range or
+            bears another load than the known one.
         """
         weight = self._weight.effort_nm(reading.q_rad, np.zeros_like(reading.q_rad))
-        reason = self._overload(weight) or self._at_an_end(reading.q_rad)
+        reason = (
+            self._overload(weight)
+            or self._at_an_end(reading.q_rad)
+            or self._strange(reading.effort_nm, reading.effort_nm - weight)
+        )
         if reason:
             raise FloatRefused(reason)
 
@@ -142,20 +162,38 @@ class Floater:
             StaleFeedback: what is known of a joint is too old.
         """
         self._check_age(reading.age_s)
-        if self._place is None:
-            self._since_s, self._place, self._borne = t_s, reading.q_rad.copy(), reading.effort_nm.copy()
         rate = reading.qd_rad_s if self._settings.velocity_forces else np.zeros_like(reading.q_rad)
         weight = self._weight.effort_nm(reading.q_rad, rate)
+        if self._place is None:
+            self._begin(t_s, reading, weight)
         self._guard(t_s, reading, weight)
         if self.phase == "loading" and self._share(t_s, self._settings.ramp_s) >= TARED_FROM:
             self._strangers.append(reading.effort_nm - weight)
         self._go_on(t_s, reading)
         # What is too much is held by the position loop as far as the motor can.
-        effort = np.clip(weight + self._tare, -self._most_nm, self._most_nm)
+        most = self._most_nm
+        self._asked = np.clip(self._effort(t_s, weight + self._tare), -most, most)
+        if self._way is not None:
+            return Targets(*self._way.at(t_s - self._since_s), self._asked)
+        return Targets(self._held(t_s, reading.q_rad), np.zeros_like(self._asked), self._asked)
+
+    def _begin(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
+        self._since_s, self._place = t_s, reading.q_rad.copy()
+        self._borne = self._asked = reading.effort_nm.copy()
+        if self._left_nm is not None:
+            self._left_nm = self._borne
+        elif strange := self._strange(reading.effort_nm, reading.effort_nm - weight_nm):
+            self._fault(t_s, reading, strange)
+
+    def _effort(self, t_s: float, weight_nm: Array) -> Array:
+        """Return what the springs are asked for: the weight, once the robot is known to weigh that."""
         if self.phase == "loading":
-            share = self._share(t_s, self._settings.ramp_s)
-            return Targets(self._place, self._borne + share * (effort - self._borne))
-        return Targets(self._held(t_s, reading.q_rad), effort)
+            return self._borne + self._share(t_s, self._settings.ramp_s) * (weight_nm - self._borne)
+        if self._left_nm is None:
+            return weight_nm
+        # It was not set free: from what was asked last to what it bore by itself, without a step.
+        gone = self._share(t_s, self._settings.hold_s) if self.phase == "holding" else 1.0
+        return self._left_nm + gone * (self._borne - self._left_nm)
 
     def is_in(self, *phases: Phase) -> bool:
         """Whether it is in one of these phases."""
@@ -167,12 +205,31 @@ class Floater:
             self._enter("freeing", t_s)
 
     def hold(self, t_s: float, why: str) -> None:
-        """Take hold of the robot where it is at the next step, if it is not held already."""
-        if self.phase not in ("holding", "held"):
-            self.why = why
-            if self.phase in ("freeing", "floating"):
-                self._place = None
-            self._enter("holding", t_s)
+        """Take hold of the robot at the next step, if it is not held already.
+
+        Where it is held, or is on its way, it stays there with full grip; where it is being set free the pull
+        goes on as it is; where it is free it is taken hold of where it is.
+        """
+        if self.phase in ("holding", "held"):
+            return
+        self.why = self.why or why
+        if self.phase == "loading":
+            self._left_nm = self._asked
+        elif self.phase == "freeing":
+            self._pull = 1.0 - self._share(t_s, self._settings.ramp_s)
+        elif self.phase == "floating":
+            self._grip = self._pull = 0.0
+        elif self._way is not None:
+            self._place, self._way = self._way.at(t_s - self._since_s)[0], None
+            self._grip = 1.0
+        self._enter("holding", t_s)
+
+    def lead_back(self, t_s: float, target_rad: Array) -> None:
+        """Go to (n,) positions from where it holds. Only from `held`."""
+        if self.phase == "held":
+            speed = min(BACK_RAD_S, BACK_SHARE * self._settings.max_speed_rad_s)
+            self._way = Way(self.place_rad, target_rad, speed)
+            self._enter("returning", t_s)
 
     def _enter(self, phase: Phase, t_s: float) -> None:
         self.phase, self._since_s = phase, t_s
@@ -188,17 +245,19 @@ class Floater:
         assert self._place is not None
         if self.phase == "floating":
             return None
+        if self._pull is not None and self.phase == "holding":
+            self._place, self._pull = q_rad + self._pull * (self._place - q_rad), None
+        grip = 1.0
         if self.phase == "freeing":
             grip = 1.0 - self._share(t_s, self._settings.ramp_s)
         elif self.phase == "holding":
-            grip = self._share(t_s, self._settings.hold_s)
-        else:
-            grip = 1.0
+            grip = max(self._grip, self._share(t_s, self._settings.hold_s))
         return q_rad + grip * (self._place - q_rad)
 
     # ------------------------------------------------------------------ what ends it
 
     def _go_on(self, t_s: float, reading: Reading) -> None:
+        self._arrive(t_s)
         settings = self._settings
         length_s = settings.hold_s if self.phase == "holding" else settings.ramp_s
         if self._share(t_s, length_s) < 1.0:
@@ -217,19 +276,36 @@ class Floater:
         elif self.phase == "holding":
             self._enter("held", t_s)
 
+    def _arrive(self, t_s: float) -> None:
+        if self._way is not None and t_s - self._since_s >= self._way.total_s:
+            self._place, self._way = self._way.end_rad, None
+            self._enter("held", t_s)
+
     def _guard(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
-        if self.phase not in ("freeing", "floating"):
-            return
-        reason = (
-            self._too_fast(reading.qd_rad_s) or self._at_an_end(reading.q_rad) or self._overload(weight_nm)
-        )
+        if self._way is not None:
+            wanted = self._way.at(t_s - self._since_s)[0]
+            reason = self._astray(reading.q_rad - wanted, MOST_LAG_RAD, "behind on its way back")
+            reason = reason or self._too_fast(reading.qd_rad_s) or self._overload(weight_nm)
+        elif self.phase in ("freeing", "floating"):
+            reason = self._too_fast(reading.qd_rad_s) or self._at_an_end(reading.q_rad)
+            reason = reason or self._overload(weight_nm)
+        else:
+            reason = ""
+        if self.phase in ("loading", "freeing"):
+            given = reading.q_rad - self.place_rad
+            reason = reason or self._astray(given, MOST_GIVEN_RAD, "away before it was free")
         if reason:
             self._fault(t_s, reading, reason)
 
     def _fault(self, t_s: float, reading: Reading, why: str) -> None:
+        was_on_its_way = self._way is not None
+        if was_on_its_way:
+            # The end had another reason; what has come between is the one to tell.
+            self.why = ""
         self.is_fault = True
         self.hold(t_s, why)
-        if self._place is None:
+        if was_on_its_way:
+            # It does not push on against what has stopped it.
             self._place = reading.q_rad.copy()
 
     def _check_age(self, age_s: Array) -> None:
@@ -248,14 +324,24 @@ class Floater:
         )
 
     def _strange(self, effort_nm: Array, tare_nm: Array) -> str:
-        over = np.abs(tare_nm) - MOST_UNKNOWN * self._most_nm
+        weight = effort_nm - tare_nm
+        over = np.abs(tare_nm) - UNKNOWN_OF_WEIGHT * np.abs(weight) - UNKNOWN_OF_LARGEST * self._most_nm
         worst = int(np.argmax(over))
         if over[worst] <= 0.0:
             return ""
         return (
             f"joint {self._serials[worst]} bears {effort_nm[worst]:.2f} Nm, {tare_nm[worst]:+.2f} Nm beside "
-            "what the robot that is known weighs there: it carries something, leans on something, or stands "
-            "otherwise than when it was identified; identify it again as it is"
+            "what the robot that is known weighs there: it carries something, leans on something, is being "
+            "moved, or stands otherwise than when it was identified; identify it again as it is"
+        )
+
+    def _astray(self, away_rad: Array, most_rad: float, how: str) -> str:
+        worst = int(np.argmax(np.abs(away_rad)))
+        if abs(away_rad[worst]) <= most_rad:
+            return ""
+        return (
+            f"joint {self._serials[worst]} was {np.degrees(abs(away_rad[worst])):.1f} degrees {how}, at most "
+            f"{np.degrees(most_rad):.1f} are allowed: something pushes or stops it, or its load is another"
         )
 
     def _too_fast(self, rate_rad_s: Array) -> str:
@@ -277,25 +363,6 @@ class Floater:
             f"joint {self._serials[worst]} is at {q_rad[worst]:.2f} rad, within {margin:.2f} rad of the end "
             f"of its range, {self._low[worst] - margin:.2f} to {self._high[worst] + margin:.2f} rad"
         )
-
-
-def floating_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
-    """Return the gains under which a module floats: the factory's effort loop, and a damper."""
-    return _torque_gains(kind, damping_nm_s_rad)
-
-
-def holding_gains(kind: ModuleType) -> GainSet:
-    """Return the gains under which a module holds still what it bears."""
-    return _torque_gains(kind, HOLDING_TIMES * default_gains(kind, STRATEGY).velocity.kp)
-
-
-def _torque_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
-    factory = default_gains(kind, STRATEGY)
-    damper = factory.velocity.model_copy(
-        update={"kp": damping_nm_s_rad, "ki": 0.0, "kd": 0.0, "feed_forward": 0.0}
-    )
-    stiff = factory.position.model_copy(update={"kp": HOLDING_TIMES * factory.position.kp})
-    return factory.model_copy(update={"position": stiff, "velocity": damper})
 
 
 def _ends(values: list[float | None], otherwise: float) -> Array:

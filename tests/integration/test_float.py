@@ -67,9 +67,11 @@ def test_it_floats_until_interrupted_goes_back_with_its_weight_borne_and_lets_go
         rows = log.rows(log.first_row, log.end_row)
         streamed = rows[rows["state"] == 3]
         assert len(streamed), serial
-        # On the way back every joint is fed its weight along with its motion, as floating it was by itself.
-        back = rows[rows["motion_id"] > 0]
+        # Taken hold of, and on the way back, every joint is asked for its weight as floating it was.
+        last_free = np.flatnonzero(np.isnan(streamed["position_command_rad"]))[-1]
+        back = streamed[last_free + 1 :]
         assert len(back), serial
+        assert np.isfinite(back["position_command_rad"]).all()
         assert np.isfinite(back["effort_command_nm"]).all()
     lift = ear.rows["shoulder-lift"]
     rows = lift.rows(lift.first_row, lift.end_row)
