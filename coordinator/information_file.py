@@ -10,24 +10,34 @@ import numpy as np
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.dynamics.information import JointInformation
 
-VERSION = 1
+VERSION = 2
 
 
 class RunInformation(NamedTuple):
     """The information in the torques of one run of a robot of n joints.
 
-    name: of the run. joints: (n,) in the columns of `torque_regressor`, whatever else was in the readings
-    taken off. sigma_nm: (n,) noise of the torques. independent_fraction: independent samples per sample.
-    effects: (k_i, j) of every joint: what errors that come as a whole, one deviation long, do to its rows, in
-    Nm (`dynamics.common_errors`).
+    name: of the run. session: the trace hash of its recording, by which a run is known again. joints: (n,)
+    in the columns of `torque_regressor`, whatever else was in the readings taken off. sigma_nm: (n,) noise of
+    the torques. independent_fraction: independent samples per sample.
+    phi_parts: (20 n,) parts that the bodies are likely made of (`dynamics.parts.likely_parts`).
+    directions: (6 n, j) increments that the chain may be off by, one deviation long. effects: (k_i, j) of
+    every joint: what those do to its rows with the bodies held in the root frame, in Nm
+    (`dynamics.common_errors`).
+    scale: (n,) the torques are 1 + scale times what the sensors showed. scale_sigma: what was known of that
+    before the run; 0 of sensors that show what is.
     """
 
     name: str
+    session: str
     chain: Chain
     joints: tuple[JointInformation, ...]
     sigma_nm: Array
     independent_fraction: float
+    phi_parts: Array
+    directions: Array
     effects: tuple[Array, ...]
+    scale: Array
+    scale_sigma: float
 
 
 class InformationFileError(ValueError):
@@ -39,12 +49,17 @@ def write_information(path: Path, run: RunInformation) -> None:
     chain = run.chain
     arrays: dict[str, Any] = {
         "version": VERSION,
+        "session": run.session,
         "serials": np.array(chain.serials),
         "parent": np.array(chain.parent, dtype=np.int64),
         "reversed": np.array(chain.reversed, dtype=bool),
         **{name: getattr(chain, name) for name in ("axis", "point", "imu_home", "gravity")},
         "sigma_nm": run.sigma_nm,
         "independent_fraction": run.independent_fraction,
+        "phi_parts": run.phi_parts,
+        "directions": run.directions,
+        "scale": run.scale,
+        "scale_sigma": run.scale_sigma,
         "rest_nm2": np.array([joint.rest for joint in run.joints]),
         "samples": np.array([joint.samples for joint in run.joints], dtype=np.int64),
     }
@@ -64,7 +79,10 @@ def read_information(path: Path) -> RunInformation:
     try:
         with np.load(path, allow_pickle=False) as file:
             if int(file["version"]) != VERSION:
-                raise InformationFileError(f"{path} is of version {file['version']}, {VERSION} is read here")
+                raise InformationFileError(
+                    f"{path} is of version {file['version']}, {VERSION} is read here: replay the run's "
+                    f"session.mcap, which writes it anew"
+                )
             return _run(path.parent.name, dict(file))
     except OSError as error:
         raise InformationFileError(
@@ -99,10 +117,20 @@ def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
         )
         for k in range(joints)
     )
-    sigma = _checked(arrays["sigma_nm"], (joints,))
-    count = arrays["effects0"].shape[-1]
-    effects = tuple(_checked(arrays[f"effects{k}"], (len(arrays[f"z{k}"]), count)) for k in range(joints))
-    return RunInformation(name, chain, found, sigma, float(arrays["independent_fraction"]), effects)
+    count = arrays["directions"].shape[-1]
+    return RunInformation(
+        name=name,
+        session=str(arrays["session"]),
+        chain=chain,
+        joints=found,
+        sigma_nm=_checked(arrays["sigma_nm"], (joints,)),
+        independent_fraction=float(arrays["independent_fraction"]),
+        phi_parts=_checked(arrays["phi_parts"], (20 * joints,)),
+        directions=_checked(arrays["directions"], (6 * joints, count)),
+        effects=tuple(_checked(arrays[f"effects{k}"], (len(arrays[f"z{k}"]), count)) for k in range(joints)),
+        scale=_checked(arrays["scale"], (joints,)),
+        scale_sigma=float(_checked(arrays["scale_sigma"], ())),
+    )
 
 
 def _checked(array: Any, shape: tuple[int, ...]) -> Array:

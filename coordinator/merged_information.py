@@ -2,17 +2,19 @@
 
 Every run's rows, in standard deviations of what they err by, are taken from its bodies to the parts that
 those are made of (`dynamics.parts`) and stacked: of Gaussian errors that is all that there is to know, in any
-order. An error of a chain is one of its run; and so are errors of the torque sensors' scales taken to be.
+order. An error of a chain is one of its run, and moves the parts with their IMUs. The scale of a torque
+sensor is its module's own in every run, however often that is put together anew: it is one more unknown of
+all runs, of which what is known beforehand counts once. So is every run, which its recording is known by.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import qr
 
 from coordinator.dynamics.base_parameters import BaseParameters, Columns, base_parameters, whitened
-from coordinator.dynamics.common_errors import whitened_effects
+from coordinator.dynamics.common_errors import body_shifts, whitened_effects
 from coordinator.dynamics.identification import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG
 from coordinator.dynamics.parts import Part, bodies_from_parts, part_columns, parts_of
 from coordinator.information_file import RunInformation
@@ -75,34 +77,90 @@ def merge_runs(
             for chains that were themselves estimated.
 
     Raises:
-        ValueError: no runs, or runs with no module in common: together they say no more than each by itself.
+        ValueError: no runs, the same run twice, or runs with no module in common: together they say no more
+            than each by itself.
     """
-    if not runs:
-        raise ValueError("no runs to merge")
-    shared = set.intersection(*(set(run.chain.serials) for run in runs))
-    if not shared:
-        raise ValueError(f"the runs {', '.join(run.name for run in runs)} have no module in common")
+    _check(runs)
     parts = parts_of(run.chain for run in runs)
     columns = part_columns(parts)
-    rows = [_rows(run, parts) for run in runs]
-    together = np.vstack([row for row, _ in rows]), np.concatenate([target for _, target in rows])
+    scales = _scale_sigmas(runs)
+    rows = [_rows(run, parts, scales) for run in runs]
+    together = _without_scales(rows, len(scales))
     whole, spectrum = _base(*together, columns, tolerance), _spectrum(*together, columns)
-    shares = [
-        _share(run, _base(*own, columns, tolerance), _spectrum(*own, columns), spectrum)
-        for run, own in zip(runs, rows, strict=True)
-    ]
+    shares = []
+    for run, one in zip(runs, rows, strict=True):
+        own = _without_scales([one], len(scales))
+        shares.append(_share(run, _base(*own, columns, tolerance), _spectrum(*own, columns), spectrum))
     return MergedInformation(parts, whole, tuple(shares))
 
 
-def _rows(run: RunInformation, parts: Sequence[Part]) -> tuple[Array, Array]:
-    """Return the rows of a run over the parts, and their target, with errors that are white."""
+def _check(runs: Sequence[RunInformation]) -> None:
+    if not runs:
+        raise ValueError("no runs to merge")
+    known: dict[str, str] = {}
+    for run in runs:
+        if run.session in known:
+            raise ValueError(
+                f"the runs {known[run.session]} and {run.name} are of the same recording, which says no more "
+                "when it is counted twice: give each once"
+            )
+        known[run.session] = run.name
+    if not set.intersection(*(set(run.chain.serials) for run in runs)):
+        raise ValueError(f"the runs {', '.join(run.name for run in runs)} have no module in common")
+
+
+def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:
+    """Return what is known beforehand of every module's torque sensor, by the best that any run was told."""
+    found: dict[str, float] = {}
+    for run in runs:
+        for serial in run.chain.serials:
+            found[serial] = min(found.get(serial, np.inf), run.scale_sigma)
+    return dict(sorted(found.items()))
+
+
+def _of_rows(run: RunInformation, of_joints: Array) -> Array:
+    """Return for every row what its joint has."""
+    return np.asarray(np.repeat(of_joints, [len(piece.z) for piece in run.joints]))
+
+
+def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float]) -> Array:
+    """Return a run's rows [scales | parts | target], their errors white; scales are in deviations.
+
+    A sensor that shows z0 of the torque r phi = (1 + s) z0 was taken to show z0 = z / (1 + v), so that
+    z - v z0 = r phi - s z0. In both places z0 is what the run's own parameters say that it shows: readings
+    would bring their noise along, and all scales come out too small.
+    """
     sigma = np.maximum(run.sigma_nm, _LEAST_SIGMA_NM)
     rows, target = whitened(run.joints, sigma, run.independent_fraction)
-    effects = whitened_effects(run.effects, sigma, run.independent_fraction)
-    # Noise and the errors that come as a whole: I + E E^T = L L^T, and L^-1 makes them white.
-    lower = cholesky(np.eye(len(rows)) + effects @ effects.T, lower=True)
-    white = solve_triangular(lower, np.column_stack([rows, target]), lower=True)
-    return white[:, :-1] @ bodies_from_parts(run.chain, parts), white[:, -1]
+    of_chain = whitened_effects(run.effects, sigma, run.independent_fraction)
+    of_chain = of_chain + rows @ body_shifts(run.chain, run.directions, run.phi_parts)
+    own = rows @ (bodies_from_parts(run.chain, parts_of([run.chain])) @ run.phi_parts)
+    shown = own / (1.0 + _of_rows(run, run.scale))
+    known = np.diag(list(scales.values()))
+    place = {serial: k for k, serial in enumerate(scales)}
+    of_scale = (
+        -shown[:, None] * known[[place[serial] for serial in _of_rows(run, np.array(run.chain.serials))]]
+    )
+    over_parts = rows @ bodies_from_parts(run.chain, parts)
+    target = target - _of_rows(run, run.scale) * shown
+    return _without(np.column_stack([of_chain, of_scale, over_parts, target]), of_chain.shape[1])
+
+
+def _without_scales(rows: Sequence[Array], scales: int) -> tuple[Array, Array]:
+    """Return rows over the parts and their target of runs whose sensors' scales are the same."""
+    found = _without(np.vstack(rows), scales)
+    return found[:, :-1], found[:, -1]
+
+
+def _without(rows: Array, count: int) -> Array:
+    """Return rows without their first columns, unknowns of which one deviation is 1.
+
+    What is known of those beforehand are rows more, and QR leaves below their own rows what is told of all
+    else whatever they are (Bierman 1977, Factorization methods for discrete sequential estimation, ch. 6).
+    """
+    known = np.eye(count, rows.shape[1])
+    triangle = qr(np.vstack([known, rows]), mode="r", check_finite=False)[0]
+    return np.asarray(triangle[count : rows.shape[1], count:])
 
 
 def _base(rows: Array, target: Array, columns: Columns, tolerance: float) -> BaseParameters:

@@ -12,6 +12,9 @@ from coordinator.agents_information import dynamic_steps
 from coordinator.beside import Beside
 from coordinator.clock import Clock
 from coordinator.dynamic_motions import INDEPENDENT_FRACTION
+from coordinator.dynamics.common_errors import error_directions
+from coordinator.dynamics.parts import likely_parts
+from coordinator.dynamics.torque_scale import SCALE_SIGMA
 from coordinator.excitation.of_robot import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.hrdf import write_hrdf
@@ -23,6 +26,7 @@ from coordinator.identify import (
     identify_kinematics,
     write_held_out,
 )
+from coordinator.inertia import Inertia
 from coordinator.information_file import RunInformation, write_information
 from coordinator.journal import JournalEvent, standstill
 from coordinator.kinematics.topology_advice import NextMotion
@@ -55,7 +59,7 @@ from coordinator.urdf import write_urdf
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from coordinator.viewer_feed import FILE, LIVE, Screen, ViewerFeed
-from module_agent.catalogue import module_type
+from module_agent.catalogue import ModuleType, module_type
 from module_agent.dynamics.chain import Chain
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
@@ -358,15 +362,25 @@ def write_outputs(out: Path, found: Identified) -> None:
     if found.held_out is not None:
         write_held_out(out / HELD_OUT, found.held_out)
     if found.inertia is not None:
-        seen = found.inertia.seen
-        write_information(
-            out / INFORMATION,
-            RunInformation(
-                out.name,
-                found.kinematics.fit.chain,
-                seen.information,
-                seen.fit.torque_sigma_nm,
-                INDEPENDENT_FRACTION,
-                found.inertia.effects,
-            ),
-        )
+        write_information(out / INFORMATION, _information(out.name, found, found.inertia, types))
+
+
+def _information(
+    name: str, found: Identified, inertia: Inertia, types: Sequence[ModuleType]
+) -> RunInformation:
+    seen, fit = inertia.seen, found.kinematics.fit
+    # Of the scales' effects what is known beforehand is kept, which several runs share.
+    chain_effects = tuple(one[:, len(types) :] for one in inertia.effects)
+    return RunInformation(
+        name=name,
+        session=found.result.trace_hash,
+        chain=fit.chain,
+        joints=seen.information,
+        sigma_nm=seen.fit.torque_sigma_nm,
+        independent_fraction=INDEPENDENT_FRACTION,
+        phi_parts=likely_parts(fit.chain, types, seen.informed_phi),
+        directions=error_directions(fit.covariance),
+        effects=chain_effects,
+        scale=seen.scale.value,
+        scale_sigma=SCALE_SIGMA["uncalibrated" if seen.scale.covariance.any() else "calibrated"],
+    )

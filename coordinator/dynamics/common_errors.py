@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from coordinator.dynamics.parts import bodies_from_parts, parts_of
 from coordinator.dynamics.torque_scale import TorqueScale
 from coordinator.kinematics.increments import apply_increment
 from module_agent.dynamics.chain import Array, Chain
@@ -23,23 +24,58 @@ _NEGLIGIBLE = 1e-8
 _MOST_DIRECTIONS = 128
 
 
-def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: JointMotion) -> Array:
-    """Return what errors of a chain, each of one deviation, do to a motion's torques, (m, n, k) [Nm].
+def error_directions(covariance: Array) -> Array:
+    """Return increments (6 n, k), read-only, each one deviation long, whose squares add to a covariance.
 
-    Args:
-        chain: n joints. covariance: (6 n, 6 n) of its increments.
-        phi: (10 n,) bodies.
-        motion: (m, n).
+    Those too short to make a difference are left out.
     """
     values, vectors = np.linalg.eigh(covariance)
     kept = np.flatnonzero(values > _NEGLIGIBLE * max(values[-1], 0.0))[-_MOST_DIRECTIONS:]
+    found = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+    found.flags.writeable = False
+    return found
+
+
+def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: JointMotion) -> Array:
+    """Return what errors of a chain, each of one deviation, do to a motion's torques, (m, n, k) [Nm].
+
+    The bodies stay where they are in the root frame, as one run tells them; what is told of the parts that
+    they are made of moves with the chain (`body_shifts`).
+
+    Args:
+        chain: n joints. covariance: (6 n, 6 n) of its increments, k of whose
+            `error_directions` matter.
+        phi: (10 n,) bodies.
+        motion: (m, n).
+    """
     joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
     here = inverse_dynamics(chain, phi, *joints)
     found = [
-        inverse_dynamics(apply_increment(chain, np.sqrt(values[k]) * vectors[:, k]), phi, *joints) - here
-        for k in kept
+        inverse_dynamics(apply_increment(chain, one), phi, *joints) - here
+        for one in error_directions(covariance).T
     ]
     return np.stack(found, axis=2) if found else np.zeros((*here.shape, 0))
+
+
+def body_shifts(chain: Chain, directions: ArrayLike, phi_parts: ArrayLike) -> Array:
+    """Return what errors of a chain do to bodies that are made of known parts, (10 n, k): (T' - T) phi_parts.
+
+    A part is known in the frame of its module's IMU (`parts`), and goes wherever the chain takes that. With
+    the rows r of `torque_regressor` an error of the chain does to the torque of given parts, to first order,
+
+    ID(chain', T' phi_parts) - ID(chain, T phi_parts) = `chain_effects` + r (T' - T) phi_parts.
+
+    Args:
+        chain: n joints. directions: (6 n, k) increments.
+        phi_parts: (20 n,) in the order of `parts_of([chain])`.
+    """
+    parts = parts_of([chain])
+    here = bodies_from_parts(chain, parts)
+    found = [
+        (bodies_from_parts(apply_increment(chain, one), parts) - here) @ np.asarray(phi_parts, dtype=float)
+        for one in np.asarray(directions, dtype=float).T
+    ]
+    return np.stack(found, axis=1) if found else np.zeros((len(here), 0))
 
 
 def scale_effects(information: Sequence[JointInformation], scale: TorqueScale) -> tuple[Array, ...]:

@@ -32,18 +32,35 @@ def module_prior(chain: Chain, types: Sequence[ModuleType]) -> Array:
     Raises:
         ValueError: there is not one type per module.
     """
-    housings, outputs = housing_homes(chain, types), output_homes(chain, types)
-    leaves, enters = distal_homes(chain, types), proximal_homes(chain, types)
-    found = np.zeros((len(chain.serials), 4, 4))
-    for i, kind in enumerate(types):
-        sides = _housing(kind, housings[i]), _output(kind, outputs[i])
-        own, held = sides if chain.reversed[i] else sides[::-1]
-        found[i] += own
-        parent = chain.parent[i]
+    turned, held = sides_prior(chain, types)
+    found = turned.copy()
+    for i, parent in enumerate(chain.parent):
         if parent != BASE:
-            found[parent] += held + _link(leaves[parent][:3, 3], enters[i][:3, 3])
+            found[parent] += held[i]
     found.flags.writeable = False
     return found
+
+
+def sides_prior(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array]:
+    """Return what every module's joint turns and what is held by it, with the link that leads to it.
+
+    Each (n, 4, 4), pseudo-inertias in the root frame at q = 0, read-only. Of a module on the base the link is
+    left out: no torque shows it.
+
+    Raises:
+        ValueError: there is not one type per module.
+    """
+    housings, outputs = housing_homes(chain, types), output_homes(chain, types)
+    leaves, enters = distal_homes(chain, types), proximal_homes(chain, types)
+    turned, held = np.zeros((2, len(chain.serials), 4, 4))
+    for i, kind in enumerate(types):
+        sides = _housing(kind, housings[i]), _output(kind, outputs[i])
+        turned[i], held[i] = sides if chain.reversed[i] else sides[::-1]
+        parent = chain.parent[i]
+        if parent != BASE:
+            held[i] += _link(leaves[parent][:3, 3], enters[i][:3, 3])
+    turned.flags.writeable = held.flags.writeable = False
+    return turned, held
 
 
 def _housing(kind: ModuleType, home: Array) -> Array:

@@ -14,9 +14,12 @@ from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from coordinator.dynamics.base_parameters import Columns, inertial_columns
-from coordinator.dynamics.consistency import parameter_transform
+from coordinator.dynamics.consistency import parameter_transform, parameters
+from coordinator.dynamics.parameter_prior import sides_prior
+from module_agent.catalogue import ModuleType
 from module_agent.dynamics.chain import Array, Chain
 from module_agent.dynamics.regressor import PER_BODY
 
@@ -70,6 +73,36 @@ def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
                 found[_ten(body), _ten(place[part])] = into_root
     found.flags.writeable = False
     return found
+
+
+def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> Array:
+    """Return parameters (20 n,) of the parts of one chain that make up its bodies, read-only.
+
+    Torques tell a body as a whole. Its parts are those of modules of the type; by what the body is other than
+    such parts together, each of them is in proportion to its mass: T `likely_parts` = phi. They are in the
+    order of `parts_of([chain])`.
+
+    Args:
+        chain: n joints. types: their modules'. phi: (10 n,) bodies in the root frame.
+    """
+    turned, held = (np.stack([parameters(one) for one in side]) for side in sides_prior(chain, types))
+    bodies = np.asarray(phi, dtype=float).reshape(-1, PER_BODY)
+    expected = turned.copy()
+    for k, parent in enumerate(chain.parent):
+        if parent >= 0:
+            expected[parent] += held[k]
+    surplus = (bodies - expected) / expected[:, :1]
+    place = {part: k for k, part in enumerate(parts_of([chain]))}
+    found = np.zeros((len(place), PER_BODY))
+    for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
+        into_imu = parameter_transform(np.linalg.inv(chain.imu_home[k]))
+        own: tuple[tuple[Role, Array, int], ...] = (("turned", turned[k], k), ("held", held[k], parent))
+        for role, part, body in own:
+            whole = part + part[0] * surplus[body] if body >= 0 else part
+            found[place[Part(serial, role, bool(chain.reversed[k]))]] = into_imu @ whole
+    flat = found.ravel()
+    flat.flags.writeable = False
+    return flat
 
 
 def part_columns(parts: Sequence[Part]) -> Columns:

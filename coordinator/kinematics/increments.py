@@ -20,7 +20,8 @@ def apply_increment(chain: Chain, delta: ArrayLike) -> Chain:
         ValueError: `delta` is not (6 n,).
     """
     count = len(chain.serials)
-    twists = np.asarray(delta, dtype=float)
+    # A copy: scipy takes no read-only arrays.
+    twists = np.array(delta, dtype=float)
     if twists.shape != (6 * count,):
         raise ValueError(f"an increment of {count} modules has shape ({6 * count},), got {twists.shape}")
     moved = RigidTransform.from_exp_coords(twists.reshape(count, 6)).as_matrix()

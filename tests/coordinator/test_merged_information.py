@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from coordinator.dynamics.common_errors import chain_effects, error_directions
 from coordinator.dynamics.identification import RANK_TOLERANCE
 from coordinator.dynamics.parts import bodies_from_parts, parts_of
 from coordinator.information_file import (
@@ -19,12 +21,14 @@ from coordinator.information_file import (
     read_information,
     write_information,
 )
+from coordinator.kinematics.increments import apply_increment
 from coordinator.main import app
 from coordinator.merged_information import MergedInformation, merge_runs
 from coordinator.run_folder import INFORMATION
 from module_agent.dynamics.chain import Array, Chain
-from module_agent.dynamics.information import gather, merge
-from module_agent.dynamics.regressor import inverse_dynamics
+from module_agent.dynamics.differentiation import JointMotion
+from module_agent.dynamics.information import compress, merge
+from module_agent.dynamics.regressor import inverse_dynamics, torque_regressor
 
 SERIALS = ("A", "B", "C")
 NOISE_NM = np.array([0.02, 0.01, 0.005])
@@ -52,20 +56,63 @@ def assembled(rng: Generator, order: tuple[int, ...] = (0, 1, 2)) -> Chain:
     )
 
 
+class Errors(NamedTuple):
+    """What a run errs by beside noise.
+
+    off: (18,) by how much the chain that it takes is off. spread: (18, 18) of such errors.
+    scale: (3,) of every module's torque sensor, which shows 1 / (1 + scale) of the torque. taken: (n,) what
+    the run has multiplied its torques by beyond 1. scale_sigma: what is known of them. noise: in `NOISE_NM`.
+    """
+
+    off: Array = np.zeros(18)
+    spread: Array = np.zeros((18, 18))
+    scale: Array = np.zeros(3)
+    taken: Array = np.zeros(3)
+    scale_sigma: float = 0.0
+    noise: float = 1.0
+
+
+NOISE_ALONE = Errors()
 PARTS = parts_of([assembled(default_rng(0))])
 PHI = (default_rng(3).uniform(0.2, 1.0, (len(PARTS), 10)) * SCALE).ravel()
 
 
 def measured(
-    rng: Generator, chain: Chain, samples: int = 400, name: str = "run", phi: Array = PHI, effect: float = 0.0
+    rng: Generator,
+    chain: Chain,
+    samples: int = 400,
+    name: str = "run",
+    phi: Array = PHI,
+    errors: Errors = NOISE_ALONE,
 ) -> RunInformation:
     """A run of a chain whose bodies are made of the parts, with noise on its torques."""
+    of = [SERIALS.index(s) for s in chain.serials]
     q, qd, qdd = (scale * rng.normal(size=(samples, 3)) for scale in (1.0, 2.0, 8.0))
-    noise = NOISE_NM[[SERIALS.index(s) for s in chain.serials]]
-    tau = inverse_dynamics(chain, bodies_from_parts(chain, PARTS) @ phi, q, qd, qdd)
-    joints = gather(chain, q, qd, qdd, tau + noise * rng.normal(size=tau.shape))
-    effects = tuple(effect * joint.z[:, None] for joint in joints)
-    return RunInformation(name, chain, joints, noise, 1.0, effects)
+    bodies = bodies_from_parts(chain, PARTS) @ phi
+    tau = inverse_dynamics(chain, bodies, q, qd, qdd) / (1.0 + errors.scale[of])
+    noise = np.asarray(errors.noise * NOISE_NM[of])
+    shown = (1.0 + errors.taken) * (tau + noise * rng.normal(size=tau.shape))
+    believed = apply_increment(chain, errors.off)
+    bodies = bodies_from_parts(believed, PARTS) @ phi
+    columns = chain_effects(believed, errors.spread, bodies, JointMotion(np.arange(samples), q, qd, qdd, tau))
+    pieces = compress(np.concatenate([torque_regressor(believed, q, qd, qdd), columns], axis=2), shown)
+    rows = np.vstack([piece.r[:, :30] for piece in pieces]) @ bodies_from_parts(believed, PARTS)
+    readings = np.concatenate([piece.z for piece in pieces])
+    # What the run makes of its readings: weak directions stay what modules of the type have.
+    found = phi + np.linalg.lstsq(rows, readings - rows @ phi, rcond=1e-3)[0]
+    return RunInformation(
+        name=name,
+        session=rng.bytes(16).hex(),
+        chain=believed,
+        joints=tuple(piece._replace(r=piece.r[:, :30]) for piece in pieces),
+        sigma_nm=noise,
+        independent_fraction=1.0,
+        phi_parts=found,
+        directions=error_directions(errors.spread),
+        effects=tuple(piece.r[:, 30:] for piece in pieces),
+        scale=errors.taken,
+        scale_sigma=errors.scale_sigma,
+    )
 
 
 def exact(runs: list[RunInformation]) -> MergedInformation:
@@ -150,19 +197,88 @@ def test_a_part_that_was_not_the_same_is_noticed() -> None:
     assert max(run.strain for run in exact(other).runs) > 5.0
 
 
-def test_errors_that_come_as_a_whole_are_not_averaged_out_by_rows() -> None:
-    """A sensor's scale that may be 5 % off leaves nothing better known, with any number of rows."""
-    rng = default_rng(10)
-    chain = assembled(rng)
-    quiet, doubtful = (exact([measured(default_rng(1), chain, effect=e)]).base for e in (0.0, 0.05))
+ORDERS = ((0, 1, 2), (2, 1, 0), (1, 2, 0), (0, 2, 1))
+
+
+def test_a_doubtful_scale_leaves_nothing_better_known() -> None:
+    """Sensors that may be 5 % off leave every sum as doubtful, with any number of rows."""
+    chain = assembled(default_rng(10))
+    quiet, doubtful = (
+        exact([measured(default_rng(1), chain, errors=Errors(scale_sigma=e))]).base for e in (0.0, 0.05)
+    )
     assert quiet.relative_sigma.min() < 0.005
-    assert doubtful.relative_sigma.min() > 0.02
+    # Of three sensors' mean.
+    assert doubtful.relative_sigma.min() > 0.9 * 0.05 / np.sqrt(3)
+
+
+def test_putting_modules_together_anew_does_not_average_the_scales_of_their_sensors() -> None:
+    rng = default_rng(14)
+    doubt = Errors(scale_sigma=0.05)
+    runs = [measured(rng, assembled(rng, order), errors=doubt) for order in ORDERS]
+    found = exact(runs).base
+    # All sensors off alike are all parts heavier: no run tells that, and runs are no sensors. Four runs with
+    # sensors of their own would have half of this.
+    whole = found.grouping @ PHI
+    known = np.linalg.pinv(found.covariance, hermitian=True)
+    assert 1.0 / np.sqrt(whole @ known @ whole) > 0.95 * 0.05 / np.sqrt(3)
+
+
+def test_what_is_claimed_under_scales_of_sensors_is_true() -> None:
+    rng = default_rng(15)
+    chains = [assembled(rng, order) for order in ORDERS]
+    off = []
+    for _ in range(25):
+        scale = 0.03 * rng.normal(size=3)
+        runs = []
+        for chain, order in zip(chains, ORDERS, strict=True):
+            # A run finds the scales of its sensors relative to each other, but for what all have in common.
+            taken = (scale - scale.mean() + 0.01 * rng.normal())[list(order)]
+            runs.append(measured(rng, chain, 150, errors=Errors(scale=scale, taken=taken, scale_sigma=0.03)))
+        found = exact(runs)
+        off.append((found.base.value - found.base.grouping @ PHI) / found.base.sigma)
+    # Three scales drawn 25 times: their mean square scatters by a quarter.
+    assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
+
+
+def test_every_sum_is_as_uncertain_as_claimed_where_only_chains_err() -> None:
+    rng = default_rng(16)
+    chains = [assembled(rng, order) for order in ORDERS[:3]]
+    # A tenth of a millimetre and 0.2 mrad; noise and what is of second order are far below that.
+    length = np.tile([2e-4] * 3 + [1e-4] * 3, 3)
+    motions = default_rng(17)
+    state = motions.bit_generator.state
+    pulls = []
+    for _ in range(60):
+        motions.bit_generator.state = state
+        runs = [
+            measured(
+                motions,
+                chain,
+                150,
+                errors=Errors(off=length * rng.normal(size=18), spread=np.diag(length**2), noise=1e-2),
+            )
+            for chain in chains
+        ]
+        sums = merge_runs(runs).base
+        pulls.append((sums.value - sums.grouping @ PHI) / sums.sigma)
+    # The rms of 60 draws scatters by a tenth, and the largest of some 40 by three times that.
+    each = np.sqrt(np.mean(np.square(pulls), axis=0))
+    assert each.min() > 0.6
+    assert each.max() < 1.5
+
+
+def test_a_run_is_not_counted_twice() -> None:
+    rng = default_rng(18)
+    one, two = (measured(rng, assembled(rng), name=name) for name in ("one", "two"))
+    with pytest.raises(ValueError, match="the runs one and copy are of the same recording"):
+        merge_runs([one, two, one._replace(name="copy")])
+    assert len(merge_runs([one, two]).runs) == 2
 
 
 def test_runs_of_other_modules_are_not_merged() -> None:
     rng = default_rng(11)
     run = measured(rng, assembled(rng))
-    other = run._replace(name="other", chain=run.chain._replace(serials=("X", "Y", "Z")))
+    other = run._replace(name="other", session="another", chain=run.chain._replace(serials=("X", "Y", "Z")))
     with pytest.raises(ValueError, match="the runs run, other have no module in common"):
         merge_runs([run, other])
     with pytest.raises(ValueError, match="no runs"):
@@ -170,7 +286,8 @@ def test_runs_of_other_modules_are_not_merged() -> None:
 
 
 def test_the_file_holds_every_double(tmp_path: Path) -> None:
-    run = measured(default_rng(12), assembled(default_rng(12)), effect=0.05)
+    errors = Errors(spread=1e-8 * np.eye(18), taken=np.array([0.01, -0.02, 0.03]), scale_sigma=0.05)
+    run = measured(default_rng(12), assembled(default_rng(12)), errors=errors)
     (tmp_path / "run").mkdir()
     write_information(tmp_path / "run" / INFORMATION, run)
     again = read_information(tmp_path / "run" / INFORMATION)
@@ -182,6 +299,10 @@ def test_the_file_holds_every_double(tmp_path: Path) -> None:
         assert np.array_equal(one.z, other.z)
         assert (one.rest, one.samples) == (other.rest, other.samples)
     assert all(np.array_equal(a, b) for a, b in zip(run.effects, again.effects, strict=True))
+    assert (again.session, again.scale_sigma) == (run.session, run.scale_sigma)
+    assert np.array_equal(run.phi_parts, again.phi_parts)
+    assert np.array_equal(run.directions, again.directions)
+    assert np.array_equal(run.scale, again.scale)
 
 
 @pytest.mark.parametrize(
@@ -196,9 +317,10 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, what: str, why: str
     assert str(path) in str(caught.value)
 
 
-def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
-    np.savez(tmp_path / INFORMATION, version=99)
-    with pytest.raises(InformationFileError, match="version 99, 1 is read here"):
+@pytest.mark.parametrize("version", [1, 99])
+def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int) -> None:
+    np.savez(tmp_path / INFORMATION, version=version)
+    with pytest.raises(InformationFileError, match=f"version {version}, 2 is read here: replay"):
         read_information(tmp_path / INFORMATION)
 
 
@@ -217,6 +339,10 @@ def test_the_command_merges_folders_and_says_by_how_much(tmp_path: Path) -> None
     assert len(said["sums"]) == said["rank"]
     told = CliRunner().invoke(app, ["merge", *folders, "--out", str(tmp_path / "both")])
     assert "together" in told.output
+    twice = CliRunner().invoke(app, ["merge", folders[0], *folders, "--out", str(tmp_path / "twice")])
+    assert twice.exit_code == 1
+    assert "one and one are of the same recording" in " ".join(twice.output.split())
+    assert not (tmp_path / "twice").exists()
 
 
 def test_the_command_says_what_it_needs(tmp_path: Path) -> None:
