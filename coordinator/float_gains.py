@@ -10,8 +10,9 @@ STRATEGY = 2
 # The factory's position control gives under this strategy: it has the weight to bear by itself. Where the
 # weight is borne already it can be so much stiffer. At 16 times arms of four and six joints ring.
 HOLDING_TIMES = 6.0
-# The largest damping of a joint, of the factory's in the velocity loop of this strategy.
-MOST_DAMPING_TIMES = 25.0
+# The largest damping of a joint, of the factory's in the velocity loop of this strategy: as much as it holds
+# with. At 10 times an X5-1 in the wrist of an arm of six joints rings.
+MOST_DAMPING_TIMES = HOLDING_TIMES
 
 
 def most_damping_nm_s_rad(kind: ModuleType) -> float:

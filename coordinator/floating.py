@@ -38,8 +38,10 @@ TARED_FROM = 0.7
 # Springs lie beyond the motors' friction, so that friction hides nothing from them.
 UNKNOWN_OF_WEIGHT = 0.08
 UNKNOWN_OF_LARGEST = 0.02
-# How far a joint may go while it is being loaded or set free: nobody leads it yet.
-MOST_GIVEN_RAD = float(np.radians(5.0))
+# How far a joint may go while it is being loaded, and while it is being set free: nobody leads it yet. Heavy
+# arms whose motors were off sink by 9 degrees as they are taken, into the soft gains of the factory, and by 1
+# as they are set free.
+MOST_SUNK_RAD, MOST_GIVEN_RAD = float(np.radians(15.0)), float(np.radians(5.0))
 # How far a joint may lag on the way back: it is stopped by something then.
 MOST_LAG_RAD = 0.08
 # How fast the way back is gone at most, and as a share of the speed at which a joint is held.
@@ -293,7 +295,8 @@ class Floater:
             reason = ""
         if self.phase in ("loading", "freeing"):
             given = reading.q_rad - self.place_rad
-            reason = reason or self._astray(given, MOST_GIVEN_RAD, "away before it was free")
+            most_rad = MOST_SUNK_RAD if self.phase == "loading" else MOST_GIVEN_RAD
+            reason = reason or self._astray(given, most_rad, "away before it was free")
         if reason:
             self._fault(t_s, reading, reason)
 

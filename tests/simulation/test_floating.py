@@ -80,7 +80,7 @@ def test_a_damper_makes_the_arm_follow_a_hand_more_slowly() -> None:
     start = posed(load_robot(ARM), BENT.start_rad)
     push = Push(serial=ELBOW, force_n=(0.0, 0.0, 2.0), from_s=3.0, for_s=0.3)
     gone = []
-    for damping in (0.0, 3.0):
+    for damping in (0.0, 1.2):
         plan = FloatPlan(FloatSettings(damping), for_s=2.0, then_hold_s=0.0, is_led_back=False)
         free = float_robot(start, weight(), plan, 1, IDEAL, pushes=(push,)).floating()
         gone.append(np.ptp(free.q_rad[free.t_s > 2.9], axis=0).max())
@@ -165,6 +165,14 @@ def test_sensors_as_delivered_keep_no_arm_from_floating(seed: int) -> None:
     robot = posed(load_robot(ARM), BENT.start_rad)
     plan = SHORT._replace(for_s=0.1, is_led_back=False)
     done = float_robot(robot, weight(), plan, seed, "x5-uncalibrated")
+    assert (done.summary.is_fault, done.summary.why) == (False, "its time is over")
+
+
+def test_a_heavy_arm_that_sinks_while_its_motors_are_off_is_taken_and_set_free() -> None:
+    # Its second joint bears 6.8 Nm, and sinks at 0.6 rad/s as it is taken.
+    robot = load_robot("arm6")
+    plan = SHORT._replace(for_s=0.1, is_led_back=False)
+    done = float_robot(robot, true_weight(robot), plan, 1, "x5-uncalibrated")
     assert (done.summary.is_fault, done.summary.why) == (False, "its time is over")
 
 
