@@ -4,7 +4,10 @@ Every run's rows, in standard deviations of what they err by, are taken from its
 those are made of (`dynamics.parts`) and stacked: of Gaussian errors that is all that there is to know, in any
 order. An error of a chain is one of its run, and moves the parts with their IMUs. The scale of a torque
 sensor is its module's own in every run, however often that is put together anew: it is one more unknown of
-all runs, of which what is known beforehand counts once. So is every run, which its recording is known by.
+all runs, of which what is known beforehand counts once. So does every run, which its recording is known by.
+
+What a run claims is taken as claimed. An offset of a torque sensor that it took for the first moment of a
+light body is none of these errors: others that know that body better show it as `RunShare.strain`.
 """
 
 from collections.abc import Mapping, Sequence
