@@ -20,7 +20,7 @@ from coordinator.dynamics.common_errors import chain_effects, scale_effects
 from coordinator.dynamics.consistency import parameters
 from coordinator.dynamics.parameter_prior import module_prior
 from coordinator.dynamics.seen_information import SeenFit, solve_seen, without_used
-from coordinator.dynamics.torque_scale import SCALE_SIGMA, TorqueKind, scaled
+from coordinator.dynamics.torque_scale import OFFSET_SHARE, SCALE_SIGMA, TorqueKind, scaled
 from coordinator.gathered_rows import GatheredRows
 from coordinator.kinematics.base_motion import NoiseFloor
 from coordinator.kinematics.refinement import Refinement
@@ -79,8 +79,8 @@ class Inertia(NamedTuple):
 
     seen: parameters, terms and information, of the way of seeing that was best, `eyes`.
     noise_nm: (n,) of every way, what it leaves in the torques. effects: (k_i, j) of every joint: what errors
-    of the chain and of the torques' scale do to its rows of `seen.information`. gathered: whose the
-    information from encoders is, None if no agent can have been asked.
+    of the torques' scale, of the chain, and of offsets do to its rows of `seen.information`. gathered: whose
+    the information from encoders is, None if no agent can have been asked.
     """
 
     seen: SeenFit
@@ -178,12 +178,15 @@ def _considered(
     What was seen beyond encoders is taken off the torques: of the rows, its projection onto them.
     """
     size = seen.informed_phi.size
+    offsets_nm = _offsets_nm(robot, seen)
     beside = [GatheredRows(scaled(piece, one)) for piece, one in zip(gathered, seen.scale.value, strict=True)]
     for one in windows:
         motion = filtered_window(one)
         rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
         rows = np.concatenate([rigid, term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)], axis=2)
         effects = chain_effects(robot.chain, robot.covariance, seen.informed_phi, motion)
+        left_out = np.broadcast_to(np.diag(offsets_nm), (len(motion.t_ns), *np.diag(offsets_nm).shape))
+        effects = np.concatenate([effects, left_out], axis=2)
         departure = np.zeros_like(motion.tau_nm)
         if eyes != "encoders":
             apart = _regressor(robot, readings(one, robot.refined, DYNAMIC_CUTOFF_HZ), eyes) - rigid
@@ -198,6 +201,17 @@ def _considered(
     scale = scale_effects(bodies, seen.scale)
     chain = [piece.r[:, size:] for piece in left]
     return seen._replace(information=bodies), tuple(map(np.hstack, zip(scale, chain, strict=True)))
+
+
+def _offsets_nm(robot: Robot, seen: SeenFit) -> Array:
+    """Return by how much (n,) the offsets may be off that are taken for none [Nm]."""
+    offset = TERMS.index("offset")
+    largest = np.array([kind.max_effort_nm for kind in robot.kinds])
+    likely = OFFSET_SHARE[robot.torque] * largest
+    told = seen.terms.spread[:, offset]
+    with np.errstate(divide="ignore"):
+        either = 1.0 / np.sqrt(likely**-2.0 + told**-2.0)
+    return np.where(seen.terms.used[:, offset] | (likely == 0.0), 0.0, either)
 
 
 def _regressor(robot: Robot, seen: Readings, eyes: Eyes) -> Array:

@@ -20,9 +20,9 @@ class RunInformation(NamedTuple):
     in the columns of `torque_regressor`, whatever else was in the readings taken off. sigma_nm: (n,) noise of
     the torques. independent_fraction: independent samples per sample.
     phi_parts: (20 n,) parts that the bodies are likely made of (`dynamics.parts.likely_parts`).
-    directions: (6 n, j) increments that the chain may be off by, one deviation long. effects: (k_i, j) of
-    every joint: what those do to its rows with the bodies held in the root frame, in Nm
-    (`dynamics.common_errors`).
+    directions: (6 n, j) increments that the chain may be off by, one deviation long; zero of errors that are
+    not the chain's. effects: (k_i, j) of every joint: what those do to its rows with the bodies held in the
+    root frame, in Nm (`dynamics.common_errors`).
     scale: (n,) the torques are 1 + scale times what the sensors showed. scale_sigma: what was known of that
     before the run; 0 of sensors that show what is.
     """

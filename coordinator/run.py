@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
 from coordinator.agents_information import dynamic_steps
 from coordinator.beside import Beside
 from coordinator.clock import Clock
@@ -370,7 +372,10 @@ def _information(
 ) -> RunInformation:
     seen, fit = inertia.seen, found.kinematics.fit
     # Of the scales' effects what is known beforehand is kept, which several runs share.
-    chain_effects = tuple(one[:, len(types) :] for one in inertia.effects)
+    effects = tuple(one[:, len(types) :] for one in inertia.effects)
+    directions = error_directions(fit.covariance)
+    # Offsets of the sensors, whose effects come last, move no chain.
+    directions = np.hstack([directions, np.zeros((len(directions), len(types)))])
     return RunInformation(
         name=name,
         session=found.result.trace_hash,
@@ -379,8 +384,8 @@ def _information(
         sigma_nm=seen.fit.torque_sigma_nm,
         independent_fraction=INDEPENDENT_FRACTION,
         phi_parts=likely_parts(fit.chain, types, seen.informed_phi),
-        directions=error_directions(fit.covariance),
-        effects=chain_effects,
+        directions=directions,
+        effects=effects,
         scale=seen.scale.value,
         scale_sigma=SCALE_SIGMA["uncalibrated" if seen.scale.covariance.any() else "calibrated"],
     )

@@ -46,13 +46,15 @@ class TermsFit(NamedTuple):
     """The parameters of `TERMS` of n joints, (n, 4) each; zero where a term does not earn its place.
 
     sigma: one standard deviation. gain: by how many variances of the torque's noise a term makes the misfit
-    of its joint smaller, whether it is used or not.
+    of its joint smaller, whether it is used or not. spread: the standard deviation to which the joint by
+    itself tells a term, infinite if it does not: one that is not used may be there, but not by much more.
     """
 
     value: Array
     sigma: Array
     gain: Array
     used: NDArray[np.bool_]
+    spread: Array
 
 
 class SeenFit(NamedTuple):
@@ -120,10 +122,11 @@ def solve_seen(
 
 
 class _Earned(NamedTuple):
-    """By how much each term of a joint makes its misfit smaller, and whether it is used, (4,) each."""
+    """Of each term of a joint, (4,) each: see `TermsFit`."""
 
     gain: Array
     used: NDArray[np.bool_]
+    spread: Array
 
 
 def _without_departure(piece: JointInformation, size: int, phi: Array) -> JointInformation:
@@ -141,7 +144,7 @@ def _earned(piece: JointInformation, size: int, independent_fraction: float) -> 
     space = left[:, values > RANK_TOLERANCE * values[0]]
     terms = piece.r[:, size:]
     columns, target = (part - space @ (space.T @ part) for part in (terms, piece.z))
-    gain = np.zeros(len(TERMS))
+    gain, spread = np.zeros(len(TERMS)), np.full(len(TERMS), np.inf)
     used = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
     freedom = max(piece.samples - space.shape[1] - len(TERMS), 1)
     while used.any():
@@ -149,12 +152,13 @@ def _earned(piece: JointInformation, size: int, independent_fraction: float) -> 
         value = inverse @ target
         misfit = target - columns[:, used] @ value
         variance = (float(misfit @ misfit) + piece.rest) / freedom / independent_fraction
-        gain[used] = value**2 / np.maximum(np.sum(inverse**2, axis=1) * variance, _LEAST_NM**2)
+        spread[used] = np.maximum(np.sqrt(np.sum(inverse**2, axis=1) * variance), _LEAST_NM)
+        gain[used] = (value / spread[used]) ** 2
         weakest = np.flatnonzero(used)[np.argmin(gain[used])]
         if gain[weakest] > EARNS_ABOVE:
             break
         used[weakest] = False
-    return _Earned(gain, used)
+    return _Earned(gain, used, spread)
 
 
 def without_used(piece: JointInformation, size: int, used: NDArray[np.bool_]) -> JointInformation:
@@ -188,7 +192,7 @@ def _terms(
         through = inverse @ bodies
         noise = fit.torque_sigma_nm[i] ** 2 / independent_fraction * (inverse @ inverse.T)
         sigma[i, one.used] = np.sqrt(np.diagonal(noise + through @ fit.covariance @ through.T))
-    gain, used = (np.array([one[k] for one in earned]) for k in range(2))
-    for array in (value, sigma, gain, used):
+    gain, used, spread = (np.array([one[k] for one in earned]) for k in range(3))
+    for array in (value, sigma, gain, used, spread):
         array.flags.writeable = False
-    return TermsFit(value, sigma, gain, used)
+    return TermsFit(value, sigma, gain, used, spread)

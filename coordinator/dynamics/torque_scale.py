@@ -24,6 +24,8 @@ TorqueKind = Literal["calibrated", "uncalibrated"]
 # Of a module's torque sensor, a spring whose stiffness is known to a few percent as delivered. That is a
 # guess: no figure is published.
 SCALE_SIGMA: dict[TorqueKind, float] = {"calibrated": 0.0, "uncalibrated": 0.05}
+# Of their largest torque; a real X5-1's log shows 0.4 %.
+OFFSET_SHARE: dict[TorqueKind, float] = {"calibrated": 0.0, "uncalibrated": 0.005}
 
 
 class TorqueScale(NamedTuple):

@@ -104,6 +104,23 @@ def test_noise_alone_earns_no_term_a_place(seed: int) -> None:
     assert found.terms.gain.max() < EARNS_ABOVE
 
 
+def test_a_term_that_is_not_used_is_off_by_no_more_than_is_said(rng: Generator) -> None:
+    pulls = []
+    for _ in range(20):
+        q, torque = swings(rng)
+        # Small enough to stay unnoticed.
+        offset = 2e-3 * rng.normal(size=JOINTS)
+        found = solved(filtered(q, torque + offset + SIGMA_NM * rng.normal(size=torque.shape)))
+        k = TERMS.index("offset")
+        unused = ~found.terms.used[:, k]
+        size = np.sqrt(found.terms.gain[unused, k]) * found.terms.spread[unused, k]
+        # What was estimated of it before it was left out is it, to within its spread.
+        pulls += ((size - np.abs(offset[unused])) / found.terms.spread[unused, k]).tolist()
+    assert len(pulls) > 30
+    # In absolute values, whose noise is somewhat smaller than one.
+    assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.3
+
+
 def test_the_order_of_motions_does_not_matter(rng: Generator) -> None:
     pieces = [rows(filtered(*swings(rng, 6.0))) for _ in range(3)]
     one = solve_seen(merge(merge(*pieces[:2]), pieces[2]), np.zeros_like(PHI), FRACTION)
