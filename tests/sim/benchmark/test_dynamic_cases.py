@@ -69,7 +69,7 @@ def inertia(**changed: Any) -> InertiaTrial:
     ("changed", "figure"),
     [
         ({"rank": 35}, "runs with fewer parameters than there are, of 1"),
-        ({"sigmas_off": (0.1, 3.4)}, "base parameters known to 10 %, worst error [sigma]"),
+        ({"sigmas_off": (0.1, 3.4)}, "base parameters known to 10 %, beyond 3 sigma, of 2"),
         ({"largest": (0.012, 0.0, 0.0)}, "largest ten, of those noise tells to 1 %: worst error [%]"),
         ({"held_out": 0.031, "with_true_chain": 0.03, "bodies": 0.03}, "held-out torque, worst [%]"),
         ({"with_true_chain": 0.005}, "the same over that with the true chain"),
