@@ -68,7 +68,7 @@ def _summary(case: str, label: str, trials: Sequence[InertiaTrial]) -> Summary:
 
 
 def _sigma_rows(case: str, off: Sequence[float]) -> list[Row]:
-    """Return how many errors are beyond three sigmas; as many as normal ones are in 99 of 100 cases may be."""
+    """Return how many errors are beyond three sigmas; as many may be as of normal ones in 99 of 100 cases."""
     beyond = float(sum(abs(value) > SIGMAS for value in off))
     most = float(binom.isf(0.01, len(off), 2.0 * norm.sf(SIGMAS))) if off else None
     figure = f"base parameters known to 10 %, beyond {SIGMAS:.0f} sigma, of {len(off)}"
