@@ -5,7 +5,6 @@ Pinocchio is a development dependency; without it only our own cost is measured.
 
 import time
 from collections.abc import Callable
-from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +20,7 @@ _PINOCCHIO = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
 
 
 class RegressorTrial(NamedTuple):
-    """Microseconds a sample of a batch, in chunks of `CHUNK`, and of pinocchio's loop; medians.
+    """Microseconds a sample of a batch, in chunks of `CHUNK`, and of pinocchio's loop; the least of some repeats.
 
     difference: the largest from pinocchio's regressor on random trees, relative to the largest entry.
     Pinocchio's are None if it is not installed.
@@ -75,7 +74,8 @@ def _cost_us(work: Callable[[], None], repeats: int) -> float:
         begun = time.process_time()
         work()
         spent.append(time.process_time() - begun)
-    return 1e6 * median(spent) / SAMPLES
+    # What others take of caches and memory only adds.
+    return 1e6 * min(spent) / SAMPLES
 
 
 def _tree(rng: np.random.Generator, joints: int, parents: tuple[int, ...]) -> Chain:
