@@ -20,7 +20,7 @@ _PINOCCHIO = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
 
 
 class RegressorTrial(NamedTuple):
-    """Microseconds a sample of a batch, in chunks of `CHUNK`, and of pinocchio's loop; the least of some repeats.
+    """Microseconds a sample of a batch, in chunks of `CHUNK`, and of pinocchio's loop; the least of repeats.
 
     difference: the largest from pinocchio's regressor on random trees, relative to the largest entry.
     Pinocchio's are None if it is not installed.
