@@ -104,3 +104,12 @@ def test_base_parameters_are_as_uncertain_as_claimed(found: Identified) -> None:
     true = base.value - error
     largest = np.argsort(-np.abs(true / base.columns.scale[base.independent]))[:4]
     assert (np.abs(error[largest]) < 0.01 * np.abs(true[largest])).all()
+
+
+def test_an_offset_that_is_taken_for_none_is_claimed_as_an_error_of_its_own_joint(found: Identified) -> None:
+    assert found.inertia is not None
+    joints = len(found.inertia.effects)
+    for i, effects in enumerate(found.inertia.effects):
+        size = np.linalg.norm(effects[:, -joints:], axis=0)
+        assert size[i] > 0.0
+        np.testing.assert_array_equal(np.delete(size, i), 0.0)
