@@ -13,10 +13,10 @@ from sim.benchmark.recorded import recorded_cases
 from sim.benchmark.regressors import regressor_cases
 from sim.benchmark.watches import watch_cases
 
-TRIALS = 5
+DYNAMIC_TRIALS = 5
 
 
-class Effort(NamedTuple):
+class DynamicEffort(NamedTuple):
     """How many trials there are of everything; `shortened`: whether robots move less long than they may."""
 
     inertias: int
@@ -28,15 +28,15 @@ class Effort(NamedTuple):
     shortened: bool = False
 
 
-QUICK = Effort(1, 1, 1, 1, 1, 1, shortened=True)
+QUICK_DYNAMICS = DynamicEffort(1, 1, 1, 1, 1, 1, shortened=True)
 
 
-def full(trials: int = TRIALS) -> Effort:
+def full_dynamics(trials: int = DYNAMIC_TRIALS) -> DynamicEffort:
     """Return the effort with that many trials a case, and an hour of watching without any change."""
-    return Effort(trials, trials, trials, trials, watches=2 * trials, stretches=12)
+    return DynamicEffort(trials, trials, trials, trials, watches=2 * trials, stretches=12)
 
 
-def dynamic_cases(effort: Effort, seed: int, tx40: Path | None = None) -> list[Case]:
+def dynamic_cases(effort: DynamicEffort, seed: int, tx40: Path | None = None) -> list[Case]:
     """Return all cases, in the order in which they are reported; tx40: folder of a real arm's recording."""
     return [
         *regressor_cases(seed),

@@ -14,11 +14,11 @@ from sim.benchmark.topologies import topology_cases
 from sim.benchmark.wears import wear_cases
 from sim.experiments.arm_trial import arm_plan
 
-TRIALS = 13
+KINEMATIC_TRIALS = 13
 ALL = "all cases"
 
 
-class Effort(NamedTuple):
+class KinematicEffort(NamedTuple):
     """How many trials there are of everything; `shortened`: whether arms move less long than they may."""
 
     joints: int
@@ -30,15 +30,15 @@ class Effort(NamedTuple):
     shortened: bool = False
 
 
-QUICK = Effort(joints=1, arms=1, robots=1, networks=1, changed=1, unchanged=1, shortened=True)
+QUICK_KINEMATICS = KinematicEffort(joints=1, arms=1, robots=1, networks=1, changed=1, unchanged=1, shortened=True)
 
 
-def full(trials: int = TRIALS) -> Effort:
+def full_kinematics(trials: int = KINEMATIC_TRIALS) -> KinematicEffort:
     """Return the effort that the bars are meant for, with that many trials a case."""
-    return Effort(trials, trials, robots=200, networks=trials, changed=trials, unchanged=100)
+    return KinematicEffort(trials, trials, robots=200, networks=trials, changed=trials, unchanged=100)
 
 
-def kinematic_cases(effort: Effort, seed: int, motions: Motions | None = None) -> list[Case]:
+def kinematic_cases(effort: KinematicEffort, seed: int, motions: Motions | None = None) -> list[Case]:
     """Return all cases, in the order in which they are reported; `motions`: see `arm_plan`."""
     calibrated = arm_plan("joint", "calibrated", motions)
     plan = calibrated.model_copy(update=SHORTENED) if effort.shortened else calibrated

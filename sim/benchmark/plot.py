@@ -91,7 +91,7 @@ def _draw(axes: Any, panel: _Panel) -> None:
     axes.grid(True, axis="x", linewidth=0.4, color="#dddddd")
     axes.set_axisbelow(True)
     for place, row in enumerate(panel.rows):
-        _bar(axes, row, place)
+        _draw_bar(axes, row, place)
         for name, colour, marker, size in _MARKS:
             value = getattr(row, name)
             if value is None or not isfinite(value) or (panel.logarithmic and value <= 0.0):
@@ -113,7 +113,7 @@ def _decades(axes: Any) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _bar(axes: Any, row: Row, place: int) -> None:
+def _draw_bar(axes: Any, row: Row, place: int) -> None:
     for edge in row.limit if isinstance(row.limit, tuple) else (row.limit,):
         axes.plot(
             [edge, edge], [place - 0.45, place + 0.45], color=_BAR, linewidth=2.0, solid_capstyle="butt"

@@ -12,9 +12,9 @@ from coordinator.failure import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from coordinator.interruption import SIGNALS
 from coordinator.plan import Motions
 from coordinator.terminal import Terminal
-from sim.benchmark import dynamics as dynamic
+from sim.benchmark.dynamics import DYNAMIC_TRIALS, QUICK_DYNAMICS, dynamic_cases, full_dynamics
 from sim.benchmark.case import Case, CaseResult
-from sim.benchmark.kinematics import QUICK, TRIALS, chosen, full, kinematic_cases, over_all
+from sim.benchmark.kinematics import KINEMATIC_TRIALS, QUICK_KINEMATICS, chosen, full_kinematics, kinematic_cases, over_all
 from sim.benchmark.plot import plot
 from sim.benchmark.recorded import MOTION, URDF
 from sim.benchmark.results import Results, gathered, write_results
@@ -48,7 +48,7 @@ def dynamics(
             "--quick", help="Every row in a minute on two cores: one trial each, with motions cut short."
         ),
     ] = False,
-    trials: Annotated[int | None, typer.Option(min=1, help=f"Trials a case [{dynamic.TRIALS}].")] = None,
+    trials: Annotated[int | None, typer.Option(min=1, help=f"Trials a case [{DYNAMIC_TRIALS}].")] = None,
     seed: Seed = 0,
     tx40: Annotated[
         Path | None,
@@ -63,12 +63,12 @@ def dynamics(
     """
     if quick and trials is not None:
         fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
-    effort = dynamic.QUICK if quick else dynamic.full(trials or dynamic.TRIALS)
+    effort = QUICK_DYNAMICS if quick else full_dynamics(trials or DYNAMIC_TRIALS)
     settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only} | effort._asdict()
     for name in (URDF, MOTION):
         if tx40 is not None and not (tx40 / name).is_file():
             fail(f"--tx40 {tx40}: there is no {name} in it", EXIT_USAGE)
-    cases = dynamic.dynamic_cases(effort, seed, tx40)
+    cases = dynamic_cases(effort, seed, tx40)
     _benchmark("dynamics", cases, settings, only, processes, json_file, None)
 
 
@@ -86,7 +86,7 @@ def kinematics(
     ] = False,
     trials: Annotated[
         int | None,
-        typer.Option(min=1, help=f"Trials a case; 200 robots and 100 unchanged checks besides [{TRIALS}]."),
+        typer.Option(min=1, help=f"Trials a case; 200 robots and 100 unchanged checks besides [{KINEMATIC_TRIALS}]."),
     ] = None,
     seed: Seed = 0,
     motions: Annotated[Motions, typer.Option(help="How whole arms explore joint by joint.")] = "designed",
@@ -100,7 +100,7 @@ def kinematics(
     """
     if quick and trials is not None:
         fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
-    effort = QUICK if quick else full(trials or TRIALS)
+    effort = QUICK_KINEMATICS if quick else full_kinematics(trials or KINEMATIC_TRIALS)
     settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "motions": motions}
     settings |= effort._asdict()
     cases = kinematic_cases(effort, seed, motions)

@@ -8,7 +8,7 @@ import pytest
 from sim.benchmark.arms import ARMS, COST_ARM, WHOLE_ARM, arm_cases
 from sim.benchmark.case import Case, Summary
 from sim.benchmark.joints import SETTINGS, joint_cases
-from sim.benchmark.kinematics import ALL, QUICK, TRIALS, chosen, full, kinematic_cases, over_all
+from sim.benchmark.kinematics import ALL, QUICK_KINEMATICS, KINEMATIC_TRIALS, chosen, full_kinematics, kinematic_cases, over_all
 from sim.benchmark.networks import network_cases
 from sim.benchmark.row import Row
 from sim.benchmark.runner import concluded
@@ -38,7 +38,7 @@ def case_named(cases: list[Case], name: str) -> Case:
 
 
 def test_the_quick_benchmark_has_every_case_of_the_full_one_and_fewer_trials() -> None:
-    quick, whole = kinematic_cases(QUICK, seed=0), kinematic_cases(full(), seed=0)
+    quick, whole = kinematic_cases(QUICK_KINEMATICS, seed=0), kinematic_cases(full_kinematics(), seed=0)
     # Where the quick one does less of a case than its name says, its name says so.
     for few, many in zip(quick, whole, strict=True):
         assert few.name.startswith(many.name)
@@ -52,10 +52,10 @@ def test_the_quick_benchmark_has_every_case_of_the_full_one_and_fewer_trials() -
 
 
 def test_the_full_benchmark_has_the_trials_that_the_bars_are_about() -> None:
-    cases = kinematic_cases(full(), seed=0)
+    cases = kinematic_cases(full_kinematics(), seed=0)
     joints = [case for case in cases if " mm " in case.name and case.trials[0].work.__name__ == "joint_trial"]
     assert len(joints) == len(ALIGNMENTS) * len(LENGTHS_MM) * len(SETTINGS) == 24
-    assert {len(case.trials) for case in joints} == {TRIALS} == {13}
+    assert {len(case.trials) for case in joints} == {KINEMATIC_TRIALS} == {13}
     assert len(case_named(cases, "random robots").trials) == 200
     wear = case_named(cases, "wear").trials
     assert [sum(len(trial.arguments[which]) for trial in wear) for which in (0, 1)] == [13, 100]
@@ -76,7 +76,7 @@ def test_the_same_modules_are_measured_in_all_profiles_and_other_ones_with_anoth
 
 
 def test_cases_are_chosen_by_a_part_of_their_name_or_a_pattern() -> None:
-    cases = kinematic_cases(QUICK, seed=0)
+    cases = kinematic_cases(QUICK_KINEMATICS, seed=0)
     assert chosen(cases, "") == cases
     assert len(chosen(cases, "484 mm vertical")) == len(SETTINGS)
     assert len(chosen(cases, "484 mm*uncalibrated")) == len(ALIGNMENTS)
@@ -186,13 +186,13 @@ def test_shortened_motions_meet_no_bar_of_time_and_one_arm_moves_in_full_all_the
     assert [plan.imu for plan in plans] == ["calibrated", "uncalibrated"] * 3
     assert all(plan.sine_centre_s < plans[0].sine_centre_s for plan in plans[1:])
     # Whoever chooses the motions: those are the thesis', shortened.
-    quick = kinematic_cases(QUICK, seed=0, motions="designed")
+    quick = kinematic_cases(QUICK_KINEMATICS, seed=0, motions="designed")
     motions = [c.trials[0].arguments[-1].motions for c in chosen(quick, "joint by joint")]
     assert motions == ["designed"] + ["thesis"] * 5
 
 
 def test_other_motions_are_those_of_whole_arms_joint_by_joint() -> None:
-    cases = kinematic_cases(full(1), seed=0, motions="designed")
+    cases = kinematic_cases(full_kinematics(1), seed=0, motions="designed")
     plans = {case.name: case.trials[0].arguments[-1] for case in cases}
     assert all(plan.motions == "designed" for name, plan in plans.items() if "joint by joint" in name)
     assert plans["a2085_04, x5, clocks apart, wifi"].motions == "designed"
@@ -343,7 +343,7 @@ def test_checks_of_one_robot_are_made_in_one_process() -> None:
 # ---------------------------------------------------------------------- what was not measured
 
 
-@pytest.mark.parametrize("case", kinematic_cases(QUICK, seed=0), ids=lambda case: case.name)
+@pytest.mark.parametrize("case", kinematic_cases(QUICK_KINEMATICS, seed=0), ids=lambda case: case.name)
 def test_no_bar_is_met_by_trials_that_all_failed(case: Case) -> None:
     assert [row.holds for row in case.summarise([]).rows if row.limit is not None].count(True) == 0
 

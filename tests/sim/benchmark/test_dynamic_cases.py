@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from sim.benchmark.case import Case, Summary
-from sim.benchmark.dynamics import QUICK, TRIALS, dynamic_cases, full
+from sim.benchmark.dynamics import QUICK_DYNAMICS, DYNAMIC_TRIALS, dynamic_cases, full_dynamics
 from sim.benchmark.row import Row
 from sim.benchmark.watches import Watches
 from sim.experiments.floating import FloatTrial
@@ -16,7 +16,7 @@ from sim.experiments.regressor_trial import RegressorTrial
 from sim.experiments.torque_assistance_rows import AssistanceRow
 from sim.experiments.watching import Alarms, WatchTrial
 
-CASES = {case.name: case for case in dynamic_cases(full(), seed=0)}
+CASES = {case.name: case for case in dynamic_cases(full_dynamics(), seed=0)}
 
 
 def rows(name: str, *trials: Any) -> dict[str, Row]:
@@ -31,7 +31,7 @@ def missed(found: dict[str, Row]) -> list[str]:
 
 
 def test_the_quick_benchmark_has_every_case_and_says_where_it_does_less() -> None:
-    quick = [case.name for case in dynamic_cases(QUICK, seed=0)]
+    quick = [case.name for case in dynamic_cases(QUICK_DYNAMICS, seed=0)]
     left = [name for name in CASES if not any(one.startswith(name) for one in quick)]
     # That nothing is taken for something is tried where there is time for it.
     assert left == ["a2085_06, no payload"]
@@ -43,9 +43,9 @@ def test_the_full_benchmark_watches_for_an_hour_and_tries_everything_several_tim
     drawn = [one for trial in watched.trials for one in trial.arguments[0]]
     quiet = [day for trial in watched.trials for day in trial.arguments[1]]
     stretch_s = {trial.arguments[3] for trial in watched.trials}
-    assert len(set(drawn)) == len(drawn) == 4 * 2 * TRIALS
+    assert len(set(drawn)) == len(drawn) == 4 * 2 * DYNAMIC_TRIALS
     assert len(set(quiet)) * stretch_s.pop() == 3600.0
-    assert len(CASES["a2085_06, x5, inertia"].trials) == TRIALS
+    assert len(CASES["a2085_06, x5, inertia"].trials) == DYNAMIC_TRIALS
 
 
 def inertia(**changed: Any) -> InertiaTrial:
@@ -184,6 +184,6 @@ def test_what_is_missed_misplaced_or_imagined_is_counted() -> None:
 
 
 def test_every_case_is_named_once() -> None:
-    names = [case.name for case in dynamic_cases(full(), seed=0)]
+    names = [case.name for case in dynamic_cases(full_dynamics(), seed=0)]
     assert len(set(names)) == len(names)
     assert all(isinstance(case, Case) for case in CASES.values())
