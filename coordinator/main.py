@@ -8,35 +8,34 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.attended_run import Place, join, run_attended, sender_name
-from coordinator.check_program import check_robot
-from coordinator.command_options import Connect, Expect, Listen, Network, Robot, fail, planned
-from coordinator.dynamics.torque_scale import TorqueKind
-from coordinator.failure import EXIT_FAILED, EXIT_USAGE
-from coordinator.fit_dynamics_program import fit_dynamics
-from coordinator.float_program import float_robot
-from coordinator.identify import IdentificationError, identify
-from coordinator.inspect import AS_HUB_S, Search, listed, stop_robot
-from coordinator.kinematics.imu_intrinsics import ImuKind
-from coordinator.known_robot import KnownRobotError, known_within
-from coordinator.known_update import updated
-from coordinator.merge_program import merge
-from coordinator.payload_program import find_payload
-from coordinator.plan import Excitation, Mode, Motions
-from coordinator.recording import Recording
-from coordinator.result import DynamicsPart, Result
-from coordinator.run import RunConfig, write_outputs
-from coordinator.run_folder import load_recording
-from coordinator.scaled_loop import check_speed
-from coordinator.session_file import SessionFileError
-from coordinator.terminal import Terminal
-from coordinator.viewer_choice import viewer_choice
-from coordinator.watch_program import watch_robot
-from module_agent.catalogue import UnknownModuleType
-from module_agent.wire.endpoint import DEFAULT_ENDPOINT
+from coordinator.baseline.known_robot import KnownRobotError, known_within
+from coordinator.baseline.update import updated
+from coordinator.commands.attended_run import Place, join, run_attended, sender_name
+from coordinator.commands.check import check_robot
+from coordinator.commands.compensate import float_robot
+from coordinator.commands.fit_dynamics import fit_dynamics
+from coordinator.commands.merge import merge
+from coordinator.commands.monitor import watch_robot
+from coordinator.commands.options import Connect, Expect, Listen, Network, Robot, fail, planned
+from coordinator.commands.payload import find_payload
+from coordinator.excitation.plan import Excitation, Mode, Motions
+from coordinator.identification.identified import IdentificationError
+from coordinator.identification.identify import identify
+from coordinator.identification.result import DynamicsPart, Result
+from coordinator.live_robot.discovery import AS_HUB_S, Search, listed, stop_robot
+from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import load_recording
+from coordinator.recording.session_file import SessionFileError
+from coordinator.runtime.event_loop import check_speed
+from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
+from coordinator.runtime.terminal import Terminal
+from coordinator.session.run import RunConfig, write_outputs
+from coordinator.viewer.targets import viewer_choice
+from module_agent.model.catalogue import ImuKind, TorqueKind, UnknownModuleType
+from module_agent.network_emulation.profile_file import network as network_named
+from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from module_agent.transport.transport import Transport, TransportError
 from module_agent.wire.keys import check_chunk
-from module_agent.wire.network_file import network as network_named
-from module_agent.wire.transport import Transport, TransportError
 
 app = typer.Typer(
     add_completion=False,

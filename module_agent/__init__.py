@@ -1,1 +1,1 @@
-"""What runs in every module: firmware, its published interface, its local estimate."""
+"""What runs in every module: firmware, its published interface, and its local estimates."""

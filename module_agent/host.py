@@ -10,24 +10,26 @@ from typing import TypeVar
 from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
-from module_agent.hardware import Hardware, SensorSample
-from module_agent.inbox import Inbox
-from module_agent.information_service import InformationService, Worker
-from module_agent.motion_collection import MotionCollection, OwnRows
-from module_agent.neighbours import AskHistory, JointMotion, Listen, Neighbours
+from module_agent.hardware.hardware import Hardware, SensorSample
+from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, Neighbours
+from module_agent.peers.row_collection import MotionCollection, OwnRows
+from module_agent.torque_information.service import InformationService, Worker
+from module_agent.transport.inbox import Inbox
+from module_agent.transport.transport import (
+    Event,
+    Liveness,
+    Reply,
+    Request,
+    Sample,
+    Sink,
+    Transport,
+    Undeclare,
+)
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import (
-    Ack,
-    Estimate,
-    EstimateRequest,
-    Feedback,
-    HistoryRequest,
-    Status,
-)
+from module_agent.wire.messages import Ack, Estimate, EstimateRequest, Feedback, HistoryRequest, Status
 from module_agent.wire.refusal import Refusal, WireError
-from module_agent.wire.transport import Event, Liveness, Reply, Request, Sample, Sink, Transport, Undeclare
 
 BESIDE = (Leaf.ESTIMATE, Leaf.COLLECT, Leaf.INFORMATION)  # answered here, not by the firmware
 SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.STOP, Leaf.GAINS, *BESIDE)

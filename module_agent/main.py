@@ -11,18 +11,18 @@ from typing import Annotated
 
 import typer
 
-from module_agent.bus_client import BusClient
 from module_agent.firmware.config import FirmwareConfig, config_of
-from module_agent.hardware import HardwareLost, HardwareModule
+from module_agent.hardware.bus_client import BusClient
+from module_agent.hardware.hardware import HardwareLost, HardwareModule
 from module_agent.host import AgentHost
-from module_agent.wire.endpoint import DEFAULT_ENDPOINT
-from module_agent.wire.injected_network import inject
+from module_agent.network_emulation.impaired_transport import inject
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile
+from module_agent.network_emulation.profile_file import network as network_named
+from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from module_agent.transport.transport import NoHub, Transport, TransportError
+from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.messages import ExpiryAction
-from module_agent.wire.network_file import network as network_named
-from module_agent.wire.network_profile import PROFILES, NetworkProfile
-from module_agent.wire.transport import NoHub, Transport, TransportError
-from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.worker import ThreadWorker
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)

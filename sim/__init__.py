@@ -1,1 +1,1 @@
-"""The world in place of hardware: physics, sensors, network, launcher, score."""
+"""The simulated world in place of hardware: physics, sensors, network, launcher, experiments."""

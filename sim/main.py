@@ -7,22 +7,22 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.failure import EXIT_USAGE
-from coordinator.terminal import print_table
-from sim.benchmark.program import app as benchmark
-from sim.command_options import RobotArgument, fail, load
-from sim.drawing import draw
-from sim.effects import EFFECTS
-from sim.effects_page import OFF, default_size, page, sizes
-from sim.experiments.estimator_program import estimators
-from sim.experiments.program import amplitudes
-from sim.experiments.torque_assistance_program import assistance
-from sim.experiments.watching_program import watching
-from sim.log_program import compare_log
-from sim.noise_profile import NOISE_PROFILES
-from sim.robot_file import load_robot, shipped_robots
-from sim.run_program import launch, run, world
-from sim.score_program import score_run
+from coordinator.runtime.exit_codes import EXIT_USAGE
+from coordinator.runtime.terminal import print_table
+from sim.commands.amplitudes import amplitudes
+from sim.commands.assistance import assistance
+from sim.commands.benchmark import app as benchmark
+from sim.commands.compare_log import compare_log
+from sim.commands.effects_page import OFF, default_size, page, sizes
+from sim.commands.estimators import estimators
+from sim.commands.monitoring import watching
+from sim.commands.options import RobotArgument, fail, load
+from sim.commands.run import launch, run, world
+from sim.commands.score import score_run
+from sim.imperfections.effects import EFFECTS
+from sim.imperfections.noise_profile import NOISE_PROFILES
+from sim.robot.drawing import draw
+from sim.robot.robot_file import load_robot, shipped_robots
 
 app = typer.Typer(
     add_completion=False,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.robot_file import load_robot
+from sim.robot.robot_file import load_robot
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -1,1 +1,1 @@
-"""Dynamics of the robot: regressor, identification of inertial parameters, prediction of torques."""
+"""Rigid-body and drive models that torques are explained by."""

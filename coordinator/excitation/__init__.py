@@ -1,1 +1,1 @@
-"""Motions of several joints at once that tell the inertial parameters."""
+"""Motions chosen for what they tell: plan, single joint, multisine, D-optimal."""

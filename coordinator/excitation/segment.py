@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.motion_design.limits import JointLimits, motion_peaks
-from module_agent.dynamics.chain import Array
-from module_agent.dynamics.differentiation import differentiate
-from module_agent.firmware.waveform import duration_s, waveform
+from coordinator.excitation.joint_limits import JointLimits, motion_peaks
+from module_agent.control.waveform import duration_s, waveform
+from module_agent.model.chain import Array
+from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import GoTo, MultiSine, Sine
 
 # As many sines a joint, within the band: fast enough for inertia to show beside gravity, slow enough for

@@ -1,1 +1,1 @@
-"""Kinematics of the robot: forward model, topology, and the chain from what the IMUs saw."""
+"""The kinematic chain assembled from estimates of joint and observer pairs."""

@@ -21,13 +21,13 @@ from coordinator.kinematics.chain_observations import (
     predict,
     residuals,
 )
-from coordinator.kinematics.forward import BASE
-from coordinator.kinematics.increments import apply_increment, frozen, skew
 from coordinator.kinematics.initial_guess import initial_chain
 from coordinator.kinematics.null_space import Unresolved, name_null_space
-from coordinator.kinematics.topology import Topology
-from module_agent.catalogue import ModuleType
-from module_agent.dynamics.chain import Array, Chain
+from coordinator.topology.topology import Topology
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE
+from module_agent.model.perturbation import apply_increment, frozen, skew
 
 # A direction counts as resolved if its one sigma is below this (rad or m). A parallel pair of axes is never
 # parallel to the last digit: the noise of the axes would "resolve" the offset along them to half a metre.

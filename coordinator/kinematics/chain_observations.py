@@ -2,6 +2,8 @@
 
 Everything is vectorised over observations; the base is body -1, kept in the last place of every array of
 bodies.
+
+What a module's local estimate of a joint is worth to the assembly of the chain.
 """
 
 from collections.abc import Sequence
@@ -10,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.kinematics.forward import body_displacements, carrier
-from coordinator.kinematics.increments import adjoint, skew
-from module_agent.dynamics.chain import Array, Chain
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import body_displacements, carrier
+from module_agent.model.perturbation import adjoint, skew
+from module_agent.wire.messages import Estimate
 
 # Floors of what is believed, added in squares to the stated sigmas, which know nothing of the sensors' own
 # errors: an accelerometer's scale is good to 0.5 %, its place in the housing to 0.3 mm, a gyro's axes to 2
@@ -276,3 +279,28 @@ def _across(directions: Array) -> Array:
     helper = np.eye(3)[np.argmin(np.abs(directions), axis=1)]
     first = _unit(np.cross(directions, helper))
     return np.stack([first, np.cross(directions, first)], axis=2)
+
+
+def circle_observation(estimate: Estimate, q_rad: Array) -> PairObservation | None:
+    """Return the circle of an estimate as an observation; None without one.
+
+    An IMU that turned by more or by less than the joint was moved by something else too: by held joints that
+    give between the two, above all. By that share axis and distance are believed less.
+
+    Args:
+        estimate: what `serial` made of `joint`.
+        q_rad: (n,) mean positions of all joints meanwhile.
+    """
+    circle = estimate.circle
+    if circle is None:
+        return None
+    excess = abs(estimate.rate_ratio - 1.0)
+    return PairObservation(
+        estimate.joint,
+        estimate.serial,
+        np.array(circle.axis),
+        np.array(circle.radial_m),
+        circle.sigma_axis_rad + excess,
+        circle.sigma_distance_m + excess * circle.distance_m,
+        q_rad,
+    )

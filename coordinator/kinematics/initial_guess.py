@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coordinator.kinematics.chain_observations import ChainObservations
-from coordinator.kinematics.forward import BASE, body_displacements, screw_motion
-from coordinator.kinematics.increments import frozen
-from coordinator.kinematics.topology import Topology
-from module_agent.catalogue import ModuleType
-from module_agent.dynamics.chain import Array, Chain
+from coordinator.topology.topology import Topology
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE, body_displacements, screw_motion
+from module_agent.model.perturbation import frozen
 
 # How far a mounting may be from neutral, in rad and m. It only fills in what no observation says better than
 # this; the refinement that follows knows nothing of it.

@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from coordinator.kinematics.forward import BASE, ancestors, descendants
-from coordinator.kinematics.increments import frozen
-from module_agent.dynamics.chain import Array, Chain
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE, ancestors, descendants
+from module_agent.model.perturbation import frozen
 
 Kind = Literal[
     "offset_along_axis", "rotation_about_axis", "rotation_about_gravity", "position", "combination"

@@ -1,1 +1,1 @@
-"""What one watches while the robot measures itself: a Rerun recording, live and as a file."""
+"""The live view in Rerun."""

@@ -5,11 +5,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from coordinator.viewer import blueprint, layout, progress, robot_geometry, robot_scene, time_series
-from coordinator.viewer import topology_graph as graphs
-from coordinator.viewer.parameter import Estimate, with_estimate
-from coordinator.viewer.time_series import Batch, IntArray
-from module_agent.dynamics.chain import Array, Chain
+from coordinator.viewer.scene import (
+    blueprint,
+    entity_paths,
+    progress,
+    robot_geometry,
+    robot_scene,
+    time_series,
+)
+from coordinator.viewer.scene import topology_graph as graphs
+from coordinator.viewer.scene.parameter_plot import Estimate, with_estimate
+from coordinator.viewer.scene.time_series import Batch, IntArray
+from module_agent.model.chain import Array, Chain
 
 # Times the reach that the eye was set for.
 OUTGROWN = 1.25
@@ -21,7 +28,7 @@ class Recorder:
     def __init__(self, stream: rr.RecordingStream, robot: str, lays_out: bool = True) -> None:
         self._stream = stream
         self._lays_out = lays_out
-        self._palette = layout.Palette()
+        self._palette = entity_paths.Palette()
         self._types: dict[str, str] = {}
         self._contents = blueprint.Contents(robot)
         self._shown: blueprint.Contents | None = None
@@ -70,7 +77,7 @@ class Recorder:
         self._know(topology.serials)
         progress.set_time(self._stream, t_ns)
         for drawn in graphs.graph(topology, self._types, self._colours(topology.serials)):
-            self._stream.log(layout.TOPOLOGY, drawn)
+            self._stream.log(entity_paths.TOPOLOGY, drawn)
         self._contents = self._contents._replace(topology=topology)
         self._show()
 
@@ -113,7 +120,7 @@ class Recorder:
             robot_scene.clear_gone(self._stream, before, scene)
         robot_scene.log_scene(self._stream, scene, self._posture(chain))
         self._scenes[look.world] = scene
-        self._contents = self._contents._replace(truth=layout.TRUE_WORLD in self._scenes)
+        self._contents = self._contents._replace(truth=entity_paths.TRUE_WORLD in self._scenes)
         self._frame(chain)
 
     def poses(self, t_ns: IntArray, q_rad: Array, serials: Sequence[str] | None) -> None:
@@ -121,7 +128,7 @@ class Recorder:
 
         Without `serials` it is in the identified chain's order. Joints that are not named stay as they are.
         """
-        first = self._scenes.get(layout.ESTIMATED_WORLD, self._scenes.get(layout.TRUE_WORLD))
+        first = self._scenes.get(entity_paths.ESTIMATED_WORLD, self._scenes.get(entity_paths.TRUE_WORLD))
         if first is None and serials is None:
             return  # before there is a robot there is nothing to turn
         named = tuple(serials or ()) if first is None or serials is not None else first.chain.serials
@@ -152,7 +159,7 @@ class Recorder:
     def _frame(self, chain: Chain) -> None:
         placed = robot_geometry.modules(chain, self._types)
         reach = robot_geometry.reach_m(chain, placed)
-        self._stream.log(layout.GRAVITY, robot_scene.gravity_arrow(chain, reach))
+        self._stream.log(entity_paths.GRAVITY, robot_scene.gravity_arrow(chain, reach))
         # The eye stays in the hands of whoever looks, unless the robot has outgrown what is seen.
         if self._contents.reach_m is None or reach > OUTGROWN * self._contents.reach_m:
             self._contents = self._contents._replace(reach_m=reach)
@@ -161,7 +168,7 @@ class Recorder:
     def _posture(self, chain: Chain) -> Array:
         return np.array([self._q_rad.get(serial, 0.0) for serial in chain.serials])
 
-    def _colours(self, serials: Sequence[str]) -> dict[str, layout.Colour]:
+    def _colours(self, serials: Sequence[str]) -> dict[str, entity_paths.Colour]:
         return {serial: self._palette.colour(serial) for serial in serials}
 
     def show_if_new(self) -> None:

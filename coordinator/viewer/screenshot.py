@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from rerun.experimental import ViewerClient
 
-from coordinator.viewer import layout, viewer_process
-from coordinator.viewer.blueprint import TABS
-from coordinator.viewer.merge import MAGIC, is_recording
+from coordinator.viewer import viewer_process
+from coordinator.viewer.scene import entity_paths
+from coordinator.viewer.scene.blueprint import TABS
 from coordinator.viewer.targets import proxy_url
+from coordinator.viewer.viewer_process import MAGIC, is_recording
 
 SETTLE_SECONDS = 40.0
 SAME_PICTURES = 3
@@ -105,15 +106,17 @@ def _open(client: ViewerClient, rrd: Path, t_s: float | None) -> None:
             line.end
             for recording in state.recordings
             for line in recording.timelines
-            if line.name == layout.TIMELINE and line.end is not None
+            if line.name == entity_paths.TIMELINE and line.end is not None
         ]
         if ends and not state.loading:
             break
         if time.monotonic() > deadline:
-            raise ScreenshotFailed(f"{rrd} has no timeline {layout.TIMELINE!r}: it is no recording of a run")
+            raise ScreenshotFailed(
+                f"{rrd} has no timeline {entity_paths.TIMELINE!r}: it is no recording of a run"
+            )
         time.sleep(_POLL_SECONDS)
     t_ns = ends[0] if t_s is None else round(1e9 * t_s)
-    client.set_time(layout.TIMELINE, duration=np.timedelta64(t_ns, "ns"), play_state="paused")
+    client.set_time(entity_paths.TIMELINE, duration=np.timedelta64(t_ns, "ns"), play_state="paused")
 
 
 def _turn_to(client: ViewerClient, tab: str) -> None:

@@ -1,4 +1,7 @@
-"""Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page."""
+"""Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page.
+
+Which live viewer a person asks for.
+"""
 
 import logging
 import socket
@@ -118,3 +121,31 @@ def _web_url(server: viewer_process.ViewerProcess | None, targets: ViewerTargets
     url = proxy_url(targets.serve_port + 1)
     logger.info("watch at http://127.0.0.1:%d?url=%s", targets.serve_port, quote(url, safe=""))
     return url
+
+
+SCHEMES = ("rerun", "rerun+http", "rerun+https")
+
+
+class ViewerChoice(NamedTuple):
+    """A native viewer to start, a web page to serve, or the address of a viewer that is open already."""
+
+    spawn: bool = False
+    serve: bool = False
+    connect: str | None = None
+
+
+def viewer_choice(text: str) -> ViewerChoice:
+    """Read `none`, `spawn`, `serve` or an address.
+
+    Raises:
+        ValueError: none of these; the message says what would be right.
+    """
+    if text in ("none", "spawn", "serve"):
+        return ViewerChoice(text == "spawn", text == "serve")
+    scheme, separator, rest = text.partition("://")
+    if scheme not in SCHEMES or not separator or not rest:
+        raise ValueError(
+            f"--viewer {text}: it must be none, spawn, serve or an address like "
+            "rerun+http://127.0.0.1:9876/proxy"
+        )
+    return ViewerChoice(connect=text)

@@ -8,14 +8,15 @@ import numpy as np
 import rerun as rr
 from numpy.typing import ArrayLike
 
-from coordinator.viewer import blueprint, layout, robot_scene, viewer_process
+from coordinator.viewer import viewer_process
 from coordinator.viewer.logging_thread import Job, LoggingThread
-from coordinator.viewer.parameter import Estimate
 from coordinator.viewer.recorder import Recorder
+from coordinator.viewer.scene import blueprint, entity_paths, robot_scene
+from coordinator.viewer.scene.parameter_plot import Estimate
+from coordinator.viewer.scene.time_series import Batch, IntArray
+from coordinator.viewer.scene.topology_graph import as_topology
 from coordinator.viewer.targets import ViewerTargets, open_targets
-from coordinator.viewer.time_series import Batch, IntArray
-from coordinator.viewer.topology_graph import as_topology
-from module_agent.dynamics.chain import Chain
+from module_agent.model.chain import Chain
 from module_agent.wire.feedback_rows import Rows
 
 POSE_PERIOD_NS = 33_333_333
@@ -47,7 +48,7 @@ class Viewer:
         Raises:
             OSError: the file cannot be written. A live viewer that is not there is only reported.
         """
-        self._stream = rr.RecordingStream(layout.APPLICATION_ID, recording_id=run_id)
+        self._stream = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id)
         first = blueprint.build(blueprint.Contents(robot)) if lays_out else None
         self._opened = open_targets(self._stream, targets, first)
         self._recorder = Recorder(self._stream, robot, lays_out)

@@ -1,1 +1,1 @@
-"""The estimates that a module computes from its own samples."""
+"""The module's own estimate of the joint that moves it."""

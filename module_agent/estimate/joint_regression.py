@@ -17,6 +17,7 @@ from module_agent.estimate.joint_model import (
     ACCEL_BIAS,
     ALONG,
     BEARING,
+    CALIBRATED,
     COMPLIANCE,
     DELAY,
     FELT,
@@ -25,20 +26,17 @@ from module_agent.estimate.joint_model import (
     HINGE,
     RADIAL,
     TURN,
+    Beliefs,
+    ImuKnowledge,
     Motion,
+    beliefs,
     felt_columns,
     predict,
 )
-from module_agent.estimate.joint_prior import (
-    CALIBRATED,
-    Beliefs,
-    ImuKnowledge,
-    beliefs,
-)
-from module_agent.estimate.seen_motion import SeenMotion
-from module_agent.estimate.smooth_motion import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
+from module_agent.estimate.observed_motion import SeenMotion
+from module_agent.estimate.smoothing import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
 from module_agent.estimate.windows import Array
-from module_agent.gravity import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
+from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.wire.messages import RegressionEstimate, Vector3
 
 # The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.

@@ -14,13 +14,13 @@ from module_agent.estimate.circle_point_analysis import (
     rest_reading,
 )
 from module_agent.estimate.clock_delay import clock_delay
-from module_agent.estimate.joint_prior import AS_DELIVERED, ImuKnowledge
+from module_agent.estimate.joint_model import AS_DELIVERED, ImuKnowledge
 from module_agent.estimate.joint_regression import regress_joint, regression_estimate
 from module_agent.estimate.motion_detection import detect_motion
-from module_agent.estimate.seen_motion import MotionWindows, seen_motions
+from module_agent.estimate.observed_motion import MotionWindows, seen_motions
 from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, imu_window, joint_window
-from module_agent.firmware.history import History
-from module_agent.neighbours import JointMotion
+from module_agent.firmware.feedback import History
+from module_agent.peers.motion_listener import JointMotion
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import CircleEstimate, MotionRecord, RegressionEstimate, Vector3
 

@@ -1,1 +1,1 @@
-"""The pure firmware of a module: one step a tick, no clock, no socket, no file."""
+"""The cyclic executive of a module: states, lease, freshness, expiry, limits."""

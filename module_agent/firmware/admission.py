@@ -9,13 +9,7 @@ from typing import TypeVar
 
 from module_agent.firmware.lease import Lease
 from module_agent.wire.codec import MAX_COMMAND_BYTES, decode
-from module_agent.wire.messages import (
-    GainsCommand,
-    LeaseRequest,
-    Message,
-    MotionCommand,
-    Setpoint,
-)
+from module_agent.wire.messages import GainsCommand, LeaseRequest, Message, MotionCommand, Setpoint
 from module_agent.wire.refusal import Refusal, WireError
 
 M = TypeVar("M", bound=Message)

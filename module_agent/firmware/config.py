@@ -2,8 +2,8 @@
 
 from typing import Any, NamedTuple
 
-from module_agent.catalogue import ModuleType, module_type
-from module_agent.hardware import HardwareModule
+from module_agent.hardware.hardware import HardwareModule
+from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.wire.messages import ExpiryAction, GainSet, Info, Limits
 
 FIRMWARE_NAME = "x5-agent 0.1"

@@ -7,17 +7,16 @@ runs the control law, and publishes feedback rows and status.
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from module_agent.control.controller import UNSET, Command, Controller
+from module_agent.control.gains import default_gains
+from module_agent.control.motion import Motion, check_duration, check_motion, check_setpoint
 from module_agent.firmware.admission import Admission
 from module_agent.firmware.config import FirmwareConfig, check_config, describe
-from module_agent.firmware.controller import UNSET, Command, Controller
-from module_agent.firmware.feedback_stream import Batch, FeedbackStream
-from module_agent.firmware.gains import default_gains
-from module_agent.firmware.history import MAX_ROWS_PER_ANSWER
+from module_agent.firmware.feedback import MAX_ROWS_PER_ANSWER, Batch, FeedbackStream
 from module_agent.firmware.lease import Lease
-from module_agent.firmware.motion import Motion, check_duration, check_motion, check_setpoint
 from module_agent.firmware.motor_guard import WINDING_LIMIT_C, WINDING_REARM_C, MotorGuard
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
-from module_agent.hardware import SensorSample
+from module_agent.hardware.hardware import SensorSample
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (

@@ -1,8 +1,8 @@
 """What a motor is kept from, whatever commands it: heat, the ends of its range, and its own momentum."""
 
+from module_agent.control.controller import NOMINAL_VOLTAGE_V
 from module_agent.firmware.config import FirmwareConfig
-from module_agent.firmware.controller import NOMINAL_VOLTAGE_V
-from module_agent.hardware import SensorSample
+from module_agent.hardware.hardware import SensorSample
 
 # Above this the manufacturer's PWM ceiling 1 - 1/(155 - T) has fallen to zero.
 WINDING_LIMIT_C = 154.0

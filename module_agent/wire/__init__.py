@@ -1,1 +1,1 @@
-"""The published interface of a module: keys, messages, their bytes, and the transports that carry them."""
+"""What is said between modules and coordinator: keys, messages, bytes."""

@@ -2,6 +2,8 @@
 
 A process grows by tens of megabytes with every virtual run, so that each works for some minutes only. One
 that dies takes its trial with it, which counts as failed, and is replaced.
+
+Runs the cases of a benchmark in worker processes, all their trials mixed, and hears how it goes.
 """
 
 import multiprocessing
@@ -15,7 +17,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
-from sim.benchmark.case import Failed, Trial
+from sim.benchmark.case import Case, CaseResult, Failed, Trial, concluded
 
 # To start a process costs about three seconds of imports.
 SECONDS_PER_PROCESS = 150.0
@@ -160,3 +162,28 @@ def _short(argument: object) -> str:
     """Return an argument in a few words: a profile or a robot by its name."""
     words = str(getattr(argument, "name", argument))
     return words if len(words) <= LONGEST_WORDS else words[:LONGEST_WORDS] + "..."
+
+
+def run_cases(
+    cases: Sequence[Case], processes: int, on_trial: Callable[[Case, int], None] = lambda case, left: None
+) -> list[CaseResult]:
+    """Run all trials of all cases; `on_trial` is told of the case of each, and how many it has left.
+
+    The results do not depend on the number of processes.
+    """
+    owner = [(number, case) for number, case in enumerate(cases) for _ in case.trials]
+    left = [len(case.trials) for case in cases]
+
+    def done(index: int, _result: object) -> None:
+        number, case = owner[index]
+        left[number] -= 1
+        on_trial(case, left[number])
+
+    found = run_trials([trial for case in cases for trial in case.trials], processes, done)
+    own: list[list[Done]] = [[] for _ in cases]
+    for (number, _), each in zip(owner, found, strict=True):
+        own[number].append(each)
+    return [
+        concluded(case, [each.result for each in mine], sum(each.cpu_s for each in mine))
+        for case, mine in zip(cases, own, strict=True)
+    ]

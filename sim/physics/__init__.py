@@ -1,1 +1,1 @@
-"""The physics of the simulated world: rigid bodies, actuators, IMUs."""
+"""Rigid multibody dynamics, by PyBullet and by compiled kernels."""

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from sim.geometry.pose import Array
 from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import Skeleton
-from sim.pose import Array
-from sim.robot_file import RobotFileError
+from sim.robot.robot_file import RobotFileError
 
 _STEP = 1e-6
 _ROUNDS = 30

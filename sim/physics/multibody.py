@@ -1,15 +1,46 @@
-"""PyBullet's articulated-body dynamics, set up to be exact: semi-implicit Euler, no hidden damping."""
+"""PyBullet, imported without the greeting that its C code prints.
 
+Standard output belongs to results, some of them machine-readable, and standard error to what a person must
+know.
+
+PyBullet's articulated-body dynamics, set up to be exact: semi-implicit Euler, no hidden damping.
+"""
+
+import ctypes
+import importlib
+import os
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from sim.physics.bullet import pybullet
+from sim.geometry.pose import Array
 from sim.physics.skeleton import Skeleton
-from sim.physics.urdf import joint_name, urdf_text
-from sim.pose import Array
+from sim.physics.skeleton_urdf import joint_name, urdf_text
+
+
+def _imported_quietly() -> Any:
+    streams = (1, 2)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept, nowhere = [os.dup(n) for n in streams], os.open(os.devnull, os.O_WRONLY)
+    try:
+        for number in streams:
+            os.dup2(nowhere, number)
+        return importlib.import_module("pybullet")
+    finally:
+        # The greeting waits in the C library's buffer.
+        ctypes.CDLL(None).fflush(None)
+        for number, copy in zip(streams, kept, strict=True):
+            os.dup2(copy, number)
+            os.close(copy)
+        os.close(nowhere)
+
+
+pybullet: Any = _imported_quietly()
 
 
 class Multibody:

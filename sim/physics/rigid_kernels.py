@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from module_agent.compiled import compiled
-from sim.pose import Array
+from module_agent.model.compiled import compiled
+from sim.geometry.pose import Array
 
 Indices = np.ndarray[Any, np.dtype[np.int64]]
 

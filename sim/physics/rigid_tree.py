@@ -7,9 +7,9 @@ specific force is wrong by 3e-2 m/s^2 on a 2 Hz motion, paired so by less than 1
 
 import numpy as np
 
+from sim.geometry.pose import Array
 from sim.physics.rigid_kernels import feel, mass_and_biases, reach
 from sim.physics.skeleton import Skeleton
-from sim.pose import Array
 
 
 class RigidTree:

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.parts import Hinge
-from sim.pose import Array, inverse, pose, read_only
-from sim.rigid_body import RigidBody, joined, moved, tensor
-from sim.robot_file import BASE, BaseCompliance, Robot
-from sim.robot_tree import RobotTree, Segment, build_tree
+from sim.geometry.link_parts import Hinge
+from sim.geometry.pose import Array, inverse, pose, read_only
+from sim.geometry.rigid_body import RigidBody, joined, moved, tensor
+from sim.robot.robot_file import BASE, BaseCompliance, Robot
+from sim.robot.robot_tree import RobotTree, Segment, build_tree
 
 # Between two passive joints at one place is a body that only physics engines ask for; far below all others.
 _LIGHT = RigidBody(1e-6, read_only(np.zeros(3)), read_only(np.eye(3) * 1e-10))

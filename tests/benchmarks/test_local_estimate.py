@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from coordinator.plan import Plan
-from module_agent.estimate.joint_prior import AS_DELIVERED
-from sim.experiments.one_joint_rig import OneJointRig, TrialRows, analyse, regress
-from sim.robot_file import load_robot
+from coordinator.excitation.plan import Plan
+from module_agent.estimate.joint_model import AS_DELIVERED
+from sim.robot.robot_file import load_robot
+from sim.test_bench.one_joint_rig import OneJointRig, TrialRows, analyse, regress
 
 pytestmark = pytest.mark.benchmark
 

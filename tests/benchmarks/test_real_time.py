@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import pytest
 
+from module_agent.transport.transport import Event, Sample
+from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf, every
 from module_agent.wire.messages import Feedback
-from module_agent.wire.transport import Event, Sample
-from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
-from sim.launcher import Child, LaunchConfig, Launcher, last_words, stop_child
-from sim.robot_file import load_robot
+from sim.processes.launcher import Child, LaunchConfig, Launcher, last_words, stop_child
+from sim.robot.robot_file import load_robot
 
 pytestmark = pytest.mark.benchmark
 

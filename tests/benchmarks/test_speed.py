@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.kinematics.inertial_prediction import imu_readings
-from coordinator.plan import Plan
-from coordinator.terminal import Terminal
-from module_agent.catalogue import CATALOGUE
+from coordinator.batch_estimation.imu_prediction import imu_readings
+from coordinator.excitation.plan import Plan
+from coordinator.runtime.terminal import Terminal
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits
 from module_agent.firmware.firmware import Firmware
-from module_agent.hardware import SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.model.catalogue import CATALOGUE
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import ROW, unpack
 from module_agent.wire.messages import Feedback, LeaseRequest
-from sim.experiments.regressor_trial import CHUNK, JOINTS, regressor_trial
-from sim.robot_file import load_robot
-from sim.robot_tree import true_chain
-from sim.virtual_run import VirtualConfig, run_virtual
-from sim.world import World
+from sim.benchmark.cases.regressor import CHUNK, JOINTS, regressor_trial
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
+from sim.virtual_time.run import VirtualConfig, run_virtual
+from sim.world.world import World
 
 pytestmark = pytest.mark.benchmark
 

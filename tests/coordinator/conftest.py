@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.journal import JournalEvent
-from coordinator.recording import JOURNAL_TOPIC, Entry
-from module_agent.catalogue import module_type
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import JOURNAL_TOPIC, Entry
+from module_agent.control.gains import default_gains
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits
-from module_agent.firmware.gains import default_gains
+from module_agent.model.catalogue import module_type
 from module_agent.wire.codec import encode
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.keys import Leaf, key

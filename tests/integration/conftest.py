@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.session_file import read_session
+from coordinator.recording.session_file import read_session
+from module_agent.transport.transport import Event, Liveness, Reply, Sample
+from module_agent.transport.zenoh_transport import ZenohConfig, ZenohTransport, open_zenoh
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.keys import Leaf, every, key, parse
@@ -35,10 +37,8 @@ from module_agent.wire.messages import (
 )
 from module_agent.wire.refusal import WireError
 from module_agent.wire.row_log import RowLog
-from module_agent.wire.transport import Event, Liveness, Reply, Sample
-from module_agent.wire.zenoh_transport import ZenohConfig, ZenohTransport, open_zenoh
-from sim.launcher import Child, LaunchConfig, Launcher
-from sim.robot_file import load_robot
+from sim.processes.launcher import Child, LaunchConfig, Launcher
+from sim.robot.robot_file import load_robot
 
 ROOT = Path(__file__).parents[2]
 # No test waits this long unless it fails: the machine may be slow and shared.

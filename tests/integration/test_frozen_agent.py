@@ -9,7 +9,7 @@ import pytest
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import MotionCommand
-from sim.truth import read_motion
+from sim.world.truth import read_motion
 
 HELD_RAD, ASKED_RAD = 0.3, 1.8
 

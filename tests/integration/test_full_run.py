@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coordinator.agents_information import AGREES_BELOW
+from coordinator.identification.inertia.agent_information import AGREES_BELOW
 
 FILES = (
     "session.mcap",

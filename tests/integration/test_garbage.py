@@ -9,8 +9,8 @@ import numpy as np
 from module_agent.host import HEARD, SERVED
 from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
 from module_agent.wire.keys import ROOT, Leaf, key
-from sim.score import score
-from sim.truth import read_motion
+from sim.scoring.score import score
+from sim.world.truth import read_motion
 
 NAN, INFINITY = float("nan"), float("inf")
 

@@ -1,6 +1,6 @@
 """An agent that dies in the middle of a motion."""
 
-from coordinator.run_folder import load_recording
+from coordinator.recording.run_folder import load_recording
 
 
 def test_a_killed_agent_is_named_and_what_it_did_until_then_is_kept(launcher, client, programs) -> None:

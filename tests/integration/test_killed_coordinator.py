@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from coordinator.recording import Recording
-from coordinator.robot_link import LEASE_NS
-from coordinator.run_folder import load_recording
+from coordinator.live_robot.module_group import LEASE_NS
+from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import load_recording
 from module_agent.wire.feedback_rows import STATE_NAMES
-from sim.score import score
+from sim.scoring.score import score
 
 EXPIRED = STATE_NAMES.index("expired")
 

@@ -1,11 +1,11 @@
 """One message in twenty is lost, and the recording is complete all the same."""
 
-from coordinator.run_folder import load_recording
+from coordinator.recording.run_folder import load_recording
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Feedback
 from module_agent.wire.row_log import RowLog
-from sim.score import score
+from sim.scoring.score import score
 
 
 def test_no_row_is_missing_when_the_network_drops_feedback(launcher, programs) -> None:

@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import pytest
 
-from coordinator.run_folder import load_recording
-from sim.launcher import Child, LaunchConfig, Launcher, stop_child
-from sim.link_emulator import UP
-from sim.network_namespace import NamespaceError, NetworkNamespace, open_tun
-from sim.robot_file import load_robot
-from sim.score import score
+from coordinator.recording.run_folder import load_recording
+from sim.processes.launcher import Child, LaunchConfig, Launcher, stop_child
+from sim.processes.link_emulator import UP
+from sim.processes.network_namespace import NamespaceError, NetworkNamespace, open_tun
+from sim.robot.robot_file import load_robot
+from sim.scoring.score import score
 
 ROBOT = "thesis_245_horizontal"
 HUB = "10.77.0.1"
@@ -70,7 +70,9 @@ def hosts(tmp_path: Path, programs) -> Iterator[Hosts]:
         options = ("--network", str(network), "--seed", "5", "--counts", str(counts))
         with open(log, "wb") as output:
             process = subprocess.Popen(
-                [sys.executable, "-m", "sim.link_emulator", *named, *options], stdout=output, stderr=output
+                [sys.executable, "-m", "sim.processes.link_emulator", *named, *options],
+                stdout=output,
+                stderr=output,
             )
         emulator = Child("link emulator", process, log)
         opened.callback(stop_child, emulator)

@@ -5,8 +5,8 @@ import signal
 import subprocess
 import sys
 
-from coordinator.run_folder import load_recording
-from sim.launcher import Child
+from coordinator.recording.run_folder import load_recording
+from sim.processes.launcher import Child
 
 ROBOT = "thesis_171_horizontal"
 

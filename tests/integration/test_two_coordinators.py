@@ -1,7 +1,7 @@
 """A second coordinator comes to a robot that is taken."""
 
-from coordinator.run_folder import load_recording
-from sim.score import score
+from coordinator.recording.run_folder import load_recording
+from sim.scoring.score import score
 
 
 def test_the_second_coordinator_is_told_who_holds_the_robot_and_disturbs_nothing(

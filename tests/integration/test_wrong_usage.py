@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from module_agent.hardware import HardwareModule
-from sim.bus_server import BusServer
+from module_agent.hardware.hardware import HardwareModule
+from sim.world.bus_server import BusServer
 
 ROBOT = "thesis_171_horizontal"
 

@@ -13,12 +13,11 @@ import typer
 from typer.testing import CliRunner
 
 from module_agent import main as agent_program
-from module_agent.hardware import HardwareLost
+from module_agent.hardware.hardware import HardwareLost
 from module_agent.main import app
-from module_agent.wire.endpoint import check_endpoint
-from module_agent.wire.impaired_transport import ImpairedTransport
-from module_agent.wire.injected_network import inject
-from module_agent.wire.network_profile import NetworkProfile, PathProfile, profile
+from module_agent.network_emulation.impaired_transport import ImpairedTransport, inject
+from module_agent.network_emulation.profile import NetworkProfile, PathProfile, profile
+from module_agent.transport.endpoint import check_endpoint
 from module_agent.worker import ThreadWorker
 
 

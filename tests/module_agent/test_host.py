@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from module_agent.transport.transport import Liveness, Reply, Sample
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf, key
@@ -24,8 +25,7 @@ from module_agent.wire.messages import (
     Status,
     WindowedSine,
 )
-from module_agent.wire.transport import Liveness, Reply, Sample
-from sim.robot_tree import true_chain
+from sim.robot.robot_tree import true_chain
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"

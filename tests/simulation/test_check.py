@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.check import check, check_plan
-from coordinator.check_program import CHECK, EXIT_CHANGED
-from coordinator.known_robot import KnownRobot, KnownRobotError, load_known
+from coordinator.baseline.check import check, check_plan
+from coordinator.baseline.known_robot import KnownRobot, KnownRobotError, load_known
+from coordinator.commands.check import CHECK, EXIT_CHANGED
+from coordinator.excitation.plan import Plan
 from coordinator.main import app
-from coordinator.plan import Plan
-from coordinator.terminal import Terminal
-from sim.experiments.wear import Wear, draw_wear, worn
-from sim.robot_file import Robot, load_robot
-from sim.robot_tree import true_chain
-from sim.virtual_run import VirtualConfig, run_virtual
+from coordinator.runtime.terminal import Terminal
+from sim.benchmark.cases.link_change import Wear, draw_wear, worn
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.robot_tree import true_chain
+from sim.virtual_time.run import VirtualConfig, run_virtual
 
 ARM = "a2085_03"
 SLIPPED_M = 4e-3

@@ -4,21 +4,22 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from coordinator.dynamic_motions import INDEPENDENT_FRACTION
-from coordinator.dynamics.consistency import parameter_transform
-from coordinator.dynamics.joint_frames import joint_frames
-from coordinator.identify import Identified, identify
-from coordinator.plan import Plan
-from coordinator.recording import Recording
-from module_agent.dynamics.chain import Chain
-from module_agent.dynamics.regressor import torque_regressor
-from module_agent.dynamics.torque_terms import TERMS
-from module_agent.wire.network_file import network
-from sim.physics.actuator import SPRING_LOSS_S
-from sim.robot_file import load_robot
-from sim.robot_tree import build_tree, true_chain, true_inertia
-from sim.virtual_robot import VirtualSettings
-from sim.virtual_session import record_session
+from coordinator.dynamics.pseudo_inertia import parameter_transform
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identified import Identified
+from coordinator.identification.identify import identify
+from coordinator.parameter_fit.base_parameters import joint_frames
+from coordinator.recording.recording import Recording
+from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION
+from module_agent.model.chain import Chain
+from module_agent.model.regressor import torque_regressor
+from module_agent.network_emulation.profile_file import network
+from module_agent.signals.torque_terms import TERMS
+from sim.actuator.actuator import SPRING_LOSS_S
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import build_tree, true_chain, true_inertia
+from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.session import record_session
 
 ARM, MOTIONS = "a2085_03", 3
 PLAN = Plan(excitation="designed", excitation_motions=MOTIONS, excitation_s=4.0, imu="calibrated")

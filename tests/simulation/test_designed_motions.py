@@ -4,10 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from coordinator.plan import Plan
-from coordinator.run_folder import load_recording
-from module_agent.catalogue import module_type
-from sim.score import score
+from coordinator.excitation.plan import Plan
+from coordinator.recording.run_folder import load_recording
+from module_agent.model.catalogue import module_type
+from sim.scoring.score import score
 
 Rigs = Callable[..., Any]
 

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.identify import identify
-from coordinator.plan import Plan
-from coordinator.run import write_outputs
-from coordinator.run_folder import load_recording
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identify import identify
+from coordinator.recording.run_folder import load_recording
+from coordinator.session.run import write_outputs
 
 ROOT = Path(__file__).parents[2]
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from coordinator.link_errors import ModuleLost, MotionInterrupted, UnfitLink
-from coordinator.plan import Plan
-from coordinator.run_folder import load_recording
-from coordinator.session import NobodyThere
-from module_agent.wire.network_profile import NetworkProfile
-from sim.score import score
+from coordinator.excitation.plan import Plan
+from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, UnfitLink
+from coordinator.recording.run_folder import load_recording
+from coordinator.session.session import NobodyThere
+from module_agent.network_emulation.profile import NetworkProfile
+from sim.scoring.score import score
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"

@@ -9,20 +9,33 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.float_session import FloatPlan, FloatSession, Moment
-from coordinator.floating import Floater, FloatRefused, FloatSettings, StaleFeedback
-from coordinator.known_presence import NotTheKnownRobot
-from coordinator.known_weight import KnownWeight
-from coordinator.link_errors import RobotStopped
-from coordinator.radio import Refused
-from module_agent.dynamics.chain import Array
-from module_agent.wire.network_profile import NetworkProfile
-from module_agent.wire.transport import TransportError
-from sim.experiments.floating import POSES, FloatTrial, Pose, float_robot, float_trial, posed, true_weight
-from sim.noise_profile import NOISE_PROFILES, switched
-from sim.parts import FreePose
-from sim.push import Push
-from sim.robot_file import Robot, load_robot
+from coordinator.live_robot.errors import RobotStopped
+from coordinator.live_robot.messenger import Refused
+from coordinator.torque_control.gravity_compensation import (
+    Floater,
+    FloatRefused,
+    FloatSettings,
+    StaleFeedback,
+)
+from coordinator.torque_control.gravity_model import KnownWeight
+from coordinator.torque_control.preconditions import NotTheKnownRobot
+from coordinator.torque_control.session import FloatPlan, FloatSession, Moment
+from module_agent.model.chain import Array
+from module_agent.network_emulation.profile import NetworkProfile
+from module_agent.transport.transport import TransportError
+from sim.benchmark.cases.gravity_compensation import (
+    POSES,
+    FloatTrial,
+    Pose,
+    float_robot,
+    float_trial,
+    posed,
+    true_weight,
+)
+from sim.geometry.link_parts import FreePose
+from sim.imperfections.noise_profile import NOISE_PROFILES, switched
+from sim.robot.robot_file import Robot, load_robot
+from sim.world.external_force import Push
 
 ARM = "a2085_03"
 LIFT, ELBOW = "shoulder-lift", "elbow"

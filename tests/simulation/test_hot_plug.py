@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.known_robot import KNOWN, KnownRobot, load_known
+from coordinator.baseline.known_robot import KNOWN, KnownRobot, load_known
+from coordinator.excitation.plan import Plan
 from coordinator.main import app
-from coordinator.plan import Plan
-from coordinator.run_folder import RESULT
-from module_agent.dynamics.chain import Chain
-from sim.robot_file import Robot, load_robot
-from sim.score import score
-from sim.virtual_run import VirtualConfig, run_virtual
-from tests.conftest import Notes
+from coordinator.recording.run_folder import RESULT
+from module_agent.model.chain import Chain
+from sim.robot.robot_file import Robot, load_robot
+from sim.scoring.score import score
+from sim.virtual_time.run import VirtualConfig, run_virtual
+from tests.rig import Notes
 
 ARM = "a2085_03"
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.plan import Plan
-from coordinator.robot_link import ModuleLost
-from coordinator.run_folder import load_recording
-from module_agent.wire.network_file import network
-from module_agent.wire.network_profile import NetworkProfile, Stall, profile
-from module_agent.wire.transport import LEASE_S
+from coordinator.excitation.plan import Plan
+from coordinator.live_robot.module_group import ModuleLost
+from coordinator.recording.run_folder import load_recording
+from module_agent.network_emulation.profile import NetworkProfile, Stall, profile
+from module_agent.network_emulation.profile_file import network
+from module_agent.transport.transport import LEASE_S
 from sim.main import app
-from sim.score import score
+from sim.scoring.score import score
 
 ARM = "thesis_171_horizontal"
 Rigs = Callable[..., Any]

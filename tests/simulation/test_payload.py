@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.known_robot import KnownRobot, load_known
+from coordinator.baseline.known_robot import KnownRobot, load_known
+from coordinator.baseline.payload import PayloadError, payload_plan, search_payload
+from coordinator.commands.payload import PAYLOAD
+from coordinator.description.urdf_writer import link_homes
+from coordinator.excitation.plan import Plan
 from coordinator.main import app
-from coordinator.payload_program import PAYLOAD
-from coordinator.payload_search import PayloadError, payload_plan, search_payload
-from coordinator.plan import Plan
-from coordinator.terminal import Terminal
-from coordinator.urdf import link_homes
-from module_agent.dynamics.chain import Array, Chain
-from sim.loaded import loaded
-from sim.parts import FreePose
-from sim.robot_file import Robot, load_robot
-from sim.robot_tree import true_chain, true_inertia
-from sim.virtual_run import VirtualConfig, run_virtual
+from coordinator.runtime.terminal import Terminal
+from module_agent.model.chain import Array, Chain
+from sim.geometry.link_parts import FreePose
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.robot_tree import true_chain, true_inertia
+from sim.robot.variants import loaded
+from sim.virtual_time.run import VirtualConfig, run_virtual
 
 ARM = "a2085_03"
 HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))

@@ -2,9 +2,9 @@
 
 import pytest
 
-from coordinator.watching.watcher import Heard, Watcher
-from sim.experiments.watched_robot import Happening, watched
-from sim.experiments.watching import Alarms, Subject, WatchTrial, confusion, known_subject, settings_of
+from coordinator.monitoring.monitor import Heard, Watcher
+from sim.benchmark.cases.monitored_robot import Happening, watched
+from sim.benchmark.cases.monitoring import Alarms, Subject, WatchTrial, confusion, known_subject, settings_of
 
 ARM = Subject(robot="a2085_03", seed=3, brief=True)
 

@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import pytest
 
-from coordinator.plan import Plan
-from coordinator.result import Result
-from coordinator.terminal import Terminal
-from sim.noise_profile import NoiseProfile, noise_profile, switched
-from sim.robot_file import load_robot, shipped_robots
-from sim.score import Score, score
-from sim.virtual_run import VirtualConfig, run_virtual
+from coordinator.excitation.plan import Plan
+from coordinator.identification.result import Result
+from coordinator.runtime.terminal import Terminal
+from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
+from sim.robot.robot_file import load_robot, shipped_robots
+from sim.scoring.score import Score, score
+from sim.virtual_time.run import VirtualConfig, run_virtual
 
 THESIS = tuple(name for name in shipped_robots() if name.startswith("thesis"))
 # Sixteen joints take long: 54 s of robot time with these, 87 s without.

@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.agents_information import AGREES_BELOW
-from coordinator.identify import identify
-from coordinator.plan import Plan
-from coordinator.recording import Recording
-from coordinator.result import DynamicsPart
-from coordinator.run_folder import SESSION, load_recording
-from coordinator.torque_questions import TorqueQuestions
-from module_agent.information_service import InformationService
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identify import identify
+from coordinator.identification.inertia.agent_information import AGREES_BELOW
+from coordinator.identification.result import DynamicsPart
+from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import SESSION, load_recording
+from coordinator.session.information_requests import TorqueQuestions
+from module_agent.torque_information.service import InformationService
 from module_agent.wire.information_messages import CollectRequest
 from module_agent.wire.refusal import Refusal, WireError
-from sim.robot_file import load_robot
-from sim.virtual_robot import VirtualRobot
-from sim.virtual_run import VirtualConfig, run_virtual
+from sim.robot.robot_file import load_robot
+from sim.virtual_time.robot import VirtualRobot
+from sim.virtual_time.run import VirtualConfig, run_virtual
 
 ARM = "thesis_171_horizontal"
 SERIALS = ("X-00009", "X-00010")

@@ -7,17 +7,17 @@ from typing import Any
 
 import pytest
 
+from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
-from coordinator.journal import JournalEvent
-from coordinator.kinematics.topology_advice import NextMotion
-from coordinator.plan import Plan
-from coordinator.recording import JOURNAL_TOPIC, Entry, Recording
-from coordinator.session import NobodyThere, Session
-from coordinator.topology_search import TopologyFound, doubtful_motions, search_topology
+from coordinator.identification.topology_search import TopologyFound, doubtful_motions, search_topology
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
+from coordinator.session.session import NobodyThere, Session
+from coordinator.topology.next_motion import NextMotion
 from module_agent.firmware.config import config_of
 from module_agent.wire.keys import Leaf, parse
-from sim.experiments.random_robots import PLAN, topology_trial
-from sim.virtual_network import VirtualEndpoint
+from sim.benchmark.cases.topology import PLAN, topology_trial
+from sim.virtual_time.network import VirtualEndpoint
 
 # yaw - lift - elbow (reversed) - wrist: the first axis is vertical, so that nothing falls when it lets go.
 ARM = """

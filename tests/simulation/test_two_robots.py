@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.plan import Plan
-from coordinator.result import Result
-from sim.score import score
+from coordinator.excitation.plan import Plan
+from coordinator.identification.result import Result
+from sim.scoring.score import score
 
 Rigs = Callable[..., Any]
 

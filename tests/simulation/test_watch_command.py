@@ -7,13 +7,13 @@ import pytest
 from typer.testing import CliRunner
 
 from coordinator.main import app
-from coordinator.terminal import Terminal
-from sim.experiments.watching import Subject
-from sim.loaded import loaded
-from sim.parts import FreePose
-from sim.robot_file import load_robot
-from sim.virtual_robot import VirtualRobot
-from sim.virtual_run import VirtualConfig, run_virtual
+from coordinator.runtime.terminal import Terminal
+from sim.benchmark.cases.monitoring import Subject
+from sim.geometry.link_parts import FreePose
+from sim.robot.robot_file import load_robot
+from sim.robot.variants import loaded
+from sim.virtual_time.robot import VirtualRobot
+from sim.virtual_time.run import VirtualConfig, run_virtual
 
 ARM = load_robot("a2085_03")
 HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))

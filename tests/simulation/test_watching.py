@@ -2,11 +2,18 @@
 
 import pytest
 
-from coordinator.watching.finding import Finding
-from coordinator.watching.watcher import Heard, Watcher
-from sim.experiments.watched_robot import Happening, watched
-from sim.experiments.watching import Happens, Subject, WatchTrial, known_subject, settings_of, watch_trial
-from sim.push import Push
+from coordinator.monitoring.findings import Finding
+from coordinator.monitoring.monitor import Heard, Watcher
+from sim.benchmark.cases.monitored_robot import Happening, watched
+from sim.benchmark.cases.monitoring import (
+    Happens,
+    Subject,
+    WatchTrial,
+    known_subject,
+    settings_of,
+    watch_trial,
+)
+from sim.world.external_force import Push
 
 # One robot for all tests of the file, recorded once.
 ARM = Subject(robot="a2085_03", seed=3, brief=True)

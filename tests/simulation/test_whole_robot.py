@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.plan import Plan
-from coordinator.run_folder import load_recording
-from sim.score import score
+from coordinator.excitation.plan import Plan
+from coordinator.recording.run_folder import load_recording
+from sim.scoring.score import score
 
 Rigs = Callable[..., Any]
 WHOLE = Plan(mode="whole", dynamics=False, imu="calibrated")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.dynamics.body_tracks import body_tracks, track_regressor
-from coordinator.kinematics.base_motion import BaseMotion
-from coordinator.kinematics.inertial_prediction import LinkTurn, body_motions
-from module_agent.dynamics.chain import Array, Chain
-from module_agent.dynamics.regressor import inverse_dynamics, torque_regressor
+from coordinator.batch_estimation.imu_prediction import LinkTurn, body_motions
+from coordinator.batch_estimation.sensor_data import BaseMotion
+from coordinator.dynamics.body_regressor import body_tracks, track_regressor
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import inverse_dynamics, torque_regressor
 
 SAMPLES = 40
 

@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
-from coordinator.dynamics.consistency import (
+from coordinator.dynamics.pseudo_inertia import (
+    REACH_M,
     body,
     is_consistent,
     nearest_consistent,
     parameters,
     pseudo_inertia,
 )
-from coordinator.dynamics.identification import REACH_M
-from module_agent.dynamics.chain import Array
+from module_agent.model.chain import Array
 
 UPPER = np.triu_indices(3)
 

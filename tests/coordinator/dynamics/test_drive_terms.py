@@ -7,14 +7,8 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from coordinator.dynamics.drive_terms import (
-    TERMS,
-    DriveColumn,
-    drive_columns,
-    drive_regressor,
-    drive_signals,
-)
-from module_agent.dynamics.chain import Array
+from coordinator.dynamics.drive_model import TERMS, DriveColumn, drive_columns, drive_regressor, drive_signals
+from module_agent.model.chain import Array
 
 
 def matrix(columns: Sequence[DriveColumn], qd: Array, qdd: Array, slow: ArrayLike) -> Array:

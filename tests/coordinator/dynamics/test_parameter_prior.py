@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.dynamics.consistency import body, is_consistent, pseudo_inertia
-from coordinator.dynamics.parameter_prior import LEAST_LINK_KG, LINK_KG_M, OUTPUT_SHARE, module_prior
-from sim.random_robot import random_robot
-from sim.robot_file import Robot, load_robot
-from sim.robot_tree import build_tree, true_chain, true_inertia
+from coordinator.dynamics.inertia_prior import LEAST_LINK_KG, LINK_KG_M, OUTPUT_SHARE, module_prior
+from coordinator.dynamics.pseudo_inertia import body, is_consistent, pseudo_inertia
+from sim.robot.random_robot import random_robot
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.robot_tree import build_tree, true_chain, true_inertia
 
 ROBOTS = Path(__file__).resolve().parents[3] / "sim" / "robots"
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from coordinator.dynamics.identification import solve_information
-from coordinator.dynamics.prediction import check_held_out, torque_error
-from module_agent.dynamics.chain import Chain
-from module_agent.dynamics.differentiation import JointMotion, filtered_motion
-from module_agent.dynamics.information import gather
-from module_agent.dynamics.regressor import inverse_dynamics
+from coordinator.dynamics.torque_prediction import check_held_out, torque_error
+from coordinator.parameter_fit.least_squares import solve_information
+from module_agent.model.chain import Chain
+from module_agent.model.information import gather
+from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.filtering import JointMotion, filtered_motion
 
 
 def test_the_error_is_the_ratio_of_norms() -> None:

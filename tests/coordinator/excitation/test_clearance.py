@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from coordinator.excitation.clearance import CLEARANCE_M, clearance_m, link_axes, segment_distances
-from coordinator.kinematics.forward import body_displacements
-from module_agent.dynamics.chain import Chain
-from sim.robot_file import load_robot
-from sim.robot_tree import true_chain
+from coordinator.excitation.self_collision import CLEARANCE_M, clearance_m, link_axes, segment_distances
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import body_displacements
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from coordinator.excitation.clearance import CLEARANCE_M, clearance_m
-from coordinator.excitation.design import (
+from coordinator.excitation.d_optimal import (
     RATE_HZ,
     TORQUE_SHARE,
     Excitation,
@@ -15,16 +14,17 @@ from coordinator.excitation.design import (
     design_excitation,
     information,
 )
+from coordinator.excitation.joint_limits import JointLimits, joint_limits, motion_peaks
+from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import SampledMotion, sampled, way
-from coordinator.motion_design.limits import JointLimits, joint_limits, motion_peaks
-from coordinator.plan import Plan
-from module_agent.catalogue import module_type
-from module_agent.dynamics.chain import Array
-from module_agent.dynamics.differentiation import differentiate
-from module_agent.dynamics.regressor import inverse_dynamics
-from module_agent.firmware.waveform import duration_s, waveform
-from sim.robot_file import load_robot
-from sim.robot_tree import true_chain, true_inertia
+from coordinator.excitation.self_collision import CLEARANCE_M, clearance_m
+from module_agent.control.waveform import duration_s, waveform
+from module_agent.model.catalogue import module_type
+from module_agent.model.chain import Array
+from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.filtering import differentiate
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain, true_inertia
 
 SIGMA_NM = 0.05
 
@@ -134,7 +134,7 @@ def test_ways_are_looked_at_in_both_directions(monkeypatch: pytest.MonkeyPatch) 
         looked.append((tuple(from_rad), tuple(to_rad)))
         return way(from_rad, to_rad, *others)
 
-    monkeypatch.setattr("coordinator.excitation.design.way", heard)
+    monkeypatch.setattr("coordinator.excitation.d_optimal.way", heard)
     found = design_excitation(task, np.random.default_rng(5), candidates=6)
     home = tuple(task.home_rad)
     for segment in found.segments:

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from coordinator.excitation.of_robot import END_RAD, RobotModule, excitation_task, robot_excitation
-from coordinator.plan import Plan
-from module_agent.catalogue import module_type
+from coordinator.excitation.plan import Plan
+from coordinator.excitation.robot_excitation import END_RAD, RobotModule, excitation_task, robot_excitation
+from module_agent.control.waveform import waveform
 from module_agent.firmware.config import catalogue_limits
-from module_agent.firmware.waveform import waveform
-from sim.robot_file import load_robot
-from sim.robot_tree import true_chain
+from module_agent.model.catalogue import module_type
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
 
 ROBOT = load_robot("a2085_04")
 CHAIN = true_chain(ROBOT)

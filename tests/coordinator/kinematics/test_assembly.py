@@ -14,10 +14,10 @@ from coordinator.kinematics.chain_observations import (
     DISTANCE_FLOOR_RELATIVE,
     GRAVITY_FLOOR_RAD,
 )
-from coordinator.kinematics.forward import imu_poses
-from coordinator.kinematics.increments import apply_increment
-from module_agent.catalogue import CATALOGUE
-from module_agent.dynamics.chain import Chain
+from module_agent.model.catalogue import CATALOGUE
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import imu_poses
+from module_agent.model.perturbation import apply_increment
 
 X5 = CATALOGUE["X5-4"]
 

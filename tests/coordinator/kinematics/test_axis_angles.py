@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.kinematics.axis_angles import axis_angles
-from coordinator.kinematics.increments import apply_increment
+from coordinator.kinematics.frames import axis_angles
+from module_agent.model.perturbation import apply_increment
 
 
 def test_the_sigma_is_the_spread_of_many_robots_drawn_from_the_chains(robots: Any) -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coordinator.kinematics.chain_observations import jacobian, pack, predict, residuals
-from coordinator.kinematics.increments import apply_increment
+from module_agent.model.perturbation import apply_increment
 
 
 @pytest.mark.parametrize("seed", range(5))

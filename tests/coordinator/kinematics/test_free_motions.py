@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.kinematics.forward import descendants
-from coordinator.kinematics.free_motions import carried, free_motions, moved, nearest, settled
-from coordinator.kinematics.increments import apply_increment
+from coordinator.kinematics.gauge_fixing import carried, free_motions, moved, nearest, settled
 from coordinator.kinematics.null_space import Unresolved, name_null_space
-from module_agent.dynamics.chain import Chain
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import descendants
+from module_agent.model.perturbation import apply_increment
 
 
 def hidden(chain: Chain) -> tuple[Unresolved, ...]:

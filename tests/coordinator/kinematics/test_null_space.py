@@ -7,8 +7,8 @@ import pytest
 
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import pack, residuals
-from coordinator.kinematics.increments import apply_increment
 from coordinator.kinematics.null_space import name_null_space
+from module_agent.model.perturbation import apply_increment
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coordinator.kinematics.pair_estimate import circle_observation
+from coordinator.kinematics.chain_observations import circle_observation
 from module_agent.wire.messages import CircleEstimate, Estimate
 
 CIRCLE = CircleEstimate(

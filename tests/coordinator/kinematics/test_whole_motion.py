@@ -5,12 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from coordinator.batch_estimation.estimator import SensorData, refine_chain
+from coordinator.batch_estimation.imu_prediction import imu_readings
 from coordinator.kinematics.assembly import assemble
-from coordinator.kinematics.forward import ancestors, carrier
-from coordinator.kinematics.inertial_prediction import imu_readings
-from coordinator.kinematics.refinement import SensorData, refine_chain
-from coordinator.kinematics.topology import find_topology
-from coordinator.kinematics.whole_motion import (
+from coordinator.kinematics.simultaneous_motion import (
     StillReading,
     WholeMotion,
     WholeResponse,
@@ -18,7 +16,9 @@ from coordinator.kinematics.whole_motion import (
     seen_by_all,
     whole_response,
 )
-from module_agent.dynamics.chain import Chain
+from coordinator.topology.topology import find_topology
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import ancestors, carrier
 
 RATE_HZ = 250.0
 DURATION_S = 12.0

@@ -8,7 +8,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from module_agent.dynamics.chain import Chain
+from module_agent.model.chain import Chain
 from module_agent.wire.feedback_rows import ROW, Rows
 
 Read = Callable[[Path, str], pd.DataFrame]

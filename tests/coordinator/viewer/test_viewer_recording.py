@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 from rerun.chunk import RrdReader
 
-from coordinator.kinematics.forward import imu_poses
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
-from module_agent.dynamics.chain import Chain
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import imu_poses
 from module_agent.wire.feedback_rows import Rows
 
 Read = Callable[[Path, str], pd.DataFrame]

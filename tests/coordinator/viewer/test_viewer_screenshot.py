@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from coordinator.viewer import layout
+from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.screenshot import ScreenshotFailed, screenshot, with_active_tab
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
-from module_agent.dynamics.chain import Chain
+from module_agent.model.chain import Chain
 
 BLUEPRINT = {
     "/container/1": {
@@ -78,7 +78,7 @@ def drawn(tmp_path: Path, name: str, arm: Chain, types: dict[str, str], known: b
     pixels = np.asarray(Image.open(io.BytesIO(png.read_bytes())).convert("HSV"), dtype=int)
     # Below the title bar, which has orange warnings of its own.
     hue, saturation, value = np.moveaxis(pixels[60:], -1, 0)
-    red, green, blue, _ = layout.ESTIMATE_COLOUR
+    red, green, blue, _ = entity_paths.ESTIMATE_COLOUR
     orange = Image.new("RGB", (1, 1), (red, green, blue)).convert("HSV").getpixel((0, 0))
     assert isinstance(orange, tuple)
     return int(((abs(hue - orange[0]) < 8) & (saturation > 150) & (value > 90)).sum())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from module_agent.estimate.base_motion import ACCELERATION, FORCE, RATE, BaseMotion
+from module_agent.estimate.base_shake import ACCELERATION, FORCE, RATE, BaseMotion
 from module_agent.estimate.windows import ImuWindow, JointWindow
 
 T_S = np.arange(0.0, 5.6, 0.004)

@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from module_agent.estimate.base_motion import BaseMotion
+from module_agent.estimate.base_shake import BaseMotion
 from module_agent.estimate.joint_model import (
     BEARING,
     COMPLIANCE,
@@ -19,7 +19,7 @@ from module_agent.estimate.joint_model import (
     Motion,
     predict,
 )
-from module_agent.estimate.smooth_motion import SmoothMotion
+from module_agent.estimate.smoothing import SmoothMotion
 from module_agent.estimate.windows import ImuWindow, JointWindow
 
 T_S = np.linspace(0.5, 2.5, 60)

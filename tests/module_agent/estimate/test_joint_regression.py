@@ -7,10 +7,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from module_agent.estimate.circle_point_analysis import circle_point_analysis, rest_reading
-from module_agent.estimate.joint_prior import AS_DELIVERED, CALIBRATED
+from module_agent.estimate.joint_model import AS_DELIVERED, CALIBRATED
 from module_agent.estimate.joint_regression import JointRegression, regress_joint, regression_estimate
-from module_agent.estimate.seen_motion import SeenMotion
-from module_agent.estimate.smooth_motion import SmoothMotion, smooth_imu
+from module_agent.estimate.observed_motion import SeenMotion
+from module_agent.estimate.smoothing import SmoothMotion, smooth_imu
 from module_agent.estimate.windows import ImuWindow, JointWindow, align
 from module_agent.wire.messages import RegressionEstimate
 

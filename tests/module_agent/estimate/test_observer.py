@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from module_agent.estimate.observer import Observer
-from module_agent.firmware.history import History
-from module_agent.neighbours import JointMotion
+from module_agent.firmware.feedback import History
+from module_agent.peers.motion_listener import JointMotion
 from module_agent.wire.feedback_rows import ROW, Rows
 from module_agent.wire.messages import ConstantMotion, MotionRecord, Pattern, Rest, WindowedSine
 

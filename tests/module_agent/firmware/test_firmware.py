@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from module_agent.catalogue import CATALOGUE
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits, check_config
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Publication
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
-from module_agent.hardware import SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.model.catalogue import CATALOGUE
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import STATE_NAMES, unpack
 from module_agent.wire.keys import Leaf

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.firmware.history import History
+from module_agent.firmware.feedback import History
 from module_agent.wire.refusal import Refusal, WireError
 
 CAPACITY = 7

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.firmware.effort_profile import MOST_SAMPLES, effort_profile
+from module_agent.control.motion import MOST_SAMPLES, effort_profile
 from module_agent.wire import keys
 from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import ROW, unpack

@@ -3,9 +3,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from module_agent.catalogue import ModuleTypeName, module_type
-from sim.noise_profile import NoiseProfile
-from sim.physics.sensors import Instant, Sensors
+from module_agent.model.catalogue import ModuleTypeName, module_type
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.sensors.sensors import Instant, Sensors
 
 GRAVITY_M_S2 = 9.81
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from module_agent.hardware import SensorSample
-from sim.noise_profile import NOISE_PROFILES, switched
+from module_agent.hardware.hardware import SensorSample
+from sim.imperfections.noise_profile import NOISE_PROFILES, switched
 
 LOG = Path(__file__).resolve().parents[4] / "shared" / "data" / "x5-1-sine-log.csv"
 X5 = NOISE_PROFILES["x5"]

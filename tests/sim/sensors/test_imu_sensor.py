@@ -8,8 +8,8 @@ import pytest
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from sim.noise_profile import NOISE_PROFILES, NoiseProfile, switched
-from sim.physics.imu_sensor import butterworth
+from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, switched
+from sim.sensors.imu import butterworth
 
 NOTHING = NoiseProfile(name="nothing")
 X5 = NOISE_PROFILES["x5"]

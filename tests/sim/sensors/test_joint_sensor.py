@@ -7,8 +7,8 @@ import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from module_agent.hardware import SensorSample
-from sim.noise_profile import NOISE_PROFILES, NoiseProfile, switched
+from module_agent.hardware.hardware import SensorSample
+from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, switched
 
 NOTHING = NoiseProfile(name="nothing")
 X5 = NOISE_PROFILES["x5"]

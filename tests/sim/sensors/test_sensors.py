@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from module_agent.hardware import SensorSample
-from sim.effects import EFFECTS
-from sim.module_clock import module_time
-from sim.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
-from sim.physics.sensor_noise import generator
+from module_agent.hardware.hardware import SensorSample
+from sim.imperfections.effects import EFFECTS
+from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
+from sim.imperfections.random_streams import generator
+from sim.sensors.module_clock import module_time
 
 FIELDS = SensorSample._fields
 IMU = FIELDS[-6:]

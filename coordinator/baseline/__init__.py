@@ -1,0 +1,1 @@
+"""Checking and updating a robot that is known from an earlier run."""

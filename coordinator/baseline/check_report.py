@@ -1,0 +1,224 @@
+"""`check.json`: what a check says of every link of a known robot, in figures and in words."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from rich.table import Table
+from scipy.stats import norm
+
+from coordinator.baseline.change_detection import Findings, LinkChange
+from module_agent.model.chain import Chain
+
+SCHEMA = 1
+BASE_NAME = "base"
+# The accelerometer's bias may drift by 5 mg between two sessions, which is 0.3 deg.
+TILT_ABOVE_DEG = 0.5
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class LinkCheck(_Part):
+    """One link: how the child's IMU is displaced and turned against the parent, in the IMU's frame at q = 0.
+
+    Of a link that changed it is the change that explains the differences best with all others unchanged, of
+    the others the apparent change with all free. false_alarm_probability: that chance alone makes it look as
+    changed, over all links. unseen: in words, what of the change cannot be seen by any motion.
+    would_find_mm: the smallest displacement that would surely have been found; None if none would.
+    """
+
+    parent: str
+    child: str
+    changed: bool
+    displacement_mm: tuple[float, float, float]
+    displacement_sigma_mm: tuple[float, float, float]
+    length_mm: float
+    length_sigma_mm: float
+    rotation_deg: tuple[float, float, float]
+    rotation_sigma_deg: tuple[float, float, float]
+    false_alarm_probability: float
+    sigmas: float
+    unseen: list[str]
+    would_find_mm: float | None
+
+
+class CheckReport(_Part):
+    """The whole check. `changed`: a link or the modules themselves are not what they were."""
+
+    robot: str
+    known: str
+    changed: bool
+    modules_missing: list[str]
+    modules_new: list[str]
+    remounted: list[str]
+    links: list[LinkCheck]
+    false_alarm_probability: float
+    base_tilt_deg: float | None
+    robot_time_s: float
+    words: list[str]
+    schema_version: int = Field(default=SCHEMA, alias="schema")
+
+
+class Session(_Part):
+    """What is said of the two sessions beside the figures."""
+
+    robot: str
+    known: str
+    robot_time_s: float
+
+
+def compared(session: Session, before: Chain, after: Chain, found: Findings) -> CheckReport:
+    """Report on a robot of the same modules, mounted as they were."""
+    tilt = _tilt_deg(before, after)
+    links = _links(before, found)
+    return CheckReport(
+        **session.model_dump(),
+        changed=bool(found.changed),
+        modules_missing=[],
+        modules_new=[],
+        remounted=[],
+        links=links,
+        false_alarm_probability=found.least_false_alarm,
+        base_tilt_deg=tilt,
+        words=[*_words(links), *_tilt_words(tilt)],
+    )
+
+
+def other_robot(
+    session: Session, missing: Sequence[str], new: Sequence[str], remounted: Sequence[str]
+) -> CheckReport:
+    """Report on a robot whose modules are not those that are known, or not mounted as they were."""
+    words = [f"module {s} is gone" for s in missing]
+    words += [f"module {s} is new" for s in new]
+    words += [f"module {s} is mounted elsewhere than it was" for s in remounted]
+    words.append("links are compared only where all modules are as they were: measure the robot again")
+    return CheckReport(
+        **session.model_dump(),
+        changed=True,
+        modules_missing=list(missing),
+        modules_new=list(new),
+        remounted=list(remounted),
+        links=[],
+        false_alarm_probability=0.0,
+        base_tilt_deg=None,
+        words=words,
+    )
+
+
+def _links(chain: Chain, found: Findings) -> list[LinkCheck]:
+    alarms = {c.child: a for c, a in zip(found.changed, found.false_alarm, strict=True)}
+    changed = {c.child: c for c in found.changed}
+    parts = []
+    for one in found.each:
+        alarm = alarms.get(one.child, min(1.0, one.chance * len(found.each)))
+        limit = float(found.would_find_m[one.child])
+        parts.append(_link(chain, changed.get(one.child, one), one.child in changed, alarm, limit))
+    return parts
+
+
+def _link(chain: Chain, change: LinkChange, changed: bool, alarm: float, limit_m: float) -> LinkCheck:
+    parent = chain.parent[change.child]
+    sigma = np.sqrt(np.diag(change.covariance))
+    return LinkCheck(
+        parent=chain.serials[parent] if parent >= 0 else BASE_NAME,
+        child=chain.serials[change.child],
+        changed=changed,
+        displacement_mm=_triple(1e3 * change.displacement_m),
+        displacement_sigma_mm=_triple(1e3 * sigma[3:]),
+        length_mm=1e3 * change.length_m,
+        length_sigma_mm=1e3 * change.length_sigma_m,
+        rotation_deg=_triple(np.degrees(change.rotation_rad)),
+        rotation_sigma_deg=_triple(np.degrees(sigma[:3])),
+        false_alarm_probability=alarm,
+        sigmas=float(norm.isf(0.5 * max(alarm, 1e-300))),
+        unseen=[_direction(row) for row in change.unseen],
+        would_find_mm=1e3 * limit_m if np.isfinite(limit_m) else None,
+    )
+
+
+def _triple(values: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def _direction(row: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> str:
+    """Name a direction of [rotation, displacement] by whichever it mostly is: 1 rad counts as 1 m."""
+    turn, shift = np.linalg.norm(row[:3]), np.linalg.norm(row[3:])
+    kind, part = ("turn about", row[:3]) if turn > shift else ("displacement along", row[3:])
+    unit = part / np.linalg.norm(part)
+    unit = unit * (1.0 if unit[int(np.argmax(np.abs(unit)))] > 0.0 else -1.0)
+    return f"{kind} ({', '.join(f'{v + 0.0:.2f}' for v in unit)})"
+
+
+def _tilt_deg(before: Chain, after: Chain) -> float:
+    up, then = before.gravity, after.gravity
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(up, then)), up @ then)))
+
+
+def _tilt_words(tilt_deg: float) -> list[str]:
+    if tilt_deg < TILT_ABOVE_DEG:
+        return []
+    return [f"the base, or the first module on it, leans by {tilt_deg:.1f} deg against how it stood"]
+
+
+def _words(links: Sequence[LinkCheck]) -> list[str]:
+    changed = sorted((link for link in links if link.changed), key=lambda link: link.false_alarm_probability)
+    lines = [_changed(link) for link in changed]
+    if not changed and links:
+        lines.append("no link has changed")
+        limits = [link.would_find_mm for link in links if link.would_find_mm is not None]
+        if limits:
+            lines[-1] += f": of any of them {max(limits):.1f} mm would have been found"
+    hidden = [f"{link.parent} - {link.child}: {', '.join(link.unseen)}" for link in links if link.unseen]
+    if hidden:
+        lines.append(f"no motion shows, in the IMU's frame, of {'; '.join(hidden)}")
+    return lines
+
+
+def _changed(link: LinkCheck) -> str:
+    x, y, z = link.displacement_mm
+    turn = float(np.linalg.norm(link.rotation_deg))
+    return (
+        f"the link {link.parent} - {link.child} has changed: its far end is displaced by "
+        f"{link.length_mm:.2f} +- {link.length_sigma_mm:.2f} mm, ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm in the "
+        f"frame of {link.child}'s IMU, and turned by {turn:.2f} +- {max(link.rotation_sigma_deg):.2f} deg; "
+        f"chance alone would say so of a sound robot in {_odds(link.false_alarm_probability)} checks "
+        f"({link.sigmas:.1f} sigma)"
+    )
+
+
+def _odds(probability: float) -> str:
+    return f"1 of {1.0 / probability:.0e}" if probability > 1e-15 else "less than 1 of 1e+15"
+
+
+def table(report: CheckReport) -> Table:
+    """Return the links as a table to print."""
+    shown = Table(title=f"{report.robot} against {report.known}")
+    for name in ("parent", "child"):
+        shown.add_column(name)
+    for name in ("displaced [mm]", "+-", "turned [deg]", "+-", "false alarm"):
+        shown.add_column(name, justify="right")
+    shown.add_column("")
+    for link in report.links:
+        shown.add_row(
+            link.parent,
+            link.child,
+            f"{link.length_mm:.2f}",
+            f"{link.length_sigma_mm:.2f}",
+            f"{np.linalg.norm(link.rotation_deg):.3f}",
+            f"{max(link.rotation_sigma_deg):.3f}",
+            f"{link.false_alarm_probability:.1g}",
+            "changed" if link.changed else "",
+        )
+    return shown
+
+
+def write_check(path: Path, report: CheckReport) -> None:
+    """Write `check.json`; the file is the complete old or the complete new one."""
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(report.model_dump_json(indent=1, by_alias=True) + "\n", encoding="utf-8")
+    os.replace(temporary, path)

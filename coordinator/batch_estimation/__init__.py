@@ -1,0 +1,1 @@
+"""One nonlinear least-squares fit of chain, IMU errors and link compliance to all samples."""

@@ -1,0 +1,340 @@
+"""One batch refinement of a chain over all motions at once, from all IMUs and all encoders.
+
+The circle point analysis takes it that only one joint moves. In a real arm the springs of the held joints
+give, so that distal IMUs turn by more than the moving joint does (up to 50 % more near a resonance), and
+the circles come out wrong. Here every IMU sample is predicted from the measured motion of all joints
+(`inertial_prediction`), so what the held joints do is part of the model. Solved by Gauss-Newton on the
+normal equations; gravity and the IMUs' own errors (`imu_intrinsics`) are estimated along.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.batch_estimation.imu_intrinsics import (
+    BIASES_ONLY,
+    ImuIntrinsics,
+    ImuPrior,
+    mixing,
+    perfect,
+    read,
+    slopes,
+)
+from coordinator.batch_estimation.imu_jacobian import imu_slopes
+from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
+from coordinator.batch_estimation.link_compliance import FlexSlopes, no_flex
+from coordinator.batch_estimation.sensor_data import SensorData
+from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
+from module_agent.model.chain import Array, Chain
+from module_agent.model.perturbation import apply_increment, frozen
+
+ITERATIONS = 20
+CONVERGED = 1e-7
+# What the data knows worse than this (in rad, or in m) it does not know: a turn of 6 deg, a tenth of a metre.
+UNKNOWN_ABOVE = 0.1
+# A step (rad, m) along what only the motion of the base tells.
+FARTHEST = 0.3
+# Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
+FINEST = 1e-6
+# Samples, 50 a second.
+LONGEST_LAG = 100
+
+Index = NDArray[np.int64]
+
+
+class Refinement(NamedTuple):
+    """A refined chain; increments are as in `increments`, of all n modules (the first one's are zero).
+
+    covariance: (6 n, 6 n), zero along what is unknown. noise_covariance: the same if the sensors' noise were
+    all, without what the model leaves out, which two sessions with the same motions share. null_basis:
+    (6 n, k) orthonormal directions that the data does not know. residual_gyro_rad_s, residual_accel_m_s2:
+    (n,) rms per axis. intrinsics: the IMUs' own errors; where nothing tells them, they are those expected.
+    compliance: of the links, in the order and units of `FlexSlopes`. late_s: how late all IMUs are alike,
+    beside their own delays in `intrinsics`.
+    """
+
+    chain: Chain
+    covariance: Array
+    noise_covariance: Array
+    null_basis: Array
+    rank: int
+    condition: float
+    residual_gyro_rad_s: Array
+    residual_accel_m_s2: Array
+    intrinsics: ImuIntrinsics
+    compliance: Array
+    iterations: int
+    late_s: float = 0.0
+
+
+class _State(NamedTuple):
+    chain: Chain
+    imus: ImuIntrinsics
+    compliance: Array
+
+
+class _Expected(NamedTuple):
+    """What a chain makes of the joints' motion: its bodies' motions, and what perfect IMUs would read."""
+
+    bodies: list[BodyMotion]
+    ideal: ImuReadings
+    shaken: list[BodyMotion] | None
+    carried: ImuReadings
+
+
+class _Normal(NamedTuple):
+    """Normal equations: pose block, nuisance block (gravity, IMU errors), coupling, right-hand sides."""
+
+    pose: Array
+    cross: Array
+    nuisance: Array
+    pose_rhs: Array
+    nuisance_rhs: Array
+
+
+def refine_chain(
+    chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY, flex: FlexSlopes | None = None
+) -> Refinement:
+    """Refine a chain that is roughly right (within about 0.2 rad and 0.1 m).
+
+    Args:
+        chain: where to start.
+        data: what the sensors read.
+        prior: how well the IMUs are known beforehand.
+
+    Raises:
+        ValueError: fewer samples than parameters; delays wanted without the readings' rates.
+    """
+    if prior.delay_s > 0.0 and data.imu_rates is None:
+        raise ValueError("the IMUs' delays cannot be refined without the rates of their readings (imu_rates)")
+    count = len(chain.serials)
+    if 6 * data.q_rad.shape[0] < 12 * count:
+        raise ValueError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
+    flex = flex if flex is not None else no_flex(count, len(data.q_rad))
+    state = _State(chain, perfect(count), np.zeros(len(flex.links)))
+    shape = (len(data.motions), count)
+    sigmas = np.full(shape, 0.01), np.full(shape, 0.1)
+    used = 0
+    for used in range(1, ITERATIONS + 1):
+        expected = _expected(state, data, flex)
+        gyro, accel = _residuals(state, data, expected)
+        if used > 1:
+            sigmas = _spread(data, gyro), _spread(data, accel)
+        normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), sigmas)
+        step, nuisance, spectrum = _solve(normal)
+        if expected.shaken is not None:
+            seen = expected._replace(bodies=expected.shaken)
+            shaken = _normal_equations(state, data, prior, flex, seen, (gyro, accel), sigmas)
+            step += _along_unknown(shaken, spectrum)
+        state = _moved(state, step, nuisance, prior)
+        if used > 2 and float(np.abs(step).max()) < CONVERGED:
+            break
+    expected = _expected(state, data, flex)
+    gyro, accel = _residuals(state, data, expected)
+    # What the model leaves out repeats with the motion.
+    believed = _believed(data, gyro), _believed(data, accel)
+    normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), believed)
+    _, _, spectrum = _solve(normal)
+    white = _spread(data, gyro), _spread(data, accel)
+    by_noise = _normal_equations(state, data, prior, flex, expected, (gyro, accel), white)
+    return _report(state, spectrum, _reduced(by_noise)[0], _rms(gyro), _rms(accel), used)
+
+
+def _expected(state: _State, data: SensorData, flex: FlexSlopes) -> _Expected:
+    chain = state.chain
+    bodies = body_motions(chain, *data.smooth)
+    ideal = readings_on(chain, bodies)
+    base = data.base
+    motions = None if base is None else body_motions(chain, *data.smooth, base)
+    carried = readings_on(chain, body_motions(chain, *data.joints, base))
+    given = np.tensordot(state.compliance, flex.slopes, axes=1).transpose(1, 2, 0)
+    carried = ImuReadings(carried.gyro_rad_s + given[..., :3], carried.accel_m_s2 + given[..., 3:])
+    return _Expected(bodies, ideal, motions, carried)
+
+
+def _residuals(state: _State, data: SensorData, expected: _Expected) -> tuple[Array, Array]:
+    ideal = expected.carried
+    gyro, accel = read(state.imus, ideal.gyro_rad_s, ideal.accel_m_s2, data.imu_rates)
+    return data.gyro_rad_s - gyro, data.accel_m_s2 - accel
+
+
+def _rms(residual: Array) -> Array:
+    """Return the rms (n,) per axis of residuals (m, n, 3), no smaller than any sensor's resolution."""
+    return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), FINEST))
+
+
+def _spread(data: SensorData, residual: Array) -> Array:
+    """Return the rms of every motion, (motions, n): gears that turn shake an IMU more than those at rest."""
+    return np.stack([_rms(residual[samples]) for samples in data.motions])
+
+
+def _believed(data: SensorData, residual: Array) -> Array:
+    """Return the spread of every motion, (motions, n), widened for what repeats in it."""
+    parts = [residual[samples] for samples in data.motions]
+    return np.stack([_rms(part) * np.sqrt(repeats(part)) for part in parts])
+
+
+def repeats(residual: Array) -> Array:
+    """Return how many samples of residuals (m, n, 3) say the same, for every IMU (n,), at least 1.
+
+    That is 1 + 2 sum |rho(lag)|, the variance of a sum of correlated samples over that of independent ones
+    (Bayley and Hammersley, 1946), with the correlations' magnitude, as what follows the motion is met again
+    at every turn of it; over the lags whose correlation is more than chance makes it, up to 2 s.
+    """
+    samples = residual.shape[0]
+    lags = min(samples // 4, LONGEST_LAG)
+    centred = residual - residual.mean(axis=0)
+    spectrum = np.fft.rfft(centred, 2 * samples, axis=0)
+    covariance = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: lags + 1].sum(axis=2)
+    correlation = np.abs(covariance[1:] / np.maximum(covariance[0], FINEST**2))
+    # Three axes share a lag; of as many correlations of nothing the largest is below four sigmas.
+    correlation[correlation < 4.0 / np.sqrt(3.0 * samples)] = 0.0
+    return np.asarray(1.0 + 2.0 * correlation.sum(axis=0))
+
+
+def _normal_equations(
+    state: _State,
+    data: SensorData,
+    prior: ImuPrior,
+    flex: FlexSlopes,
+    expected: _Expected,
+    residuals: tuple[Array, Array],
+    sigmas: tuple[Array, Array],
+) -> _Normal:
+    """Build the weighted normal equations, IMU by IMU; the root stays."""
+    count, samples = len(state.chain.serials), len(data.q_rad)
+    poses, free = 6 * count, prior.sigmas > 0.0
+    information, rhs = _before(state, prior, flex)
+    bodies, ideal, _, _ = expected
+    motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
+    for k in range(count):
+        found = imu_slopes(state.chain, bodies, *data.smooth[:2], k)
+        true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity, flex.slopes[..., k]])
+        rates = None if data.imu_rates is None else data.imu_rates[:, k]
+        own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
+        weight = 1.0 / np.repeat([sigma[:, k] for sigma in sigmas], 3, axis=0)[:, motion]
+        rows = (np.concatenate([true, own]) * weight).reshape(-1, 6 * samples)
+        target = (np.concatenate([part[:, k] for part in residuals], axis=1).T * weight).ravel()
+        at = _places(found.modules, k, count, len(flex.links), int(free.sum()))
+        information[np.ix_(at, at)] += rows @ rows.T
+        rhs[at] += rows @ target
+    return _Normal(
+        information[6:poses, 6:poses],
+        information[6:poses, poses:],
+        information[poses:, poses:],
+        rhs[6:poses],
+        rhs[poses:],
+    )
+
+
+def _before(state: _State, prior: ImuPrior, flex: FlexSlopes) -> tuple[Array, Array]:
+    """Return the information on [increments (6 n), gravity (3), free IMU errors], and its right-hand side.
+
+    Before any sample the IMUs' errors are known: they are small; and so is gravity's size, which is what
+    tells an accelerometer's scale. What `chain` would change of gravity's size is all that is held.
+    """
+    count, free = len(state.chain.serials), prior.sigmas > 0.0
+    nothing = np.zeros(6 * count + 3)
+    known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(prior.sigmas[free] ** -2.0, count)])
+    held = np.concatenate([nothing, state.compliance + flex.taken, state.imus.errors[:, free].ravel()])
+    information, rhs = np.diag(known), -known * held
+    size = float(np.linalg.norm(state.chain.gravity))
+    up, at = state.chain.gravity / size, slice(6 * count, 6 * count + 3)
+    information[at, at] += np.outer(up, up) / GRAVITY_SIGMA_M_S2**2
+    rhs[at] += up * (GRAVITY_M_S2 - size) / GRAVITY_SIGMA_M_S2**2
+    return information, rhs
+
+
+def _places(modules: Sequence[int], imu: int, count: int, links: int, size: int) -> Index:
+    """Return where the parameters that one IMU feels stand among all of them, in the order of its slopes."""
+    increments = [6 * module + np.arange(6) for module in modules]
+    shared = 6 * count + np.arange(3 + links)
+    own = 6 * count + 3 + links + size * imu + np.arange(size)
+    return np.concatenate([*increments, shared, own])
+
+
+class _Spectrum(NamedTuple):
+    """Eigenvectors (columns) of the pose information with the nuisance taken out; the sigmas along them."""
+
+    vectors: Array
+    sigmas: Array
+
+    @property
+    def known(self) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+        return self.sigmas <= UNKNOWN_ABOVE
+
+
+def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
+    """Return information and right-hand side of the poses with the nuisance taken out, and what took it."""
+    sides = np.column_stack([normal.cross.T, normal.nuisance_rhs])
+    through: Array = np.linalg.solve(normal.nuisance, sides).astype(np.float64)
+    information = normal.pose - normal.cross @ through[:, :-1]
+    return information, normal.pose_rhs - normal.cross @ through[:, -1], through
+
+
+def _solve(normal: _Normal) -> tuple[Array, Array, _Spectrum]:
+    """Return the step of all modules (6 n,), that of the nuisance, the spectrum; unknown directions stay."""
+    information, rhs, through = _reduced(normal)
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    with np.errstate(divide="ignore"):
+        sigmas = 1.0 / np.sqrt(np.maximum(values, 0.0))
+    spectrum = _Spectrum(vectors[:, ::-1], sigmas[::-1])
+    kept = spectrum.vectors[:, spectrum.known]
+    step = kept @ (spectrum.sigmas[spectrum.known] ** 2 * (kept.T @ rhs))
+    nuisance = through[:, -1] - through[:, :-1] @ step
+    return np.concatenate([np.zeros(6), step]), nuisance, spectrum
+
+
+def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
+    """Return the step (6 n,) along what the joints' motions leave unknown, by the base's motion."""
+    information, rhs, _ = _reduced(normal)
+    unknown = spectrum.vectors[:, ~spectrum.known]
+    information, rhs = unknown.T @ information @ unknown, unknown.T @ rhs
+    step = np.linalg.solve(information + np.eye(len(rhs)) * FARTHEST**-2.0, rhs)
+    return np.concatenate([np.zeros(6), unknown @ np.clip(step, -FARTHEST, FARTHEST)])
+
+
+def _moved(state: _State, step: Array, nuisance: Array, prior: ImuPrior) -> _State:
+    chain, free = apply_increment(state.chain, step), prior.sigmas > 0.0
+    change = np.zeros_like(state.imus.errors)
+    links = 3 + len(state.compliance)
+    change[:, free] = nuisance[links:].reshape(len(change), -1)
+    return _State(
+        chain._replace(gravity=frozen(chain.gravity + nuisance[:3])),
+        state.imus.moved(change),
+        state.compliance + nuisance[3:links],
+    )
+
+
+def _report(
+    state: _State,
+    spectrum: _Spectrum,
+    by_noise: Array,
+    sigma_gyro: Array,
+    sigma_accel: Array,
+    iterations: int,
+) -> Refinement:
+    known = spectrum.known
+    kept = spectrum.vectors[:, known]
+    size = 6 * len(state.chain.serials)
+    covariance, noise = np.zeros((size, size)), np.zeros((size, size))
+    covariance[6:, 6:] = (kept * spectrum.sigmas[known] ** 2) @ kept.T
+    noise[6:, 6:] = kept @ np.linalg.solve(kept.T @ by_noise @ kept, kept.T)
+    unknown = np.zeros((size, int(np.count_nonzero(~known))))
+    unknown[6:] = spectrum.vectors[:, ~known]
+    sigmas = spectrum.sigmas[known]
+    return Refinement(
+        chain=state.chain,
+        covariance=frozen(covariance),
+        noise_covariance=frozen(noise),
+        null_basis=frozen(unknown),
+        rank=int(np.count_nonzero(known)),
+        condition=float(sigmas.max() / sigmas.min()) if sigmas.size else float("inf"),
+        residual_gyro_rad_s=frozen(sigma_gyro),
+        residual_accel_m_s2=frozen(sigma_accel),
+        intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
+        compliance=frozen(state.compliance),
+        iterations=iterations,
+    )

@@ -1,0 +1,140 @@
+"""What an IMU makes of the truth: scale, misalignment, bias and delay, as nuisance of the batch refinement.
+
+A sensor of three axes reads y = (I + E) x + b, late by a delay (Titterton & Weston, Strapdown Inertial
+Navigation Technology, 8.3): the diagonal of E holds the scale errors, the rest the axes' misalignments.
+Gravity and the joints' own rates are the references that tell them, as far as the joints turn the IMU; what
+they do not reach stays as uncertain as it was before.
+"""
+
+from math import radians
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from module_agent.model.catalogue import ImuKind
+from module_agent.model.chain import Array
+
+# One IMU's errors as one vector: E of the gyro and of the accelerometer row by row, their biases, the delay,
+# and the gyro's sensitivity to specific force row by row.
+SIZE = 34
+_GYRO, _ACCEL, DELAY, _FORCE = slice(0, 9), slice(9, 18), 24, slice(25, 34)
+
+
+class ImuPrior(NamedTuple):
+    """How well an IMU is known beforehand, one standard deviation each; zero means exactly."""
+
+    scale: float
+    misalignment_rad: float
+    gyro_bias_rad_s: float
+    accel_bias_m_s2: float
+    delay_s: float
+    g_sensitivity_s_m: float = 0.0
+
+    @property
+    def sigmas(self) -> Array:
+        """The standard deviations of an IMU's errors, (34,)."""
+        matrix = np.full((3, 3), self.misalignment_rad)
+        np.fill_diagonal(matrix, self.scale)
+        biases = np.repeat([self.gyro_bias_rad_s, self.accel_bias_m_s2], 3)
+        return np.concatenate(
+            [matrix.ravel(), matrix.ravel(), biases, [self.delay_s], np.full(9, self.g_sensitivity_s_m)]
+        )
+
+
+# What the data sheets of this class of IMU allow. The bias keeps apart what the motions cannot: an
+# accelerometer's bias and gravity where the IMU never turns.
+BIASES_ONLY = ImuPrior(0.0, 0.0, 0.05, 0.2, 0.0)
+# 0.1 deg/s per g, which calibrations of scale and axes leave as it is.
+G_SENSITIVITY_S_M = 1.8e-4
+# As delivered: scale good to 1 %, axes to 1 deg; a low-pass before the sampling makes readings late.
+UNCALIBRATED = ImuPrior(0.01, radians(1.0), 0.05, 0.2, 3e-3, G_SENSITIVITY_S_M)
+# Calibrated on a rate table and by gravity: what is left of scale and axes is below what motions tell.
+CALIBRATED = ImuPrior(1e-4, 1e-4, 0.05, 0.2, 3e-3, G_SENSITIVITY_S_M)
+
+IMU_PRIORS: dict[ImuKind, ImuPrior] = {"calibrated": CALIBRATED, "uncalibrated": UNCALIBRATED}
+
+
+class ImuIntrinsics(NamedTuple):
+    """The errors of n IMUs, (n, 34); see the module's text for the order."""
+
+    errors: Array
+
+    @property
+    def gyro_bias_rad_s(self) -> Array:
+        """Biases of the gyros, (n, 3)."""
+        return self.errors[:, 18:21]
+
+    @property
+    def accel_bias_m_s2(self) -> Array:
+        """Biases of the accelerometers, (n, 3)."""
+        return self.errors[:, 21:24]
+
+    @property
+    def gyro_matrix(self) -> Array:
+        """I + E of the gyros, (n, 3, 3)."""
+        return np.asarray(np.eye(3) + self.errors[:, _GYRO].reshape(-1, 3, 3))
+
+    @property
+    def accel_matrix(self) -> Array:
+        """I + E of the accelerometers, (n, 3, 3)."""
+        return np.asarray(np.eye(3) + self.errors[:, _ACCEL].reshape(-1, 3, 3))
+
+    @property
+    def g_sensitivity_s_m(self) -> Array:
+        """What a specific force adds to the gyros' rates, (n, 3, 3) [rad/s per m/s^2]."""
+        return self.errors[:, _FORCE].reshape(-1, 3, 3)
+
+    def moved(self, change: Array) -> "ImuIntrinsics":
+        """Return these errors changed by (n, 34)."""
+        return ImuIntrinsics(self.errors + change)
+
+
+def beyond(intrinsics: ImuIntrinsics, prior: ImuPrior) -> Array:
+    """Return the largest error of every IMU (n,) in standard deviations of what was expected of it."""
+    free = prior.sigmas > 0.0
+    return np.asarray(np.abs(intrinsics.errors[:, free] / prior.sigmas[free]).max(axis=1))
+
+
+def perfect(count: int) -> ImuIntrinsics:
+    """Return the errors of IMUs that have none."""
+    return ImuIntrinsics(np.zeros((count, SIZE)))
+
+
+def read(intrinsics: ImuIntrinsics, gyro: Array, accel: Array, rates: Array | None) -> tuple[Array, Array]:
+    """Return what IMUs with these errors read of true rates and specific forces, (m, n, 3) each.
+
+    rates: (m, n, 6) how fast gyro and accelerometer readings change [rad/s^2, m/s^3]; None without delays.
+    """
+    turned = np.einsum("nij,mnj->mni", intrinsics.gyro_matrix, gyro) + intrinsics.gyro_bias_rad_s
+    turned += np.einsum("nij,mnj->mni", intrinsics.g_sensitivity_s_m, accel)
+    forced = np.einsum("nij,mnj->mni", intrinsics.accel_matrix, accel) + intrinsics.accel_bias_m_s2
+    if rates is None:
+        return turned, forced
+    late = intrinsics.errors[:, DELAY, None]
+    return turned - late * rates[..., :3], forced - late * rates[..., 3:]
+
+
+def mixing(intrinsics: ImuIntrinsics, module: int) -> Array:
+    """Return the matrix (6, 6) from one IMU's true rates and forces to its readings."""
+    found = np.zeros((6, 6))
+    found[:3, :3], found[3:, 3:] = intrinsics.gyro_matrix[module], intrinsics.accel_matrix[module]
+    found[:3, 3:] = intrinsics.g_sensitivity_s_m[module]
+    return found
+
+
+def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool_]) -> Array:
+    """Return the derivatives of one IMU's readings by those of its errors that are free, (k, 6, m).
+
+    gyro, accel: (m, 3) the truth. rates: (m, 6) or None. free: (34,).
+    """
+    samples = len(gyro)
+    found = np.zeros((SIZE, 6, samples))
+    for row in range(3):
+        found[3 * row : 3 * row + 3, row] = gyro.T
+        found[9 + 3 * row : 12 + 3 * row, 3 + row] = accel.T
+        found[25 + 3 * row : 28 + 3 * row, row] = accel.T
+    found[18:24] = np.eye(6)[:, :, None]
+    if rates is not None:
+        found[DELAY] = -rates.T
+    return found[free]

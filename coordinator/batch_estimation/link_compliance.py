@@ -1,0 +1,308 @@
+"""Links that give under what they carry: quasi-static bending and twisting of each link at one place.
+
+A tube that is clamped at one end moves its other end like a rigid bar on a hinge (pseudo-rigid-body model,
+Howell, Compliant Mechanisms, 2001, section 5). What turns the hinge is the moment of all that lies beyond:
+the modules' masses, which the catalogue gives, times their specific forces. Links resonate at ten times the
+motions' frequencies and more, so the turn follows the moment at once: theta = C M, with one compliance for
+bending and one for twisting to be estimated. Without it a link that gives by 1 % comes out 0.7 % long.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.batch_estimation.imu_prediction import (
+    BodyMotion,
+    ImuReadings,
+    LinkTurn,
+    LinkTurns,
+    acceleration_at,
+    body_motions,
+    given,
+    readings_on,
+    turned,
+)
+from coordinator.batch_estimation.sensor_data import SensorData
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE
+from module_agent.model.perturbation import cross
+from module_agent.signals.filtering import differentiate
+
+# Where the hinge is, as a share of the length: 0 for a clamp that gives, 0.15 for a clamped beam (Howell,
+# section 5), up to a third where the end's slope counts more than its place.
+HINGE_SHARE, HINGE_SHARE_SIGMA = 0.15, 0.1
+# And how far it may be beside the line from face to face: tubes are centimetres beside the modules' axes.
+HINGE_ASIDE_SIGMA_M = 0.02
+HINGE_SIGMAS = (HINGE_SHARE_SIGMA, HINGE_ASIDE_SIGMA_M, HINGE_ASIDE_SIGMA_M)
+
+
+# A link's own mass: that of the manufacturer's tubes, 0.2 kg of ends and 0.4 kg/m. It need not be exact: what
+# a compliance is multiplied with is not told apart from it.
+LINK_MASS_KG, LINK_MASS_KG_M = 0.2, 0.4
+
+JointTrack = tuple[Array, Array, Array]  # positions, velocities, accelerations, (m, n) each
+
+
+class LinkLoad(NamedTuple):
+    """The moment that turns one link, and where; root frame at q = 0.
+
+    hinge: (3,) the place. along: (3,) unit direction of the link. length_m: of the link.
+    force, moment: (3, 3, m) force [N] and moment about the hinge [Nm], their first and their second time
+    derivatives, in the frame of the body that the link starts from.
+    """
+
+    hinge: Array
+    along: Array
+    length_m: float
+    force: Array
+    moment: Array
+
+    def bending(self, compliance: float) -> LinkTurn:
+        """Return how the link turns across its direction, for a compliance in rad/Nm."""
+        return LinkTurn(self.hinge, compliance * (self.moment - self._about_itself()))
+
+    def twisting(self, compliance: float) -> LinkTurn:
+        """Return how the link turns about its direction, for a compliance in rad/Nm."""
+        return LinkTurn(self.hinge, compliance * self._about_itself())
+
+    def moved(self, shift: Array) -> "LinkLoad":
+        """Return the load of a hinge that is somewhere else by (3,) metres."""
+        about = self.moment - cross(np.broadcast_to(shift[:, None], self.force.shape), self.force)
+        return self._replace(hinge=self.hinge + shift, moment=about)
+
+    def turns(self, bending: float, twisting: float) -> list[LinkTurn]:
+        """Return how the link turns across its direction and about it, for two compliances in rad/Nm."""
+        return [self.bending(bending), self.twisting(twisting)]
+
+    @property
+    def shifts(self) -> Array:
+        """Unit shifts (3, 3) of the hinge: by the link's length along it, and by a metre to either side."""
+        aside = np.linalg.svd(self.along[None])[2][1:]
+        return np.vstack([self.length_m * self.along, aside])
+
+    def _about_itself(self) -> Array:
+        return np.asarray(self.along[:, None] * np.einsum("i,dim->dm", self.along, self.moment)[:, None])
+
+
+def link_loads(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    bodies: Sequence[BodyMotion],
+    q_rad: Array,
+    rate_hz: float,
+    turns: LinkTurns | None = None,
+) -> list[LinkLoad | None]:
+    """Return the load of the link below every module; None for modules on the base.
+
+    Args:
+        chain: n joints; roughly right.
+        kinds: (n,) their types, which give the masses.
+        bodies: their motion, from `body_motions`, over one stretch of time without holes.
+        q_rad: (m, n) joint positions.
+        rate_hz: of the samples.
+        turns: how the links turn, as far as it is known, and is counted in `bodies`: near a resonance what
+            gives is a load itself.
+    """
+    samples = len(q_rad)
+    carried = [np.zeros((2, 3, samples)) for _ in chain.parent]  # force, and moment about the root's origin
+    loads: list[LinkLoad | None] = [None] * len(chain.parent)
+    for i in reversed(range(len(chain.parent))):
+        parent = chain.parent[i]
+        if chain.reversed[i]:
+            carried[i] += _weight(bodies[i], _centre(chain, kinds, i), kinds[i].mass_kg)
+        if parent == BASE:
+            continue
+        below = _seen_from_below(chain, i, q_rad[:, i], carried[i])
+        start, end = link_ends(chain, kinds, i)
+        length = float(np.linalg.norm(end - start))
+        beyond = given(bodies[parent], (turns or {}).get(i, ()))
+        below += _weight(beyond, 0.5 * (start + end), LINK_MASS_KG + LINK_MASS_KG_M * length)
+        if not chain.reversed[i]:
+            below += _weight(beyond, _centre(chain, kinds, i), kinds[i].mass_kg)
+        hinge = start + HINGE_SHARE * (end - start)
+        moment = below[1] - cross(hinge[:, None], below[0])
+        along = (end - start) / max(length, 1e-9)
+        loads[i] = LinkLoad(hinge, along, length, *(_series(part, rate_hz) for part in (below[0], moment)))
+        carried[parent] += below
+    return loads
+
+
+def _series(values: Array, rate_hz: float) -> Array:
+    """Return values (3, m), their first and their second derivative, (3, 3, m)."""
+    first = differentiate(values.T, rate_hz)
+    return np.stack([values, first.T, differentiate(first, rate_hz).T])
+
+
+def joined(parts: Sequence[Sequence[LinkLoad | None]], keep_every: int = 1) -> list[LinkLoad | None]:
+    """Join the loads of several stretches of time, link by link, one sample in `keep_every` of each."""
+    found: list[LinkLoad | None] = []
+    for of_link in zip(*parts, strict=True):
+        known = [part for part in of_link if part is not None]
+        force, moment = (
+            [getattr(part, name)[..., ::keep_every] for part in known] for name in ("force", "moment")
+        )
+        found.append(
+            known[0]._replace(force=np.concatenate(force, axis=2), moment=np.concatenate(moment, axis=2))
+            if known
+            else None
+        )
+    return found
+
+
+def link_ends(chain: Chain, kinds: Sequence[ModuleType], module: int) -> tuple[Array, Array]:
+    """Return where the link below a module begins, at its parent's face, and where it ends, at its own."""
+    parent = chain.parent[module]
+    begins = _face(chain, kinds, parent, output=not chain.reversed[parent])
+    return begins, _face(chain, kinds, module, output=chain.reversed[module])
+
+
+def _face(chain: Chain, kinds: Sequence[ModuleType], module: int, output: bool) -> Array:
+    kind, home = kinds[module], chain.imu_home[module]
+    seen = np.array(kind.output_xyz if output else (0.0, 0.0, 0.0)) - np.array(kind.imu_xyz)
+    return np.asarray(home[:3, :3] @ seen + home[:3, 3])
+
+
+def _centre(chain: Chain, kinds: Sequence[ModuleType], module: int) -> Array:
+    kind, home = kinds[module], chain.imu_home[module]
+    seen = np.array(kind.com_xyz) - np.array(kind.imu_xyz)
+    return np.asarray(home[:3, :3] @ seen + home[:3, 3])
+
+
+def _weight(body: BodyMotion, place: Array, mass_kg: float) -> Array:
+    """Return the force (3, m) of a mass at a place (3,) of a body on it, and its moment about the origin."""
+    force = -mass_kg * acceleration_at(body, place[:, None])
+    return np.stack([force, cross(np.broadcast_to(place[:, None], force.shape), force)])
+
+
+def _seen_from_below(chain: Chain, joint: int, q: Array, load: Array) -> Array:
+    """Return force and moment (2, 3, m) beyond a joint as the body below it sees them."""
+    axis, point = chain.axis[joint], np.broadcast_to(chain.point[joint][:, None], load[0].shape)
+    about_point = np.stack([load[0], load[1] - cross(point, load[0])], axis=1)
+    force, moment = np.swapaxes(turned(axis, q, about_point), 0, 1)
+    return np.stack([force, moment + cross(point, force)])
+
+
+class FlexSlopes(NamedTuple):
+    """How IMU readings change with the links' compliances.
+
+    links: (p,) the module that each compliance's link carries. sigmas: (p,) how well each is known before,
+    in `UNIT_RAD_NM`, or for hinges in shares of the length and in metres. slopes: (p, 6, m, n) of [gyro,
+    specific force]. taken: (p,) what is counted in already, which belongs to what is known before.
+    """
+
+    links: tuple[int, ...]
+    sigmas: Array
+    slopes: Array
+    taken: Array
+
+
+# One unit of compliance; that of a metre of light aluminium tube.
+UNIT_RAD_NM = 1e-4
+# Tubes of the manufacturer's kits have 1.2e-4 rad/Nm; anything ten times as soft is no link of a robot.
+COMPLIANCE_SIGMA = 5.0
+
+
+def flex_slopes(chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | None]) -> FlexSlopes:
+    """Return the slopes of all IMUs' readings by every link's compliance in bending and in twisting."""
+    still = readings_on(chain, body_motions(chain, *joints))
+    links: list[int] = []
+    slopes: list[Array] = []
+    for module, load in enumerate(loads):
+        if load is None:
+            continue
+        for turn in (load.bending(UNIT_RAD_NM), load.twisting(UNIT_RAD_NM)):
+            links.append(module)
+            slopes.append(_change(chain, joints, still, module, turn))
+    if not links:
+        return no_flex(len(chain.serials), len(joints[0]))
+    count = len(links)
+    return FlexSlopes(tuple(links), np.full(count, COMPLIANCE_SIGMA), np.array(slopes), np.zeros(count))
+
+
+def _change(chain: Chain, joints: JointTrack, still: ImuReadings, module: int, *turn: LinkTurn) -> Array:
+    """Return what turns of one link make of all IMUs' readings, (6, m, n)."""
+    turns = {module: turn}
+    moved = readings_on(chain, body_motions(chain, *joints, turns=turns), turns)
+    change = [moved.gyro_rad_s - still.gyro_rad_s, moved.accel_m_s2 - still.accel_m_s2]
+    return np.concatenate(change, axis=2).transpose(2, 0, 1)
+
+
+def hinge_slopes(
+    chain: Chain,
+    joints: JointTrack,
+    loads: Sequence[LinkLoad | None],
+    known: FlexSlopes,
+    compliance: Array,
+    taken: Array | None = None,
+) -> FlexSlopes:
+    """Return slopes by the places of the hinges (see `LinkLoad.shifts`), beside those known.
+
+    Their size follows from the compliances (2 l,) found with the slopes known, of l links. taken: (3 l,) by
+    how much the hinges of the loads have been moved already.
+    """
+    if not known.links:
+        return known
+    links: list[int] = []
+    slopes: list[Array] = []
+    still = readings_on(chain, body_motions(chain, *joints))
+    for place, module in enumerate(known.links[::2]):
+        load = loads[module]
+        assert load is not None
+        bending, twisting = UNIT_RAD_NM * compliance[2 * place : 2 * place + 2]
+        here = _change(chain, joints, still, module, *load.turns(bending, twisting))
+        for shift in load.shifts:
+            # Linear in the shift: a centimetre is small, and far from what numbers resolve.
+            there = load.moved(0.01 * shift).turns(bending, twisting)
+            slopes.append(100.0 * (_change(chain, joints, still, module, *there) - here))
+            links.append(module)
+    return FlexSlopes(
+        (*known.links, *links),
+        np.concatenate([known.sigmas, np.tile(HINGE_SIGMAS, len(links) // 3)]),
+        np.concatenate([known.slopes, np.array(slopes)]),
+        np.concatenate([known.taken, np.zeros(len(links)) if taken is None else taken]),
+    )
+
+
+def with_hinges_moved(
+    loads: Sequence[Sequence[LinkLoad | None]], links: Sequence[int], moved: Array
+) -> list[list[LinkLoad | None]]:
+    """Return loads with the hinges of some links moved by (3 l,), in the units of `LinkLoad.shifts`."""
+    by_link = dict(zip(links, moved.reshape(-1, 3), strict=True))
+    return [
+        [load and load.moved(by_link[module] @ load.shifts) for module, load in enumerate(part)]
+        for part in loads
+    ]
+
+
+def turns_under(
+    loads: Sequence[LinkLoad | None], links: Sequence[int], compliance: Array
+) -> dict[int, list[LinkTurn]]:
+    """Return how links turn under their loads, for compliances (2 l,) in bending and twisting by turns."""
+    found = {}
+    for module, pair in zip(links, compliance.reshape(-1, 2), strict=True):
+        load = loads[module]
+        if load is not None:
+            found[module] = load.turns(*(UNIT_RAD_NM * pair))
+    return found
+
+
+def no_flex(count: int, samples: int) -> FlexSlopes:
+    """Return the slopes of links that do not give, for so many modules and samples."""
+    return FlexSlopes((), np.zeros(0), np.zeros((0, 6, samples, count)), np.zeros(0))
+
+
+def loads_of(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    parts: Sequence[SensorData],
+    rate_hz: float,
+    turns: Sequence[LinkTurns] | None = None,
+) -> list[list[LinkLoad | None]]:
+    """Return the loads over each of several stretches of time, as `link_loads` does over one."""
+    found = []
+    for part, turned_links in zip(parts, turns or [{}] * len(parts), strict=True):
+        bodies = body_motions(chain, *part.smooth, part.base, turned_links)
+        found.append(link_loads(chain, kinds, bodies, part.smooth[0], rate_hz, turned_links))
+    return found

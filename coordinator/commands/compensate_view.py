@@ -1,0 +1,142 @@
+"""A float in the terminal: a live table, plain lines in a pipe, or lines of JSON for programs."""
+
+import json
+from collections.abc import Callable
+from math import degrees
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.table import Table
+
+from coordinator.runtime.terminal import print_table
+from coordinator.torque_control.session import Moment
+from coordinator.torque_control.summary import FloatSummary
+
+# A live table; a pipe is read later, and by line.
+LIVE_S, LINE_S = 0.25, 0.5
+
+
+class FloatView:
+    """Shows moments every so often; `now_s` is the clock of the session.
+
+    Use as a context manager. Notes, and what is live, go to standard error; lines of JSON and the summary to
+    standard output.
+    """
+
+    def __init__(self, serials: tuple[str, ...], now_s: Callable[[], float], as_json: bool, quiet: bool):
+        self._serials = serials
+        self._now_s = now_s
+        self._as_json, self._quiet = as_json, quiet
+        self._console = Console(stderr=True, highlight=False, quiet=quiet)
+        is_live = self._console.is_terminal and not quiet and not as_json
+        self._live = Live(console=self._console, auto_refresh=False, transient=True) if is_live else None
+        self._due_s = 0.0
+
+    def __enter__(self) -> "FloatView":
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def note(self, text: str) -> None:
+        """Something worth a line."""
+        self._console.print(f"  {text}", markup=False, soft_wrap=True)
+
+    def moment(self, now: Moment) -> None:
+        """Set-points have been sent."""
+        now_s = self._now_s()
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + (LIVE_S if self._live is not None else LINE_S)
+        if self._as_json:
+            print(json.dumps(moment_fields(self._serials, now)), flush=True)
+        elif self._live is not None:
+            self._live.update(moment_table(self._serials, now), refresh=True)
+        else:
+            self._console.print(moment_line(self._serials, now), markup=False, soft_wrap=True)
+
+    def summary(self, found: FloatSummary) -> None:
+        """It is over."""
+        if self._as_json:
+            print(json.dumps(summary_fields(found)), flush=True)
+        elif not self._quiet:
+            print_table(summary_table(found))
+
+
+def moment_fields(serials: tuple[str, ...], now: Moment) -> dict[str, object]:
+    """Return a moment for programs; SI units."""
+    reading = now.reading
+    columns = zip(
+        serials,
+        reading.q_rad.tolist(),
+        reading.qd_rad_s.tolist(),
+        now.effort_nm.tolist(),
+        reading.effort_nm.tolist(),
+        reading.age_s.tolist(),
+        strict=True,
+    )
+    names = "serial", "position_rad", "velocity_rad_s", "asked_nm", "measured_nm", "age_s"
+    return {
+        "phase": now.phase,
+        "floated_s": round(now.floated_s, 3),
+        "missed": now.missed,
+        "joints": [dict(zip(names, row, strict=True)) for row in columns],
+    }
+
+
+def moment_line(serials: tuple[str, ...], now: Moment) -> str:
+    """Return a moment in one line: degrees and newton metres by joint."""
+    joints = ", ".join(
+        f"{serial} {degrees(q):.1f} deg {tau:.2f} Nm"
+        for serial, q, tau in zip(serials, now.reading.q_rad, now.effort_nm, strict=True)
+    )
+    return f"{now.phase} {now.floated_s:.1f} s: {joints}"
+
+
+def moment_table(serials: tuple[str, ...], now: Moment) -> RenderableType:
+    """Return a moment as a table."""
+    titles = "joint", "position [deg]", "speed [deg/s]", "asked for [Nm]", "measured [Nm]", "age [ms]"
+    shown = Table(*titles, title=f"{now.phase}, {now.floated_s:.1f} s, {now.missed} set-points missed")
+    reading = now.reading
+    for k, serial in enumerate(serials):
+        shown.add_row(
+            serial,
+            f"{degrees(reading.q_rad[k]):.1f}",
+            f"{degrees(reading.qd_rad_s[k]):.1f}",
+            f"{now.effort_nm[k]:.2f}",
+            f"{reading.effort_nm[k]:.2f}",
+            f"{1e3 * reading.age_s[k]:.0f}",
+        )
+    return shown
+
+
+def summary_fields(found: FloatSummary) -> dict[str, object]:
+    """Return a summary for programs; SI units."""
+    return {**found._asdict(), "joints": [joint._asdict() for joint in found.joints]}
+
+
+def summary_table(found: FloatSummary) -> Table:
+    """Return a summary as a table."""
+    titles = (
+        "joint",
+        "moved [deg]",
+        "farthest [deg]",
+        "top speed [deg/s]",
+        "torque, rms [Nm]",
+        "most [Nm]",
+    )
+    title = f"floated for {found.floated_s:.1f} s: {found.why}; {found.missed} set-points missed"
+    shown = Table(*titles, title=title)
+    for joint in found.joints:
+        shown.add_row(
+            joint.serial,
+            f"{degrees(joint.ended_rad - joint.began_rad):+.1f}",
+            f"{degrees(joint.farthest_rad):.1f}",
+            f"{degrees(joint.top_speed_rad_s):.1f}",
+            f"{joint.effort_rms_nm:.2f}",
+            f"{joint.effort_most_nm:.2f}",
+        )
+    return shown

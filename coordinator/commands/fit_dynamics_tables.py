@@ -1,0 +1,185 @@
+"""The report of a recording as tables for the terminal."""
+
+from collections.abc import Iterator
+
+from rich.table import Table
+
+from coordinator.fit_dynamics.report import BaseParameterPart, ErrorPart, FitReport, Model, TermPart
+
+_MODEL_WORDS: dict[Model, str] = {
+    "fitted": "least squares",
+    "bodies": "real bodies near the URDF's",
+    "urdf": "the URDF's inertias, no friction",
+    "drives_only": "friction and motors only",
+    "mean": "constant mean",
+}
+_KINDS = (("filtered", "all"), ("filtered", "masked"), ("raw", "all"), ("raw", "masked"))
+
+
+def tables(report: FitReport) -> Iterator[Table]:
+    """Yield the tables, the most wanted first."""
+    yield _held_out(report)
+    yield _joints(report)
+    yield _lengths(report)
+    if report.fit.drives:
+        yield _gains(report)
+        yield _drives(report)
+    yield _base(report)
+    yield _bodies(report)
+
+
+def notes(report: FitReport) -> Iterator[str]:
+    """Yield what one should know of the figures, in sentences."""
+    data, fit = report.recording, report.fit
+    evened = ", whose times were uneven" if data.resampled else ""
+    yield (
+        f"{data.duration_s:.2f} s at {data.recorded_hz:.6g} Hz{evened}; low-pass at {data.cutoff_hz:.3g} Hz, "
+        f"{data.samples} samples kept at {data.kept_hz:.4g} Hz"
+    )
+    yield (
+        f"the low-pass takes {_percent(data.noise)} % of the torque away, which is in every error called raw"
+    )
+    yield (
+        f"rank {fit.rank} of {fit.parameters} parameters, condition {fit.condition:.3g}; "
+        f"{fit.independent_samples:.0f} independent samples"
+    )
+    if fit.bodies_note:
+        yield f"no real bodies: {fit.bodies_note}"
+
+
+def _held_out(report: FitReport) -> Table:
+    table = _table(
+        "Held-out torque error |e| / |tau| [%]: fitted to one half, tried on the other"
+        + (", and to the whole" if report.held_out_data else ""),
+        ("model", "tried on"),
+        [f"{torque}, {samples}" for torque, samples in _KINDS],
+    )
+    for model in report.models():
+        for tried_on in dict.fromkeys(e.tried_on for e in report.errors(model)):
+            errors = [_error(report, model, tried_on, *kind).overall for kind in _KINDS]
+            table.add_row(_MODEL_WORDS[model], tried_on, *(_percent(error) for error in errors))
+        table.add_section()
+    return table
+
+
+def _joints(report: FitReport) -> Table:
+    baselines = [model for model in report.models() if model != "fitted"]
+    kinds = [f"{torque}, {samples}" for torque, samples in _KINDS]
+    table = _table(
+        "The same joint by joint, both halves; the baselines filtered, all samples",
+        ("joint",),
+        [*kinds, *(_MODEL_WORDS[model] for model in baselines), "noise", "alike"],
+    )
+    for i, residual in enumerate(report.fit.residuals):
+        fitted = [_both(report, "fitted", *kind).per_joint[i] for kind in _KINDS]
+        others = [_both(report, model, "filtered", "all").per_joint[i] for model in baselines]
+        cells = [_percent(error) for error in [*fitted, *others]]
+        table.add_row(residual.joint, *cells, f"{residual.sigma_nm:.3g} Nm", f"{residual.correlation:.1f}")
+    table.caption = "alike: so many samples of the residual count as one"
+    return table
+
+
+def _lengths(report: FitReport) -> Table:
+    table = _table("Held-out error [%] by the length fitted to", (), ("seconds", "all", "masked"))
+    for point in report.lengths:
+        table.add_row(f"{point.seconds:.2f}", _percent(point.all), _percent(point.masked))
+    return table
+
+
+def _gains(report: FitReport) -> Table:
+    table = _table("Held-out error [%] without a kind of term", ("without",), ("all", "masked", ""))
+    whole = [_both(report, "fitted", "filtered", samples).overall for samples in ("all", "masked")]
+    table.add_row("nothing", *(_percent(error) for error in whole), "")
+    for gain in report.gains:
+        worse = whole[0] is not None and gain.all > whole[0]
+        table.add_row(
+            gain.without, _percent(gain.all), _percent(gain.masked), "needed" if worse else "not worth having"
+        )
+    return table
+
+
+def _drives(report: FitReport) -> Table:
+    table = _table(
+        "Drives: F-test of each parameter, alike residuals counted once",
+        ("parameter", "joint"),
+        ("value", "+-", "unit", "F", "chance", ""),
+    )
+    for part in report.fit.drives:
+        table.add_row(
+            part.name,
+            ", ".join(part.joints),
+            f"{part.value:.4g}",
+            f"{part.sigma:.2g}",
+            part.unit,
+            f"{part.f:.1f}",
+            f"{part.chance:.1g}",
+            _place(part),
+        )
+    return table
+
+
+def _base(report: FitReport) -> Table:
+    table = _table(
+        "What the torques show: sums of parameters, bodies in the frames of the URDF's links",
+        ("sum",),
+        ("value", "+-", "+- [%]", "URDF", ""),
+    )
+    drives = [part.name for part in report.fit.drives]
+    for part in report.fit.base_parameters:
+        if part.words in drives:
+            continue
+        table.add_row(
+            part.words,
+            f"{part.value:.4g}",
+            f"{part.sigma:.2g}",
+            _percent(part.relative_sigma),
+            _claim(part),
+            part.verdict,
+        )
+    return table
+
+
+def _bodies(report: FitReport) -> Table:
+    table = _table("Body by body", ("body", "turned by", "its parameters"), ("mass [kg]", "URDF"))
+    for i, body in enumerate(report.fit.bodies, start=1):
+        masses = (_mass(body.mass_kg), _mass(body.urdf_mass_kg))
+        table.add_row(f"{i}: {body.link}", body.joint, body.words, *masses)
+    return table
+
+
+def _mass(mass_kg: float | None) -> str:
+    return "-" if mass_kg is None else f"{mass_kg:.3g}"
+
+
+def _both(report: FitReport, model: Model, torque: str, samples: str) -> ErrorPart:
+    return _error(report, model, "both", torque, samples)
+
+
+def _error(report: FitReport, model: Model, tried_on: str, torque: str, samples: str) -> ErrorPart:
+    return next(e for e in report.errors(model, torque) if (e.tried_on, e.samples) == (tried_on, samples))
+
+
+def _place(part: TermPart) -> str:
+    if part.lumped_with:
+        return "within the inertias"
+    return "earns its place" if part.earns_its_place else "could go"
+
+
+def _claim(part: BaseParameterPart) -> str:
+    return "-" if part.urdf is None else f"{part.urdf:.4g}"
+
+
+def _percent(part: float | None) -> str:
+    if part is None:
+        return "-"
+    # Beyond tenfold the figure says no more than that.
+    return f"{100.0 * part:.1f}" if part < 10.0 else "> 1000"
+
+
+def _table(title: str, words: tuple[str, ...], figures: "list[str] | tuple[str, ...]") -> Table:
+    table = Table(title=title)
+    for name in words:
+        table.add_column(name)
+    for name in figures:
+        table.add_column(name, justify="right")
+    return table

@@ -1,0 +1,111 @@
+"""What a person sees of a watch: a table that changes on a terminal, lines in a pipe; and a JSON file."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from coordinator.monitoring.findings import Finding, Key
+from coordinator.monitoring.monitor import Heard, Watcher
+
+_NOTES = 6
+
+
+class WatchScreen:
+    """Shows what a watcher says. Times are seconds since `start_ns`, which is set before anything is said."""
+
+    def __init__(self, watcher: Watcher, json_file: Path | None, quiet: bool = False):
+        self.start_ns = 0
+        self._watcher = watcher
+        self._file: TextIO | None = json_file.open("w", encoding="utf-8") if json_file else None
+        self._console = Console(highlight=False, quiet=quiet)
+        self._live: Live | None = None
+        if self._console.is_terminal and not quiet:
+            self._live = Live(get_renderable=self._shown, console=self._console, refresh_per_second=4.0)
+        self._notes: list[str] = []
+
+    def __enter__(self) -> "WatchScreen":
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+        if self._file is not None:
+            self._file.close()
+
+    def say(self, heard: Heard) -> None:
+        """Show what is new."""
+        for note in heard.notes:
+            self._line(note)
+            self._write({"note": note})
+        for finding in heard.findings:
+            self._line(self.sentence(finding))
+            self._write({"finding": finding.model_dump()})
+        for key in heard.withdrawn:
+            self._line(f"taken back: {_named(key, self.start_ns)}; what is said above explains it")
+            self._write({"withdrawn": list(key)})
+
+    def sum_up(self) -> None:
+        """Show all that was found, as it is held at the end."""
+        found, watcher = self._watcher.ledger.all, self._watcher
+        self._write(
+            {
+                "watched_s": round(watcher.looked_s, 3),
+                "findings": [finding.model_dump() for finding in found],
+            }
+        )
+        if self._live is not None:
+            self._live.refresh()
+            return
+        self._console.print(f"watched for {watcher.looked_s:.1f} s", markup=False)
+        for finding in found:
+            self._console.print(f"  {self.sentence(finding)}", markup=False, soft_wrap=True)
+        if not found:
+            self._console.print("  nothing is other than it was", markup=False)
+
+    def sentence(self, finding: Finding) -> str:
+        """Return a finding in a line."""
+        since = 1e-9 * (finding.since_ns - self.start_ns)
+        sure = f"{finding.gain:.0f} against {finding.level:.0f}" if finding.kind != "collision" else ""
+        over = "" if finding.until_ns is None or finding.kind == "collision" else ", over now"
+        return f"{since:8.2f} s  {finding.kind}: {finding.words}{f' ({sure})' if sure else ''}{over}"
+
+    def _line(self, text: str) -> None:
+        if self._live is None:
+            self._console.print(text, markup=False, soft_wrap=True)
+        else:
+            self._notes = [*self._notes, text][-_NOTES:]
+
+    def _write(self, what: dict[str, object]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(what) + "\n")
+            self._file.flush()
+
+    def _shown(self) -> Group:
+        watcher, outside = self._watcher, self._watcher.outside_nm
+        table = Table("joint", "from outside [Nm]", "level [Nm]", title=f"{watcher.looked_s:.0f} s watched")
+        for k, serial in enumerate(watcher.reference.chain.serials):
+            now = "-" if outside is None else f"{outside[k]:+.2f}"
+            table.add_row(serial, now, f"{watcher.levels.contact_nm[k]:.2f}")
+        return Group(table, *_lines(self.sentence(f) for f in watcher.ledger.all), *_lines(self._notes))
+
+
+def _lines(texts: Iterable[str]) -> list[Text]:
+    return [Text(text) for text in texts]
+
+
+def _named(key: Key, start_ns: int) -> str:
+    kind, at = key
+    if isinstance(at, int) and at:
+        return f"the {kind} of {1e-9 * (at - start_ns):.2f} s"
+    return "a payload, or torques that nothing explained" if kind == "load" else f"{kind} {at}"

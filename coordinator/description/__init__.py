@@ -1,0 +1,1 @@
+"""Robot descriptions: URDF in and out, HRDF, Denavit-Hartenberg, product of exponentials."""

@@ -1,0 +1,151 @@
+"""Denavit-Hartenberg parameters of a chain: the standard convention of the thesis' eq. 2.
+
+Frame i - 1 has its z along the axis of joint i, so that joint i turns A_i = Rz(theta_i + q_i) Tz(d_i) Tx(a_i)
+Rx(alpha_i). They exist for serial robots only: a tree has one table per path from a root to a leaf. Two axes
+that are all but parallel have a common normal far away, and d then says more of the noise than of the robot
+(Hayati 1983); `parallel_below_rad` takes such axes for parallel.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import ancestors
+from module_agent.model.perturbation import frozen
+
+PARALLEL_BELOW_RAD = 1e-7
+MEETING_BELOW_M = 1e-9
+
+
+class DhRow(NamedTuple):
+    """The parameters of one joint; `theta_rad` is the offset that is added to the joint's position."""
+
+    serial: str
+    theta_rad: float
+    d_m: float
+    a_m: float
+    alpha_rad: float
+
+
+class DhPath(NamedTuple):
+    """The table of one path from the base to a leaf; base: (4, 4) pose of frame 0 in the root frame.
+
+    The last row has only zeros: beyond the last joint there is no axis to refer to.
+    """
+
+    base: Array
+    rows: tuple[DhRow, ...]
+
+
+def dh_paths(chain: Chain, parallel_below_rad: float = PARALLEL_BELOW_RAD) -> tuple[DhPath, ...]:
+    """Return one table per leaf, in the order of the chain."""
+    leaves = [k for k in range(len(chain.serials)) if k not in chain.parent]
+    return tuple(dh_path(chain, leaf, parallel_below_rad) for leaf in leaves)
+
+
+def dh_path(chain: Chain, leaf: int, parallel_below_rad: float = PARALLEL_BELOW_RAD) -> DhPath:
+    """Return the table of the joints from the base to module `leaf`.
+
+    Frame 0 has its origin at the first joint's point and its x along the root frame's x, as near as it goes.
+    Of parallel axes the common normal through the last origin is taken, so that d = 0.
+    """
+    path = ancestors(chain, leaf)
+    first = path[0]
+    frame = _frame(chain.axis[first], _beside(chain.axis[first]), chain.point[first])
+    base, rows = frozen(frame), []
+    for joint, following in pairwise(path):
+        row, frame = _step(
+            chain.serials[joint], frame, chain.axis[following], chain.point[following], parallel_below_rad
+        )
+        rows.append(row)
+    rows.append(DhRow(chain.serials[path[-1]], 0.0, 0.0, 0.0, 0.0))
+    return DhPath(base, tuple(rows))
+
+
+def dh_transform(theta_rad: ArrayLike, d_m: float, a_m: float, alpha_rad: float) -> Array:
+    """Return eq. 2 for (m,) joint angles: (m, 4, 4) poses of frame i in frame i - 1."""
+    theta = np.atleast_1d(np.asarray(theta_rad, dtype=float))
+    c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha_rad), np.sin(alpha_rad)
+    found = np.zeros((theta.size, 4, 4))
+    found[:, 0] = np.stack([c, -s * ca, s * sa, a_m * c], axis=1)
+    found[:, 1] = np.stack([s, c * ca, -c * sa, a_m * s], axis=1)
+    found[:, 2] = [0.0, sa, ca, d_m]
+    found[:, 3, 3] = 1.0
+    return found
+
+
+def dh_poses(path: DhPath, q_rad: ArrayLike) -> Array:
+    """Return the pose of the last frame in the root frame, (m, 4, 4), for `q_rad` (m, joints of the path).
+
+    Raises:
+        ValueError: wrong shape.
+    """
+    q = np.asarray(q_rad, dtype=float)
+    if q.ndim != 2 or q.shape[1] != len(path.rows):
+        raise ValueError(f"q_rad has shape {q.shape}; (samples, {len(path.rows)}) is needed for this path")
+    pose = np.broadcast_to(path.base, (q.shape[0], 4, 4))
+    for i, row in enumerate(path.rows):
+        pose = pose @ dh_transform(row.theta_rad + q[:, i], row.d_m, row.a_m, row.alpha_rad)
+    return frozen(pose)
+
+
+def _step(
+    serial: str, frame: Array, axis: Array, point: Array, parallel_below_rad: float
+) -> tuple[DhRow, Array]:
+    """Return the row that leads from a frame to the next axis, and the frame there."""
+    x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
+    normal, foot, along = _common_normal(frame, axis, point, parallel_below_rad)
+    row = DhRow(
+        serial=serial,
+        theta_rad=_angle(x, normal, z),
+        d_m=float((foot - origin) @ z),
+        a_m=float((along - foot) @ normal),
+        alpha_rad=_angle(z, axis, normal),
+    )
+    return row, _frame(axis, normal, along)
+
+
+def _common_normal(
+    frame: Array, axis: Array, point: Array, parallel_below_rad: float
+) -> tuple[Array, Array, Array]:
+    """Return the common normal of a frame's z and an axis: its direction and its feet on the two."""
+    x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
+    cross = np.cross(z, axis)
+    between = point - origin
+    sine = float(np.linalg.norm(cross))
+    if sine < parallel_below_rad:
+        along = point - axis * (axis @ between)
+        gap = (along - origin) - z * (z @ (along - origin))
+        size = float(np.linalg.norm(gap))
+        return (gap / size if size > MEETING_BELOW_M else x), origin, along
+    foot = origin + z * float(np.cross(between, axis) @ cross) / sine**2
+    along = point + axis * float(np.cross(between, z) @ cross) / sine**2
+    normal = cross / sine
+    # From the first axis to the second, so that a >= 0; of axes that meet either direction will do.
+    return (-normal if float((along - foot) @ normal) < 0.0 else normal), foot, along
+
+
+def _angle(start: Array, end: Array, about: Array) -> float:
+    return float(np.arctan2(np.cross(start, end) @ about, start @ end))
+
+
+def _beside(axis: Array) -> Array:
+    """Return the unit vector across `axis` that is nearest to the root frame's x, or to its y."""
+    for candidate in np.eye(3)[:2]:
+        across = candidate - axis * (axis @ candidate)
+        size = float(np.linalg.norm(across))
+        if size > 0.1:
+            break
+    return np.asarray(across / size)
+
+
+def _frame(z: Array, x: Array, origin: Array) -> Array:
+    found = np.eye(4)
+    # An x that is off by rounding, or by near-parallel axes, is squared up against z.
+    x = x - z * (z @ x)
+    x = x / np.linalg.norm(x)
+    found[:3, 0], found[:3, 1], found[:3, 2], found[:3, 3] = x, np.cross(z, x), z, origin
+    return found

@@ -1,0 +1,194 @@
+"""The identified robot in the manufacturer's robot description format (HRDF 1.6), for its API and tools.
+
+A forward X5 module is an `actuator`, which goes from its housing to its output; what was identified between
+two modules is a `rigid-body`. The format has no actuator that is mounted by its output and none for modules
+other than its own types: those are a `joint` about z between rigid bodies. Every joint is tagged with its
+serial, every end of a branch with `tip_<serial>`. The format knows no IMUs, no limits but the types', and no
+uncertainty: those are in `result.json`.
+
+The base frame has z up; the degrees of freedom are in the order of the file, which a comment in it repeats.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, indent
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coordinator.description.urdf_writer import link_homes, upright_pose
+from coordinator.dynamics.pseudo_inertia import body, is_consistent, nearest_consistent, pseudo_inertia
+from coordinator.kinematics.frames import distal_homes, housing_homes
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE
+from module_agent.model.regressor import PER_BODY, check_phi
+
+VERSION = "1.6.0"
+ACTUATORS = ("X5-1", "X5-4", "X5-9")
+# Two frames, or a joint's axis and its module's, are the same below this (m, and rad at a metre).
+SAME_BELOW = 1e-11
+_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+class _Robot(NamedTuple):
+    """What is written, in the root frame at q = 0.
+
+    entry, leave: (n, 4, 4) the frames before and after every joint's element. actuator: its type, None for a
+    bare joint. tip: (n, 4, 4) the faces that the joints move. bodies: (n, 10) inertial parameters, or None.
+    """
+
+    chain: Chain
+    entry: Array
+    leave: Array
+    actuator: tuple[str | None, ...]
+    tip: Array
+    bodies: Array | None
+
+
+def write_hrdf(
+    path: Path,
+    chain: Chain,
+    types: Sequence[ModuleType],
+    phi: ArrayLike | None = None,
+    name: str = "robot",
+) -> None:
+    """Write the robot; the file is the complete old or the complete new one.
+
+    Args:
+        path: the file.
+        chain: n joints.
+        types: per joint.
+        phi: (10 n,) inertial parameters as in `torque_regressor`. They include the modules' own masses, so
+            that the actuators get none; without them the actuators have their types' and links none.
+        name: of the robot.
+
+    Raises:
+        ValueError: `phi` or `types` do not fit the chain.
+        OSError: the file cannot be written.
+    """
+    robot = hrdf_element(chain, types, phi, name)
+    indent(robot, space="  ")
+    temporary = path.with_name(path.name + ".part")
+    ElementTree(robot).write(temporary, encoding="utf-8", xml_declaration=True)
+    os.replace(temporary, path)
+
+
+def hrdf_element(
+    chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None = None, name: str = "robot"
+) -> Element:
+    """Return the `robot` element; for the arguments and errors see `write_hrdf`."""
+    written = _prepared(chain, types, phi)
+    rot = _numbers(upright_pose(chain.gravity)[:3, :3])
+    robot = Element("robot", version=VERSION, rot=rot, description=name)
+    order = ", ".join(chain.serials[k] for k in joint_order(chain))
+    _comment(robot, f"Lengths in m. The order of the degrees of freedom: {order}.")
+    if phi is None:
+        _comment(robot, "Masses of links are not identified: only the actuators have their types' mass.")
+    else:
+        _comment(robot, "The modules' own masses are part of the identified bodies.")
+    _follow(robot, written, BASE, np.eye(4))
+    return robot
+
+
+def joint_order(chain: Chain) -> tuple[int, ...]:
+    """Return the joints in the order in which the format counts its degrees of freedom: branch by branch."""
+    order: list[int] = []
+    stack = [k for k in reversed(range(len(chain.parent))) if chain.parent[k] == BASE]
+    while stack:
+        joint = stack.pop()
+        order.append(joint)
+        stack += [k for k in reversed(range(len(chain.parent))) if chain.parent[k] == joint]
+    return tuple(order)
+
+
+def _prepared(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None) -> _Robot:
+    housing, tip, axes = housing_homes(chain, types), distal_homes(chain, types), link_homes(chain)
+    bodies = None if phi is None else check_phi(chain, phi).reshape(len(chain.serials), PER_BODY)
+    made = tuple(_actuator(chain, k, kind, tip[k]) for k, kind in enumerate(types))
+    is_made = np.array([m is not None for m in made])[:, None, None]
+    entry, leave = np.where(is_made, housing, axes), np.where(is_made, tip, axes)
+    return _Robot(chain, entry, leave, made, tip, bodies)
+
+
+def _actuator(chain: Chain, k: int, kind: ModuleType, output: Array) -> str | None:
+    """Return the format's type for a module, None if it has none that turns as this one does."""
+    name = kind.name.removesuffix("-old")
+    off = output[:3, 3] - chain.point[k]
+    beside = off - chain.axis[k] * (chain.axis[k] @ off)
+    apart = max(float(np.abs(output[:3, 2] - chain.axis[k]).max()), float(np.abs(beside).max()))
+    return name if name in ACTUATORS and not chain.reversed[k] and apart < SAME_BELOW else None
+
+
+def _follow(parent: Element, robot: _Robot, carrier: int, frame: Array) -> None:
+    """Add what the body `carrier` holds; `frame` is where the element before it ended.
+
+    Without recursion over a chain: one of a hundred joints is as deep as it is long.
+    """
+    while True:
+        children = [k for k, p in enumerate(robot.chain.parent) if p == carrier]
+        if len(children) != 1:
+            break
+        _rigid(parent, robot, carrier, frame, robot.entry[children[0]])
+        carrier, frame = children[0], _joint(parent, robot, children[0])
+    if not children:
+        _rigid(parent, robot, carrier, frame, frame)
+        tip = _pose(np.linalg.inv(frame) @ robot.tip[carrier], "output_")
+        SubElement(
+            parent, "end-effector", {"type": "Custom", "tag": f"tip_{robot.chain.serials[carrier]}"} | tip
+        )
+        return
+    fork = SubElement(parent, "rigid-body", _mass(parent, robot, carrier, frame))
+    for child in children:
+        output = SubElement(fork, "output", _pose(np.linalg.inv(frame) @ robot.entry[child], ""))
+        _follow(output, robot, child, _joint(output, robot, child))
+
+
+def _joint(parent: Element, robot: _Robot, k: int) -> Array:
+    """Add joint k and return the frame after it at q = 0."""
+    serial, made = robot.chain.serials[k], robot.actuator[k]
+    if made is None:
+        SubElement(parent, "joint", {"axis": "rz", "tag": serial})
+    else:
+        none = {} if robot.bodies is None else dict.fromkeys(("mass", *_INERTIA), "0")
+        SubElement(parent, "actuator", {"type": made, "tag": serial} | none)
+    return np.asarray(robot.leave[k])
+
+
+def _rigid(parent: Element, robot: _Robot, carrier: int, frame: Array, end: Array) -> None:
+    """Add the body from `frame` to `end`, unless it is neither long nor heavy."""
+    across = np.linalg.inv(frame) @ end
+    if np.abs(across - np.eye(4)).max() < SAME_BELOW and (robot.bodies is None or carrier == BASE):
+        return
+    SubElement(parent, "rigid-body", _mass(parent, robot, carrier, frame) | _pose(across, "output_"))
+
+
+def _mass(parent: Element, robot: _Robot, carrier: int, frame: Array) -> dict[str, str]:
+    """Return the mass attributes of a body in `frame`; a comment says where it had to be made a real one."""
+    if robot.bodies is None or carrier == BASE:
+        return {"mass": "0"}
+    into = np.linalg.inv(frame)
+    pseudo = into @ pseudo_inertia(robot.bodies[carrier]) @ into.T
+    if not is_consistent(pseudo):
+        words = "The identified parameters of the next body are no real body's; this is the nearest real one."
+        _comment(parent, f"{words} For torques use those in result.json.")
+        pseudo = nearest_consistent(pseudo)
+    real = body(pseudo)
+    values = real.inertia_kg_m2[np.triu_indices(3)]
+    inertia = {key: _numbers(value) for key, value in zip(_INERTIA, values, strict=True)}
+    return {"mass": _numbers(real.mass_kg), "com_trans": _numbers(real.com_m)} | inertia
+
+
+def _pose(pose: Array, prefix: str) -> dict[str, str]:
+    return {f"{prefix}trans": _numbers(pose[:3, 3]), f"{prefix}rot": _numbers(pose[:3, :3])}
+
+
+def _comment(parent: Element, text: str) -> None:
+    parent.append(Comment(f" {text.replace('--', '- -')} "))
+
+
+def _numbers(values: ArrayLike) -> str:
+    # 15 digits: what survives a round trip through decimal in every reader. Adding 0 makes no zero negative.
+    return " ".join(f"{float(value) + 0.0:.15g}" for value in np.asarray(values, dtype=float).ravel())

@@ -1,0 +1,117 @@
+"""The chain as a product of exponentials: screw axes in the space frame and the tips' poses at q = 0.
+
+T_tip(q) = exp([S_1] q_1) ... exp([S_k] q_k) M_tip over the joints from the base to the tip (Lynch and Park,
+Modern Robotics, eq. 4.14). Unlike Denavit-Hartenberg parameters it exists for every robot, and is as well
+conditioned for parallel axes as for any other. Twists are [rotation, translation], the space frame is the
+root frame.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
+
+from coordinator.kinematics.frames import distal_homes
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import ancestors
+from module_agent.model.perturbation import frozen, skew
+
+
+class Tip(NamedTuple):
+    """Where a branch ends: the face of its last module that the last joint moves.
+
+    joints: serials from the base to the tip, its own module last. home: (4, 4) M, its pose at q = 0.
+    covariance: (6, 6) of the twist that displaces M from the left; zero along what is unknown.
+    """
+
+    serial: str
+    frame: Literal["output", "housing"]
+    joints: tuple[str, ...]
+    home: Array
+    covariance: Array
+
+
+class ScrewModel(NamedTuple):
+    """A robot as screws, in the order of `serials`; arrays read-only.
+
+    screws: (n, 6) [w, v] with v = -w x p, for joint positions in rad.
+    covariance: (n, 6, 6) of each screw, zero along what is unknown and for the first root's, which is exact
+    by the choice of the frame.
+    """
+
+    serials: tuple[str, ...]
+    screws: Array
+    covariance: Array
+    tips: tuple[Tip, ...]
+
+
+def screw_model(chain: Chain, types: Sequence[ModuleType], covariance: ArrayLike) -> ScrewModel:
+    """Return the screws and tips of a chain.
+
+    Args:
+        chain: n joints.
+        types: per joint, which say where the outputs are.
+        covariance: (6 n, 6 n) of the chain's increments (`increments.apply_increment`).
+
+    Raises:
+        ValueError: types or covariance do not fit the chain.
+    """
+    count = len(chain.serials)
+    spread = np.asarray(covariance, dtype=float)
+    if spread.shape != (6 * count, 6 * count):
+        raise ValueError(f"covariance of shape {spread.shape} for the increments of {count} modules")
+    own = np.array([spread[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
+    screws = screw_axes(chain)
+    # Displaced by the twist d, a screw changes by ad(d) S = -ad(S) d.
+    slope = -_ad(screws)
+    homes = distal_homes(chain, types)
+    leaves = [k for k in range(count) if k not in chain.parent]
+    return ScrewModel(
+        serials=chain.serials,
+        screws=screws,
+        covariance=frozen(slope @ own @ np.swapaxes(slope, 1, 2)),
+        tips=tuple(_tip(chain, leaf, homes[leaf], own[leaf]) for leaf in leaves),
+    )
+
+
+def screw_axes(chain: Chain) -> Array:
+    """Return the (n, 6) screw axes of the joints at q = 0 in the root frame, read-only."""
+    return frozen(np.concatenate([chain.axis, np.cross(chain.point, chain.axis)], axis=1))
+
+
+def tip_poses(model: ScrewModel, tip: Tip, q_rad: ArrayLike) -> Array:
+    """Return the tip's pose (m, 4, 4) in the space frame, read-only, at `q_rad` (m, n) in `model.serials`.
+
+    Raises:
+        ValueError: wrong shape.
+    """
+    q = np.asarray(q_rad, dtype=float)
+    if q.ndim != 2 or q.shape[1] != len(model.serials):
+        raise ValueError(f"q_rad has shape {q.shape}; (samples, {len(model.serials)}) is needed")
+    pose = np.broadcast_to(np.eye(4), (q.shape[0], 4, 4))
+    for serial in tip.joints:
+        joint = model.serials.index(serial)
+        twists = q[:, joint, None] * model.screws[joint]
+        pose = pose @ RigidTransform.from_exp_coords(twists).as_matrix()
+    return frozen(pose @ tip.home)
+
+
+def _tip(chain: Chain, leaf: int, home: Array, covariance: Array) -> Tip:
+    return Tip(
+        serial=chain.serials[leaf],
+        frame="housing" if chain.reversed[leaf] else "output",
+        joints=tuple(chain.serials[i] for i in ancestors(chain, leaf)),
+        home=frozen(home),
+        covariance=frozen(covariance),
+    )
+
+
+def _ad(twists: Array) -> Array:
+    """Return the (n, 6, 6) matrices of the Lie bracket with twists (n, 6) (Lynch and Park, eq. 8.38)."""
+    found = np.zeros((len(twists), 6, 6))
+    found[:, :3, :3] = found[:, 3:, 3:] = skew(twists[:, :3])
+    found[:, 3:, :3] = skew(twists[:, 3:])
+    return found

@@ -1,0 +1,243 @@
+"""A URDF file as a `Chain`, with the inertias that it claims.
+
+The root link's frame is the root frame. Links that a fixed joint joins are one body; what is fixed to the
+root link moves with nothing and says nothing. A body's own frame is that of the link right behind its joint.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+from xml.etree.ElementTree import Element, ParseError, parse
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from coordinator.dynamics.pseudo_inertia import parameters, pseudo_inertia
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE
+
+STANDARD_GRAVITY = (0.0, 0.0, 9.81)
+_MOVING, _FIXED = ("revolute", "continuous"), "fixed"
+
+
+class UrdfError(ValueError):
+    """A URDF file that cannot be read as a tree of revolute joints."""
+
+
+class UrdfRobot(NamedTuple):
+    """A robot as its URDF describes it; arrays are read-only.
+
+    chain: n moving joints; `serials` are the joints' names, in the file's order as far as a parent comes
+        before its children.
+    bodies: names of the links right behind the joints.
+    homes: (n, 4, 4) pose of every such link's frame at q = 0 in the root frame.
+    carried: all links that move with some joint.
+    phi: (10 n,) the inertias of the file, as in `torque_regressor`: in the root frame at q = 0, of all
+        links of a body together. None if no moving link has one.
+    """
+
+    chain: Chain
+    bodies: tuple[str, ...]
+    homes: Array
+    carried: frozenset[str]
+    phi: Array | None
+
+
+class _Joint(NamedTuple):
+    name: str
+    parent: str
+    child: str
+    moves: bool
+    pose: Array
+    axis: Array
+
+
+class _Placed(NamedTuple):
+    """A link: the pose of its frame at q = 0 in the root frame, and the body that it belongs to."""
+
+    pose: Array
+    body: int
+
+
+def read_urdf(path: Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRobot:
+    """Return the robot of a file; `gravity` (3,) is the specific force of rest, up in the root link's frame.
+
+    Raises:
+        UrdfError: no XML, no robot, no tree, or a joint that is neither revolute, continuous nor fixed; the
+            message names file and joint or link.
+        OSError: the file cannot be read.
+    """
+    try:
+        root = parse(path).getroot()
+    except ParseError as error:
+        raise UrdfError(f"{path}: not XML: {error}") from None
+    if root.tag != "robot":
+        raise UrdfError(f"{path}: its element is <{root.tag}>; a URDF begins with <robot>")
+    try:
+        return _robot(root, np.array(gravity, dtype=float))
+    except UrdfError as error:
+        raise UrdfError(f"{path}: {error}") from None
+
+
+def _robot(root: Element, gravity: Array) -> UrdfRobot:
+    links = {_name(link): link for link in root.findall("link")}
+    joints = [_joint(element, links) for element in root.findall("joint")]
+    ordered = _ordered(joints, _base(joints, links))
+    moving = [joint for joint in ordered if joint.moves]
+    if not moving:
+        _refuse("it has no moving joint")
+    placed = _placed(ordered)
+    homes = np.array([placed[joint.child].pose for joint in moving])
+    axis = np.array([home[:3, :3] @ j.axis for home, j in zip(homes, moving, strict=True)])
+    point = homes[:, :3, 3].copy()
+    for array in (homes, axis, point, gravity):
+        array.flags.writeable = False
+    chain = Chain(
+        serials=tuple(joint.name for joint in moving),
+        parent=tuple(_body(placed, joint.parent) for joint in moving),
+        reversed=(False,) * len(moving),
+        axis=axis,
+        point=point,
+        imu_home=homes,
+        gravity=gravity,
+    )
+    return UrdfRobot(
+        chain,
+        tuple(joint.child for joint in moving),
+        homes,
+        frozenset(link for link, (_, body) in placed.items() if body != BASE),
+        _inertias(links, placed, len(moving)),
+    )
+
+
+def _joint(element: Element, links: dict[str, Element]) -> _Joint:
+    name, kind = _name(element), element.get("type", "")
+    if kind not in (*_MOVING, _FIXED):
+        _refuse(f"joint {name!r} is {kind or 'of no type'}; revolute, continuous and fixed joints are known")
+    if element.find("mimic") is not None:
+        _refuse(f"joint {name!r} mimics another; only joints that move by themselves are known")
+    ends = [_end(element, name, end, links) for end in ("parent", "child")]
+    found = element.find("axis")
+    axis = np.array([1.0, 0.0, 0.0]) if found is None else _three(found, "xyz", f"axis of joint {name!r}")
+    length = float(np.linalg.norm(axis))
+    if kind in _MOVING and not length > 1e-9:
+        _refuse(f"axis of joint {name!r} is zero; it must be a direction")
+    pose = _pose(element.find("origin"), f"origin of joint {name!r}")
+    return _Joint(name, ends[0], ends[1], kind in _MOVING, pose, axis / max(length, 1e-9))
+
+
+def _end(element: Element, name: str, end: str, links: dict[str, Element]) -> str:
+    found = element.find(end)
+    link = None if found is None else found.get("link")
+    if link is None or link not in links:
+        _refuse(f"joint {name!r} has {end} {link!r}, and no link has that name")
+    return link
+
+
+def _base(joints: Sequence[_Joint], links: dict[str, Element]) -> str:
+    children = [joint.child for joint in joints]
+    for joint in joints:
+        if children.count(joint.child) > 1:
+            _refuse(f"link {joint.child!r} is the child of several joints; a tree is needed")
+    roots = [link for link in links if link not in children]
+    if len(roots) != 1:
+        _refuse(f"its root links are {', '.join(roots) or 'none'}; a tree has one, every other is a child")
+    return roots[0]
+
+
+def _ordered(joints: Sequence[_Joint], base: str) -> list[_Joint]:
+    """Return the joints in the file's order, but parents before children."""
+    reached, waiting, ordered = {base}, list(joints), list[_Joint]()
+    while waiting:
+        following = next((joint for joint in waiting if joint.parent in reached), None)
+        if following is None:
+            _refuse(f"joint {waiting[0].name!r} is part of a ring; a tree is needed")
+        waiting.remove(following)
+        reached.add(following.child)
+        ordered.append(following)
+    return ordered
+
+
+def _placed(ordered: Sequence[_Joint]) -> dict[str, _Placed]:
+    """Place every link that some joint carries, fixed or moving."""
+    placed: dict[str, _Placed] = {}
+    bodies = 0
+    for joint in ordered:
+        below = placed.get(joint.parent, _Placed(np.eye(4), BASE))
+        placed[joint.child] = _Placed(below.pose @ joint.pose, bodies if joint.moves else below.body)
+        bodies += joint.moves
+    return placed
+
+
+def _body(placed: dict[str, _Placed], link: str) -> int:
+    return placed[link].body if link in placed else BASE
+
+
+def _inertias(links: dict[str, Element], placed: dict[str, _Placed], joints: int) -> Array | None:
+    total = np.zeros((joints, 4, 4))
+    claimed = False
+    for name, (pose, body) in placed.items():
+        inertial = links[name].find("inertial")
+        if inertial is None or body == BASE:
+            continue
+        claimed = True
+        total[body] += pose @ _link_inertia(inertial, f"inertial of link {name!r}") @ pose.T
+    if not claimed:
+        return None
+    phi = np.concatenate([parameters(pseudo) for pseudo in total])
+    phi.flags.writeable = False
+    return phi
+
+
+def _link_inertia(inertial: Element, where: str) -> Array:
+    """Return the pseudo-inertia in the link's frame."""
+    mass, inertia = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or inertia is None:
+        _refuse(f"{where} lacks <mass> or <inertia>")
+    about_centre = [_number(inertia, key, where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
+    phi = np.array([_number(mass, "value", where), 0.0, 0.0, 0.0, *about_centre])
+    pose = _pose(inertial.find("origin"), where)
+    found: Array = pose @ pseudo_inertia(phi) @ pose.T
+    return found
+
+
+def _pose(origin: Element | None, where: str) -> Array:
+    pose = np.eye(4)
+    if origin is not None:
+        # Roll, pitch and yaw are turns about fixed axes.
+        pose[:3, :3] = Rotation.from_euler("xyz", _three(origin, "rpy", where, "0 0 0")).as_matrix()
+        pose[:3, 3] = _three(origin, "xyz", where, "0 0 0")
+    return pose
+
+
+def _three(element: Element, key: str, where: str, default: str = "") -> Array:
+    words = element.get(key, default).split()
+    if len(words) != 3:
+        _refuse(f"{where}: {key}={element.get(key)!r}; three numbers are needed")
+    return np.array([_float(word, key, where) for word in words])
+
+
+def _number(element: Element, key: str, where: str) -> float:
+    return _float(element.get(key, ""), key, where)
+
+
+def _float(word: str, key: str, where: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        _refuse(f"{where}: {key} holds {word!r}; a finite number is needed")
+    return value
+
+
+def _name(element: Element) -> str:
+    name = element.get("name")
+    if not name:
+        _refuse(f"a <{element.tag}> has no name")
+    return name
+
+
+def _refuse(text: str) -> NoReturn:
+    raise UrdfError(text)

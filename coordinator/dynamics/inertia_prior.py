@@ -1,0 +1,94 @@
+"""What is known of the bodies before anything moved: the modules are of known make, the links are not.
+
+A body is what its joint turns: one side of its own module, the links to its children, and the held side of
+each child. Masses of modules are the catalogue's; the links' are a guess per length. The prior decides only
+where torques say little, so a guess that is off by a factor of two does no harm.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from coordinator.kinematics.frames import distal_homes, housing_homes, output_homes, proximal_homes
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE
+
+# What turns with a module's output: a flange and the last wheel of the gear. Not published; a flange of
+# aluminium of 36 mm by 6 mm has 16 g, the wheel and its bearing about as much.
+OUTPUT_SHARE = 0.1
+OUTPUT_RADIUS_M = 0.02
+# Tubes and brackets of aluminium with their ends, between what joins two modules: 0.3 to 0.8 kg/m.
+LINK_KG_M = 0.5
+# Modules stand apart by at least their screws and a plate.
+LEAST_LINK_KG = 0.02
+# Nothing is thinner than this, and no place is known better.
+SMEAR_M = 0.01
+
+
+def module_prior(chain: Chain, types: Sequence[ModuleType]) -> Array:
+    """Return the pseudo-inertia (n, 4, 4) that every body is expected to have, root frame, q = 0; read-only.
+
+    Raises:
+        ValueError: there is not one type per module.
+    """
+    turned, held = sides_prior(chain, types)
+    found = turned.copy()
+    for i, parent in enumerate(chain.parent):
+        if parent != BASE:
+            found[parent] += held[i]
+    found.flags.writeable = False
+    return found
+
+
+def sides_prior(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array]:
+    """Return what every module's joint turns and what is held by it, with the link that leads to it.
+
+    Each (n, 4, 4), pseudo-inertias in the root frame at q = 0, read-only. Of a module on the base the link is
+    left out: no torque shows it.
+
+    Raises:
+        ValueError: there is not one type per module.
+    """
+    housings, outputs = housing_homes(chain, types), output_homes(chain, types)
+    leaves, enters = distal_homes(chain, types), proximal_homes(chain, types)
+    turned, held = np.zeros((2, len(chain.serials), 4, 4))
+    for i, kind in enumerate(types):
+        sides = _housing(kind, housings[i]), _output(kind, outputs[i])
+        turned[i], held[i] = sides if chain.reversed[i] else sides[::-1]
+        parent = chain.parent[i]
+        if parent != BASE:
+            held[i] += _link(leaves[parent][:3, 3], enters[i][:3, 3])
+    turned.flags.writeable = held.flags.writeable = False
+    return turned, held
+
+
+def _housing(kind: ModuleType, home: Array) -> Array:
+    ixx, iyy, izz, ixy, ixz, iyz = kind.inertia
+    inertia = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
+    share = 1.0 - OUTPUT_SHARE
+    spread = share * (0.5 * np.trace(inertia) * np.eye(3) - inertia)
+    return _lump(
+        share * kind.mass_kg, home @ np.array([*kind.com_xyz, 1.0]), home[:3, :3] @ spread @ home[:3, :3].T
+    )
+
+
+def _output(kind: ModuleType, home: Array) -> Array:
+    mass = OUTPUT_SHARE * kind.mass_kg
+    # A disc across the axis: m r^2 / 4 along each of its directions.
+    across = np.eye(3) - np.outer(home[:3, 2], home[:3, 2])
+    return _lump(mass, home[:, 3], 0.25 * mass * OUTPUT_RADIUS_M**2 * across)
+
+
+def _link(begin: Array, end: Array) -> Array:
+    """Return a straight rod between two faces."""
+    along = end - begin
+    mass = max(LINK_KG_M * float(np.linalg.norm(along)), LEAST_LINK_KG)
+    return _lump(mass, np.append(0.5 * (begin + end), 1.0), mass / 12.0 * np.outer(along, along))
+
+
+def _lump(mass_kg: float, centre: Array, spread: Array) -> Array:
+    """Return the pseudo-inertia of a mass about a centre (4,), its second moments `spread` (3, 3) smeared."""
+    found = mass_kg * np.outer(centre, centre)
+    found[:3, :3] += spread + mass_kg * SMEAR_M**2 * np.eye(3)
+    return np.asarray(found)

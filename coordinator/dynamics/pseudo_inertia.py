@@ -1,0 +1,123 @@
+"""Whether ten inertial parameters belong to a real body, and the nearest real body if they do not.
+
+A body is real if some distribution of positive mass has its parameters, and that is so exactly if its
+pseudo-inertia matrix is positive definite (Wensing, Kim and Slotine 2018, Linear matrix inequalities for
+physically consistent inertial parameter identification). That one condition holds a positive mass, a positive
+definite inertia about the centre of mass and the triangle inequality of its principal moments.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from module_agent.model.chain import Array
+
+# Parameters in kg, kg m and kg m^2 have no common size. First moments are measured per 0.3 m and inertias per
+# (0.3 m)^2, a usual reach of a module with its link, so that all are in kg. A scale per column of the
+# regressor would blow columns that are zero but for rounding up to full size, and they would count into the
+# rank.
+REACH_M = 0.3
+
+
+# Half a gram at 0.3 m, 5e-5 kg m^2: below every module's inertia, and still far enough from singular for
+# simulators that invert it.
+SMALLEST_KG = 5e-4
+
+_UPPER = np.triu_indices(3)
+
+
+class Body(NamedTuple):
+    """A rigid body: mass [kg], centre of mass (3,) [m], inertia about it (3, 3) [kg m^2]; read-only."""
+
+    mass_kg: float
+    com_m: Array
+    inertia_kg_m2: Array
+
+
+def pseudo_inertia(phi: ArrayLike) -> Array:
+    """Return the (4, 4) integral of [r; 1] [r; 1]^T dm of ten parameters (order of thesis eq. 25)."""
+    values = np.asarray(phi, dtype=float)
+    inertia = _symmetric(values[4:])
+    found = np.empty((4, 4))
+    found[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    found[:3, 3] = found[3, :3] = values[1:4]
+    found[3, 3] = values[0]
+    return found
+
+
+def parameters(pseudo: ArrayLike) -> Array:
+    """Return the ten parameters (10,) of a pseudo-inertia matrix: the inverse of `pseudo_inertia`."""
+    matrix = np.asarray(pseudo, dtype=float)
+    inertia = np.trace(matrix[:3, :3]) * np.eye(3) - matrix[:3, :3]
+    return np.concatenate([[matrix[3, 3]], matrix[:3, 3], inertia[_UPPER]])
+
+
+def parameter_transform(pose: ArrayLike) -> Array:
+    """Return the matrix (10, 10) that takes ten parameters from a frame into the one that sees it at `pose`.
+
+    The pseudo-inertia goes over by J' = T J T^T, T the pose (4, 4), which is linear in the parameters.
+    """
+    transform = np.asarray(pose, dtype=float)
+    columns = [parameters(transform @ pseudo_inertia(unit) @ transform.T) for unit in np.eye(10)]
+    return np.stack(columns, axis=1)
+
+
+def smallest_eigenvalue(pseudo: ArrayLike) -> float:
+    """Return the smallest eigenvalue of a pseudo-inertia matrix [kg], lengths counted in `REACH_M`."""
+    return float(np.linalg.eigvalsh(_in_kg(pseudo))[0])
+
+
+def is_consistent(pseudo: ArrayLike) -> bool:
+    """Tell whether a pseudo-inertia matrix is that of a real body of more than rounding's size.
+
+    The bound scales with the body, because a small one about a far origin is legitimately near singular.
+    """
+    values = np.linalg.eigvalsh(_in_kg(pseudo))
+    return bool(values[0] > 1e-9 * values[-1])
+
+
+def nearest_consistent(pseudo: ArrayLike) -> Array:
+    """Return the nearest real body's pseudo-inertia (4, 4): eigenvalues below `SMALLEST_KG` are raised to it.
+
+    Nearest in the Frobenius norm with lengths counted in `REACH_M`, about the given origin. It is not the
+    body that explains the torques best.
+    """
+    values, vectors = np.linalg.eigh(_in_kg(pseudo))
+    raised = vectors * np.maximum(values, SMALLEST_KG) @ vectors.T
+    found: Array = raised * _reach()
+    return found
+
+
+def body(pseudo: ArrayLike) -> Body:
+    """Return mass, centre and inertia about the centre of a consistent pseudo-inertia matrix, in its axes."""
+    matrix = np.asarray(pseudo, dtype=float)
+    mass, centre = float(matrix[3, 3]), matrix[:3, 3] / matrix[3, 3]
+    spread = matrix[:3, :3] - mass * np.outer(centre, centre)
+    inertia = np.trace(spread) * np.eye(3) - spread
+    centre.flags.writeable = inertia.flags.writeable = False
+    return Body(mass, centre, inertia)
+
+
+def _symmetric(upper: Array) -> Array:
+    found = np.zeros((3, 3))
+    found[_UPPER] = upper
+    return found + np.triu(found, 1).T
+
+
+def _reach() -> Array:
+    scale = np.array([REACH_M, REACH_M, REACH_M, 1.0])
+    return np.outer(scale, scale)
+
+
+def _in_kg(pseudo: ArrayLike) -> Array:
+    found: Array = np.asarray(pseudo, dtype=float) / _reach()
+    return found
+
+
+def parameter_scale(bodies: int) -> Array:
+    """Return the sizes (10 n,) in which parameters are counted: phi = scale * (parameters in kg).
+
+    The columns of the regressor are multiplied by it.
+    """
+    return np.tile(REACH_M ** np.array([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], dtype=float), bodies)

@@ -1,0 +1,93 @@
+"""How well inertial parameters predict torques that they were not fitted to.
+
+The figure is |e| / |tau| with 2-norms over the samples. It stands beside that of the simplest prediction, the
+mean torque of the motion that was fitted: a model that does not beat it has learnt nothing of the dynamics.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.filtering import JointMotion
+
+
+class TorqueError(NamedTuple):
+    """Relative torque errors |e| / |tau|, of all joints together and per joint (n,), read-only.
+
+    `mean_overall` and `mean_per_joint` are those of predicting the constant mean. NaN where |tau| is zero.
+    `samples` (n,) is how many were compared.
+    """
+
+    overall: float
+    per_joint: Array
+    mean_overall: float
+    mean_per_joint: Array
+    samples: NDArray[np.int64]
+
+
+class HeldOut(NamedTuple):
+    """A held-out motion with the torques that were measured and predicted, (m, n) [Nm], read-only."""
+
+    motion: JointMotion
+    tau_predicted_nm: Array
+    error: TorqueError
+
+
+def torque_error(
+    tau_nm: ArrayLike,
+    tau_predicted_nm: ArrayLike,
+    tau_mean_nm: ArrayLike,
+    mask: ArrayLike | None = None,
+) -> TorqueError:
+    """Compare torques (m, n) with their prediction and with a constant.
+
+    Args:
+        tau_nm, tau_predicted_nm: (m, n) of the held-out motion.
+        tau_mean_nm: (n,) mean torques of the motion that was fitted (not of this one, which would favour
+        them).
+        mask: (m, n) or (m, 1), True where to compare; None compares all. State both when you mask.
+
+    Raises:
+        ValueError: shapes that do not fit, values that are not finite, or nothing to compare.
+    """
+    tau, predicted, mean = (np.asarray(a, dtype=float) for a in (tau_nm, tau_predicted_nm, tau_mean_nm))
+    if tau.ndim != 2 or predicted.shape != tau.shape or mean.shape != tau.shape[1:]:
+        raise ValueError(f"torques {tau.shape}, predicted {predicted.shape} and mean {mean.shape} do not fit")
+    if not all(np.isfinite(a).all() for a in (tau, predicted, mean)):
+        raise ValueError("a torque is not finite")
+    used = np.broadcast_to(True if mask is None else np.asarray(mask, dtype=bool), tau.shape)
+    if not used.any():
+        raise ValueError("no samples to compare: the mask lets none through")
+    size = np.where(used, tau, 0.0)
+    errors = (np.where(used, predicted - tau, 0.0), np.where(used, mean - tau, 0.0))
+    (overall, mean_overall), (per_joint, mean_per_joint) = (
+        [float(_ratio(_norm(e, None), _norm(size, None))) for e in errors],
+        [_ratio(_norm(e, 0), _norm(size, 0)) for e in errors],
+    )
+    samples = used.sum(axis=0, dtype=np.int64)
+    for array in (per_joint, mean_per_joint, samples):
+        array.flags.writeable = False
+    return TorqueError(overall, per_joint, mean_overall, mean_per_joint, samples)
+
+
+def check_held_out(chain: Chain, phi: ArrayLike, motion: JointMotion, tau_mean_nm: ArrayLike) -> HeldOut:
+    """Predict the torques of a held-out motion (thesis eq. 26 with the fitted `phi`) and compare.
+
+    Raises:
+        ValueError: shapes that do not fit, or values that are not finite.
+    """
+    predicted = inverse_dynamics(chain, phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+    return HeldOut(motion, predicted, torque_error(motion.tau_nm, predicted, tau_mean_nm))
+
+
+def _norm(signal: Array, axis: int | None) -> Array:
+    found: Array = np.sqrt(np.sum(signal**2, axis=axis))
+    return found
+
+
+def _ratio(error: Array, size: Array) -> Array:
+    found: Array = np.divide(error, size, out=np.full(np.shape(size), np.nan), where=size > 0.0)
+    return found

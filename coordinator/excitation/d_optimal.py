@@ -1,0 +1,185 @@
+"""Which motions tell the inertial parameters best: D-optimal among many that the robot may run.
+
+Candidates are drawn within the limits; of each the regressor says how much it would tell of the base
+parameters. Those are chosen, one after another and then in exchange for one another, whose information
+together has the largest determinant (Fedorov 1972; Swevers et al., Optimal robot excitation and
+identification, 1997, for sines as candidates).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.dynamics.pseudo_inertia import parameter_scale
+from coordinator.excitation.joint_limits import JointLimits
+from coordinator.excitation.segment import SampledMotion, Segment, draw_segment, sampled, smaller, way
+from coordinator.excitation.self_collision import CLEARANCE_M, clearance_m
+from coordinator.parameter_fit.least_squares import MAX_SIGMA_KG
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import inverse_dynamics, torque_regressor
+
+CANDIDATES = 150
+# Faster than the sines by ten: each period of the fastest is seen in a dozen samples.
+RATE_HZ = 20.0
+# Of the largest eigenvalue: rounding in a sum of squares is 1e-16 of it, the weakest that a motion tells
+# 1e-10.
+BASE_TOLERANCE = 1e-13
+# Passes of exchanging each chosen motion for a better one; it settles in two or three.
+MOST_PASSES = 6
+# A motion that goes too far is tried again smaller, about a pose nearer to home.
+SHRINK = (1.0, 0.7, 0.5, 0.35)
+# Of the torque that a joint has: inertia that is not known yet may be larger than believed.
+TORQUE_SHARE = 0.6
+
+
+class ExcitationTask(NamedTuple):
+    """What is to be excited, and within which limits; arrays (n,) in the order of the chain.
+
+    phi: (10 n,) what is believed of the bodies; it keeps torques within the motors' and is no prior of the
+        information. reach_rad: how far from home any joint may go. max_effort_nm: of the motors.
+    torque_sigma_nm: noise of a torque reading. travel_speed_rad_s: of the ways from home to the poses.
+    """
+
+    chain: Chain
+    phi: Array
+    limits: tuple[JointLimits, ...]
+    max_effort_nm: Array
+    torque_sigma_nm: Array
+    home_rad: Array
+    reach_rad: float
+    segments: int
+    segment_s: float
+    travel_speed_rad_s: float = 1.0
+
+
+class Excitation(NamedTuple):
+    """The chosen motions in the order in which they were chosen, and what they tell.
+
+    rank: of the base parameters that any candidate tells. log_det: of the information of those, per kg^-2.
+    condition: of the stacked regressor within them. refused: candidates that came too near to the robot
+        itself or asked too much of a motor, however small.
+    """
+
+    segments: tuple[Segment, ...]
+    rank: int
+    log_det: float
+    condition: float
+    refused: int
+
+
+class NoExcitation(ValueError):
+    """No motion, or too few, within the limits; the message says which limit refused most."""
+
+
+def design_excitation(
+    task: ExcitationTask, rng: np.random.Generator, candidates: int = CANDIDATES
+) -> Excitation:
+    """Choose motions.
+
+    Raises:
+        NoExcitation: fewer candidates than motions asked for stay within the limits.
+        ValueError: a joint has no room at all.
+    """
+    kept: list[Segment] = []
+    pieces: list[Array] = []
+    reasons = {"the robot's own links": 0, "the motors' torques": 0}
+    for _ in range(candidates):
+        segment = draw_possible(task, rng)
+        if isinstance(segment, Segment):
+            kept.append(segment)
+            pieces.append(information(task, sampled(segment, RATE_HZ)))
+        else:
+            reasons[segment] += 1
+    if len(kept) < task.segments:
+        worst = max(reasons, key=lambda reason: reasons[reason])
+        raise NoExcitation(
+            f"{len(kept)} of {candidates} motions within {task.reach_rad:.2f} rad of home are possible, "
+            f"{task.segments} are needed; most were refused for {worst}: begin elsewhere, or reach less far"
+        )
+    base = _base_directions(pieces)
+    within = np.array([base.T @ piece @ base for piece in pieces])
+    chosen = _exchanged(within, _greedy(within, task.segments))
+    total = within[chosen].sum(axis=0)
+    values = np.linalg.eigvalsh(total)
+    return Excitation(
+        tuple(kept[k] for k in chosen),
+        base.shape[1],
+        float(np.linalg.slogdet(total)[1]),
+        float(np.sqrt(values[-1] / max(values[0], np.finfo(float).tiny))),
+        sum(reasons.values()),
+    )
+
+
+def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | str:
+    """Draw one motion that the robot may run, or return what refuses it, however small it is made.
+
+    Raises:
+        ValueError: a joint has no room at all.
+    """
+    drawn = draw_segment(rng, task.limits, task.home_rad, task.reach_rad, task.segment_s)
+    reason = ""
+    for share in SHRINK:
+        segment = smaller(drawn, task.home_rad, share)
+        refused = _refused(task, segment)
+        if refused is None:
+            return segment
+        reason = refused
+    return reason
+
+
+def information(task: ExcitationTask, motion: SampledMotion) -> Array:
+    """Return Y^T W Y (10 n, 10 n) of a motion, parameters in kg (see `identification.parameter_scale`)."""
+    regressor = torque_regressor(task.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+    scale = parameter_scale(len(task.limits))
+    rows = (regressor / task.torque_sigma_nm[:, None]).reshape(-1, scale.size) * scale
+    return np.asarray(rows.T @ rows)
+
+
+def _refused(task: ExcitationTask, segment: Segment) -> str | None:
+    motion = sampled(segment, RATE_HZ)
+    torque = inverse_dynamics(task.chain, task.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+    if (np.abs(torque) > TORQUE_SHARE * task.max_effort_nm).any():
+        return "the motors' torques"
+    # The way back is another: short journeys end first on both.
+    ends = task.home_rad, segment.pose_rad
+    ways = [way(*pair, task.travel_speed_rad_s, RATE_HZ) for pair in (ends, ends[::-1])]
+    if clearance_m(task.chain, np.vstack([motion.q_rad, *ways]), task.home_rad).min() < CLEARANCE_M:
+        return "the robot's own links"
+    return None
+
+
+def _base_directions(pieces: Sequence[Array]) -> Array:
+    """Return what all candidates together tell, (10 n, rank), orthonormal."""
+    values, vectors = np.linalg.eigh(np.sum(pieces, axis=0))
+    return np.asarray(vectors[:, values > BASE_TOLERANCE * values[-1]])
+
+
+def _log_det(total: Array) -> float:
+    """Return the log of the determinant, of what is known to `MAX_SIGMA_KG` beforehand."""
+    return float(np.linalg.slogdet(total + np.eye(len(total)) / MAX_SIGMA_KG**2)[1])
+
+
+def _greedy(within: Array, count: int) -> list[int]:
+    chosen: list[int] = []
+    total = np.zeros(within.shape[1:])
+    for _ in range(count):
+        left = [k for k in range(len(within)) if k not in chosen]
+        best = max(left, key=lambda k: _log_det(total + within[k]))
+        chosen.append(best)
+        total = total + within[best]
+    return chosen
+
+
+def _exchanged(within: Array, chosen: Sequence[int]) -> list[int]:
+    """Replace each motion by the one that serves the others best, until none does better."""
+    order = list(chosen)
+    for _ in range(MOST_PASSES):
+        before = list(order)
+        for place in range(len(order)):
+            others = within[order[:place] + order[place + 1 :]].sum(axis=0)
+            free = [k for k in range(len(within)) if k not in order or k == order[place]]
+            order[place] = max(free, key=lambda k: _log_det(others + within[k]))
+        if order == before:
+            break
+    return order

@@ -1,0 +1,146 @@
+"""What a joint may be asked for, by its type, what it carries and what it held at rest.
+
+How much inertia a joint moves, roughly, by its own slow motion: what the next may ask of its torque.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.control.waveform import duration_s, waveform
+from module_agent.model.catalogue import GRAVITY_M_S2, ModuleType
+from module_agent.model.chain import Array
+from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
+from module_agent.wire.messages import Pattern
+
+# Of the type's speed: back-EMF then leaves a third of the voltage for torque.
+SPEED_SHARE = 0.7
+# The maker's thermal resistances winding-housing, housing-body, body-ambient [K/W]; how much warmer than a
+# room of 25 C the winding may get, and how much more resistance copper then has (0.393 %/K).
+THERMAL_K_W = 4.626 + 1.0 + 8.0
+WINDING_RISE_K = 130.0
+HOT_RESISTANCE = 1.0 + 0.00393 * WINDING_RISE_K
+# Gravity may take all of the continuous torque. So much of the type's torque is still given to a motion,
+# which is over before the winding is warm; and so much is never asked for.
+LEAST_SHARE = 0.1
+RESERVE_SHARE = 0.2
+# Of the range of a module that does not turn through; the end stops are felt before they are met.
+RANGE_SHARE = 0.9
+# Links and brackets weigh about 0.6 of the modules; a module with its link reaches about 0.12 m further.
+LINK_MASS_SHARE = 0.6
+REACH_PER_MODULE_M = 0.12
+# Of the torque that holds an arm level: whoever can carry an arm has so much left to move it.
+LEVEL_SHARE = 0.05
+# Of any motion: 100 a period at 4 Hz for 15 s.
+PEAK_SAMPLES = 6001
+
+
+class JointLimits(NamedTuple):
+    """The largest speed and acceleration of a motion, and the places it may reach."""
+
+    speed_rad_s: float
+    accel_rad_s2: float
+    low_rad: float
+    high_rad: float
+
+    def room_rad(self, home_rad: float) -> float:
+        """Return how far a motion about `home_rad` may go to either side."""
+        return min(self.high_rad - home_rad, home_rad - self.low_rad)
+
+
+def continuous_torque_nm(kind: ModuleType) -> float:
+    """Return the torque that a module holds for ever: its winding's losses i^2 R warm it by 130 K."""
+    motor = kind.motor
+    current_a = np.sqrt(WINDING_RISE_K / THERMAL_K_W / (motor.resistance_ohm * HOT_RESISTANCE))
+    torque = current_a * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
+    return min(float(torque), kind.max_effort_nm)
+
+
+def joint_limits(kind: ModuleType, rest_torque_nm: float, inertia_kg_m2: float) -> JointLimits:
+    """Return what a joint may do.
+
+    Args:
+        kind: its type.
+        rest_torque_nm: what it held where the motion takes place.
+        inertia_kg_m2: of what it moves, about its axis; too large rather than too small.
+
+    Raises:
+        ValueError: an inertia that is not positive.
+    """
+    if not inertia_kg_m2 > 0.0:
+        raise ValueError(f"an inertia of {inertia_kg_m2} kg m^2; it must be positive")
+    held = abs(rest_torque_nm)
+    least = min(LEAST_SHARE * kind.max_effort_nm, (1.0 - RESERVE_SHARE) * kind.max_effort_nm - held)
+    torque = max(continuous_torque_nm(kind) - held, least, 0.0)
+    low, high = kind.range_rad or (-np.pi, np.pi)
+    return JointLimits(
+        SPEED_SHARE * kind.max_speed_rad_s, torque / inertia_kg_m2, RANGE_SHARE * low, RANGE_SHARE * high
+    )
+
+
+def likely_inertia_kg_m2(kinds: list[ModuleType]) -> float:
+    """Return the inertia of a stretched arm of all these modules about its base: no joint carries more."""
+    mass = (1.0 + LINK_MASS_SHARE) * sum(kind.mass_kg for kind in kinds)
+    reach = REACH_PER_MODULE_M * len(kinds)
+    # Each module's own housing turns too, a lone one about itself.
+    return mass * reach**2 / 3.0 + 2e-3
+
+
+def least_accel_rad_s2(modules: int) -> float:
+    """Return the acceleration that a joint always has left, in an arm of so many modules that holds itself.
+
+    Holding a stretched uniform arm level takes m g L / 2, turning it m L^2 / 3 times the acceleration.
+    """
+    return LEVEL_SHARE * 1.5 * GRAVITY_M_S2 / (REACH_PER_MODULE_M * modules)
+
+
+def motion_peaks(pattern: Pattern, origin_rad: float = 0.0) -> tuple[float, float]:
+    """Return the largest speed [rad/s] and acceleration [rad/s^2] of a motion."""
+    t_s = np.linspace(0.0, duration_s(pattern, origin_rad), PEAK_SAMPLES)
+    velocity = waveform(pattern, origin_rad, t_s).velocity_rad_s
+    return float(np.abs(velocity).max()), float(np.abs(np.gradient(velocity, t_s)).max())
+
+
+# Below what a held spring rings at; the ramps of a slow motion last 0.15 s and more.
+CUTOFF_HZ = 6.0
+# Whatever a joint carries, it has an output and a gear train of its own.
+LEAST_KG_M2 = 2e-3
+
+
+class Load(NamedTuple):
+    """Inertia about the joint's axis [kg m^2] and its standard deviation."""
+
+    inertia_kg_m2: float
+    sigma_kg_m2: float
+
+    @property
+    def at_most_kg_m2(self) -> float:
+        """What it hardly exceeds: two standard deviations more, and a fifth for what the fit leaves out."""
+        return max(1.2 * (max(self.inertia_kg_m2, 0.0) + 2.0 * self.sigma_kg_m2), LEAST_KG_M2)
+
+
+def measured_load(q_rad: Array, tau_nm: Array, rate_hz: float) -> Load:
+    """Fit tau = I d2q/dt2 + c dq/dt + a q + b to one motion of one joint, the others held.
+
+    Over a turn in one direction dry friction is part of b, and gravity is straight to first order.
+
+    Args:
+        q_rad, tau_nm: (m,) samples of the joint's position and measured torque.
+        rate_hz: of the samples.
+
+    Raises:
+        ValueError: a motion that is too short for the low-pass.
+    """
+    q, tau = (zero_phase_low_pass(signal, rate_hz, CUTOFF_HZ) for signal in (q_rad, tau_nm))
+    rate = differentiate(q, rate_hz)
+    edge = settling_samples(rate_hz, CUTOFF_HZ) // 2
+    kept = slice(edge, len(q) - edge)
+    terms = np.column_stack([differentiate(rate, rate_hz), rate, q - q.mean(), np.ones(len(q))])[kept]
+    found, *_ = np.linalg.lstsq(terms, tau[kept], rcond=None)
+    residual = tau[kept] - terms @ found
+    # A low-passed sample is not independent of its neighbours.
+    independent = len(terms) * min(1.0, 2.0 * CUTOFF_HZ / rate_hz)
+    freedom = max(independent - terms.shape[1], 1.0)
+    scatter = float(residual @ residual) / len(terms) * independent / freedom
+    variance = scatter * np.linalg.pinv(terms.T @ terms)[0, 0] * len(terms) / independent
+    return Load(float(found[0]), float(np.sqrt(variance)))

@@ -1,0 +1,86 @@
+"""Motions of all joints at once, told apart by their frequencies (thesis 7.2: whole manipulator movements).
+
+Each joint turns slowly and widely, so that gravity turns in the IMUs, and quickly about that, so that lever
+arms show. No two joints share a frequency; within the window they are nearly orthogonal.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.excitation.joint_limits import JointLimits, motion_peaks
+from module_agent.wire.messages import MultiSine, Sine
+
+# Slow: several turns of gravity within the window. Fast: links and bases that give lengthen what they carry
+# by (f / 13 Hz)^2 or so, whatever the amplitude.
+SLOW_HZ = (0.15, 0.4)
+FAST_HZ = (0.6, 1.3)
+# Nobody knows yet what a robot may run into: all joints together carry a tip as far as the sum of them.
+SLOW_RAD = 0.25
+FAST_RAD = 0.12
+# Half of speed and acceleration is left to the fast motion.
+SLOW_SHARE = 0.5
+SHORTEST_S = 11.0
+# Periods of the difference of neighbouring frequencies within the flat part of the window.
+BEATS = 0.5
+FLAT_SHARE = 0.7
+
+
+class JointSetting(NamedTuple):
+    """What a joint may do, and where its motion takes place."""
+
+    limits: JointLimits
+    home_rad: float
+
+
+def whole_duration_s(joints: int) -> float:
+    """Return how long all joints must turn for their frequencies to be told apart."""
+    spacing_hz = (FAST_HZ[1] - FAST_HZ[0]) / max(joints - 1, 1)
+    return max(SHORTEST_S, BEATS / spacing_hz / FLAT_SHARE)
+
+
+def whole_patterns(
+    settings: Mapping[str, JointSetting], total_s: float | None = None
+) -> dict[str, MultiSine]:
+    """Return a motion for every joint, to be run at the same time.
+
+    Slower joints get the lower frequencies, which ask less of them.
+
+    Raises:
+        ValueError: a joint has no room to move about its home, or nothing left to accelerate with.
+    """
+    order = sorted(settings, key=lambda s: (settings[s].limits.speed_rad_s, s))
+    slow, fast = np.linspace(*SLOW_HZ, len(order)), np.linspace(*FAST_HZ, len(order))
+    lasting_s = total_s if total_s is not None else whole_duration_s(len(order))
+    return {
+        serial: _pattern(serial, settings[serial], float(slow[k]), float(fast[k]), lasting_s)
+        for k, serial in enumerate(order)
+    }
+
+
+def _pattern(serial: str, setting: JointSetting, slow_hz: float, fast_hz: float, total_s: float) -> MultiSine:
+    limits = setting.limits
+    room = limits.room_rad(setting.home_rad)
+    if room <= 0.0 or limits.accel_rad_s2 <= 0.0:
+        raise ValueError(
+            f"{serial} cannot move about {setting.home_rad:.2f} rad: its range is {limits.low_rad:.2f} .. "
+            f"{limits.high_rad:.2f} rad, it may accelerate by {limits.accel_rad_s2:.2f} rad/s^2"
+        )
+    slow_w, fast_w = 2.0 * np.pi * slow_hz, 2.0 * np.pi * fast_hz
+    share = SLOW_SHARE
+    slow = min(
+        SLOW_RAD, 0.8 * room, share * limits.speed_rad_s / slow_w, share * limits.accel_rad_s2 / slow_w**2
+    )
+    speed, accel = limits.speed_rad_s - slow * slow_w, limits.accel_rad_s2 - slow * slow_w**2
+    fast = min(FAST_RAD, 0.2 * room, speed / fast_w, accel / fast_w**2)
+    sines = (Sine(amplitude_rad=slow, frequency_hz=slow_hz), Sine(amplitude_rad=fast, frequency_hz=fast_hz))
+    return _within(limits, MultiSine(sines=sines, duration_s=total_s))
+
+
+def _within(limits: JointLimits, pattern: MultiSine) -> MultiSine:
+    """Return a motion made smaller if the taper, which adds to speed and acceleration, asks for too much."""
+    speed, accel = motion_peaks(pattern)
+    scale = min(1.0, limits.speed_rad_s / speed, limits.accel_rad_s2 / accel)
+    smaller = tuple(s.model_copy(update={"amplitude_rad": scale * s.amplitude_rad}) for s in pattern.sines)
+    return pattern.model_copy(update={"sines": smaller})

@@ -1,0 +1,145 @@
+"""What a session does with a robot: which motions, how large, how long."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from module_agent.control.gains import default_gains
+from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind
+from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
+
+Mode = Literal["joint", "whole"]
+Motions = Literal["thesis", "designed"]
+Excitation = Literal["thesis", "designed"]
+Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
+
+
+class PlanFileError(ValueError):
+    """The file is no plan; the message names the file, the setting and what would be right."""
+
+
+class Plan(BaseModel):
+    """The settings of an identification run; defaults are the thesis' where the thesis has one."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    # One joint after the other, or all at once: sooner done, without the agents' own estimates.
+    mode: Mode = "joint"
+    # The thesis' motions of every joint as below; or those designed for it (`motion_design`), and then one of
+    # all joints at once.
+    motions: Motions = "thesis"
+    # Of designed motions: how long exploring a joint may take, journeys included; by their number if not set,
+    # so that all of the session takes 10 s a joint.
+    joint_s: Seconds | None = None
+    # Of designed motions: fast ones are repeated until the sensors leave less than this of a radius open, by
+    # the information predicted of them, or until more would not help.
+    precision_mm: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
+    # Of the motion of all joints at once; by their number if not set.
+    whole_duration_s: Seconds | None = None
+    discover_s: Seconds = 1.0
+    link_s: Seconds = 1.0
+    home_rad: float = 0.0
+    travel_speed_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 1.0
+    settle_s: Seconds = 0.6
+    rest_s: Seconds = 2.0
+    # Thesis 6.2.1.1: from an offset of 0.5 rad at 1 rad/s for 0.75 s.
+    constant_velocity_rad_s: Annotated[float, Field(gt=0.0, le=10.0)] = 1.0
+    constant_duration_s: Seconds = 0.75
+    # Thesis table 3, and amplitudes of tables 4 and 5.
+    sine_amplitude_rad: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    sine_frequency_hz: Annotated[float, Field(gt=0.0, le=10.0)] = 2.0
+    sine_centre_s: Seconds = 2.8
+    sine_sigma_s: Seconds = 1.0
+    # Thesis table 6 and figure 44.
+    dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
+    dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
+    # Joint by joint, as above, or so many motions of all joints at once, designed for what they tell of the
+    # inertia, each so long and no joint further than that from home: there must be room around the robot. A
+    # joint that went further could fold a link onto its neighbour, which nothing here would see.
+    excitation: Excitation = "thesis"
+    excitation_motions: Annotated[int, Field(ge=2, le=50)] = 5
+    excitation_s: Annotated[float, Field(ge=3.0, le=60.0)] = 6.0
+    excitation_reach_rad: Annotated[float, Field(gt=0.0, le=1.2)] = 0.8
+    dynamics: bool = True
+    # Who is mounted on whom takes the slow motions alone; without the fast ones there is no chain.
+    topology_only: bool = False
+    # How well the modules' IMUs are known beforehand: `kinematics.imu_intrinsics`.
+    imu: ImuKind = "uncalibrated"
+    # And how well the scales of their torque sensors: `dynamics.torque_scale`.
+    torque: TorqueKind = "uncalibrated"
+    hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
+    retries: Annotated[int, Field(ge=0, le=5)] = 2
+
+    def constant(self) -> ConstantMotion:
+        """Return the thesis' constant motion."""
+        return ConstantMotion(
+            velocity_rad_s=self.constant_velocity_rad_s, duration_s=self.constant_duration_s
+        )
+
+    def sine(self, kind: ModuleType) -> WindowedSine:
+        """Return the thesis' windowed sine motion, no faster than the module type can follow."""
+        return WindowedSine(
+            amplitude=self.sine_amplitude_rad or _amplitude(kind, self.sine_frequency_hz, 0.10),
+            frequency_hz=self.sine_frequency_hz,
+            centre_s=self.sine_centre_s,
+            sigma_s=self.sine_sigma_s,
+        )
+
+    def dynamic(self, kind: ModuleType) -> DynamicPattern:
+        """Return the thesis' dynamic pattern, wide enough to be followed."""
+        return DynamicPattern(
+            amplitude_rad=self.dynamic_amplitude_rad or _amplitude(kind, 0.7, 0.35),
+            frequency_hz=0.7,
+            sigma_s=0.5,
+            half_width_s=1.0,
+            repeats=self.dynamic_repeats,
+            alternate=True,
+        )
+
+    def held_out(self, kind: ModuleType) -> DynamicPattern:
+        """Return a motion that no parameter is fitted to: another frequency, amplitude and shape."""
+        return DynamicPattern(
+            amplitude_rad=_amplitude(kind, 1.0, 0.25),
+            frequency_hz=1.0,
+            sigma_s=0.35,
+            half_width_s=0.8,
+            repeats=2,
+            alternate=False,
+        )
+
+    def exploring_gains(self, kind: ModuleType, strategy: int) -> GainSet:
+        """Return the factory gains, the position loop `hold_stiffness` times as stiff."""
+        factory = default_gains(kind, strategy)
+        position = factory.position.model_copy(update={"kp": factory.position.kp * self.hold_stiffness})
+        return factory.model_copy(update={"position": position})
+
+
+def _amplitude(kind: ModuleType, frequency_hz: float, most_rad: float) -> float:
+    """Return an amplitude whose peak speed is 70 % of the type's: back-EMF then leaves torque to spare."""
+    return min(most_rad, 0.7 * kind.max_speed_rad_s / (6.2832 * frequency_hz))
+
+
+def load_plan(path: Path) -> Plan:
+    """Read a plan from a TOML file; what the file does not set keeps its default.
+
+    Raises:
+        PlanFileError: the file cannot be read, is not TOML, or sets something unknown or out of range.
+    """
+    try:
+        return Plan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise PlanFileError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise PlanFileError(f"{path} is not TOML: {error}") from error
+    except ValidationError as error:
+        raise PlanFileError(f"{path}: {_first_fault(error)}") from error
+
+
+def _first_fault(error: ValidationError) -> str:
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"unknown setting {name}; known are {', '.join(Plan.model_fields)}"
+    return f"{name} = {first['input']!r}: {first['msg']}"

@@ -1,0 +1,191 @@
+"""Which slow and which fast motion of one joint tell most of the circles that it makes others describe.
+
+Every candidate within the joint's limits and the time there is gets the variance of the radius that it
+leaves: that of the noise (`circle_information`), and the square of what links and bases that give add, which
+grows with the frequency's square whatever the amplitude. So slow and wide motions win, until the noise takes
+over.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.batch_estimation.imu_intrinsics import ImuPrior
+from coordinator.excitation.fisher_information import CircleSetting, JointPath, SensorNoise, circle_covariance
+from coordinator.excitation.joint_limits import JointLimits, motion_peaks
+from module_agent.control.waveform import SHORTEST_GOTO_S, duration_s, waveform
+from module_agent.model.catalogue import GRAVITY_M_S2
+from module_agent.wire.messages import ConstantMotion, Pattern, WindowedSine
+
+# Before anything has moved, a link is taken to be as long as a kit's tube.
+LIKELY_RADIUS_M = 0.3
+# Links and bases that give lengthen what a motion of frequency f shows by (f / f_g)^2: by 0.6 % at 1 Hz on
+# the simulated arms. The refinement leaves a tenth of that, where it has found how they give.
+GIVE_HZ = 40.0
+SWEEPS_RAD = (0.3, 0.45, 0.7, 1.0)
+FREQUENCIES_HZ = (0.6, 0.8, 1.0, 1.4, 2.0)
+# Nobody knows yet what a joint's motion may run into.
+SINE_RAD = 0.25
+SWEEP_SPEED_RAD_S = 1.0
+# Ramps that begin slowly do not ring links and bases: a cycle of 0.8 Hz.
+RAMP_S = 0.6
+SHORTEST_LEVEL_S = 0.1
+# The thesis' window: 2.8 s to its middle with 1 s of spread.
+SIGMA_SHARE = 1.0 / 2.8
+SHORTEST_PERIODS = 2.0
+LONGEST_SINE_S = 8.0
+# Samples that a prediction is made of; the noise of the sensors' 250 is averaged over as many.
+RATE_HZ = 50.0
+SENSOR_RATE_HZ = 250.0
+
+
+class JointTask(NamedTuple):
+    """What is to be explored.
+
+    along: component of the specific force of rest along the joint's axis, over its size: 1 if the axis is
+        upright, 0 if it is level. Seen by the module's own IMU before anything moves.
+    radius_m: of the circle that is to be measured best.
+    budget_s: for going to where the slow motion begins, both motions, and settling.
+    """
+
+    limits: JointLimits
+    along: float
+    prior: ImuPrior
+    home_rad: float
+    travel_speed_rad_s: float
+    settle_s: float
+    budget_s: float
+    radius_m: float = LIKELY_RADIUS_M
+
+
+class JointMotions(NamedTuple):
+    """A slow motion through home and a fast one about it, how long all of it takes, what they leave unknown.
+
+    sigma_m: of the radius by the sensors' noise and errors. give_m: what links that give may add to it.
+    """
+
+    constant: ConstantMotion
+    sine: WindowedSine
+    time_s: float
+    sigma_m: float
+    give_m: float
+
+    @property
+    def error_m(self) -> float:
+        """Both together."""
+        return float(np.hypot(self.sigma_m, self.give_m))
+
+
+def design_joint(task: JointTask, constant: ConstantMotion | None = None) -> JointMotions:
+    """Return the motions that leave the radius least uncertain; the slow one is `constant`, if it is given.
+
+    Raises:
+        ValueError: nothing fits into range, limits and time, with all three.
+    """
+    slow = [constant] if constant is not None else _sweeps(task)
+    found = [
+        _judged(task, one, sine) for one in slow for sine in _sines(task, task.budget_s - _other_s(task, one))
+    ]
+    if not found:
+        raise ValueError(
+            f"no motion fits: {task.budget_s:.1f} s, {task.limits.room_rad(task.home_rad):.2f} rad to either "
+            f"side, at most {task.limits.speed_rad_s:.2f} rad/s and {task.limits.accel_rad_s2:.2f} rad/s^2"
+        )
+    return min(found, key=lambda motions: motions.error_m)
+
+
+def next_sine(task: JointTask, done: Sequence[Pattern], lasting_s: float) -> WindowedSine | None:
+    """Return the fast motion that tells most beside those that are done; None if none fits."""
+    found = list(_sines(task, lasting_s))
+    return min(found, key=lambda sine: predicted_sigma_m(task, [*done, sine]), default=None)
+
+
+def predicted_sigma_m(task: JointTask, patterns: Sequence[Pattern]) -> float:
+    """Return the sigma of the radius after all these motions, each begun at home or through it.
+
+    Where on its circle gravity finds the IMU is not known: the mean variance of two places a quarter apart.
+    """
+    paths = [_path(pattern) for pattern in patterns]
+    noise = SensorNoise()
+    fewer = np.sqrt(RATE_HZ / SENSOR_RATE_HZ)
+    noise = SensorNoise(noise.gyro_rad_s * fewer, noise.accel_m_s2 * fewer)
+    variances = [circle_covariance(s, paths, noise, task.prior)[0, 0] for s in _settings(task)]
+    return float(np.sqrt(np.mean(variances)))
+
+
+def _settings(task: JointTask) -> list[CircleSetting]:
+    up = np.clip(task.along, -1.0, 1.0)
+    level = np.sqrt(1.0 - up**2)
+    axis, radial = np.array([0.0, 0.0, 1.0]), np.array([task.radius_m, 0.0, 0.0])
+    return [
+        CircleSetting(
+            axis, radial, GRAVITY_M_S2 * np.array([level * np.cos(phase), level * np.sin(phase), up])
+        )
+        for phase in (0.0, 0.5 * np.pi)
+    ]
+
+
+def _path(pattern: Pattern) -> JointPath:
+    t_s = np.arange(0.0, duration_s(pattern, 0.0), 1.0 / RATE_HZ)
+    found = waveform(pattern, 0.0, t_s)
+    # A slow motion passes home in its middle.
+    middle = 0.5 * (found.offset_rad[0] + found.offset_rad[-1])
+    acceleration = np.gradient(found.velocity_rad_s, t_s)
+    return JointPath(found.offset_rad - middle, found.velocity_rad_s, acceleration, RATE_HZ)
+
+
+def _sweeps(task: JointTask) -> list[ConstantMotion]:
+    return [one for sweep in SWEEPS_RAD if (one := _sweep(task, sweep)) is not None]
+
+
+def _sines(task: JointTask, lasting_s: float) -> list[WindowedSine]:
+    most_s = min(lasting_s, LONGEST_SINE_S)
+    return [one for f in FREQUENCIES_HZ if (one := _sine(task, f, most_s)) is not None]
+
+
+def _sweep(task: JointTask, sweep_rad: float) -> ConstantMotion | None:
+    if sweep_rad > task.limits.room_rad(task.home_rad):
+        return None
+    speed = min(
+        SWEEP_SPEED_RAD_S,
+        task.limits.speed_rad_s,
+        task.limits.accel_rad_s2 * RAMP_S,
+        2.0 * sweep_rad / (RAMP_S + SHORTEST_LEVEL_S),
+    )
+    if speed <= 0.0:
+        return None
+    level_s = 2.0 * sweep_rad / speed - RAMP_S
+    return ConstantMotion(velocity_rad_s=speed, duration_s=level_s, ramp_s=RAMP_S) if level_s < 60.0 else None
+
+
+def _other_s(task: JointTask, constant: ConstantMotion) -> float:
+    """Return how long going to the slow motion's start, it, going home and settling twice take."""
+    travel_rad = 0.5 * constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
+    journey_s = max(1.875 * travel_rad / task.travel_speed_rad_s, SHORTEST_GOTO_S)
+    return duration_s(constant, 0.0) + 2.0 * (journey_s + task.settle_s)
+
+
+def _sine(task: JointTask, frequency_hz: float, lasting_s: float) -> WindowedSine | None:
+    room = task.limits.room_rad(task.home_rad)
+    if lasting_s < SHORTEST_PERIODS / frequency_hz or room <= 0.0:
+        return None
+    full = WindowedSine(
+        amplitude=min(SINE_RAD, room),
+        frequency_hz=frequency_hz,
+        centre_s=0.5 * lasting_s,
+        sigma_s=0.5 * lasting_s * SIGMA_SHARE,
+    )
+    speed, accel = motion_peaks(full)
+    scale = min(1.0, task.limits.speed_rad_s / speed, task.limits.accel_rad_s2 / accel)
+    return full.model_copy(update={"amplitude": scale * full.amplitude}) if scale > 0.0 else None
+
+
+def _judged(task: JointTask, constant: ConstantMotion, sine: WindowedSine) -> JointMotions:
+    return JointMotions(
+        constant,
+        sine,
+        _other_s(task, constant) + 2.0 * sine.centre_s,
+        predicted_sigma_m(task, [constant, sine]),
+        task.radius_m * (sine.frequency_hz / GIVE_HZ) ** 2,
+    )

@@ -1,0 +1,192 @@
+"""How well a model predicts torques that it was not fitted to: fitted to one half, tried on the other.
+
+Both ways, so that every sample is predicted once. A gap lies between the halves, over which the low-pass
+mixes them. What is masked and what is not, raw and filtered, stand beside each other, because each of them
+flatters something: masking hides friction at reversals, filtering hides noise.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.dynamics.drive_model import Term
+from coordinator.dynamics.torque_prediction import TorqueError, torque_error
+from coordinator.fit_dynamics.problem import Problem
+from coordinator.parameter_fit.robust_least_squares import WeightedFit, fit_weighted
+from module_agent.model.chain import Array
+
+Index = NDArray[np.int64]
+Tried = Literal["second half", "first half", "both", "other recording"]
+# From the samples that a model may see, and those that it is tried on, to what it says of the latter.
+Predictor = Callable[[slice, slice], Array]
+
+# Parts of a half of which the data-length curve is made.
+CURVE_PARTS = (0.25, 0.5, 0.75, 1.0)
+
+
+class HeldOutError(NamedTuple):
+    """The relative torque error |e| / |tau| of one model on held-out samples."""
+
+    tried_on: Tried
+    masked: bool
+    raw: bool
+    error: TorqueError
+
+
+class CurvePoint(NamedTuple):
+    """What fitting to `seconds` of a half gives on the other one, both ways together."""
+
+    seconds: float
+    all_samples: float
+    masked: float
+
+
+class TermGain(NamedTuple):
+    """The held-out error, both ways together, of a model that lacks something."""
+
+    without: str
+    all_samples: float
+    masked: float
+
+
+def halves(samples: int, settling: int) -> tuple[slice, slice]:
+    """Return both halves of `samples`, with a gap of `settling` between them, over which the low-pass mixes.
+
+    Raises:
+        ValueError: too few samples to divide.
+    """
+    middle, gap = samples // 2, -(-settling // 2)
+    if middle - gap < 2:
+        raise ValueError(f"{samples} samples cannot be halved: {2 * gap} between the halves are mixed")
+    return slice(0, middle - gap), slice(middle + gap, samples)
+
+
+def fit_part(problem: Problem, some: slice) -> WeightedFit:
+    """Fit to the moving samples of a part of the recording.
+
+    Raises:
+        ValueError: a joint with too few samples.
+    """
+    return fit_weighted(
+        problem.regressor[some],
+        problem.log.tau_nm[some],
+        problem.columns.scale,
+        problem.moving[some],
+        problem.choice.robust,
+        problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
+        None if problem.instruments is None else problem.instruments[some],
+    )
+
+
+def fitted(problem: Problem) -> Predictor:
+    """Return the predictor that fits all of the problem's columns."""
+    return lambda seen, tried: problem.regressor[tried] @ fit_part(problem, seen).parameters
+
+
+def claimed(problem: Problem, phi: Array) -> Predictor:
+    """Return the predictor that knows the bodies' parameters beforehand, and nothing of the drives."""
+    return lambda _, tried: problem.regressor[tried][..., : problem.inertial] @ phi
+
+
+def mean_torque(problem: Problem) -> Predictor:
+    """Return the predictor of constant torques."""
+    tau = problem.log.tau_nm
+    return lambda seen, tried: np.broadcast_to(tau[seen].mean(axis=0), tau[tried].shape)
+
+
+def held_out_errors(problem: Problem, predictor: Predictor) -> tuple[HeldOutError, ...]:
+    """Try a predictor on either half and on both together: filtered and raw, all samples and masked.
+
+    Raises:
+        ValueError: too few samples, see `halves` and `fit_part`.
+    """
+    parts = list(_predictions(problem, predictor))
+    parts.append(
+        ("both", np.concatenate([at for _, at, _ in parts]), np.concatenate([said for *_, said in parts]))
+    )
+    return _errors(problem, parts)
+
+
+def errors_elsewhere(both: Problem, predictor: Predictor, seen: int) -> tuple[HeldOutError, ...]:
+    """Try a predictor that saw the first `seen` samples of two recordings (`joined`) on the second one.
+
+    Raises:
+        ValueError: too few samples, see `fit_part`.
+    """
+    samples = len(both.log.tau_nm)
+    predicted = predictor(slice(0, seen), slice(seen, samples))
+    return _errors(both, [("other recording", np.arange(seen, samples), predicted)])
+
+
+def _errors(problem: Problem, parts: Sequence[tuple[Tried, Index, Array]]) -> tuple[HeldOutError, ...]:
+    return tuple(
+        HeldOutError(name, masked, raw, _error(problem, at, predicted, masked, raw))
+        for (name, at, predicted), masked, raw in product(parts, (False, True), (False, True))
+    )
+
+
+def length_curve(problem: Problem) -> Iterator[CurvePoint]:
+    """Yield the held-out error against the length of what was fitted, without lengths that are too short.
+
+    Of a half the part next to the gap is fitted, so that all lengths are as near to what they are tried on.
+    """
+    for part in CURVE_PARTS:
+        try:
+            errors = held_out_errors(problem, _shortened(problem, part))
+        except ValueError:
+            continue
+        first = halves(len(problem.log.tau_nm), problem.log.settling)[0]
+        yield CurvePoint(part * (first.stop - first.start) / problem.log.rate_hz, *overall(errors))
+
+
+def gain_of_terms(problem: Problem) -> Iterator[TermGain]:
+    """Yield what each kind of term is worth: the held-out error of the model without it.
+
+    Raises:
+        ValueError: too few samples.
+    """
+    for term in problem.choice.terms:
+        lacking = _without(problem, term)
+        yield TermGain(term, *overall(held_out_errors(lacking, fitted(lacking))))
+    if problem.choice.coupled:
+        lacking = problem.with_drives(lambda drive: len(drive.joints) == 1)
+        yield TermGain("coupling", *overall(held_out_errors(lacking, fitted(lacking))))
+
+
+def _without(problem: Problem, term: Term) -> Problem:
+    return problem.with_drives(lambda drive: drive.term != term)
+
+
+def overall(errors: tuple[HeldOutError, ...]) -> tuple[float, float]:
+    """Return the errors of both halves and all joints together, filtered: of all samples, and masked."""
+    found = {e.masked: e.error.overall for e in errors if e.tried_on == "both" and not e.raw}
+    return found[False], found[True]
+
+
+def _predictions(problem: Problem, predictor: Predictor) -> Iterator[tuple[Tried, Index, Array]]:
+    samples = len(problem.log.tau_nm)
+    first, second = halves(samples, problem.log.settling)
+    yield "second half", np.arange(samples)[second], predictor(first, second)
+    yield "first half", np.arange(samples)[first], predictor(second, first)
+
+
+def _shortened(problem: Problem, part: float) -> Predictor:
+    def predict(seen: slice, tried: slice) -> Array:
+        kept = max(1, round(part * (seen.stop - seen.start)))
+        near = (
+            slice(seen.stop - kept, seen.stop)
+            if seen.stop <= tried.start
+            else slice(seen.start, seen.start + kept)
+        )
+        return fitted(problem)(near, tried)
+
+    return predict
+
+
+def _error(problem: Problem, at: Index, predicted: Array, masked: bool, raw: bool) -> TorqueError:
+    tau = (problem.log.tau_raw_nm if raw else problem.log.tau_nm)[at]
+    # Constant torques are a predictor of their own here.
+    return torque_error(tau, predicted, np.zeros(tau.shape[1]), problem.moving[at] if masked else None)

@@ -1,0 +1,267 @@
+"""Recorded joint positions and torques of anybody's robot, from CSV or npz, on one uniform time base.
+
+CSV, one line of names and one line a sample: `t_s`, and per joint `q_<joint>_rad`, `tau_<joint>_nm` and, for
+all joints or none, `qd_<joint>_rad_s`; <joint> as in the URDF, columns in any order, others are ignored.
+
+npz: `position_rad` (m, n); `torque` or `torque_nm` (m, n); `sample_rate_hz` () or `t_s` (m,). They may be
+joined by `velocity_rad_s` (m, n) and by `joint_names` (n,), without which the joints are in the URDF's order.
+"""
+
+import csv
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from module_agent.model.chain import Array
+from module_agent.signals.filtering import NS_PER_S, resample
+
+# Of a sampling interval; a fiftieth at 0.1 of the sampling rate is 1.3 % of the amplitude, between samples.
+_JITTER = 0.02
+# Longer holes than this, in usual intervals, are not bridged: nobody knows what the robot did.
+_BRIDGED = 5.0
+
+
+class DataFileError(ValueError):
+    """A recording that cannot be read, or does not fit the robot."""
+
+
+class JointLog(NamedTuple):
+    """A recording of n joints in the robot's order at uniform times, read-only.
+
+    q_rad, tau_nm: (m, n); qd_rad_s: (m, n) or None. resampled: whether the file's own times were uneven.
+    """
+
+    rate_hz: float
+    q_rad: Array
+    qd_rad_s: Array | None
+    tau_nm: Array
+    resampled: bool
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        return (len(self.q_rad) - 1) / self.rate_hz
+
+
+class _Table(NamedTuple):
+    """What a file holds: times (m,) [s], signals by name (m, n), and how one of its rows is called."""
+
+    t_s: Array
+    signals: dict[str, Array]
+    row: Callable[[int], str]
+
+
+def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
+    """Return the recording by every other sample, and the same motion at the same times by the others.
+
+    White noise of an encoder in the one is independent of that in the other. The others are interpolated to
+    the times of the first, which at their rate is exact for what a low-pass well below it leaves.
+    """
+    count = (len(log.q_rad) - 1) // 2
+    step_ns = NS_PER_S / log.rate_hz
+    odd_ns = np.round(np.arange(0, 2 * count + 1, 2) * step_ns).astype(np.int64)
+    even_ns = np.round(np.arange(1, 2 * count, 2) * step_ns).astype(np.int64)
+    signals = [log.q_rad, log.tau_nm, *([] if log.qd_rad_s is None else [log.qd_rad_s])]
+    first = [_frozen(signal[1 : 2 * count : 2]) for signal in signals]
+    gap_ns = int(np.ceil(3.0 * step_ns))
+    others = [
+        _frozen(resample([odd_ns], [signal[0 : 2 * count + 1 : 2]], even_ns, max_gap_ns=gap_ns)[:, 0])
+        for signal in signals
+    ]
+    return _half(log, first), _half(log, others)
+
+
+def _half(log: JointLog, signals: Sequence[Array]) -> JointLog:
+    velocity = signals[2] if len(signals) > 2 else None
+    return JointLog(0.5 * log.rate_hz, signals[0], velocity, signals[1], log.resampled)
+
+
+def _frozen(signal: Array) -> Array:
+    copy = np.array(signal)
+    copy.flags.writeable = False
+    return copy
+
+
+def read_data(path: Path, joints: Sequence[str]) -> JointLog:
+    """Return the recording in a file, its columns in the order of `joints`.
+
+    Raises:
+        DataFileError: neither CSV nor npz, columns or arrays that are missing or do not fit the joints, a
+            value that is not a finite number, or times that do not grow or have a hole; with file, column
+            and row.
+        OSError: the file cannot be read.
+    """
+    readers = {".csv": _read_csv, ".npz": _read_npz}
+    if path.suffix.lower() not in readers:
+        raise DataFileError(f"{path}: its name ends on {path.suffix!r}; .csv and .npz are read")
+    try:
+        return _log(readers[path.suffix.lower()](path, joints))
+    except DataFileError as error:
+        raise DataFileError(f"{path}: {error}") from None
+
+
+# ---------------------------------------------------------------------- CSV
+
+
+def _read_csv(path: Path, joints: Sequence[str]) -> _Table:
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        try:
+            reader = csv.reader(file)
+            header = [name.strip() for name in next(reader, [])]
+            names = _csv_columns(header, joints)
+            numbered = ((reader.line_num, cells) for cells in reader)
+            values, lines = _csv_values(numbered, header, [n for some in names.values() for n in some])
+        except (csv.Error, UnicodeDecodeError) as error:
+            _refuse(f"not a CSV file: {error}")
+    count = len(joints)
+    signals = {key: values[:, 1 + count * i : 1 + count * (i + 1)] for i, key in enumerate(list(names)[1:])}
+    return _Table(values[:, 0], signals, lambda row: f"line {lines[row]}")
+
+
+def _csv_columns(header: Sequence[str], joints: Sequence[str]) -> dict[str, list[str]]:
+    wanted = {"t_s": ["t_s"]} | {
+        key: [pattern.format(joint) for joint in joints]
+        for key, pattern in (("q", "q_{}_rad"), ("tau", "tau_{}_nm"), ("qd", "qd_{}_rad_s"))
+    }
+    if not any(name in header for name in wanted["qd"]):
+        del wanted["qd"]
+    missing = [name for names in wanted.values() for name in names if name not in header]
+    if missing:
+        _refuse(f"line 1: no column {', '.join(missing)}; the columns are {', '.join(header) or 'none'}")
+    twice = [name for names in wanted.values() for name in names if header.count(name) > 1]
+    if twice:
+        _refuse(f"line 1: column {twice[0]} is there twice")
+    return wanted
+
+
+def _csv_values(
+    numbered: Iterable[tuple[int, list[str]]], header: Sequence[str], wanted: Sequence[str]
+) -> tuple[Array, list[int]]:
+    at = [list(header).index(name) for name in wanted]
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for line, cells in numbered:
+        if not cells:
+            continue
+        if len(cells) != len(header):
+            _refuse(f"line {line}: {len(cells)} cells; the first line names {len(header)} columns")
+        rows.append([_number(cells[i], line, header[i]) for i in at])
+        lines.append(line)
+    return np.array(rows, dtype=float).reshape(len(rows), len(wanted)), lines
+
+
+def _number(cell: str, line: int, column: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        _refuse(f"line {line}, column {column}: {cell!r}; a finite number is needed")
+    return value
+
+
+# ---------------------------------------------------------------------- npz
+
+
+def _read_npz(path: Path, joints: Sequence[str]) -> _Table:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files}
+    except (BadZipFile, ValueError, EOFError) as error:
+        _refuse(f"not an npz file of plain arrays: {error}")
+    position = _array(arrays, "position_rad", joints)
+    order = _npz_order(arrays, joints)
+    torque = "torque_nm" if "torque_nm" in arrays else "torque"
+    signals = {"q": position[:, order], "tau": _array(arrays, torque, joints, len(position))[:, order]}
+    if "velocity_rad_s" in arrays:
+        signals["qd"] = _array(arrays, "velocity_rad_s", joints, len(position))[:, order]
+    return _Table(_npz_times(arrays, len(position)), signals, lambda row: f"row {row}")
+
+
+def _array(arrays: dict[str, NDArray[np.generic]], key: str, joints: Sequence[str], rows: int = -1) -> Array:
+    if key not in arrays:
+        _refuse(f"no array {key}; its arrays are {', '.join(arrays) or 'none'}")
+    found = arrays[key]
+    if found.ndim != 2 or found.shape[1] != len(joints) or (rows >= 0 and found.shape[0] != rows):
+        _refuse(
+            f"{key} has shape {found.shape}; ({rows if rows >= 0 else 'samples'}, {len(joints)}) is needed: "
+            f"the joints are {', '.join(joints)}"
+        )
+    values = _floats(found, key)
+    if not np.isfinite(values).all():
+        row, column = np.argwhere(~np.isfinite(values))[0]
+        _refuse(f"{key}, row {row}, column {column}: {values[row, column]}; a finite number is needed")
+    return values
+
+
+def _floats(found: NDArray[np.generic], key: str) -> Array:
+    if found.dtype.kind not in "fiu":
+        _refuse(f"{key} holds {found.dtype}; real numbers are needed")
+    return found.astype(float)
+
+
+def _npz_times(arrays: dict[str, NDArray[np.generic]], rows: int) -> Array:
+    if "t_s" in arrays:
+        times = _floats(arrays["t_s"], "t_s")
+        if times.shape != (rows,) or not np.isfinite(times).all():
+            _refuse(f"t_s has shape {times.shape}; {rows} finite times are needed")
+        return times
+    if "sample_rate_hz" not in arrays:
+        _refuse(f"neither t_s nor sample_rate_hz; its arrays are {', '.join(arrays)}")
+    rate = _floats(arrays["sample_rate_hz"], "sample_rate_hz")
+    if rate.size != 1 or not 0.0 < float(rate.reshape(())) < np.inf:
+        _refuse(f"sample_rate_hz is {rate}; one positive number is needed")
+    return np.arange(rows) / float(rate.reshape(()))
+
+
+def _npz_order(arrays: dict[str, NDArray[np.generic]], joints: Sequence[str]) -> list[int]:
+    if "joint_names" not in arrays:
+        return list(range(len(joints)))
+    names = [str(name) for name in arrays["joint_names"].reshape(-1)]
+    if sorted(names) != sorted(joints):
+        _refuse(f"joint_names are {', '.join(names)}; the URDF's joints are {', '.join(joints)}")
+    return [names.index(joint) for joint in joints]
+
+
+# ---------------------------------------------------------------------- times
+
+
+def _log(table: _Table) -> JointLog:
+    times = table.t_s
+    # An identification needs thousands; four are what a spline needs.
+    if times.size < 4:
+        _refuse(f"{times.size} samples are no recording")
+    steps = np.diff(times)
+    if (steps <= 0.0).any():
+        row = int(np.argmax(steps <= 0.0)) + 1
+        _refuse(f"{table.row(row)}: its time {times[row]} s is not after that of the sample before it")
+    usual = float(np.median(steps))
+    if steps.max() > _BRIDGED * usual:
+        row = int(np.argmax(steps)) + 1
+        _refuse(
+            f"{table.row(row)}: a hole of {steps.max():.4g} s before it; samples come every {usual:.4g} s "
+            f"and at most {_BRIDGED:.0f} intervals are bridged"
+        )
+    rate_hz = (times.size - 1) / float(times[-1] - times[0])
+    even = np.arange(times.size) / rate_hz
+    uneven = bool(np.abs(times - times[0] - even).max() > _JITTER / rate_hz)
+    found = {key: _even(times, values, even) if uneven else values for key, values in table.signals.items()}
+    for array in found.values():
+        array.flags.writeable = False
+    return JointLog(rate_hz, found["q"], found.get("qd"), found["tau"], uneven)
+
+
+def _even(times: Array, values: Array, even: Array) -> Array:
+    """Interpolate (m, n) to even times from the first sample to the last."""
+    known_ns = np.round((times - times[0]) * NS_PER_S).astype(np.int64)
+    common_ns = np.minimum(np.round(even * NS_PER_S).astype(np.int64), known_ns[-1])
+    gap_ns = int(np.diff(known_ns).max())
+    return resample([known_ns], [values], common_ns, max_gap_ns=gap_ns)[:, 0].copy()
+
+
+def _refuse(text: str) -> NoReturn:
+    raise DataFileError(text)

@@ -1,0 +1,309 @@
+"""From a recording and a URDF to the report: fit, held-out errors, baselines, and what each term is worth."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from coordinator.fit_dynamics.cross_validation import (
+    HeldOutError,
+    Predictor,
+    claimed,
+    errors_elsewhere,
+    fit_part,
+    fitted,
+    gain_of_terms,
+    held_out_errors,
+    length_curve,
+    mean_torque,
+)
+from coordinator.fit_dynamics.data_file import JointLog
+from coordinator.fit_dynamics.physically_consistent import (
+    USUAL_TRUST,
+    RealBodies,
+    by_real_bodies,
+    claimed_bodies,
+    real_bodies,
+)
+from coordinator.fit_dynamics.problem import Problem, joined
+from coordinator.fit_dynamics.report import (
+    BaseParameterPart,
+    BodyPart,
+    DataPart,
+    ErrorPart,
+    FitPart,
+    FitReport,
+    JointNoisePart,
+    LengthPart,
+    Model,
+    TermGainPart,
+    TermPart,
+    Verdict,
+)
+from coordinator.parameter_fit.base_parameters import (
+    BaseParameters,
+    base_parameters,
+    inertial_units,
+    into_frames,
+)
+from coordinator.parameter_fit.identifiability import WEAK_ABOVE, verdicts, words_of_body
+from coordinator.parameter_fit.physically_consistent import NotSolvedError
+from coordinator.parameter_fit.robust_least_squares import WeightedFit
+from module_agent.model.chain import Array
+from module_agent.model.regressor import PER_BODY
+
+_TOLD_BELOW = 1.0
+# A term of no use passes a test at this level once in a hundred.
+EARNS_BELOW = 0.01
+_LARGEST_F = 1e12
+_ROUNDING = 1e-9
+
+Step = Callable[[str], None]
+STEPS = 4
+
+
+class Identified(NamedTuple):
+    """The report, and the real bodies with the drives beside them; None where there are none."""
+
+    report: FitReport
+    real: RealBodies | None
+
+
+class Elsewhere(NamedTuple):
+    """Another recording of the same robot, which is only predicted."""
+
+    data: Path
+    problem: Problem
+
+
+def identified(
+    urdf: Path,
+    data: Path,
+    log: JointLog,
+    problem: Problem,
+    step: Step,
+    trust: float = USUAL_TRUST,
+    elsewhere: Elsewhere | None = None,
+) -> Identified:
+    """Return what a recording tells.
+
+    Args:
+        urdf, data: the files' names. log, problem: the recording, as read and as posed.
+        step: told of each of the `STEPS` before it begins.
+        trust: how much the URDF's own inertias count where real bodies are fitted (`physical_fit`).
+        elsewhere: another recording to predict, posed with the top speeds of this one.
+
+    Raises:
+        ValueError: too few samples for the parameters.
+    """
+    step("fit to the whole recording")
+    fit = fit_part(problem, slice(0, len(problem.log.tau_nm)))
+    real, note = _real(problem, fit, trust)
+    step("fit to each half, tried on the other")
+    try:
+        held_out = _held_out(problem, elsewhere, None if real is None else trust)
+    except NotSolvedError as error:
+        real, note = None, str(error)
+        held_out = _held_out(problem, elsewhere, None)
+    step("fit to ever longer parts")
+    lengths = [
+        LengthPart(seconds=p.seconds, all=p.all_samples, masked=p.masked) for p in length_curve(problem)
+    ]
+    step("fit without each kind of term")
+    gains = [
+        TermGainPart(without=g.without, all=g.all_samples, masked=g.masked) for g in gain_of_terms(problem)
+    ]
+    report = FitReport(
+        urdf=str(urdf),
+        data=str(data),
+        held_out_data=None if elsewhere is None else str(elsewhere.data),
+        recording=_data_part(log, problem),
+        held_out=held_out,
+        lengths=lengths,
+        gains=gains,
+        fit=_fit_part(problem, fit, real, note),
+    )
+    return Identified(report, real)
+
+
+def named(problem: Problem, fit: WeightedFit) -> BaseParameters:
+    """Return what a fit knows as base parameters in the frames of the URDF's links.
+
+    Their covariance counts how alike the residuals are (`WeightedFit.covariance`).
+    """
+    homes = problem.robot.homes
+    found = base_parameters(into_frames(fit.rows, homes), fit.target, problem.columns)
+    in_root = into_frames(found.grouping, np.linalg.inv(homes))
+    covariance = in_root @ fit.covariance @ in_root.T
+    covariance.flags.writeable = False
+    return found._replace(covariance=covariance)
+
+
+def _real(problem: Problem, fit: WeightedFit, trust: float) -> tuple[RealBodies | None, str]:
+    try:
+        return real_bodies(problem, fit, claimed_bodies(problem.robot), trust), ""
+    except (ValueError, NotSolvedError) as error:
+        return None, str(error)
+
+
+def _predictors(problem: Problem, trust: float | None) -> list[tuple[Model, tuple[Problem, Predictor]]]:
+    tried: list[tuple[Model, tuple[Problem, Predictor]]] = [("fitted", (problem, fitted(problem)))]
+    if trust is not None:
+        prior = claimed_bodies(problem.robot)
+        tried.append(("bodies", (problem, by_real_bodies(problem, prior, trust))))
+    if problem.robot.phi is not None:
+        tried.append(("urdf", (problem, claimed(problem, problem.robot.phi))))
+    if problem.drives:
+        alone = problem.with_drives(lambda _: True, bodies=False)
+        tried.append(("drives_only", (alone, fitted(alone))))
+    return [*tried, ("mean", (problem, mean_torque(problem)))]
+
+
+def _held_out(problem: Problem, elsewhere: Elsewhere | None, trust: float | None) -> list[ErrorPart]:
+    found = [(name, held_out_errors(*tried)) for name, tried in _predictors(problem, trust)]
+    if elsewhere is not None:
+        both, seen = joined(problem, elsewhere.problem), len(problem.log.tau_nm)
+        found += [(name, errors_elsewhere(*tried, seen)) for name, tried in _predictors(both, trust)]
+    return [_error_part(name, error) for name, errors in found for error in errors]
+
+
+def _error_part(model: Model, found: HeldOutError) -> ErrorPart:
+    return ErrorPart(
+        model=model,
+        tried_on=found.tried_on,
+        torque="raw" if found.raw else "filtered",
+        samples="masked" if found.masked else "all",
+        overall=_finite(found.error.overall),
+        per_joint=[_finite(float(e)) for e in found.error.per_joint],
+    )
+
+
+def _data_part(log: JointLog, problem: Problem) -> DataPart:
+    return DataPart(
+        joints=list(problem.robot.chain.serials),
+        duration_s=log.duration_s,
+        recorded_hz=log.rate_hz,
+        resampled=log.resampled,
+        cutoff_hz=problem.log.cutoff_hz,
+        kept_hz=problem.log.rate_hz,
+        samples=len(problem.log.tau_nm),
+        noise=problem.log.noise,
+        mask_rad_s=[float(v) for v in problem.choice.mask_part * problem.log.top_rad_s],
+    )
+
+
+def _fit_part(problem: Problem, fit: WeightedFit, real: RealBodies | None, note: str) -> FitPart:
+    found = named(problem, fit)
+    names = problem.robot.chain.serials
+    return FitPart(
+        parameters=len(problem.columns.names),
+        rank=fit.rank,
+        condition=fit.condition,
+        robust=problem.choice.robust,
+        instruments=problem.instruments is not None,
+        terms=list(problem.choice.terms),
+        coupled=[[names[i], names[j]] for i, j in problem.choice.coupled],
+        independent_samples=fit.independent_samples,
+        base_parameters=_base_parts(problem, found),
+        bodies=_bodies(problem, found, real),
+        bodies_note=note,
+        drives=[_term_part(problem, fit, found, k) for k in range(len(problem.drives))],
+        residuals=[
+            JointNoisePart(
+                joint=name,
+                sigma_nm=float(fit.sigma_nm[i]),
+                correlation=float(fit.correlation[i]),
+                samples=int(fit.samples[i]),
+                downweighted=float(fit.downweighted[i]),
+            )
+            for i, name in enumerate(names)
+        ],
+    )
+
+
+def _bodies(problem: Problem, found: BaseParameters, real: RealBodies | None) -> list[BodyPart]:
+    robot = problem.robot
+    units = (*inertial_units(len(robot.bodies)), *(drive.unit for drive in problem.drives))
+    judged = verdicts(found, units)
+    parts = []
+    for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True)):
+        own = None if real is None else real.bodies[i]
+        part = BodyPart(
+            link=link,
+            joint=joint,
+            words=words_of_body(judged[PER_BODY * i : PER_BODY * (i + 1)]),
+            mass_kg=None if own is None else own.mass_kg,
+            com_m=None if own is None else own.com_m.tolist(),
+            inertia_kg_m2=None if own is None else own.inertia_kg_m2.tolist(),
+            urdf_mass_kg=None if robot.phi is None else float(robot.phi[PER_BODY * i]),
+        )
+        parts.append(part)
+    return parts
+
+
+def _base_parts(problem: Problem, found: BaseParameters) -> list[BaseParameterPart]:
+    claims = _claims(problem, found)
+
+    def alone(i: int) -> bool:
+        return min(found.lumped(i)) >= problem.inertial
+
+    return [
+        BaseParameterPart(
+            words=found.words(i),
+            value=float(found.value[i]),
+            sigma=float(found.sigma[i]),
+            relative_sigma=_finite(float(found.relative_sigma[i])),
+            urdf=None if claims is None or alone(i) else float(claims[i]),
+            verdict=_verdict(float(found.relative_sigma[i])),
+        )
+        for i in range(found.rank)
+    ]
+
+
+def _claims(problem: Problem, found: BaseParameters) -> Array | None:
+    """Return what the URDF claims for every base parameter."""
+    if problem.robot.phi is None:
+        return None
+    bodies = slice(0, problem.inertial)
+    in_root = into_frames(found.grouping[:, bodies], np.linalg.inv(problem.robot.homes))
+    claims: Array = in_root @ problem.robot.phi
+    # Groupings have rounding where they are zero.
+    size = np.abs(found.grouping[:, bodies]) @ np.abs(problem.columns.scale[bodies])
+    return np.where(np.abs(claims) > _ROUNDING * size, claims, 0.0)
+
+
+def _verdict(relative_sigma: float) -> Verdict:
+    if relative_sigma <= WEAK_ABOVE:
+        return "identified"
+    return "weak" if relative_sigma < _TOLD_BELOW else "not told from zero"
+
+
+def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int) -> TermPart:
+    """Test a parameter of a drive: the F of the model without it is (value / sigma)^2 for a single one."""
+    drive, column = problem.drives[k], problem.inertial + k
+    # A drive's columns are tried first, so in most cases one begins its own group; else it is within others.
+    groups = [i for i in range(found.rank) if column in found.lumped(i)]
+    own = min(groups, key=lambda i: found.independent[i] != column)
+    others = [found.columns.names[j] for j in found.lumped(own) if j != column]
+    value, sigma = float(found.value[own]), float(found.sigma[own])
+    # Torques without any noise leave no scatter to test against.
+    f = min((value / max(sigma, np.finfo(float).tiny)) ** 2, _LARGEST_F)
+    chance = float(f_distribution.sf(f, 1, max(1.0, fit.independent_samples - fit.rank)))
+    return TermPart(
+        name=drive.name,
+        term=drive.term,
+        joints=[problem.robot.chain.serials[j] for j in drive.joints],
+        unit=drive.unit,
+        value=value,
+        sigma=sigma,
+        f=f,
+        chance=chance,
+        earns_its_place=chance < EARNS_BELOW and not others,
+        lumped_with=", ".join(others),
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,163 @@
+"""The least-squares problem of a recording: every column that the model has, for every kept sample."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.description.urdf_reader import UrdfRobot
+from coordinator.dynamics.drive_model import (
+    NONLINEAR,
+    USUAL_TERMS,
+    DriveColumn,
+    Term,
+    drive_columns,
+    drive_regressor,
+    drive_signals,
+)
+from coordinator.fit_dynamics.filtered_log import FilteredLog
+from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
+from module_agent.model.chain import Array
+from module_agent.model.regressor import PER_BODY, torque_regressor
+
+
+class ModelChoice(NamedTuple):
+    """What the model has.
+
+    terms, coupled: see `drive_columns`. robust: Huber's weights. slow_part, mask_part: the speed below which
+    the sign of friction fades, and that below which a sample is masked, in parts of the joint's top speed.
+    """
+
+    terms: tuple[Term, ...] = USUAL_TERMS
+    coupled: tuple[tuple[int, int], ...] = ()
+    robust: bool = False
+    slow_part: float = 0.01
+    mask_part: float = 0.05
+
+
+class Problem(NamedTuple):
+    """m samples of n joints and p columns, the inertial ones first; arrays are read-only.
+
+    moving: (m, n) samples whose joint turns fast enough that friction has a direction. Only these are
+        fitted to: what holds a joint that stands is decided by how it came to a stop. instruments: (m, n, p)
+        the regressor by other measurements of the same motion, None for least squares.
+    """
+
+    robot: UrdfRobot
+    log: FilteredLog
+    choice: ModelChoice
+    drives: tuple[DriveColumn, ...]
+    columns: Columns
+    regressor: Array
+    moving: NDArray[np.bool_]
+    instruments: Array | None
+
+    @property
+    def inertial(self) -> int:
+        """How many of the columns are the bodies'."""
+        return PER_BODY * len(self.robot.bodies)
+
+    def with_drives(self, kept: Callable[[DriveColumn], bool], bodies: bool = True) -> "Problem":
+        """Return the problem with some of the drives' columns, and with or without the bodies'."""
+        some = np.array(
+            [bodies] * self.inertial + [kept(drive) for drive in self.drives],
+            dtype=bool,
+        )
+        at = np.flatnonzero(some)
+        order = {int(column): i for i, column in enumerate(at)}
+        preferred = [order[int(c)] for c in self.columns.preferred if some[c]]
+        return self._replace(
+            drives=tuple(drive for drive in self.drives if kept(drive)),
+            columns=Columns(
+                tuple(self.columns.names[i] for i in at),
+                self.columns.scale[at],
+                np.array(preferred, dtype=np.int64),
+            ),
+            regressor=self.regressor[..., at],
+            instruments=None if self.instruments is None else self.instruments[..., at],
+        )
+
+
+def problem(
+    robot: UrdfRobot,
+    log: FilteredLog,
+    choice: ModelChoice,
+    again: FilteredLog | None = None,
+    top_rad_s: Array | None = None,
+) -> Problem:
+    """Return the columns of all samples of a recording.
+
+    Args:
+        robot, log, choice: what moved, what was recorded, and what the model has.
+        again: the same motion at the same times by other measurements, for instruments (`in_two`).
+        top_rad_s: (n,) top speeds that count, of another recording that this one is compared with.
+
+    Raises:
+        ValueError: terms or pairs that do not exist, parts of speed out of range, or a joint that never
+            moves.
+    """
+    for name, part in (("slow", choice.slow_part), ("mask", choice.mask_part)):
+        if not 0.0 < part < 1.0:
+            raise ValueError(f"the {name} part of the top speed is {part}; it must be between 0 and 1")
+    top_rad_s = log.top_rad_s if top_rad_s is None else top_rad_s
+    if (still := np.flatnonzero(top_rad_s < 1e-6)).size:
+        raise ValueError(f"joint {robot.chain.serials[still[0]]!r} never moves; nothing shows its friction")
+    drives = drive_columns(len(robot.bodies), choice.terms, choice.coupled)
+    slow_rad_s = choice.slow_part * top_rad_s
+    moving = np.abs(log.qd_rad_s) > choice.mask_part * top_rad_s
+    moving.flags.writeable = False
+    return Problem(
+        robot=robot,
+        log=log,
+        choice=choice,
+        drives=drives,
+        columns=inertial_columns(len(robot.bodies)).beside([drive.name for drive in drives]),
+        regressor=_regressor(robot, drives, log, slow_rad_s),
+        moving=moving,
+        instruments=None if again is None else _regressor(robot, drives, again, slow_rad_s),
+    )
+
+
+def joined(one: Problem, other: Problem) -> Problem:
+    """Return the samples of both recordings, those of `one` first; for what is fitted to either but not both.
+
+    Raises:
+        ValueError: the two have different columns.
+    """
+    if one.columns.names != other.columns.names:
+        raise ValueError("two recordings with different columns cannot be joined")
+    log, more = one.log, other.log
+    return one._replace(
+        log=log._replace(
+            q_rad=np.concatenate([log.q_rad, more.q_rad]),
+            qd_rad_s=np.concatenate([log.qd_rad_s, more.qd_rad_s]),
+            qdd_rad_s2=np.concatenate([log.qdd_rad_s2, more.qdd_rad_s2]),
+            tau_nm=np.concatenate([log.tau_nm, more.tau_nm]),
+            tau_raw_nm=np.concatenate([log.tau_raw_nm, more.tau_raw_nm]),
+        ),
+        regressor=np.concatenate([one.regressor, other.regressor]),
+        moving=np.concatenate([one.moving, other.moving]),
+        instruments=None
+        if one.instruments is None
+        # Only fitted to in `one`; what is tried needs none.
+        else np.concatenate([one.instruments, other.regressor]),
+    )
+
+
+def _regressor(robot: UrdfRobot, drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
+    inertial = torque_regressor(robot.chain, log.q_rad, log.qd_rad_s, log.qdd_rad_s2)
+    further = drive_regressor(drives, _signals(drives, log, slow_rad_s), len(robot.bodies))
+    found = np.concatenate([inertial, further], axis=2)
+    found.flags.writeable = False
+    return found
+
+
+def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
+    """Return the drives' signals (m, k) as they are behind the torque's low-pass."""
+    found = drive_signals(drives, log.qd_rad_s, log.qdd_rad_s2, slow_rad_s).copy()
+    at = [k for k, drive in enumerate(drives) if drive.term in NONLINEAR]
+    fine = drive_signals([drives[k] for k in at], log.fine_qd_rad_s, log.fine_qdd_rad_s2, slow_rad_s)
+    if at:
+        found[:, at] = log.low_passed(fine)
+    return found

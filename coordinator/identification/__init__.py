@@ -1,0 +1,1 @@
+"""From a recording to topology, chain, inertia and the result."""

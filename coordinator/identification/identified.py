@@ -1,0 +1,78 @@
+"""What is identified from a recording: topology, chain, inertia, held-out motions."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.batch_estimation.estimator import Refinement
+from coordinator.dynamics.torque_prediction import TorqueError
+from coordinator.identification.inertia.inertia import Inertia
+from coordinator.identification.inertia.robot_bodies import RobotBodies
+from coordinator.identification.result import Result
+from coordinator.kinematics.assembly import ChainFit
+from coordinator.topology.topology import Topology
+from module_agent.model.chain import Array
+from module_agent.signals.clock_map import ClockMap
+
+
+class IdentificationError(ValueError):
+    """The recording does not hold what is needed; the message says what is missing and where."""
+
+
+class Kinematics(NamedTuple):
+    """Topology and chain: `first` as assembled from the circles, `fit` after the batch refinement."""
+
+    topology: Topology
+    first: ChainFit
+    fit: ChainFit
+    refinement: Refinement
+    clocks: dict[str, ClockMap]
+    notes: tuple[str, ...]
+
+    def words(self) -> list[str]:
+        """Return the tree and the links in lines to read."""
+        lines = []
+        for k, serial in enumerate(self.topology.serials):
+            parent = self.topology.parent[k]
+            mounted = ", mounted reversed" if self.topology.reversed[k] else ""
+            mounted += self.topology.caveat(k)
+            if parent < 0:
+                lines.append(f"{serial} on the base{mounted}")
+                continue
+            length, sigma = 1e3 * self.fit.link_length_m[k], 1e3 * self.fit.link_length_sigma_m[k]
+            lines.append(
+                f"{serial} on {self.topology.serials[parent]}{mounted}: {length:.1f} +- {sigma:.1f} mm"
+            )
+        return lines
+
+
+class HeldOutMotion(NamedTuple):
+    """Torques of the held-out motions, measured (low-passed) and predicted, columns in the chain's order.
+
+    session_ns: (m,). module_ns: (m, n) the same instants in every module's own clock. The others (m, n).
+    """
+
+    serials: tuple[str, ...]
+    session_ns: "np.ndarray[tuple[int], np.dtype[np.int64]]"
+    module_ns: "np.ndarray[tuple[int, int], np.dtype[np.int64]]"
+    q_rad: Array
+    tau_measured_nm: Array
+    tau_predicted_nm: Array
+    error: TorqueError
+
+
+class Identified(NamedTuple):
+    """Everything that follows from a recording."""
+
+    kinematics: Kinematics
+    inertia: Inertia | None
+    bodies: RobotBodies | None
+    held_out: HeldOutMotion | None
+    result: Result
+
+    @property
+    def real_phi(self) -> Array | None:
+        """The inertial parameters for files that other programs read: of real bodies, if any were found."""
+        if self.bodies is not None and self.bodies.fit is not None:
+            return self.bodies.fit.phi
+        return self.inertia.seen.fit.phi if self.inertia is not None else None

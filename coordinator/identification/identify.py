@@ -1,0 +1,313 @@
+"""From a recording to what it says of the robot: pure, so that a replay computes the same.
+
+Topology from who moved, a first chain from the agents' circle point analyses, one batch refinement of it
+over all exploration motions, then the inertial parameters, checked on motions that nothing was fitted to.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from coordinator.batch_estimation.estimator import Refinement
+from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
+from coordinator.batch_estimation.sensor_data import NoiseFloor
+from coordinator.dynamics.torque_prediction import check_held_out
+from coordinator.identification.identified import HeldOutMotion, IdentificationError, Identified, Kinematics
+from coordinator.identification.inertia.agent_information import gathered
+from coordinator.identification.inertia.inertia import Robot, find_inertia, without_terms
+from coordinator.identification.inertia.robot_bodies import RobotBodies, robot_bodies
+from coordinator.identification.result_builder import build_result
+from coordinator.identification.robot_refinement import CUTOFF_HZ, refine_robot
+from coordinator.identification.simultaneous_exploration import respond, whole_motion
+from coordinator.identification.topology_search import search_topology
+from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
+from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
+from coordinator.kinematics.gauge_fixing import settled
+from coordinator.kinematics.null_space import name_null_space
+from coordinator.kinematics.simultaneous_motion import circles_of_all
+from coordinator.recording.journal import JournalEvent, Purpose, left_out
+from coordinator.recording.recording import Recording
+from coordinator.synchronisation.clock_refinement import refine_clocks
+from coordinator.synchronisation.motion_windows import (
+    INDEPENDENT_FRACTION,
+    RATE_HZ,
+    Window,
+    dynamic_windows,
+    joined_motions,
+    noise_floor,
+    window,
+)
+from coordinator.synchronisation.round_trips import map_clocks
+from coordinator.topology.topology import Topology, TopologyError
+from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.chain import Array, Chain
+from module_agent.signals.clock_map import ClockMap
+from module_agent.signals.filtering import JointMotion, settling_samples
+from module_agent.wire.messages import Estimate
+
+# Of some 30 errors an IMU the largest is below this in 99 of 100.
+STRANGE_ABOVE = 3.5
+
+
+def identify(
+    recording: Recording,
+    revise: Callable[[Kinematics], Kinematics] | None = None,
+    kinematics: Kinematics | None = None,
+) -> Identified:
+    """Compute everything from a recording; `revise` is what is known beforehand put into the kinematics.
+
+    `kinematics` is what was computed already of this recording, `revise` included.
+
+    Raises:
+        IdentificationError: what is needed is not there, or contradicts itself.
+    """
+    if kinematics is None:
+        kinematics = identify_kinematics(recording)
+        kinematics = revise(kinematics) if revise is not None else kinematics
+    inertia, bodies, held_out = None, None, None
+    if _motions(recording, "dynamic"):
+        chain, serials = kinematics.fit.chain, kinematics.topology.serials
+        types = [recorded_type(recording, s) for s in serials]
+        floor = base_floor(recording, kinematics.clocks, kinematics.topology)
+        covariance = kinematics.fit.covariance
+        robot = Robot(chain, types, kinematics.refinement, covariance, floor, recording.torque)
+        windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
+        clocks = kinematics.clocks
+        inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
+        seen = inertia.seen
+        bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION, inertia.effects)
+        if _motions(recording, "held_out"):
+            means = joined_motions([without_terms(one, seen) for one in windows]).tau_nm.mean(axis=0)
+            windows = dynamic_windows(recording, kinematics.clocks, serials, "held_out")
+            motion = joined_motions([without_terms(one, seen) for one in windows])
+            held_out = _held_out(kinematics, motion, seen.fit.phi, means)
+            bodies = _checked(bodies, kinematics, motion, means)
+    result = build_result(recording, kinematics, inertia, held_out, bodies)
+    return Identified(kinematics, inertia, bodies, held_out, result)
+
+
+# ---------------------------------------------------------------------- kinematics
+
+
+def identify_kinematics(recording: Recording) -> Kinematics:
+    """Find topology and chain.
+
+    Raises:
+        IdentificationError: see `identify`.
+    """
+    serials = _explored(recording)
+    try:
+        clocks = map_clocks({s: recording.modules[s].trips for s in serials})
+        found = search_topology(recording, serials)
+        topology = found.topology
+        types = [recorded_type(recording, s) for s in topology.serials]
+        windows = _exploration(recording, clocks, topology.serials)
+        first = assemble(
+            topology,
+            types,
+            _pairs(recording, clocks, topology.serials, windows),
+            [_rest(recording, topology.serials)],
+        )
+        clocks |= refine_clocks(first.chain, clocks, windows).clocks
+        windows = _exploration(recording, clocks, topology.serials)
+        prior = IMU_PRIORS[recording.imu]
+        floor = base_floor(recording, clocks, topology)
+        refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
+    except (TopologyError, AssemblyError, ValueError) as error:
+        raise IdentificationError(str(error)) from error
+    notes = tuple(
+        f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"
+        # Copies: while this is computed beside a session, late estimates still arrive.
+        for found in list(recording.estimates.values())
+        for estimate in list(found.values())
+        if estimate.note
+    )
+    notes += found.notes
+    notes += _strange_imus(topology.serials, refined, prior)
+    return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
+
+
+def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:
+    """Say whose IMU came out with errors that its kind does not have: then something is not in the model."""
+    far = dict(zip(serials, beyond(refined.intrinsics, prior), strict=True))
+    return tuple(
+        f"{serial}: its IMU seems to have {far[serial]:.1f} times the error that its kind has. It is poor, "
+        "or the robot's base or links give; lengths and axes near it may be worse than claimed"
+        for serial in serials
+        if far[serial] > STRANGE_ABOVE
+    )
+
+
+def _settled(refined: Refinement, reference: Chain) -> Refinement:
+    """Return a refinement with what it does not know where `reference` has it (`free_motions.settled`)."""
+    known, by_noise = (
+        settled(refined.chain, covariance, refined.null_basis, reference)
+        for covariance in (refined.covariance, refined.noise_covariance)
+    )
+    return refined._replace(
+        chain=known.chain,
+        covariance=known.covariance,
+        noise_covariance=by_noise.covariance,
+        null_basis=known.null_basis,
+    )
+
+
+def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
+    length, sigma = link_lengths(refined.chain, refined.covariance)
+    return first._replace(
+        chain=refined.chain,
+        covariance=refined.covariance,
+        rank=refined.rank,
+        condition=refined.condition,
+        unresolved=name_null_space(refined.chain, refined.null_basis),
+        null_basis=refined.null_basis,
+        link_length_m=length,
+        link_length_sigma_m=sigma,
+    )
+
+
+def _motions(recording: Recording, *purposes: Purpose) -> list[JournalEvent]:
+    """Return the last motion of every purpose of every joint, in the order of the journal."""
+    latest: dict[tuple[str, str], JournalEvent] = {}
+    for event in recording.motions(*purposes):
+        latest[event.serial, event.purpose] = event
+    return list(latest.values())
+
+
+def _explored(recording: Recording) -> list[str]:
+    rested = sorted({e.serial for e in _motions(recording, "rest")})
+    explored = {e.serial for e in _motions(recording, "windowed_sine", "whole")}
+    missing = [s for s in rested if s not in explored and s not in left_out(recording.journal)]
+    if not rested or missing:
+        raise IdentificationError(
+            "no rest was recorded" if not rested else f"no exploration of {', '.join(missing)} was recorded"
+        )
+    return rested
+
+
+def recorded_type(recording: Recording, serial: str) -> ModuleType:
+    """Return a module's type, as it has told it.
+
+    Raises:
+        IdentificationError: it has not.
+    """
+    info = recording.modules[serial].info
+    if info is None:
+        raise IdentificationError(f"module {serial} has not told its type")
+    return module_type(info.module_type)
+
+
+def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose) -> Estimate | None:
+    """Return what `observer` made of the latest motion of this purpose of `joint`."""
+    found = [e for e in _motions(recording, purpose) if e.serial == joint]
+    number = found[-1].motion.motion_id if found and found[-1].motion is not None else -1
+    for ids, estimate in list(recording.estimates.get((joint, observer), {}).items()):
+        if ids[-1] == number:
+            return estimate
+    return None
+
+
+def _pairs(
+    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str], windows: Sequence[Window]
+) -> list[PairObservation]:
+    """Return the circles as observations."""
+    whole = whole_motion(recording, serials)
+    if whole is not None:
+        return circles_of_all(serials, respond(recording, clocks, serials, whole))
+    sines = {
+        e.serial: i
+        for i, e in enumerate(_exploration_motions(recording, serials))
+        if e.purpose == "windowed_sine"
+    }
+    pairs = []
+    for joint in [s for s in serials if s in sines]:
+        q_mean = windows[sines[joint]].q_rad.mean(axis=0)
+        for observer in serials:
+            estimate = _estimate(recording, joint, observer, "windowed_sine")
+            if estimate is None or joint == observer:
+                continue
+            pair = circle_observation(estimate, q_mean)
+            pairs += [] if pair is None else [pair]
+    return pairs
+
+
+def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
+    """Average every IMU and encoder over its rest."""
+    force, scatter, position = [], [], []
+    events = {e.serial: e for e in _motions(recording, "rest")}
+    for serial in serials:
+        motion = events[serial].motion
+        assert motion is not None
+        assert motion.end_row is not None
+        rows = recording.rows(serial, motion.start_row, motion.end_row)
+        if len(rows) < 10:
+            raise IdentificationError(f"module {serial} has {len(rows)} rows at rest, 10 are needed")
+        accel = rows["accel_m_s2"].astype(float)
+        force.append(accel.mean(axis=0))
+        scatter.append(float(accel.std(axis=0).max()) / np.sqrt(len(rows)))
+        position.append(float(rows["position_rad"].mean()))
+    return RestObservation(np.array(force), max(scatter), np.array(position))
+
+
+def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topology) -> NoiseFloor | None:
+    """Return the noise of the IMU that rides on the base, if the first module's does."""
+    if topology.reversed[0]:
+        return None
+    still = [e for e in _motions(recording, "rest") if e.serial == topology.serials[0]]
+    return noise_floor(window(recording, clocks, topology.serials, still[0]), CUTOFF_HZ, 0)
+
+
+def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
+    """Return the motions that the chain is fitted to, of modules that take part in it."""
+    alone = _motions(recording, "constant", "windowed_sine")
+    whole, repeats = _motions(recording, "whole"), recording.motions("repeat")
+    alone, whole, repeats = ([e for e in some if e.serial in serials] for some in (alone, whole, repeats))
+    # All joints at once are in the window of any of them.
+    return [*alone, *whole[:1], *repeats]
+
+
+def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:
+    margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+    return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording, serials)]
+
+
+# ---------------------------------------------------------------------- dynamics
+
+
+def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Array) -> HeldOutMotion:
+    found = check_held_out(kinematics.fit.chain, phi, motion, means)
+    serials = kinematics.topology.serials
+    return HeldOutMotion(
+        serials,
+        motion.t_ns,
+        np.stack([kinematics.clocks[s].to_module(motion.t_ns) for s in serials], axis=1),
+        motion.q_rad,
+        motion.tau_nm,
+        found.tau_predicted_nm,
+        found.error,
+    )
+
+
+def _checked(bodies: RobotBodies, kinematics: Kinematics, motion: JointMotion, means: Array) -> RobotBodies:
+    """Return the bodies with how well they predict held-out torques."""
+    if bodies.fit is None:
+        return bodies
+    found = check_held_out(kinematics.fit.chain, bodies.fit.phi, motion, means)
+    return bodies._replace(held_out_error=found.error.overall)
+
+
+def write_held_out(path: Path, held_out: HeldOutMotion) -> None:
+    """Write the held-out torques as npz, whole or not at all."""
+    temporary = path.with_name("held_out.part.npz")
+    np.savez_compressed(
+        temporary,
+        serials=np.array(held_out.serials),
+        t_ns=held_out.module_ns,
+        session_ns=held_out.session_ns,
+        q_rad=held_out.q_rad,
+        tau_measured_nm=held_out.tau_measured_nm,
+        tau_predicted_nm=held_out.tau_predicted_nm,
+    )
+    os.replace(temporary, path)

@@ -1,0 +1,1 @@
+"""Inertial parameters of an identified chain, from its recording."""

@@ -1,0 +1,199 @@
+"""What the agents say of their own torques, out of a recording: asked for, put together, and checked.
+
+A module's answer stands for the rows of its joint if it is whole, of the boot that made the rows, and
+computed with the chain and the clocks that all else is computed with. Otherwise the coordinator's rows do.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import ModuleRecord, Recording
+from coordinator.synchronisation.motion_windows import DYNAMIC_CUTOFF_HZ, RATE_HZ, STEP_NS, span, window
+from coordinator.synchronisation.round_trips import map_clocks
+from module_agent.model.chain import Chain
+from module_agent.model.information import JointInformation
+from module_agent.signals.clock_map import ClockMap
+from module_agent.signals.filtering import settling_samples
+from module_agent.torque_information.serialisation import chain_of, chain_part, clock_part, clocks_of, unpack
+from module_agent.wire.information_messages import MOST_MODULES, InformationRequest, RowRange, SpanPart
+
+# Of a chain and of clocks that are worked out again, on another machine for example.
+SAME_CHAIN, SAME_CLOCK_NS = 1e-9, 2.0
+# Some hundred thousand additions of doubles, and the bar. More is another computation.
+AGREES_BELOW = 1e-10
+# Beyond the rows that count by the clocks as they are mapped so far: those may turn out otherwise.
+_SPARE_NS = 100_000_000
+_MARGIN_S = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
+
+
+class Gathered(NamedTuple):
+    """The information of n joints, and whose it is.
+
+    by_agents: of which serials it is the module's own. difference: the largest between what an agent and what
+    the coordinator has of a joint, relative; None without any answer. note: why some are not the agents', and
+    empty if all are or nobody was asked.
+    """
+
+    joints: tuple[JointInformation, ...]
+    by_agents: tuple[str, ...]
+    difference: float | None
+    note: str
+
+
+def dynamic_steps(recording: Recording) -> list[JournalEvent]:
+    """Return the motions that inertia is found from: of every step the latest, as in `dynamic_motion`."""
+    return list({event.step: event for event in recording.motions("dynamic")}.values())
+
+
+def rows_to_keep(recording: Recording, serials: Sequence[str], event: JournalEvent) -> tuple[RowRange, ...]:
+    """Return which rows of every module are to be kept of a motion.
+
+    Raises:
+        ValueError: a module has no rows of it, or no round trip by which to tell when it was.
+    """
+    clocks = map_clocks({s: recording.modules[s].trips for s in serials})
+    start_ns, end_ns = span(recording, clocks, event, _MARGIN_S)
+    found = []
+    for serial in serials:
+        record = recording.modules[serial]
+        around = clocks[serial].module_span(start_ns - _SPARE_NS, end_ns + _SPARE_NS, STEP_NS)
+        first, end = record.rows.range_between(*around)
+        if first == end or record.rows.missing(first, end):
+            raise ValueError(f"rows of {serial} in the motion of {event.step} are missing")
+        found.append(RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end))
+    return tuple(found)
+
+
+def question(
+    recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap], sender: str
+) -> InformationRequest:
+    """Return what every module is asked; whom, by which sequence number, and from where on is to be put in.
+
+    Raises:
+        ValueError: there is no dynamic motion, a hole in its rows, or more than a message carries.
+    """
+    steps = dynamic_steps(recording)
+    if not steps or len(chain.serials) > MOST_MODULES:
+        raise ValueError(f"{len(steps)} dynamic motions of {len(chain.serials)} modules")
+    return InformationRequest(
+        serial="",
+        boot=0,
+        seq=0,
+        sender=sender,
+        chain=chain_part(chain),
+        clocks=tuple(clock_part(clocks[s]) for s in chain.serials),
+        motions=tuple(_span_part(recording, chain, clocks, event) for event in steps),
+        step_ns=STEP_NS,
+        cutoff_hz=DYNAMIC_CUTOFF_HZ,
+    )
+
+
+def _span_part(
+    recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap], event: JournalEvent
+) -> SpanPart:
+    assert event.motion is not None
+    start_ns, end_ns = span(recording, clocks, event, _MARGIN_S)
+    t_ns = window(recording, clocks, chain.serials, event, _MARGIN_S).t_ns
+    return SpanPart(
+        motion_id=event.motion.motion_id,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        first_ns=int(t_ns[0]),
+        samples=len(t_ns),
+    )
+
+
+def gathered(
+    recording: Recording,
+    chain: Chain,
+    clocks: Mapping[str, ClockMap],
+    own: Sequence[JointInformation],
+) -> Gathered:
+    """Return the agents' information where they have answered, else the coordinator's `own`, joint by joint.
+
+    Own rows may have further columns than the agents', which then have nothing to say of those: they are
+    compared in the columns that both have, and the own ones are used.
+    """
+    digest, why = _asked(recording, chain, clocks)
+    if digest is None:
+        return Gathered(tuple(own), (), None, why)
+    joints = list(own)
+    by_agents: list[str] = []
+    apart: list[float] = []
+    reasons: list[str] = []
+    for k, serial in enumerate(chain.serials):
+        try:
+            theirs = _answer(recording.modules[serial], digest)
+        except ValueError as error:
+            reasons.append(f"{serial}: {error}")
+            continue
+        apart.append(difference(theirs, own[k]))
+        if apart[-1] > AGREES_BELOW:
+            reasons.append(f"{serial}: its own differs by {apart[-1]:.1e}")
+        elif theirs.r.shape[1] == own[k].r.shape[1]:
+            joints[k] = theirs
+            by_agents.append(serial)
+    note = f"torques by the rows of the coordinator, not the agent: {'; '.join(reasons)}" if reasons else ""
+    return Gathered(tuple(joints), tuple(by_agents), max(apart, default=None), note)
+
+
+def difference(one: JointInformation, other: JointInformation) -> float:
+    """Return how different two are in the columns that both have, relative to the size of what they say.
+
+    What they say is R^T R, R^T z and |tau|^2; the rows themselves are up to their signs.
+    """
+    if one.samples != other.samples:
+        return float("inf")
+    both = min(one.r.shape[1], other.r.shape[1])
+    said = [
+        (i.r[:, :both].T @ i.r[:, :both], i.r[:, :both].T @ i.z, np.array([i.z @ i.z + i.rest]))
+        for i in (one, other)
+    ]
+    return max(
+        float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), 1e-300)
+        for a, b in zip(*said, strict=True)
+    )
+
+
+def _asked(recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap]) -> tuple[bytes | None, str]:
+    """Return the latest question that was asked with this chain, these clocks and these motions."""
+    if not recording.questions:
+        return None, ""
+    for digest, asked in reversed(recording.questions.items()):
+        if _is_same(asked, chain, clocks) and _is_of(asked, dynamic_steps(recording)):
+            return digest, ""
+    return None, "the agents were asked with another chain, other clocks or other motions"
+
+
+def _is_of(asked: InformationRequest, steps: Sequence[JournalEvent]) -> bool:
+    return {m.motion_id for m in asked.motions} == {e.motion.motion_id for e in steps if e.motion is not None}
+
+
+def _is_same(asked: InformationRequest, chain: Chain, clocks: Mapping[str, ClockMap]) -> bool:
+    told = chain_of(asked.chain)
+    if told[:3] != chain[:3] or asked.cutoff_hz != DYNAMIC_CUTOFF_HZ or asked.step_ns != STEP_NS:
+        return False
+    off = max(float(np.abs(a - b).max()) for a, b in zip(told[3:], chain[3:], strict=True))
+    ends = np.array([t for motion in asked.motions for t in (motion.start_ns, motion.end_ns)])
+    late = [
+        np.abs(there.to_module(ends) - clocks[serial].to_module(ends)).max()
+        for serial, there in zip(told.serials, clocks_of(asked.clocks), strict=True)
+    ]
+    return off <= SAME_CHAIN and float(max(late)) <= SAME_CLOCK_NS
+
+
+def _answer(module: ModuleRecord, digest: bytes) -> JointInformation:
+    """Put the parts of an answer together.
+
+    Raises:
+        ValueError: it is not whole, or not information.
+    """
+    parts = module.information.get(digest, {})
+    block = b"".join(parts[offset].part for offset in sorted(parts))
+    total = next(iter(parts.values())).total_bytes if parts else 0
+    if not parts or len(block) != total:
+        raise ValueError(f"{len(block)} of {total or '?'} bytes of its answer have come")
+    return unpack(block)

@@ -1,0 +1,123 @@
+"""What torques and modules' make say together of a robot's bodies: real ones, and what is known of each.
+
+Base parameters and verdicts are from torques alone; the bodies explain the torques as well, and have the
+modules' known make where torques are silent. Parameters are worded in `joint_frames`, where they lump least;
+the bodies are in the links' frames of `urdf`.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from coordinator.description.urdf_writer import link_homes
+from coordinator.dynamics.inertia_prior import module_prior
+from coordinator.dynamics.pseudo_inertia import Body, body, parameter_transform
+from coordinator.parameter_fit.base_parameters import (
+    BaseParameters,
+    base_parameters,
+    inertial_columns,
+    inertial_units,
+    into_frames,
+    joint_frames,
+    whitened,
+)
+from coordinator.parameter_fit.identifiability import Verdict, verdicts, words_of_base, words_of_body
+from coordinator.parameter_fit.least_squares import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG, InertialFit
+from coordinator.parameter_fit.physically_consistent import NotSolvedError, PhysicalFit, fit_physical
+from coordinator.parameter_fit.systematic_errors import whitened_effects
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.information import JointInformation
+from module_agent.model.regressor import PER_BODY
+
+# Torques without noise, as a simulation may have them, would weigh infinitely.
+_LEAST_SIGMA_NM = 1e-9
+
+
+class RobotBodies(NamedTuple):
+    """The bodies of a robot of n joints.
+
+    frames: (n, 4, 4) of the words, in the root frame at q = 0. base: the base parameters. verdicts: (10 n,)
+    of every parameter. fit: the real bodies, None if none were found. bodies: (n,) the same as masses, in the
+    links' frames; empty if none were found. note: why.
+    held_out_error: relative torque error of `fit` on motions that were not fitted, None without any.
+    """
+
+    serials: tuple[str, ...]
+    frames: Array
+    base: BaseParameters
+    verdicts: tuple[Verdict, ...]
+    fit: PhysicalFit | None
+    bodies: tuple[Body, ...]
+    note: str
+    held_out_error: float | None = None
+
+    def words(self) -> list[str]:
+        """Return what is known in lines to read: the sums, then body by body."""
+        lines = [words_of_base(self.base)]
+        for i, serial in enumerate(self.serials):
+            own = self.verdicts[PER_BODY * i : PER_BODY * (i + 1)]
+            lines.append(f"body {i + 1}, turned by {serial}: {words_of_body(own)}")
+        return lines
+
+
+def robot_bodies(
+    information: Sequence[JointInformation],
+    chain: Chain,
+    types: Sequence[ModuleType],
+    least_squares: InertialFit,
+    independent_fraction: float,
+    effects: Sequence[Array] | None = None,
+) -> RobotBodies:
+    """Return the bodies that a robot's joints turn.
+
+    Args:
+        information: per joint of n.
+        chain, types: of the same n.
+        least_squares: its noise weighs the joints.
+        independent_fraction: independent samples per sample, below 1 after a low-pass.
+        effects: (k_i, j) of every joint: what errors that come as a whole do to its rows (`common_errors`).
+
+    Raises:
+        ValueError: shapes that do not fit, or torques that say nothing.
+    """
+    joints = len(chain.serials)
+    frames = joint_frames(chain)
+    sigma = np.maximum(least_squares.torque_sigma_nm, _LEAST_SIGMA_NM)
+    rows, target = whitened(information, sigma, independent_fraction)
+    common = None if effects is None else whitened_effects(effects, sigma, independent_fraction)
+    base = base_parameters(
+        into_frames(rows, frames),
+        target,
+        inertial_columns(joints),
+        max_sigma=MAX_SIGMA_KG,
+        common_errors=common,
+        tolerance=ESTIMATED_CHAIN_TOLERANCE,
+    )
+    fit, note = None, ""
+    try:
+        prior = module_prior(chain, types)
+        fit = fit_physical(
+            information,
+            prior,
+            least_squares,
+            independent_fraction,
+            effects=effects,
+        )
+    except NotSolvedError as error:
+        note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
+    if fit is None:
+        judged = verdicts(base, inertial_units(joints))
+        return RobotBodies(chain.serials, frames, base, judged, None, (), note)
+    into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
+    informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
+    judged = verdicts(base, inertial_units(joints), into @ fit.phi, informed_sigma)
+    bodies = _in_links(fit.pseudo, link_homes(chain))
+    return RobotBodies(chain.serials, frames, base, judged, fit, bodies, note)
+
+
+def _in_links(pseudo: Array, homes: Array) -> tuple[Body, ...]:
+    into = np.linalg.inv(homes)
+    return tuple(body(one @ matrix @ one.T) for one, matrix in zip(into, pseudo, strict=True))

@@ -1,0 +1,305 @@
+"""The robot as far as it is known while its joints are still being explored: cheap, to be looked at.
+
+Joints that have not moved yet are as good as locked. So a module stands on the nearest joint that has been
+explored and moves it, and modules that nothing ties to another one yet are left out. The chain is assembled
+from the modules' own circle point analyses (`kinematics.assembly`); the batch refinement comes at the end.
+
+Looks at a robot while its joints are being explored: assembled from circles, refined by a few samples.
+
+Every motion is filtered once and kept thinned, so that a look costs little more than its refinement.
+"""
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.batch_estimation.estimator import Refinement, refine_chain
+from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS, ImuPrior
+from coordinator.batch_estimation.link_compliance import flex_slopes, joined, loads_of
+from coordinator.batch_estimation.sensor_data import SensorData
+from coordinator.kinematics.assembly import ChainFit, assemble, link_lengths
+from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
+from coordinator.kinematics.null_space import name_null_space
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import Recording
+from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, window
+from coordinator.synchronisation.round_trips import map_clocks
+from coordinator.topology.topology import MotionSeen, Topology, likely_topology
+from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE
+from module_agent.signals.filtering import settling_samples
+from module_agent.wire.messages import Estimate
+
+# Of the weighted squares: far less than their noise.
+LEAST_GAIN = 1e-3
+
+
+class RobotSoFar(NamedTuple):
+    """A chain of the modules that are tied to others by now.
+
+    explored: serials of the joints that have been explored. beside: (n,) whether nothing that is still to be
+    explored can lie between a module and its parent, so that what joins them is one link.
+    """
+
+    fit: ChainFit
+    explored: tuple[str, ...]
+    beside: tuple[bool, ...]
+
+
+def robot_so_far(recording: Recording, explored: Collection[str]) -> RobotSoFar | None:
+    """Assemble what the joints explored so far tell; None as long as they tie no module to another.
+
+    Raises:
+        ValueError: the estimates contradict each other, or modules were not seen at rest.
+    """
+    rests = _rests(recording)
+    serials = sorted(rests)
+    moved = sorted(set(explored) & set(serials))
+    seen = {(i, k): e for i in moved for k in serials if (e := _seen(recording, i, k)) is not None}
+    if not seen:
+        return None
+    found = likely_topology(seen, [s for s in serials if s not in moved])
+    kept = _tied(found)
+    if not kept:
+        return None
+    topology = _part(found, kept)
+    rest = _rest(recording, rests, topology.serials)
+    pairs = [
+        pair
+        for joint in moved
+        for observer in topology.serials
+        if joint in topology.serials
+        and joint != observer
+        and (pair := _pair(recording, joint, observer, topology, rest.q_rad)) is not None
+    ]
+    types = [module_type(_type(recording, s)) for s in topology.serials]
+    fit = assemble(topology, types, pairs, [rest], LEAST_GAIN)
+    return RobotSoFar(fit, tuple(moved), beside(fit.chain, moved))
+
+
+def beside(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
+    """Return (n,) whether a module of a chain so far is known to be mounted on its parent and nothing else.
+
+    A joint that is still to be explored may carry what now stands beside it.
+    """
+    open_ = [s not in explored for s in chain.serials]
+    return tuple(
+        parent != BASE
+        and not any(open_[other] for other, p in enumerate(chain.parent) if p == parent and other != k)
+        for k, parent in enumerate(chain.parent)
+    )
+
+
+# ---------------------------------------------------------------------- what was seen
+
+
+def _seen(recording: Recording, joint: str, observer: str) -> MotionSeen | None:
+    """Return who moved with whom, by the slow motion where there is one (see `estimate.observer`)."""
+    found = list(recording.estimates.get((joint, observer), {}).values())
+    if not found:
+        return None
+    slow_ids = {
+        e.motion.motion_id for e in _motions(recording, joint) if e.purpose == "constant" and e.motion
+    }
+    slow = [e for e in found if e.motion_ids[-1] in slow_ids]
+    estimate, turned = (slow or found)[-1], _circle(found)
+    axis = np.array(turned.circle.axis) if turned is not None and turned.circle is not None else None
+    return MotionSeen(estimate.moved, estimate.rate_ratio, axis)
+
+
+def _circle(found: Sequence[Estimate]) -> Estimate | None:
+    circles = [e for e in found if e.circle is not None]
+    return circles[-1] if circles else None
+
+
+def _pair(
+    recording: Recording, joint: str, observer: str, topology: Topology, q_rad: Array
+) -> PairObservation | None:
+    """Return a circle as an observation."""
+    estimate = _circle(list(recording.estimates.get((joint, observer), {}).values()))
+    if estimate is None:
+        return None
+    # The others hold where they rested.
+    at = q_rad.copy()
+    at[topology.serials.index(joint)] = _mean_position(recording, joint, estimate.motion_ids)
+    return circle_observation(estimate, at)
+
+
+def _motions(recording: Recording, serial: str) -> list[JournalEvent]:
+    return [
+        e for e in recording.journal if e.what == "motion" and e.serial == serial and e.motion is not None
+    ]
+
+
+def _mean_position(recording: Recording, joint: str, motion_ids: Sequence[int]) -> float:
+    rows = [
+        recording.rows(joint, e.motion.start_row, e.motion.end_row)["position_rad"]
+        for e in _motions(recording, joint)
+        if e.motion is not None and e.motion.end_row is not None and e.motion.motion_id == motion_ids[-1]
+    ]
+    if not rows or not len(rows[-1]):
+        raise ValueError(f"no rows of the motion of joint {joint} that was estimated")
+    return float(rows[-1].mean())
+
+
+def _rests(recording: Recording) -> dict[str, tuple[int, int]]:
+    """Return the rows (first, end) of every module's last rest."""
+    serials = sorted({e.serial for e in recording.journal if e.purpose == "rest"})
+    found = {s: [e.motion for e in _motions(recording, s) if e.purpose == "rest"][-1:] for s in serials}
+    return {
+        s: (motion.start_row, motion.end_row)
+        for s, motions in found.items()
+        for motion in motions
+        if motion is not None and motion.end_row is not None
+    }
+
+
+def _rest(recording: Recording, rests: dict[str, tuple[int, int]], serials: Sequence[str]) -> RestObservation:
+    rows = [recording.rows(s, *rests[s]) for s in serials]
+    bare = [s for s, one in zip(serials, rows, strict=True) if not len(one)]
+    if bare:
+        raise ValueError(f"no rows at rest of {', '.join(bare)}")
+    force = np.array([one["accel_m_s2"].astype(float).mean(axis=0) for one in rows])
+    scatter = [float(one["accel_m_s2"].std(axis=0).max()) / np.sqrt(len(one)) for one in rows]
+    position = np.array([float(one["position_rad"].mean()) for one in rows])
+    return RestObservation(force, max(scatter), position)
+
+
+def _type(recording: Recording, serial: str) -> str:
+    info = recording.modules[serial].info
+    if info is None:
+        raise ValueError(f"module {serial} has not told its type")
+    return info.module_type
+
+
+# ---------------------------------------------------------------------- what hangs together
+
+
+def _tied(topology: Topology) -> list[int]:
+    """Return the modules of all trees of more than one."""
+    root: list[int] = []
+    for k, parent in enumerate(topology.parent):
+        root.append(k if parent == BASE else root[parent])
+    return [k for k, r in enumerate(root) if root.count(r) > 1]
+
+
+def _part(topology: Topology, kept: Sequence[int]) -> Topology:
+    """Return whole trees of a topology, in its order."""
+    place = {k: n for n, k in enumerate(kept)} | {BASE: BASE}
+    return Topology(
+        serials=tuple(topology.serials[k] for k in kept),
+        parent=tuple(place[topology.parent[k]] for k in kept),
+        reversed=tuple(topology.reversed[k] for k in kept),
+        confidence=topology.confidence,
+    )
+
+
+CUTOFF_HZ = 12.0
+# 50 samples a second are kept of every motion, for the loads of its links; the refinement has a quarter of
+# them: six of every period of the windowed sine.
+KEPT_EVERY, FITTED_EVERY = 5, 4
+# Farther from where the circles put a module the refinement has found something else than the robot.
+LOST_ABOVE_M = 0.15
+
+
+class Looks:
+    """The looks at one robot, one after the other, from its recording as it grows; one at a time.
+
+    Robots of more than `most_refined` modules are only assembled: a refinement of seven costs half a second,
+    and grows with the square.
+    """
+
+    def __init__(self, recording: Recording, most_refined: int | None = None):
+        self._recording = recording
+        self._most_refined = most_refined
+        self._parts: dict[tuple[str, int, tuple[str, ...]], SensorData] = {}
+
+    def look(self, explored: Collection[str]) -> RobotSoFar | None:
+        """Return the robot as far as the joints `explored` tell; None as long as they tie nothing together.
+
+        Where samples are missing, or do not fit, it is as assembled.
+
+        Raises:
+            ValueError: see `robot_so_far`.
+        """
+        found = robot_so_far(self._recording, explored)
+        if found is None or not self._is_refined(found):
+            return found
+        try:
+            return _refined(found, self._kinds(found), self._parts_of(found), self._prior)
+        except (ValueError, np.linalg.LinAlgError):
+            return found
+
+    def _is_refined(self, found: RobotSoFar) -> bool:
+        return self._most_refined is None or len(found.fit.chain.serials) <= self._most_refined
+
+    @property
+    def _prior(self) -> ImuPrior:
+        return IMU_PRIORS[self._recording.imu]
+
+    def _kinds(self, found: RobotSoFar) -> list[ModuleType]:
+        infos = [self._recording.modules[s].info for s in found.fit.chain.serials]
+        return [module_type(info.module_type) for info in infos if info is not None]
+
+    def _parts_of(self, found: RobotSoFar) -> list[SensorData]:
+        """Return the samples of every slow and fast motion so far, modules as in the chain."""
+        serials = found.fit.chain.serials
+        events: dict[tuple[str, str], JournalEvent] = {}
+        for event in self._recording.journal:
+            if event.what == "motion" and event.purpose in ("constant", "windowed_sine"):
+                events[event.serial, event.purpose] = event
+        moved = [event for event in events.values() if event.serial in serials and event.motion is not None]
+        if not moved:
+            raise ValueError("no motion of these modules is recorded")
+        everybody = tuple(sorted(self._recording.modules))
+        order = [everybody.index(s) for s in serials]
+        return [_columns(self._part(event, everybody), order) for event in moved]
+
+    def _part(self, event: JournalEvent, serials: tuple[str, ...]) -> SensorData:
+        assert event.motion is not None
+        key = (event.serial, event.motion.motion_id, serials)
+        if key not in self._parts:
+            clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
+            margin_s = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+            whole = filtered(window(self._recording, clocks, serials, event, margin_s), CUTOFF_HZ)
+            self._parts[key] = thinned([whole], KEPT_EVERY)
+        return self._parts[key]
+
+
+def _columns(part: SensorData, order: Sequence[int]) -> SensorData:
+    """Return the columns of some modules, in another order."""
+    at = np.array(order)
+    rates = None if part.imu_rates is None else part.imu_rates[:, at]
+    joints = (part.q_rad[:, at], part.qd_rad_s[:, at], part.qdd_rad_s2[:, at])
+    return SensorData(*joints, part.gyro_rad_s[:, at], part.accel_m_s2[:, at], rates)
+
+
+def _refined(
+    found: RobotSoFar, kinds: Sequence[ModuleType], parts: Sequence[SensorData], prior: ImuPrior
+) -> RobotSoFar:
+    """Refine the robot as if it were rigid, and again with links that give under their loads."""
+    data = thinned(parts, FITTED_EVERY)
+    rigid = refine_chain(found.fit.chain, data, prior)
+    loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / KEPT_EVERY), FITTED_EVERY)
+    refined = refine_chain(rigid.chain, data, prior, flex_slopes(rigid.chain, data.joints, loads))
+    length, sigma = link_lengths(refined.chain, refined.covariance)
+    if _is_lost(found, refined):
+        return found
+    fit = found.fit._replace(
+        chain=refined.chain,
+        covariance=refined.covariance,
+        rank=refined.rank,
+        condition=refined.condition,
+        unresolved=name_null_space(refined.chain, refined.null_basis),
+        null_basis=refined.null_basis,
+        link_length_m=length,
+        link_length_sigma_m=sigma,
+    )
+    return found._replace(fit=fit)
+
+
+def _is_lost(found: RobotSoFar, refined: Refinement) -> bool:
+    off = refined.chain.imu_home[:, :3, 3] - found.fit.chain.imu_home[:, :3, 3]
+    return not bool(np.linalg.norm(off, axis=1).max() < LOST_ABOVE_M)

@@ -1,0 +1,132 @@
+"""The batch refinement of a whole robot from its windows: rigid at first, then with what gives in it.
+
+A base that shakes and links that bend are found in turn: each needs a chain that is roughly right.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from coordinator.batch_estimation.base_heading import faced
+from coordinator.batch_estimation.estimator import Refinement, refine_chain
+from coordinator.batch_estimation.imu_intrinsics import DELAY, ImuPrior
+from coordinator.batch_estimation.link_compliance import (
+    FlexSlopes,
+    LinkLoad,
+    flex_slopes,
+    hinge_slopes,
+    joined,
+    loads_of,
+    turns_under,
+    with_hinges_moved,
+)
+from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData
+from coordinator.synchronisation.motion_windows import RATE_HZ, Window, encoder_steps, filtered, thinned
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.perturbation import frozen
+
+# Six times the 2 Hz of the windowed sine, and above the resonance of a base that is worth the name.
+CUTOFF_HZ = 12.0
+# Half the time constant of that low-pass: about as many independent samples as there are.
+KEEP_EVERY = 5
+# IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
+MOST_IMU_SAMPLES = 40_000
+# Before the last step a quarter of them will do.
+COARSE = 4
+
+
+def refine_robot(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    windows: Sequence[Window],
+    prior: ImuPrior,
+    floor: NoiseFloor | None = None,
+) -> Refinement:
+    """Refine a chain that is roughly right by all motions of its joints.
+
+    Args:
+        chain: n joints.
+        kinds: (n,) types of the modules.
+        windows: the motions, columns in the order of the chain.
+        prior: how well the IMUs are known.
+        floor: the noise of the first module's IMU at rest, if that module is bolted to the base by its
+            housing: what it sees beyond is the base's motion. None takes it that the base rests.
+
+    Raises:
+        ValueError: as `refine_chain`.
+    """
+    keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MOST_IMU_SAMPLES))
+    parts = _parts(windows, floor)
+    rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior)
+    # The first IMU may see no motion that would tell how late it is; all are of one make.
+    late_s = float(np.median(rigid.intrinsics.errors[1:, DELAY])) if len(chain.serials) > 1 else 0.0
+    parts = _parts(windows, floor, late_s, encoder_steps(windows))
+    loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
+    giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
+    if not giving.compliance.size:
+        return refine_chain(giving.chain, thinned(parts, keep), prior)._replace(late_s=late_s)
+    # Where the hinges are changes what turns them: once roughly, then for good.
+    coarse = thinned(parts, COARSE * keep)
+    flex = _hinged(giving.chain, coarse, joined(loads, COARSE * keep), giving.compliance)
+    hinged = refine_chain(giving.chain, coarse, prior, flex)
+    links = len(giving.compliance)
+    moved, joints = hinged.compliance[links:], flex.links[:links:2]
+    loads = with_hinges_moved(loads, joints, moved)
+    turns = [turns_under(part, joints, hinged.compliance[:links]) for part in loads]
+    loads = loads_of(hinged.chain, kinds, parts, RATE_HZ, turns)
+    loads = with_hinges_moved(loads, joints, moved)
+    fine = thinned(parts, keep)
+    flex = _hinged(hinged.chain, fine, joined(loads, keep), hinged.compliance[:links], moved)
+    found = refine_chain(hinged.chain, fine, prior, flex)
+    # Of the hinges the last step finds by how much more they are elsewhere.
+    return found._replace(compliance=frozen(found.compliance + flex.taken), late_s=late_s)
+
+
+def _hinged(
+    chain: Chain,
+    data: SensorData,
+    loads: Sequence[LinkLoad | None],
+    compliance: Array,
+    moved: Array | None = None,
+) -> FlexSlopes:
+    flex = flex_slopes(chain, data.smooth, loads)
+    return hinge_slopes(chain, data.smooth, loads, flex, compliance, moved)
+
+
+def _parts(
+    windows: Sequence[Window],
+    floor: NoiseFloor | None,
+    late_s: float = 0.0,
+    step_rad: Array | None = None,
+) -> list[SensorData]:
+    return [filtered(one, CUTOFF_HZ, floor, late_s, step_rad) for one in windows]
+
+
+def _giving(
+    rigid: Refinement,
+    parts: list[SensorData],
+    loads: Sequence[LinkLoad | None],
+    prior: ImuPrior,
+    keep: int,
+) -> tuple[Refinement, list[SensorData]]:
+    """Let links and base give; the base only if the other IMUs feel what the one on it reads.
+
+    They do not where that one is shaken by its own gears.
+    """
+    still = [part._replace(base_motion=None) for part in parts]
+    resting = thinned(still, keep)
+    flex = flex_slopes(rigid.chain, resting.smooth, loads)
+    at_rest = refine_chain(rigid.chain, resting, prior, flex)
+    data = thinned(parts, keep)
+    nobody_else = len(rigid.chain.serials) == 1
+    if data.base_motion is None or not data.base_motion.any() or nobody_else:
+        return at_rest, still
+    shaken = refine_chain(faced(rigid.chain, data, rigid.null_basis), data, prior, flex)
+    return (shaken, parts) if _misfit(shaken) < _misfit(at_rest) else (at_rest, still)
+
+
+def _misfit(fit: Refinement) -> float:
+    """Return the mean logarithm of what an IMU that does not ride on the base scatters about a fit."""
+    residuals = np.concatenate([fit.residual_gyro_rad_s[1:], fit.residual_accel_m_s2[1:]])
+    return float(np.log(residuals).mean())

@@ -1,0 +1,74 @@
+"""What a motion of all joints at once says of who carries whom and of every circle, out of a recording."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from coordinator.kinematics.simultaneous_motion import (
+    StillReading,
+    WholeMotion,
+    WholeResponse,
+    whole_response,
+)
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import Recording
+from coordinator.synchronisation.motion_windows import RATE_HZ, Window, window
+from module_agent.signals.clock_map import ClockMap
+from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
+
+# Six times the fastest sine.
+CUTOFF_HZ = 15.0
+
+
+def whole_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent | None:
+    """Return the latest motion in which all these joints took part at once, as that of the first of them.
+
+    None if not all of them did, or if all were moved one by one as well: those motions tell more clearly.
+    """
+    latest = {e.serial: e for e in recording.motions("whole")}
+    alone = {e.serial for e in recording.motions("windowed_sine")}
+    if all(s in alone for s in serials):
+        return None
+    return latest[serials[0]] if serials and all(s in latest for s in serials) else None
+
+
+def respond(
+    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], event: JournalEvent
+) -> WholeResponse:
+    """Regress what all modules saw on what all joints did; columns in the order of `serials`.
+
+    Raises:
+        ValueError: see `kinematics.whole_motion.whole_response`; also a hole in the recording, or no rest.
+    """
+    margin_s = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+    one = window(recording, clocks, serials, event, margin_s)
+    return whole_response(_filtered(one), _still(recording, serials), RATE_HZ, CUTOFF_HZ)
+
+
+def _filtered(one: Window) -> WholeMotion:
+    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
+    q, gyro, accel = (
+        zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ)
+        for signal in (one.q_rad, one.gyro_rad_s, one.accel_m_s2)
+    )
+    # Velocities from positions, which are not late.
+    qd = differentiate(q, RATE_HZ)
+    return WholeMotion(*(s[edge:-edge] for s in (q, qd, differentiate(qd, RATE_HZ), gyro, accel)))
+
+
+def _still(recording: Recording, serials: Sequence[str]) -> StillReading:
+    events = {
+        e.serial: e.motion
+        for e in recording.journal
+        if e.what == "motion" and e.purpose == "rest" and e.motion is not None and e.motion.end_row
+    }
+    missing = [s for s in serials if s not in events]
+    if missing:
+        raise ValueError(
+            f"no rest of {', '.join(missing)} was recorded: the offsets of its gyro are not known"
+        )
+    rows = [recording.rows(s, events[s].start_row, events[s].end_row or 0) for s in serials]
+    return StillReading(
+        np.array([one["gyro_rad_s"].astype(float).mean(axis=0) for one in rows]),
+        np.array([one["accel_m_s2"].astype(float).mean(axis=0) for one in rows]),
+    )

@@ -1,0 +1,137 @@
+"""Motions of a robot's parts that no observation tells, carried out: how far, is whoever's choice.
+
+Small increments along a null space are straight; a branch that is turned about a joint by half a turn goes
+round. So the motions that have a name are done one after the other, each where the robot stands by then.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from coordinator.kinematics.null_space import Kind, Unresolved, name_null_space
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE, ancestors, descendants
+from module_agent.model.perturbation import adjoint, apply_increment, frozen
+
+# What a wrong orientation counts against a wrong place: the displacement at a usual module's reach.
+REACH_M = 0.3
+# Starts for what may be off by half a turn.
+TURNS_RAD = (0.5 * np.pi, np.pi, 1.5 * np.pi)
+
+
+class FreeMotion(NamedTuple):
+    """What lies beyond `branch` moves as one: along or about the axis of `joint`, or on the base."""
+
+    kind: Kind
+    joint: int
+    branch: int
+
+
+class Settled(NamedTuple):
+    """A chain with the covariance of its increments (6 n, 6 n) and those that it does not know (6 n, k)."""
+
+    chain: Chain
+    covariance: Array
+    null_basis: Array
+
+
+def settled(chain: Chain, covariance: Array, null_basis: Array, reference: Chain) -> Settled:
+    """Return a fitted chain with what it does not know as near as can be to where `reference` has it.
+
+    A fit of many steps drifts along what it does not know, and nothing calls it back.
+    """
+    free = free_motions(chain, name_null_space(chain, null_basis))
+    if not free:
+        return Settled(chain, covariance, null_basis)
+    everybody = range(len(chain.serials))
+    found = moved(chain, free, nearest(chain, free, everybody, reference.imu_home))
+    hidden = carried(chain, found, null_basis)
+    basis, _ = np.linalg.qr(hidden)
+    basis[~hidden.any(axis=1)] = 0.0  # exactly, as the root is exactly known
+    # What is known is what is across the unknown, also in the new place.
+    across = np.eye(len(basis)) - basis @ basis.T
+    half = across @ carried(chain, found, covariance)
+    return Settled(found, frozen(across @ carried(chain, found, half.T)), frozen(basis))
+
+
+def free_motions(chain: Chain, unresolved: Sequence[Unresolved]) -> tuple[FreeMotion, ...]:
+    """Return the unresolved motions as motions of a chain, proximal ones first.
+
+    The chain may be another one of the same modules; what is no motion of it, and what has no name, is left
+    out.
+    """
+    found: list[FreeMotion] = []
+    for item in unresolved:
+        first = chain.serials.index(item.modules[0])
+        path = ancestors(chain, first)
+        if item.kind in ("offset_along_axis", "rotation_about_axis"):
+            joint = chain.serials.index(item.joint)
+            if joint in path[:-1]:
+                found.append(FreeMotion(item.kind, joint, path[path.index(joint) + 1]))
+        elif item.kind in ("position", "rotation_about_gravity") and chain.parent[first] == BASE:
+            found.append(FreeMotion(item.kind, BASE, first))
+    return tuple(sorted(dict.fromkeys(found), key=lambda one: one.branch))
+
+
+def nearest(chain: Chain, free: Sequence[FreeMotion], places: Sequence[int], imu_home: Array) -> Array:
+    """Return the amounts (`moved`) that bring the IMUs of modules `places` nearest to poses (m, 4, 4)."""
+    if not free:
+        return np.zeros(0)
+
+    def misfit(amounts: Array) -> Array:
+        off = moved(chain, free, amounts).imu_home[list(places)] - imu_home
+        return np.concatenate([off[:, :3, 3].ravel(), REACH_M / np.sqrt(2.0) * off[:, :3, :3].ravel()])
+
+    found = least_squares(misfit, _start(misfit, free), xtol=1e-10, ftol=1e-10)
+    return np.asarray(found.x)
+
+
+def moved(chain: Chain, free: Sequence[FreeMotion], amounts: Array) -> Chain:
+    """Return the chain after all free motions: offsets in m, turns in rad; a position has three amounts."""
+    used = 0
+    for one in free:
+        twists = _twists(chain, one)
+        increment = np.zeros((len(chain.serials), 6))
+        increment[list(descendants(chain, one.branch))] = amounts[used : used + len(twists)] @ twists
+        chain = apply_increment(chain, increment.ravel())
+        used += len(twists)
+    return chain
+
+
+def carried(before: Chain, after: Chain, increments: Array) -> Array:
+    """Return increments (6 n, k) of a chain as those of the chain after free motions: the same changes."""
+    motions = after.imu_home @ np.linalg.inv(before.imu_home)
+    blocks = np.asarray(increments).reshape(len(before.serials), 6, -1)
+    return frozen((adjoint(np.asarray(motions)) @ blocks).reshape(np.shape(increments)))
+
+
+def _twists(chain: Chain, one: FreeMotion) -> Array:
+    """Return the twists (k, 6) of a free motion, where the chain stands now."""
+    if one.kind == "position":
+        return frozen(np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1))
+    if one.kind == "rotation_about_gravity":
+        axis, point = chain.gravity / np.linalg.norm(chain.gravity), chain.imu_home[one.branch, :3, 3]
+    else:
+        axis, point = chain.axis[one.joint], chain.point[one.joint]
+    if one.kind == "offset_along_axis":
+        return frozen(np.r_[np.zeros(3), axis][None])
+    return frozen(np.r_[axis, np.cross(point, axis)][None])
+
+
+def _start(misfit: Callable[[Array], Array], free: Sequence[FreeMotion]) -> Array:
+    """Choose where Gauss-Newton begins: a free heading may be off by half a turn, out of its reach."""
+    sizes = [3 if one.kind == "position" else 1 for one in free]
+    start = np.zeros(sum(sizes))
+    best = float(np.sum(misfit(start) ** 2))
+    for place, one in zip(np.cumsum([0, *sizes]), free, strict=False):
+        if not one.kind.startswith("rotation"):
+            continue
+        for angle in TURNS_RAD:
+            trial = start.copy()
+            trial[place] = angle
+            cost = float(np.sum(misfit(trial) ** 2))
+            if cost < best:
+                best, start = cost, trial
+    return start

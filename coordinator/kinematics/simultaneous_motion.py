@@ -1,0 +1,207 @@
+"""Who carries whom, and a first chain, from one motion in which all joints turn at once (thesis 7.2).
+
+Joints that turn at frequencies of their own are told apart by regression. The gyro of IMU k reads
+
+    w_k = sum_i j_ik dq_i/dt + b       over the joints i that carry it, j_ik the axis of joint i in its frame,
+
+and its accelerometer, less gravity as the gyro says that it turned,
+
+    f_k - g_k = sum_i (j_ik x r_ik) d2q_i/dt2 + ...,
+
+so that r_ik = (j_ik x r_ik) x j_ik is the radial vector of the circle that joint i makes it describe (thesis
+eqs 15 to 24 for all joints together). The joints between turn the axes in the IMU's frame by as much as they
+move: that is regressed on to first order; what is of second order stays with the refinement that follows.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coordinator.kinematics.chain_observations import PairObservation
+from coordinator.topology.topology import MotionSeen
+from module_agent.model.chain import Array
+from module_agent.model.perturbation import frozen
+
+MOVED_ABOVE = 0.5
+# What is left of taking the axes as constant, per square of the joints' swing [1 / rad^2]: joints between
+# that turn by s shorten what is across them by s^2 / 2, so that an axis at 45 degrees to theirs tilts by
+# s^2 / 4.
+TILT_PER_SWING2 = 0.25
+# What is left in a radius of the other joints' motion: a share of the longest radius that the IMU turns at,
+# and the least of it. On random robots of six joints with links of 0.3 m it is 6 cm rms of up to 1 m.
+CROSSTALK_SHARE = 0.15
+RADIUS_FLOOR_M = 0.01
+# A joint that turns less than this (rms) hardly says who moves with it: gyros err by some mrad/s.
+LEAST_RATE_RAD_S = 0.005
+
+
+class WholeMotion(NamedTuple):
+    """Uniform samples of n joints (m, n) and their IMUs (m, n, 3), in their frames, through one low-pass."""
+
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+    gyro_rad_s: Array
+    accel_m_s2: Array
+
+
+class StillReading(NamedTuple):
+    """Means of all IMUs at rest, where the motion begins: rates and specific forces (n, 3)."""
+
+    gyro_rad_s: Array
+    force_m_s2: Array
+
+
+class WholeResponse(NamedTuple):
+    """What IMU k answers to joint i: arrays (n joints, n IMUs, ...), in the IMU's frame, read-only.
+
+    axis: (n, n, 3) of the gyro to the joint's rate: the axis if it is carried, else about zero.
+    tangential_m: (n, n, 3) of the specific force to the joint's acceleration, j x r.
+    sigma_axis, sigma_tangential_m: (n, n) one standard deviation of each component, from the scatter.
+    swing2_rad2: (n,) mean square of the joints' motion about its mean. q_mean_rad: (n,).
+    """
+
+    axis: Array
+    tangential_m: Array
+    sigma_axis: Array
+    sigma_tangential_m: Array
+    swing2_rad2: Array
+    q_mean_rad: Array
+
+    def moved(self, joint: int, observer: int) -> bool:
+        """Return whether the observer's IMU is carried by the joint."""
+        return float(np.linalg.norm(self.axis[joint, observer])) > MOVED_ABOVE
+
+
+def whole_response(
+    data: WholeMotion, still: StillReading, rate_hz: float, bandwidth_hz: float
+) -> WholeResponse:
+    """Regress all IMUs on the motion of all joints.
+
+    Args:
+        data: samples at `rate_hz` that begin where `still` was read.
+        still: the IMUs at rest.
+        rate_hz: of the samples.
+        bandwidth_hz: of their low-pass; there are 2 bandwidth / rate as many independent samples.
+
+    Raises:
+        ValueError: a joint hardly turned, or two joints cannot be told apart, with their columns.
+    """
+    _check_told_apart(data.qd_rad_s)
+    independent = min(1.0, 2.0 * bandwidth_hz / rate_hz)
+    samples, count = data.q_rad.shape
+    gyro = data.gyro_rad_s - still.gyro_rad_s
+    swing = data.q_rad - data.q_rad.mean(axis=0)
+    tilted = _tilted(swing, data.qd_rad_s)
+    axis, sigma_axis = _regressed(
+        np.column_stack([data.qd_rad_s, np.ones(samples), tilted]), gyro, independent
+    )
+    force = data.accel_m_s2 - _gravity(gyro, still.force_m_s2, rate_hz)
+    terms = [data.qdd_rad_s2, swing, np.ones(samples), _products(data.qd_rad_s)]
+    tangential, sigma_tangential = _regressed(np.column_stack(terms), force, independent)
+    return WholeResponse(
+        frozen(axis[:count]),
+        frozen(tangential[:count]),
+        frozen(sigma_axis[:count]),
+        frozen(sigma_tangential[:count]),
+        frozen(np.mean(swing**2, axis=0)),
+        frozen(data.q_rad.mean(axis=0)),
+    )
+
+
+def seen_by_all(serials: Sequence[str], response: WholeResponse) -> dict[tuple[str, str], MotionSeen]:
+    """Return who moved with whom, {(joint, observer): MotionSeen}, the columns named by `serials`."""
+    seen: dict[tuple[str, str], MotionSeen] = {}
+    for i, joint in enumerate(serials):
+        for k, observer in enumerate(serials):
+            size = float(np.linalg.norm(response.axis[i, k]))
+            moved = response.moved(i, k)
+            seen[joint, observer] = MotionSeen(moved, size, response.axis[i, k] / size if moved else None)
+    return seen
+
+
+def circles_of_all(serials: Sequence[str], response: WholeResponse) -> list[PairObservation]:
+    """Return the circle of every joint in every other IMU that it carries; `serials` name the columns."""
+    tilt = TILT_PER_SWING2 * float(response.swing2_rad2.sum())
+    return [
+        _circle(serials[i], serials[k], response, i, k, tilt)
+        for i in range(len(serials))
+        for k in range(len(serials))
+        if i != k and response.moved(i, k)
+    ]
+
+
+def _circle(
+    joint: str, observer: str, response: WholeResponse, i: int, k: int, tilt: float
+) -> PairObservation:
+    axis = response.axis[i, k] / np.linalg.norm(response.axis[i, k])
+    radial = np.cross(response.tangential_m[i, k], axis)
+    longest = max(
+        float(np.linalg.norm(response.tangential_m[other, k]))
+        for other in range(len(response.axis))
+        if response.moved(other, k)
+    )
+    floor = np.hypot(RADIUS_FLOOR_M, CROSSTALK_SHARE * longest)
+    return PairObservation(
+        joint,
+        observer,
+        axis,
+        radial,
+        float(np.hypot(response.sigma_axis[i, k], tilt)),
+        float(np.hypot(response.sigma_tangential_m[i, k], floor)),
+        response.q_mean_rad,
+    )
+
+
+def _check_told_apart(qd_rad_s: Array) -> None:
+    size = np.sqrt(np.mean(qd_rad_s**2, axis=0))
+    if size.min() < LEAST_RATE_RAD_S:
+        raise ValueError(
+            f"the joint in column {int(size.argmin())} turned at only {size.min():.2g} rad/s rms while all "
+            f"moved; {LEAST_RATE_RAD_S} are needed"
+        )
+    alike = np.abs(qd_rad_s.T @ qd_rad_s) / len(qd_rad_s) / np.outer(size, size) - np.eye(len(size))
+    if alike.max() > 0.9:
+        i, k = np.unravel_index(int(alike.argmax()), alike.shape)
+        raise ValueError(
+            f"the joints in columns {i} and {k} moved alike (correlation {alike.max():.2f}): give them "
+            "frequencies of their own"
+        )
+
+
+def _regressed(terms: Array, signals: Array, independent: float) -> tuple[Array, Array]:
+    """Return coefficients (p, n, 3) of signals (m, n, 3) on terms (m, p), and their sigmas (p, n)."""
+    samples, count, _ = signals.shape
+    scale = np.maximum(np.sqrt(np.mean(terms**2, axis=0)), np.finfo(float).tiny)
+    found, *_ = np.linalg.lstsq(terms / scale, signals.reshape(samples, -1), rcond=1e-10)
+    residual = signals.reshape(samples, -1) - (terms / scale) @ found
+    scatter = np.sqrt(np.mean(residual.reshape(samples, count, 3) ** 2, axis=(0, 2)) / independent)
+    spread = np.sqrt(np.diag(np.linalg.pinv((terms / scale).T @ (terms / scale))))
+    coefficients = (found / scale[:, None]).reshape(len(scale), count, 3)
+    return coefficients, np.outer(spread / scale, scatter)
+
+
+def _products(qd_rad_s: Array) -> Array:
+    """Return all products of two rates: what centripetal and Coriolis accelerations are made of."""
+    first, second = np.triu_indices(qd_rad_s.shape[1])
+    return np.asarray(qd_rad_s[:, first] * qd_rad_s[:, second])
+
+
+def _tilted(swing_rad: Array, qd_rad_s: Array) -> Array:
+    """Return all products of a joint's place and another's rate: the one tilts the other's axis."""
+    first, second = np.nonzero(~np.eye(swing_rad.shape[1], dtype=bool))
+    return np.asarray(swing_rad[:, first] * qd_rad_s[:, second])
+
+
+def _gravity(gyro_rad_s: Array, force_m_s2: Array, rate_hz: float) -> Array:
+    """Return the specific force of rest (m, n, 3) as every IMU sees it after what its gyro has turned."""
+    samples, count, _ = gyro_rad_s.shape
+    between = 0.5 * (gyro_rad_s[1:] + gyro_rad_s[:-1]) / rate_hz
+    steps = Rotation.from_rotvec(-between.reshape(-1, 3)).as_matrix().reshape(samples - 1, count, 3, 3)
+    found = np.empty((samples, count, 3))
+    found[0] = force_m_s2
+    for row, step in enumerate(steps):
+        found[row + 1] = np.einsum("nij,nj->ni", step, found[row])
+    return found

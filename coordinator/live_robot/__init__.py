@@ -1,0 +1,1 @@
+"""One connected robot: discovery, commands, replies, missing rows."""

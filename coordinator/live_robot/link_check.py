@@ -1,0 +1,72 @@
+"""Whether the network to a robot can carry a session: measured before anything moves."""
+
+import asyncio
+from collections.abc import Callable
+
+import numpy as np
+
+from coordinator.live_robot.errors import UnfitLink
+from coordinator.live_robot.messenger import Clock, together
+from coordinator.live_robot.module_group import RobotLink
+
+# Of the round trips so many must take at most half a command's life: the keep-alives between them, several to
+# a life, bridge the rest.
+FIT_FRACTION = 0.8
+# Looks, each as long as the plan says: a second of a poor network may be its worst.
+LOOKS = 3
+BETWEEN_S = 0.03
+
+
+async def check_link(link: RobotLink, clock: Clock, seconds: float, note: Callable[[str], None]) -> None:
+    """Measure rates and round trips of all modules and note them.
+
+    Raises:
+        UnfitLink: a module's feedback does not come through, or commands would be too old on arrival; said
+        after as many looks as `LOOKS`.
+    """
+    before = {serial: link.module(serial).rows.end_row for serial in link.serials}
+    start_ns = clock()
+    for look in range(1, LOOKS + 1):
+        end_ns = start_ns + look * int(seconds * 1e9)
+        await together(_ask_until(link, serial, clock, end_ns) for serial in link.serials)
+        span_s = (clock() - start_ns) / 1e9
+        rates = {s: (link.module(s).rows.end_row - before[s]) / span_s for s in link.serials}
+        faults = [fault for s in link.serials if (fault := _fault(link, s, rates[s]))]
+        if not faults:
+            break
+    for serial in link.serials:
+        note(_words(link, serial, rates[serial]))
+    if faults:
+        raise UnfitLink(faults[0])
+
+
+async def _ask_until(link: RobotLink, serial: str, clock: Clock, end_ns: int) -> None:
+    while clock() < end_ns:
+        await link.ask_status(serial)
+        await asyncio.sleep(BETWEEN_S)
+
+
+def _trips_ms(link: RobotLink, serial: str) -> list[float]:
+    return [(trip.received_ns - trip.sent_ns) / 1e6 for trip in link.module(serial).round_trips]
+
+
+def _words(link: RobotLink, serial: str, rate: float) -> str:
+    median, most = (float(np.percentile(_trips_ms(link, serial), share)) for share in (50, 95))
+    kind = link.info(serial).module_type
+    return f"{serial} ({kind}): {rate:.0f} rows/s, round trip {median:.2f} ms, 95 % {most:.2f} ms"
+
+
+def _fault(link: RobotLink, serial: str, rate: float) -> str:
+    info = link.info(serial)
+    if rate < 0.5 * info.feedback_rate_hz:
+        return (
+            f"unfit: module {serial} delivers {rate:.0f} rows/s of {info.feedback_rate_hz:.0f}; "
+            "check the network and the load of its machine"
+        )
+    slow_ms, life_ms = np.percentile(_trips_ms(link, serial), 100.0 * FIT_FRACTION), info.lifetime_ns / 1e6
+    if slow_ms > 0.5 * life_ms:
+        return (
+            f"unfit: of the round trips to module {serial} one in five takes more than {slow_ms:.0f} ms, "
+            f"commands live {life_ms:.0f} ms; check the network"
+        )
+    return ""

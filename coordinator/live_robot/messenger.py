@@ -1,0 +1,168 @@
+"""The coordinator's clock: an argument, so that the same code runs in real and in virtual time.
+
+The coordinator's asyncio face of a transport; all that is heard and said passes through `record`.
+
+Several things done at once, all to their end.
+"""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Iterable
+
+from coordinator.recording.recording import Entry
+from module_agent.transport.inbox import Inbox
+from module_agent.transport.transport import CLOSED, Event, Liveness, Reply, Sample, Transport, Undeclare
+from module_agent.wire.codec import encode
+from module_agent.wire.keys import Leaf, every, key, parse
+from module_agent.wire.messages import Ack, Message
+
+Clock = Callable[[], int]
+"""Returns session time in integer nanoseconds; it never goes back."""
+
+
+Post = Callable[[Callable[[], None]], object]
+Record = Callable[[Entry], Message | None]
+
+
+class NoAnswer(TimeoutError):
+    """A module did not answer; the message says which, on what, and why."""
+
+    def __init__(self, serial: str, leaf: Leaf, why: str):
+        super().__init__(f"module {serial} did not answer on {leaf.value}: {why or 'no reply'}")
+        self.serial = serial
+
+
+class Refused(RuntimeError):
+    """A module refused a command; the message names the reason."""
+
+    def __init__(self, serial: str, leaf: Leaf, ack: Ack):
+        super().__init__(f"module {serial} refused {leaf.value}: {ack.reason}: {ack.detail}")
+        self.serial = serial
+        self.ack = ack
+
+
+class Radio:
+    """Publishes, asks and listens for the coordinator.
+
+    `post` runs a function on the event loop from any thread (`call_soon_threadsafe` in real time).
+    """
+
+    def __init__(self, transport: Transport, robot: str, clock: Clock, post: Post, record: Record):
+        self.robot = robot
+        self.alive: set[str] = set()
+        self._transport = transport
+        self._clock = clock
+        self._post = post
+        self._record = record
+        self._inbox = Inbox(capacity=100_000)
+        self._draining = False
+        self._closed = False
+        self._pending: dict[int, asyncio.Future[Reply]] = {}
+        self._declared: list[Undeclare] = []
+        self._tag = 0
+        self._seq = 0
+
+    @property
+    def dropped(self) -> int:
+        """Events lost because the loop did not keep up."""
+        return self._inbox.dropped
+
+    def start(self) -> None:
+        """Begin to listen."""
+        for leaf in (Leaf.FEEDBACK, Leaf.STATUS, Leaf.ESTIMATE):
+            self._declared.append(self._transport.subscribe(every(self.robot, leaf), self._sink))
+        self._declared.append(self._transport.watch_alive(every(self.robot, Leaf.ALIVE), self._sink))
+
+    def next_seq(self) -> int:
+        """Return a sequence number larger than all before."""
+        self._seq += 1
+        return self._seq
+
+    def _sink(self, event: Event) -> None:
+        self._inbox.put(event)
+        if not self._draining:
+            self._draining = True
+            self._post(self._drain)
+
+    def _drain(self) -> None:
+        self._draining = False
+        # A few at a time: after a stall the keep-alives that are due must not wait for all that has piled up.
+        for event in self._inbox.drain(limit=32):
+            self._hear(event)
+        if len(self._inbox) and not self._draining:
+            self._draining = True
+            self._post(self._drain)
+
+    def _hear(self, event: Event) -> None:
+        if self._closed:
+            # A recording that is closed must not change any more; whoever still waits is let go.
+            if isinstance(event, Reply):
+                self._answer(event._replace(payload=None, error=CLOSED))
+        elif isinstance(event, Sample):
+            self._record(Entry("publication", event.key, self._clock(), event.payload))
+        elif isinstance(event, Liveness):
+            serial = parse(event.key).serial
+            (self.alive.add if event.alive else self.alive.discard)(serial)
+        elif isinstance(event, Reply):
+            self._answer(event)
+
+    def _answer(self, reply: Reply) -> None:
+        future = self._pending.pop(reply.tag, None)
+        if future is not None and not future.done():
+            future.set_result(reply)
+
+    def publish(self, serial: str, leaf: Leaf, message: Message) -> None:
+        """Publish on a module's key."""
+        self._transport.publish(key(self.robot, serial, leaf), encode(message))
+
+    async def ask(self, serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Message:
+        """Ask a module and return its answer, which may be a refusal.
+
+        Raises:
+            NoAnswer: nobody answered within the time, or the answer could not be read.
+        """
+        topic, payload = key(self.robot, serial, leaf), encode(message)
+        self._tag += 1
+        tag = self._tag
+        future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        self._pending[tag] = future
+        self._record(Entry("request", topic, self._clock(), payload))
+        self._transport.query(topic, payload, timeout_s, self._sink, tag)
+        try:
+            reply = await future
+        finally:
+            self._pending.pop(tag, None)
+        if reply.payload is None:
+            raise NoAnswer(serial, leaf, reply.error)
+        answer = self._record(Entry("reply", topic, self._clock(), reply.payload))
+        if answer is None:
+            raise NoAnswer(serial, leaf, "its answer could not be read")
+        return answer
+
+    async def command(self, serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+        """Ask for something to be done.
+
+        Raises:
+            Refused: the module said no.
+            NoAnswer: it said nothing.
+        """
+        answer = await self.ask(serial, leaf, message, timeout_s)
+        if not isinstance(answer, Ack):
+            raise NoAnswer(serial, leaf, f"its answer is {type(answer).__name__}, not Ack")
+        if not answer.accepted:
+            raise Refused(serial, leaf, answer)
+        return answer
+
+    def close(self) -> None:
+        """Stop listening and leave the network; what has arrived and is not recorded yet never will be."""
+        self._closed = True
+        for declared in reversed(self._declared):
+            declared.undeclare()
+        self._declared.clear()
+        self._transport.close()
+
+
+async def together(work: Iterable[Coroutine[None, None, object]]) -> None:
+    """Do all of it at once, all to its end; raise what the first of those that failed raised."""
+    for outcome in await asyncio.gather(*work, return_exceptions=True):
+        if isinstance(outcome, BaseException):
+            raise outcome

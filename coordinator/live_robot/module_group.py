@@ -1,0 +1,481 @@
+"""The coordinator's hold on all modules of a robot: leases, keep-alives, motions, complete recordings."""
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable, Container, Coroutine, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple, TypeVar
+
+from coordinator.live_robot.backfill import RowCompletion
+from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, RobotStopped
+from coordinator.live_robot.messenger import Clock, NoAnswer, Radio, Refused, together
+from coordinator.recording.recording import ModuleRecord, Recording
+from module_agent.control.waveform import duration_s
+from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import (
+    Ack,
+    Ask,
+    EffortProfile,
+    Estimate,
+    EstimateRequest,
+    GainsCommand,
+    GainSet,
+    HistoryRequest,
+    Info,
+    LeaseRequest,
+    MotionCommand,
+    MotionRecord,
+    Pattern,
+    Setpoint,
+    Status,
+    Stop,
+)
+from module_agent.wire.refusal import Refusal
+
+POLL_S = 0.02
+# Four keep-alives within the default lifetime of 250 ms.
+KEEP_ALIVE_S = 0.06
+# A renewal that takes longer, or is lost, says for a while that the network is poor.
+LATE_NS = 100_000_000
+POOR_NS = 10_000_000_000
+LEASE_NS = 1_000_000_000
+ATTEMPTS = 8
+SILENT_NS = 1_000_000_000
+TOKEN_GONE_NS = 300_000_000
+# Refusals that the next attempt can mend: it carries a newer echo and a newer sequence number.
+PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
+# Refusals of a motion that arming again mends. SEQUENCE that does not pass says that the motion has ended
+# already: it had begun, the answer was lost, and so were the keep-alives.
+UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.value)
+
+T = TypeVar("T")
+
+
+class _Started(NamedTuple):
+    """A motion that a module has been told to begin."""
+
+    number: int
+    pattern: Pattern
+    effort: EffortProfile | None
+
+
+class RobotLink:
+    """Commands to the modules of one robot under this sender's leases."""
+
+    def __init__(self, radio: Radio, recording: Recording, clock: Clock, sender: str):
+        self.serials: tuple[str, ...] = ()
+        self.sender = sender
+        self._radio = radio
+        self._recording = recording
+        self._clock = clock
+        self._tokens: dict[str, int] = {}
+        self._boots: dict[str, int] = {}
+        self._armed_ns: dict[str, int] = {}
+        self._rows: dict[str, RowCompletion] = {}
+        self._last_id = 0
+        self._renewals: set[asyncio.Task[None]] = set()
+        self._taken_by: dict[str, str] = {}
+        self._running: dict[str, _Started] = {}
+        self._poor_until_ns = 0
+
+    # ------------------------------------------------------------------ knowing them
+
+    def module(self, serial: str) -> ModuleRecord:
+        """Return what is recorded of a module."""
+        return self._recording.modules[serial]
+
+    def kind(self, serial: str) -> ModuleType:
+        """Return the catalogue entry of a module.
+
+        Raises:
+            KeyError: the catalogue does not know what the module says it is.
+        """
+        return module_type(self.info(serial).module_type)
+
+    def info(self, serial: str) -> Info:
+        """Return what a module says it is."""
+        info = self.module(serial).info
+        if info is None:
+            raise NoAnswer(serial, Leaf.INFO, "it has not told its type")
+        return info
+
+    async def meet(self, serials: Sequence[str]) -> None:
+        """Ask every module who it is, and remember its boot."""
+        for serial in serials:
+            info = await self._ask_info(serial)
+            if not isinstance(info, Info):
+                raise NoAnswer(serial, Leaf.INFO, f"its answer is {type(info).__name__}")
+            self._boots[serial] = info.boot
+            log = self.module(serial).rows
+            self._rows[serial] = RowCompletion(log, partial(self._fetch, serial))
+        self.serials = tuple(serials)
+
+    async def _ask_info(self, serial: str) -> object:
+        return await self._persist(serial, lambda: self._ask(serial, Leaf.INFO))
+
+    async def ask_status(self, serial: str) -> Status:
+        """Return the present status of a module; also one round trip for its clock."""
+        status = await self._persist(serial, lambda: self._ask(serial, Leaf.STATUS))
+        if not isinstance(status, Status):
+            raise NoAnswer(serial, Leaf.STATUS, f"its answer is {type(status).__name__}")
+        return status
+
+    async def _ask(self, serial: str, leaf: Leaf) -> object:
+        ask = Ask(serial=serial, boot=0, seq=self._radio.next_seq(), sender=self.sender)
+        return await self._radio.ask(serial, leaf, ask)
+
+    async def _persist(self, serial: str, attempt: Callable[[], Awaitable[T]]) -> T:
+        """Try until answered; a network may lose questions and answers."""
+        for left in reversed(range(ATTEMPTS)):
+            try:
+                return await attempt()
+            except NoAnswer:
+                self.check()
+                if not left:
+                    raise
+            except Refused as refused:
+                if refused.ack.reason not in PASSING or not left:
+                    raise
+                # The echo is renewed by the next feedback.
+                await asyncio.sleep(POLL_S)
+        raise AssertionError("unreachable")
+
+    def check(self) -> None:
+        """Check that every module is still there.
+
+        Raises:
+            ModuleLost: a module's token is gone, it is silent, it booted anew, or somebody took its lease.
+            RobotStopped: somebody has stopped a module that this sender holds.
+        """
+        now = self._clock()
+        for serial in self.serials:
+            record = self.module(serial)
+            if record.boot != self._boots[serial]:
+                raise ModuleLost(serial, "it has booted anew")
+            heard = record.arrivals[-1][0] if record.arrivals else now
+            if serial not in self._radio.alive and now - heard > TOKEN_GONE_NS:
+                raise ModuleLost(serial, "its agent has left the network")
+            if record.arrivals and now - heard > SILENT_NS:
+                raise ModuleLost(serial, f"no feedback for {(now - heard) / 1e9:.1f} s")
+            if serial in self._taken_by:
+                raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
+            status = record.status
+            # A status from before the lease was taken tells of an earlier stop.
+            fresh = status is not None and serial in self._tokens and status.t_ns > self._armed_ns[serial]
+            if fresh and status is not None and status.state == "stopped":
+                raise RobotStopped(serial, status.note)
+
+    async def check_now(self) -> None:
+        """Ask every module how it is, then `check`; a status may not have arrived yet."""
+        for serial in self.serials:
+            await self.ask_status(serial)
+        self.check()
+
+    async def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until a condition holds; False when the time is up.
+
+        Raises:
+            ModuleLost: see `check`.
+        """
+        end = self._clock() + int(timeout_s * 1e9)
+        while not condition():
+            self.check()
+            if self._clock() >= end:
+                return False
+            await asyncio.sleep(POLL_S)
+        return True
+
+    @property
+    def is_poor(self) -> bool:
+        """Whether of late the network was slow with renewals, or lost some."""
+        return self._clock() < self._poor_until_ns
+
+    # ------------------------------------------------------------------ leases
+
+    async def acquire(self, serial: str) -> None:
+        """Take the lease of a module and arm it.
+
+        Raises:
+            Refused: somebody else holds it; the message names the holder and the time left.
+        """
+
+        async def attempt() -> Ack:
+            return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "acquire"))
+
+        self._running.pop(serial, None)
+        ack = await self._persist(serial, attempt)
+        self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
+        # Its life counts from what was known before the question: on a slow network little of it is left.
+        self._send(self._renew(serial))
+
+    def _lease(self, serial: str, action: str) -> LeaseRequest:
+        return LeaseRequest.model_validate({**self._head(serial), "action": action, "duration_ns": LEASE_NS})
+
+    def _head(self, serial: str) -> dict[str, object]:
+        """Return what every command carries."""
+        return {
+            "serial": serial,
+            "boot": self._boots[serial],
+            "seq": self._radio.next_seq(),
+            "sender": self.sender,
+            "token": self._tokens.get(serial, 0),
+            "echo_ns": self.module(serial).newest_ns,
+        }
+
+    async def keep_alive(self) -> None:
+        """Renew all leases until cancelled; a late answer does not hold up the next renewal.
+
+        While renewals come late or not at all, the modules' motions are told again in between, which says as
+        much as a renewal does. Messages on one key keep their order, so that one that is held up holds up
+        all behind it; on two keys that seldom happens at the same time.
+        """
+        while True:
+            self.renew()
+            await asyncio.sleep(0.5 * KEEP_ALIVE_S)
+            if self.is_poor:
+                for serial in list(self._tokens):
+                    again = self._repeat if serial in self._running else self._renew
+                    self._send(again(serial))
+            await asyncio.sleep(0.5 * KEEP_ALIVE_S)
+
+    def renew(self) -> None:
+        """Renew all leases once; whoever commands without `keep_alive` does so every `KEEP_ALIVE_S`."""
+        for serial in list(self._tokens):
+            self._send(self._renew(serial))
+
+    def _send(self, work: Coroutine[None, None, None]) -> None:
+        task = asyncio.create_task(work)
+        self._renewals.add(task)
+        task.add_done_callback(self._renewals.discard)
+
+    async def _renew(self, serial: str) -> None:
+        sent_ns = self._clock()
+        try:
+            await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
+        except NoAnswer:
+            pass  # lost on the way; the next one follows, and silence is noticed by `check`
+        except Refused as refused:
+            if refused.ack.reason == Refusal.HELD.value:
+                self._taken_by[serial] = refused.ack.detail
+        if self._clock() - sent_ns > LATE_NS:
+            self._poor_until_ns = self._clock() + POOR_NS
+
+    async def _repeat(self, serial: str) -> None:
+        """Tell a module again of its latest motion; it begins no motion twice."""
+        running = self._running.get(serial)
+        if running is None:
+            return
+        motion = self._motion(serial, running)
+        # Lost or refused: the next renewal follows.
+        with contextlib.suppress(NoAnswer, Refused):
+            await self._radio.command(serial, Leaf.MOTION, motion, timeout_s=0.3)
+
+    async def release_all(self) -> None:
+        """Let go of all modules; their motors are off then."""
+        await asyncio.gather(*(self._release(serial) for serial in list(self._tokens)))
+
+    async def _release(self, serial: str) -> None:
+        async def attempt() -> Ack:
+            return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "release"))
+
+        try:
+            await self._persist(serial, attempt)
+        except Refused as refused:
+            # The first answer may have been lost: then there is nothing left to release.
+            if refused.ack.reason not in (Refusal.NO_LEASE.value, Refusal.HELD.value):
+                raise
+        self._tokens.pop(serial, None)
+
+    async def stop_all(self, why: str) -> list[str]:
+        """Tell every module that this sender holds to stop; return the serials that did not confirm."""
+        # A module that another coordinator holds is its business.
+        held = [serial for serial in self._tokens if serial not in self._taken_by]
+        self._tokens.clear()
+        done = await asyncio.gather(*(self._stop(serial, why) for serial in held), return_exceptions=True)
+        return [s for s, r in zip(held, done, strict=True) if isinstance(r, BaseException)]
+
+    async def _stop(self, serial: str, why: str) -> None:
+        for left in reversed(range(3)):
+            stop = Stop(serial=serial, boot=0, seq=self._radio.next_seq(), sender=self.sender, why=why)
+            try:
+                await self._radio.command(serial, Leaf.STOP, stop, timeout_s=0.3)
+                return
+            except NoAnswer:
+                if not left:
+                    raise
+
+    # ------------------------------------------------------------------ motions
+
+    async def set_gains(self, serial: str, gains: GainSet) -> None:
+        """Replace a module's gains."""
+
+        async def attempt() -> Ack:
+            command = GainsCommand.model_validate({**self._head(serial), "gains": gains})
+            return await self._radio.command(serial, Leaf.GAINS, command)
+
+        await self._persist(serial, attempt)
+
+    def stream(
+        self,
+        serial: str,
+        position_rad: float | None,
+        velocity_rad_s: float | None,
+        effort_nm: float | None,
+    ) -> None:
+        """Send one set-point, which nobody answers; what is None switches its loop off."""
+        point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
+        self._radio.publish(serial, Leaf.SETPOINT, Setpoint.model_validate({**self._head(serial), **point}))
+
+    def _next_id(self) -> int:
+        # Numbers grow over coordinators too, so that a new one does not repeat an old one's.
+        clock_ms = self._clock() // 1_000_000 & 0x3FFFFFFF
+        self._last_id = max(self._last_id + 1, clock_ms)
+        return self._last_id
+
+    async def run(
+        self, patterns: Mapping[str, Pattern], efforts: Mapping[str, EffortProfile] | None = None
+    ) -> dict[str, MotionRecord]:
+        """Run one motion on each of the given modules at the same time; return how they went.
+
+        `efforts` are fed forward along the motions of the modules that they name; the effort loops of the
+        others are off.
+
+        Raises:
+            KeyError: efforts of a module that has no motion.
+            MotionInterrupted: one of them expired or was stopped, or another module that this sender holds
+            expired meanwhile and let go of its joint.
+            ModuleLost: see `check`.
+        """
+        fed = efforts or {}
+        if idle := [serial for serial in fed if serial not in patterns]:
+            raise KeyError(
+                f"efforts for {idle[0]}, which has no motion; of those that have one: {', '.join(patterns)}"
+            )
+        started = {s: _Started(self._next_id(), pattern, fed.get(s)) for s, pattern in patterns.items()}
+        numbers = {serial: motion.number for serial, motion in started.items()}
+        await together(self._start(serial, motion) for serial, motion in started.items())
+        longest = max(duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items())
+        ended = await self.wait(
+            lambda: (
+                all(self._ended(serial, number) for serial, number in numbers.items())
+                or self._limp(numbers) is not None
+            ),
+            longest + 3.0,
+        )
+        if self.is_poor:
+            # What is to tell of a module that let go may itself be lost.
+            await together(self.ask_status(serial) for serial in self._tokens)
+        limp = self._limp(numbers)
+        if limp is not None:
+            raise MotionInterrupted(next(iter(patterns)), f"spoilt: module {limp} expired and let go")
+        records: dict[str, MotionRecord] = {}
+        for serial, number in numbers.items():
+            status = self.module(serial).status if ended else await self.ask_status(serial)
+            motion = status.motion if status is not None else None
+            if motion is None or motion.motion_id != number or motion.outcome != "done":
+                raise MotionInterrupted(serial, motion.outcome if motion is not None else "lost")
+            records[serial] = motion
+        return records
+
+    def _limp(self, moved: Container[str]) -> str | None:
+        """Return a module that should have held still meanwhile and has expired."""
+        for serial in self._tokens:
+            status = self.module(serial).status
+            fresh = status is not None and status.t_ns > self._armed_ns[serial]
+            if serial not in moved and fresh and status is not None and status.state == "expired":
+                return serial
+        return None
+
+    def _origin(self, serial: str) -> float:
+        status = self.module(serial).status
+        return status.motion.origin_rad if status is not None and status.motion is not None else 0.0
+
+    def _ended(self, serial: str, number: int) -> bool:
+        status = self.module(serial).status
+        if status is None:
+            return False
+        motion = status.motion
+        if motion is None or motion.motion_id != number:
+            return status.state in ("expired", "stopped", "fault", "idle")
+        return motion.outcome != "running"
+
+    def _motion(self, serial: str, motion: _Started) -> MotionCommand:
+        what = {"motion_id": motion.number, "pattern": motion.pattern, "effort": motion.effort}
+        return MotionCommand.model_validate({**self._head(serial), **what})
+
+    async def _start(self, serial: str, motion: _Started) -> None:
+        async def attempt() -> Ack:
+            return await self._radio.command(serial, Leaf.MOTION, self._motion(serial, motion))
+
+        self._running.pop(serial, None)
+        try:
+            await self._persist(serial, attempt)
+            self._running[serial] = motion
+        except Refused as refused:
+            if refused.ack.reason in UNSTARTED:
+                raise MotionInterrupted(serial, f"refused: {refused.ack.detail}") from refused
+            raise
+
+    # ------------------------------------------------------------------ recordings
+
+    async def complete_rows(self) -> None:
+        """Fetch whatever feedback rows the network has dropped, of every module, up to now."""
+        await together(self._complete_now(serial) for serial in self.serials)
+
+    async def _complete_now(self, serial: str) -> None:
+        status = await self.ask_status(serial)
+        await self._rows[serial].complete(status.next_row)
+
+    async def close_gaps(self) -> None:
+        """Fetch what is missing before the newest row of every module that has arrived.
+
+        Nothing is missing on return, and while the caller does not give way to the event loop.
+        """
+        for _ in range(ATTEMPTS):
+            ends = {serial: self.module(serial).rows.end_row for serial in self.serials}
+            gaps = [serial for serial, end in ends.items() if self._rows[serial].has_gap(end)]
+            if not gaps:
+                return
+            await together(self._rows[serial].complete(ends[serial]) for serial in gaps)
+
+    async def _fetch(self, serial: str, first: int, end: int) -> None:
+        """Ask for rows until they, or a refusal, have come."""
+        await self._persist(serial, lambda: self._ask_history(serial, first, end))
+
+    async def _ask_history(self, serial: str, first: int, end: int) -> object:
+        request = HistoryRequest(
+            serial=serial,
+            boot=self._boots[serial],
+            seq=self._radio.next_seq(),
+            sender=self.sender,
+            first_row=first,
+            end_row=end,
+        )
+        answer = await self._radio.ask(serial, Leaf.HISTORY, request)
+        if isinstance(answer, Ack):
+            raise Refused(serial, Leaf.HISTORY, answer)
+        return answer
+
+    async def estimate(self, observer: str, joint: str, motion_id: int, timeout_s: float) -> Estimate | None:
+        """Wait for what `observer` makes of a motion, and ask if it was lost; None if there is none."""
+
+        def found() -> Estimate | None:
+            for ids, estimate in self._recording.estimates.get((joint, observer), {}).items():
+                if motion_id in ids:
+                    return estimate
+            return None
+
+        if await self.wait(lambda: found() is not None, timeout_s):
+            return found()
+        for _ in range(ATTEMPTS):
+            request = EstimateRequest(
+                serial=observer, boot=0, seq=self._radio.next_seq(), sender=self.sender, joint=joint
+            )
+            try:
+                await self._radio.ask(observer, Leaf.ESTIMATE, request)
+            except NoAnswer:
+                self.check()
+            if await self.wait(lambda: found() is not None, 0.3):
+                break
+        return found()

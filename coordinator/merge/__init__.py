@@ -1,0 +1,1 @@
+"""Combining the information of several runs about the same modules."""

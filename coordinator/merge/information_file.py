@@ -1,0 +1,139 @@
+"""`information.npz`: what a run's torques say, with the chain that it was computed with; versioned."""
+
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from module_agent.model.chain import Array, Chain
+from module_agent.model.information import JointInformation
+
+VERSION = 2
+
+
+class RunInformation(NamedTuple):
+    """The information in the torques of one run of a robot of n joints.
+
+    name: of the run. session: the trace hash of its recording, by which a run is known again. joints: (n,)
+    in the columns of `torque_regressor`, whatever else was in the readings taken off. sigma_nm: (n,) noise of
+    the torques. independent_fraction: independent samples per sample.
+    phi_parts: (20 n,) parts that the bodies are likely made of (`dynamics.parts.likely_parts`).
+    directions: (6 n, j) increments that the chain may be off by, one deviation long; zero of errors that are
+    not the chain's. effects: (k_i, j) of every joint: what those do to its rows with the bodies held in the
+    root frame, in Nm (`dynamics.common_errors`).
+    scale: (n,) the torques are 1 + scale times what the sensors showed. scale_sigma: what was known of that
+    before the run; 0 of sensors that show what is.
+    """
+
+    name: str
+    session: str
+    chain: Chain
+    joints: tuple[JointInformation, ...]
+    sigma_nm: Array
+    independent_fraction: float
+    phi_parts: Array
+    directions: Array
+    effects: tuple[Array, ...]
+    scale: Array
+    scale_sigma: float
+
+
+class InformationFileError(ValueError):
+    """The file is not there, or does not hold what it should; the message names it."""
+
+
+def write_information(path: Path, run: RunInformation) -> None:
+    """Write the information of a run, whole or not at all."""
+    chain = run.chain
+    arrays: dict[str, Any] = {
+        "version": VERSION,
+        "session": run.session,
+        "serials": np.array(chain.serials),
+        "parent": np.array(chain.parent, dtype=np.int64),
+        "reversed": np.array(chain.reversed, dtype=bool),
+        **{name: getattr(chain, name) for name in ("axis", "point", "imu_home", "gravity")},
+        "sigma_nm": run.sigma_nm,
+        "independent_fraction": run.independent_fraction,
+        "phi_parts": run.phi_parts,
+        "directions": run.directions,
+        "scale": run.scale,
+        "scale_sigma": run.scale_sigma,
+        "rest_nm2": np.array([joint.rest for joint in run.joints]),
+        "samples": np.array([joint.samples for joint in run.joints], dtype=np.int64),
+    }
+    for k, joint in enumerate(run.joints):
+        arrays[f"r{k}"], arrays[f"z{k}"], arrays[f"effects{k}"] = joint.r, joint.z, run.effects[k]
+    temporary = path.with_name("information.part.npz")
+    np.savez_compressed(temporary, **arrays)
+    os.replace(temporary, path)
+
+
+def read_information(path: Path) -> RunInformation:
+    """Read the information of a run; its name is that of the folder.
+
+    Raises:
+        InformationFileError: no such file, another version, or not what it should be.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if int(file["version"]) != VERSION:
+                raise InformationFileError(
+                    f"{path} is of version {file['version']}, {VERSION} is read here: replay the run's "
+                    f"session.mcap, which writes it anew"
+                )
+            return _run(path.parent.name, dict(file))
+    except OSError as error:
+        raise InformationFileError(
+            f"{path}: {error.strerror or error}; a run with dynamics writes it, and so does replaying one"
+        ) from error
+    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+        if isinstance(error, InformationFileError):
+            raise
+        raise InformationFileError(f"{path} is not the information of a run: {error}") from error
+
+
+def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
+    for array in arrays.values():
+        array.flags.writeable = False
+    joints = len(arrays["serials"])
+    chain = Chain(
+        serials=tuple(str(serial) for serial in arrays["serials"]),
+        parent=tuple(int(parent) for parent in arrays["parent"]),
+        reversed=tuple(bool(turned) for turned in arrays["reversed"]),
+        axis=_checked(arrays["axis"], (joints, 3)),
+        point=_checked(arrays["point"], (joints, 3)),
+        imu_home=_checked(arrays["imu_home"], (joints, 4, 4)),
+        gravity=_checked(arrays["gravity"], (3,)),
+    )
+    rest, samples = _checked(arrays["rest_nm2"], (joints,)), arrays["samples"]
+    found = tuple(
+        JointInformation(
+            _checked(arrays[f"r{k}"], (len(arrays[f"z{k}"]), 10 * joints)),
+            _checked(arrays[f"z{k}"], (len(arrays[f"z{k}"]),)),
+            float(rest[k]),
+            int(samples[k]),
+        )
+        for k in range(joints)
+    )
+    count = arrays["directions"].shape[-1]
+    return RunInformation(
+        name=name,
+        session=str(arrays["session"]),
+        chain=chain,
+        joints=found,
+        sigma_nm=_checked(arrays["sigma_nm"], (joints,)),
+        independent_fraction=float(arrays["independent_fraction"]),
+        phi_parts=_checked(arrays["phi_parts"], (20 * joints,)),
+        directions=_checked(arrays["directions"], (6 * joints, count)),
+        effects=tuple(_checked(arrays[f"effects{k}"], (len(arrays[f"z{k}"]), count)) for k in range(joints)),
+        scale=_checked(arrays["scale"], (joints,)),
+        scale_sigma=float(_checked(arrays["scale_sigma"], ())),
+    )
+
+
+def _checked(array: Any, shape: tuple[int, ...]) -> Array:
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"an array of shape {array.shape}, finite {shape} is needed")
+    return np.asarray(array, dtype=float)

@@ -1,0 +1,196 @@
+"""What several runs with the same modules say together, however the modules were put together for each.
+
+Every run's rows, in standard deviations of what they err by, are taken from its bodies to the parts that
+those are made of (`dynamics.parts`) and stacked: of Gaussian errors that is all that there is to know, in any
+order. An error of a chain is one of its run, and moves the parts with their IMUs. The scale of a torque
+sensor is its module's own in every run, however often that is put together anew: it is one more unknown of
+all runs, of which what is known beforehand counts once. So does every run, which its recording is known by.
+
+What a run claims is taken as claimed. An offset of a torque sensor that it took for the first moment of a
+light body is none of these errors: others that know that body better show it as `RunShare.strain`.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import qr
+
+from coordinator.merge.information_file import RunInformation
+from coordinator.parameter_fit.base_parameters import BaseParameters, Columns, base_parameters, whitened
+from coordinator.parameter_fit.least_squares import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG
+from coordinator.parameter_fit.module_parts import Part, bodies_from_parts, part_columns, parts_of
+from coordinator.parameter_fit.systematic_errors import body_shifts, whitened_effects
+from module_agent.model.chain import Array
+
+# Torques without noise, as a simulation may have them, would weigh infinitely.
+_LEAST_SIGMA_NM = 1e-9
+
+
+class RunShare(NamedTuple):
+    """One run by itself and within the whole.
+
+    base: what it tells of the parts by itself. sigma_alone, sigma_merged: (rank,) standard deviations of the
+    same combinations by itself and by all runs together. strain: by how many of the run's own standard
+    deviations what all say of them is off from what it says, root mean square. Noise alone makes at most 1.
+    """
+
+    name: str
+    serials: tuple[str, ...]
+    base: BaseParameters
+    sigma_alone: Array
+    sigma_merged: Array
+    strain: float
+
+    @property
+    def gain(self) -> float:
+        """The median over its combinations of sigma merged over sigma alone."""
+        return float(np.median(self.sigma_merged / self.sigma_alone))
+
+
+class _Spectrum(NamedTuple):
+    """All rows: singular values (k,), right singular vectors (k, p), the target along the left ones (k,)."""
+
+    values: Array
+    directions: Array
+    along: Array
+
+
+class MergedInformation(NamedTuple):
+    """All runs together: base parameters of `parts`, and every run's share."""
+
+    parts: tuple[Part, ...]
+    base: BaseParameters
+    runs: tuple[RunShare, ...]
+
+    @property
+    def gain(self) -> float:
+        """The median over the combinations of all runs of sigma merged over sigma alone."""
+        return float(np.median(np.concatenate([run.sigma_merged / run.sigma_alone for run in self.runs])))
+
+
+def merge_runs(
+    runs: Sequence[RunInformation], tolerance: float = ESTIMATED_CHAIN_TOLERANCE
+) -> MergedInformation:
+    """Return what runs say together of the parts that their robots were made of.
+
+    Args:
+        runs: at least one, each a robot of some of the modules.
+        tolerance: singular values below this share of the largest are not told by the torques; the default is
+            for chains that were themselves estimated.
+
+    Raises:
+        ValueError: no runs, the same run twice, or runs with no module in common: together they say no more
+            than each by itself.
+    """
+    _check(runs)
+    parts = parts_of(run.chain for run in runs)
+    columns = part_columns(parts)
+    scales = _scale_sigmas(runs)
+    rows = [_rows(run, parts, scales) for run in runs]
+    together = _without_scales(rows, len(scales))
+    whole, spectrum = _base(*together, columns, tolerance), _spectrum(*together, columns)
+    shares = []
+    for run, one in zip(runs, rows, strict=True):
+        own = _without_scales([one], len(scales))
+        shares.append(_share(run, _base(*own, columns, tolerance), _spectrum(*own, columns), spectrum))
+    return MergedInformation(parts, whole, tuple(shares))
+
+
+def _check(runs: Sequence[RunInformation]) -> None:
+    if not runs:
+        raise ValueError("no runs to merge")
+    known: dict[str, str] = {}
+    for run in runs:
+        if run.session in known:
+            raise ValueError(
+                f"the runs {known[run.session]} and {run.name} are of the same recording, which says no more "
+                "when it is counted twice: give each once"
+            )
+        known[run.session] = run.name
+    if not set.intersection(*(set(run.chain.serials) for run in runs)):
+        raise ValueError(f"the runs {', '.join(run.name for run in runs)} have no module in common")
+
+
+def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:
+    """Return what is known beforehand of every module's torque sensor, by the best that any run was told."""
+    found: dict[str, float] = {}
+    for run in runs:
+        for serial in run.chain.serials:
+            found[serial] = min(found.get(serial, np.inf), run.scale_sigma)
+    return dict(sorted(found.items()))
+
+
+def _of_rows(run: RunInformation, of_joints: Array) -> Array:
+    """Return for every row what its joint has."""
+    return np.asarray(np.repeat(of_joints, [len(piece.z) for piece in run.joints]))
+
+
+def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float]) -> Array:
+    """Return a run's rows [scales | parts | target], their errors white; scales are in deviations.
+
+    A sensor that shows z0 of the torque r phi = (1 + s) z0 was taken to show z0 = z / (1 + v), so that
+    z - v z0 = r phi - s z0. In both places z0 is what the run's own parameters say that it shows: readings
+    would bring their noise along, and all scales come out too small.
+    """
+    sigma = np.maximum(run.sigma_nm, _LEAST_SIGMA_NM)
+    rows, target = whitened(run.joints, sigma, run.independent_fraction)
+    of_chain = whitened_effects(run.effects, sigma, run.independent_fraction)
+    of_chain = of_chain + rows @ body_shifts(run.chain, run.directions, run.phi_parts)
+    own = rows @ (bodies_from_parts(run.chain, parts_of([run.chain])) @ run.phi_parts)
+    shown = own / (1.0 + _of_rows(run, run.scale))
+    known = np.diag(list(scales.values()))
+    place = {serial: k for k, serial in enumerate(scales)}
+    of_scale = (
+        -shown[:, None] * known[[place[serial] for serial in _of_rows(run, np.array(run.chain.serials))]]
+    )
+    over_parts = rows @ bodies_from_parts(run.chain, parts)
+    target = target - _of_rows(run, run.scale) * shown
+    return _without(np.column_stack([of_chain, of_scale, over_parts, target]), of_chain.shape[1])
+
+
+def _without_scales(rows: Sequence[Array], scales: int) -> tuple[Array, Array]:
+    """Return rows over the parts and their target of runs whose sensors' scales are the same."""
+    found = _without(np.vstack(rows), scales)
+    return found[:, :-1], found[:, -1]
+
+
+def _without(rows: Array, count: int) -> Array:
+    """Return rows without their first columns, unknowns of which one deviation is 1.
+
+    What is known of those beforehand are rows more, and QR leaves below their own rows what is told of all
+    else whatever they are (Bierman 1977, Factorization methods for discrete sequential estimation, ch. 6).
+    """
+    known = np.eye(count, rows.shape[1])
+    triangle = qr(np.vstack([known, rows]), mode="r", check_finite=False)[0]
+    return np.asarray(triangle[count : rows.shape[1], count:])
+
+
+def _base(rows: Array, target: Array, columns: Columns, tolerance: float) -> BaseParameters:
+    return base_parameters(rows, target, columns, max_sigma=MAX_SIGMA_KG, tolerance=tolerance)
+
+
+def _spectrum(rows: Array, target: Array, columns: Columns) -> _Spectrum:
+    left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
+    return _Spectrum(values, directions, left.T @ target)
+
+
+def _share(run: RunInformation, own: BaseParameters, alone: _Spectrum, whole: _Spectrum) -> RunShare:
+    sums = own.grouping * own.columns.scale
+    _, sigma_alone = _of(sums, alone)
+    value, sigma_merged = _of(sums, whole)
+    strain = float(np.sqrt(np.mean(((value - own.value) / own.sigma) ** 2)))
+    return RunShare(run.name, run.chain.serials, own, sigma_alone, sigma_merged, strain)
+
+
+def _of(sums: Array, told: _Spectrum) -> tuple[Array, Array]:
+    """Return values and standard deviations of sums (r, p) of parameters in kg.
+
+    Every parameter is zero to `MAX_SIGMA_KG` beforehand. Sums that two runs have in common, but for errors of
+    their chains, would otherwise be told apart by those.
+    """
+    along = sums @ told.directions.T
+    square = told.values**2 + MAX_SIGMA_KG**-2
+    sigma = np.linalg.norm(along / np.sqrt(square), axis=1)
+    sigma.flags.writeable = False
+    return along @ (told.values / square * told.along), sigma

@@ -1,0 +1,1 @@
+"""Detecting and diagnosing changes of a known robot while it runs."""

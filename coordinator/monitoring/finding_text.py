@@ -1,0 +1,135 @@
+"""Findings from what tests say, with a sentence for who reads them."""
+
+import numpy as np
+
+from coordinator.monitoring.contact import Contact
+from coordinator.monitoring.diagnosis import DriveShift, LinkShift, LoadShift
+from coordinator.monitoring.findings import UNITS, Finding
+from coordinator.monitoring.reference import Reference
+from coordinator.monitoring.thresholds import Levels
+from coordinator.parameter_fit.payload import Payload
+
+
+def collision_finding(reference: Reference, levels: Levels, contact: Contact, now_ns: int) -> Finding:
+    """Say that something touched the robot, and which joints felt it."""
+    serials, strength = reference.chain.serials, contact.strength(levels.contact_nm)
+    last = contact.joints[-1] if contact.joints else int(np.argmax(np.abs(contact.peak_nm)))
+    strongest = float(np.abs(contact.peak_nm).max())
+    felt = ", ".join(serials[k] for k in contact.joints) or serials[last]
+    lasted = (
+        "and goes on"
+        if contact.end_ns is None
+        else f"for {1e-6 * (contact.end_ns - contact.start_ns):.0f} ms"
+    )
+    return Finding(
+        kind="collision",
+        serial=serials[last],
+        since_ns=contact.start_ns,
+        found_ns=now_ns,
+        said_ns=now_ns,
+        until_ns=contact.end_ns,
+        size=strongest,
+        sigma=float(reference.contact.sigma_nm[int(np.argmax(np.abs(contact.peak_nm)))]),
+        unit=UNITS["collision"],
+        gain=strength,
+        level=1.0,
+        words=f"something pushes what {serials[last]} turns, or what is beyond, {lasted}: felt by {felt} "
+        f"with up to {strongest:.2f} Nm, {strength:.1f} times what goes unnoticed",
+    )
+
+
+def load_finding(
+    reference: Reference,
+    levels: Levels,
+    load: LoadShift,
+    found: Payload,
+    since_ns: int,
+    now_ns: int,
+) -> Finding:
+    """Say what is carried that was not carried before, or the other way round."""
+    serial, taken_off = reference.chain.serials[load.carrier], load.taken_off
+    done = "was taken off" if taken_off else "is on"
+    mass = -found.mass_kg if taken_off else found.mass_kg
+    return Finding(
+        kind="payload",
+        serial=serial,
+        since_ns=since_ns,
+        found_ns=now_ns,
+        said_ns=now_ns,
+        until_ns=None,
+        size=mass,
+        sigma=found.mass_sigma_kg,
+        unit=UNITS["payload"],
+        gain=load.gain,
+        level=levels.payload,
+        words=f"{found.mass_kg:.3f} +- {found.mass_sigma_kg:.3f} kg {done} what {serial} turns",
+    )
+
+
+def wear_finding(
+    reference: Reference, levels: Levels, link: LinkShift, since_ns: int, now_ns: int
+) -> Finding:
+    """Say which link is not where it was."""
+    chain = reference.chain
+    serial, parent = chain.serials[link.child], chain.serials[chain.parent[link.child]]
+    return Finding(
+        kind="wear",
+        serial=serial,
+        since_ns=since_ns,
+        found_ns=now_ns,
+        said_ns=now_ns,
+        until_ns=None,
+        size=1e3 * link.shift_m,
+        sigma=1e3 * link.sigma_m,
+        unit=UNITS["wear"],
+        gain=link.gain,
+        level=levels.link,
+        words=f"the link from {parent} to {serial} is displaced by {1e3 * link.shift_m:.1f} +- "
+        f"{1e3 * link.sigma_m:.1f} mm and turned by {1e3 * link.turn_rad:.1f} mrad; `x5-coordinator check` "
+        "measures it",
+    )
+
+
+def friction_finding(
+    reference: Reference, levels: Levels, drive: DriveShift, since_ns: int, now_ns: int
+) -> Finding:
+    """Say whose drive turns with more friction, or less."""
+    serial = reference.chain.serials[drive.joint]
+    more = "more" if drive.change > 0.0 else "less"
+    return Finding(
+        kind="friction",
+        serial=serial,
+        since_ns=since_ns,
+        found_ns=now_ns,
+        said_ns=now_ns,
+        until_ns=None,
+        size=100.0 * drive.change,
+        sigma=100.0 * drive.sigma,
+        unit=UNITS["friction"],
+        gain=drive.gain,
+        level=levels.drive,
+        words=f"the drive of {serial} has {abs(100.0 * drive.change):.0f} +- {100.0 * drive.sigma:.0f} % "
+        f"{more} friction at half its speed",
+    )
+
+
+def unexplained_finding(
+    reference: Reference, levels: Levels, load: LoadShift, since_ns: int, now_ns: int
+) -> Finding:
+    """Say that torques have changed in a way that no payload on one body explains."""
+    serial = reference.chain.serials[load.carrier]
+    return Finding(
+        kind="unexplained",
+        serial=serial,
+        since_ns=since_ns,
+        found_ns=now_ns,
+        said_ns=now_ns,
+        until_ns=None,
+        size=0.0,
+        sigma=0.0,
+        unit=UNITS["unexplained"],
+        gain=load.gain,
+        level=levels.payload,
+        words="the torques have changed in a way that no payload on one body explains: something holds the "
+        "robot, several things were added, or a joint's torque sensor is off",
+    )

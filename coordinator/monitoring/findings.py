@@ -1,0 +1,134 @@
+"""What the watch found: of which kind, where, since when, how large and how sure.
+
+What the watch holds to be so: each finding once, said again when there is more to say, and ended.
+"""
+
+from collections.abc import Iterable
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+Kind = Literal["collision", "payload", "friction", "wear", "unexplained"]
+KINDS: tuple[Kind, ...] = ("collision", "payload", "friction", "wear", "unexplained")
+# By what each kind's size is measured.
+UNITS: dict[Kind, str] = {
+    "collision": "Nm",
+    "payload": "kg",
+    "friction": "%",
+    "wear": "mm",
+    "unexplained": "Nm",
+}
+
+
+class Finding(BaseModel):
+    """One thing that is other than it was.
+
+    serial: the module: of a collision, the last joint that felt it, so that it was on what this turns, or
+    beyond; of a payload, whose joint turns the body that carries it; of friction, whose drive; of wear, whose
+    link to its parent. since_ns, found_ns, said_ns, until_ns: session time of its beginning, of the first and
+    of the latest word on it, and of its end, None as long as it lasts.
+    size, sigma: in `unit`, one standard deviation. gain: by how much it makes the misfit smaller, in
+    variances of the noise, above the `level` that chance exceeds as seldom as asked for; of a collision, how
+    many times its level the torque was.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Kind
+    serial: str
+    since_ns: int
+    found_ns: int
+    said_ns: int
+    until_ns: int | None
+    size: float
+    sigma: float
+    unit: str
+    gain: float
+    level: float
+    words: str
+
+    @property
+    def key(self) -> tuple[str, str | int]:
+        """What makes it the same finding as an earlier one: a later word on it replaces the earlier."""
+        match self.kind:
+            case "collision":
+                return self.kind, self.since_ns
+            case "friction":
+                return self.kind, self.serial
+            case "wear":
+                return "structure", 0
+            case _:
+                return "load", 0
+
+
+Key = tuple[str, str | int]
+
+# A size is said again when it moved by more than this share of itself, and by more than two sigmas.
+WORTH_SAYING = 0.1
+# A change that no window has shown for so long is over: longer than the longest window.
+OVER_NS = 8_000_000_000
+
+
+class Ledger:
+    """Findings by key; `ended` are those that were over before the watch was."""
+
+    def __init__(self) -> None:
+        self.held: dict[Key, Finding] = {}
+        self.ended: list[Finding] = []
+        self._said: dict[Key, Finding] = {}
+        self._seen_ns: dict[Key, int] = {}
+
+    @property
+    def all(self) -> tuple[Finding, ...]:
+        """All that was found and not withdrawn, in the order of time."""
+        return tuple(sorted([*self.ended, *self.held.values()], key=lambda f: f.since_ns))
+
+    def put(self, finding: Finding) -> list[Finding]:
+        """Take in a finding; return it if it is worth saying."""
+        earlier = self.held.get(finding.key)
+        if earlier is not None and earlier.kind == finding.kind:
+            known = {"since_ns": earlier.since_ns, "found_ns": earlier.found_ns}
+            finding = finding.model_copy(update=known)
+        self._seen_ns[finding.key] = finding.said_ns
+        self.held[finding.key] = finding
+        if not _news(self._said.get(finding.key), finding):
+            return []
+        self._said[finding.key] = finding
+        return [finding]
+
+    def see(self, key: Key, now_ns: int) -> None:
+        """Note that a finding still holds."""
+        self._seen_ns[key] = now_ns
+
+    def withdraw(self, keys: Iterable[Key]) -> list[Key]:
+        """Take back findings; return the keys of those that were held."""
+        gone = [key for key in keys if key in self.held]
+        for key in gone:
+            del self.held[key]
+            self._said.pop(key, None)
+        return gone
+
+    def end_unseen(self, now_ns: int) -> list[Finding]:
+        """End the changes that have not been seen of late; return them."""
+        said = []
+        for key, finding in list(self.held.items()):
+            if finding.kind == "collision":
+                if finding.until_ns is not None and now_ns - finding.until_ns > OVER_NS:
+                    self._end(key, finding)
+            elif now_ns - self._seen_ns[key] > OVER_NS:
+                said.append(finding.model_copy(update={"until_ns": self._seen_ns[key]}))
+                self._end(key, said[-1])
+        return said
+
+    def _end(self, key: Key, finding: Finding) -> None:
+        self.ended.append(finding)
+        self.withdraw([key])
+
+
+def _news(said: Finding | None, finding: Finding) -> bool:
+    if said is None or (said.kind, said.serial) != (finding.kind, finding.serial):
+        return True
+    if (said.until_ns is None) != (finding.until_ns is None):
+        return True
+    moved = abs(finding.size - said.size)
+    return finding.kind != "collision" and moved > max(WORTH_SAYING * abs(said.size), 2.0 * said.sigma)

@@ -1,0 +1,120 @@
+"""Watching a robot that somebody moves: hears feedback, asks for status, holds no lease, moves nothing.
+
+The watch itself is `watching.watcher`; here is its place on a network and on a clock, real or virtual.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+
+from coordinator.live_robot.messenger import Clock, NoAnswer, Radio
+from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.recording.recording import Entry, Recording
+from coordinator.synchronisation.round_trips import map_clocks
+from module_agent.signals.clock_map import ClockMap
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import Ask, Message
+from module_agent.wire.refusal import WireError
+
+# How often the watch looks: a blow is said by so much later.
+LOOK_S = 0.02
+ASK_S, REMAP_S = 0.25, 5.0
+# What a clock is mapped by: the last minute's trips; so many are enough to begin with.
+MOST_TRIPS, FEWEST_TRIPS = 240, 6
+# Rows that are kept, at 250 a second; none is older than the cubic's and the filter's reach.
+KEPT_ROWS = 2000
+
+Say = Callable[[Heard], None]
+
+
+class LiveWatch:
+    """One watch over a radio. `record` is what the radio is given to hear with."""
+
+    def __init__(self, watcher: Watcher, clock: Clock, sender: str, say: Say):
+        self.recording = Recording()
+        self._watcher = watcher
+        self._clock = clock
+        self._sender = sender
+        self._say = say
+        self._serials: Sequence[str] = watcher.reference.chain.serials
+        self._clocks: Mapping[str, ClockMap] | None = None
+        self._boots: dict[str, int] = {}
+        self._left: tuple[str, ...] = ()
+
+    def record(self, entry: Entry) -> Message | None:
+        """Take in what was heard."""
+        try:
+            message = self.recording.add(entry)
+        except (WireError, ValueError):
+            return None  # counted by the recording, by reason
+        return message if isinstance(message, Message) else None
+
+    async def watch(
+        self, radio: Radio, until_ns: int | None = None, enough: Callable[[], bool] = lambda: False
+    ) -> None:
+        """Watch until a time [ns], until it is enough, or until cancelled."""
+        asking = asyncio.create_task(self._ask_all(radio))
+        mapped_ns = 0
+        try:
+            while (until_ns is None or self._clock() < until_ns) and not enough():
+                await asyncio.sleep(LOOK_S)
+                self._note_presence(radio)
+                if self._clocks is None or self._clock() - mapped_ns > REMAP_S * 1e9:
+                    self._map_clocks()
+                    mapped_ns = self._clock()
+                if self._clocks is not None:
+                    self.look()
+        finally:
+            asking.cancel()
+            await asyncio.gather(asking, return_exceptions=True)
+
+    def look(self) -> None:
+        """Look at what was heard since the last look."""
+        if self._clocks is None:
+            return
+        heard = self._watcher.advance(self.recording, self._clocks)
+        if any(heard):
+            self._say(heard)
+        for serial in self._serials:
+            record = self.recording.modules.get(serial)
+            if record is not None:
+                record.rows.forget_before(record.rows.end_row - KEPT_ROWS)
+                del record.arrivals[:-1]
+                del record.round_trips[:-MOST_TRIPS]
+        for found in self.recording.estimates.values():
+            found.clear()
+
+    async def _ask_all(self, radio: Radio) -> None:
+        while True:
+            # At once: two modules that are asked at the same moment tell their clocks apart.
+            asks = [self._ask(radio, serial) for serial in self._serials if serial in radio.alive]
+            await asyncio.gather(*asks)
+            await asyncio.sleep(ASK_S if self._clocks is not None else 0.2 * ASK_S)
+
+    async def _ask(self, radio: Radio, serial: str) -> None:
+        ask = Ask(serial=serial, boot=0, seq=radio.next_seq(), sender=self._sender)
+        try:
+            await radio.ask(serial, Leaf.STATUS, ask)
+        except NoAnswer:
+            return  # one of many; who is gone is noticed by its token and its silence
+
+    def _map_clocks(self) -> None:
+        records = [self.recording.modules.get(serial) for serial in self._serials]
+        if any(record is None or len(record.round_trips) < FEWEST_TRIPS for record in records):
+            return
+        known = [record for record in records if record is not None]
+        boots = {record.serial: record.boot for record in known}
+        notes = [f"module {s} has booted anew" for s, b in boots.items() if self._boots.get(s, b) != b]
+        self._boots = boots
+        self._clocks = map_clocks({record.serial: record.round_trips for record in known})
+        if notes:
+            self._say(Heard((), (), tuple(notes)))
+
+    def _note_presence(self, radio: Radio) -> None:
+        # Only of those that were there: at the beginning all are on their way.
+        left = tuple(s for s in self._serials if s in self.recording.modules and s not in radio.alive)
+        if left == self._left:
+            return
+        notes = [f"module {s} has left the network" for s in left if s not in self._left]
+        notes += [f"module {s} is back" for s in self._left if s not in left]
+        self._left = left
+        self._say(Heard((), (), tuple(notes)))

@@ -1,0 +1,327 @@
+"""What joint torques say of a change of the bodies' inertial parameters.
+
+What IMUs say of a link that has changed: rates and specific forces against those of the joints' motion.
+
+A payload changes nothing in them, as encoders sit beyond the springs. A link that is displaced moves every
+module beyond it by the same twist, linear in the readings as long as it is small (`inertial_slopes`).
+Biases and delays are each stretch's own: they drift, and clocks are mapped anew every day.
+
+What motor currents say of a drive's friction: the motor's torque against the spring's.
+
+A motor that turns at w (seen at the output) with current i, behind a gear of ratio N that passes on a share
+eta of what drives and all of what is driven back, has
+
+    m = k N i (eta or 1) = c tau + l sign(w) |tau| + Fc sign(w) + Fv w + J w' + offset,
+
+tau the spring's torque, c and l what motor constant and losses are off their type's (1 and 0; Khalil and
+Dombre 2002, section 9.6, for the rest). The motor's side stands alone on the left, as a joint that carries
+nothing would else be explained best by no motor at all. Only where the motor turns is friction what it seems,
+so that slow samples do not count.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.batch_estimation.imu_intrinsics import (
+    DELAY,
+    SIZE,
+    ImuIntrinsics,
+    ImuPrior,
+    mixing,
+    read,
+    slopes,
+)
+from coordinator.batch_estimation.imu_jacobian import imu_slopes
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
+from coordinator.dynamics.pseudo_inertia import parameter_scale
+from coordinator.monitoring.likelihood_ratio import Evidence, compressed, joined, without_own
+from coordinator.monitoring.segments import Stretch
+from coordinator.parameter_fit.base_parameters import whitened
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import ancestors
+from module_agent.model.information import JointInformation, gather
+from module_agent.model.regressor import PER_BODY, inverse_dynamics
+
+# How far parameters may be from where a fit has them, per `parameter_scale`: bodies weigh some hundred grams.
+PRIOR_KG = 0.5
+# Of a payload: a change of 1 is one of a kilogram at the body's place.
+LARGE_KG = 1.0
+
+
+def information_of(chain: Chain, stretch: Stretch) -> tuple[JointInformation, ...]:
+    """Return the information of every joint."""
+    return gather(chain, stretch.q_rad, stretch.qd_rad_s, stretch.qdd_rad_s2, stretch.tau_nm)
+
+
+def torque_residual(chain: Chain, phi: Array, stretch: Stretch) -> Array:
+    """Return what a model leaves of the torques, (m, n) [Nm]."""
+    predicted = inverse_dynamics(chain, phi, stretch.q_rad, stretch.qd_rad_s, stretch.qdd_rad_s2)
+    return np.asarray(stretch.tau_nm - predicted)
+
+
+def torque_evidence(information: Sequence[JointInformation], phi: Array, sigma_nm: Array) -> Evidence:
+    """Return the evidence (k, 10 n) about phi's deviation from `phi`, in kilograms by `parameter_scale`.
+
+    sigma_nm: (n,) noise as if samples were independent.
+    """
+    rows, target = whitened(information, sigma_nm)
+    return compressed(rows * parameter_scale(len(information)), target - rows @ phi)
+
+
+def payload_changes(count: int) -> tuple[Array, ...]:
+    """Return the hypotheses: all ten parameters of one body change."""
+    unit = LARGE_KG * np.eye(PER_BODY * count)
+    return tuple(unit[:, PER_BODY * b : PER_BODY * (b + 1)] for b in range(count))
+
+
+# The low-pass leaves about as many independent samples as one in five.
+KEEP_EVERY = 5
+# Of an IMU's errors: those that are the stretch's own, and those that stay.
+_OWN = [*range(18, 24), DELAY]
+_LASTING = [k for k in range(SIZE) if k not in _OWN]
+_PER_TWIST = 6
+# How far the known links may be off, in radians and metres; gravity, in m/s^2; own biases against those of
+# the known run, and delays against those of no filter at all.
+_LINK_SIGMA, _GRAVITY_SIGMA = 0.02, 0.05
+_OWN_SIGMA = np.array([3e-3] * 3 + [0.05] * 3 + [5e-3])
+# Of a change: 0.1 rad, 0.1 m.
+LARGE = 0.1
+
+
+class ImuModel(NamedTuple):
+    """What IMUs should read, and how well: the chain, the IMUs' errors, and scatters (n, 6) per sample."""
+
+    chain: Chain
+    intrinsics: ImuIntrinsics
+    prior: ImuPrior
+    sigma: Array
+
+    @property
+    def own_sigma(self) -> Array:
+        """How far a stretch's own parameters may be from the known, (7 n,)."""
+        return np.tile(_OWN_SIGMA, len(self.chain.serials))
+
+    @property
+    def prior_sigma(self) -> Array:
+        """The same of those that stay: twists of all links (6 n), gravity (3), IMUs' errors (27 n)."""
+        count = len(self.chain.serials)
+        errors = np.maximum(self.prior.sigmas[_LASTING], 1e-5)
+        return np.concatenate(
+            [np.full(_PER_TWIST * count, _LINK_SIGMA), np.full(3, _GRAVITY_SIGMA), np.tile(errors, count)]
+        )
+
+
+def without_delay(intrinsics: ImuIntrinsics) -> ImuIntrinsics:
+    """Return the errors without delays, which are each stretch's own."""
+    errors = intrinsics.errors.copy()
+    errors[:, DELAY] = 0.0
+    return ImuIntrinsics(errors)
+
+
+def imu_residual(model: ImuModel, stretch: Stretch) -> Array:
+    """Return what the model leaves of the readings, (m, n, 6): rates, then specific forces."""
+    at = _thinned(stretch)
+    bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
+    ideal = readings_on(model.chain, bodies)
+    gyro, accel = read(model.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
+    return np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
+
+
+def lasting_residual(model: ImuModel, stretches: Sequence[Stretch]) -> list[Array]:
+    """Return what the model leaves of the readings but for biases and delays that are the same in all.
+
+    Per stretch (m, 6 n).
+    """
+    left = [imu_residual(model, one) for one in stretches]
+    rates = [-one.imu_rates[::KEEP_EVERY] for one in stretches]
+    whole, late = np.concatenate(left), np.concatenate(rates)
+    whole, late = whole - whole.mean(axis=0), late - late.mean(axis=0)
+    # One delay for all six axes of an IMU, weighed by what each scatters.
+    weight = 1.0 / np.maximum(whole.var(axis=0), 1e-12)
+    delay = (weight * late * whole).sum(axis=(0, 2)) / np.maximum((weight * late**2).sum(axis=(0, 2)), 1e-12)
+    settled = whole - delay[:, None] * late
+    ends = np.cumsum([len(one) for one in left])[:-1]
+    return [part.reshape(len(part), -1) for part in np.split(settled, ends)]
+
+
+def imu_evidence(model: ImuModel, stretch: Stretch) -> Evidence:
+    """Return the evidence (k, p): own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
+    at, count = _thinned(stretch), len(model.chain.serials)
+    bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
+    ideal = readings_on(model.chain, bodies)
+    residual = imu_residual(model, stretch)
+    samples, own = len(at.q_rad), len(_OWN) * count
+    rows = np.zeros((count, samples, 6, own + len(model.prior_sigma)))
+    free = np.ones(SIZE, dtype=bool)
+    for k in range(count):
+        moved = imu_slopes(model.chain, bodies, at.q_rad, at.qd_rad_s, k)
+        mixed = mixing(model.intrinsics, k)
+        poses = np.einsum("ij,cjm->mic", mixed, moved.poses)
+        for place, module in enumerate(moved.modules):
+            to = own + _PER_TWIST * module
+            rows[k, :, :, to : to + _PER_TWIST] = poses[..., _PER_TWIST * place : _PER_TWIST * (place + 1)]
+        tilt = own + _PER_TWIST * count
+        rows[k, :, :, tilt : tilt + 3] = np.einsum("ij,cjm->mic", mixed, moved.gravity)
+        by_error = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], at.imu_rates[:, k], free)
+        by_error = np.moveaxis(by_error, 2, 0).swapaxes(1, 2)
+        rows[k, :, :, len(_OWN) * k : len(_OWN) * (k + 1)] = by_error[..., _OWN]
+        to = tilt + 3 + len(_LASTING) * k
+        rows[k, :, :, to : to + len(_LASTING)] = by_error[..., _LASTING]
+    weighted = rows / model.sigma[:, None, :, None]
+    target = np.swapaxes(residual, 0, 1) / model.sigma[:, None, :]
+    return compressed(weighted.reshape(-1, rows.shape[-1]), target.reshape(-1))
+
+
+def link_changes(chain: Chain) -> tuple[Array, ...]:
+    """Return the hypotheses, one for every module but those on the base: all beyond its link is displaced."""
+    count = len(chain.serials)
+    total = _PER_TWIST * count + 3 + len(_LASTING) * count
+    found = []
+    for child in linked(chain):
+        change = np.zeros((total, _PER_TWIST))
+        for module in range(count):
+            if child in ancestors(chain, module):
+                change[_PER_TWIST * module : _PER_TWIST * (module + 1)] = LARGE * np.eye(_PER_TWIST)
+        found.append(change)
+    return tuple(found)
+
+
+def linked(chain: Chain) -> tuple[int, ...]:
+    """Return the modules whose link to another module is tested."""
+    return tuple(k for k, parent in enumerate(chain.parent) if parent >= 0)
+
+
+def displacement(chain: Chain, child: int, size: Array) -> tuple[Array, Array]:
+    """Return the turn (3,) [rad] and the displacement (3,) [m] of a module's IMU, in the root frame at q = 0.
+
+    size: (6,) of `Change`.
+    """
+    turn, shift = LARGE * size[:3], LARGE * size[3:]
+    return turn, shift + np.cross(turn, chain.imu_home[child, :3, 3])
+
+
+def _thinned(stretch: Stretch) -> Stretch:
+    kept = slice(None, None, KEEP_EVERY)
+    return stretch._replace(
+        q_rad=stretch.q_rad[kept],
+        qd_rad_s=stretch.qd_rad_s[kept],
+        qdd_rad_s2=stretch.qdd_rad_s2[kept],
+        gyro_rad_s=stretch.gyro_rad_s[kept],
+        accel_m_s2=stretch.accel_m_s2[kept],
+        imu_rates=stretch.imu_rates[kept],
+    )
+
+
+# c, l, Fc, Fv, J, offset: Fc and Fv are what changes.
+TERMS = 6
+_COULOMB, _VISCOUS = 2, 3
+# Of the largest speed; below, a motor may stick within its tick.
+SLOW_SHARE = 0.04
+# Of the low-pass: what is farther has no say.
+REACH_SAMPLES = 10
+FEWEST = 20
+# Of c and l: what a joint that carries little tells of them is not what they are under another load.
+OWN_SIGMA = np.array([0.1, 0.1])
+
+
+class DriveModel(NamedTuple):
+    """A joint's drive: its parameters (6,), and its scatter [Nm] as if samples were independent."""
+
+    kind: ModuleType
+    theta: Array
+    sigma_nm: float
+
+    def friction_nm(self, speed_rad_s: float, change: Array | None = None) -> float:
+        """Return the friction at a speed, of this drive or of one that has changed by (2,)."""
+        coulomb, viscous = self.theta[[_COULOMB, _VISCOUS]] + (0.0 if change is None else change)
+        return float(coulomb + viscous * speed_rad_s)
+
+    @property
+    def typical_rad_s(self) -> float:
+        """Half of the largest speed."""
+        return 0.5 * self.kind.max_speed_rad_s
+
+    @property
+    def prior_sigma(self) -> Array:
+        """How far its parameters may be from where they are (6,): gears and motors of a type are alike."""
+        motor = self.kind.motor
+        return np.array(
+            [
+                *(0.05, 0.1),
+                max(motor.coulomb_nm, 0.01) * 2.0,
+                max(motor.viscous_nm_s_rad, 0.01) * 2.0,
+                motor.rotor_inertia_kg_m2 * self.kind.gear_ratio**2,
+                0.05 * self.kind.max_effort_nm,
+            ]
+        )
+
+    @property
+    def change(self) -> Array:
+        """The hypothesis: Coulomb and viscous friction change, by as much as the catalogue has them."""
+        found = np.zeros((TERMS, 2))
+        found[_COULOMB, 0] = self.kind.motor.coulomb_nm
+        found[_VISCOUS, 1] = self.kind.motor.viscous_nm_s_rad
+        return found
+
+    def change_of(self, size: Array) -> Array:
+        """Return the change (2,) of Coulomb [Nm] and viscous friction [Nm s/rad], of a `Change`'s size."""
+        return np.asarray(size * [self.kind.motor.coulomb_nm, self.kind.motor.viscous_nm_s_rad])
+
+
+def drive_rows(kind: ModuleType, stretch: Stretch, joint: int) -> tuple[Array, Array]:
+    """Return the rows (k, 6) and motor torques (k,) [Nm] of the samples in which the motor of a joint turns.
+
+    All signals went through the same low-pass, which reaches into what is around a sample.
+    """
+    speed = stretch.raw.motor_rad_s[:, joint] / kind.gear_ratio
+    slow = np.abs(speed) < SLOW_SHARE * kind.max_speed_rad_s
+    turning = np.convolve(slow, np.ones(2 * REACH_SAMPLES + 1), mode="same") == 0
+    driving, driven, loss, sign, turned, change = stretch.drive[:, joint].T
+    per_amp = kind.gear_ratio * kind.motor.back_emf_v_s_rad
+    motor = per_amp * (kind.motor.efficiency * driving + driven)
+    speeds = turned / kind.gear_ratio, change / kind.gear_ratio
+    rows = np.column_stack([stretch.tau_nm[:, joint], loss, sign, *speeds, np.ones_like(sign)])
+    return rows[turning], motor[turning]
+
+
+def drive_evidence(model: DriveModel, stretch: Stretch, joint: int) -> Evidence | None:
+    """Return the evidence about the drive's deviation from its model; None if the motor stood.
+
+    Before the six parameters are those of how torque is passed on, the stretch's own (2,): see `OWN_SIGMA`.
+    """
+    rows, torque = drive_rows(model.kind, stretch, joint)
+    if len(rows) < FEWEST:
+        return None
+    weighted = np.column_stack([rows[:, : OWN_SIGMA.size], rows]) / model.sigma_nm
+    return compressed(weighted, (torque - rows @ model.theta) / model.sigma_nm)
+
+
+def drive_window(parts: Sequence[Evidence]) -> Evidence:
+    """Return the evidence (k, 6) of a window's stretches together."""
+    return without_own(joined(parts), OWN_SIGMA)
+
+
+def fitted_drive(kind: ModuleType, rows: Array, torque_nm: Array) -> Array:
+    """Return the parameters (6,) that explain a drive's torques best.
+
+    A drive that hardly moved keeps what its type's catalogue says, as far as the samples leave it open.
+    """
+    expected = catalogued_drive(kind)
+    sigma = 0.01 * kind.max_effort_nm
+    prior = DriveModel(kind, expected, sigma).prior_sigma
+    stacked = np.vstack([rows / sigma, np.diag(1.0 / prior)])
+    target = np.concatenate([(torque_nm - rows @ expected) / sigma, np.zeros(TERMS)])
+    change = np.linalg.lstsq(stacked, target, rcond=None)[0]
+    found: Array = expected + change
+    found.flags.writeable = False
+    return found
+
+
+def catalogued_drive(kind: ModuleType) -> Array:
+    """Return a drive's parameters (6,) by its type."""
+    motor = kind.motor
+    inertia = motor.rotor_inertia_kg_m2 * kind.gear_ratio**2
+    return np.array([1.0, 0.0, motor.coulomb_nm, motor.viscous_nm_s_rad, inertia, 0.0])

@@ -1,0 +1,1 @@
+"""Solvers for inertial parameters and their uncertainty."""

@@ -1,0 +1,116 @@
+"""A robot's bodies as sums of parts that outlive it: what a module's joint turns, and what is held by it.
+
+Body i of a robot is the part of module i that turns, and of every module k that it carries the part that is
+held, with the link that leads to it: in whatever order modules are put together, those stay as they are as
+long as every link stays with the module that it leads to. The parameters of a module's parts are counted in
+the frame of its IMU at q = 0, which a robot that has measured itself knows of every module, so that
+phi_bodies = T phi_parts. What rests on the base no torque shows.
+
+A module that is mounted the other way round holds its output with the link, and turns its housing: those are
+other parts.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coordinator.dynamics.inertia_prior import sides_prior
+from coordinator.dynamics.pseudo_inertia import parameter_transform, parameters
+from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import PER_BODY
+
+Role = Literal["turned", "held"]
+
+
+class Part(NamedTuple):
+    """One part of a module, mounted forward or reversed."""
+
+    serial: str
+    role: Role
+    reversed: bool
+
+    @property
+    def name(self) -> str:
+        """In words: "J1 turned", "J2 held, reversed"."""
+        return f"{self.serial} {self.role}" + (", reversed" if self.reversed else "")
+
+
+def parts_of(chains: Iterable[Chain]) -> tuple[Part, ...]:
+    """Return the parts of all these robots, each once, in whatever order the robots come."""
+    roles: tuple[Role, ...] = get_args(Role)
+    found = {
+        Part(serial, role, bool(turned))
+        for chain in chains
+        for serial, turned in zip(chain.serials, chain.reversed, strict=True)
+        for role in roles
+    }
+    return tuple(sorted(found))
+
+
+def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
+    """Return the matrix T (10 n, 10 p), read-only, by which the bodies of a chain are made of parts.
+
+    phi_bodies = T phi_parts, the bodies' in the root frame as in `torque_regressor`, a part's in the frame of
+    its module's IMU at q = 0.
+
+    Raises:
+        ValueError: a part of the chain is not among them.
+    """
+    place = {part: k for k, part in enumerate(parts)}
+    found = np.zeros((PER_BODY * len(chain.serials), PER_BODY * len(parts)))
+    for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
+        into_root = parameter_transform(chain.imu_home[k])
+        roles: tuple[tuple[Role, int], ...] = (("turned", k), ("held", parent))
+        for role, body in roles:
+            part = Part(serial, role, bool(chain.reversed[k]))
+            if part not in place:
+                raise ValueError(f"{part.name} is not among the {len(parts)} parts")
+            if body >= 0:
+                found[_ten(body), _ten(place[part])] = into_root
+    found.flags.writeable = False
+    return found
+
+
+def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> Array:
+    """Return parameters (20 n,) of the parts of one chain that make up its bodies, read-only.
+
+    Torques tell a body as a whole. Its parts are those of modules of the type; by what the body is other than
+    such parts together, each of them is in proportion to its mass: T `likely_parts` = phi. They are in the
+    order of `parts_of([chain])`.
+
+    Args:
+        chain: n joints. types: their modules'. phi: (10 n,) bodies in the root frame.
+    """
+    turned, held = (np.stack([parameters(one) for one in side]) for side in sides_prior(chain, types))
+    bodies = np.asarray(phi, dtype=float).reshape(-1, PER_BODY)
+    expected = turned.copy()
+    for k, parent in enumerate(chain.parent):
+        if parent >= 0:
+            expected[parent] += held[k]
+    surplus = (bodies - expected) / expected[:, :1]
+    place = {part: k for k, part in enumerate(parts_of([chain]))}
+    found = np.zeros((len(place), PER_BODY))
+    for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
+        into_imu = parameter_transform(np.linalg.inv(chain.imu_home[k]))
+        own: tuple[tuple[Role, Array, int], ...] = (("turned", turned[k], k), ("held", held[k], parent))
+        for role, part, body in own:
+            whole = part + part[0] * surplus[body] if body >= 0 else part
+            found[place[Part(serial, role, bool(chain.reversed[k]))]] = into_imu @ whole
+    flat = found.ravel()
+    flat.flags.writeable = False
+    return flat
+
+
+def part_columns(parts: Sequence[Part]) -> Columns:
+    """Return what the 10 p columns of `bodies_from_parts` are: those of a body each, named by the part."""
+    columns = inertial_columns(len(parts))
+    kinds = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+    return columns._replace(names=tuple(f"{kind}({part.name})" for part in parts for kind in kinds))
+
+
+def _ten(which: int) -> slice:
+    return slice(PER_BODY * which, PER_BODY * (which + 1))

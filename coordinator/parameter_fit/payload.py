@@ -1,0 +1,187 @@
+"""What was added to a robot whose dynamics are known: mass, centre and inertia, and on which body.
+
+What is added to a body adds to its ten parameters (Kubus, Kroeger and Wahl 2008, On-line estimation of
+inertial parameters using a recursive total least-squares approach, identify it at the wrist by a sensor; here
+the joints' torques tell it). With information on the robot from before, and rows of later motions,
+
+    [ R  0   ] [ phi ]   [ z  ]
+    [ S  S_b ] [ psi ] = [ z' ],
+
+S_b the columns of the body b that carries it: the robot's parameters are free as far as neither motion tells
+them, and the payload's covariance holds what is uncertain of the robot. The payload is a body that can exist.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import qr
+
+from coordinator.dynamics.pseudo_inertia import Body, body, parameter_scale, pseudo_inertia
+from coordinator.parameter_fit.base_parameters import whitened
+from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
+from coordinator.parameter_fit.physically_consistent import physically_consistent
+from module_agent.model.chain import Array
+from module_agent.model.information import JointInformation
+from module_agent.model.regressor import PER_BODY
+
+# Before anything moved: some hundred grams, about as large as a fist, near the module that carries it. It
+# counts as much as one torque reading.
+LIKELY_KG, LIKELY_SIZE_M = 0.2, 0.05
+PRIOR_WEIGHT = 1.0
+# Of the rows' misfit: ten parameters in noise alone take some 10 off, and models err by more than noise.
+FOUND_ABOVE = 50.0
+# What a payload leaves of the misfit is one variance a row, and a little more where springs give; several
+# times that is another change.
+EXPLAINED_BELOW = 10.0
+
+
+class PayloadOn(NamedTuple):
+    """The best payload on one body: (10,) its parameters, (10, 10), and the misfit that it leaves."""
+
+    misfit: float
+    phi: Array
+    covariance: Array
+
+
+class Payload(NamedTuple):
+    """What was added; arrays are read-only, in the root frame at q = 0.
+
+    carrier: index of the body that carries it. changed: whether the torques are others at all. phi: (10,) its
+    parameters. covariance: (10, 10). gain: by how much it makes the misfit smaller, in variances of the
+    torques' noise; rival: the same of the next best, `rival_carrier`, None if no other body may carry it.
+    left: the misfit that it leaves, for one degree of freedom: about 1 if it is all that has changed. pseudo:
+    (4, 4).
+    """
+
+    carrier: int
+    changed: bool
+    phi: Array
+    covariance: Array
+    pseudo: Array
+    left: float
+    gain: float
+    rival: float
+    rival_carrier: int | None
+
+    @property
+    def explains(self) -> bool:
+        """Whether a payload on one body is all that has changed."""
+        return self.left < EXPLAINED_BELOW
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a payload."""
+        return self.changed and self.explains
+
+    @property
+    def mass_kg(self) -> float:
+        """Its mass."""
+        return float(self.phi[0])
+
+    @property
+    def mass_sigma_kg(self) -> float:
+        """One standard deviation of the mass."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def com_m(self) -> Array:
+        """(3,) its centre, root frame at q = 0."""
+        return np.asarray(self.phi[1:4] / self.phi[0])
+
+    @property
+    def com_covariance_m2(self) -> Array:
+        """(3, 3) covariance of the centre's coordinates."""
+        slope = np.zeros((3, PER_BODY))
+        slope[:, 0] = -self.com_m / self.mass_kg
+        slope[:, 1:4] = np.eye(3) / self.mass_kg
+        return np.asarray(slope @ self.covariance @ slope.T)
+
+    @property
+    def body(self) -> Body:
+        """The payload as a body."""
+        return body(self.pseudo)
+
+
+def find_payload(
+    before: Sequence[JointInformation],
+    later: Sequence[JointInformation],
+    places_m: ArrayLike,
+    sigma_nm: ArrayLike,
+    independent_fraction: float = 1.0,
+    carriers: Sequence[int] | None = None,
+) -> Payload:
+    """Find what was added to one body of a robot between two stretches of motion.
+
+    Args:
+        before: what motions without the payload say, per joint of n.
+        later: what motions with it say.
+        places_m: (n, 3) where on each body a payload is likely, in the root frame at q = 0.
+        sigma_nm: (n,) noise of the torques, with what the model leaves out.
+        independent_fraction: independent samples per sample, below 1 after a low-pass.
+        carriers: the bodies that may carry it; all when None.
+
+    Raises:
+        ValueError: shapes that do not fit, noise that is not positive, or no carrier.
+        NotSolvedError: numerical trouble.
+    """
+    likely = np.asarray(places_m, dtype=float)
+    known, known_target = whitened(before, sigma_nm, independent_fraction)
+    rows, target = whitened(later, sigma_nm, independent_fraction)
+    if likely.shape != (len(before), 3) or known.shape[1] != rows.shape[1]:
+        raise ValueError(
+            f"places {likely.shape}, {len(before)} joints before and {len(later)} later do not fit"
+        )
+    candidates = range(len(before)) if carriers is None else carriers
+    if not len(candidates):
+        raise ValueError("no body may carry the payload")
+    stacked = np.vstack([known, rows])
+    none, beyond = _complement(stacked, np.concatenate([known_target, target]))
+    found: dict[int, PayloadOn] = {}
+    for b in candidates:
+        added = np.vstack([np.zeros((len(known), PER_BODY)), rows[:, PER_BODY * b : PER_BODY * (b + 1)]])
+        found[b] = _on(beyond.T @ added, none, likely[b])
+    gains = {b: float(none @ none) - one.misfit for b, one in found.items()}
+    best = max(gains, key=lambda b: gains[b])
+    rival = max((b for b in gains if b != best), key=lambda b: gains[b], default=None)
+    one, pseudo = found[best], pseudo_inertia(found[best].phi)
+    for array in (one.phi, one.covariance, pseudo):
+        array.flags.writeable = False
+    return Payload(
+        carrier=best,
+        changed=float(none @ none) > FOUND_ABOVE + EXPLAINED_BELOW * len(none) or gains[best] > FOUND_ABOVE,
+        left=one.misfit / max(len(none) - PER_BODY, 1),
+        phi=one.phi,
+        covariance=one.covariance,
+        pseudo=pseudo,
+        gain=gains[best],
+        rival=gains[rival] if rival is not None else 0.0,
+        rival_carrier=rival,
+    )
+
+
+def _complement(rows: Array, target: Array) -> tuple[Array, Array]:
+    """Return what no parameters of the robot explain: of the target (j,), and of any rows, an orthonormal
+    basis (k, j) of the complement of the rows' range."""
+    scale = parameter_scale(rows.shape[1] // PER_BODY)
+    left, values, _ = np.linalg.svd(rows * scale)
+    rank = int((values > RANK_TOLERANCE * values[0]).sum())
+    beyond = left[:, rank:]
+    return beyond.T @ target, beyond
+
+
+def _on(columns: Array, none: Array, place_m: Array) -> PayloadOn:
+    triangle = qr(np.column_stack([columns, none]), mode="r", check_finite=False)[0][: PER_BODY + 1]
+    rows, target = triangle[:, :-1], triangle[:, -1]
+    solved = physically_consistent(rows, target, _likely(place_m)[None], PRIOR_WEIGHT)
+    off = rows @ solved.x - target
+    return PayloadOn(float(off @ off), solved.x, solved.covariance)
+
+
+def _likely(place_m: Array) -> Array:
+    """Return the pseudo-inertia (4, 4) of a payload as it is likely."""
+    centre = np.append(place_m, 1.0)
+    found = LIKELY_KG * np.outer(centre, centre)
+    found[:3, :3] += LIKELY_KG * LIKELY_SIZE_M**2 * np.eye(3)
+    return np.asarray(found)

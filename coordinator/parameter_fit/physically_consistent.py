@@ -1,0 +1,336 @@
+"""Real bodies that explain the torques: least squares over bodies that can exist, drawn towards a prior.
+
+A body can exist if its pseudo-inertia J is positive definite (`consistency`). Torques leave many directions
+open; there a prior J0 decides, by the entropic divergence of two mass distributions (Lee, Wensing and Park
+2020, Geometric robot dynamic identification: a convex programming approach),
+
+    d(J | J0) = -log det(J J0^-1) + tr(J J0^-1) - 4,
+
+which does not depend on frames or units and grows without bound where J ceases to be a body's. So
+
+    minimise |R x - z|^2 / 2 + w sum_i d(J_i(x) | J0_i)
+
+is convex, smooth and self-concordant, and needs no constraint: Newton's method with a line search solves it
+(Boyd and Vandenberghe 2004, Convex optimization, section 9.6).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import block_diag, qr, solve_triangular
+from scipy.optimize import brentq
+
+from coordinator.dynamics.pseudo_inertia import parameter_transform, pseudo_inertia
+from coordinator.parameter_fit.base_parameters import whitened
+from coordinator.parameter_fit.least_squares import InertialFit
+from coordinator.parameter_fit.systematic_errors import whitened_effects
+from module_agent.model.chain import Array
+from module_agent.model.information import JointInformation
+from module_agent.model.regressor import PER_BODY
+
+# Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 10 is the belief that a body's distribution of
+# mass is known to about 30 %: modules better, links worse. What no model has, friction and springs, is no
+# white noise, and a weaker prior buys it off with bodies of tons: weaker ones are for where this one costs
+# too much.
+WEIGHTS = (10.0, 1.0, 0.1, 0.01)
+# How much the relative torque error may grow from least squares' for the prior's sake: half of what is
+# promised for motions that were not fitted, because those are another sample of the same.
+MOST_COST = 5e-4
+# Of the torques' rms: no torque is known better, and a simulated one without noise is not solved better.
+_FINEST = 1e-5
+
+_MOST_STEPS = 200
+# Of the prior's weight: the objective is then within 1e-7 divergences of its minimum.
+_DECREMENT = 1e-7
+# Good enough to go on from, to the next smaller barrier: tenth by tenth.
+_ROUGHLY = 0.05
+_FALL = 10.0
+# On the way bodies may grow to this many times the prior where torques are silent.
+_LARGEST = 1e3
+# A body far too small grows at most this many times over in a step.
+_LONGEST_STEP = 1e6
+_UNITS = np.stack([pseudo_inertia(unit) for unit in np.eye(PER_BODY)])
+_TRACE = np.trace(_UNITS, axis1=1, axis2=2)
+
+
+class NotSolvedError(ArithmeticError):
+    """Newton's method did not come to an end; the message says how far it came."""
+
+
+class PhysicalFit(NamedTuple):
+    """n bodies that can exist and explain the torques; arrays are read-only.
+
+    phi: (10 n,) as in `torque_regressor`. covariance: (10 n, 10 n) with the prior taken for knowledge: it is
+        small where the prior holds, so compare `InertialFit.covariance`.
+    pseudo: (n, 4, 4) the bodies' pseudo-inertias, in the root frame. divergence: (n,) from the prior.
+    weight: of the prior. error: relative torque error |e| / |tau| of the fit. least_squares_error: that of
+        least squares, which leaves alone what the noise hides.
+    """
+
+    phi: Array
+    covariance: Array
+    pseudo: Array
+    divergence: Array
+    weight: float
+    error: float
+    least_squares_error: float
+
+    @property
+    def cost(self) -> float:
+        """How much more of the torque is left unexplained than by least squares, as a share of |tau|.
+
+        Negative where the prior gives directions a say that least squares leaves to the noise.
+        """
+        return self.error - self.least_squares_error
+
+
+class Solution(NamedTuple):
+    """The minimum for one weight: x (p,), its covariance (p, p), the divergences (n,), Newton's steps."""
+
+    x: Array
+    covariance: Array
+    divergence: Array
+    steps: int
+
+
+def fit_physical(
+    information: Sequence[JointInformation],
+    prior: ArrayLike,
+    least_squares: InertialFit,
+    independent_fraction: float = 1.0,
+    most_cost: float = MOST_COST,
+    effects: Sequence[Array] | None = None,
+) -> PhysicalFit:
+    """Fit real bodies to the torques of all joints.
+
+    The prior has the largest of `WEIGHTS` with which the torques are explained worse than by least squares by
+    at most `most_cost`, or by no more than the noise that least squares fits; if none is, because friction is
+    missing in the model for example, then worse than by the best real bodies by at most `most_cost`.
+
+    Args:
+        information: per joint of n.
+        prior: (n, 4, 4) pseudo-inertias in the root frame at q = 0 (`parameter_prior.module_prior`).
+        least_squares: what is fitted without bodies to the same information. Its noise says how much the data
+            outweigh the prior; all joints count alike, as in unweighted least squares, so that the errors of
+            the two compare.
+        independent_fraction: independent samples per sample, below 1 after a low-pass.
+        most_cost: see above; a share of |tau|.
+        effects: (k_i, j) of every joint, of errors that come as a whole (`common_errors`); they widen the
+            covariance.
+
+    Raises:
+        ValueError: shapes that do not fit, a prior that is no body's, or torques that are all zero.
+        NotSolvedError: numerical trouble.
+    """
+    bodies = np.asarray(prior, dtype=float)
+    size = float(np.sqrt(sum(piece.z @ piece.z + piece.rest for piece in information)))
+    if not size > 0.0:
+        raise ValueError("all torques are zero: no bodies explain them")
+    best = _relative_error(information, least_squares.phi, size)
+    # Least squares fits its own noise too: by so much the true bodies themselves would be worse.
+    sigma = _common_sigma(information, least_squares, size)
+    rows, target = whitened(information, sigma, independent_fraction)
+    own = least_squares.rank * float(sigma[0]) ** 2 / independent_fraction
+    allowed = max(best + most_cost, float(np.hypot(best, np.sqrt(own) / size)))
+
+    def error_of(phi: Array) -> float:
+        return _relative_error(information, phi, size)
+
+    found, weight, error = _strongest_prior(rows, target, bodies, error_of, allowed, most_cost)
+    covariance = found.covariance
+    if effects is not None:
+        shifts = covariance @ (rows.T @ whitened_effects(effects, sigma, independent_fraction))
+        covariance = covariance + shifts @ shifts.T
+    pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
+    for array in (pseudo, found.x, covariance, found.divergence):
+        array.flags.writeable = False
+    return PhysicalFit(found.x, covariance, pseudo, found.divergence, weight, error, best)
+
+
+def _strongest_prior(
+    rows: Array,
+    target: Array,
+    prior: Array,
+    error_of: Callable[[Array], float],
+    allowed: float,
+    most_cost: float,
+) -> tuple[Solution, float, float]:
+    """Return the solution with the largest weight whose error is allowed, the weight, and the error."""
+    tried: list[tuple[Solution, float, float]] = []
+    for weight in WEIGHTS:
+        found = physically_consistent(rows, target, prior, weight)
+        tried.append((found, weight, error_of(found.x)))
+        if tried[-1][2] <= allowed:
+            return tried[-1]
+    # No real bodies do as well as least squares: the model lacks something. What the prior adds to their
+    # price is kept small instead.
+    cheapest = min(error for _, _, error in tried)
+    return next(one for one in tried if one[2] - cheapest <= most_cost)
+
+
+def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:
+    """Minimise |R x - z|^2 / 2 + weight * divergence from the prior over bodies that can exist.
+
+    Args:
+        rows: (k, p) in standard deviations; the first 10 n columns are the bodies'. The rest are parameters
+            without constraint and without prior (friction), which the rows must determine.
+        target: (k,). prior: (n, 4, 4). weight: above 0.
+
+    Raises:
+        ValueError: shapes that do not fit, a prior that is no body's, or a weight that is not positive.
+        NotSolvedError: numerical trouble.
+    """
+    problem = _problem(rows, target, prior, weight)
+    y = problem.origin()
+    # Far from the minimum Newton's steps are many. So the logarithm alone begins with a weight beside which
+    # the misfit is small, and that falls to the prior's (the barrier method: Boyd and Vandenberghe, section
+    # 11.3). Were the whole divergence to fall with it, a prior that is far off would cost hundreds of steps.
+    high = problem.misfit(y) / (4.0 * problem.bodies)
+    times = max(0, int(np.ceil(np.log(high / weight) / np.log(_FALL)))) if high > 0.0 else 0
+    steps = 0
+    for left in range(times, 0, -1):
+        barrier = weight * _FALL**left
+        far = problem._replace(barrier=barrier, weight=max(weight, barrier / _LARGEST))
+        y, taken = _descend(far, y, _ROUGHLY)
+        steps += taken
+    y, taken = _descend(problem, y, _DECREMENT)
+    spread = problem.scale @ solve_triangular(problem.slope(y)[1], np.eye(len(y)))
+    return Solution(problem.scale @ y, spread @ spread.T, problem.divergence(y), steps + taken)
+
+
+def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, int]:
+    """Return the minimum to within `decrement` times the barrier, from `y`, and Newton's steps."""
+    fall = np.inf
+    for step in range(_MOST_STEPS):
+        try:
+            gradient, triangle = problem.slope(y)
+            down = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))
+        except np.linalg.LinAlgError as error:
+            raise NotSolvedError(
+                f"no real bodies were found, after {step} steps: {error}; parameters without a prior may be "
+                "such that the rows do not determine them"
+            ) from error
+        fall = float(-gradient @ down)
+        if fall < 2.0 * decrement * problem.barrier:
+            return y, step
+        length = problem.best_length(y, down)
+        if not length > 0.0:
+            # Rounding, not descent: nothing lower can be told from here.
+            return y, step
+        y = y + length * down
+    raise NotSolvedError(f"no real bodies were found in {_MOST_STEPS} steps; the last would gain {fall:.2g}")
+
+
+class _Problem(NamedTuple):
+    """The problem in coordinates in which every prior is the identity: x = scale @ y, J_i = C_i Y_i C_i^T.
+
+    The objective is |triangle y - target|^2 / 2 + sum_i (weight tr Y_i - barrier log det Y_i).
+    """
+
+    triangle: Array
+    target: Array
+    scale: Array
+    bodies: int
+    weight: float
+    barrier: float
+
+    def origin(self) -> Array:
+        """Return the prior (p,), and zero for what has none."""
+        one = np.array([1.0, 0, 0, 0, 2.0, 0, 0, 2.0, 0, 2.0])
+        return np.concatenate([np.tile(one, self.bodies), np.zeros(len(self.scale) - PER_BODY * self.bodies)])
+
+    def matrices(self, y: Array) -> Array:
+        """Return the Y_i (n, 4, 4)."""
+        own = y[: PER_BODY * self.bodies].reshape(self.bodies, PER_BODY)
+        return np.asarray(np.einsum("na,aij->nij", own, _UNITS))
+
+    def divergence(self, y: Array) -> Array:
+        """Return the divergences (n,); infinite where a body cannot exist."""
+        matrices = self.matrices(y)
+        values = np.linalg.eigvalsh(matrices)
+        if not (values > 0.0).all():
+            return np.full(self.bodies, np.inf)
+        return np.asarray(np.sum(values - np.log(values) - 1.0, axis=1))
+
+    def misfit(self, y: Array) -> float:
+        """Return |R x - z|^2 / 2 but for what no parameters explain."""
+        error = self.triangle @ y - self.target
+        return float(0.5 * error @ error)
+
+    def best_length(self, y: Array, down: Array) -> float:
+        """Return the t that minimises the objective along y + t * down, 0 if it does not fall.
+
+        Steps that merely go down may end next to a body that cannot exist, and the next ones are then short.
+        Along a line log det(Y + t D) is the sum of log(1 + t l) over the eigenvalues l of L^-1 D L^-T.
+        """
+        lower = np.linalg.inv(np.linalg.cholesky(self.matrices(y)))
+        along = self.matrices(down)
+        rates = np.linalg.eigvalsh(lower @ along @ lower.transpose(0, 2, 1)).ravel()
+        seen = self.triangle @ down
+        curvature = float(seen @ seen)
+        pull = float(seen @ (self.triangle @ y - self.target))
+        pull += self.weight * float(np.trace(along, axis1=1, axis2=2).sum())
+
+        def grows(t: float) -> float:
+            return curvature * t + pull - self.barrier * float(np.sum(rates / (1.0 + t * rates)))
+
+        if not grows(0.0) < 0.0:
+            return 0.0
+        # The slope grows from below zero to above it before a body ceases to exist.
+        longest = 1.0 / -float(rates.min()) if rates.min() < 0.0 else np.inf
+        reach = min(1.0, 0.5 * longest)
+        while grows(reach) < 0.0 and reach < _LONGEST_STEP:
+            reach = min(2.0 * reach, 0.5 * (reach + longest))
+        return float(brentq(grows, 0.0, reach, rtol=1e-6)) if grows(reach) > 0.0 else reach
+
+    def slope(self, y: Array) -> tuple[Array, Array]:
+        """Return the gradient (p,) and the triangular square root (p, p) of the Hessian.
+
+        Of -log det Y along E: -tr(Y^-1 E); along E and F: tr(Y^-1 E Y^-1 F), the product of L^-1 E L^-T and
+        L^-1 F L^-T for Y = L L^T.
+        """
+        lower = np.linalg.inv(np.linalg.cholesky(self.matrices(y)))
+        seen = lower[:, None] @ _UNITS @ lower[:, None].transpose(0, 1, 3, 2)
+        gradient = self.triangle.T @ (self.triangle @ y - self.target)
+        pull = self.weight * _TRACE - self.barrier * np.trace(seen, axis1=2, axis2=3)
+        gradient[: pull.size] += pull.ravel()
+        roots = np.sqrt(self.barrier) * block_diag(*(one.reshape(PER_BODY, 16).T for one in seen))
+        stacked = np.zeros((len(self.triangle) + len(roots), len(y)))
+        stacked[: len(self.triangle)] = self.triangle
+        stacked[len(self.triangle) :, : roots.shape[1]] = roots
+        return gradient, qr(stacked, mode="r", check_finite=False)[0][: len(y)]
+
+
+def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> _Problem:
+    matrix, seen = np.asarray(rows, dtype=float), np.asarray(target, dtype=float)
+    bodies = np.asarray(prior, dtype=float)
+    if matrix.ndim != 2 or seen.shape != matrix.shape[:1] or bodies.shape != (len(bodies), 4, 4):
+        raise ValueError(f"rows {matrix.shape}, target {seen.shape} and prior {bodies.shape} do not fit")
+    free = matrix.shape[1] - PER_BODY * len(bodies)
+    if free < 0:
+        raise ValueError(f"rows of {matrix.shape[1]} columns for {len(bodies)} bodies of ten parameters")
+    if not weight > 0.0:
+        raise ValueError(f"the prior's weight is {weight}; it must be above 0")
+    try:
+        roots = np.linalg.cholesky(bodies)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("a body of the prior cannot exist: its pseudo-inertia is not positive") from error
+    scale = block_diag(*(parameter_transform(root) for root in roots), np.eye(free))
+    square = qr(np.column_stack([matrix @ scale, seen]), mode="r", check_finite=False)[0]
+    # The last row is what no parameters explain: dropped, so that small gains are not lost beside it.
+    square = square[: matrix.shape[1]]
+    return _Problem(square[:, :-1], square[:, -1], scale, len(bodies), weight, weight)
+
+
+def _common_sigma(information: Sequence[JointInformation], fit: InertialFit, size: float) -> Array:
+    least = _FINEST * size / np.sqrt(sum(piece.samples for piece in information))
+    common = max(float(np.sqrt(np.mean(fit.torque_sigma_nm**2))), least)
+    return np.full(len(information), common)
+
+
+def _relative_error(information: Sequence[JointInformation], phi: Array, size: float) -> float:
+    misfit = [piece.r @ phi - piece.z for piece in information]
+    total = sum(float(e @ e) + piece.rest for e, piece in zip(misfit, information, strict=True))
+    return float(np.sqrt(total)) / size

@@ -1,0 +1,251 @@
+"""Everything that a session received and sent, in order, and what follows from it without looking further.
+
+The live session and a replay feed the same entries through the same `Recording`, so that both compute the
+same results. The recording's hash is the trace hash of the run.
+"""
+
+import hashlib
+import struct
+from typing import Literal, NamedTuple
+
+from coordinator.recording.journal import JournalEvent, Purpose
+from module_agent.model.catalogue import ImuKind, TorqueKind
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
+from module_agent.wire.keys import Leaf, parse
+from module_agent.wire.messages import (
+    Ack,
+    Ask,
+    Estimate,
+    EstimateRequest,
+    Feedback,
+    GainsCommand,
+    HistoryRequest,
+    Info,
+    LeaseRequest,
+    Message,
+    MotionCommand,
+    Setpoint,
+    Status,
+    Stop,
+)
+from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.row_log import RowLog
+
+Kind = Literal["publication", "request", "reply", "journal"]
+JOURNAL_TOPIC = "journal"
+
+PUBLISHED: dict[Leaf, type[Message]] = {
+    Leaf.FEEDBACK: Feedback,
+    Leaf.STATUS: Status,
+    Leaf.ESTIMATE: Estimate,
+    Leaf.SETPOINT: Setpoint,
+}
+ASKED: dict[Leaf, type[Message]] = {
+    Leaf.INFO: Ask,
+    Leaf.STATUS: Ask,
+    Leaf.HISTORY: HistoryRequest,
+    Leaf.ESTIMATE: EstimateRequest,
+    Leaf.LEASE: LeaseRequest,
+    Leaf.MOTION: MotionCommand,
+    Leaf.STOP: Stop,
+    Leaf.GAINS: GainsCommand,
+    Leaf.COLLECT: CollectRequest,
+    Leaf.INFORMATION: InformationRequest,
+}
+ANSWERED: dict[Leaf, type[Message]] = {
+    Leaf.INFO: Info,
+    Leaf.STATUS: Status,
+    Leaf.HISTORY: Feedback,
+    Leaf.ESTIMATE: Estimate,
+    Leaf.INFORMATION: Information,
+}
+
+
+class Entry(NamedTuple):
+    """One message as it passed: `topic` is its key (or `journal`), `t_ns` the session time."""
+
+    kind: Kind
+    topic: str
+    t_ns: int
+    payload: bytes
+
+
+class RoundTrip(NamedTuple):
+    """A question and its answer: session times of sending and receiving, module time of answering."""
+
+    sent_ns: int
+    received_ns: int
+    module_ns: int
+
+
+class ModuleRecord:
+    """What is known of one boot of one module."""
+
+    def __init__(self, serial: str, boot: int):
+        self.serial = serial
+        self.boot = boot
+        self.rows = RowLog(boot)
+        self.info: Info | None = None
+        self.status: Status | None = None
+        self.round_trips: list[RoundTrip] = []
+        self.settled_trips: int | None = None
+        self.information: dict[bytes, dict[int, Information]] = {}
+        self.arrivals: list[tuple[int, int]] = []
+        self.newest_ns = 0
+
+    @property
+    def trips(self) -> list[RoundTrip]:
+        """The round trips that clocks are mapped by: all, until it is settled what is known."""
+        return self.round_trips[: self.settled_trips]
+
+    def see(self, t_ns: int) -> None:
+        """Note a module time that was heard."""
+        self.newest_ns = max(self.newest_ns, t_ns)
+
+
+class Recording:
+    """The messages of one session and their indices. `modules` holds the latest boot of every serial."""
+
+    def __init__(self) -> None:
+        self.modules: dict[str, ModuleRecord] = {}
+        self.past: dict[tuple[str, int], ModuleRecord] = {}
+        self.estimates: dict[tuple[str, str], dict[tuple[int, ...], Estimate]] = {}
+        self.journal: list[JournalEvent] = []
+        self.questions: dict[bytes, InformationRequest] = {}
+        self.refused: dict[str, int] = {}
+        self._hash = hashlib.sha256()
+        self._sent: dict[tuple[str, int], int] = {}
+
+    @property
+    def trace_hash(self) -> str:
+        """SHA-256 over kind, topic, session time and bytes of every message so far."""
+        return self._hash.hexdigest()
+
+    def module(self, serial: str, boot: int) -> ModuleRecord:
+        """Return the record of one boot of a module, new if it was not known."""
+        found = self.past.get((serial, boot))
+        if found is None:
+            # A straggler of an earlier boot, known already, does not make that boot the latest again.
+            found = self.past[serial, boot] = self.modules[serial] = ModuleRecord(serial, boot)
+        return found
+
+    def add(self, entry: Entry) -> Message | JournalEvent:
+        """Take in one entry; return what it says.
+
+        Raises:
+            WireError: the bytes are not what their key announces; they are counted in `refused`.
+        """
+        if entry.kind == "journal":
+            event = JournalEvent.model_validate_json(entry.payload)
+            self.journal.append(event)
+            if event.what in ("session", "settled"):
+                for module in self.modules.values():
+                    module.settled_trips = len(module.round_trips) if event.what == "settled" else None
+            return event
+        head = f"{entry.kind} {entry.topic} {len(entry.payload)} ".encode()
+        self._hash.update(head + struct.pack("<q", entry.t_ns) + entry.payload)
+        try:
+            return self._index(entry)
+        except WireError as error:
+            self.refused[error.reason.value] = self.refused.get(error.reason.value, 0) + 1
+            raise
+
+    def _index(self, entry: Entry) -> Message:
+        parts = parse(entry.topic)
+        message = self._decode(entry, parts.leaf)
+        if message.serial != parts.serial:
+            raise WireError(Refusal.WRONG_SERIAL, f"{message.serial} speaks on the key of {parts.serial}")
+        if entry.kind == "request":
+            self._sent[entry.topic, message.seq] = entry.t_ns
+            if isinstance(message, InformationRequest):
+                self.questions.setdefault(message.digest(), message)
+            return message
+        if isinstance(message, Setpoint):
+            return message
+        module = self.module(message.serial, message.boot)
+        self._note(module, message, entry)
+        return message
+
+    def _decode(self, entry: Entry, leaf: Leaf) -> Message:
+        if entry.kind == "publication":
+            table = PUBLISHED
+        elif entry.kind == "request":
+            table = ASKED
+        else:
+            table = ANSWERED
+            if leaf not in table:
+                return decode(Ack, entry.payload)
+        if leaf not in table:
+            raise WireError(Refusal.MALFORMED, f"nothing is {entry.kind} on {leaf.value}")
+        try:
+            return decode(table[leaf], entry.payload, MAX_MESSAGE_BYTES)
+        except WireError as error:
+            if entry.kind == "reply" and error.reason is Refusal.TYPES:
+                return decode(Ack, entry.payload)
+            raise
+
+    def _note(self, module: ModuleRecord, message: Message, entry: Entry) -> None:
+        match message:
+            case Feedback():
+                rows = module.rows.add(message)
+                if len(rows):
+                    newest = int(rows["t_ns"][-1])
+                    module.see(newest)
+                    if entry.kind == "publication":
+                        module.arrivals.append((entry.t_ns, newest))
+            case Status():
+                module.status = message
+                module.see(message.t_ns)
+                self._note_round_trip(module, entry, message.re, message.t_ns)
+            case Ack():
+                module.see(message.t_ns)
+                self._note_round_trip(module, entry, message.re, message.t_ns)
+            case Info():
+                module.info = message
+                module.see(message.t_ns)
+            case Estimate():
+                found = self.estimates.setdefault((message.joint, message.serial), {})
+                found[message.motion_ids] = message
+            case Information():
+                module.information.setdefault(message.digest, {})[message.offset] = message
+            case _:
+                pass
+
+    def _note_round_trip(self, module: ModuleRecord, entry: Entry, re: int, module_ns: int) -> None:
+        sent_ns = self._sent.pop((entry.topic, re), None)
+        if entry.kind == "reply" and sent_ns is not None:
+            module.round_trips.append(RoundTrip(sent_ns, entry.t_ns, module_ns))
+
+    @property
+    def imu(self) -> ImuKind:
+        """How well the IMUs are known beforehand, as the session was told last."""
+        told = [event.imu for event in list(self.journal) if event.what == "session"]
+        return told[-1] if told else "uncalibrated"
+
+    @property
+    def torque(self) -> TorqueKind:
+        """How well the torque sensors' scales are known beforehand, as the session was told last."""
+        told = [event.torque for event in list(self.journal) if event.what == "session"]
+        return told[-1] if told else "uncalibrated"
+
+    def motions(self, *purposes: Purpose) -> list[JournalEvent]:
+        """Return the motions of these purposes whose rows are those of their module's latest boot.
+
+        A module that boots numbers its rows anew, and may have lost its zero: what it did before is no part
+        of the robot that is there.
+        """
+        boots = {serial: module.boot for serial, module in list(self.modules.items())}
+        return [
+            event
+            for event in list(self.journal)
+            if event.what == "motion"
+            and event.purpose in purposes
+            and event.motion is not None
+            and event.boot in (0, boots.get(event.serial, event.boot))
+        ]
+
+    def rows(self, serial: str, first: int, end: int) -> Rows:
+        """Return the rows of a range of the latest boot of a module that have arrived."""
+        return self.modules[serial].rows.rows(first, end)

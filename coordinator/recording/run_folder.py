@@ -1,0 +1,108 @@
+"""The folder of one run: recording, view, result and the robot as URDF and HRDF."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import Recording
+from coordinator.recording.session_file import SessionFileError, read_session
+from module_agent.wire.refusal import WireError
+
+SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION = (
+    "session.mcap",
+    "session.rrd",
+    "result.json",
+    "robot.urdf",
+    "robot.hrdf",
+    "held_out.npz",
+    "information.npz",
+)
+ASIDE = "session.crashed.mcap"
+
+
+class RunFolderError(ValueError):
+    """The folder cannot be used; the message says why and what to do."""
+
+
+def check_free(path: Path) -> None:
+    """Check that a new run may use the folder, without making it.
+
+    A run that ended before it did anything, because nobody was there for example, does not count.
+
+    Raises:
+        RunFolderError: it holds a run already.
+    """
+    if (path / RESULT).exists() or any(_has_begun(path / name) for name in (SESSION, ASIDE)):
+        raise RunFolderError(f"{path} holds a run already: choose another --out, or --resume it")
+
+
+def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path | None:
+    """Make the folder; return the recording of the crashed run to resume from, if there is one.
+
+    The crashed run's recording is set aside under another name and kept until the resumed run is complete.
+
+    Args:
+        path: of the folder.
+        resume: go on with what is in it.
+        robot: whose run it must be to be resumed; None for anybody's.
+
+    Raises:
+        RunFolderError: the folder holds a run already and is not to be resumed, or there is nothing to
+        resume, or the run is another robot's.
+    """
+    if not resume:
+        check_free(path)
+        path.mkdir(parents=True, exist_ok=True)
+        for name in (SESSION, ASIDE):
+            (path / name).unlink(missing_ok=True)
+        return None
+    if (path / RESULT).exists():
+        raise RunFolderError(f"{path} holds a complete run: there is nothing to resume")
+    session, aside = path / SESSION, path / ASIDE
+    if not session.exists() and not aside.exists():
+        raise RunFolderError(f"{path} holds no recording to resume")
+    # Crashed while resuming: what was set aside first has everything that the new file had begun to repeat,
+    # unless the new file went further.
+    older = aside.exists() and (not session.exists() or session.stat().st_size < aside.stat().st_size)
+    _check_robot(aside if older else session, robot)
+    if not older:
+        session.replace(aside)
+    return aside
+
+
+def _journal(session: Path) -> Iterator[JournalEvent]:
+    for entry in read_session(session):
+        if entry.kind == "journal":
+            yield JournalEvent.model_validate_json(entry.payload)
+
+
+def _has_begun(session: Path) -> bool:
+    if not session.exists():
+        return False
+    try:
+        return any(event.what == "begin" for event in _journal(session))
+    except (SessionFileError, ValidationError):
+        # Whatever that is, it is not ours to write over.
+        return True
+
+
+def _check_robot(session: Path, robot: str | None) -> None:
+    started = next((event for event in _journal(session) if event.what == "session"), None)
+    if started is not None and robot is not None and started.robot != robot:
+        raise RunFolderError(
+            f"{session.parent} holds a run of robot {started.robot!r}, not of {robot!r}: give --robot "
+            f"{started.robot}, or the --out of a run of {robot!r}"
+        )
+
+
+def load_recording(path: Path) -> Recording:
+    """Read a recording; what could not be understood when it came is left out as it was then."""
+    recording = Recording()
+    for entry in read_session(path):
+        try:
+            recording.add(entry)
+        except WireError:
+            continue  # counted in `recording.refused`
+    return recording

@@ -1,0 +1,1 @@
+"""Event loop, exit codes and terminal of the command-line programs."""

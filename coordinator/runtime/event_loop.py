@@ -1,0 +1,98 @@
+"""An asyncio loop whose clock runs faster or slower than real time, for a simulation run at another speed.
+
+A task that a signal may end, with all that it does in its `finally`.
+"""
+
+import asyncio
+import math
+import selectors
+import signal
+import time
+from typing import TypeVar
+
+
+def check_speed(speed: float) -> float:
+    """Return a speed that a clock can run at.
+
+    Raises:
+        ValueError: not positive, or not finite.
+    """
+    if not (math.isfinite(speed) and speed > 0.0):
+        raise ValueError(f"speed {speed}: it must be a positive number, 1 for real time")
+    return speed
+
+
+class _ScaledSelector(selectors.DefaultSelector):
+    def __init__(self, speed: float):
+        super().__init__()
+        self._speed = speed
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        """Wait for the real time that `timeout` session seconds take."""
+        return super().select(timeout if timeout is None else timeout / self._speed)
+
+
+class ScaledLoop(asyncio.SelectorEventLoop):
+    """Sleeps and time-outs are in session seconds: `speed` of them pass in a real second.
+
+    Raises:
+        ValueError: see `check_speed`.
+    """
+
+    def __init__(self, speed: float = 1.0):
+        super().__init__(_ScaledSelector(check_speed(speed)))
+        self._speed = speed
+        # Wall time at the start, so that the recordings of a resumed session do not overlap.
+        self._origin_ns = time.time_ns()
+        self._start_ns = time.monotonic_ns()
+
+    def time(self) -> float:
+        """Return session seconds."""
+        return time.monotonic() * self._speed
+
+    def clock_ns(self) -> int:
+        """Return session time as integer nanoseconds since 1970 (at the start)."""
+        return self._origin_ns + int((time.monotonic_ns() - self._start_ns) * self._speed)
+
+
+T = TypeVar("T")
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def ignore_signals() -> None:
+    """Ignore what has been obeyed, up to the end of the process: it would end with another exit code."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+
+
+class Interruption:
+    """A signal handler: the first call cancels the task, later ones do not disturb its clean-up."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]"):
+        self._loop = loop
+        self._task = task
+        self.asked = False
+
+    def __call__(self, *_: object) -> None:
+        """Cancel the task, once; to be called from the loop's thread."""
+        if not self.asked:
+            self.asked = True
+            # By the loop, so that a task that has not begun yet runs as far as its `try` first.
+            self._loop.call_soon(self._task.cancel, "interrupted")
+
+
+def run_to_end(loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]") -> T:
+    """Run a task, then cancel and await whatever it has left on the loop; return or raise what it did."""
+    try:
+        return loop.run_until_complete(task)
+    finally:
+        left = sorted(asyncio.all_tasks(loop), key=lambda each: each.get_name())
+        loop.run_until_complete(_end(left))
+
+
+async def _end(tasks: "list[asyncio.Task[object]]") -> None:
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)

@@ -1,0 +1,1 @@
+"""The sequence of a run: which motion comes next."""

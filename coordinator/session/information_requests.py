@@ -1,0 +1,110 @@
+"""Asking the modules what their own torques say: to keep the rows of every motion, and at last for the sum.
+
+A session does not fail by it: what a module does not tell is computed from the recording.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+
+from coordinator.identification.inertia.agent_information import dynamic_steps, question, rows_to_keep
+from coordinator.live_robot.messenger import Clock, NoAnswer, Radio, together
+from coordinator.recording.recording import Recording
+from module_agent.model.chain import Chain
+from module_agent.signals.clock_map import ClockMap
+from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import Ack
+from module_agent.wire.refusal import Refusal
+
+ATTEMPTS = 10
+POLL_S = 0.1
+# An agent has to load what it computes with, and on a poor network to fetch rows again and again.
+PATIENCE_NS = 40_000_000_000
+
+
+class TorqueQuestions:
+    """Of one session; `note` takes a line for whoever watches."""
+
+    def __init__(
+        self, radio: Radio, recording: Recording, clock: Clock, sender: str, note: Callable[[str], None]
+    ):
+        self._radio = radio
+        self._recording = recording
+        self._clock = clock
+        self._sender = sender
+        self._note = note
+        self._kept: set[int] = set()
+
+    async def collect(self, serials: tuple[str, ...]) -> None:
+        """Ask all modules to keep the rows of the motions that they were not asked to keep yet."""
+        for event in dynamic_steps(self._recording):
+            assert event.motion is not None
+            number = event.motion.motion_id
+            if number in self._kept:
+                continue
+            self._kept.add(number)
+            try:
+                rows = rows_to_keep(self._recording, serials, event)
+            except ValueError as error:
+                self._note(f"the agents do not share motion {event.step}: {error}")
+                continue
+            await together(
+                self._collect_one(
+                    CollectRequest(
+                        serial=serial,
+                        boot=self._recording.modules[serial].boot,
+                        seq=self._radio.next_seq(),
+                        sender=self._sender,
+                        motion_id=number,
+                        rows=rows,
+                    )
+                )
+                for serial in serials
+            )
+
+    async def _collect_one(self, request: CollectRequest) -> None:
+        for _ in range(ATTEMPTS):
+            try:
+                answer = await self._radio.ask(request.serial, Leaf.COLLECT, request)
+            except NoAnswer:
+                continue
+            if isinstance(answer, Ack) and not answer.accepted:
+                self._note(f"{request.serial} does not keep motion {request.motion_id}: {answer.detail}")
+            return
+
+    async def ask(self, chain: Chain, clocks: Mapping[str, ClockMap]) -> None:
+        """Ask every module of a chain what its torques tell; the answers are in the recording."""
+        try:
+            asked = question(self._recording, chain, clocks, self._sender)
+        except ValueError as error:
+            self._note(f"the agents are not asked for what their torques say: {error}")
+            return
+        await together(self._ask_one(serial, asked) for serial in chain.serials)
+
+    async def _ask_one(self, serial: str, asked: InformationRequest) -> None:
+        end_ns = self._clock() + PATIENCE_NS
+        silent, offset = 0, 0
+        while silent < ATTEMPTS and self._clock() < end_ns:
+            head = {
+                "serial": serial,
+                "boot": self._recording.modules[serial].boot,
+                "seq": self._radio.next_seq(),
+                "offset": offset,
+            }
+            try:
+                answer = await self._radio.ask(serial, Leaf.INFORMATION, asked.model_copy(update=head))
+            except NoAnswer:
+                silent += 1
+                continue
+            silent = 0
+            if isinstance(answer, Information):
+                offset = answer.offset + len(answer.part)
+                if offset >= answer.total_bytes:
+                    return
+            elif isinstance(answer, Ack) and answer.reason == Refusal.BUSY.value:
+                await asyncio.sleep(POLL_S)
+            else:
+                why = answer.detail if isinstance(answer, Ack) else type(answer).__name__
+                self._note(f"{serial} does not say what its torques tell: {why}")
+                return
+        self._note(f"{serial} has not said in time what its torques tell")

@@ -1,0 +1,160 @@
+"""Which motions a session runs: the plan's, or designed ones, from what the recording says of every joint."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS
+from coordinator.excitation.joint_limits import (
+    JointLimits,
+    joint_limits,
+    least_accel_rad_s2,
+    likely_inertia_kg_m2,
+    measured_load,
+)
+from coordinator.excitation.multisine import JointSetting, whole_patterns
+from coordinator.excitation.plan import Plan
+from coordinator.excitation.single_joint import (
+    LIKELY_RADIUS_M,
+    JointMotions,
+    JointTask,
+    design_joint,
+    next_sine,
+    predicted_sigma_m,
+)
+from coordinator.recording.recording import Recording
+from module_agent.model.catalogue import ModuleType
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.messages import ConstantMotion, MotionRecord, MultiSine, Pattern, WindowedSine
+
+# A session of designed motions: 10 s a joint and a little to spare, less what it takes to find and check the
+# modules, rest, and move all joints at once.
+JOINT_S = 9.8
+AROUND_S = 19.0
+# Below the shortest no designed motion fits: short journeys, two settlings and ramps take most of it.
+SHORTEST_S, LONGEST_S = 5.25, 9.0
+# Asking all modules for their estimates, and the module's own ticks between motions.
+ANSWERS_S = 0.3
+# A repeat that takes less than this off the predicted sigma is not worth its time.
+WORTH_SHARE = 0.05
+MOST_MOTIONS = 8
+
+
+class MotionChoice:
+    """Chooses motions; `serials` tells which joints there are to move, `kind` the type of a module."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        recording: Recording,
+        serials: Callable[[], Sequence[str]],
+        kind: Callable[[str], ModuleType],
+    ):
+        self._plan = plan
+        self._serials = serials
+        self._recording = recording
+        self._kind = kind
+
+    def slow(self, serial: str) -> ConstantMotion:
+        """Return a joint's slow motion, before anything is known of its load but whom there is to carry."""
+        found = self._designed(serial, self._unmoved_limits(serial)) if self._designs() else None
+        return found.constant if found is not None else self._plan.constant()
+
+    def fast(self, serial: str, slow: MotionRecord) -> WindowedSine:
+        """Return a joint's fast motion, from the load that its slow motion has shown."""
+        if not self._designs() or not isinstance(slow.pattern, ConstantMotion):
+            return self._plan.sine(self._kind(serial))
+        found = self._designed(serial, self._moved_limits(serial, slow), slow.pattern)
+        return found.sine if found is not None else self._plan.sine(self._kind(serial))
+
+    def again(self, serial: str, done: Sequence[MotionRecord]) -> WindowedSine | None:
+        """Return one more fast motion if the precision asked for needs one and it would help; else None."""
+        wanted_mm = self._plan.precision_mm
+        if wanted_mm is None or len(done) >= MOST_MOTIONS:
+            return None
+        task = self._task(serial, self._moved_limits(serial, done[0]))
+        patterns: list[Pattern] = [record.pattern for record in done]
+        sigma = predicted_sigma_m(task, patterns)
+        more = next_sine(task, patterns, 2.0 * self._plan.sine_centre_s)
+        if sigma <= 1e-3 * wanted_mm or more is None:
+            return None
+        return more if predicted_sigma_m(task, [*patterns, more]) < (1.0 - WORTH_SHARE) * sigma else None
+
+    def predicted_mm(self, serial: str, done: Sequence[MotionRecord]) -> float:
+        """Return what the sensors' noise and errors leave of the radius after these motions [mm]."""
+        task = self._task(serial, self._moved_limits(serial, done[0]))
+        return 1e3 * predicted_sigma_m(task, [record.pattern for record in done])
+
+    def whole(self) -> dict[str, MultiSine]:
+        """Return the motions of all joints at once."""
+        home = self._plan.home_rad
+        settings = {s: JointSetting(self._unmoved_limits(s), home) for s in self._serials()}
+        return whole_patterns(settings, self._plan.whole_duration_s)
+
+    # ------------------------------------------------------------------ what is known
+
+    def _designs(self) -> bool:
+        return self._plan.motions == "designed"
+
+    def _designed(
+        self, serial: str, limits: JointLimits, slow: ConstantMotion | None = None
+    ) -> JointMotions | None:
+        """Return the best motions; none if none fits into the time, and the plan's have to do."""
+        try:
+            return design_joint(self._task(serial, limits), slow)
+        except ValueError:
+            return None
+
+    def _task(self, serial: str, limits: JointLimits) -> JointTask:
+        force = self._rest_rows(serial)["accel_m_s2"].astype(float).mean(axis=0)
+        return JointTask(
+            limits,
+            float(force[2] / np.linalg.norm(force)),
+            IMU_PRIORS[self._plan.imu],
+            self._plan.home_rad,
+            self._plan.travel_speed_rad_s,
+            self._plan.settle_s,
+            self._joint_s() - 2.0 * ANSWERS_S,
+            self._radius_m(serial),
+        )
+
+    def _joint_s(self) -> float:
+        count = len(self._serials())
+        return self._plan.joint_s or float(np.clip(JOINT_S - AROUND_S / count, SHORTEST_S, LONGEST_S))
+
+    def _radius_m(self, serial: str) -> float:
+        """Return the largest radius that any module has seen of this joint, likely before any has."""
+        circles = [
+            estimate.circle.distance_m
+            for (joint, observer), found in self._recording.estimates.items()
+            for estimate in found.values()
+            if joint == serial and observer != serial and estimate.circle is not None
+        ]
+        return max(circles, default=LIKELY_RADIUS_M)
+
+    def _unmoved_limits(self, serial: str) -> JointLimits:
+        inertia = likely_inertia_kg_m2([self._kind(s) for s in self._serials()])
+        return self._limits(serial, inertia)
+
+    def _moved_limits(self, serial: str, slow: MotionRecord) -> JointLimits:
+        rows = self._recording.rows(serial, slow.start_row, slow.end_row or slow.start_row)
+        rate_hz = 1e9 * (len(rows) - 1) / float(rows["t_ns"][-1] - rows["t_ns"][0])
+        load = measured_load(rows["position_rad"].astype(float), rows["effort_nm"].astype(float), rate_hz)
+        return self._limits(serial, load.at_most_kg_m2)
+
+    def _limits(self, serial: str, inertia_kg_m2: float) -> JointLimits:
+        found = joint_limits(self._kind(serial), self._rest_torque_nm(serial), inertia_kg_m2)
+        least = least_accel_rad_s2(len(self._serials()))
+        return found._replace(accel_rad_s2=max(found.accel_rad_s2, least))
+
+    def _rest_torque_nm(self, serial: str) -> float:
+        """Return what a joint holds at home, as it did at rest."""
+        return float(self._rest_rows(serial)["effort_nm"].astype(float).mean())
+
+    def _rest_rows(self, serial: str) -> Rows:
+        rests = [
+            e.motion
+            for e in self._recording.journal
+            if e.purpose == "rest" and e.serial == serial and e.motion
+        ]
+        return self._recording.rows(serial, rests[-1].start_row, rests[-1].end_row or rests[-1].start_row)

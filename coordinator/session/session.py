@@ -1,0 +1,445 @@
+"""One identification run, from discovery to the last motion. Estimation from what it recorded is `identify`.
+
+Steps are journaled: a step that the journal says is done is not done again when a crashed run resumes.
+"""
+
+import asyncio
+import itertools
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
+from typing import Protocol
+
+from coordinator.excitation.plan import Plan
+from coordinator.excitation.segment import RobotMotion
+from coordinator.live_robot.errors import MotionInterrupted
+from coordinator.live_robot.excluded_modules import LeftOut
+from coordinator.live_robot.link_check import check_link
+from coordinator.live_robot.messenger import Clock, Radio, Refused, together
+from coordinator.live_robot.module_group import RobotLink
+from coordinator.recording.journal import JournalEvent, Purpose, left_out_event
+from coordinator.recording.recording import Recording
+from coordinator.session.motion_selection import MotionChoice
+from coordinator.topology.next_motion import MOST_REPEATS, NextMotion
+from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
+
+# Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
+ESTIMATE_WAIT_S = 0.6
+# A poor network interrupts more than one motion in ten; so many times the plan's retries leave none undone.
+POOR_RETRIES = 4
+# Who moves all joints at once is in a hurry; a second tells the gyros' offsets to 0.1 mrad/s.
+WHOLE_REST_S = 1.0
+
+
+class Reporter(Protocol):
+    """Hears how the session goes; screen and viewer implement it."""
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """A step begins."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Something worth a line."""
+        ...
+
+    def estimates(self, joint: str) -> None:
+        """All estimates of the motions of a joint have arrived."""
+        ...
+
+    async def doubts(self) -> Sequence[NextMotion]:
+        """All joints are explored. Return what to move again to settle doubts about the topology."""
+        ...
+
+    async def explored(self) -> None:
+        """All joints are explored: topology and chain can be assembled. Raises if they cannot."""
+        ...
+
+    async def excitation(self) -> Sequence[RobotMotion]:
+        """Return motions of all joints at once that tell their inertia, the last to be held out.
+
+        Empty if there are none that the robot could run.
+        """
+        ...
+
+
+class NobodyThere(RuntimeError):
+    """No module, or not as many as expected, announced itself."""
+
+
+class Session:
+    """Runs the steps on a robot. `journal` records an event; `reporter` hears of progress.
+
+    `closer` is asked after a motion of all joints at once which of them to explore by themselves as well.
+    `share` is called after every motion that tells the inertia, while the modules still have its rows.
+    """
+
+    def __init__(
+        self,
+        link: RobotLink,
+        radio: Radio,
+        recording: Recording,
+        plan: Plan,
+        clock: Clock,
+        journal: Callable[[JournalEvent], None],
+        reporter: Reporter,
+        closer: Callable[[], Awaitable[Sequence[str]]] | None = None,
+        share: Callable[[], Awaitable[None]] | None = None,
+    ):
+        self.link = link
+        self._share = share
+        self._closer = closer
+        self._radio = radio
+        self._recording = recording
+        self._plan = plan
+        self._clock = clock
+        self._journal = journal
+        self._reporter = reporter
+        self._choice = MotionChoice(plan, recording, lambda: self._left_out.movers(), link.kind)
+        self._done = {e.step: e for e in recording.journal if e.what == "done"}
+        self._index = 0
+        self._total = 4
+        self._keeper: asyncio.Task[None] | None = None
+        self._left_out = LeftOut(link, self._note_left_out)
+
+    # ------------------------------------------------------------------ the run
+
+    async def run(self, expect: int | None = None) -> None:
+        """Discover, check, take, move, and let go; raises what went wrong after stopping the robot."""
+        await self._discover(expect)
+        self._report("checking the link")
+        await check_link(self.link, self._clock, self._plan.link_s, self._reporter.note)
+        serials = self.link.serials
+        explorations = 1 if self._plan.mode == "whole" else len(serials) + (self._plan.motions == "designed")
+        self._total = 6 + explorations + (self._excitations(len(serials)) if self._plan.dynamics else 0)
+        self._mend_after_restart()
+        starts = {s: self._position(s) for s in serials}
+        try:
+            await self._take()
+            await self._if_it_moves("home", "all joints to their home position", self._home)
+            await self._step("rest", "listening at rest", self._rest)
+            if self._plan.mode == "whole":
+                await self._step("explore", "exploring all joints at once", self._explore_all)
+                await self._look_closer()
+            else:
+                for serial in serials:
+                    text = f"exploring joint {serial}"
+                    await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
+                if self._plan.motions == "designed" and not self._plan.topology_only:
+                    await self._step("explore", "exploring all joints at once", self._explore_all)
+            await self._settle_doubts()
+            self._report("topology and chain")
+            await self._reporter.explored()
+            if self._plan.dynamics:
+                await self._show_inertia()
+            await self._finish(starts)
+        except BaseException as error:
+            await self._abandon(error)
+            raise
+
+    async def _discover(self, expect: int | None) -> None:
+        self._report("discovering modules")
+        quiet_since, known = self._clock(), frozenset[str]()
+        end = self._clock() + int((self._plan.discover_s + (10.0 if expect else 3.0)) * 1e9)
+        while self._clock() < end:
+            await asyncio.sleep(0.05)
+            if frozenset(self._radio.alive) != known:
+                known, quiet_since = frozenset(self._radio.alive), self._clock()
+            settled = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
+            if known and settled and (expect is None or len(known) >= expect):
+                break
+        if not known or (expect is not None and len(known) != expect):
+            names = ", ".join(sorted(known)) or "none"
+            wanted = "at least one" if expect is None else str(expect)
+            raise NobodyThere(f"{wanted} module expected, found {len(known)}: {names}")
+        await self._left_out.meet(sorted(known))
+        if not self.link.serials:
+            raise NobodyThere(
+                f"none of the modules that announced themselves responds: {', '.join(sorted(known))}"
+            )
+        for serial in self.link.serials:
+            self.link.kind(serial)
+        self._reporter.note(f"found {len(self.link.serials)}: {', '.join(self.link.serials)}")
+
+    def _mend_after_restart(self) -> None:
+        """Forget what the journal says is done if a module has booted since: its zero may have moved."""
+        moved = [e for e in self._recording.journal if e.what == "motion"]
+        for event in [*self._done.values(), *moved]:
+            record = self._recording.modules.get(event.serial)
+            rebooted = event.serial and (record is None or record.boot != event.boot)
+            if rebooted and self._done.pop(event.step, None) is not None:
+                self._reporter.note(f"{event.step} is done again: module {event.serial} has booted since")
+        for journey in ("home", "back"):
+            self._done.pop(journey, None)
+        if self._done:
+            self._reporter.note(f"resuming: {len(self._done)} steps are done already")
+
+    async def _take(self) -> None:
+        # The keeper first: what is taken already must not expire while the next one is slow to answer.
+        self._keeper = asyncio.create_task(self.link.keep_alive())
+        await self._arm()
+
+    async def _arm(self) -> None:
+        """Acquire every module, and set gains where the plan wants others than the factory's."""
+        # At once: what is armed and has no motion yet expires the more easily.
+        await together(self._arm_one(serial) for serial in self._left_out.movers())
+
+    async def _arm_one(self, serial: str) -> None:
+        await self.link.acquire(serial)
+        if self._plan.hold_stiffness != 1.0:
+            strategy = self.link.info(serial).gains.strategy
+            gains = self._plan.exploring_gains(self.link.kind(serial), strategy)
+            await self.link.set_gains(serial, gains)
+
+    def _retries(self) -> int:
+        """Return how often an interrupted step is done again."""
+        return self._plan.retries * (POOR_RETRIES if self.link.is_poor else 1)
+
+    async def _step(
+        self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
+    ) -> None:
+        self._report(text)
+        if name in self._done:
+            return
+        self._journal(JournalEvent(t_ns=self._clock(), what="begin", step=name))
+        for attempt in itertools.count():
+            try:
+                if attempt:
+                    await self._rearm()
+                await work(*arguments)
+                break
+            except MotionInterrupted as error:
+                await self.link.check_now()
+                if attempt >= self._retries():
+                    raise
+                self._reporter.note(f"{error}; re-arming and trying again")
+                self._journal(JournalEvent(t_ns=self._clock(), what="note", step=name, text=str(error)))
+        await self.link.complete_rows()
+        serial = arguments[0] if arguments else ""
+        boot = self.link.module(serial).boot if serial else 0
+        self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
+
+    async def _if_it_moves(
+        self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
+    ) -> None:
+        """Do a step; without a module that will not move, however often it is told, if that comes up."""
+        while not (arguments and arguments[0] in self._left_out.why):
+            try:
+                await self._step(name, text, work, *arguments)
+                return
+            except (Refused, MotionInterrupted) as error:
+                if not self._left_out.without(error):
+                    raise
+                await self._rearm()
+
+    def _note_left_out(self, serial: str, why: str) -> None:
+        self._reporter.note(f"going on without {serial}: {why}")
+        self._journal(left_out_event(self._clock(), serial, why))
+
+    async def _rearm(self) -> None:
+        await self._arm()
+        await self._home()
+
+    async def _finish(self, starts: dict[str, float]) -> None:
+        speed = self._plan.travel_speed_rad_s
+
+        async def back() -> None:
+            movers = self._left_out.movers()
+            await self.link.run({s: GoTo(target_rad=starts[s], max_speed_rad_s=speed) for s in movers})
+
+        await self._step("back", "back to where it stood", back)
+        await self.link.release_all()
+        await self._stop_keeping()
+        await self.link.close_gaps()
+
+    async def _stop_keeping(self) -> None:
+        if self._keeper is not None:
+            self._keeper.cancel()
+            await asyncio.gather(self._keeper, return_exceptions=True)
+            self._keeper = None
+
+    async def _abandon(self, error: BaseException) -> None:
+        await self._stop_keeping()
+        why = str(error) or type(error).__name__
+        deaf = await self.link.stop_all(why[:200])
+        text = f"stopped: {why}" + (f"; no confirmation from {', '.join(deaf)}" if deaf else "")
+        self._journal(JournalEvent(t_ns=self._clock(), what="failed", text=text, deaf=tuple(deaf)))
+        self._reporter.note(text)
+
+    # ------------------------------------------------------------------ the steps
+
+    async def _home(self) -> None:
+        speed, home = self._plan.travel_speed_rad_s, self._plan.home_rad
+        await self.link.run(
+            {s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self._left_out.movers()}
+        )
+        await asyncio.sleep(self._plan.settle_s)
+
+    async def _rest(self) -> None:
+        longest = WHOLE_REST_S if self._plan.mode == "whole" else self._plan.rest_s
+        pattern = Rest(duration_s=min(longest, self._plan.rest_s))
+        records = await self.link.run(dict.fromkeys(self._left_out.movers(), pattern))
+        for serial, record in records.items():
+            self._note_motion("rest", serial, record, "rest")
+
+    async def _explore(self, serial: str) -> None:
+        """Constant motion through home, then the windowed sine about home (thesis 4.3.1)."""
+        plan, home = self._plan, self._plan.home_rad
+        constant = self._choice.slow(serial)
+        travel = constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
+        await self._go(serial, home - 0.5 * travel)
+        slow = await self._observe(serial, constant, "constant")
+        await self._go(serial, home)
+        if plan.topology_only:
+            return
+        fast = await self._observe(serial, self._choice.fast(serial, slow), "windowed_sine")
+        self._reporter.estimates(serial)
+        await self._repeat(serial, [slow, fast])
+
+    async def _repeat(self, serial: str, done: list[MotionRecord]) -> None:
+        """Repeat the fast motion, or another that tells more, until the radius is known as well as asked."""
+        while (more := self._choice.again(serial, done)) is not None:
+            done.append(await self._move(f"explore/{serial}", serial, more, "repeat"))
+        if self._plan.precision_mm is not None:
+            self._reporter.note(
+                f"joint {serial}: {len(done) - 2} repeats, {self._choice.predicted_mm(serial, done):.2f} mm "
+                f"of radius by the sensors, {self._plan.precision_mm:.2f} mm asked for"
+            )
+
+    async def _look_closer(self) -> None:
+        """Explore by itself every joint that a motion of all at once leaves open, if anybody says which."""
+        closer = await self._closer() if self._closer is not None else ()
+        self._total += len(closer)
+        for serial in closer:
+            text = f"exploring joint {serial}"
+            await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
+
+    async def _settle_doubts(self) -> None:
+        """Move again what leaves the topology in doubt, until nothing does or trying has no end."""
+        for turn in range(MOST_REPEATS):
+            motions = await self._reporter.doubts()
+            self._total += len(motions)
+            for motion in motions:
+                self._reporter.note(motion.words)
+                await self._step(
+                    f"settle/{turn}/{motion.joint}",
+                    f"moving joint {motion.joint} again",
+                    partial(self._move_again, motion),
+                    motion.joint,
+                )
+            if not motions:
+                return
+
+    async def _move_again(self, motion: NextMotion, serial: str) -> None:
+        slow, home = self._plan.constant(), self._plan.home_rad
+        others = {s: home + motion.others_rad for s in self._left_out.movers() if s != serial}
+        if motion.others_rad:
+            await self._go_all(others)
+        await self._go(serial, home - 0.5 * motion.travel_rad(slow))
+        await self._observe(serial, motion.pattern(slow), "constant")
+        await self._go(serial, home)
+        if motion.others_rad:
+            await self._go_all(dict.fromkeys(others, home))
+
+    async def _explore_all(self) -> None:
+        """All joints about home at the same time, each at frequencies of its own (thesis 7.2)."""
+        records = await self.link.run(self._choice.whole())
+        for serial, record in records.items():
+            self._note_motion("explore", serial, record, "whole")
+
+    async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
+        record = await self._move(f"explore/{serial}", serial, pattern, purpose)
+        for observer in self.link.serials:
+            found = await self.link.estimate(observer, serial, record.motion_id, ESTIMATE_WAIT_S)
+            if found is None:
+                self._reporter.note(f"{observer} has no estimate of the {purpose} motion of {serial}")
+            elif found.note:
+                self._reporter.note(f"{observer} on joint {serial}: {found.note}")
+        return record
+
+    async def _show_inertia(self) -> None:
+        """Excite all joints together, if all of them move and motions for that can be designed."""
+        motions = await self._reporter.excitation() if self._together() else ()
+        serials = self._left_out.movers() if not motions else ()
+        self._total += (len(motions) or 2 * len(serials)) - self._excitations(len(self.link.serials))
+        for number, motion in enumerate(motions):
+            last = number == len(motions) - 1
+            purpose: Purpose = "held_out" if last else "dynamic"
+            text = "held-out motion of all joints" if last else f"exciting all joints, {number + 1}"
+            work = partial(self._run_together, f"{purpose}/{number}", motion, purpose)
+            await self._step(f"{purpose}/{number}", text, work)
+            await self._shared()
+        for serial in serials:
+            await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
+            await self._shared()
+        for serial in serials:
+            await self._step(f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial)
+
+    async def _shared(self) -> None:
+        if self._share is not None:
+            await self._share()
+
+    def _excitations(self, joints: int) -> int:
+        """Return how many steps the plan takes to excite so many joints."""
+        return 1 + self._plan.excitation_motions if self._plan.excitation == "designed" else 2 * joints
+
+    def _together(self) -> bool:
+        if self._plan.excitation != "designed":
+            return False
+        if self._left_out.why:
+            # Its links are where they are, and it is not to be told to move again.
+            self._reporter.note("exciting joint by joint: not all joints take part")
+        return not self._left_out.why
+
+    async def _run_together(self, step: str, motion: RobotMotion, purpose: Purpose) -> None:
+        # The ways between home and the pose are known to be clear, and between two poses they are not.
+        await self._go_all(motion.pose_rad)
+        for serial, record in (await self.link.run(dict(motion.patterns))).items():
+            self._note_motion(step, serial, record, purpose)
+        await self._go_all(dict.fromkeys(motion.pose_rad, self._plan.home_rad))
+
+    async def _excite(self, serial: str) -> None:
+        pattern = self._plan.dynamic(self.link.kind(serial))
+        await self._move(f"excite/{serial}", serial, pattern, "dynamic")
+        await self._go(serial, self._plan.home_rad)
+
+    async def _hold_out(self, serial: str) -> None:
+        pattern = self._plan.held_out(self.link.kind(serial))
+        await self._move(f"held_out/{serial}", serial, pattern, "held_out")
+        await self._go(serial, self._plan.home_rad)
+
+    # ------------------------------------------------------------------ pieces
+
+    async def _go(self, serial: str, target_rad: float) -> None:
+        await self._go_all({serial: target_rad})
+
+    async def _go_all(self, targets_rad: Mapping[str, float]) -> None:
+        speed = self._plan.travel_speed_rad_s
+        await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in targets_rad.items()})
+        await asyncio.sleep(self._plan.settle_s)
+
+    async def _move(self, step: str, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
+        record = (await self.link.run({serial: pattern}))[serial]
+        self._note_motion(step, serial, record, purpose)
+        return record
+
+    def _note_motion(self, step: str, serial: str, record: MotionRecord, purpose: Purpose) -> None:
+        boot = self.link.module(serial).boot
+        self._journal(
+            JournalEvent(
+                t_ns=self._clock(),
+                what="motion",
+                step=step,
+                serial=serial,
+                boot=boot,
+                purpose=purpose,
+                motion=record,
+            )
+        )
+
+    def _position(self, serial: str) -> float:
+        log = self.link.module(serial).rows
+        rows = log.rows(log.end_row - 1, log.end_row)
+        return float(rows["position_rad"][-1]) if len(rows) else self._plan.home_rad
+
+    def _report(self, text: str) -> None:
+        self._index += 1
+        self._reporter.step(self._index, self._total, text)

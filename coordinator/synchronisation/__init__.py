@@ -1,0 +1,1 @@
+"""Module clocks mapped to one time base."""

@@ -1,0 +1,257 @@
+"""Stretches of a recording with all modules on one time base: what estimators work on.
+
+The motions of a recording as the regressor needs them: filtered alike, all joints on one time base.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData, outstanding
+from coordinator.recording.journal import JournalEvent, Purpose
+from coordinator.recording.recording import Recording
+from module_agent.model.chain import Array
+from module_agent.signals.clock_map import ClockMap
+from module_agent.signals.filtering import (
+    JointMotion,
+    differentiate,
+    filtered_motion,
+    resample,
+    settling_samples,
+    zero_phase_low_pass,
+)
+
+RATE_HZ = 250.0
+STEP_NS = 4_000_000
+# Four times the 2 Hz of the windowed sine. Loads of links are differentiated four times, which brings up an
+# encoder's noise with the fourth power of the frequency.
+INSTRUMENT_CUTOFF_HZ = 8.0
+# A joint whose position scatters by fewer steps of its encoder than this is taken to stand still.
+MOVING_STEPS = 20.0
+
+
+class Window(NamedTuple):
+    """All modules during one motion: `t_ns` (m,) session time; joints (m, n); IMUs (m, n, 3).
+
+    step_rad: (n,) the smallest difference between two readings of every encoder, 0 if all were alike.
+    Velocities are not among them: those of the modules are late by their filters.
+    """
+
+    t_ns: NDArray[np.int64]
+    q_rad: Array
+    tau_nm: Array
+    gyro_rad_s: Array
+    accel_m_s2: Array
+    step_rad: Array | None = None
+
+
+def window(
+    recording: Recording,
+    clocks: Mapping[str, ClockMap],
+    serials: Sequence[str],
+    event: JournalEvent,
+    margin_s: float = 0.0,
+) -> Window:
+    """Resample all modules over one motion, at 250 Hz of session time, with a margin on either side.
+
+    The window is cut to what all modules have recorded.
+
+    Raises:
+        ValueError: a hole in the recording, with the module or its column.
+    """
+    start_ns, end_ns = span(recording, clocks, event, margin_s)
+    tracks = [_track(recording, clocks[s], s, event, start_ns, end_ns) for s in serials]
+    start_ns = max(start_ns, *(int(t[0]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
+    end_ns = min(end_ns, *(int(t[-1]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
+    common = np.arange(start_ns, end_ns, STEP_NS, dtype=np.int64)
+    joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common)
+    imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common)
+    step = np.array([_step(track.joint[:, 0]) for track in tracks])
+    return Window(common, joint[..., 0], joint[..., 1], imu[..., :3], imu[..., 3:], step)
+
+
+class _Track(NamedTuple):
+    """One module in session time: position and effort (m, 2); gyro and accelerometer (k, 6)."""
+
+    t_ns: NDArray[np.int64]
+    imu_t_ns: NDArray[np.int64]
+    joint: Array
+    imu: Array
+
+
+def _track(
+    recording: Recording, clock: ClockMap, serial: str, event: JournalEvent, start_ns: int, end_ns: int
+) -> _Track:
+    first_ns, last_ns = clock.module_span(start_ns, end_ns, STEP_NS)
+    rows = recording.modules[serial].rows.between(first_ns, last_ns)
+    if not len(rows):
+        raise ValueError(_no_row(serial, event))
+    # An IMU that is slower than the rows repeats its samples.
+    imu_t_ns, fresh = np.unique(rows["imu_t_ns"], return_index=True)
+    return _Track(
+        clock.to_session(rows["t_ns"].astype(np.int64)),
+        clock.to_session(imu_t_ns.astype(np.int64)),
+        np.column_stack([rows[field] for field in ("position_rad", "effort_nm")]),
+        np.column_stack([rows["gyro_rad_s"], rows["accel_m_s2"]])[fresh],
+    )
+
+
+def _step(position: Array) -> float:
+    """Return the smallest change between readings of an encoder; 0 if none has changed."""
+    apart = np.diff(np.unique(position))
+    return float(apart.min()) if apart.size else 0.0
+
+
+def span(
+    recording: Recording, clocks: Mapping[str, ClockMap], event: JournalEvent, margin_s: float
+) -> tuple[int, int]:
+    """Return from when to when a motion lasted in session time, with a margin on either side.
+
+    Raises:
+        ValueError: no row of the motion is recorded.
+    """
+    assert event.motion is not None
+    assert event.motion.end_row is not None
+    log = recording.modules[event.serial].rows
+    rows = log.rows(event.motion.start_row, event.motion.end_row)
+    if not len(rows):
+        raise ValueError(_no_row(event.serial, event))
+    session = clocks[event.serial].to_session(rows["t_ns"][[0, -1]].astype(np.int64))
+    margin_ns = round(margin_s * 1e9)
+    return int(session[0]) - margin_ns, int(session[1]) + margin_ns
+
+
+def _no_row(serial: str, event: JournalEvent) -> str:
+    motion = f"{event.purpose} motion of {event.serial}"
+    return f"module {serial} has no row in the {motion}: its recording has a hole"
+
+
+def noise_floor(rest: Window, cutoff_hz: float, module: int) -> NoiseFloor:
+    """Return what one module's IMU scatters at rest, through the same low-pass as `sensor_data`."""
+    edge = settling_samples(RATE_HZ, cutoff_hz)
+    gyro, accel = (
+        zero_phase_low_pass(signal[:, module], RATE_HZ, cutoff_hz)[edge:-edge].var(axis=0)
+        for signal in (rest.gyro_rad_s, rest.accel_m_s2)
+    )
+    return NoiseFloor(gyro, accel, cutoff_hz)
+
+
+def sensor_data(
+    windows: Sequence[Window], cutoff_hz: float, keep_every: int, floor: NoiseFloor | None = None
+) -> SensorData:
+    """Filter all signals of all windows alike, differentiate, and keep one sample in `keep_every`.
+
+    With the noise `floor` of the first module's IMU, which rides on the base, it has the base's motion.
+    """
+    return thinned([filtered(one, cutoff_hz, floor) for one in windows], keep_every)
+
+
+def encoder_steps(windows: Sequence[Window]) -> Array | None:
+    """Return what the encoders resolve (n,), by the smallest change in any window; 0 if none."""
+    steps = [one.step_rad for one in windows if one.step_rad is not None]
+    if not steps:
+        return None
+    found = np.min(np.where(np.array(steps) > 0.0, steps, np.inf), axis=0)
+    return np.asarray(np.where(np.isfinite(found), found, 0.0))
+
+
+def thinned(parts: Sequence[SensorData], keep_every: int) -> SensorData:
+    """Join what was filtered, one sample in `keep_every` of each."""
+    parts = [
+        part._replace(motion=np.full(len(part.q_rad), number, dtype=np.int64))
+        for number, part in enumerate(parts)
+    ]
+    columns = zip(*parts, strict=True)
+    return SensorData(
+        *(None if one[0] is None else np.concatenate([part[::keep_every] for part in one]) for one in columns)  # type: ignore[arg-type]
+    )
+
+
+def filtered(
+    one: Window,
+    cutoff_hz: float,
+    floor: NoiseFloor | None = None,
+    imu_late_s: float = 0.0,
+    step_rad: Array | None = None,
+) -> SensorData:
+    """Filter all signals of a window alike and differentiate; what the filter has not settled on is cut.
+
+    The joints are seen as late as the IMUs are. With the steps (n,) of their encoders, which make noise that
+    differentiation brings up, the instrument is what stands out of it.
+    """
+    edge = settling_samples(RATE_HZ, cutoff_hz)
+    kept = slice(edge, len(one.t_ns) - edge)
+    q, gyro, accel = (
+        zero_phase_low_pass(signal, RATE_HZ, cutoff_hz)
+        for signal in (one.q_rad, one.gyro_rad_s, one.accel_m_s2)
+    )
+    if imu_late_s:
+        t_s = np.arange(len(q)) / RATE_HZ
+        q = CubicSpline(t_s, q)(t_s - imu_late_s)
+    instrument = None
+    if step_rad is not None:
+        slow = zero_phase_low_pass(q, RATE_HZ, INSTRUMENT_CUTOFF_HZ)
+        smooth = np.where(q.std(axis=0) > MOVING_STEPS * step_rad, slow, q.mean(axis=0))
+        speed = differentiate(smooth, RATE_HZ)
+        instrument = np.concatenate([smooth, speed, differentiate(speed, RATE_HZ)], axis=1)[kept]
+    # The module's own velocity is late by its filter; positions are of their instant.
+    qd = differentiate(q, RATE_HZ)
+    qdd = differentiate(qd, RATE_HZ)
+    rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
+    base = None
+    if floor is not None:
+        omega = outstanding(gyro[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
+        force = outstanding(accel[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
+        base = np.concatenate([omega, differentiate(omega, RATE_HZ), force], axis=1)[kept]
+    return SensorData(
+        q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept], base, None, instrument
+    )
+
+
+DYNAMIC_CUTOFF_HZ = 12.0
+# The low-pass leaves so many independent samples a sample.
+INDEPENDENT_FRACTION = min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
+
+
+def dynamic_windows(
+    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], *purposes: Purpose
+) -> list[Window]:
+    """Return all motions of some purposes, columns in the order of `serials`, with the low-pass' margins.
+
+    Of a step that was done again the latest counts.
+
+    Raises:
+        ValueError: there is no such motion, or the recording has a hole in it.
+    """
+    # Joints that move at once share their step, and its window.
+    steps = {event.step: event for event in recording.motions(*purposes)}
+    if not steps:
+        raise ValueError(f"the recording holds no motion for {' or '.join(purposes)}")
+    margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
+    return [window(recording, clocks, serials, event, margin) for event in steps.values()]
+
+
+def dynamic_motion(
+    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], *purposes: Purpose
+) -> JointMotion:
+    """Return all motions of some purposes one after the other, filtered; see `dynamic_windows`.
+
+    Raises:
+        ValueError: as there.
+    """
+    motions = [filtered_window(one) for one in dynamic_windows(recording, clocks, serials, *purposes)]
+    return joined_motions(motions)
+
+
+def joined_motions(motions: Sequence[JointMotion]) -> JointMotion:
+    """Return motions one after the other."""
+    return JointMotion(*(np.concatenate(column) for column in zip(*motions, strict=True)))
+
+
+def filtered_window(one: Window) -> JointMotion:
+    """Return a window as the regressor needs it, without its margins."""
+    # No velocity: that of the modules is late by their filter.
+    return filtered_motion(one.t_ns, one.q_rad, None, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)

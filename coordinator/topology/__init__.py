@@ -1,0 +1,1 @@
+"""Which module is mounted on which, and which motion would tell."""

@@ -1,0 +1,124 @@
+"""How strongly one motion of one joint says which IMUs it carried: rate ratios with honest uncertainties.
+
+An IMU that a joint carries reads gyro = j v, with the joint's rate v and |j| = 1; one that it does not carry
+reads none of v. What else moves an IMU in time with the joint makes the ratio uncertain: shaking and noise,
+which differ from one stretch of the motion to the next, and held joints that give, which their own encoders
+see. Where those joints' own motions have shown whom they carry, and about which axis, what they gave is taken
+off.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.model.chain import Array
+
+BLOCKS = 6
+# Of a thousand observations, one has gone wrong in a way that is in no model: it tells nothing.
+ODD = 1e-3
+# The IMU's own scale and axes, links that bend, a base that shakes: seen by no encoder, and repeating with
+# the motion. Clean ratios of uncalibrated modules are within 0.03 of 0 and 1.
+RATIO_FLOOR = 0.05
+# Less than this over a motion is no motion: encoders and springs of a joint that is stuck still jitter.
+LEAST_RATE_RAD_S = 0.02
+# Six blocks of four samples are the least that tells how much they differ.
+FEWEST_SAMPLES = 4 * BLOCKS
+# What is left of a held joint's motion after it is taken off: its axis in the IMU's frame turns with the
+# joints between, by some tenths of a radian.
+GIVE_LEFT = 0.3
+
+
+class NotMoved(ValueError):
+    """The joint was told to move and hardly did; the message says how much."""
+
+
+class MotionEvidence(NamedTuple):
+    """What n IMUs saw of one joint's motion; arrays read-only.
+
+    coefficient: (n, 3) regression of each gyro on the joint's rate, in the frame of that IMU.
+    sigma: (n,) one standard deviation of its size, from how much the stretches of the motion differ.
+    give: (n,) how much the other joints moved along, relative to this one, less what was taken off: that much
+        more or less may an IMU have turned, depending on where it sits.
+    """
+
+    coefficient: Array
+    sigma: Array
+    give: Array
+
+    @property
+    def rate_ratio(self) -> Array:
+        """(n,) sizes of the coefficients: 1 if carried, 0 if not."""
+        return np.asarray(np.linalg.norm(self.coefficient, axis=1))
+
+    @property
+    def ratio_sigma(self) -> Array:
+        """(n,) what the ratios may be wrong by, systematic errors included.
+
+        The other joints' motion adds anything between -`give` and `give`: a uniform distribution.
+        """
+        return np.asarray(np.sqrt(self.sigma**2 + self.give**2 / 3.0 + RATIO_FLOOR**2))
+
+
+def carried_log_odds(rate_ratio: float, sigma: float) -> float:
+    """Return the log-odds that an IMU with this rate ratio is carried.
+
+    Normal errors about 1 if carried and 0 if not, and in a share `ODD` of all cases anything from 0 to 2: so
+    a ratio that fits neither tells next to nothing, and none tells more than about 9, 1 to 8000.
+    """
+    scale = sigma * np.sqrt(2.0 * np.pi)
+    fits = [np.exp(-0.5 * ((rate_ratio - at) / sigma) ** 2) / scale for at in (1.0, 0.0)]
+    return float(np.log((fits[0] + 0.5 * ODD) / (fits[1] + 0.5 * ODD)))
+
+
+def motion_evidence(
+    joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s: Array, axes: Array | None = None
+) -> MotionEvidence:
+    """Regress all gyros, less their offsets and what held joints gave, on one joint's rate.
+
+    The spread is that of the jackknife over blocks of the motion (Efron, The Jackknife, 1982, eq. 3.13): it
+    needs no model of how shaking and noise hang together in time.
+
+    Args:
+        joint: column of the joint that was moved.
+        qd_rad_s: (m, n) rates of all joints.
+        gyro_rad_s: (m, n, 3) of all IMUs at the same instants, each in its own frame, filtered alike.
+        offset_rad_s: (n, 3) gyro offsets, from rest.
+        axes: (n joints, n IMUs, 3) of every joint in every IMU's frame, zero where it does not carry it, NaN
+            where that is not known; None if nothing is.
+
+    Raises:
+        NotMoved: the joint's rate is below `LEAST_RATE_RAD_S` rms.
+        ValueError: fewer than `FEWEST_SAMPLES` samples.
+    """
+    rate = qd_rad_s[:, joint]
+    if rate.size < FEWEST_SAMPLES:
+        raise ValueError(f"{rate.size} samples of the motion; at least {FEWEST_SAMPLES} are needed")
+    size = float(np.sqrt(np.mean(rate**2)))
+    if size < LEAST_RATE_RAD_S:
+        raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {LEAST_RATE_RAD_S} is needed")
+    others = np.arange(qd_rad_s.shape[1]) != joint
+    given, left = _given(qd_rad_s[:, others], axes[others] if axes is not None else None, gyro_rad_s.shape[1])
+    gyro = gyro_rad_s - offset_rad_s - given
+    blocks = np.array_split(np.arange(rate.size), BLOCKS)
+    power = np.array([rate[b] @ rate[b] for b in blocks])
+    moment = np.array([np.tensordot(rate[b], gyro[b], axes=1) for b in blocks])
+    coefficient = moment.sum(axis=0) / power.sum()
+    without = (moment.sum(axis=0) - moment) / (power.sum() - power)[:, None, None]
+    scatter = ((without - without.mean(axis=0)) ** 2).sum(axis=(0, 2))
+    give = (np.abs(rate @ qd_rad_s[:, others]) / power.sum()) @ left
+    spread = np.sqrt((BLOCKS - 1) / BLOCKS * scatter)
+    return MotionEvidence(_frozen(coefficient), _frozen(spread), _frozen(give))
+
+
+def _given(rates: Array, axes: Array | None, imus: int) -> tuple[Array, Array]:
+    """Return what held joints turned every IMU by (m, n, 3), and what share of each is left (joints, n)."""
+    if axes is None:
+        return np.zeros((len(rates), imus, 3)), np.ones((rates.shape[1], imus))
+    given = np.tensordot(rates, np.nan_to_num(axes, nan=0.0), axes=1)
+    return np.asarray(given), np.where(np.isnan(axes).any(axis=2), 1.0, GIVE_LEFT)
+
+
+def _frozen(array: Array) -> Array:
+    array = np.array(array)
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,359 @@
+"""Who carries whom: the tree of modules from which IMU moved with which joint.
+
+The joints that move a module's IMU are the ones between it and the base. So the joints that move it, its own
+apart, are its ancestors; the parent is the ancestor that itself has the most ancestors. A module that moves
+with its own joint is mounted reversed: by its output, so that the housing turns.
+
+Every observation counts by its own certainty: the forest is the likeliest one, each of its edges comes with
+the odds that it is right, and what contradicts it or leaves it in doubt is named.
+"""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from coordinator.topology.forest_likelihood import Parents, ancestors, edge_log_odds, likeliest_forest, rivals
+from coordinator.topology.motion_evidence import carried_log_odds
+from module_agent.model.chain import Array
+from module_agent.model.forward_kinematics import BASE
+
+# What is less likely than this (log-odds) to be right is worth another motion: 1 in 100 may be wrong.
+DOUBTFUL_BELOW = float(np.log(99.0))
+# What is less likely than this is not believed at all: one in four would be wrong.
+UNBELIEVABLE_BELOW = float(np.log(3.0))
+# An observation that is surer than this and does not fit has seen something: it is not outvoted.
+CONTRADICTS_ABOVE = float(np.log(19.0))
+
+
+class MotionSeen(NamedTuple):
+    """What one module saw of one joint's motion.
+
+    moved: whether its IMU was carried along.
+    rate_ratio: size of the gyro's answer to the joint's rate, 1 if carried, 0 if not.
+    axis: (3,) direction in the IMU's frame about which it turned when the joint's position grew, if it did.
+    sigma: one standard deviation of the ratio, systematic errors included. give: how much other joints moved
+        along (see `motion_evidence`).
+    summed_log_odds: of several motions together, of which this is the clearest; see `seen_again`.
+    """
+
+    moved: bool
+    rate_ratio: float
+    axis: Array | None = None
+    sigma: float = 0.1
+    give: float = 0.0
+    summed_log_odds: float | None = None
+
+    @property
+    def log_odds(self) -> float:
+        """Log-odds that the IMU was carried."""
+        if self.summed_log_odds is not None:
+            return self.summed_log_odds
+        size = abs(carried_log_odds(self.rate_ratio, self.sigma))
+        return size if self.moved else -size
+
+
+def seen_again(motions: Sequence[MotionSeen]) -> MotionSeen:
+    """Put together what one module saw of several motions of one joint: the log-odds add up.
+
+    One that went wrong is outvoted by two that did not, where an average would fit nothing.
+
+    Raises:
+        ValueError: no motion.
+    """
+    if not motions:
+        raise ValueError("no motion was seen")
+    total = sum(seen.log_odds for seen in motions)
+    agreeing = [seen for seen in motions if seen.moved == (total > 0.0)] or list(motions)
+    clearest = max(agreeing, key=lambda seen: abs(seen.log_odds))
+    return clearest._replace(moved=total > 0.0, summed_log_odds=total)
+
+
+class Doubt(NamedTuple):
+    """What is not certain, how certain it is, and what was seen least clearly of what would settle it.
+
+    log_odds: that the answer in the topology is right; for a contradiction, that the observation is wrong.
+    joint, observer: the observation to repeat.
+    """
+
+    kind: Literal["parent", "mounting", "contradiction"]
+    module: str
+    log_odds: float
+    joint: str
+    observer: str
+    text: str
+
+
+class Topology(NamedTuple):
+    """A forest of modules, parents before children: by depth, then by serial.
+
+    parent: index of the parent module, -1 on the base. reversed: mounted by the output.
+    confidence: the probability that the least certain of all these answers is right.
+    parent_log_odds, reversed_log_odds: log-odds of every answer, against all that could be instead; 0 is a
+        toss-up, and so is the mounting of a module whose joint did not move. Empty if nobody has weighed
+        them, as of a topology that was known beforehand.
+    unmoved: modules whose joints did not move. What they carry stands in the forest on their parents.
+    doubts: what another motion should settle, the least certain first.
+    """
+
+    serials: tuple[str, ...]
+    parent: tuple[int, ...]
+    reversed: tuple[bool, ...]
+    confidence: float
+    parent_log_odds: tuple[float, ...] = ()
+    reversed_log_odds: tuple[float, ...] = ()
+    unmoved: tuple[str, ...] = ()
+    doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def roots(self) -> tuple[str, ...]:
+        """The modules on the base."""
+        return tuple(s for s, p in zip(self.serials, self.parent, strict=True) if p == BASE)
+
+    def caveat(self, k: int) -> str:
+        """Return in words what is not certain of the module with this index, nothing if all is."""
+        if self.serials[k] in self.unmoved:
+            return ", its joint did not move: mounting and what it carries unknown"
+        if not self.parent_log_odds:
+            return ""
+        least = min(self.parent_log_odds[k], self.reversed_log_odds[k])
+        return f", {_chance(least)} sure" if least < DOUBTFUL_BELOW else ""
+
+
+class TopologyError(ValueError):
+    """The observations describe no tree; `serials` are the modules that contradict each other."""
+
+    def __init__(self, message: str, serials: tuple[str, ...]):
+        super().__init__(message)
+        self.serials = serials
+
+
+Observations = Mapping[tuple[str, str], MotionSeen]
+
+
+def find_topology(observations: Observations, unmoved: Collection[str] = ()) -> Topology:
+    """Derive the tree from what every module saw of every joint: {(joint, observer): MotionSeen}.
+
+    Args:
+        observations: of all pairs; a few may be missing where the others make up for them.
+        unmoved: modules whose joints did not move, of which therefore nothing was seen.
+
+    Raises:
+        TopologyError: too many observations are missing, they contradict each other beyond noise, or they
+            leave open how a module is mounted; with the serials.
+    """
+    found = likely_topology(observations, unmoved)
+    serials = list(found.serials)
+    _check_reversed(serials, observations)
+    wrong = [d for d in found.doubts if d.kind == "contradiction" and d.log_odds < -CONTRADICTS_ABOVE]
+    if wrong:
+        raise _contradiction_error(wrong[0], serials, observations)
+    open_ = [d for d in found.doubts if d.kind != "contradiction" and d.log_odds < UNBELIEVABLE_BELOW]
+    if open_:
+        raise TopologyError(open_[0].text, tuple(dict.fromkeys((open_[0].module, open_[0].joint))))
+    return found
+
+
+def likely_topology(observations: Observations, unmoved: Collection[str] = ()) -> Topology:
+    """Derive the likeliest tree, however likely it is; `find_topology` is what to believe.
+
+    Raises:
+        TopologyError: a module has seen nothing, or nobody has seen its joint and it is not `unmoved`.
+    """
+    serials = sorted({serial for pair in observations for serial in pair} | set(unmoved))
+    _check_complete(serials, observations, unmoved)
+    odds = _log_odds(serials, observations)
+    leaves = frozenset(serials.index(s) for s in unmoved)
+    parent = likeliest_forest(odds, leaves)
+    others = rivals(parent, odds, leaves)
+    case = _Case(serials, observations, odds, parent, others, edge_log_odds(parent, others))
+    return _described(case, unmoved)
+
+
+class _Case(NamedTuple):
+    """A forest in the order of `serials`, what it was made of, and what else it could be."""
+
+    serials: list[str]
+    observations: Observations
+    odds: Array
+    parent: Parents
+    others: dict[Parents, float]
+    edge_odds: Array
+
+
+def _log_odds(serials: list[str], observations: Observations) -> Array:
+    """Return (n, n) log-odds that joint i carries the IMU of module k, 0 for what was not seen."""
+    odds = np.zeros((len(serials), len(serials)))
+    for i, joint in enumerate(serials):
+        for k, observer in enumerate(serials):
+            seen = observations.get((joint, observer))
+            odds[i, k] = seen.log_odds if seen is not None else 0.0
+    return odds
+
+
+def _described(case: _Case, unmoved: Collection[str]) -> Topology:
+    depth = ancestors(case.parent).sum(axis=0)
+    order = sorted(range(len(case.serials)), key=lambda k: (depth[k], case.serials[k]))
+    index = {k: n for n, k in enumerate(order)} | {BASE: BASE}
+    turned = np.diag(case.odds)
+    moved = [k for k in order if case.serials[k] not in unmoved]
+    least = min([*case.edge_odds, *np.abs(turned[moved])], default=np.inf)
+    return Topology(
+        serials=tuple(case.serials[k] for k in order),
+        parent=tuple(index[case.parent[k]] for k in order),
+        reversed=tuple(bool(turned[k] > 0.0) for k in order),
+        confidence=float(1.0 / (1.0 + np.exp(-least))),
+        parent_log_odds=tuple(float(case.edge_odds[k]) for k in order),
+        reversed_log_odds=tuple(float(abs(turned[k])) for k in order),
+        unmoved=tuple(sorted(unmoved)),
+        doubts=tuple(sorted(_doubts(case, unmoved), key=lambda d: d.log_odds)),
+    )
+
+
+# ---------------------------------------------------------------------- doubts
+
+
+def _doubts(case: _Case, unmoved: Collection[str]) -> Iterator[Doubt]:
+    for k, serial in enumerate(case.serials):
+        if case.edge_odds[k] < DOUBTFUL_BELOW:
+            yield _parent_doubt(case, k)
+        if serial not in unmoved and abs(case.odds[k, k]) < DOUBTFUL_BELOW:
+            yield _mounting_doubt(case, k)
+    above = ancestors(case.parent)
+    for i, k in np.argwhere((case.odds > 0.0) != above):
+        if i != k and (case.serials[i], case.serials[k]) in case.observations:
+            yield from _outvoted(case, int(i), int(k))
+
+
+def _parent_doubt(case: _Case, k: int) -> Doubt:
+    """Name the likeliest other parent, and the least certain of the observations that tell them apart."""
+    rival = max((r for r in case.others if r[k] != case.parent[k]), key=lambda r: case.others[r])
+    apart = np.argwhere(ancestors(case.parent) != ancestors(rival))
+    i, o = min(apart, key=lambda pair: abs(case.odds[tuple(pair)]))
+    on, instead = (case.serials[p] if p != BASE else "the base" for p in (case.parent[k], rival[k]))
+    odds, joint, observer = float(case.edge_odds[k]), case.serials[i], case.serials[o]
+    text = (
+        f"whether {case.serials[k]} is mounted on {on} or on {instead} is not certain ({_chance(odds)}): "
+        f"{_saw(case.observations, joint, observer)}; repeat that motion"
+    )
+    return Doubt("parent", case.serials[k], odds, joint, observer, text)
+
+
+def _mounting_doubt(case: _Case, k: int) -> Doubt:
+    serial, odds = case.serials[k], float(abs(case.odds[k, k]))
+    text = (
+        f"whether {serial} is mounted forward or reversed is not certain ({_chance(odds)}): "
+        f"{_saw(case.observations, serial, serial)}; repeat that motion"
+    )
+    return Doubt("mounting", serial, odds, serial, serial, text)
+
+
+def _outvoted(case: _Case, i: int, k: int) -> Iterator[Doubt]:
+    """Name an observation that does not fit; if it is a sure one, all those of which one must be wrong."""
+    joint, observer, odds = case.serials[i], case.serials[k], float(abs(case.odds[i, k]))
+    pairs = {(joint, observer): None}
+    if odds > CONTRADICTS_ABOVE and (
+        found := _impossible(case.serials, case.observations, (joint, observer))
+    ):
+        pairs |= dict.fromkeys(found.pairs)
+    for pair in pairs:
+        text = f"{_saw(case.observations, *pair)}, which does not fit the rest; repeat that motion"
+        yield Doubt("contradiction", pair[1], -odds, *pair, text)
+
+
+def _saw(observations: Observations, joint: str, observer: str) -> str:
+    seen = observations.get((joint, observer))
+    if seen is None:
+        return f"{observer} saw nothing of joint {joint}"
+    return f"{observer} saw joint {joint} with a rate ratio of {seen.rate_ratio:.2f} +- {seen.sigma:.2f}"
+
+
+def _chance(log_odds: float) -> str:
+    return f"{100.0 / (1.0 + np.exp(-log_odds)):.1f} %"
+
+
+# ---------------------------------------------------------------------- what no tree allows
+
+
+class _Contradiction(NamedTuple):
+    text: str
+    pairs: tuple[tuple[str, str], ...]  # the observations that cannot all be true
+
+
+def _check_complete(serials: list[str], observations: Observations, unmoved: Collection[str]) -> None:
+    """A module that never answered is named as such, rather than with each of its missing pairs.
+
+    Raises:
+        TopologyError: a module has seen nothing, or nobody has seen its joint and it is not `unmoved`.
+    """
+    joints, observers = {i for i, _ in observations}, {k for _, k in observations}
+    silent = [k for k in serials if k not in observers]
+    unseen = [i for i in serials if i not in joints and i not in unmoved]
+    parts = [f"module {k} reported on no joint" for k in silent]
+    parts += [f"nobody reported on joint {i}" for i in unseen]
+    if parts:
+        raise TopologyError(
+            "; ".join(parts) + ". Every module must have watched every joint",
+            tuple(dict.fromkeys([*silent, *unseen])),
+        )
+
+
+def _contradictions(serials: list[str], movers: Mapping[str, list[str]]) -> Iterator[_Contradiction]:
+    """Yield what no tree allows: the movers of a module must be a chain, each moved by all before it."""
+    for k in serials:
+        for i in movers[k]:
+            if k in movers[i]:
+                yield _Contradiction(f"{i} moves {k} and {k} moves {i}", ((i, k), (k, i)))
+            for a in movers[i]:
+                if a != k and a not in movers[k]:
+                    yield _Contradiction(
+                        f"{a} moves {i} and {i} moves {k}, but {a} does not move {k}",
+                        ((a, i), (i, k), (a, k)),
+                    )
+            for other in movers[k]:
+                if i < other and i not in movers[other] and other not in movers[i]:
+                    yield _Contradiction(
+                        f"{i} and {other} both move {k}, but neither moves the other",
+                        ((i, k), (other, k), (i, other), (other, i)),
+                    )
+
+
+def _impossible(
+    serials: list[str], observations: Observations, pair: tuple[str, str]
+) -> _Contradiction | None:
+    movers = {k: [i for i in serials if i != k and _carried(observations, i, k)] for k in serials}
+    return next((found for found in _contradictions(serials, movers) if pair in found.pairs), None)
+
+
+def _contradiction_error(doubt: Doubt, serials: list[str], observations: Observations) -> TopologyError:
+    """Say what no tree allows, with the observation that does not fit the rest."""
+    pair = (doubt.joint, doubt.observer)
+    found = _impossible(serials, observations, pair)
+    told, pairs = (f"{found.text}: no tree does that. ", found.pairs) if found is not None else ("", ())
+    return TopologyError(
+        f"{told}{doubt.text}", tuple(dict.fromkeys(serial for one in (pair, *pairs) for serial in one))
+    )
+
+
+def _carried(observations: Observations, joint: str, observer: str) -> bool:
+    seen = observations.get((joint, observer))
+    return seen is not None and seen.moved
+
+
+def _check_reversed(serials: list[str], observations: Observations) -> None:
+    """A housing that turns about its own axis turns backwards: about -z of its IMU when the position grows.
+
+    Raises:
+        TopologyError: a module surely turned about something else.
+    """
+    for k in serials:
+        seen = observations.get((k, k))
+        if seen is None or seen.axis is None or seen.log_odds < CONTRADICTS_ABOVE:
+            continue
+        if seen.axis[2] > -0.7:
+            raise TopologyError(
+                f"{k} moved with its own joint, as a reversed module does, but about "
+                f"{seen.axis.round(2).tolist()} instead of -z of its IMU: check its encoder's sign, "
+                "or how its IMU is mounted",
+                (k,),
+            )

@@ -1,0 +1,1 @@
+"""Gravity compensation and torque feed-forward by an identified model."""

@@ -1,0 +1,146 @@
+"""Torque set-points of a motion from what was identified: the thesis' input mode 3 (chapter 6.3.2).
+
+The effort of a module is what its spring exerts on its output, and the set-point of its effort loop means the
+same. So it is the torque of the rigid bodies alone, tau = Y(q, qd, qdd) phi (thesis eq. 28): friction, gear
+loss and the rotor's inertia lie before the spring. They are what the module's loops have to make up for.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from module_agent.control.motion import effort_profile, profile_period_ns
+from module_agent.control.waveform import duration_s, waveform
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.filtering import differentiate
+from module_agent.wire.messages import EffortProfile, GoTo, Pattern, Rest
+
+# The modules' own tick: a reference at its rate is what a module itself samples of a pattern.
+RATE_HZ = 1000.0
+# Patterns that end within half a tick of one another end together.
+_TOGETHER_S = 5e-4
+# Nearer than this a joint is where it shall be.
+_THERE_RAD, _SLOWEST_RAD_S = 1e-4, 1e-6
+
+
+class Reference(NamedTuple):
+    """The motion that is asked for: `t_s` (m,) from its start, the others (m, n); read-only."""
+
+    t_s: Array
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+
+
+class SetPoints(NamedTuple):
+    """A reference and the efforts (m, n) [Nm] of the springs that it takes, read-only."""
+
+    reference: Reference
+    effort_nm: Array
+
+
+def joint_reference(
+    serials: Sequence[str],
+    patterns: Mapping[str, Pattern],
+    origins_rad: Mapping[str, float],
+    rate_hz: float = RATE_HZ,
+) -> Reference:
+    """Sample the motion of all joints; one without a pattern stands still at its origin.
+
+    Raises:
+        KeyError: a pattern of a module that is not among the serials, or a joint without an origin.
+        ValueError: no pattern, or patterns that do not end together.
+    """
+    if unknown := [serial for serial in patterns if serial not in serials]:
+        raise KeyError(f"a pattern for {unknown[0]}, which is not among the joints {', '.join(serials)}")
+    if missing := [serial for serial in serials if serial not in origins_rad]:
+        raise KeyError(f"joint {missing[0]} has no origin: where it stands as the motion begins")
+    total_s = _common_duration_s(patterns, origins_rad)
+    t_s = np.arange(round(total_s * rate_hz) + 1) / rate_hz
+    q, qd = np.empty((2, t_s.size, len(serials)))
+    for column, serial in enumerate(serials):
+        q[:, column], qd[:, column] = origins_rad[serial], 0.0
+        if serial in patterns:
+            samples = waveform(patterns[serial], origins_rad[serial], np.minimum(t_s, total_s))
+            q[:, column] += samples.offset_rad
+            qd[:, column] = samples.velocity_rad_s
+    return Reference(*(_frozen(array) for array in (t_s, q, qd, differentiate(qd, rate_hz))))
+
+
+def paths_together(
+    origins_rad: Mapping[str, float], targets_rad: Mapping[str, float], max_speed_rad_s: float
+) -> dict[str, Pattern]:
+    """Return paths of all joints with a target that end at the same time, the longest at the given speed.
+
+    Raises:
+        ValueError: no joint has a target.
+        KeyError: a joint has a target and no origin.
+    """
+    if not targets_rad:
+        raise ValueError("no joint has a target: there is nowhere to go")
+    ways = {serial: abs(target - origins_rad[serial]) for serial, target in targets_rad.items()}
+    longest = max(ways, key=lambda serial: ways[serial])
+    last = GoTo(target_rad=targets_rad[longest], max_speed_rad_s=max_speed_rad_s)
+    total_s = duration_s(last, origins_rad[longest])
+    found: dict[str, Pattern] = {}
+    for serial, way in ways.items():
+        # The peak of a minimum-jerk path is 15/8 of its mean speed.
+        own = GoTo(target_rad=targets_rad[serial], max_speed_rad_s=max(1.875 * way / total_s, _SLOWEST_RAD_S))
+        found[serial] = own if way >= _THERE_RAD else Rest(duration_s=total_s)
+    return found
+
+
+def standing(reference: Reference, row: int, length_s: float, rate_hz: float = RATE_HZ) -> Reference:
+    """Return a reference that stands for a while where another one is at a row (-1: its end)."""
+    t_s = np.arange(round(length_s * rate_hz) + 1) / rate_hz
+    q = np.tile(reference.q_rad[row], (t_s.size, 1))
+    return Reference(*(_frozen(array) for array in (t_s, q, np.zeros_like(q), np.zeros_like(q))))
+
+
+def feed_forward(chain: Chain, phi: ArrayLike, reference: Reference) -> SetPoints:
+    """Return what the springs have to exert along a reference whose columns are in the chain's order.
+
+    Args:
+        chain: as identified. phi: (10 n,) or (n, 10), its parameters. Only combinations of them that show in
+            torques matter, so that what the identification leaves open has no effect.
+
+    Raises:
+        ValueError: another number of joints or parameters, or values that are not finite.
+    """
+    effort = inverse_dynamics(chain, phi, reference.q_rad, reference.qd_rad_s, reference.qdd_rad_s2)
+    return SetPoints(reference, effort)
+
+
+def on_module(points: SetPoints) -> list[EffortProfile]:
+    """Return the efforts as the modules play them beside their motion, one profile a joint, in order.
+
+    Raises:
+        ValueError: a value that is not finite, or a motion too long for a profile: over 799 s.
+    """
+    t_s = points.reference.t_s
+    period_ns = profile_period_ns(float(t_s[-1]))
+    # The last sample is at the end or beyond it, where the effort stays as it is at the end.
+    count = int(np.ceil(t_s[-1] * 1e9 / period_ns - 1e-9)) + 1
+    at_s = np.arange(max(count, 2)) * (period_ns * 1e-9)
+    return [effort_profile(np.interp(at_s, t_s, joint), period_ns) for joint in points.effort_nm.T]
+
+
+def _common_duration_s(patterns: Mapping[str, Pattern], origins_rad: Mapping[str, float]) -> float:
+    if not patterns:
+        raise ValueError("no joint has a pattern: there is no motion to compute efforts of")
+    ends = {serial: duration_s(pattern, origins_rad[serial]) for serial, pattern in patterns.items()}
+    first, last = min(ends, key=lambda s: ends[s]), max(ends, key=lambda s: ends[s])
+    if ends[last] - ends[first] > _TOGETHER_S:
+        raise ValueError(
+            f"joint {first} ends after {ends[first]:.3f} s and {last} after {ends[last]:.3f} s: a joint that "
+            "has ended would miss what the others' motion asks of it, so all must end together"
+        )
+    return ends[last]
+
+
+def _frozen(array: Array) -> Array:
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,29 @@
+"""The way of a robot that is led back: all joints begin and end together, on minimum-jerk paths."""
+
+import numpy as np
+
+from module_agent.model.chain import Array
+
+# The peak of a minimum-jerk path is 15/8 of its mean speed (Flash and Hogan, 1985).
+_PEAK = 1.875
+_SHORTEST_S = 0.2
+
+
+class Way:
+    """From `start_rad` to `end_rad` (n,); the joint that goes farthest reaches `top_speed_rad_s`."""
+
+    def __init__(self, start_rad: Array, end_rad: Array, top_speed_rad_s: float):
+        self.end_rad = end_rad.copy()
+        self._start_rad = start_rad.copy()
+        farthest_rad = float(np.abs(end_rad - start_rad).max())
+        self.total_s = max(_PEAK * farthest_rad / top_speed_rad_s, _SHORTEST_S)
+
+    def at(self, t_s: float) -> tuple[Array, Array]:
+        """Return positions [rad] and velocities [rad/s], (n,) each, at a time from its beginning."""
+        gone = self.end_rad - self._start_rad
+        if t_s >= self.total_s:
+            return self.end_rad.copy(), np.zeros_like(gone)
+        s = max(t_s, 0.0) / self.total_s
+        share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        rate = 30.0 * (s * (1.0 - s)) ** 2 / self.total_s
+        return self._start_rad + share * gone, rate * gone

@@ -1,0 +1,136 @@
+"""How warm a motor's winding gets from the current that it is going to carry.
+
+Winding, housing and body are three heat capacities in a row; in the seconds of a motion the winding follows
+its losses, the housing warms a little, and the body does not. Constants are the manufacturer's.
+
+What a motor takes beside the torque of its spring, put into the torque's set-point.
+
+The effort of a module is its spring's. To exert it while it turns, the motor overcomes friction, the gear's
+loss and its own rotor's inertia, which all lie before the spring; the module's feed-forward knows of a
+constant efficiency and of the back-EMF. What it lacks is left to the loops, and shows as tracking error: of
+position control (strategy 3) as PWM / P. So the PWM that the motor will need is worked out from the
+catalogue,
+
+    X = tau + Jr thdd + b thd + Tc s(thd)        th = q + tau / k, s: the sign, smoothed about rest
+    K N i = X / eff where the motor drives, X where it is driven
+    u = (R i + K N thd) / 48 V                   R: as warm as the winding gets (`winding`)
+
+and the set-point is raised until the effort loop puts out what is missing: its answer to a target is E + F,
+its gain and its feed-forward. Friction is a catalogue's figure that single modules miss by a tenth or more;
+the loops have what is left.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from coordinator.torque_control.feed_forward import RATE_HZ, SetPoints
+from module_agent.control.controller import NOMINAL_VOLTAGE_V, pwm_per_rad_s, torque_at_full_pwm_nm
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array
+from module_agent.signals.filtering import differentiate
+from module_agent.wire.messages import GainSet
+
+AMBIENT_C = 25.0
+WINDING_J_K, HOUSING_J_K = 0.367, 16.6
+WINDING_K_W, HOUSING_K_W = 4.626, 1.0
+# Copper's resistance grows by this share for every kelvin above the ambient, at which it is catalogued.
+COPPER_PER_K = 0.00393
+
+
+def winding_c(cold_w: Array, step_s: float, start_c: float) -> Array:
+    """Return the winding's temperature (m,) [deg C] from `start_c` on.
+
+    Args:
+        cold_w: (m,) the losses i^2 R that the current makes in a winding at the ambient temperature [W].
+        step_s: between them; much less than the winding's 1.7 s.
+        start_c: as measured. The housing is as warm as the first losses leave it to be.
+    """
+    found = np.empty(len(cold_w))
+    winding = start_c
+    warm_w = float(cold_w[0]) * _growth(winding)
+    body = housing = max(AMBIENT_C, winding - WINDING_K_W * warm_w)
+    for k, watt in enumerate(cold_w.tolist()):
+        found[k] = winding
+        into_housing_w = (winding - housing) / WINDING_K_W
+        winding += step_s * (watt * _growth(winding) - into_housing_w) / WINDING_J_K
+        housing += step_s * (into_housing_w - (housing - body) / HOUSING_K_W) / HOUSING_J_K
+    return found
+
+
+def resistance_factor(temperature_c: Array) -> Array:
+    """Return a winding's resistance over that at the ambient temperature, (m,)."""
+    found: Array = 1.0 + COPPER_PER_K * (temperature_c - AMBIENT_C)
+    return found
+
+
+def _growth(temperature_c: float) -> float:
+    return 1.0 + COPPER_PER_K * (temperature_c - AMBIENT_C)
+
+
+# Friction comes up within this speed: at rest nobody knows which way it points.
+_SLOW_RAD_S = 0.02
+_WARMING_TICKS = 10
+
+
+def with_drive(
+    points: SetPoints,
+    kinds: Sequence[ModuleType],
+    gains: Sequence[GainSet],
+    winding_start_c: Sequence[float] | None = None,
+) -> SetPoints:
+    """Return set-points at 1 kHz whose efforts make up for what the motors take, one kind and gains a column.
+
+    `winding_start_c` are the windings' temperatures as the reference begins, the ambient's if not given.
+    A joint with a loop that integrates is left as it is: that finds out by itself, and what is added would
+    wind it up.
+
+    Raises:
+        ValueError: another number of kinds or gains than columns.
+    """
+    effort = points.effort_nm.copy()
+    start_c = [AMBIENT_C] * len(kinds) if winding_start_c is None else winding_start_c
+    for column, (kind, own, begin_c) in enumerate(zip(kinds, gains, start_c, strict=True)):
+        integrates = own.position.ki or own.velocity.ki or own.effort.ki
+        if integrates or own.strategy not in _WITH_EFFORT:
+            continue
+        rate = points.reference.qd_rad_s[:, column]
+        tau = points.effort_nm[:, column]
+        known = own.effort.feed_forward / torque_at_full_pwm_nm(kind) * tau
+        if own.strategy != 2:
+            known = known + own.velocity.feed_forward * pwm_per_rad_s(kind) * rate
+        missing = motor_pwm(kind, tau, rate, begin_c) - known
+        answer = own.effort.kp + own.effort.feed_forward / torque_at_full_pwm_nm(kind)
+        effort[:, column] += missing / answer
+    effort.flags.writeable = False
+    return SetPoints(points.reference, effort)
+
+
+_WITH_EFFORT = (2, 3, 4)
+
+
+def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array, winding_start_c: float = AMBIENT_C) -> Array:
+    """Return the PWM at 48 V (m,) under which a spring exerts `tau_nm` (m,) while it moves, at 1 kHz."""
+    motor = kind.motor
+    speed = qd_rad_s + differentiate(tau_nm, RATE_HZ) / kind.spring_nm_rad
+    change = differentiate(speed, RATE_HZ)
+    rotor = kind.gear_ratio**2 * motor.rotor_inertia_kg_m2
+    sign = np.tanh(speed / _SLOW_RAD_S)
+    net = tau_nm + rotor * change + motor.viscous_nm_s_rad * speed + motor.coulomb_nm * sign
+    # Between driving and being driven the loss goes over as friction does.
+    drives = 0.5 * (1.0 + np.sign(net) * sign)
+    gross = net * (1.0 + drives * (1.0 / motor.efficiency - 1.0))
+    per_amp = motor.back_emf_v_s_rad * kind.gear_ratio
+    ampere = gross / per_amp
+    ohm = motor.resistance_ohm * resistance_factor(
+        _warmth_c(motor.resistance_ohm * ampere**2, winding_start_c)
+    )
+    found: Array = (ohm * ampere + per_amp * speed) / NOMINAL_VOLTAGE_V
+    return found
+
+
+def _warmth_c(cold_w: Array, start_c: float) -> Array:
+    """Return the winding's temperature (m,) at 1 kHz; it changes by far less within the steps it takes."""
+    ticks = np.arange(len(cold_w))
+    coarse = winding_c(cold_w[::_WARMING_TICKS], _WARMING_TICKS / RATE_HZ, start_c)
+    return np.interp(ticks, ticks[::_WARMING_TICKS], coarse)

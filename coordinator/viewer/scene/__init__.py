@@ -1,0 +1,1 @@
+"""What the view shows: geometry, graphs, time series, blueprint."""

@@ -1,0 +1,248 @@
+"""The blueprint: robot and step on the left, tabs on the right, with explicit lists of what is in each view.
+
+Wildcards in the middle of a path match nothing, silently; so every view names its entities.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from coordinator.viewer.scene import entity_paths
+from coordinator.viewer.scene.parameter_plot import Parameter, is_dynamic
+from coordinator.viewer.scene.topology_graph import Topology, extent
+
+IDENTIFICATION, DYNAMICS, IMU, NETWORK = TABS = ("Identification", "Dynamics", "IMU", "Network")
+LINK_LENGTH, AXIS_ANGLE = OF_LINKS = ("link_length", "axis_angle")
+
+# More than this on one page leaves plots too small to read; there are further pages for the rest.
+MODULES_PER_PAGE = 4
+ROWS_PER_PAGE, COLUMNS_PER_PAGE = 3, 3
+# About a housing's length, which is seen around what the joints can reach.
+HOUSING_M = 0.12
+
+_WHOLE_RUN = rr.TimeRange(
+    rr.TimeRangeBoundary.absolute(seconds=0), rr.TimeRangeBoundary.cursor_relative(seconds=0)
+)
+
+
+class Contents(NamedTuple):
+    """What there is to show."""
+
+    robot: str
+    serials: tuple[str, ...] = ()
+    estimated: tuple[Parameter, ...] = ()
+    topology: Topology | None = None
+    reach_m: float | None = None
+    truth: bool = False
+
+
+def views(contents: Contents) -> Contents:
+    """Return the contents without the ranges of the plots: what differs in it has other views."""
+    return contents._replace(estimated=tuple(p.without_ranges() for p in contents.estimated))
+
+
+def build(contents: Contents, active_tab: str = IDENTIFICATION) -> rrb.Blueprint:
+    """Return the layout for the modules, estimates and topology there are.
+
+    Raises:
+        ValueError: there is no such tab.
+    """
+    if active_tab not in TABS:
+        raise ValueError(f"no tab {active_tab!r}; there are {', '.join(TABS)}")
+    tabs = (_identification(contents), _dynamics(contents), _imu(contents), _network(contents))
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            _left(contents), rrb.Tabs(*tabs, active_tab=TABS.index(active_tab)), column_shares=[2, 3]
+        ),
+        rrb.TimePanel(state="collapsed", timeline=entity_paths.TIMELINE),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _left(contents: Contents) -> rrb.Vertical:
+    return rrb.Vertical(
+        rrb.TextDocumentView(origin=entity_paths.PHASE_NOW, name="Step"),
+        _robot(contents),
+        _of_modules(
+            "Joint position [rad]", contents.serials, entity_paths.module_path, entity_paths.POSITION
+        ),
+        row_shares=[1.5, 7, 3],
+    )
+
+
+def _robot(contents: Contents) -> rrb.Spatial3DView:
+    eye = None
+    if contents.reach_m is not None:
+        size = contents.reach_m + HOUSING_M
+        eye = rrb.EyeControls3D(
+            # Far enough for all that the robot can reach, not only for where it stands now.
+            position=[0.75 * size, -1.2 * size, 0.68 * size],
+            look_target=[0.0, 0.0, 0.1 * size],
+            eye_up=[0.0, 0.0, 1.0],
+        )
+    return rrb.Spatial3DView(
+        origin="/world",
+        contents=["/world/**"],
+        name=f"{contents.robot}: as identified (orange links)"
+        + (", truth in grey" if contents.truth else ""),
+        background=(24, 26, 32),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=0.1, stroke_width=0.6, color=(110, 115, 125, 90)),
+        eye_controls=eye,
+    )
+
+
+def _identification(contents: Contents) -> rrb.Vertical:
+    # The links of the identified robot come before what single modules made of single joints.
+    geometric = sorted(
+        (parameter for parameter in contents.estimated if not is_dynamic(parameter)),
+        key=lambda parameter: (parameter.name not in OF_LINKS, parameter.name != LINK_LENGTH),
+    )
+    log = rrb.TextLogView(
+        origin=entity_paths.PHASE_LOG, name="Log", columns=rrb.TextLogColumns(text_log_columns=["Body"])
+    )
+    return rrb.Vertical(
+        _parameters(geometric, "Estimates", contents) if geometric else _awaited(contents),
+        rrb.Horizontal(_topology(contents), log, column_shares=[2, 3]),
+        row_shares=[3, 2],
+        name=IDENTIFICATION,
+    )
+
+
+def _awaited(contents: Contents) -> rrb.View:
+    # One empty plot says what to wait for.
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[entity_paths.estimate_path(LINK_LENGTH, serial) for serial in contents.serials],
+        name="Link length [m]: no estimate yet",
+    )
+
+
+def _parameters(parameters: Sequence[Parameter], name: str, contents: Contents) -> rrb.Container:
+    """Give every parameter a row and every module a column, on as many pages as it takes."""
+    serials = list(dict.fromkeys(serial for p in parameters for serial in p.ranges_by_serial()))
+    # From the base to the tips, as far as that is known.
+    known = contents.topology.serials if contents.topology is not None else ()
+    serials.sort(key=lambda serial: known.index(serial) if serial in known else len(known))
+    rows = [parameters[i : i + ROWS_PER_PAGE] for i in range(0, len(parameters), ROWS_PER_PAGE)]
+    columns = [serials[i : i + COLUMNS_PER_PAGE] for i in range(0, len(serials), COLUMNS_PER_PAGE)]
+    if len(rows) == len(columns) == 1:
+        return _parameter_page(parameters, serials, name)
+    what = [f": {some[0].title()} …" if len(rows) > 1 else "" for some in rows]
+    whose = [f"{some[0]} to {some[-1]}" if len(some) > 1 else some[0] for some in columns]
+    pages = [
+        _parameter_page(rows[i], columns[k], whose[k] + what[i])
+        for i in range(len(rows))
+        for k in range(len(columns))
+    ]
+    return rrb.Tabs(*pages, name=name)
+
+
+def _parameter_page(parameters: Sequence[Parameter], serials: Sequence[str], name: str) -> rrb.Container:
+    shown = [[(p, serial) for serial in serials if serial in p.ranges_by_serial()] for p in parameters]
+    rows = [rrb.Horizontal(*(_estimate(p, serial) for p, serial in row)) for row in shown if row]
+    return rrb.Vertical(*rows, name=name)
+
+
+def _estimate(parameter: Parameter, serial: str) -> rrb.View:
+    seen = parameter.ranges_by_serial()[serial]
+    return rrb.TimeSeriesView(
+        origin=entity_paths.estimate_path(parameter.name, serial),
+        name=f"{serial} {parameter.title()} [{parameter.units}]",
+        # All in the same time, so that one sees what a motion does to each of them.
+        axis_x=rrb.TimeAxis(view_range=_WHOLE_RUN),
+        axis_y=None if seen is None else rrb.ScalarAxis(range=seen),
+        plot_legend=rrb.PlotLegend(visible=False),
+    )
+
+
+def _topology(contents: Contents) -> rrb.GraphView:
+    bounds = None
+    if contents.topology is not None:
+        x_min, x_max, y_min, y_max = extent(contents.topology)
+        bounds = rrb.VisualBounds2D(x_range=(x_min, x_max), y_range=(y_min, y_max))
+    return rrb.GraphView(
+        origin=entity_paths.TOPOLOGY, name="Topology: who is mounted on whom", visual_bounds=bounds
+    )
+
+
+def _dynamics(contents: Contents) -> rrb.Vertical:
+    held_out = [
+        rrb.TimeSeriesView(
+            origin=entity_paths.residual_path(serial, entity_paths.HELD_OUT),
+            name=f"{serial} held-out torque [Nm]",
+        )
+        for serial in contents.serials
+    ]
+    of_all = rrb.Vertical(
+        _of_modules(
+            "Held-out torque, measured − predicted [Nm]",
+            contents.serials,
+            entity_paths.residual_path,
+            entity_paths.ERROR,
+        ),
+        _of_modules(
+            "Torque at the springs [Nm]", contents.serials, entity_paths.module_path, entity_paths.EFFORT
+        ),
+        name="All modules",
+    )
+    inertial = [parameter for parameter in contents.estimated if is_dynamic(parameter)]
+    return rrb.Vertical(
+        _paged(held_out, MODULES_PER_PAGE, "Held-out torque"),
+        rrb.Tabs(of_all, _parameters(inertial, "Parameters", contents), active_tab=0) if inertial else of_all,
+        row_shares=[1, 1],
+        name=DYNAMICS,
+    )
+
+
+def _imu(contents: Contents) -> rrb.Container:
+    plots: list[rrb.View] = []
+    for serial in contents.serials:
+        for group, title in (
+            (entity_paths.GYRO, "gyro [rad/s]"),
+            (entity_paths.ACCEL, "specific force [m/s²]"),
+        ):
+            path = entity_paths.module_path(serial, group)
+            plots.append(rrb.TimeSeriesView(origin=path, name=f"{serial} {title}"))
+    # No container around a single one: the viewer takes such out, and its name with it.
+    return _paged(plots, 2 * MODULES_PER_PAGE, IMU)
+
+
+def _network(contents: Contents) -> rrb.Vertical:
+    return rrb.Vertical(
+        _of_modules("Round trip [ms]", contents.serials, entity_paths.network_path, entity_paths.ROUND_TRIP),
+        _of_modules(
+            "Age of the newest sample [ms]", contents.serials, entity_paths.network_path, entity_paths.AGE
+        ),
+        _of_modules(
+            "Refused commands, total", contents.serials, entity_paths.network_path, entity_paths.REFUSALS
+        ),
+        rrb.StateTimelineView(
+            origin="/modules",
+            contents=[entity_paths.module_path(serial, entity_paths.STATE) for serial in contents.serials],
+            name="Firmware state",
+        ),
+        row_shares=[2, 2, 2, 3],
+        name=NETWORK,
+    )
+
+
+def _of_modules(
+    name: str, serials: Sequence[str], path: Callable[[str, str], str], group: str
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(origin="/", contents=[path(serial, group) for serial in serials], name=name)
+
+
+def _paged(views: Sequence[rrb.View], per_page: int, name: str) -> rrb.Container:
+    """Put views into two columns, on as many pages as it takes."""
+    pages = [views[i : i + per_page] for i in range(0, len(views), per_page)]
+    if len(pages) <= 1:
+        return rrb.Grid(*views, grid_columns=2, name=name)
+    grids = [
+        rrb.Grid(*page, grid_columns=2, name=f"{name} {number}") for number, page in enumerate(pages, start=1)
+    ]
+    return rrb.Tabs(*grids, name=name)

@@ -1,0 +1,94 @@
+"""What is said as the run goes on: steps, estimates, held-out torque, the network."""
+
+import math
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from coordinator.viewer.scene import entity_paths
+from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS, Estimate
+from coordinator.viewer.scene.time_series import IntArray, send_scalars
+
+LEGEND = "Band: 1σ. Thin lines and spheres: 95 %. Grey: the truth, where it is known."
+
+
+def set_time(stream: rr.RecordingStream, t_ns: int) -> None:
+    """Set the session time of what is logged next; only the logging thread does so."""
+    stream.set_time(entity_paths.TIMELINE, duration=np.timedelta64(t_ns, "ns"))
+
+
+def log_phase(stream: rr.RecordingStream, text: str) -> None:
+    """Log a step of the run: a line of the log, and the heading that says what is going on."""
+    stream.log(entity_paths.PHASE_LOG, rr.TextLog(text, level=rr.TextLogLevel.INFO))
+    stream.log(entity_paths.PHASE_NOW, rr.TextDocument(f"**{text}**\n\n{LEGEND}", media_type="text/markdown"))
+
+
+def log_estimate(stream: rr.RecordingStream, estimate: Estimate, colour: entity_paths.Colour) -> None:
+    """Log a value with its variance and the ends of its 95 % interval; not finite sigma: neither.
+
+    The viewer draws a line in a band of one sigma, and two thin lines that are right 95 times in 100.
+    """
+    known = math.isfinite(estimate.sigma)
+    drawn = rr.Measurements(
+        [estimate.value],
+        # None would leave the variance of the estimate before standing.
+        variances=[estimate.sigma**2] if known else [],
+        units=estimate.units,
+        names=estimate.serial,
+        colors=[colour],
+        widths=[2.0],
+        # An estimate stays what it is until the next one.
+        interpolation_mode="stepafter",
+    )
+    stream.log(entity_paths.estimate_path(estimate.name, estimate.serial), drawn)
+    reach = NINETY_FIVE_SIGMAS * estimate.sigma if known else math.nan
+    ends = [estimate.value - reach, estimate.value + reach]
+    stream.log(entity_paths.interval_path(estimate.name, estimate.serial), rr.Scalars(ends))
+
+
+def log_interval_style(
+    stream: rr.RecordingStream, name: str, serial: str, colour: entity_paths.Colour
+) -> None:
+    """Log how the ends of a parameter's interval are drawn, static."""
+    style = rr.SeriesLines(
+        names=["95 %: from", "95 %: to"],
+        colors=[entity_paths.shade(colour, 0.75)] * 2,
+        widths=[1.0, 1.0],
+        interpolation_mode="stepafter",
+    )
+    stream.log(entity_paths.interval_path(name, serial), style, static=True)
+
+
+def log_truth_style(stream: rr.RecordingStream, name: str, serial: str) -> None:
+    """Log how a parameter's true value is drawn, static."""
+    style = rr.SeriesLines(names="true", colors=[entity_paths.TRUTH_COLOUR], widths=[1.5])
+    stream.log(entity_paths.truth_path(name, serial), style, static=True)
+
+
+def log_truth(stream: rr.RecordingStream, name: str, serial: str, value: float) -> None:
+    """Log a parameter's true value; it is a line from the first estimate to the last."""
+    stream.log(entity_paths.truth_path(name, serial), rr.Scalars(value))
+
+
+def log_network(
+    stream: rr.RecordingStream, serial: str, round_trip_ms: float, age_ms: float, refusals: int
+) -> None:
+    """Log the state of a module's connection."""
+    stream.log(entity_paths.network_path(serial, entity_paths.ROUND_TRIP), rr.Scalars(round_trip_ms))
+    stream.log(entity_paths.network_path(serial, entity_paths.AGE), rr.Scalars(age_ms))
+    stream.log(entity_paths.network_path(serial, entity_paths.REFUSALS), rr.Scalars(float(refusals)))
+
+
+def send_residuals(
+    stream: rr.RecordingStream,
+    serial: str,
+    t_ns: IntArray,
+    measured_nm: NDArray[np.float64],
+    predicted_nm: NDArray[np.float64],
+) -> None:
+    """Log held-out torque (m,) as measured and as predicted, and the difference."""
+    both = np.stack([measured_nm, predicted_nm], axis=1)
+    send_scalars(stream, entity_paths.residual_path(serial, entity_paths.HELD_OUT), t_ns, both)
+    error = (measured_nm - predicted_nm)[:, None]
+    send_scalars(stream, entity_paths.residual_path(serial, entity_paths.ERROR), t_ns, error)

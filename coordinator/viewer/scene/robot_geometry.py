@@ -1,0 +1,180 @@
+"""What an identified chain looks like: where housings, outputs, links and axes are at q = 0.
+
+Everything is in the root frame at q = 0 and is grouped by the body that carries it, so that a body's
+displacement D_i(q) (`kinematics.forward`) moves all of it.
+
+Trees of a chain set apart, to be looked at: where they stand against each other is not known.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from module_agent.model.catalogue import module_type
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE, carrier, descendants
+from module_agent.model.perturbation import apply_increment
+
+
+class Box(NamedTuple):
+    """A housing's outline in its own frame [m]."""
+
+    size: tuple[float, float, float]
+    centre: tuple[float, float, float]
+
+
+# The X5's output is not in the middle of its 110 mm: it is half a width (36.5 mm) from one end.
+_X5_BOX = Box((0.110, 0.073, 0.031), (-0.0185, 0.0, 0.0155))
+_BOXES = {"SEA-snake": Box((0.051, 0.051, 0.064), (0.0, 0.0, 0.032))}
+
+
+class Module(NamedTuple):
+    """One module in its place.
+
+    housing_body, output_body: the bodies that carry the housing and the output, `BASE` for the base.
+    housing: (4, 4) pose of the housing frame.
+    box: the housing's outline.
+    output: (3,) the point of the identified axis nearest to where the output is in the housing.
+    axis: (3,) unit vector of the joint's axis.
+    """
+
+    housing_body: int
+    output_body: int
+    housing: Array
+    box: Box
+    output: Array
+    axis: Array
+
+
+class Link(NamedTuple):
+    """A straight line from `start` (3,) to `end` (3,) that joins two modules, and its body."""
+
+    body: int
+    start: Array
+    end: Array
+
+
+def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
+    """Place every module of the chain.
+
+    Args:
+        chain: n joints.
+        types: the module type's name by serial, which says where the IMU and the output are in the housing.
+
+    Raises:
+        KeyError: a serial of the chain is not in `types`, or its type is not in the catalogue.
+    """
+    return tuple(_module(chain, k, types) for k in range(len(chain.serials)))
+
+
+def _module(chain: Chain, k: int, types: Mapping[str, str]) -> Module:
+    serial = chain.serials[k]
+    if serial not in types:
+        raise KeyError(f"the type of module {serial!r} is not known; known are {', '.join(types) or 'none'}")
+    made = module_type(types[serial])
+    housing = chain.imu_home[k] @ _shift(-np.array(made.imu_xyz))
+    nominal = housing[:3, :3] @ made.output_xyz + housing[:3, 3]
+    axis, point = chain.axis[k], chain.point[k]
+    return Module(
+        housing_body=carrier(chain, k),
+        output_body=chain.parent[k] if chain.reversed[k] else k,
+        housing=housing,
+        box=_BOXES.get(made.name, _X5_BOX),
+        output=point + axis * float(axis @ (nominal - point)),
+        axis=axis,
+    )
+
+
+def links(chain: Chain, placed: tuple[Module, ...]) -> tuple[Link, ...]:
+    """Return what joins each module to its parent, or to the origin of the base for a root module.
+
+    A link runs from the parent's distal side (its output, or its housing if reversed) to the child's proximal
+    side (its housing, or its output if reversed).
+    """
+    found = []
+    for k, parent in enumerate(chain.parent):
+        child = placed[k]
+        end = child.output if chain.reversed[k] else child.housing[:3, 3]
+        if parent == BASE:
+            start = np.zeros(3)
+        else:
+            above = placed[parent]
+            start = above.housing[:3, 3] if chain.reversed[parent] else above.output
+        found.append(Link(parent, start, end))
+    return tuple(found)
+
+
+def upright(gravity: Array) -> Rotation:
+    """Return the least rotation of the root frame that points the specific force of rest (3,) along +z.
+
+    The heading about the vertical is not observable on a fixed base, so the least rotation is as good as any.
+
+    Raises:
+        ValueError: `gravity` has no direction.
+    """
+    length = float(np.linalg.norm(gravity))
+    if not np.isfinite(length) or length < 1e-6:
+        raise ValueError(f"gravity {gravity} has no direction, so the robot cannot be set upright")
+    return from_z(gravity / length).inv()
+
+
+def from_z(direction: Array) -> Rotation:
+    """Return the least rotation that turns +z into the unit vector `direction` (3,)."""
+    axis = np.cross([0.0, 0.0, 1.0], direction)
+    sine = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(sine, direction[2]))
+    # Along z the axis is not defined, and any horizontal one will do for the half turn.
+    unit = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+    return Rotation.from_rotvec(angle * unit)
+
+
+def reach_m(chain: Chain, placed: tuple[Module, ...]) -> float:
+    """Return the greatest distance of a module from the root along the links; no posture exceeds it [m]."""
+    along: list[float] = []
+    for k, link in enumerate(links(chain, placed)):
+        parent = chain.parent[k]
+        before = 0.0 if parent == BASE else along[parent]
+        stacked = float(np.linalg.norm(placed[k].output - placed[k].housing[:3, 3]))
+        along.append(before + float(np.linalg.norm(link.end - link.start)) + stacked)
+    return max(along, default=0.0)
+
+
+def _shift(by: Array) -> Array:
+    pose = np.eye(4)
+    pose[:3, 3] = by
+    return pose
+
+
+GAP_M = 0.25
+
+
+def side_by_side(chain: Chain) -> Chain:
+    """Return the chain with its trees in a row along the horizontal, the first where it is.
+
+    Nothing that sensors on a fixed base tell depends on where a second tree stands.
+    """
+    roots = [k for k, parent in enumerate(chain.parent) if parent == BASE]
+    if len(roots) == 1:
+        return chain
+    along = _horizontal(chain)
+    shift, end = np.zeros((len(chain.serials), 6)), 0.0
+    for number, root in enumerate(roots):
+        tree = list(descendants(chain, root))
+        places = np.concatenate([chain.imu_home[tree, :3, 3], chain.point[tree]]) @ along
+        if number > 0:
+            shift[tree, 3:] = (end + GAP_M - places.min()) * along
+        end = max(end, float((places + shift[root, 3:] @ along).max()))
+    return apply_increment(chain, shift.ravel())
+
+
+def _horizontal(chain: Chain) -> Array:
+    """Return the level direction (3,) that is nearest to the root frame's y, or to its x."""
+    up = chain.gravity / np.linalg.norm(chain.gravity)
+    for candidate in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
+        level = candidate - up * (up @ candidate)
+        size = float(np.linalg.norm(level))
+        if size > 0.5:
+            break
+    return np.asarray(level / size)

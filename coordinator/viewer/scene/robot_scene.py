@@ -1,0 +1,268 @@
+"""The robot in 3D: housings, outputs, links, joint axes and IMU frames, each under the body that moves it."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+from scipy.spatial.transform import Rotation
+
+from coordinator.viewer.scene import entity_paths
+from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS
+from coordinator.viewer.scene.robot_geometry import Link, Module, from_z, links, modules, upright
+from coordinator.viewer.scene.time_series import IntArray, time_column
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE, body_displacements
+
+LINK_RADIUS_M = 0.009
+OUTPUT_RADIUS_M = 0.024
+OUTPUT_THICKNESS_M = 0.008
+AXIS_LENGTH_M = 0.09
+IMU_AXIS_LENGTH_M = 0.05
+# Sigmas: as far as the 95 % intervals of the plots.
+SPREAD = NINETY_FIVE_SIGMAS
+
+Drawn = rr.AsComponents
+
+
+class Look(NamedTuple):
+    """How a robot is drawn in one world: `link` for what joins modules; `plain` paints everything so.
+
+    The truth is translucent and without labels, so that it does not hide the estimate that it should coincide
+    with.
+    """
+
+    world: str
+    link: entity_paths.Colour
+    plain: entity_paths.Colour | None
+    fill: rr.components.FillMode
+    labels: bool
+
+
+ESTIMATE_LOOK = Look(
+    entity_paths.ESTIMATED_WORLD,
+    entity_paths.ESTIMATE_COLOUR,
+    None,
+    rr.components.FillMode.Solid,
+    labels=True,
+)
+TRUTH_LOOK = Look(
+    entity_paths.TRUE_WORLD,
+    entity_paths.TRUE_BODY_COLOUR,
+    entity_paths.TRUE_BODY_COLOUR,
+    rr.components.FillMode.TransparentFillMajorWireframe,
+    labels=False,
+)
+
+
+class Scene(NamedTuple):
+    """Everything to log for a chain: (entity path, archetypes), in the root frame at q = 0."""
+
+    chain: Chain
+    look: Look
+    drawn: tuple[tuple[str, tuple[Drawn, ...]], ...]
+
+
+def build_scene(
+    chain: Chain,
+    types: Mapping[str, str],
+    colours: Mapping[str, entity_paths.Colour],
+    sigma_m: Sequence[float] | None = None,
+    look: Look = ESTIMATE_LOOK,
+) -> Scene:
+    """Draw a chain at q = 0.
+
+    Args:
+        chain: n joints.
+        types: module type's name by serial.
+        colours: the modules' colours by serial.
+        sigma_m: (n,) standard deviation of each joint's place [m]; not finite means that it is not known.
+        look: world and colours.
+
+    Raises:
+        KeyError: a serial has no type or colour.
+        ValueError: `sigma_m` has not one value per joint, or gravity has no direction.
+    """
+    if sigma_m is not None and len(sigma_m) != len(chain.serials):
+        raise ValueError(f"{len(sigma_m)} sigmas for a chain of {len(chain.serials)} joints")
+    placed = modules(chain, types)
+    paint = [look.plain or colours[serial] for serial in chain.serials]
+    drawn: list[tuple[str, tuple[Drawn, ...]]] = [(look.world, (_upright(chain.gravity),))]
+    for body in range(BASE, len(chain.serials)):
+        drawn += _body(chain, placed, paint, sigma_m, look, body)
+    return Scene(chain, look, tuple(drawn))
+
+
+def log_scene(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
+    """Log a scene at the stream's present time, in the posture `q_rad` (n,)."""
+    for path, archetypes in scene.drawn:
+        for archetype in archetypes:
+            stream.log(path, archetype)
+    _log_pose(stream, scene, q_rad)
+
+
+def send_poses(stream: rr.RecordingStream, scene: Scene, t_ns: IntArray, q_rad: Array) -> None:
+    """Turn the robot to `q_rad` (k, n) at `t_ns` (k,): one column of transforms per body.
+
+    Raises:
+        ValueError: `q_rad` has not one position per joint.
+    """
+    displaced = body_displacements(scene.chain, q_rad)
+    for body, serial in enumerate(scene.chain.serials):
+        moved = rr.Transform3D.columns(
+            translation=displaced[:, body, :3, 3], mat3x3=displaced[:, body, :3, :3]
+        )
+        stream.send_columns(entity_paths.body_path(scene.look.world, serial), [time_column(t_ns)], moved)
+
+
+def _log_pose(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
+    displaced = body_displacements(scene.chain, q_rad[None, :])[0]
+    for serial, motion in zip(scene.chain.serials, displaced, strict=True):
+        path = entity_paths.body_path(scene.look.world, serial)
+        stream.log(path, rr.Transform3D(translation=motion[:3, 3], mat3x3=motion[:3, :3]))
+
+
+def clear_gone(stream: rr.RecordingStream, before: Scene, after: Scene) -> None:
+    """Take away, from the stream's present time on, what the new scene no longer has."""
+    kept = {path for path, _ in after.drawn}
+    for path, _ in before.drawn:
+        if path not in kept:
+            stream.log(path, rr.Clear(recursive=False))
+
+
+def gravity_arrow(chain: Chain, reach_m: float) -> rr.Arrows3D:
+    """Return gravity as an arrow beside the robot, in the upright world."""
+    length = 0.25 * max(reach_m, 0.2)
+    strength = float(np.linalg.norm(chain.gravity))
+    return rr.Arrows3D(
+        origins=[[-length, -0.4 * length, 1.4 * length]],
+        vectors=[[0.0, 0.0, -length]],
+        radii=0.008,
+        colors=[(200, 200, 210, 255)],
+        labels=[f"gravity {strength:.2f} m/s²"],
+        show_labels=True,
+    )
+
+
+def _body(
+    chain: Chain,
+    placed: tuple[Module, ...],
+    paint: Sequence[entity_paths.Colour],
+    sigma_m: Sequence[float] | None,
+    look: Look,
+    body: int,
+) -> list[tuple[str, tuple[Drawn, ...]]]:
+    path = entity_paths.body_path(look.world, None if body == BASE else chain.serials[body])
+    housed = [k for k, module in enumerate(placed) if module.housing_body == body]
+    drawn: list[tuple[str, tuple[Drawn, ...]]] = []
+    if housed:
+        drawn.append((f"{path}/housing", (_housings(chain, placed, paint, sigma_m, look, housed),)))
+        if look.plain is None:
+            drawn += [(f"{path}/imu/{entity_paths.part(chain.serials[k])}", _imu(chain, k)) for k in housed]
+    turning = [k for k, module in enumerate(placed) if module.output_body == body]
+    if turning:
+        drawn.append((f"{path}/output", (_outputs(placed, paint, look, turning),)))
+    if body != BASE:
+        drawn.append((f"{path}/axis", (_axis(placed[body], paint[body]),)))
+        if sigma_m is not None and np.isfinite(sigma_m[body]):
+            drawn.append((f"{path}/spread", (_spread(placed[body], sigma_m[body], look),)))
+    joined = [link for link in links(chain, placed) if link.body == body and _length(link) > 1e-4]
+    if body == BASE and look.plain is not None:
+        # The base is where the identified robot's first module stands, and the truth may be drawn elsewhere.
+        joined = []
+    if joined:
+        drawn.append((f"{path}/link", (_links(joined, look),)))
+    return drawn
+
+
+def _housings(
+    chain: Chain,
+    placed: tuple[Module, ...],
+    paint: Sequence[entity_paths.Colour],
+    sigma_m: Sequence[float] | None,
+    look: Look,
+    housed: Sequence[int],
+) -> rr.Boxes3D:
+    poses = [placed[k].housing for k in housed]
+    return rr.Boxes3D(
+        sizes=[placed[k].box.size for k in housed],
+        centers=[
+            pose[:3, :3] @ placed[k].box.centre + pose[:3, 3] for k, pose in zip(housed, poses, strict=True)
+        ],
+        quaternions=[_quaternion(Rotation.from_matrix(pose[:3, :3])) for pose in poses],
+        colors=[paint[k] for k in housed],
+        fill_mode=look.fill,
+        labels=[_label(chain, k, sigma_m) for k in housed],
+        show_labels=look.labels,
+    )
+
+
+def _label(chain: Chain, k: int, sigma_m: Sequence[float] | None) -> str:
+    how = " (reversed)" if chain.reversed[k] else ""
+    if sigma_m is None or sigma_m[k] == 0.0:  # the root is where the others are measured from
+        return f"{chain.serials[k]}{how}"
+    if not np.isfinite(sigma_m[k]):
+        return f"{chain.serials[k]}{how}  place not known"
+    return f"{chain.serials[k]}{how}  ±{1e3 * sigma_m[k]:.2g} mm"
+
+
+def _outputs(
+    placed: tuple[Module, ...], paint: Sequence[entity_paths.Colour], look: Look, turning: Sequence[int]
+) -> rr.Cylinders3D:
+    return rr.Cylinders3D(
+        lengths=[OUTPUT_THICKNESS_M] * len(turning),
+        radii=[OUTPUT_RADIUS_M] * len(turning),
+        centers=[placed[k].output for k in turning],
+        quaternions=[_quaternion(from_z(placed[k].axis)) for k in turning],
+        colors=[entity_paths.shade(paint[k], 0.5) for k in turning],
+        fill_mode=look.fill,
+    )
+
+
+def _axis(module: Module, colour: entity_paths.Colour) -> rr.Arrows3D:
+    return rr.Arrows3D(
+        origins=[module.output],
+        vectors=[AXIS_LENGTH_M * module.axis],
+        radii=0.004,
+        colors=[entity_paths.shade(colour, 1.4)],
+    )
+
+
+def _spread(module: Module, sigma_m: float, look: Look) -> rr.Ellipsoids3D:
+    return rr.Ellipsoids3D(
+        centers=[module.output],
+        radii=[SPREAD * sigma_m],
+        colors=[look.link],
+        fill_mode="transparentfillmajorwireframe",
+    )
+
+
+def _links(joined: Sequence[Link], look: Look) -> rr.Capsules3D:
+    return rr.Capsules3D(
+        lengths=[_length(link) for link in joined],
+        radii=[LINK_RADIUS_M] * len(joined),
+        translations=[link.start for link in joined],
+        quaternions=[_quaternion(from_z((link.end - link.start) / _length(link))) for link in joined],
+        colors=[look.link] * len(joined),
+        fill_mode=look.fill,
+    )
+
+
+def _imu(chain: Chain, k: int) -> tuple[Drawn, ...]:
+    pose = chain.imu_home[k]
+    return (
+        rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
+        rr.TransformAxes3D(axis_length=IMU_AXIS_LENGTH_M),
+    )
+
+
+def _upright(gravity: Array) -> rr.Transform3D:
+    return rr.Transform3D(quaternion=_quaternion(upright(gravity)))
+
+
+def _length(link: Link) -> float:
+    return float(np.linalg.norm(link.end - link.start))
+
+
+def _quaternion(rotation: Rotation) -> rr.Quaternion:
+    return rr.Quaternion(xyzw=rotation.as_quat())

@@ -1,0 +1,110 @@
+"""The tree of modules as a graph: who is mounted on whom, and which way round."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import rerun as rr
+
+from coordinator.viewer.scene import entity_paths
+from module_agent.model.forward_kinematics import BASE
+
+BASE_NODE = "base"
+BASE_COLOUR: entity_paths.Colour = (200, 200, 210, 255)
+# In the graph's own units (points at zoom 1): room for a label of a dozen letters.
+LEVEL, LEAF = 42.0, 130.0
+
+
+class Topology(NamedTuple):
+    """Per module its serial, the index of its parent (-1 is the base) and whether it is mounted reversed."""
+
+    serials: tuple[str, ...]
+    parent: tuple[int, ...]
+    reversed: tuple[bool, ...]
+
+
+def positions(topology: Topology) -> list[tuple[float, float]]:
+    """Return a place for the base, then for every module: the depth goes down, every leaf has its own column.
+
+    A parent is above the middle of its children, so no two edges cross.
+    """
+    children: dict[int, list[int]] = {}
+    for k, parent in enumerate(topology.parent):
+        children.setdefault(parent, []).append(k)
+    across: dict[int, float] = {}
+    depths: dict[int, int] = {BASE: 0}
+    leaves = 0
+    # Post-order without recursion: a chain of 64 modules is as deep as it is long.
+    stack: list[tuple[int, bool]] = [(BASE, False)]
+    while stack:
+        node, done = stack.pop()
+        below = children.get(node, [])
+        if done:
+            across[node] = sum(across[k] for k in below) / len(below)
+        elif below:
+            depths |= dict.fromkeys(below, depths[node] + 1)
+            stack.append((node, True))
+            stack += [(k, False) for k in reversed(below)]
+        else:
+            across[node] = float(leaves)
+            leaves += 1
+    order = (BASE, *range(len(topology.serials)))
+    return [(LEAF * across[k], LEVEL * depths[k]) for k in order]
+
+
+def graph(
+    topology: Topology, types: Mapping[str, str], colours: Mapping[str, entity_paths.Colour]
+) -> tuple[rr.GraphNodes, rr.GraphEdges]:
+    """Draw the tree with fixed places, which need no settling."""
+    labels = [_label(topology, k, types) for k in range(len(topology.serials))]
+    nodes = rr.GraphNodes(
+        node_ids=[BASE_NODE, *topology.serials],
+        labels=[BASE_NODE, *labels],
+        colors=[BASE_COLOUR, *(colours[serial] for serial in topology.serials)],
+        positions=positions(topology),
+        show_labels=True,
+        radii=8.0,
+    )
+    names = (*topology.serials, BASE_NODE)  # so that the index -1 is the base
+    edges = rr.GraphEdges(
+        edges=[
+            (names[parent], serial) for parent, serial in zip(topology.parent, topology.serials, strict=True)
+        ],
+        graph_type="directed",
+    )
+    return nodes, edges
+
+
+def extent(topology: Topology) -> tuple[float, float, float, float]:
+    """Return the box (x_min, x_max, y_min, y_max) that shows all of the graph."""
+    x, y = zip(*positions(topology), strict=True)
+    return (min(x) - LEAF, max(x) + LEAF, min(y) - 0.6 * LEVEL, max(y) + 0.6 * LEVEL)
+
+
+def complaint(topology: Topology) -> str | None:
+    """Return what is wrong with a topology, None if it is a tree in order (parents before children)."""
+    count = len(topology.serials)
+    if not (len(topology.parent) == len(topology.reversed) == count):
+        return f"{count} serials, {len(topology.parent)} parents, {len(topology.reversed)} directions"
+    for k, parent in enumerate(topology.parent):
+        if not BASE <= parent < k:
+            return f"module {topology.serials[k]!r} (index {k}) has parent index {parent}"
+    return None
+
+
+def _label(topology: Topology, k: int, types: Mapping[str, str]) -> str:
+    made = types.get(topology.serials[k], "")
+    how = ["reversed"] if topology.reversed[k] else []
+    return " · ".join([topology.serials[k], *([made] if made else []), *how])
+
+
+def as_topology(serials: Sequence[str], parent: Sequence[int], reverse: Sequence[bool]) -> Topology:
+    """Make a topology of any sequences.
+
+    Raises:
+        ValueError: the sequences differ in length, or a parent does not come before its child.
+    """
+    topology = Topology(tuple(serials), tuple(int(p) for p in parent), tuple(bool(r) for r in reverse))
+    wrong = complaint(topology)
+    if wrong is not None:
+        raise ValueError(f"not a tree with parents before children: {wrong}")
+    return topology

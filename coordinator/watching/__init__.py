@@ -1,1 +1,0 @@
-"""Watching a known robot: what in its sensors is other than its model says, and what explains it."""

@@ -1,0 +1,1 @@
+"""PID controllers, gains and motions; pure functions of time."""

@@ -1,0 +1,132 @@
+"""Control strategies 0-4: how position, velocity and effort loops make one PWM (in [-1, 1], at 48 V).
+
+    0 Off        pwm = 0
+    1 DirectPWM  pwm = effort command
+    2            pwm = T(effort command + P + V)
+    3            pwm = clip(P + V + T(effort command))
+    4            pwm = clip(V + T(effort command + P))
+
+P outputs Nm under 2 and 4 and PWM under 3; V outputs Nm only under 2. An unset command disables its loop.
+Feed-forward turns a target into the PWM that holds it in steady state: v N 30 / (pi Kv 48) for a velocity,
+verified on a real log, and tau R / (48 Kt N efficiency) for an effort.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from module_agent.control.pid import Pid
+from module_agent.model.catalogue import ModuleType
+from module_agent.wire.messages import GainSet
+
+NOMINAL_VOLTAGE_V = 48.0
+
+
+class Command(NamedTuple):
+    """What the loops shall follow at one tick; None disables a loop."""
+
+    position_rad: float | None
+    velocity_rad_s: float | None
+    effort_nm: float | None
+
+
+UNSET = Command(None, None, None)
+
+
+Law = Callable[[Command, float, float, float], float]
+
+
+def pwm_per_rad_s(kind: ModuleType) -> float:
+    """Return what the velocity loop takes to hold a speed: the PWM of its back-EMF, by the motor's Kv."""
+    return kind.gear_ratio * 30.0 / (math.pi * kind.motor.velocity_constant_rpm_v * NOMINAL_VOLTAGE_V)
+
+
+def torque_at_full_pwm_nm(kind: ModuleType) -> float:
+    """Return what the effort loop takes full PWM to exert at rest, behind a gear of constant efficiency."""
+    motor = kind.motor
+    stalled_a = NOMINAL_VOLTAGE_V / motor.resistance_ohm
+    return stalled_a * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
+
+
+class Controller:
+    """The three loops of one module under its control strategy.
+
+    `update(command, position_rad, velocity_rad_s, effort_nm)` returns the PWM of this tick.
+    """
+
+    def __init__(self, kind: ModuleType, gains: GainSet, dt_s: float):
+        self.gains = gains
+        self._loops = (
+            Pid(gains.position, dt_s),
+            Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s(kind)),
+            Pid(gains.effort, dt_s, 1.0 / torque_at_full_pwm_nm(kind)),
+        )
+        self.update: Law = _LAWS[gains.strategy](*self._loops)
+
+    def reset(self) -> None:
+        """Forget all loops' past."""
+        for loop in self._loops:
+            loop.reset()
+
+
+def _off(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    return lambda command, position_rad, velocity_rad_s, effort_nm: 0.0
+
+
+def _direct_pwm(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    return lambda command, position_rad, velocity_rad_s, effort_nm: _clip(_sum(command.effort_nm))
+
+
+def _all_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
+        p_target, v_target, feed_nm = command
+        p = position.follow(p_target, position_rad)
+        v = velocity.follow(v_target, velocity_rad_s)
+        unset = p is None and v is None and feed_nm is None
+        return _clip(_sum(effort.follow(None if unset else _sum(p, v, feed_nm), effort_nm)))
+
+    return law
+
+
+def _side_by_side(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
+        p_target, v_target, e_target = command
+        p = position.follow(p_target, position_rad)
+        v = velocity.follow(v_target, velocity_rad_s)
+        return _clip(_sum(p, v, effort.follow(e_target, effort_nm)))
+
+    return law
+
+
+def _position_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
+    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
+        p_target, v_target, feed_nm = command
+        p = position.follow(p_target, position_rad)
+        v = velocity.follow(v_target, velocity_rad_s)
+        unset = p is None and feed_nm is None
+        return _clip(_sum(v, effort.follow(None if unset else _sum(p, feed_nm), effort_nm)))
+
+    return law
+
+
+_LAWS: dict[int, Callable[[Pid, Pid, Pid], Law]] = {
+    0: _off,
+    1: _direct_pwm,
+    2: _all_through_effort,
+    3: _side_by_side,
+    4: _position_through_effort,
+}
+
+
+def _sum(*terms: float | None) -> float:
+    total = 0.0
+    for term in terms:
+        if term is not None:
+            total += term
+    return total
+
+
+def _clip(pwm: float) -> float:
+    if pwm < -1.0:
+        return -1.0
+    return 1.0 if pwm > 1.0 else pwm

@@ -1,0 +1,50 @@
+"""The factory gains of every module type under every control strategy."""
+
+from module_agent.model.catalogue import ModuleType
+from module_agent.wire.messages import GainSet, PidGains
+
+# kp of (position, velocity, effort) by strategy, from the manufacturer's default gain files.
+_KP: dict[str, dict[int, tuple[float, float, float]]] = {
+    "X5-1": {2: (5.0, 0.1, 0.25), 3: (0.5, 0.05, 0.25), 4: (15.0, 0.05, 0.25)},
+    "X5-4": {2: (10.0, 0.2, 0.25), 3: (1.0, 0.05, 0.25), 4: (10.0, 0.05, 0.25)},
+    "X5-9": {2: (15.0, 0.5, 0.25), 3: (1.5, 0.05, 0.25), 4: (15.0, 0.05, 0.25)},
+}
+# The older generation has the same gear trains, and the snake module that of the X5-4 and no published file.
+for _name in ("X5-1", "X5-4", "X5-9"):
+    _KP[f"{_name}-old"] = _KP[_name]
+_KP["SEA-snake"] = _KP["X5-4"]
+
+
+def default_gains(kind: ModuleType, strategy: int) -> GainSet:
+    """Return the factory gains of a module type for control strategy 0-4.
+
+    Position outputs Nm under strategies 2 and 4, velocity under strategy 2; those outputs are limited to the
+    type's effort, all others to full PWM.
+    """
+    kp = _KP[kind.name].get(strategy, _KP[kind.name][3])
+    effort = kind.max_effort_nm
+    position_limit = effort if strategy in (2, 4) else 1.0
+    velocity_limit = effort if strategy == 2 else 1.0
+    effort_target = 4.0 if kind.name in ("X5-1", "X5-1-old") else 1.6 * effort
+    return GainSet(
+        strategy=strategy,
+        position=PidGains(kp=kp[0], min_output=-position_limit, max_output=position_limit),
+        velocity=PidGains(
+            kp=kp[1],
+            feed_forward=0.0 if strategy == 2 else 1.0,
+            min_target=-kind.velocity_clamp_rad_s,
+            max_target=kind.velocity_clamp_rad_s,
+            min_output=-velocity_limit,
+            max_output=velocity_limit,
+            output_lowpass=0.75,
+        ),
+        effort=PidGains(
+            kp=kp[2],
+            kd=0.001,
+            feed_forward=1.0,
+            min_target=-effort_target,
+            max_target=effort_target,
+            output_lowpass=0.9,
+            d_on_error=False,
+        ),
+    )

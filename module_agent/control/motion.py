@@ -1,0 +1,178 @@
+"""The efforts that a motion is fed forward: as bytes on the wire, and at the ticks of a module.
+
+A motion pattern running on a module: its command at any module time.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from module_agent.control.controller import Command
+from module_agent.control.waveform import duration_s, waveform
+from module_agent.wire.messages import EffortProfile, Limits, Pattern, Setpoint
+from module_agent.wire.refusal import Refusal, WireError
+
+SAMPLE = np.dtype("<f4")
+# What `EffortProfile` takes.
+MOST_SAMPLES = 800
+LEAST_PERIOD_NS = 1_000_000
+# A motion of a few hertz is then interpolated to better than 0.2 %: (2 pi f h)^2 / 8 at 2 Hz.
+USUAL_PERIOD_NS = 10_000_000
+
+
+def profile_period_ns(total_s: float) -> int:
+    """Return how far apart the samples of a motion are: 10 ms, more for a motion over 8 s."""
+    fitting_ns = -(-round(total_s * 1e9) // (MOST_SAMPLES - 1))
+    # Whole milliseconds, which are a module's ticks.
+    return max(USUAL_PERIOD_NS, -(-fitting_ns // LEAST_PERIOD_NS) * LEAST_PERIOD_NS)
+
+
+def effort_profile(effort_nm: ArrayLike, period_ns: int) -> EffortProfile:
+    """Return the efforts (k,) at 0, 1, 2 ... periods of a motion as a module takes them.
+
+    Raises:
+        ValueError: not 2 to 800 finite numbers in a row, or a period outside 1 ms to 1 s.
+    """
+    values = np.asarray(effort_nm, dtype=float)
+    if values.ndim != 1 or not 2 <= values.size <= MOST_SAMPLES or not np.isfinite(values).all():
+        raise ValueError(
+            f"efforts of shape {values.shape}; a profile is 2 to {MOST_SAMPLES} finite numbers in a row"
+        )
+    return EffortProfile(period_ns=period_ns, samples=values.astype(SAMPLE).tobytes())
+
+
+def effort_at(profile: EffortProfile, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the efforts (m,) [Nm] at times (m,) since the start of the motion.
+
+    Raises:
+        WireError: TYPES, the block is no whole number of samples; NOT_FINITE, one of them is no number.
+    """
+    if len(profile.samples) % SAMPLE.itemsize:
+        raise WireError(
+            Refusal.TYPES,
+            f"an effort profile of {len(profile.samples)} bytes; a sample is {SAMPLE.itemsize} bytes long",
+        )
+    values = np.frombuffer(profile.samples, dtype=SAMPLE).astype(float)
+    if not np.isfinite(values).all():
+        place = int(np.argmin(np.isfinite(values)))
+        raise WireError(Refusal.NOT_FINITE, f"sample {place} of the effort profile is {values[place]}")
+    found: NDArray[np.float64] = np.interp(t_s, np.arange(values.size) * (profile.period_ns * 1e-9), values)
+    return found
+
+
+# A motion is sampled when it starts; a minute takes 3 ms.
+LONGEST_S = 60.0
+# The thesis asks for up to 9 times what the module can do, to show how it saturates.
+ABSURD_SPEED = 10.0
+
+
+class Motion:
+    """A pattern sampled once at its start (0.3 ms for 6 s), so that a tick only looks it up."""
+
+    __slots__ = (
+        "_effort",
+        "_end_ns",
+        "_position",
+        "_start_ns",
+        "_tick_ns",
+        "_velocity",
+        "last_effort_nm",
+        "last_position_rad",
+    )
+
+    def __init__(
+        self,
+        pattern: Pattern,
+        origin_rad: float,
+        start_ns: int,
+        tick_ns: int,
+        effort: EffortProfile | None = None,
+    ):
+        total_s = duration_s(pattern, origin_rad)
+        ticks = max(1, round(total_s * 1e9 / tick_ns))
+        t_s = np.minimum(np.arange(ticks + 1) * (tick_ns / 1e9), total_s)
+        samples = waveform(pattern, origin_rad, t_s)
+        self._position: list[float] = (origin_rad + samples.offset_rad).tolist()
+        self._velocity: list[float] = samples.velocity_rad_s.tolist()
+        self._effort: list[float] | None = None if effort is None else effort_at(effort, t_s).tolist()
+        self._start_ns = start_ns
+        self._end_ns = start_ns + ticks * tick_ns
+        self._tick_ns = tick_ns
+        self.last_position_rad = self._position[-1]
+        self.last_effort_nm = None if self._effort is None else self._effort[-1]
+
+    @property
+    def top_speed_rad_s(self) -> float:
+        """The highest commanded speed of the motion."""
+        return max(max(self._velocity), -min(self._velocity))
+
+    @property
+    def range_rad(self) -> tuple[float, float]:
+        """The lowest and the highest position of the motion."""
+        return min(self._position), max(self._position)
+
+    def command(self, now_ns: int) -> Command | None:
+        """Return the command at this time, None when the motion is over."""
+        if now_ns >= self._end_ns:
+            return None
+        index = (now_ns - self._start_ns) // self._tick_ns
+        effort_nm = None if self._effort is None else self._effort[index]
+        return Command(self._position[index], self._velocity[index], effort_nm)
+
+
+def check_duration(pattern: Pattern, origin_rad: float) -> None:
+    """Check that a motion is short enough to be sampled within a tick or so.
+
+    Raises:
+        WireError: LIMIT, with the duration.
+    """
+    total_s = duration_s(pattern, origin_rad)
+    if total_s > LONGEST_S:
+        raise WireError(
+            Refusal.LIMIT, f"the motion would take {total_s:.0f} s, at most {LONGEST_S:.0f} s are taken"
+        )
+
+
+def check_speed(speed_rad_s: float, limits: Limits) -> None:
+    """Check that a speed is one that somebody may mean. The loops clamp what the motor cannot follow.
+
+    Raises:
+        WireError: LIMIT, with the speed.
+    """
+    if speed_rad_s > ABSURD_SPEED * limits.max_speed_rad_s:
+        raise WireError(
+            Refusal.LIMIT,
+            f"{speed_rad_s:.1f} rad/s is over {ABSURD_SPEED:.0f} times what this module can do, "
+            f"{limits.max_speed_rad_s:.2f} rad/s",
+        )
+
+
+def check_setpoint(setpoint: Setpoint, limits: Limits) -> None:
+    """Check that a setpoint is within the position limits and is not absurdly fast.
+
+    Raises:
+        WireError: LIMIT, with the position and the range that is allowed, or the speed.
+    """
+    check_speed(abs(setpoint.velocity_rad_s or 0.0), limits)
+    position, low, high = setpoint.position_rad, limits.min_position_rad, limits.max_position_rad
+    if position is not None and (
+        (low is not None and position < low) or (high is not None and position > high)
+    ):
+        raise WireError(Refusal.LIMIT, f"position {position:.3f} rad is outside {low} .. {high} rad")
+
+
+def check_motion(motion: Motion, limits: Limits) -> None:
+    """Check that a motion stays within the position limits and is not absurdly fast.
+
+    Raises:
+        WireError: LIMIT, with the range that the motion needs and the one that is allowed, or its speed.
+    """
+    check_speed(motion.top_speed_rad_s, limits)
+    low, high = motion.range_rad
+    if (limits.min_position_rad is not None and low < limits.min_position_rad) or (
+        limits.max_position_rad is not None and high > limits.max_position_rad
+    ):
+        raise WireError(
+            Refusal.LIMIT,
+            f"the motion needs {low:.3f} .. {high:.3f} rad, "
+            f"allowed are {limits.min_position_rad} .. {limits.max_position_rad} rad",
+        )

@@ -1,1 +1,0 @@
-"""What agents and coordinator compute alike of dynamics: chain, derivatives, regressor, information."""

@@ -1,0 +1,156 @@
+"""The last minute of feedback rows, so that nothing that a network drops is lost.
+
+When feedback rows are due, what they hold, and when a batch of them is to be published.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.control.controller import NOMINAL_VOLTAGE_V, Command
+from module_agent.firmware.config import FirmwareConfig
+from module_agent.hardware.hardware import SensorSample
+from module_agent.wire.feedback_rows import ROW, STATE_NAMES, Rows, pack_row
+from module_agent.wire.messages import State
+from module_agent.wire.refusal import Refusal, WireError
+
+MAX_ROWS_PER_ANSWER = 256
+
+
+class History:
+    """A ring of feedback rows, numbered from 0 since boot."""
+
+    def __init__(self, capacity: int):
+        self._bytes = bytearray(capacity * ROW.itemsize)
+        # The same memory: rows are written one by one as bytes and read in bulk as records.
+        self._ring: Rows = np.frombuffer(self._bytes, dtype=ROW)
+        self.capacity = capacity
+        self.next_row = 0
+
+    @property
+    def first_row(self) -> int:
+        """The oldest row still kept."""
+        return max(0, self.next_row - self.capacity)
+
+    def append(self, values: tuple[float, ...]) -> None:
+        """Add one row: its values in the order of `feedback_rows.ROW`, vectors element by element."""
+        pack_row(self._bytes, self.next_row % self.capacity, values)
+        self.next_row += 1
+
+    def rows(self, first: int, end: int) -> Rows:
+        """Return a copy of rows `first` up to and without `end`, shape (end - first,).
+
+        Raises:
+            WireError: GONE (overwritten or not yet there), saying which rows are kept.
+        """
+        return np.frombuffer(self.block(first, end), dtype=ROW)
+
+    def block(self, first: int, end: int) -> bytes:
+        """Return the bytes of rows `first` up to and without `end`.
+
+        Raises:
+            WireError: GONE (overwritten or not yet there), saying which rows are kept.
+        """
+        if first > end or first < self.first_row or end > self.next_row:
+            raise WireError(
+                Refusal.GONE,
+                f"rows {first} to {end} are not kept; kept are {self.first_row} to {self.next_row}",
+            )
+        start = first % self.capacity * ROW.itemsize
+        stop = start + (end - first) * ROW.itemsize
+        ring = memoryview(self._bytes)
+        if stop <= len(ring):
+            return bytes(ring[start:stop])
+        return bytes(ring[start:]) + bytes(ring[: stop - len(ring)])
+
+    def between(self, start_ns: int, end_ns: int) -> Rows:
+        """Return a copy of the rows kept whose module time is within a span, both ends included."""
+        first, end = self._row_from(start_ns), self._row_from(end_ns + 1)
+        return self.rows(first, max(first, end))
+
+    def _row_from(self, t_ns: int) -> int:
+        """Return the first row kept at or after a module time; rows are in the order of their time."""
+        low, high = self.first_row, self.next_row
+        stamps = self._ring["t_ns"]
+        while low < high:
+            middle = (low + high) // 2
+            if stamps[middle % self.capacity] < t_ns:
+                low = middle + 1
+            else:
+                high = middle
+        return low
+
+
+_STATE_INDEX = {name: index for index, name in enumerate(STATE_NAMES)}
+_NAN = float("nan")
+
+
+class Batch(NamedTuple):
+    """Consecutive rows to be published: the number of the first, one past the last, and their bytes."""
+
+    first_row: int
+    end_row: int
+    block: bytes
+
+
+class FeedbackStream:
+    """The feedback rows of one module, at its feedback rate and never twice with one IMU sample if slower.
+
+    `history` keeps what has been appended.
+    """
+
+    def __init__(self, config: FirmwareConfig):
+        self.history = History(config.history_rows)
+        self._batch_rows = config.batch_rows
+        self._period_ns = round(1e9 / config.feedback_rate_hz)
+        self._half_tick_ns = config.tick_ns // 2
+        self._imu_period_ns = config.imu_period_ns
+        # Rows no faster than the IMU wait for its next sample, so that every row holds a new one.
+        self._waits_for_imu = self._period_ns >= config.imu_period_ns
+        self._due_ns = 0
+        self._last_imu_ns = -1
+        self._sent_row = 0
+
+    def due(self, now_ns: int, imu_t_ns: int) -> bool:
+        """Return whether this tick, asked for once and with its IMU's time, is to make a row."""
+        new_imu = imu_t_ns != self._last_imu_ns
+        self._last_imu_ns = imu_t_ns
+        if now_ns < self._due_ns - self._half_tick_ns:
+            return False
+        in_step = self._waits_for_imu and new_imu
+        if self._waits_for_imu and not new_imu and now_ns < self._due_ns + self._imu_period_ns:
+            return False
+        begin_ns = now_ns if in_step else max(self._due_ns, now_ns - self._half_tick_ns)
+        self._due_ns = begin_ns + self._period_ns
+        return True
+
+    def append(
+        self, sample: SensorSample, motion_id: int, state: State, command: Command, pwm: float
+    ) -> Batch | None:
+        """Add the row of a tick; return the batch that is complete with it."""
+        voltage_v = sample.voltage_v
+        duty = pwm * NOMINAL_VOLTAGE_V / voltage_v if voltage_v else 0.0
+        position, velocity, effort = command
+        history = self.history
+        # From the deflection on, a sample's fields are in the order of a row's.
+        history.append(
+            (
+                sample.t_ns,
+                sample.imu_t_ns,
+                motion_id,
+                _STATE_INDEX[state],
+                sample.position_rad,
+                sample.velocity_rad_s,
+                sample.effort_nm,
+                _NAN if position is None else position,
+                _NAN if velocity is None else velocity,
+                _NAN if effort is None else effort,
+                min(max(duty, -1.0), 1.0),
+                *sample[5:],
+            )
+        )
+        first, end = self._sent_row, history.next_row
+        if end - first < self._batch_rows:
+            return None
+        self._sent_row = end
+        return Batch(first, end, history.block(first, end))

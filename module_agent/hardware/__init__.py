@@ -1,0 +1,1 @@
+"""The contract to the module, and the client of the physics bus."""

@@ -1,0 +1,155 @@
+"""Square-root information: what the samples of a joint say of the inertial parameters, in a few rows.
+
+A QR of [Y | tau] keeps everything that least squares needs of any number of samples (Golub and Van Loan,
+Matrix Computations, section 5.3). Two such pieces merge by a QR of their stacked rows: exactly, in any order,
+and joint by joint, because a joint's torque depends on the bodies that it carries alone.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import qr
+
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import PER_BODY, torque_regressor
+
+# Bounds the memory: a block of 64 joints is 0.7 GB at most, one of 7 joints 8 MB.
+_BLOCK = 2048
+# Of one joint alone: values in a block of the whole regressor, of which only that joint's are kept.
+_VALUES = 2_000_000
+
+
+class JointInformation(NamedTuple):
+    """Rows equivalent to all samples of one joint, read-only: |Y phi - tau|^2 = |r phi - z|^2 + rest.
+
+    r: (k, p), upper triangular in the columns that are not zero; the first 10 n are those of the bodies, zero
+    where the joint does not carry one. z: (k,) [Nm].
+    rest: the part of |tau|^2 that no parameters explain [Nm^2]. samples: how many went in.
+    """
+
+    r: Array
+    z: Array
+    rest: float
+    samples: int
+
+
+def compress(regressor: ArrayLike, tau_nm: ArrayLike) -> tuple[JointInformation, ...]:
+    """Return the information of every joint from a regressor (m, n, p) and torques (m, n) [Nm].
+
+    The columns are the 10 n of `torque_regressor`, and any further ones behind them.
+
+    Raises:
+        ValueError: shapes that do not fit, no samples, or values that are not finite.
+    """
+    y = np.asarray(regressor, dtype=float)
+    tau = np.asarray(tau_nm, dtype=float)
+    if y.ndim != 3 or tau.shape != y.shape[:2] or y.shape[2] < PER_BODY * y.shape[1] or not y.shape[0]:
+        raise ValueError(
+            f"regressor {y.shape} and torques {tau.shape} do not fit: "
+            "(m, n, 10 n or more) and (m, n) with m > 0 are needed"
+        )
+    if not (np.isfinite(y).all() and np.isfinite(tau).all()):
+        raise ValueError("the regressor or a torque holds a value that is not finite")
+    return tuple(_triangular(y[:, i], tau[:, i], 0.0, y.shape[0]) for i in range(y.shape[1]))
+
+
+def gather(
+    chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2: ArrayLike, tau_nm: ArrayLike
+) -> tuple[JointInformation, ...]:
+    """Return the information of every joint from a motion, all (m, n), without holding its whole regressor.
+
+    Raises:
+        ValueError: shapes that do not fit, no samples, or values that are not finite.
+    """
+    signals = [np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2)]
+    tau = np.asarray(tau_nm, dtype=float)
+    total: tuple[JointInformation, ...] = ()
+    for begin in range(0, max(tau.shape[0], 1), _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        found = compress(torque_regressor(chain, *(signal[part] for signal in signals)), tau[part])
+        total = merge(total, found) if total else found
+    return total
+
+
+def gather_joint(
+    chain: Chain,
+    joint: int,
+    q_rad: ArrayLike,
+    qd_rad_s: ArrayLike,
+    qdd_rad_s2: ArrayLike,
+    tau_nm: ArrayLike,
+    further: ArrayLike | None = None,
+) -> JointInformation:
+    """Return the information of one joint: what `gather` returns for it, from its torques (m,) alone.
+
+    The motion is (m, n). That of joints which neither carry it nor are carried by it has no effect. `further`
+    are columns (m, k) of this joint beside the bodies'.
+
+    Raises:
+        ValueError: shapes that do not fit, no samples, or values that are not finite.
+    """
+    signals = [np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2)]
+    tau = np.asarray(tau_nm, dtype=float)
+    if tau.ndim != 1 or not tau.size or tau.shape != signals[0].shape[:1] or not np.isfinite(tau).all():
+        raise ValueError(
+            f"torques {tau.shape} do not fit a motion {signals[0].shape}, are none or not finite"
+        )
+    beside = np.zeros((tau.size, 0)) if further is None else np.asarray(further, dtype=float)
+    total: JointInformation | None = None
+    for begin in range(0, tau.size, _BLOCK):
+        part = slice(begin, begin + _BLOCK)
+        bodies = _own_rows(chain, joint, [signal[part] for signal in signals])
+        own = np.column_stack([bodies, beside[part]])
+        found = _triangular(own, tau[part], 0.0, len(own))
+        total = found if total is None else merge_joint(total, found)
+    assert total is not None
+    return total
+
+
+def _own_rows(chain: Chain, joint: int, signals: Sequence[Array]) -> Array:
+    joints = len(chain.serials)
+    step = max(32, _VALUES // (PER_BODY * joints**2))
+    starts = range(0, len(signals[0]), step)
+    parts = [
+        torque_regressor(chain, *(signal[start : start + step] for signal in signals))[:, joint]
+        for start in starts
+    ]
+    return np.concatenate(parts)
+
+
+def merge(one: Sequence[JointInformation], other: Sequence[JointInformation]) -> tuple[JointInformation, ...]:
+    """Return the information of both, joint by joint: as if all their samples had been taken together.
+
+    Raises:
+        ValueError: the two are of robots with different numbers of joints, or of different columns.
+    """
+    if len(one) != len(other):
+        raise ValueError(f"information of {len(one)} joints cannot be merged with that of {len(other)}")
+    return tuple(merge_joint(a, b) for a, b in zip(one, other, strict=True))
+
+
+def merge_joint(one: JointInformation, other: JointInformation) -> JointInformation:
+    """Return the information of both, of one joint.
+
+    Raises:
+        ValueError: they have different columns.
+    """
+    if one.r.shape[1] != other.r.shape[1]:
+        raise ValueError(
+            f"information in {one.r.shape[1]} columns cannot be merged with that in {other.r.shape[1]}"
+        )
+    rows, target = np.vstack([one.r, other.r]), np.concatenate([one.z, other.z])
+    return _triangular(rows, target, one.rest + other.rest, one.samples + other.samples)
+
+
+def _triangular(y: Array, tau: NDArray[np.float64], rest: float, samples: int) -> JointInformation:
+    felt = np.flatnonzero(y.any(axis=0))
+    rows = qr(np.column_stack([y[:, felt], tau]), mode="r", check_finite=False)[0][: felt.size + 1]
+    kept = min(felt.size, rows.shape[0])
+    r = np.zeros((kept, y.shape[1]))
+    r[:, felt] = rows[:kept, :-1]
+    z = rows[:kept, -1].copy()
+    r.flags.writeable = z.flags.writeable = False
+    return JointInformation(r, z, rest + float(rows[kept:, -1] @ rows[kept:, -1]), samples)

@@ -1,0 +1,404 @@
+"""A transport whose network misbehaves, around any other: late, lost, stalled, cut off, out of order, twice.
+
+Every message crosses exactly one wrapper, that of the endpoint that receives it: samples, requests, and the
+replies to this endpoint's queries. What this endpoint sends goes out untouched, unless it is cut off.
+
+A network profile put between a program and its transport, in real time.
+"""
+
+import threading
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.network_emulation.channel import Channel, OrderedFlow
+from module_agent.network_emulation.partition import OwnToken, WatchedTokens
+from module_agent.network_emulation.profile import NetworkProfile, Receiver
+from module_agent.network_emulation.scheduler import Scheduler, TimerThread
+from module_agent.transport.transport import (
+    CLOSED,
+    LEASE_S,
+    TIMEOUT,
+    Event,
+    Liveness,
+    Reply,
+    Request,
+    Sample,
+    Sink,
+    Transport,
+    TransportError,
+    Undeclare,
+)
+
+# A lost request stays referenced this long: a transport may tell the asker at once that nobody answers when
+# the request is garbage collected, and the loss would not look like one. Longer than any time-out in use.
+_LOST_REQUEST_S = 30.0
+
+
+class DropCounts(NamedTuple):
+    """What an endpoint lost so far, by kind; `sent` is what it tried to send while it was cut off."""
+
+    samples: int
+    requests: int
+    replies: int
+    sent: int
+
+
+class _Declaration:
+    """A declaration of the inner transport; events still on their way end with it."""
+
+    def __init__(self, sink: Sink, forget: Callable[["_Declaration"], None] = lambda declaration: None):
+        self._sink: Sink | None = sink
+        self._forget = forget
+        self._inner: Undeclare | None = None
+
+    def hold(self, inner: Undeclare) -> "_Declaration":
+        self._inner = inner
+        return self
+
+    def deliver(self, event: Event) -> None:
+        sink = self._sink
+        if sink is not None:
+            sink(event)
+
+    def undeclare(self) -> None:
+        self._sink = None
+        self._forget(self)
+        inner, self._inner = self._inner, None
+        if inner is not None:
+            inner.undeclare()
+
+
+class _Question:
+    """A query under way; whatever comes first, answer or time-out, is its one reply."""
+
+    def __init__(self, tag: int, key: str, sink: Sink):
+        self.tag = tag
+        self.key = key
+        self._sink: Sink | None = sink
+        self._lock = threading.Lock()
+
+    def withdraw(self) -> Sink | None:
+        with self._lock:
+            sink, self._sink = self._sink, None
+        return sink
+
+    def finish(self, reply: Reply) -> None:
+        sink = self.withdraw()
+        if sink is not None:
+            sink(reply)
+
+
+class _Once:
+    """The reply function of a request that may arrive twice: only the first answer goes out."""
+
+    def __init__(
+        self, reply: Callable[[bytes], None], send: Callable[[Callable[[bytes], None], bytes], None]
+    ):
+        self._reply: Callable[[bytes], None] | None = reply
+        self._send = send
+        self._lock = threading.Lock()
+
+    def __call__(self, payload: bytes) -> None:
+        with self._lock:
+            reply, self._reply = self._reply, None
+        if reply is not None:
+            self._send(reply, payload)
+
+
+class ImpairedTransport:
+    """Wraps a transport and impairs what its endpoint receives, as the profile's way to it says.
+
+    Order is kept per key and kind of message but for the fraction `reorder`. A stall holds up all messages of
+    the endpoint together. Lost requests and replies end as a `Reply` with error "Timeout" when the query's
+    time is up. A reply is never duplicated, and a duplicated request is answered once. Liveliness is delayed,
+    in order, never lost; so are errors of queries, which no message carries, delivered as they come. A
+    perfect way delivers from inside the call of the inner transport.
+
+    Partition: from `partition` to `heal`, and at a coordinator at the profile's times, the endpoint is cut
+    off: what it sends and what comes for it is lost, what is under way to it already arrives. Liveliness then
+    goes as with a session of which nothing is heard: changes are told at the end; if the partition lasts
+    longer than the lease (`LEASE_S`), both sides see the other's tokens vanish after it, and appear again at
+    the end.
+
+    Thread-safe; the scheduler must run its calls one at a time.
+    """
+
+    def __init__(
+        self,
+        inner: Transport,
+        profile: NetworkProfile,
+        rng: np.random.Generator,
+        scheduler: Scheduler,
+        *,
+        receiver: Receiver,
+    ):
+        path = profile.path(receiver)
+        self._inner = inner
+        self._scheduler = scheduler
+        self._start_s = scheduler.now_s
+        self._channel = None if path.is_perfect else Channel(path, rng)
+        self._lock = threading.Lock()
+        self._closed = False
+        self._flows: dict[tuple[str, str], OrderedFlow] = {}
+        self._questions: dict[_Question, None] = {}
+        self._dropped = {"sample": 0, "request": 0, "reply": 0, "sent": 0}
+        # Guards what follows; taken before the other, never after it.
+        self._parting = threading.Lock()
+        self._parted = False
+        self._partition = 0
+        self._own_tokens: dict[OwnToken, None] = {}
+        self._watched: dict[_Declaration, WatchedTokens] = {}
+        for start_s, end_s in profile.partitions if receiver == "coordinator" else ():
+            scheduler.call_later(start_s, self.partition)
+            scheduler.call_later(end_s, self.heal)
+
+    @property
+    def drops(self) -> DropCounts:
+        """What was lost so far at this endpoint."""
+        with self._lock:
+            return DropCounts(*self._dropped.values())
+
+    def publish(self, key: str, payload: bytes) -> None:
+        """Send to all subscribers; untouched, unless cut off."""
+        if not self._is_cut_off():
+            self._inner.publish(key, payload)
+
+    def subscribe(self, key_expr: str, sink: Sink) -> Undeclare:
+        """Deliver samples late, not at all, out of order or twice."""
+        declaration = _Declaration(sink)
+
+        def on_sample(event: Event) -> None:
+            assert isinstance(event, Sample)
+            self._impair("sample", event.key, lambda: declaration.deliver(event))
+
+        return declaration.hold(self._inner.subscribe(key_expr, on_sample))
+
+    def serve(self, key_expr: str, sink: Sink) -> Undeclare:
+        """Deliver requests late, not at all, out of order or twice; answers go out unless cut off."""
+        declaration = _Declaration(sink)
+
+        def on_request(event: Event) -> None:
+            assert isinstance(event, Request)
+            request = event._replace(reply=_Once(event.reply, self._answer))
+            arrives = self._impair("request", event.key, lambda: declaration.deliver(request))
+            if not arrives:
+                self._scheduler.call_later(_LOST_REQUEST_S, lambda: _let_go(event.reply))
+
+        return declaration.hold(self._inner.serve(key_expr, on_request))
+
+    def query(self, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
+        """Ask; the answer comes late or, if it is lost or too late, as the error "Timeout"."""
+        question = _Question(tag, key, sink)
+        with self._lock:
+            if self._closed:
+                raise TransportError(f"cannot query {key}: {CLOSED}")
+            self._questions[question] = None
+        try:
+            if not self._is_cut_off():
+                self._inner.query(key, payload, timeout_s, lambda event: self._on_reply(question, event), tag)
+        except TransportError:
+            self._forget(question)
+            # Closing meanwhile has answered it.
+            if question.withdraw() is not None:
+                raise
+        self._scheduler.call_later(timeout_s, lambda: self._finish(question, Reply(tag, key, None, TIMEOUT)))
+
+    def declare_alive(self, key: str) -> Undeclare:
+        """Hold a liveliness token while this session lives; the others see it unless cut off for long."""
+        with self._parting:
+            token = OwnToken(lambda: self._inner.declare_alive(key), self._forget_token)
+            self._own_tokens[token] = None
+            visible = not self._parted or self._closed
+        if visible:
+            token.show()
+        return token
+
+    def watch_alive(self, key_expr: str, sink: Sink) -> Undeclare:
+        """Deliver changes of matching tokens late, in order, never lost."""
+        declaration = _Declaration(sink, self._forget_watch)
+
+        def tell(event: Liveness) -> None:
+            self._delay("liveness", event.key, lambda: declaration.deliver(event))
+
+        watched = WatchedTokens(tell)
+
+        def on_liveness(event: Event) -> None:
+            assert isinstance(event, Liveness)
+            with self._parting:
+                watched.hear(event, self._parted)
+
+        with self._parting:
+            self._watched[declaration] = watched
+        return declaration.hold(self._inner.watch_alive(key_expr, on_liveness))
+
+    def close(self) -> None:
+        """Close the inner transport; messages under way are gone, queries under way get their `Reply`."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._flows.clear()
+            questions, self._questions = list(self._questions), {}
+        self._inner.close()
+        for question in questions:
+            question.finish(Reply(question.tag, question.key, None, CLOSED))
+
+    # ------------------------------------------------------------------ partition
+
+    def partition(self) -> None:
+        """Cut this endpoint off until `heal`; nothing happens if it is cut off already."""
+        with self._parting:
+            if self._parted:
+                return
+            self._parted = True
+            self._partition += 1
+            number = self._partition
+        self._scheduler.call_later(LEASE_S, lambda: self._lapse(number))
+
+    def heal(self) -> None:
+        """End the partition, whoever began it."""
+        with self._parting:
+            if not self._parted:
+                return
+            self._parted = False
+            for watched in self._watched.values():
+                watched.heal()
+            tokens = list(self._own_tokens)
+        if self._closed:
+            return
+        for token in tokens:
+            token.show()
+
+    def _lapse(self, number: int) -> None:
+        with self._parting:
+            if not self._parted or self._partition != number or self._closed:
+                return
+            for watched in self._watched.values():
+                watched.lapse()
+            tokens = list(self._own_tokens)
+        for token in tokens:
+            token.hide()
+
+    def _is_cut_off(self) -> bool:
+        """Return whether what is to be sent is lost, and count it."""
+        if not self._parted or self._closed:
+            return False
+        with self._lock:
+            self._dropped["sent"] += 1
+        return True
+
+    def _answer(self, reply: Callable[[bytes], None], payload: bytes) -> None:
+        if self._is_cut_off():
+            self._scheduler.call_later(_LOST_REQUEST_S, lambda: _let_go(reply))
+        else:
+            reply(payload)
+
+    def _forget_token(self, token: OwnToken) -> None:
+        with self._parting:
+            self._own_tokens.pop(token, None)
+
+    def _forget_watch(self, declaration: _Declaration) -> None:
+        with self._parting:
+            self._watched.pop(declaration, None)
+
+    # ------------------------------------------------------------------ what comes in
+
+    def _on_reply(self, question: _Question, event: Event) -> None:
+        assert isinstance(event, Reply)
+        if event.payload is None:
+            self._finish(question, event)
+        else:
+            self._impair("reply", event.key, lambda: self._finish(question, event))
+
+    def _finish(self, question: _Question, reply: Reply) -> None:
+        self._forget(question)
+        question.finish(reply)
+
+    def _forget(self, question: _Question) -> None:
+        with self._lock:
+            self._questions.pop(question, None)
+
+    def _delay(self, kind: str, key: str, deliver: Callable[[], None]) -> None:
+        with self._lock:
+            if self._closed:
+                return
+            channel = self._channel
+            if channel is not None:
+                delay_s = channel.fate(self._scheduler.now_s - self._start_s).delay_s
+                deliver = self._enter(kind, key, deliver)
+        if channel is None:
+            deliver()
+        else:
+            self._scheduler.call_later(delay_s, deliver)
+
+    def _impair(self, kind: str, key: str, deliver: Callable[[], None]) -> bool:
+        """Deliver as fate has it; return False when the message is lost."""
+        with self._lock:
+            if self._closed:
+                return False
+            if self._parted:
+                self._dropped[kind] += 1
+                return False
+            calls = self._calls(kind, key, deliver)
+        if calls is None:
+            deliver()
+            return True
+        for delay_s, call in calls:
+            self._scheduler.call_later(delay_s, call)
+        return bool(calls)
+
+    def _calls(
+        self, kind: str, key: str, deliver: Callable[[], None]
+    ) -> list[tuple[float, Callable[[], None]]] | None:
+        """Return what to call when for a message; nothing if it is lost, None if the way is perfect."""
+        if self._channel is None:
+            return None
+        fate = self._channel.fate(self._scheduler.now_s - self._start_s)
+        if fate.lost:
+            self._dropped[kind] += 1
+            return []
+        # The copy has its place in the queue right behind the original, as order goes but for `reorder`.
+        route = self._past_queue if fate.reordered else self._enter
+        calls = [(fate.delay_s, route(kind, key, deliver))]
+        if fate.copy_delay_s is not None and kind != "reply":
+            calls.append((fate.copy_delay_s, route(kind, key, deliver)))
+        return calls
+
+    def _past_queue(self, kind: str, key: str, deliver: Callable[[], None]) -> Callable[[], None]:
+        def call() -> None:
+            if not self._closed:
+                deliver()
+
+        return call
+
+    def _enter(self, kind: str, key: str, deliver: Callable[[], None]) -> Callable[[], None]:
+        """Queue behind the earlier messages of this key; return what is to be called at its own time."""
+        flow = self._flows.setdefault((kind, key), OrderedFlow())
+        entry = flow.enter()
+
+        def call() -> None:
+            with self._lock:
+                if self._closed:
+                    return
+                ready = flow.ripen(entry, deliver)
+                if flow.is_empty and self._flows.get((kind, key)) is flow:
+                    del self._flows[kind, key]
+            for each in ready:
+                each()
+
+        return call
+
+
+def _let_go(reply: Callable[[bytes], None]) -> None:
+    """Hold the last reference to what would have answered a lost request until here."""
+
+
+def inject(transport: Transport, network: NetworkProfile, seed: int, receiver: Receiver) -> Transport:
+    """Return the transport impaired as the profile says for this receiver; a perfect path changes nothing."""
+    parted = receiver == "coordinator" and network.partitions
+    if network.path(receiver).is_perfect and not parted:
+        return transport
+    rng = np.random.default_rng(seed)
+    return ImpairedTransport(transport, network, rng, TimerThread(), receiver=receiver)

@@ -1,0 +1,1 @@
+"""Other modules' rows, gathered by an agent."""

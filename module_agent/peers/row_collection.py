@@ -1,0 +1,187 @@
+"""The rows of motions that an agent process keeps, to say later what its torques tell: its own, and others'.
+
+A network drops feedback, so the rows of other modules are asked for from their histories, which keep them for
+a minute; what is kept here stays longer. Pure: what is to be asked comes back as wishes.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from module_agent.firmware.feedback import History
+from module_agent.peers.motion_listener import ANSWER_TIMEOUT_NS, ROWS_PER_QUESTION, AskHistory
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.information_messages import CollectRequest, RowRange
+from module_agent.wire.messages import Feedback
+from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.row_log import RowLog
+
+GIVE_UP_NS = 30_000_000_000
+# Of all motions of all modules together: 20 bytes each.
+MOST_ROWS = 4_000_000
+MOST_MOTIONS = 256
+QUESTIONS_AT_ONCE = 8
+
+
+class Track(NamedTuple):
+    """Rows of one module in a motion: times of its own clock (m,), position (m,) and effort (m,)."""
+
+    t_ns: NDArray[np.int64]
+    position_rad: NDArray[np.float64]
+    effort_nm: NDArray[np.float32]
+
+
+class OwnRows(NamedTuple):
+    """The rows of a module of this process, and the boot that they are of."""
+
+    boot: int
+    history: History
+
+
+class _Part:
+    """The rows of one module in one motion, complete or on their way."""
+
+    def __init__(self, wanted: RowRange, now_ns: int):
+        self.wanted = wanted
+        self.track: Track | None = None
+        self.log = RowLog(wanted.boot)
+        self.asked: AskHistory | None = None
+        self.asked_until_ns = now_ns
+        self.give_up_ns = now_ns + GIVE_UP_NS
+        self.gone = False
+
+    @property
+    def is_open(self) -> bool:
+        return self.track is None and not self.gone
+
+    def keep(self, rows: Rows) -> None:
+        self.track = Track(*(rows[name].copy() for name in ("t_ns", "position_rad", "effort_nm")))
+        self.log = RowLog(self.wanted.boot)
+
+    def missing(self) -> list[tuple[int, int]]:
+        return self.log.missing(self.wanted.first_row, self.wanted.end_row)
+
+
+class MotionCollection:
+    """Keeps motions by their number, which no two motions of a boot share, whoever has asked for them.
+
+    `restless` says whether rows are still to be fetched, so that `poll` may have something to ask.
+    """
+
+    def __init__(self) -> None:
+        self.restless = False
+        self._motions: dict[int, dict[str, _Part]] = {}
+        self._open: list[_Part] = []
+
+    def collect(self, request: CollectRequest, own: Mapping[str, OwnRows], now_ns: int) -> None:
+        """Begin to keep a motion; rows of the process's `own` modules are copied from their histories.
+
+        What is kept of it already stays, of a module that has not booted since: the histories may have
+        forgotten it. `now_ns` is any one steady clock of this process. What is refused changes nothing.
+
+        Raises:
+            WireError: GONE for own rows that are not kept, WRONG_BOOT for those of another boot.
+        """
+        known = self._motions.get(request.motion_id, {})
+        # All of them before any is stored: a refusal of one leaves no motion behind that lacks it.
+        parts = {
+            wanted.serial: _begun(wanted, own.get(wanted.serial), now_ns)
+            for wanted in request.rows
+            if not _is_kept(known.get(wanted.serial), wanted)
+        }
+        for serial in parts.keys() & known.keys():
+            known[serial].gone = True
+        self._motions.setdefault(request.motion_id, {}).update(parts)
+        self._open += parts.values()
+        self._forget()
+        self.restless = True
+
+    def _forget(self) -> None:
+        """Drop the oldest motions while there are more, or more rows, than are kept."""
+        rows = sum(map(_rows, self._motions.values()))
+        while len(self._motions) > MOST_MOTIONS or (len(self._motions) > 1 and rows > MOST_ROWS):
+            oldest = self._motions.pop(next(iter(self._motions)))
+            rows -= _rows(oldest)
+            for part in oldest.values():
+                part.gone = True
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        """Take rows that some motion waits for."""
+        first, end = feedback.first_row, feedback.first_row + feedback.count
+        for part in self._open:
+            wanted = part.wanted
+            if not part.is_open or (wanted.serial, wanted.boot) != (feedback.serial, feedback.boot):
+                continue
+            if first >= wanted.end_row or end <= wanted.first_row:
+                continue
+            part.log.add(feedback)
+            part.asked_until_ns = 0
+            if not part.missing():
+                part.keep(part.log.rows(wanted.first_row, wanted.end_row))
+
+    def on_gone(self, asked: AskHistory) -> None:
+        """Take notice that a module has rows no longer, by the question that it refused.
+
+        Motions whose rows were not in that question wait on: they are told by their own.
+        """
+        for part in self._open:
+            if part.is_open and part.asked == asked:
+                part.gone = True
+
+    def poll(self, now_ns: int) -> list[AskHistory]:
+        """Return what to ask now."""
+        self._open = [part for part in self._open if part.is_open]
+        self.restless = bool(self._open)
+        wishes = []
+        for part in self._open[:QUESTIONS_AT_ONCE]:
+            if now_ns >= part.give_up_ns:
+                part.gone = True
+            elif now_ns >= part.asked_until_ns:
+                first, end = part.missing()[0]
+                part.asked_until_ns = now_ns + ANSWER_TIMEOUT_NS
+                end = min(end, first + ROWS_PER_QUESTION)
+                part.asked = AskHistory(part.wanted.serial, part.wanted.boot, first, end)
+                wishes.append(part.asked)
+        return wishes
+
+    def tracks(self, motion_id: int) -> dict[str, Track]:
+        """Return the rows of a motion by serial.
+
+        Raises:
+            WireError: BUSY while some are on their way; GONE if they never come, or the motion is not known.
+        """
+        parts = self._motions.get(motion_id)
+        if parts is None:
+            raise WireError(Refusal.GONE, f"motion {motion_id} was not collected here")
+        gone = [serial for serial, part in parts.items() if part.gone]
+        if gone:
+            raise WireError(Refusal.GONE, f"motion {motion_id}: rows of {', '.join(gone)[:200]} are gone")
+        waiting = [serial for serial, part in parts.items() if part.track is None]
+        if waiting:
+            raise WireError(
+                Refusal.BUSY, f"motion {motion_id}: rows of {', '.join(waiting)[:200]} are on their way"
+            )
+        return {serial: part.track for serial, part in parts.items() if part.track is not None}
+
+
+def _is_kept(known: _Part | None, wanted: RowRange) -> bool:
+    return known is not None and known.wanted.boot == wanted.boot and not known.gone
+
+
+def _begun(wanted: RowRange, own: OwnRows | None, now_ns: int) -> _Part:
+    part = _Part(wanted, now_ns)
+    if own is None:
+        return part
+    if own.boot != wanted.boot:
+        raise WireError(
+            Refusal.WRONG_BOOT,
+            f"rows of boot {wanted.boot:016x} of {wanted.serial}, which has booted anew as {own.boot:016x}",
+        )
+    part.keep(own.history.rows(wanted.first_row, wanted.end_row))
+    return part
+
+
+def _rows(parts: Mapping[str, _Part]) -> int:
+    return sum(part.wanted.end_row - part.wanted.first_row for part in parts.values())

@@ -1,0 +1,1 @@
+"""Sampled signals: filters, clock maps, torque-term columns."""

@@ -1,0 +1,196 @@
+"""Positions, velocities, accelerations and torques on one time base, all through the same low-pass.
+
+The regressor needs accelerations, and they come by differentiation (thesis section 5.1), which needs a
+low-pass. Whatever the low-pass takes from the motion it must take from the torque too: a filter on the
+acceleration alone makes every inertia come out too large. So one linear filter goes over torque and motion
+alike, forward and backward, which leaves no delay.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.signal import butter, sosfiltfilt
+
+from module_agent.model.chain import Array
+
+FILTER_ORDER = 4
+NS_PER_S = 1_000_000_000
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+class JointMotion(NamedTuple):
+    """Filtered signals of n joints on one time base, (m, n) each and read-only; `t_ns` is (m,)."""
+
+    t_ns: NDArray[np.int64]
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+    tau_nm: Array
+
+
+def resample(
+    t_ns: Sequence[ArrayLike],
+    signals: Sequence[ArrayLike],
+    t_common_ns: ArrayLike,
+    kind: Literal["linear", "cubic"] = "cubic",
+    max_gap_ns: int = 40_000_000,
+) -> Array:
+    """Interpolate the signal of every module onto one time base.
+
+    At 250 Hz a straight line between samples is up to 0.8 % off at 10 Hz, the cubic spline 0.005 %.
+
+    Args:
+        t_ns: per module the times (m_i,) of its samples, increasing, already mapped into one clock.
+        signals: per module the values (m_i,), or (m_i, k) of k signals that were sampled together.
+        t_common_ns: (m,) times to interpolate to.
+        kind: order of the spline through the samples.
+        max_gap_ns: the longest hole between samples that is bridged (10 samples at 250 Hz by default).
+
+    Returns:
+        (m, n), or (m, n, k), read-only.
+
+    Raises:
+        ValueError: times out of order, a hole that is too long, or a common time outside a module's samples;
+            the message gives the column.
+    """
+    common = np.asarray(t_common_ns, dtype=np.int64)
+    if len(t_ns) != len(signals):
+        raise ValueError(
+            f"{len(t_ns)} time bases for {len(signals)} signals; one of each per module is needed"
+        )
+    found = np.empty((common.size, len(signals), *np.shape(signals[0])[1:]))
+    for column, (times, values) in enumerate(zip(t_ns, signals, strict=True)):
+        known = np.asarray(times, dtype=np.int64)
+        _check_times(column, known, common, max_gap_ns)
+        # Nanoseconds since an epoch need more digits than a float has: subtract first.
+        spline = make_interp_spline(
+            (known - known[0]) / NS_PER_S, np.asarray(values, dtype=float), k=1 if kind == "linear" else 3
+        )
+        found[:, column] = spline((common - known[0]) / NS_PER_S)
+    found.flags.writeable = False
+    return found
+
+
+def zero_phase_low_pass(signal: ArrayLike, rate_hz: float, cutoff_hz: float) -> Array:
+    """Filter (m, ...) along its first axis without delay; read-only.
+
+    A Butterworth low-pass of order 4 runs forward and backward, so that `cutoff_hz` is where half the
+    amplitude is left; below a third of it the gain is above 0.9998. The ends are extended by odd reflection;
+    the first and last `settling_samples` are less exact.
+
+    Raises:
+        ValueError: a cut-off outside (0, rate / 2), or fewer samples than the reflection needs.
+    """
+    if not 0.0 < cutoff_hz < 0.5 * rate_hz:
+        raise ValueError(f"cutoff_hz {cutoff_hz} is outside 0 to {0.5 * rate_hz}, half the sampling rate")
+    values = np.asarray(signal, dtype=float)
+    padding = settling_samples(rate_hz, cutoff_hz)
+    if values.shape[0] <= padding:
+        raise ValueError(f"{values.shape[0]} samples; a cut-off of {cutoff_hz} Hz needs more than {padding}")
+    sections = butter(FILTER_ORDER, cutoff_hz, fs=rate_hz, output="sos")
+    found: Array = sosfiltfilt(sections, values, axis=0, padlen=padding)
+    found.flags.writeable = False
+    return found
+
+
+def settling_samples(rate_hz: float, cutoff_hz: float) -> int:
+    """Return how many samples at either end the low-pass has not settled: its response is then below 1 %."""
+    # The slowest poles of the fourth-order filter decay as exp(-0.38 * 2 pi fc t): 2 periods leave 0.8 %.
+    return int(np.ceil(2.0 * rate_hz / cutoff_hz))
+
+
+def differentiate(signal: ArrayLike, rate_hz: float) -> Array:
+    """Return the time derivative of (m, ...) samples along the first axis, by a cubic spline; read-only.
+
+    At a tenth of the sampling rate the derivative is 0.1 % short (a central difference: 6.5 %).
+    """
+    values = np.asarray(signal, dtype=float)
+    t = np.arange(values.shape[0]) / rate_hz
+    found: Array = np.asarray(CubicSpline(t, values, axis=0)(t, 1))
+    found.flags.writeable = False
+    return found
+
+
+def filtered_motion(
+    t_ns: ArrayLike,
+    q_rad: ArrayLike,
+    qd_rad_s: ArrayLike | None,
+    tau_nm: ArrayLike,
+    rate_hz: float,
+    cutoff_hz: float,
+) -> JointMotion:
+    """Return what the regressor and the least squares need, through one and the same low-pass.
+
+    Args:
+        t_ns: (m,) uniform times at `rate_hz`.
+        q_rad, qd_rad_s, tau_nm: (m, n) as measured; without velocities the positions are differentiated
+        twice.
+        rate_hz: sampling rate.
+        cutoff_hz: of `zero_phase_low_pass`; at least three times the motion's highest frequency.
+
+    Returns:
+        The signals without the unsettled samples at both ends. The bandwidth left has about
+        `2 * cutoff_hz / rate_hz` independent samples per sample (see `solve_pseudo_inverse`).
+
+    Raises:
+        ValueError: shapes that differ, times that are not uniform, too few samples, or a bad cut-off.
+    """
+    times = np.asarray(t_ns, dtype=np.int64)
+    signals = [np.asarray(s, dtype=float) for s in (q_rad, tau_nm, *([] if qd_rad_s is None else [qd_rad_s]))]
+    for signal in signals:
+        if signal.shape != signals[0].shape or signal.shape[0] != times.size or signal.ndim != 2:
+            raise ValueError(
+                f"a signal has shape {signal.shape}; ({times.size}, joints) is needed for all alike"
+            )
+    _check_uniform(times, rate_hz)
+    filtered = [zero_phase_low_pass(signal, rate_hz, cutoff_hz) for signal in signals]
+    velocity = filtered[2] if qd_rad_s is not None else differentiate(filtered[0], rate_hz)
+    edge = settling_samples(rate_hz, cutoff_hz)
+    kept = slice(edge, times.size - edge)
+    if kept.stop <= kept.start:
+        raise ValueError(f"{times.size} samples; {edge} at either end are unsettled and nothing is left")
+    motion = (filtered[0], velocity, differentiate(velocity, rate_hz), filtered[1])
+    return JointMotion(_frozen(times[kept]), *(_frozen(signal[kept]) for signal in motion))
+
+
+def _frozen(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    copy = array.copy()
+    copy.flags.writeable = False
+    return copy
+
+
+def _check_times(column: int, known: NDArray[np.int64], common: NDArray[np.int64], max_gap_ns: int) -> None:
+    if known.size < 4:
+        raise ValueError(f"column {column} has {known.size} samples; at least 4 are needed to interpolate")
+    steps = np.diff(known)
+    if (steps <= 0).any():
+        row = int(np.argmax(steps <= 0)) + 1
+        raise ValueError(
+            f"column {column}: the time of sample {row} is not after that of the sample before it"
+        )
+    if common.size and (common.min() < known[0] or common.max() > known[-1]):
+        raise ValueError(
+            f"column {column} has samples from {known[0]} to {known[-1]} ns; the common times run from "
+            f"{common.min()} to {common.max()} ns, and nothing is extrapolated"
+        )
+    if steps.max() > max_gap_ns:
+        row = int(np.argmax(steps)) + 1
+        raise ValueError(
+            f"column {column} has a hole of {steps.max() / 1e6:.1f} ms before sample {row}; "
+            f"at most {max_gap_ns / 1e6:.1f} ms are bridged"
+        )
+
+
+def _check_uniform(times: NDArray[np.int64], rate_hz: float) -> None:
+    off = np.abs(np.diff(times) - NS_PER_S / rate_hz)
+    # Integer nanoseconds round by up to one; a drifting module clock is the business of `resample`.
+    if off.size and off.max() > 1.0:
+        sample = int(np.argmax(off)) + 1
+        raise ValueError(
+            f"t_ns is not uniform at {rate_hz} Hz: sample {sample} is {off.max() / 1e3:.1f} us off; "
+            "resample first"
+        )

@@ -1,0 +1,1 @@
+"""Square-root information of the module's own torques about the robot's inertia."""

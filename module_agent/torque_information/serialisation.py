@@ -1,0 +1,131 @@
+"""Chains and clock maps as parts of messages, and back: doubles as they are, so that nothing is rounded.
+
+The information of a joint as bytes, for the wire: doubles as they are, so that nothing is rounded.
+
+Little-endian: the number of columns, of rows k and of columns f that are not zero ("<3I"), how many samples
+went in ("<Q"), and `rest` ("<d"); the f columns ("<u2" each); of every row i the values from its diagonal on,
+f - i of them; the k targets.
+"""
+
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+
+from module_agent.model.chain import Chain
+from module_agent.model.information import JointInformation
+from module_agent.signals.clock_map import ClockMap
+from module_agent.wire.information_messages import GEOMETRY_BYTES, ChainPart, ClockPart
+
+
+def chain_part(chain: Chain) -> ChainPart:
+    """Return a chain as it goes over the wire.
+
+    Raises:
+        ValueError: more modules than a message carries.
+    """
+    joints = len(chain.serials)
+    columns = [chain.axis, chain.point, chain.imu_home.reshape(joints, 16)]
+    x, y, z = (float(value) for value in chain.gravity)
+    return ChainPart(
+        serials=chain.serials,
+        parent=tuple(int(parent) for parent in chain.parent),
+        reversed=tuple(bool(turned) for turned in chain.reversed),
+        geometry=np.hstack(columns).astype("<f8").tobytes(),
+        gravity_m_s2=(x, y, z),
+    )
+
+
+def chain_of(part: ChainPart) -> Chain:
+    """Return the chain that a message carries; its arrays are read-only.
+
+    Raises:
+        ValueError: parts that do not fit, a parent that does not come before its child, a serial twice, or a
+            value that is not finite.
+    """
+    joints = len(part.serials)
+    if len(part.parent) != joints or len(part.reversed) != joints or len(set(part.serials)) != joints:
+        raise ValueError(f"{joints} serials, {len(part.parent)} parents, {len(part.reversed)} mountings")
+    if len(part.geometry) != joints * GEOMETRY_BYTES:
+        raise ValueError(
+            f"{len(part.geometry)} bytes of geometry, {joints} modules need {joints * GEOMETRY_BYTES}"
+        )
+    if any(parent >= child for child, parent in enumerate(part.parent)):
+        raise ValueError(f"parents {part.parent}: a parent comes before its children")
+    values = np.frombuffer(part.geometry, "<f8").astype(np.float64).reshape(joints, 22)
+    if not np.isfinite(values).all():
+        raise ValueError("the chain's geometry holds a value that is not finite")
+    gravity = np.array(part.gravity_m_s2)
+    axis, point, home = values[:, :3].copy(), values[:, 3:6].copy(), values[:, 6:].reshape(joints, 4, 4)
+    for array in (axis, point, home, gravity):
+        array.flags.writeable = False
+    return Chain(part.serials, part.parent, part.reversed, axis, point, home, gravity)
+
+
+def clock_part(clock: ClockMap) -> ClockPart:
+    """Return a clock map as it goes over the wire, without how well it is known."""
+    return ClockPart(
+        origin_ns=int(clock.origin_ns), offset_ns=float(clock.offset_ns), drift=float(clock.drift)
+    )
+
+
+def clocks_of(parts: Sequence[ClockPart]) -> list[ClockMap]:
+    """Return the clock maps that a message carries."""
+    return [ClockMap(part.origin_ns, part.offset_ns, part.drift, 0.0) for part in parts]
+
+
+_HEAD = struct.Struct("<3IQd")
+# 64 bodies, and half as many further columns.
+MOST_COLUMNS = 960
+MOST_BYTES = _HEAD.size + 2 * MOST_COLUMNS + 8 * (MOST_COLUMNS * (MOST_COLUMNS + 1) // 2 + MOST_COLUMNS)
+
+
+def pack(information: JointInformation) -> bytes:
+    """Return the bytes of what `information.gather_joint` or `merge_joint` has returned.
+
+    Raises:
+        ValueError: more than `MOST_COLUMNS` columns, or rows that are not triangular.
+    """
+    rows, columns = information.r.shape
+    felt = np.flatnonzero(information.r.any(axis=0))
+    kept = information.r[:, felt]
+    if columns > MOST_COLUMNS or rows > felt.size or np.tril(kept, -1).any():
+        raise ValueError(
+            f"{rows} rows of {columns} columns: triangular ones of at most {MOST_COLUMNS} columns are packed"
+        )
+    upper = kept[np.triu_indices(rows, 0, felt.size)]
+    head = _HEAD.pack(columns, rows, felt.size, information.samples, information.rest)
+    values = np.concatenate([upper, information.z]).astype("<f8")
+    return head + felt.astype("<u2").tobytes() + values.tobytes()
+
+
+def unpack(block: bytes) -> JointInformation:
+    """Return the information that `pack` has made bytes of; its arrays are read-only.
+
+    Raises:
+        ValueError: the bytes are not what they announce, or hold a value that is not finite.
+    """
+    if len(block) < _HEAD.size:
+        raise ValueError(f"{len(block)} bytes of information, the head alone has {_HEAD.size}")
+    columns, rows, felt_count, samples, rest = _HEAD.unpack_from(block)
+    if not rows <= felt_count <= columns <= MOST_COLUMNS:
+        raise ValueError(
+            f"{rows} rows in {felt_count} of {columns} columns: at most {MOST_COLUMNS}, and rows in as many"
+        )
+    upper = felt_count * rows - rows * (rows - 1) // 2
+    due = _HEAD.size + 2 * felt_count + 8 * (upper + rows)
+    if len(block) != due:
+        raise ValueError(f"{len(block)} bytes of information, {due} are announced")
+    felt = np.frombuffer(block, "<u2", felt_count, _HEAD.size).astype(np.int64)
+    values = np.frombuffer(block, "<f8", upper + rows, _HEAD.size + 2 * felt_count).astype(np.float64)
+    if not (np.diff(felt, prepend=-1) > 0).all() or (felt >= columns).any():
+        raise ValueError("the columns of the information are out of order, or out of range")
+    if not (np.isfinite(values).all() and np.isfinite(rest) and rest >= 0.0):
+        raise ValueError("the information holds a value that is not finite, or a negative square")
+    kept = np.zeros((rows, felt_count))
+    kept[np.triu_indices(rows, 0, felt_count)] = values[:upper]
+    r = np.zeros((rows, columns))
+    r[:, felt] = kept
+    z = values[upper:].copy()
+    r.flags.writeable = z.flags.writeable = False
+    return JointInformation(r, z, rest, samples)

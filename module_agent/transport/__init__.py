@@ -1,0 +1,1 @@
+"""Who carries messages: the contract, Zenoh, and the bounded inbox."""

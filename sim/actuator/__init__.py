@@ -1,0 +1,1 @@
+"""Motor, gear, spring and temperature of a module."""

@@ -1,0 +1,216 @@
+"""One step of all motors, springs and passive joints, solved together with the bodies' inertia; compiled.
+
+The equations are those of `sim.actuator.actuator`.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from module_agent.model.compiled import compiled
+from sim.geometry.pose import Array
+
+Records = np.ndarray[Any, np.dtype[np.void]]
+
+MODULE = np.dtype(
+    [
+        ("joint", np.int64),
+        ("resistance_ohm", np.float64),
+        ("per_amp_nm", np.float64),  # motor torque, seen at the output; likewise volts per speed
+        ("loss", np.float64),  # of the gear: 1 - efficiency
+        ("coulomb_nm", np.float64),
+        ("viscous_nm_s_rad", np.float64),
+        ("rotor_kg_m2", np.float64),
+        ("linear_nm_rad", np.float64),
+        ("cubic_nm_rad3", np.float64),
+        ("spring_loss_s", np.float64),
+        ("half_gap_rad", np.float64),
+        ("least_rad", np.float64),  # the end stops; infinite without
+        ("most_rad", np.float64),
+        ("stop_nm_rad", np.float64),
+        ("stop_loss_s", np.float64),
+    ]
+)
+PASSIVE = np.dtype([("joint", np.int64), ("stiffness", np.float64), ("damping", np.float64)])
+
+# Rows of the state.
+MOTOR_RAD, MOTOR_RAD_S, TORQUE_NM, DUTY, CURRENT_A, DEFLECTION_RAD, ELASTIC_NM, RATE_RAD_S = range(8)
+ELECTRICAL_W, OUTPUT_W, COPPER_W, FRICTION_W, GEAR_W, SPRING_W = range(8, 14)
+ROWS = 14
+
+
+@compiled
+def _clamp(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
+
+
+@compiled
+def _clamp_between(value: float, least: float, most: float) -> float:
+    return min(max(value, least), most)
+
+
+@compiled
+def _solve(matrix: Array, x: Array) -> None:
+    """Solve a symmetric positive definite system in place, by Cholesky's factors; x becomes the solution."""
+    m = len(x)
+    for j in range(m):
+        for k in range(j):
+            matrix[j, j] -= matrix[j, k] * matrix[j, k]
+        pivot = np.sqrt(matrix[j, j])
+        matrix[j, j] = pivot
+        for i in range(j + 1, m):
+            for k in range(j):
+                matrix[i, j] -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] /= pivot
+    for i in range(m):
+        for k in range(i):
+            x[i] -= matrix[i, k] * x[k]
+        x[i] /= matrix[i, i]
+    for i in range(m - 1, -1, -1):
+        for k in range(i + 1, m):
+            x[i] -= matrix[k, i] * x[k]
+        x[i] /= matrix[i, i]
+
+
+@compiled
+def _spring(own: Any, stretch: float, rate: float) -> tuple[float, float, float, float]:
+    """Return deflection, elastic torque, whole torque, and stiffness; the stiffness is 0 without contact."""
+    y = stretch - _clamp(stretch, own.half_gap_rad)
+    elastic = (own.linear_nm_rad + own.cubic_nm_rad3 * y * y) * y
+    stiffness = own.linear_nm_rad + 3.0 * own.cubic_nm_rad3 * y * y
+    push = elastic + own.spring_loss_s * stiffness * rate
+    # Flanks of teeth do not pull: a spring that goes back slower than the gap opens lets go.
+    if own.half_gap_rad > 0.0 and (y == 0.0 or push * y < 0.0):
+        return y, elastic, 0.0, 0.0
+    return y, elastic, push, stiffness
+
+
+@compiled
+def advance(
+    modules: Records,
+    passives: Records,
+    state: Array,
+    pwm: Array,
+    resistance_factor: Array,
+    voltage_v: float,
+    gain: float,
+    dt_s: float,
+    mass: Array,
+    bias: Array,
+    q: Array,
+    qd: Array,
+) -> tuple[Array, Array]:
+    """Return the joints' forces (m,) for one step, and the next state (ROWS, n)."""
+    m, n = len(q), len(modules)
+    pull, added, after = np.empty(m), np.empty(m), np.zeros((ROWS, n))
+    momentum, inertia = np.empty(n), np.empty(n)
+    stopped, stiffened = np.zeros(n), np.zeros(n)
+    for i in range(len(passives)):
+        one = passives[i]
+        pull[one.joint] = -(one.stiffness * q[one.joint] + one.damping * qd[one.joint])
+        added[one.joint] = one.stiffness * dt_s * dt_s / 4.0 + one.damping * dt_s / 2.0
+    for i in range(n):
+        j = modules[i].joint
+        after[DUTY, i] = _clamp(pwm[i] * gain, 1.0)
+        drive = after[DUTY, i] * voltage_v
+        pull[j], added[j], momentum[i], inertia[i], after[CURRENT_A, i] = _pull(
+            modules[i], state[:, i], drive, resistance_factor[i], dt_s, q[j], qd[j]
+        )
+        stopped[i], stiffened[i] = _stop(modules[i], q[j], qd[j], dt_s)
+    # (M + diag(added)) qdd = pull - bias follows by eliminating the motors' accelerations and the torques.
+    matrix, qdd = mass.copy(), np.empty(m)
+    for j in range(m):
+        matrix[j, j] += added[j]
+        qdd[j] = pull[j] - bias[j]
+    for i in range(n):
+        j = modules[i].joint
+        matrix[j, j] += stiffened[i]
+        qdd[j] += stopped[i]
+    _solve(matrix, qdd)
+    force = pull - added * qdd
+    whole = force.copy()
+    for i in range(n):
+        own = modules[i]
+        j = own.joint
+        whole[j] += stopped[i] - stiffened[i] * qdd[j]
+        limit = _friction_limit(own, after[CURRENT_A, i])
+        free = momentum[i] - force[j]
+        friction = _clamp(free, limit)
+        after[MOTOR_RAD_S, i] = (free - friction) * dt_s / inertia[i]
+        after[MOTOR_RAD, i] = state[MOTOR_RAD, i] + dt_s * after[MOTOR_RAD_S, i]
+        after[TORQUE_NM, i] = force[j]
+        after[RATE_RAD_S, i] = (state[MOTOR_RAD_S, i] + after[MOTOR_RAD_S, i]) / 2.0
+        share = own.coulomb_nm / limit if limit > 0.0 else 0.0
+        ohm = own.resistance_ohm * resistance_factor[i]
+        stretch, rate = state[MOTOR_RAD, i] - q[j], qd[j] + dt_s / 2.0 * qdd[j]
+        _account(own, ohm, voltage_v, friction, share, stretch, rate, after[:, i])
+    return whole, after
+
+
+@compiled
+def _stop(own: Any, q: float, qd: float, dt_s: float) -> tuple[float, float]:
+    """Return what an end stop exerts on the output at qdd = 0, and by how much less per qdd."""
+    beyond = q - _clamp_between(q, own.least_rad, own.most_rad)
+    # Implicit Euler, as the blow of a bare output is over within a step: a rule that keeps its energy would
+    # throw it back and forth for ever.
+    push = own.stop_nm_rad * (beyond + (dt_s + own.stop_loss_s) * qd)
+    # A stop does not hold back what leaves it.
+    if beyond == 0.0 or push * beyond <= 0.0:
+        return 0.0, 0.0
+    return -push, own.stop_nm_rad * (dt_s + own.stop_loss_s) * dt_s
+
+
+@compiled
+def _friction_limit(own: Any, amps: float) -> float:
+    limit: float = own.coulomb_nm + own.loss / 2.0 * own.per_amp_nm * abs(amps)
+    return limit
+
+
+@compiled
+def _pull(
+    own: Any, state: Array, drive_v: float, resistance_factor: float, dt_s: float, q: float, qd: float
+) -> tuple[float, float, float, float, float]:
+    """Return what the spring exerts at qdd = 0, by how much less per qdd, and the motor's side of it.
+
+    That is the motor's momentum over the step but for friction and spring, its inertia, and the current.
+    """
+    speed = state[MOTOR_RAD_S]
+    ohm = own.resistance_ohm * resistance_factor
+    mean = (1.0 - own.loss / 2.0) * own.per_amp_nm
+    drag = own.viscous_nm_s_rad + mean * own.per_amp_nm / ohm
+    inertia = own.rotor_kg_m2 + dt_s / 2.0 * drag
+    drive = mean * drive_v / ohm
+    # The current of this instant, half a step ahead of the speed, as the last change of speed predicts.
+    amps = (drive_v - own.per_amp_nm * (2.0 * speed - state[RATE_RAD_S])) / ohm
+    momentum = drive + (own.rotor_kg_m2 / dt_s - drag / 2.0) * speed
+    # Friction as the last step's torque predicts it; only the spring's second-order term depends on it.
+    friction = _clamp(momentum - state[TORQUE_NM], _friction_limit(own, amps))
+    _, _, push, stiffness = _spring(own, state[MOTOR_RAD] - q, speed - qd)
+    g = stiffness * (dt_s / 4.0 + own.spring_loss_s / 2.0) * dt_s
+    shrink = 1.0 / (1.0 + g / inertia)
+    pull = shrink * (push + g / inertia * (drive - drag * speed - friction))
+    return pull, shrink * g, momentum, inertia, amps
+
+
+@compiled
+def _account(
+    own: Any,
+    ohm: float,
+    voltage_v: float,
+    friction: float,
+    coulomb_share: float,
+    stretch: float,
+    output_rad_s: float,
+    after: Array,
+) -> None:
+    """Fill in the current at the instant itself, and where the power goes; every entry by its own law."""
+    rate = after[RATE_RAD_S]
+    amps = (after[DUTY] * voltage_v - own.per_amp_nm * rate) / ohm
+    y, elastic, push, _ = _spring(own, stretch, rate - output_rad_s)
+    after[CURRENT_A], after[DEFLECTION_RAD], after[ELASTIC_NM] = amps, -y, elastic
+    after[ELECTRICAL_W] = after[DUTY] * voltage_v * amps
+    after[OUTPUT_W] = after[TORQUE_NM] * output_rad_s
+    after[COPPER_W] = amps * amps * ohm
+    after[FRICTION_W] = (coulomb_share * friction + own.viscous_nm_s_rad * rate) * rate
+    after[GEAR_W] = (own.loss / 2.0 * own.per_amp_nm * amps + (1.0 - coulomb_share) * friction) * rate
+    after[SPRING_W] = (push - elastic) * (rate - output_rad_s)

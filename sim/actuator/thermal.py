@@ -1,0 +1,59 @@
+"""The motors' temperatures: winding, housing and body as one chain of heat capacities to the ambient air."""
+
+import numpy as np
+
+from module_agent.model.compiled import compiled
+from sim.geometry.pose import Array, read_only
+
+AMBIENT_C = 25.0
+CAPACITIES_J_K = (0.367, 16.6, 1250.0)
+RESISTANCES_K_W = (4.626, 1.0, 8.0)
+# Copper's resistance grows by this share for every kelvin above the ambient, at which it is catalogued.
+COPPER_PER_K = 0.00393
+
+
+def heat_flow(dt_s: float) -> Array:
+    """Return the matrix (3, 3) that takes temperatures above the ambient through one explicit Euler step."""
+    a, b, c = 1.0 / np.array(RESISTANCES_K_W)
+    flow = np.array([[-a, a, 0.0], [a, -a - b, b], [0.0, b, -b - c]])
+    return read_only(np.eye(3) + dt_s * flow / np.array(CAPACITIES_J_K)[:, None])
+
+
+@compiled
+def _warmed(above_k: Array, flow: Array, kelvin_per_w: float, heat_w: Array) -> Array:
+    n = above_k.shape[1]
+    after = np.zeros((3, n))
+    for i in range(n):
+        for r in range(3):
+            for c in range(3):
+                after[r, i] += flow[r, c] * above_k[c, i]
+        after[0, i] += kelvin_per_w * heat_w[i]
+    return after
+
+
+class Windings:
+    """The temperatures of n modules above the ambient, rows winding, housing, body: (3, n) [K].
+
+    `heat` multiplies what warms them: with 0 they stay at the ambient temperature.
+    """
+
+    def __init__(self, n: int, dt_s: float, heat: float = 1.0):
+        self.above_k = np.zeros((3, n))
+        self._flow = np.array(heat_flow(dt_s))
+        self._kelvin_per_w = heat * dt_s / CAPACITIES_J_K[0]
+
+    def step(self, heat_w: Array) -> None:
+        """Heat the windings with their losses (n,) for one step."""
+        self.above_k = _warmed(self.above_k, self._flow, self._kelvin_per_w, heat_w)
+
+    @property
+    def winding_c(self) -> Array:
+        """The windings' temperatures, (n,) [deg C]."""
+        celsius: Array = self.above_k[0] + AMBIENT_C
+        return celsius
+
+    @property
+    def resistance_factor(self) -> Array:
+        """The windings' resistances over those at the ambient temperature, (n,)."""
+        factor: Array = 1.0 + COPPER_PER_K * self.above_k[0]
+        return factor

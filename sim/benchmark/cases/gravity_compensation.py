@@ -1,0 +1,290 @@
+"""A robot floats in virtual time: how far it drifts, and what it takes to lead it by hand.
+
+The same session as `x5-coordinator float` runs on a simulated robot over a simulated network; a hand is a
+push at the tip.
+
+Gravity compensation: an arm stays where it is left, and a light hand leads it.
+"""
+
+import asyncio
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identify import identify
+from coordinator.runtime.event_loop import run_to_end
+from coordinator.torque_control.gravity_model import KnownWeight, weight_of
+from coordinator.torque_control.session import FloatPlan, FloatSession, Moment
+from coordinator.torque_control.summary import FloatSummary
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import body_displacements
+from module_agent.network_emulation.profile_file import network
+from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.row import Row, largest, ratio
+from sim.geometry.pose import read_only
+from sim.imperfections.noise_profile import NoiseProfile, imu_kind
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.robot_tree import true_chain, true_inertia
+from sim.robot.variants import somewhere
+from sim.virtual_time.loop import VirtualLoop
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.virtual_time.session import record_session
+from sim.world.external_force import Push
+
+COORDINATOR = "coordinator"
+# From the start of the world to a robot that floats, and half a second more.
+FREE_S = 3.0
+# A hand's force grows in steps, slowly enough for what gives: to 5 N a robot that is free, to 60 N one that
+# is held. It is led when its tip has gone so far.
+GROWING_S, STEP_S, LED_M = 5.0, 0.05, 0.02
+FREE_MOST_N, HELD_MOST_N = 5.0, 60.0
+# A hand that leads for a moment, and how long after it the arm has come to rest.
+_LEAD_N, _LEAD_S, _REST_S = 4.0, 0.6, 1.0
+
+
+class Pose(NamedTuple):
+    """Where joints are as a float begins [rad]; those that are not named where the robot's file has them."""
+
+    name: str
+    start_rad: Mapping[str, float]
+
+
+# The kit arms' poses: as they are at zero, with the elbow bent, and hanging down.
+POSES = (
+    Pose("level", {}),
+    Pose("bent", {"shoulder-lift": 0.7, "elbow": -0.8}),
+    Pose("hanging", {"shoulder-lift": -1.2}),
+)
+
+
+class FloatTrial(NamedTuple):
+    """What came of floating.
+
+    drift_deg: how far any joint went by itself, in any pose, in `drift_s`. led_deg: how far a hand led one of
+    them in a moment, and rest_deg how far any joint went in the seconds after it was left alone.
+    guiding_n: the force that moves the tip by 20 mm; held_n: the same of the arm that is held in position,
+    infinite if no force up to 60 N does.
+    """
+
+    drift_deg: float
+    drift_s: float
+    led_deg: float
+    rest_deg: float
+    guiding_n: float
+    held_n: float
+
+
+class Floated(NamedTuple):
+    """One float: what the session says of it, and what the joints truly did.
+
+    phase: (m,) at every set-point, t_s (m,) world time, q_rad (m, n) the true positions then.
+    """
+
+    summary: FloatSummary
+    phases: tuple[str, ...]
+    t_s: Array
+    q_rad: Array
+
+    def floating(self) -> "Floated":
+        """Return the part of it in which the robot was free."""
+        free = np.array([phase == "floating" for phase in self.phases])
+        phases = tuple(phase for phase in self.phases if phase == "floating")
+        return Floated(self.summary, phases, self.t_s[free], self.q_rad[free])
+
+
+def float_trial(
+    seed: int,
+    robot: Robot,
+    weight: KnownWeight,
+    noise: str | NoiseProfile | None = None,
+    drift_s: float = 10.0,
+    poses: Sequence[Pose] = POSES,
+) -> FloatTrial:
+    """Let a robot float in some poses, lead it in the last but one by hand, and hold it against the hand.
+
+    Raises:
+        what `FloatSession.run` raises.
+    """
+    free = FloatPlan(for_s=drift_s, then_hold_s=0.0, is_led_back=False)
+    drifts = []
+    for pose in poses:
+        alone = float_robot(posed(robot, pose.start_rad), weight, free, seed, noise).floating()
+        drifts.append(_most_deg(alone.q_rad - alone.q_rad[0]))
+    here = posed(robot, poses[min(1, len(poses) - 1)].start_rad)
+    tip = here.serials[-1]
+    lead = Push(serial=tip, force_n=(0.0, 0.0, _LEAD_N), from_s=FREE_S, for_s=_LEAD_S)
+    led = float_robot(here, weight, free, seed, noise, pushes=(lead,)).floating()
+    left = led.q_rad[led.t_s > FREE_S + _LEAD_S + _REST_S]
+    long = free._replace(for_s=FREE_S + GROWING_S)
+    guided = float_robot(here, weight, long, seed, noise, pushes=_growing(tip, FREE_MOST_N))
+    # Held from the moment at which it would float.
+    still = free._replace(for_s=0.0, then_hold_s=FREE_S + GROWING_S)
+    held = float_robot(here, weight, still, seed, noise, pushes=_growing(tip, HELD_MOST_N))
+    return FloatTrial(
+        drift_deg=max(drifts),
+        drift_s=drift_s,
+        led_deg=_most_deg(left[0] - led.q_rad[led.t_s <= FREE_S][-1]),
+        rest_deg=_most_deg(left - left[0]),
+        guiding_n=_leading_force_n(weight.chain, guided, FREE_MOST_N),
+        held_n=_leading_force_n(weight.chain, held, HELD_MOST_N),
+    )
+
+
+def _growing(serial: str, most_n: float) -> list[Push]:
+    """Return a force on a module's output, upwards, that grows from nothing in small steps."""
+    steps = round(GROWING_S / STEP_S)
+    return [
+        Push(
+            serial=serial,
+            force_n=(0.0, 0.0, most_n * (k + 1) / steps),
+            from_s=FREE_S + k * STEP_S,
+            for_s=STEP_S,
+        )
+        for k in range(steps)
+    ]
+
+
+def _leading_force_n(chain: Chain, floated: "Floated", most_n: float) -> float:
+    """Return the force at which the tip has gone far enough; infinite if it never has."""
+    tip = np.append(chain.point[-1], 1.0)
+    place = (body_displacements(chain, floated.q_rad)[:, -1] @ tip)[:, :3]
+    before = place[floated.t_s <= FREE_S][-1]
+    led = (np.linalg.norm(place - before, axis=1) > LED_M) & (floated.t_s > FREE_S)
+    if not led.any():
+        return float(np.inf)
+    return float(most_n * (floated.t_s[np.argmax(led)] - FREE_S) / GROWING_S)
+
+
+def _most_deg(away_rad: Array) -> float:
+    return float(np.degrees(np.abs(away_rad).max()))
+
+
+def true_weight(robot: Robot) -> KnownWeight:
+    """Return what a simulated robot weighs, as if it had been identified without error."""
+    types = tuple(module.type for module in robot.modules)
+    return KnownWeight(robot.name, types, true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
+
+
+def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> KnownWeight:
+    """Return what a robot weighs by a whole session on it, as a run would write it down.
+
+    Raises:
+        what `record_session` and `identify` raise.
+        ValueError: the plan leaves out the dynamics.
+    """
+    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
+    return weight_of(identify(record_session(settings, plan or Plan(imu=imu_kind(noise)))).result)
+
+
+def posed(robot: Robot, start_rad: Mapping[str, float]) -> Robot:
+    """Return a robot that begins elsewhere; joints that are not named stay."""
+    modules = tuple(
+        m.model_copy(update={"start_rad": start_rad.get(m.serial, m.start_rad)}) for m in robot.modules
+    )
+    return robot.model_copy(update={"modules": modules})
+
+
+def float_robot(
+    robot: Robot,
+    weight: KnownWeight,
+    plan: FloatPlan,
+    seed: int = 0,
+    noise: str | NoiseProfile | None = None,
+    network_name: str = "lan",
+    pushes: Sequence[Push] = (),
+) -> Floated:
+    """Let a robot float as the plan says, from where its file has it.
+
+    Raises:
+        what `FloatSession.run` raises.
+    """
+    loop = VirtualLoop()
+    settings = VirtualSettings(robot, network(network_name), seed, noise, noise_seed=1, pushes=tuple(pushes))
+    virtual = VirtualRobot(settings, loop)
+    watcher = _Watcher(virtual)
+    session = FloatSession(
+        virtual.endpoint(COORDINATOR),
+        robot.name,
+        weight,
+        plan,
+        lambda: loop.now_ns,
+        loop.call_soon,
+        watcher,
+        COORDINATOR,
+    )
+    virtual.start()
+    try:
+        summary = run_to_end(loop, loop.create_task(_to_end(session, virtual)))
+        return Floated(summary, tuple(watcher.phases), np.array(watcher.t_s), np.array(watcher.q_rad))
+    finally:
+        virtual.close()
+        loop.close()
+
+
+async def _to_end(session: FloatSession, virtual: VirtualRobot) -> FloatSummary:
+    try:
+        return await session.run()
+    finally:
+        virtual.stop()
+        await asyncio.sleep(0)
+
+
+class _Watcher:
+    """Takes down where the joints truly are at every set-point."""
+
+    def __init__(self, virtual: VirtualRobot):
+        self._virtual = virtual
+        self.phases: list[str] = []
+        self.t_s: list[float] = []
+        self.q_rad: list[Array] = []
+
+    def note(self, text: str) -> None:
+        """Nobody reads."""
+
+    def moment(self, now: Moment) -> None:
+        """Take down one moment."""
+        plant = self._virtual.world.plant
+        self.phases.append(now.phase)
+        self.t_s.append(1e-9 * plant.t_ns)
+        self.q_rad.append(plant.q_rad)
+
+
+ROBOT = "a2085_04"
+DRIFT_S, QUICK_DRIFT_S = 10.0, 3.0
+# A tip at 0.7 m stays within an inch, and a hand needs a quarter of the force.
+DRIFT_DEG, LIGHT = 2.0, 0.25
+_COST_S, _QUICK_COST_S = 10.0, 5.0
+
+
+def float_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
+    """Return the one case; `shortened`: of one pose, and for some seconds."""
+    name = f"{ROBOT}, x5, floating, known without error"
+    cost_s = _QUICK_COST_S if shortened else _COST_S
+    work = tuple(
+        Trial(floated, (trial_seed(seed, name, number), shortened), cost_s) for number in range(trials)
+    )
+    return [Case(name, work, partial(_summary, name))]
+
+
+def floated(seed: int, shortened: bool) -> FloatTrial:
+    """Let an arm float that knows its weight without error: what is left is the modules' own."""
+    robot = somewhere(load_robot(ROBOT), seed)
+    drift_s, poses = (QUICK_DRIFT_S, POSES[1:2]) if shortened else (DRIFT_S, POSES)
+    return float_trial(seed, robot, true_weight(robot), "x5", drift_s, poses)
+
+
+def _summary(case: str, trials: Sequence[FloatTrial]) -> Summary:
+    alone = largest([trial.drift_deg for trial in trials])
+    after = largest([trial.rest_deg for trial in trials])
+    guiding = largest([trial.guiding_n for trial in trials])
+    light = largest([ratio(trial.guiding_n, trial.held_n) for trial in trials])
+    rows = (
+        Row(case, "drift left alone, most [deg]", None, alone, None, DRIFT_DEG),
+        Row(case, "force that leads the tip, most [N]", None, guiding),
+        Row(case, "the same over that of an arm held in position", None, light, None, LIGHT),
+        Row(case, "drift after a hand has led it [deg]", None, after, None, DRIFT_DEG),
+    )
+    return Summary(rows)

@@ -1,0 +1,350 @@
+"""One identification of a robot's inertia in virtual time, against the truth.
+
+The thesis' way on the same recording is the pseudo-inverse of what the encoders and the torque readings say
+as they are (thesis eq. 29).
+
+Arms that find out their inertia: base parameters, held-out torques, real bodies, and what IMUs add.
+"""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import binom, norm
+
+from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_transform
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identified import Identified
+from coordinator.identification.identify import base_floor, identify, recorded_type
+from coordinator.identification.inertia.body_motion import Eyes
+from coordinator.identification.inertia.inertia import Robot as SeenRobot
+from coordinator.identification.inertia.inertia import find_inertia
+from coordinator.parameter_fit.base_parameters import joint_frames
+from coordinator.parameter_fit.least_squares import solve_information
+from coordinator.recording.recording import Recording
+from coordinator.runtime.exit_codes import explain
+from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, dynamic_motion, dynamic_windows
+from module_agent.model.chain import Array, Chain
+from module_agent.model.information import gather
+from module_agent.model.regressor import inverse_dynamics, torque_regressor
+from module_agent.network_emulation.profile_file import network
+from module_agent.signals.filtering import JointMotion, resample
+from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.cases.arm import SHORTENED
+from sim.benchmark.row import Row, count, largest, scaled
+from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain, true_inertia
+from sim.robot.variants import somewhere
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.virtual_time.session import record_session
+from sim.world.truth import Motion
+
+# A base parameter is known whose standard deviation is less than this share of it.
+KNOWN_BELOW = 0.1
+LARGEST = 10
+# What makes torques other than a rigid robot's.
+GIVING = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
+
+
+class InertiaTrial(NamedTuple):
+    """What came of one trial; of one that did not come to its end only the first four fields tell.
+
+    why: what ended it, empty if nothing did. rank, most_rank: base parameters that were found, and that any
+    motion could show. known: how many of them are known to 10 %. sigmas_off: |error| / sigma of these.
+    largest: relative errors of the largest ten of them, and largest_sigma what is claimed.
+    held_out: relative torque errors on held-out motions against the torque without noise; with_true_chain
+    with the chain as it is, thesis the thesis' way; bodies: that of real bodies. not_definite: poses out of
+    `poses` where the bodies' mass matrix is not positive definite. eyes: what the motion was seen by; gain:
+    by how much that leaves less in the torques than encoders.
+    """
+
+    robot: str
+    noise: str
+    seed: int
+    why: str
+    rank: int = 0
+    most_rank: int = 0
+    known: int = 0
+    sigmas_off: tuple[float, ...] = ()
+    largest: tuple[float, ...] = ()
+    largest_sigma: tuple[float, ...] = ()
+    held_out: float = float("nan")
+    with_true_chain: float = float("nan")
+    thesis: float = float("nan")
+    bodies: float = float("nan")
+    poses: int = 0
+    not_definite: int = 0
+    eyes: Eyes = "encoders"
+    gain: float = 1.0
+    robot_time_s: float = 0.0
+    identify_s: float = 0.0
+
+
+class _Recorded(NamedTuple):
+    recording: Recording
+    truth: Motion
+
+
+def rigid_profile() -> NoiseProfile:
+    """Return the x5 profile of a robot that does not give and has no friction."""
+    return switched(noise_profile("x5"), off=GIVING)
+
+
+def inertia_trial(
+    robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, poses: int, label: str = ""
+) -> InertiaTrial:
+    """Identify a robot, somewhere on the Earth, and compare its inertia with the truth.
+
+    Args:
+        robot: name or file. noise: profile; `label` is what to call it.
+        seed: of all noise.
+        plan: of the session.
+        poses: how many poses the mass matrix is looked at in.
+    """
+    found = somewhere(load_robot(robot), seed)
+    name = label or (noise if isinstance(noise, str) else noise.name)
+    nothing = InertiaTrial(robot, name, seed, "")
+    settings = VirtualSettings(found, network("lan"), seed, noise)
+    kept: list[Motion] = []
+
+    def keep(simulated: VirtualRobot) -> None:
+        kept.append(simulated.truth.motion())
+
+    try:
+        recording = record_session(settings, plan, keep)
+        begun = time.process_time()
+        identified = identify(recording)
+        spent_s = time.process_time() - begun
+        return _compared(
+            nothing, identified, _Recorded(recording, kept[0]), true_chain(found), true_inertia(found), poses
+        )._replace(identify_s=spent_s)
+    except Exception as error:
+        failure = explain(error)
+        if failure is None:
+            raise
+        return nothing._replace(why=failure.text)
+
+
+def _compared(
+    trial: InertiaTrial, found: Identified, recorded: _Recorded, chain: Chain, phi: Array, poses: int
+) -> InertiaTrial:
+    kinematics, inertia, bodies = found.kinematics, found.inertia, found.bodies
+    serials = kinematics.topology.serials
+    if inertia is None or bodies is None or serials != chain.serials:
+        return trial._replace(why=f"no inertia was found of {', '.join(chain.serials)}")
+    base = bodies.base
+    into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in joint_frames(chain)))
+    true = base.grouping @ (into @ phi.ravel())
+    known = base.relative_sigma < KNOWN_BELOW
+    size = np.abs(true) / base.columns.scale[base.independent]
+    largest = [i for i in np.argsort(-size) if known[i]][:LARGEST]
+    motion = dynamic_motion(recorded.recording, kinematics.clocks, serials, "held_out")
+    torque = _true_torque(motion, found, recorded.truth)
+    joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
+    estimated = kinematics.fit.chain
+    seen = inertia.seen
+    real = bodies.fit.phi if bodies.fit is not None else np.full_like(seen.fit.phi, np.nan)
+    return trial._replace(
+        rank=base.rank,
+        most_rank=_most_rank(chain),
+        known=int(known.sum()),
+        sigmas_off=tuple((np.abs(base.value - true) / base.sigma)[known].tolist()),
+        largest=tuple((np.abs(base.value - true) / np.abs(true))[largest].tolist()),
+        largest_sigma=tuple(base.relative_sigma[largest].tolist()),
+        held_out=_relative(inverse_dynamics(estimated, seen.fit.phi, *joints), torque),
+        with_true_chain=_relative(_by_true_chain(found, recorded, chain, joints), torque),
+        thesis=_relative(_thesis(found, recorded, joints), torque),
+        bodies=_relative(inverse_dynamics(estimated, real, *joints), torque),
+        poses=poses,
+        not_definite=_not_definite(estimated, real, poses, trial.seed),
+        eyes=inertia.eyes,
+        gain=inertia.gain,
+        robot_time_s=found.result.robot_time_s,
+    )
+
+
+def _true_torque(motion: JointMotion, found: Identified, truth: Motion) -> Array:
+    """Return the springs' true torques (m, n) at the instants of a motion."""
+    columns = []
+    for serial in found.kinematics.topology.serials:
+        k = truth.serials.index(serial)
+        times = found.kinematics.clocks[serial].to_module(motion.t_ns)
+        columns.append(resample([truth.clock_ns[:, k]], [truth.spring_torque_nm[:, k]], times))
+    return np.hstack(columns)
+
+
+def _by_true_chain(
+    found: Identified, recorded: _Recorded, chain: Chain, joints: tuple[Array, Array, Array]
+) -> Array:
+    """Return the torques predicted by inertia that was found with the chain as it is."""
+    kinematics, recording = found.kinematics, recorded.recording
+    serials = kinematics.topology.serials
+    robot = SeenRobot(
+        chain,
+        [recorded_type(recording, serial) for serial in serials],
+        kinematics.refinement,
+        np.zeros((6 * len(serials),) * 2),
+        base_floor(recording, kinematics.clocks, kinematics.topology),
+        recording.torque,
+    )
+    inertia = find_inertia(robot, dynamic_windows(recording, kinematics.clocks, serials, "dynamic"))
+    return inverse_dynamics(chain, inertia.seen.fit.phi, *joints)
+
+
+def _thesis(found: Identified, recorded: _Recorded, joints: tuple[Array, Array, Array]) -> Array:
+    kinematics = found.kinematics
+    motion = dynamic_motion(recorded.recording, kinematics.clocks, kinematics.topology.serials, "dynamic")
+    chain = kinematics.fit.chain
+    said = gather(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
+    fit = solve_information(said, independent_fraction=INDEPENDENT_FRACTION)
+    return inverse_dynamics(chain, fit.phi, *joints)
+
+
+def _most_rank(chain: Chain) -> int:
+    """Return the rank at positions, rates and accelerations at random: what any motion at all could show."""
+    joints = len(chain.serials)
+    motion = np.random.default_rng(0).uniform(-3.0, 3.0, (3, 60 * joints, joints))
+    regressor = torque_regressor(chain, *motion).reshape(-1, 10 * joints) * parameter_scale(joints)
+    return int(np.linalg.matrix_rank(regressor, tol=1e-9 * np.linalg.norm(regressor, 2)))
+
+
+def _not_definite(chain: Chain, phi: Array, poses: int, seed: int) -> int:
+    """Return in how many of so many random poses the mass matrix is not positive definite."""
+    if not np.isfinite(phi).all():
+        return poses
+    joints = len(chain.serials)
+    q = np.random.default_rng((seed, 7)).uniform(-np.pi, np.pi, (poses, joints))
+    still = np.zeros_like(q)
+    weight = inverse_dynamics(chain, phi, q, still, still)
+    columns = [
+        inverse_dynamics(chain, phi, q, still, np.tile(unit, (poses, 1))) - weight for unit in np.eye(joints)
+    ]
+    matrices = np.stack(columns, axis=2)
+    smallest = np.linalg.eigvalsh(0.5 * (matrices + matrices.transpose(0, 2, 1)))[:, 0]
+    return int(np.count_nonzero(smallest <= 0.0))
+
+
+def _relative(predicted: Array, true: Array) -> float:
+    return float(np.linalg.norm(predicted - true) / np.linalg.norm(true))
+
+
+ARMS = ("a2085_04", "a2085_06")
+# What is asked of held-out torques, of a rigid arm and of one with friction, springs and a base that gives.
+HELD_OUT_PERCENT = {"rigid": 1.0, "x5": 3.0}
+SIGMAS = 3.0
+LARGEST_PERCENT = 1.0
+TRUE_CHAIN_RATIO = 1.2
+BODIES_POINTS = 0.1
+PLAN = Plan(
+    excitation="designed", motions="designed", imu="calibrated", torque="calibrated", excitation_s=8.0
+)
+QUICK_PLAN = PLAN.model_copy(
+    update=SHORTENED | {"mode": "whole", "excitation_motions": 3, "excitation_s": 4.0}
+)
+POSES, QUICK_POSES = 10_000, 1_000
+_COST_S = {"a2085_04": 10.0, "a2085_06": 18.0}
+
+
+def inertia_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
+    """Return one case for every arm, as good as rigid and with all that real ones do.
+
+    `shortened`: all joints are explored at once, excitation is half as long, with a tenth of the poses.
+    """
+    plan, poses = (QUICK_PLAN, QUICK_POSES) if shortened else (PLAN, POSES)
+    profiles = {"rigid": rigid_profile(), "x5": "x5"}
+    cases = []
+    for arm in ARMS:
+        for label, noise in profiles.items():
+            work = tuple(
+                Trial(
+                    inertia_trial,
+                    (arm, noise, trial_seed(seed, arm, number), plan, poses, label),
+                    0.5 * _COST_S[arm] if shortened else _COST_S[arm],
+                )
+                for number in range(trials)
+            )
+            name = f"{arm}, {label}, inertia"
+            cases.append(Case(name, work, partial(_summary, name, label)))
+    return cases
+
+
+def _summary(case: str, label: str, trials: Sequence[InertiaTrial]) -> Summary:
+    done = [trial for trial in trials if not trial.why]
+    off = tuple(value for trial in done for value in trial.sigmas_off)
+    rows = [
+        count(case, "runs without inertia", [bool(trial.why) for trial in trials]),
+        count(case, "runs with fewer parameters than there are", [t.rank < t.most_rank for t in done]),
+        *_sigma_rows(case, off),
+        *_largest_rows(case, done),
+        *_torque_rows(case, label, done),
+        count(case, "poses with a mass matrix that is not definite", _poses(done)),
+        Row(case, "noise left in torques, encoders over IMUs", None, _median([t.gain for t in done])),
+    ]
+    return Summary(tuple(rows), off)
+
+
+def _sigma_rows(case: str, off: Sequence[float]) -> list[Row]:
+    """Return how many errors are beyond three sigmas; as many may be as of normal ones in 99 of 100 cases."""
+    beyond = float(sum(abs(value) > SIGMAS for value in off))
+    most = float(binom.isf(0.01, len(off), 2.0 * norm.sf(SIGMAS))) if off else None
+    figure = f"base parameters known to 10 %, beyond {SIGMAS:.0f} sigma, of {len(off)}"
+    return [
+        Row(case, figure, None, beyond if off else None, None, most if off else 0.0),
+        Row(case, "the same: worst error [sigma]", None, largest(off)),
+    ]
+
+
+def _largest_rows(case: str, done: Sequence[InertiaTrial]) -> list[Row]:
+    """Return the errors of the largest ten: of those that noise allows to be known so well, and of all.
+
+    Three standard deviations within the bar: of the others chance decides whether they keep it.
+    """
+    pairs = [pair for trial in done for pair in zip(trial.largest, trial.largest_sigma, strict=True)]
+    allowed = [(error, sigma) for error, sigma in pairs if 3.0 * sigma < 0.01 * LARGEST_PERCENT]
+    told = f"largest {LARGEST} that are known: noise tells to 1 %, share [%]"
+    rows = [Row(case, told, None, 100.0 * len(allowed) / len(pairs) if pairs else None)]
+    for what, chosen, limit in (
+        ("largest ten, of those noise tells to 1 %", allowed, LARGEST_PERCENT),
+        ("largest ten that are known", pairs, None),
+    ):
+        worst, claimed = (scaled(largest([pair[k] for pair in chosen]), 100.0) for k in range(2))
+        rows.append(Row(case, f"{what}: worst error [%]", None, worst, claimed, limit))
+    return rows
+
+
+def _torque_rows(case: str, label: str, done: Sequence[InertiaTrial]) -> list[Row]:
+    percent = {
+        name: [100.0 * getattr(trial, name) for trial in done]
+        for name in ("held_out", "with_true_chain", "thesis", "bodies")
+    }
+    ratios = [trial.held_out / trial.with_true_chain for trial in done]
+    worse = [100.0 * (trial.bodies - trial.held_out) for trial in done]
+    return [
+        Row(
+            case,
+            "held-out torque, worst [%]",
+            largest(percent["thesis"]),
+            largest(percent["held_out"]),
+            largest(percent["with_true_chain"]),
+            HELD_OUT_PERCENT[label],
+        ),
+        Row(case, "the same over that with the true chain", None, _most(ratios), None, TRUE_CHAIN_RATIO),
+        Row(case, "real bodies worse by [points]", None, _most(worse), None, BODIES_POINTS),
+    ]
+
+
+def _poses(done: Sequence[InertiaTrial]) -> list[bool]:
+    return [k < trial.not_definite for trial in done for k in range(trial.poses)]
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return median(values) if values else None
+
+
+def _most(values: Sequence[float]) -> float | None:
+    return max(values) if values else None

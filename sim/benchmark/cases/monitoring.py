@@ -1,0 +1,375 @@
+"""Watching: something happens to a robot that is known, while it moves, and the watch is to say what.
+
+The robot is recorded once, on a day of its own; each trial is another day: the modules and their errors are
+the same, noise, drift and network are not. What happens is drawn by the seed: where, how large, and when.
+
+Watching: what happens to a robot that moves is named; where nothing happens there is no alarm.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from statistics import median
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.stats import binom, chi2
+
+from coordinator.baseline.known_robot import KnownRobot
+from coordinator.excitation.plan import Plan
+from coordinator.excitation.segment import RobotMotion
+from coordinator.identification.identify import identify_kinematics
+from coordinator.monitoring.findings import Finding
+from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.monitoring.reference import Reference, build_reference
+from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import ancestors
+from module_agent.network_emulation.profile_file import network as network_named
+from sim.benchmark.case import Case, Summary, Trial
+from sim.benchmark.cases.link_change import Wear, draw_wear, worn
+from sim.benchmark.cases.monitored_robot import Happening, ordinary_motions, watched
+from sim.benchmark.row import Row
+from sim.geometry.link_parts import FreePose
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.variants import loaded, somewhere
+from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.session import record_session
+from sim.world.external_force import Push
+
+Happens = Literal["nothing", "collision", "payload", "friction", "wear"]
+HAPPENS: tuple[Happens, ...] = ("nothing", "collision", "payload", "friction", "wear")
+Found = Literal["nothing", "collision", "payload", "friction", "wear", "unexplained"]
+
+# Trials that share a robot, each a day of it; a robot's own day is the first.
+DAYS = 1000
+# A run by which a robot gets known: all joints at once, and six motions for its inertia.
+KNOWN_PLAN = Plan(
+    mode="whole", excitation="designed", excitation_motions=6, excitation_s=5.0, imu="calibrated"
+)
+BRIEF = {"excitation_motions": 4, "excitation_s": 4.0}
+MOTION_S, MOTIONS = 4.0, 6
+# It happens in here; the watch goes on for so long.
+EARLIEST_S, LATEST_S, AFTER_S = 8.0, 12.0, 14.0
+# What is drawn: masses, friction, displacements, and how hard and how long somebody pushes.
+MASS_KG, FRICTION, SHIFT_M = (0.05, 0.3), (1.25, 1.75), (6e-3, 12e-3)
+FORCE_N, PUSH_S, LEVER_M = (6.0, 20.0), (0.05, 0.3), 0.1
+
+
+class WatchTrial(NamedTuple):
+    """What the watch made of one robot to which something happened, or nothing.
+
+    found: the kind of the first lasting word on it, "nothing" if there was none. located: it named the right
+    module. latency_s: from when it happened to the first word of any kind, named_s: to that of the right
+    kind; size, size_error: of what happened, in the finding's unit, the latter None where the watch gives no
+    size that the truth has. false_alarms: findings that nothing explains. watched_s: how long it looked.
+    """
+
+    happened: Happens
+    found: Found
+    located: bool
+    latency_s: float | None
+    named_s: float | None
+    size: float
+    size_error: float | None
+    false_alarms: int
+    watched_s: float
+    words: tuple[str, ...]
+
+
+class Alarms(NamedTuple):
+    """False alarms of robots to which nothing happened, and for how long they were watched [s]."""
+
+    alarms: int
+    watched_s: float
+
+    @property
+    def per_hour(self) -> float:
+        """How many an hour."""
+        return 3600.0 * self.alarms / self.watched_s
+
+    def interval_per_hour(self, confidence: float = 0.95) -> tuple[float, float]:
+        """Return the rates between which the true one lies, by Poisson's law (Garwood 1936)."""
+        tail = 0.5 * (1.0 - confidence)
+        low = 0.5 * chi2.ppf(tail, 2 * self.alarms) if self.alarms else 0.0
+        high = 0.5 * chi2.isf(tail, 2 * self.alarms + 2)
+        return 3600.0 * float(low) / self.watched_s, 3600.0 * float(high) / self.watched_s
+
+
+class Subject(NamedTuple):
+    """Which robot is watched: `seed` draws its modules and the place where it stands.
+
+    brief: it is known from half as much motion, and things happen sooner.
+    """
+
+    robot: str = "a2085_03"
+    noise: str = "x5"
+    network: str = "lan"
+    seed: int = 0
+    brief: bool = False
+
+    @property
+    def plan(self) -> Plan:
+        """The plan of the run that it is known from."""
+        return KNOWN_PLAN.model_copy(update=BRIEF) if self.brief else KNOWN_PLAN
+
+    @property
+    def between_s(self) -> tuple[float, float]:
+        """Between which times it happens, whatever it is."""
+        return (4.0, 5.0) if self.brief else (EARLIEST_S, LATEST_S)
+
+
+ARM = Subject()
+
+
+class Watched(NamedTuple):
+    """The robot itself, what is known of it, and the motions that it does."""
+
+    robot: Robot
+    reference: Reference
+    motions: tuple[RobotMotion, ...]
+
+
+class _Event(NamedTuple):
+    """What happens, on which module, how large in the finding's unit, and what the world does."""
+
+    serial: str
+    size: float | None
+    at_s: float
+    happening: Happening | None
+
+
+def watch_trial(happens: Happens, seed: int, subject: Subject = ARM, after_s: float = AFTER_S) -> WatchTrial:
+    """Watch a known robot move while something happens to it.
+
+    Args:
+        happens: what. seed: draws where, how large and when, and the day's noise; below `DAYS`.
+        after_s: how long the watch goes on after it.
+    """
+    known = known_subject(subject)
+    rng = np.random.default_rng((seed, subject.seed, 0x3A7C))
+    event = _draw(happens, rng, known.robot, float(rng.uniform(*subject.between_s)))
+    watcher = Watcher(known.reference)
+    said: list[Finding] = []
+
+    def say(heard: Heard, now_ns: int) -> None:
+        said.extend(heard.findings)
+
+    happening = () if event.happening is None else (event.happening,)
+    settings = settings_of(known.robot, subject, 1 + seed)
+    watched(settings, known.motions, event.at_s + after_s, watcher, say, happening)
+    return _trial(happens, event, watcher, said)
+
+
+def false_alarms(seed: int, for_s: float, subject: Subject = ARM) -> Alarms:
+    """Watch a robot for a while to which nothing happens."""
+    known = known_subject(subject)
+    watcher = Watcher(known.reference)
+    settings = settings_of(known.robot, subject, 1 + seed)
+    watched(settings, known.motions, for_s, watcher, lambda heard, now_ns: None)
+    return Alarms(len(watcher.ledger.all), watcher.looked_s)
+
+
+@lru_cache(maxsize=2)
+def known_subject(subject: Subject) -> Watched:
+    """Return a robot, what a run tells of it, and other motions than those of that run."""
+    robot = somewhere(load_robot(subject.robot), subject.seed)
+    recording = record_session(settings_of(robot, subject, 0), subject.plan)
+    known = KnownRobot(Path("the known run"), recording, identify_kinematics(recording))
+    plan = KNOWN_PLAN.model_copy(update={"excitation_s": MOTION_S, "excitation_motions": MOTIONS})
+    # Other motions than those that it is known from.
+    motions = ordinary_motions(known.chain, recording, plan, 1000 + subject.seed)
+    return Watched(robot, build_reference(known), motions)
+
+
+def settings_of(robot: Robot, subject: Subject, day: int) -> VirtualSettings:
+    """Return the settings of one day of the robot; the known run was on day 0."""
+    return VirtualSettings(
+        robot,
+        network_named(subject.network),
+        subject.seed,
+        subject.noise,
+        noise_seed=subject.seed * (DAYS + 1) + day,
+    )
+
+
+def _draw(happens: Happens, rng: np.random.Generator, robot: Robot, at_s: float) -> _Event:
+    serial = str(rng.choice(robot.serials))
+    match happens:
+        case "nothing":
+            return _Event("", None, at_s, None)
+        case "collision":
+            return _collision(rng, robot, at_s)
+        case "payload":
+            mass = float(rng.uniform(*MASS_KG))
+            changed = loaded(robot, robot.serials[-1], _weight(rng, mass))
+            return _Event(robot.serials[-1], mass, at_s, Happening(at_s, lambda w: w.become(changed)))
+        case "friction":
+            factor = float(rng.uniform(*FRICTION))
+            happening = Happening(at_s, lambda w: w.change_friction(serial, factor))
+            return _Event(serial, 100.0 * (factor - 1.0), at_s, happening)
+        case "wear":
+            wear = draw_wear(robot, int(rng.integers(2**31)), float(rng.uniform(*SHIFT_M)))
+            return _Event(
+                wear.child,
+                1e3 * float(np.linalg.norm(wear.displacement_m)),
+                at_s,
+                _slipped(robot, wear, at_s),
+            )
+
+
+def _slipped(robot: Robot, wear: Wear, at_s: float) -> Happening:
+    changed = worn(robot, wear)
+    return Happening(at_s, lambda w: w.become(changed))
+
+
+def _collision(rng: np.random.Generator, robot: Robot, at_s: float) -> _Event:
+    """Push what a joint turns, across its axis, so that the joint feels it."""
+    serial = str(rng.choice(robot.serials))
+    direction = rng.standard_normal(3)
+    force = float(rng.uniform(*FORCE_N)) * direction / np.linalg.norm(direction)
+    x, y, z = (float(f) for f in force)
+    lasting = float(rng.uniform(*PUSH_S))
+    push = Push(serial=serial, force_n=(x, y, z), at_m=(LEVER_M, 0.0, 0.0), from_s=at_s, for_s=lasting)
+    return _Event(serial, None, at_s, Happening(at_s, lambda w: w.push(push)))
+
+
+def _weight(rng: np.random.Generator, mass_kg: float) -> FreePose:
+    x, y, z = (float(c) for c in rng.uniform(-0.05, 0.05, 3))
+    own = mass_kg * 5e-4
+    return FreePose(mass_kg=mass_kg, com_xyz_m=(x, y, z), inertia=(own, own, own, 0.0, 0.0, 0.0))
+
+
+def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Finding]) -> WatchTrial:
+    at_ns = round(1e9 * event.at_s)
+    held = watcher.ledger.all
+    # A change is known to within the windows of the watch.
+    early = [f for f in held if f.found_ns < at_ns]
+    later = [f for f in held if f.found_ns >= at_ns]
+    right = [f for f in later if f.kind == happens]
+    found: Found = "nothing"
+    if later:
+        found = later[0].kind
+    others = [f for f in later if f.kind != happens]
+    first = [f.said_ns for f in said if f.said_ns >= at_ns]
+    named = [f.said_ns for f in said if f.said_ns >= at_ns and f.kind == happens]
+    own = right[0] if right else None
+    return WatchTrial(
+        happened=happens,
+        found=found,
+        located=own is not None and _is_there(watcher.reference.chain, own, event.serial),
+        latency_s=1e-9 * (first[0] - at_ns) if first else None,
+        named_s=1e-9 * (named[0] - at_ns) if named and own is not None else None,
+        size=event.size or 0.0,
+        size_error=own.size - event.size if own is not None and event.size is not None else None,
+        false_alarms=len(early) + len(others),
+        watched_s=watcher.looked_s,
+        words=tuple(f.words for f in held),
+    )
+
+
+def _is_there(chain: Chain, finding: Finding, serial: str) -> bool:
+    """Return whether it happened where it was found: of a collision, at the module or beyond."""
+    if finding.kind != "collision":
+        return finding.serial == serial
+    named, where = (chain.serials.index(s) for s in (finding.serial, serial))
+    return named in ancestors(chain, where)
+
+
+def confusion(trials: Sequence[WatchTrial]) -> dict[Happens, dict[Found, int]]:
+    """Return how often what happened was taken for what."""
+    table: dict[Happens, dict[Found, int]] = {}
+    for trial in trials:
+        row = table.setdefault(trial.happened, {})
+        row[trial.found] = row.get(trial.found, 0) + 1
+    return table
+
+
+# Of what happens: some of what is drawn turns no joint, or stays in the noise.
+MISSED_SHARE = 0.2
+# That chance alone leaves a bar: one case in so many.
+ONE_IN = 100.0
+STRETCH_S = 300.0
+_QUICK_AFTER_S, _QUICK_STRETCH_S = 5.0, 8.0
+# Trials of unchanged robots are days of their own.
+_UNCHANGED_DAY = 500
+_KNOWN_COST_S, _COST_PER_S = 8.0, 0.2
+
+
+class Watches(NamedTuple):
+    """What became of trials, and of stretches without any change."""
+
+    trials: tuple[WatchTrial, ...]
+    quiet: tuple[Alarms, ...]
+
+
+def watch_cases(trials: int, stretches: int, seed: int, shortened: bool = False) -> list[Case]:
+    """Return the one case: every kind so many times, and stretches of no change.
+
+    `shortened`: trials and stretch are short, all in one process, which learns to know the robot once.
+    """
+    kinds = [one for one in HAPPENS if one != "nothing"]
+    after_s, stretch_s = (_QUICK_AFTER_S, _QUICK_STRETCH_S) if shortened else (AFTER_S, STRETCH_S)
+    name = f"{ARM.robot}, watched"
+    drawn = [(kind, seed * 100 + number) for number in range(trials) for kind in kinds]
+    quiet = [_UNCHANGED_DAY + number for number in range(stretches)]
+    pieces = [(tuple(drawn), tuple(quiet))] if shortened else _shares(drawn, quiet)
+    work = tuple(
+        Trial(
+            watches_of_one_robot,
+            (own, still, after_s, stretch_s, shortened),
+            _KNOWN_COST_S + _COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * stretch_s),
+        )
+        for own, still in pieces
+    )
+    return [Case(name, work, partial(_summary, name))]
+
+
+def watches_of_one_robot(
+    drawn: Sequence[tuple[Happens, int]],
+    quiet: Sequence[int],
+    after_s: float,
+    stretch_s: float,
+    shortened: bool,
+) -> Watches:
+    """Let a process learn to know a robot, and watch it for all of its trials."""
+    subject = ARM._replace(brief=shortened)
+    return Watches(
+        tuple(watch_trial(kind, seed, subject, after_s) for kind, seed in drawn),
+        tuple(false_alarms(day, stretch_s, subject) for day in quiet),
+    )
+
+
+def _shares(
+    drawn: Sequence[tuple[Happens, int]], quiet: Sequence[int]
+) -> list[tuple[tuple[tuple[Happens, int], ...], tuple[int, ...]]]:
+    """Return pieces of work of some minutes each."""
+    count = max(1, -(-len(drawn) // 12), len(quiet))
+    return [(tuple(drawn[k::count]), tuple(quiet[k::count])) for k in range(count)]
+
+
+def _summary(case: str, found: Sequence[Watches]) -> Summary:
+    trials = [trial for one in found for trial in one.trials]
+    quiet = [alarms for one in found for alarms in one.quiet]
+    rows = []
+    for kind in dict.fromkeys(trial.happened for trial in trials):
+        own = [trial for trial in trials if trial.happened == kind]
+        wrong = sum(not (trial.found == kind and trial.located) for trial in own)
+        said = [trial.named_s for trial in own if trial.named_s is not None]
+        # With as many trials chance makes so many of that share.
+        limit = float(binom.isf(1.0 / ONE_IN, len(own), MISSED_SHARE))
+        rows += [
+            Row(case, f"{kind}: missed or misplaced, of {len(own)}", None, float(wrong), None, limit),
+            Row(case, f"{kind}: named after, median [s]", None, median(said) if said else None),
+        ]
+    total = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
+    low, high = total.interval_per_hour()
+    hours = total.watched_s / 3600.0
+    beside = sum(trial.false_alarms for trial in trials)
+    rows += [
+        Row(case, f"something else said beside it, in {len(trials)} trials", None, float(beside)),
+        Row(case, f"false alarms in {hours:.2g} h", None, float(total.alarms)),
+        Row(case, "false alarms, 95 % sure to be above [1/h]", None, low, None, ALARMS_PER_HOUR),
+        Row(case, "false alarms, 95 % sure to be below [1/h]", None, high),
+    ]
+    return Summary(tuple(rows))

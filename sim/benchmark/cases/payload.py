@@ -1,0 +1,159 @@
+"""An arm that knows its inertia is handed something: mass and centre against the truth.
+
+Payloads: what an arm is handed is found on the right body, as heavy and where it is; nothing is not.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.payload import payload_plan, search_payload
+from coordinator.description.urdf_writer import link_homes
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identified import Kinematics
+from coordinator.identification.identify import identify_kinematics
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import BASE
+from module_agent.network_emulation.profile_file import network
+from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.cases.inertia import PLAN, QUICK_PLAN
+from sim.benchmark.row import Row, count, largest, scaled
+from sim.geometry.link_parts import FreePose
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.robot_tree import true_chain, true_inertia
+from sim.robot.variants import loaded, somewhere
+from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.session import record_session
+
+MASS_KG = 0.2
+# About as large as a fist, and beside the flange.
+HELD = FreePose(mass_kg=MASS_KG, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
+
+
+class PayloadTrial(NamedTuple):
+    """What came of one search: whether a payload was found, and on the body that carries it.
+
+    mass_error: relative. com_error_m: by the last axis and the one before it. motion_s: how long the robot
+    was moved for it.
+    """
+
+    robot: str
+    seed: int
+    found: bool
+    on_its_body: bool
+    mass_error: float
+    com_error_m: float
+    motion_s: float
+
+
+def payload_trial(
+    robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, carries: bool = True
+) -> PayloadTrial:
+    """Let a robot find out its inertia, hand it a payload, or nothing, and ask it what that is.
+
+    Raises:
+        what the session raises, and `PayloadError`.
+    """
+    bare = somewhere(load_robot(robot), seed)
+    carrier = bare.serials[-1]
+    full = loaded(bare, carrier, HELD)
+    known = _lived(bare, noise, seed, 0, plan)
+    later = _lived(full if carries else bare, noise, seed, 1, payload_plan(known, Plan()))
+    report = search_payload(known, later)
+    if not report.found or not carries:
+        return PayloadTrial(robot, seed, report.found, False, np.nan, np.nan, report.motion_s)
+    added = (true_inertia(full) - true_inertia(bare))[-1]
+    there = _from_axis(true_chain(bare), added[1:4] / added[0])
+    body = known.chain.serials.index(report.carrier)
+    centre = (link_homes(known.chain)[body] @ np.append(1e-3 * np.array(report.com_mm), 1.0))[:3]
+    apart = _from_axis(known.chain, centre) - there
+    return PayloadTrial(
+        robot,
+        seed,
+        True,
+        report.carrier == carrier,
+        report.mass_kg / MASS_KG - 1.0,
+        float(np.linalg.norm(apart)),
+        report.motion_s,
+    )
+
+
+def _lived(robot: Robot, noise: str | NoiseProfile, seed: int, day: int, plan: Plan) -> KnownRobot:
+    """Return a robot after a session; the same seed has the same modules, another day other noise."""
+    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=1000 * seed + day)
+    recording = record_session(settings, plan)
+    kinematics: Kinematics = identify_kinematics(recording)
+    return KnownRobot(Path(f"day {day}"), recording, kinematics)
+
+
+def _from_axis(chain: Chain, place_m: Array) -> Array:
+    """Return a place (3,) by the last axis and the one before it: the root frame is known but for a turn.
+
+    x across both axes, z along the last one, from where the last axis is nearest to the one before.
+    """
+    body = len(chain.serials) - 1
+    before = chain.parent[body]
+    if before == BASE:
+        raise ValueError(f"{chain.serials[body]} is alone: nothing tells where its axis begins")
+    z, other = chain.axis[body], chain.axis[before]
+    x = np.cross(other, z)
+    x = x / np.linalg.norm(x)
+    along, _, _ = np.linalg.solve(np.column_stack([z, -other, x]), chain.point[before] - chain.point[body])
+    off = place_m - (chain.point[body] + along * z)
+    return np.array([off @ x, off @ np.cross(z, x), off @ z])
+
+
+ROBOT = "a2085_06"
+MASS_PERCENT, COM_MM, MOTION_S = 3.0, 5.0, 15.0
+_COST_S, _QUICK_COST_S = 26.0, 15.0
+
+
+def payload_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
+    """Return the case of a payload, and with more than one trial that of none."""
+    plan, cost_s = (QUICK_PLAN, _QUICK_COST_S) if shortened else (PLAN, _COST_S)
+    cases = [_case(f"{ROBOT}, payload of 0.2 kg", True, trials, seed, plan, cost_s)]
+    if not shortened:
+        cases.append(_case(f"{ROBOT}, no payload", False, trials, seed, plan, cost_s))
+    return cases
+
+
+def _case(name: str, carries: bool, trials: int, seed: int, plan: Plan, cost_s: float) -> Case:
+    work = tuple(
+        Trial(payload_trial, (ROBOT, "x5", trial_seed(seed, name, number), plan, carries), cost_s)
+        for number in range(trials)
+    )
+    return Case(name, work, partial(_carrying if carries else _bare, name))
+
+
+def _carrying(case: str, trials: Sequence[PayloadTrial]) -> Summary:
+    found = [trial for trial in trials if trial.found]
+    rows = (
+        count(case, "payloads not found, or on another body", [not t.on_its_body for t in trials]),
+        Row(
+            case,
+            "mass, worst [%]",
+            None,
+            scaled(largest([t.mass_error for t in found]), 100.0),
+            None,
+            MASS_PERCENT,
+        ),
+        Row(
+            case,
+            "centre, worst [mm]",
+            None,
+            scaled(largest([t.com_error_m for t in found]), 1e3),
+            None,
+            COM_MM,
+        ),
+        Row(case, "motion, longest [s]", None, largest([t.motion_s for t in trials]), None, MOTION_S),
+    )
+    return Summary(rows)
+
+
+def _bare(case: str, trials: Sequence[PayloadTrial]) -> Summary:
+    return Summary((count(case, "payloads found where none is", [t.found for t in trials]),))

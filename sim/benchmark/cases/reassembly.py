@@ -1,0 +1,175 @@
+"""What three assemblies of the same modules tell together that none of them tells by itself.
+
+A small arm measures itself as it is, then with its base on a wall, then with its modules in another order,
+each with the link that leads to it. Where gravity pulls otherwise, and where a module carries others, shows
+other sums of the same parts' parameters.
+
+Modules that share the work: what agents gathered, and what three assemblies tell together.
+"""
+
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.excitation.plan import Plan
+from coordinator.merge.information_file import RunInformation, read_information
+from coordinator.merge.merge_runs import MergedInformation, merge_runs
+from coordinator.recording.run_folder import INFORMATION
+from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.row import Row, largest
+from sim.robot.robot_file import BASE, Robot, load_robot
+from sim.virtual_time.run import VirtualConfig, run_virtual
+
+ROBOT = "a2085_03"
+# All joints explored at once, and the thesis' motions once: less robot time than any other way.
+QUICK = Plan(
+    mode="whole",
+    discover_s=0.3,
+    link_s=0.3,
+    rest_s=1.0,
+    settle_s=0.3,
+    travel_speed_rad_s=2.0,
+    dynamic_repeats=1,
+)
+
+
+class Reassembly(NamedTuple):
+    """What came of one trial.
+
+    parameters: of all parts. rank_alone: of every assembly. rank_merged: of all together.
+    sigma_ratio: the median, over the sums that the assemblies tell by themselves, of their standard deviation
+    by all over that alone; sigma_ratios of every assembly. The same assembly three times would make 0.58.
+    difference: the largest between what an agent and what the coordinator gathered, relative.
+    strain: see `merged_information.RunShare`, of every assembly.
+    """
+
+    parameters: int
+    rank_alone: tuple[int, ...]
+    rank_merged: int
+    sigma_ratio: float
+    sigma_ratios: tuple[float, ...]
+    difference: float
+    strain: tuple[float, ...]
+
+
+class _Nobody:
+    """A screen that nobody watches."""
+
+    def step(self, index: int, total: int, text: str) -> None:
+        pass
+
+    def note(self, text: str) -> None:
+        pass
+
+
+def reassembly_trial(seed: int, folder: Path, robot: str | Robot = ROBOT, plan: Plan = QUICK) -> Reassembly:
+    """Let a robot measure itself in three assemblies, in virtual time, and merge what their torques say.
+
+    Args:
+        seed: of the modules, which are the same in all three, and of their noise, which is not.
+        folder: for the three runs.
+        robot: a shipped robot, a robot file, or a robot; a chain of at least two modules.
+        plan: of every run.
+
+    Raises:
+        ValueError: an agent did not answer, so that there is nothing to compare.
+    """
+    runs: list[RunInformation] = []
+    apart: list[float] = []
+    described = robot if isinstance(robot, Robot) else load_robot(robot)
+    for number, (name, assembled) in enumerate(assemblies(described).items()):
+        out = folder / name
+        config = VirtualConfig(assembled, out, seed=seed, noise_seed=number, plan=plan)
+        found = run_virtual(config, _Nobody()).dynamics
+        if found is None or found.gathered_difference is None:
+            raise ValueError(f"no agent of the assembly {name} has said what its torques tell")
+        apart.append(found.gathered_difference)
+        runs.append(read_information(out / INFORMATION))
+    return _told(merge_runs(runs), max(apart))
+
+
+def _told(merged: MergedInformation, difference: float) -> Reassembly:
+    return Reassembly(
+        parameters=len(merged.base.columns.names),
+        rank_alone=tuple(run.base.rank for run in merged.runs),
+        rank_merged=merged.base.rank,
+        sigma_ratio=merged.gain,
+        sigma_ratios=tuple(run.gain for run in merged.runs),
+        difference=difference,
+        strain=tuple(run.strain for run in merged.runs),
+    )
+
+
+def assemblies(robot: Robot) -> dict[str, Robot]:
+    """Return a chain as it is, on a wall, and with the order of its modules turned round."""
+    wall = robot.base.model_copy(update={"mount": "wall", "rpy_deg": None})
+    return {
+        "as_built": robot,
+        "on_a_wall": robot.model_copy(update={"base": wall}),
+        "reordered": reordered(robot, np.arange(len(robot.modules))[::-1]),
+    }
+
+
+def reordered(robot: Robot, order: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> Robot:
+    """Return a chain of the same modules in another order, each with the link that leads to it."""
+    modules, parent = [], BASE
+    for k in order:
+        modules.append(robot.modules[k].model_copy(update={"parent": parent}))
+        parent = robot.modules[k].serial
+    return robot.model_copy(update={"modules": tuple(modules)})
+
+
+AGREES_BELOW = 1e-10
+_COST_S = 10.0
+
+
+def reassembly_cases(trials: int, seed: int) -> list[Case]:
+    """Return the one case: an arm as it is, on a wall, and with its modules in another order."""
+    name = f"{ROBOT}, three assemblies"
+    work = tuple(
+        Trial(reassembly_in_folder, (trial_seed(seed, name, number),), _COST_S) for number in range(trials)
+    )
+    return [Case(name, work, partial(_summary, name))]
+
+
+def reassembly_in_folder(seed: int) -> Reassembly:
+    """Run a trial in a folder that is gone afterwards."""
+    with tempfile.TemporaryDirectory() as folder:
+        return reassembly_trial(seed, Path(folder))
+
+
+def _summary(case: str, trials: Sequence[Reassembly]) -> Summary:
+    gained = [max(t.rank_alone) - t.rank_merged for t in trials]
+    rows = (
+        Row(
+            case,
+            "agents' information against the coordinator's [relative]",
+            None,
+            largest([t.difference for t in trials]),
+            None,
+            AGREES_BELOW,
+        ),
+        Row(case, "rank of the best alone less that of all merged", None, _most(gained), None, -1.0),
+        Row(case, "rank of all merged", None, _least([t.rank_merged for t in trials])),
+        Row(
+            case,
+            "standard deviations merged over alone, median",
+            None,
+            _most([t.sigma_ratio for t in trials]),
+            None,
+            1.0,
+        ),
+    )
+    return Summary(rows)
+
+
+def _most(values: Sequence[float]) -> float | None:
+    return float(max(values)) if values else None
+
+
+def _least(values: Sequence[float]) -> float | None:
+    return float(min(values)) if values else None

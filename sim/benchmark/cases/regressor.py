@@ -1,0 +1,175 @@
+"""The regressor beside pinocchio's: the same torques, and what each costs in the same process.
+
+Pinocchio is a development dependency; without it only our own cost is measured.
+
+The regressor: equal to pinocchio's, and what it costs beside it.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coordinator.dynamics.pseudo_inertia import parameter_transform
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import PER_BODY, torque_regressor
+from sim.benchmark.case import Case, Summary, Trial
+from sim.benchmark.row import Row, largest, ratio
+
+JOINTS, SAMPLES, CHUNK = 7, 4000, 50
+_TREES, _TREE_SAMPLES = 5, 20
+# In pinocchio's order: mass, first moments, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
+_PINOCCHIO = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
+
+
+class RegressorTrial(NamedTuple):
+    """Microseconds a sample of a batch, in chunks of `CHUNK`, and of pinocchio's loop; the least of repeats.
+
+    difference: the largest from pinocchio's regressor on random trees, relative to the largest entry.
+    Pinocchio's are None if it is not installed.
+    """
+
+    batch_us: float
+    chunks_us: float
+    loop_us: float | None
+    difference: float | None
+
+
+def regressor_trial(seed: int, repeats: int) -> RegressorTrial:
+    """Compare the regressor on random trees, and time it on one chain of `JOINTS` joints."""
+    rng = np.random.default_rng(seed)
+    chain = _tree(rng, JOINTS, tuple(range(-1, JOINTS - 1)))
+    motion = _motion(rng, SAMPLES, JOINTS)
+    torque_regressor(chain, *(signal[:2] for signal in motion))  # compiled, or loaded, here
+
+    def batch() -> None:
+        torque_regressor(chain, *motion)
+
+    def chunks() -> None:
+        for begin in range(0, SAMPLES, CHUNK):
+            torque_regressor(chain, *(signal[begin : begin + CHUNK] for signal in motion))
+
+    pin = _pinocchio()
+    if pin is None:
+        return RegressorTrial(_cost_us(batch, repeats), _cost_us(chunks, repeats), None, None)
+    model = _model(pin, chain)
+    data = model.createData()
+
+    def loop() -> None:
+        for q, qd, qdd in zip(*motion, strict=True):
+            pin.computeJointTorqueRegressor(model, data, q, qd, qdd)
+
+    apart = max(_difference(pin, rng) for _ in range(_TREES))
+    return RegressorTrial(_cost_us(batch, repeats), _cost_us(chunks, repeats), _cost_us(loop, repeats), apart)
+
+
+def _pinocchio() -> Any | None:
+    try:
+        import pinocchio
+    except ImportError:
+        return None
+    return pinocchio
+
+
+def _cost_us(work: Callable[[], None], repeats: int) -> float:
+    spent = []
+    for _ in range(repeats):
+        begun = time.process_time()
+        work()
+        spent.append(time.process_time() - begun)
+    # What others take of caches and memory only adds.
+    return 1e6 * min(spent) / SAMPLES
+
+
+def _tree(rng: np.random.Generator, joints: int, parents: tuple[int, ...]) -> Chain:
+    axis = rng.normal(size=(joints, 3))
+    return Chain(
+        serials=tuple(f"J{i}" for i in range(joints)),
+        parent=parents,
+        reversed=(False,) * joints,
+        axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        point=rng.uniform(-0.5, 0.5, (joints, 3)),
+        imu_home=np.tile(np.eye(4), (joints, 1, 1)),
+        gravity=rng.normal(size=3) * 5.0,
+    )
+
+
+def _motion(rng: np.random.Generator, samples: int, joints: int) -> tuple[Array, Array, Array]:
+    q, qd, qdd = rng.uniform(-3.0, 3.0, (3, samples, joints))
+    return q, qd, qdd
+
+
+def _model(pin: Any, chain: Chain) -> Any:
+    """Return pinocchio's model: joint frames parallel to the root frame at q = 0, origins on the axes."""
+    model = pin.Model()
+    model.gravity.linear = -chain.gravity
+    for i, parent in enumerate(chain.parent):
+        below = np.zeros(3) if parent < 0 else chain.point[parent]
+        joint = pin.JointModelRevoluteUnaligned(chain.axis[i])
+        placement = pin.SE3(np.eye(3), chain.point[i] - below)
+        model.addJoint(parent + 1, joint, placement, chain.serials[i])
+    return model
+
+
+def _difference(pin: Any, rng: np.random.Generator) -> float:
+    joints = int(rng.integers(2, 10))
+    chain = _tree(rng, joints, tuple(int(rng.integers(-1, i)) if i else -1 for i in range(joints)))
+    motion = _motion(rng, _TREE_SAMPLES, joints)
+    model = _model(pin, chain)
+    data = model.createData()
+    ours = torque_regressor(chain, *motion)
+    into = [_about(point) for point in chain.point]
+    worst = 0.0
+    for row, q, qd, qdd in zip(ours, *motion, strict=True):
+        theirs = np.atleast_2d(pin.computeJointTorqueRegressor(model, data, q, qd, qdd))
+        blocks = [
+            theirs[:, PER_BODY * j : PER_BODY * (j + 1)][:, _PINOCCHIO] @ into[j] for j in range(joints)
+        ]
+        worst = max(worst, float(np.abs(row - np.hstack(blocks)).max() / np.abs(row).max()))
+    return worst
+
+
+def _about(point: Array) -> Array:
+    """Return the matrix from ten parameters about the root's origin to those about a point, axes parallel."""
+
+    pose = np.eye(4)
+    pose[:3, 3] = -point
+    return parameter_transform(pose)
+
+
+EQUAL_BELOW = 1e-9
+BATCH_SHARE = 0.5
+CHUNK_US = 20.0
+_REPEATS = 9
+
+
+def regressor_cases(seed: int) -> list[Case]:
+    """Return the one case; of pinocchio's there is nothing to tell where it is not installed."""
+    name = f"regressor, {JOINTS} joints, {SAMPLES} samples"
+    return [Case(name, (Trial(regressor_trial, (seed, _REPEATS), 4.0),), partial(_summary, name))]
+
+
+def _summary(case: str, trials: Sequence[RegressorTrial]) -> Summary:
+    there = [trial for trial in trials if trial.loop_us is not None]
+    rows = [
+        Row(
+            case,
+            f"in chunks of {CHUNK} [us a sample]",
+            None,
+            largest([t.chunks_us for t in trials]),
+            None,
+            CHUNK_US,
+        )
+    ]
+    if there:
+        shares = [ratio(trial.batch_us, trial.loop_us) for trial in there]
+        differences = [trial.difference for trial in there]
+        rows += [
+            Row(
+                case, "difference from pinocchio's [relative]", None, largest(differences), None, EQUAL_BELOW
+            ),
+            Row(case, "cost of a batch over pinocchio's loop", None, largest(shares), None, BATCH_SHARE),
+        ]
+    return Summary(tuple(rows))

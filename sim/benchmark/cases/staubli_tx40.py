@@ -1,0 +1,53 @@
+"""A real arm's recording: torques of the half that was not fitted to, all samples and those that move."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from coordinator.description.urdf_reader import read_urdf
+from coordinator.fit_dynamics.data_file import read_data
+from coordinator.fit_dynamics.filtered_log import filtered_log, usual_cutoff_hz
+from coordinator.fit_dynamics.fit import identified
+from coordinator.fit_dynamics.problem import ModelChoice, problem
+from coordinator.fit_dynamics.report import FitReport
+from sim.benchmark.case import Case, Summary, Trial
+from sim.benchmark.row import Row, scaled
+
+URDF, MOTION = "tx40.urdf", "motion.npz"
+# What weighted least squares with the same terms reaches elsewhere on a Staubli TX40.
+ALL_PERCENT, MASKED_PERCENT = 12.3, 7.9
+# Its wrist's two motors share a drive.
+_COUPLED = ((4, 5),)
+
+
+def recorded_cases(folder: Path) -> list[Case]:
+    """Return the one case, of a Staubli TX40: `tx40.urdf` and `motion.npz` in a folder."""
+    name = "TX40, halves of the run"
+    return [Case(name, (Trial(fitted, (folder,), 6.0),), partial(_summary, name))]
+
+
+def fitted(folder: Path) -> FitReport:
+    """Fit one half and try the other, both ways."""
+    robot = read_urdf(folder / URDF)
+    log = read_data(folder / MOTION, robot.chain.serials)
+    posed = problem(robot, filtered_log(log, usual_cutoff_hz(log)), ModelChoice(coupled=_COUPLED))
+    return identified(folder / URDF, folder / MOTION, log, posed, lambda _: None).report
+
+
+def _summary(case: str, reports: Sequence[FitReport]) -> Summary:
+    rows = []
+    for report in reports:
+        for samples, limit in (("all", ALL_PERCENT), ("masked", MASKED_PERCENT)):
+            errors = {
+                (one.model, one.torque): scaled(one.overall, 100.0)
+                for one in report.held_out
+                if one.tried_on == "both" and one.samples == samples
+            }
+            figure = f"held-out torque, {samples} samples"
+            best = errors[("bodies", "filtered")]
+            rows += [
+                Row(case, f"{figure} [%]", None, errors[("fitted", "filtered")], None, limit),
+                Row(case, f"{figure}, real bodies [%]", None, best, None, limit),
+                Row(case, f"{figure}, raw [%]", None, errors[("fitted", "raw")], None),
+            ]
+    return Summary(tuple(rows))

@@ -1,0 +1,112 @@
+"""The benchmark of kinematics: its cases, and what holds over all of them.
+
+The benchmark of dynamics: its cases, and what holds over all of them.
+"""
+
+from collections.abc import Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import NamedTuple
+
+from coordinator.excitation.plan import Motions
+from sim.benchmark.case import Case, CaseResult
+from sim.benchmark.cases.arm import SHORTENED, arm_cases, arm_plan
+from sim.benchmark.cases.gravity_compensation import float_cases
+from sim.benchmark.cases.inertia import inertia_cases
+from sim.benchmark.cases.joint import joint_cases
+from sim.benchmark.cases.link_change import wear_cases
+from sim.benchmark.cases.monitoring import watch_cases
+from sim.benchmark.cases.network import network_cases
+from sim.benchmark.cases.payload import payload_cases
+from sim.benchmark.cases.reassembly import reassembly_cases
+from sim.benchmark.cases.regressor import regressor_cases
+from sim.benchmark.cases.staubli_tx40 import recorded_cases
+from sim.benchmark.cases.topology import topology_cases
+from sim.benchmark.cases.torque_assistance import assistance_cases
+from sim.benchmark.row import Row, coverage
+
+KINEMATIC_TRIALS = 13
+ALL = "all cases"
+
+
+class KinematicEffort(NamedTuple):
+    """How many trials there are of everything; `shortened`: whether arms move less long than they may."""
+
+    joints: int
+    arms: int
+    robots: int
+    networks: int
+    changed: int
+    unchanged: int
+    shortened: bool = False
+
+
+QUICK_KINEMATICS = KinematicEffort(
+    joints=1, arms=1, robots=1, networks=1, changed=1, unchanged=1, shortened=True
+)
+
+
+def full_kinematics(trials: int = KINEMATIC_TRIALS) -> KinematicEffort:
+    """Return the effort that the bars are meant for, with that many trials a case."""
+    return KinematicEffort(trials, trials, robots=200, networks=trials, changed=trials, unchanged=100)
+
+
+def kinematic_cases(effort: KinematicEffort, seed: int, motions: Motions | None = None) -> list[Case]:
+    """Return all cases, in the order in which they are reported; `motions`: see `arm_plan`."""
+    calibrated = arm_plan("joint", "calibrated", motions)
+    plan = calibrated.model_copy(update=SHORTENED) if effort.shortened else calibrated
+    return [
+        *joint_cases(effort.joints, seed),
+        *arm_cases(effort.arms, seed, effort.shortened, motions),
+        *topology_cases(effort.robots, seed, effort.shortened),
+        *network_cases(effort.networks, seed, plan),
+        *wear_cases(effort.changed, effort.unchanged, seed, effort.shortened),
+    ]
+
+
+def chosen(cases: Sequence[Case], pattern: str) -> list[Case]:
+    """Return the cases whose name holds the pattern, in which * and ? stand for anything."""
+    return [case for case in cases if fnmatch(case.name, f"*{pattern}*")]
+
+
+def over_all(results: Sequence[CaseResult]) -> list[Row]:
+    """Return the rows that are about all cases together; none where no case claimed an interval."""
+    off = [value for result in results for value in result.summary.sigmas_off]
+    return [coverage(ALL, off)] if off else []
+
+
+DYNAMIC_TRIALS = 5
+
+
+class DynamicEffort(NamedTuple):
+    """How many trials there are of everything; `shortened`: whether robots move less long than they may."""
+
+    inertias: int
+    payloads: int
+    reassemblies: int
+    floats: int
+    watches: int
+    stretches: int
+    shortened: bool = False
+
+
+QUICK_DYNAMICS = DynamicEffort(1, 1, 1, 1, 1, 1, shortened=True)
+
+
+def full_dynamics(trials: int = DYNAMIC_TRIALS) -> DynamicEffort:
+    """Return the effort with that many trials a case, and an hour of watching without any change."""
+    return DynamicEffort(trials, trials, trials, trials, watches=2 * trials, stretches=12)
+
+
+def dynamic_cases(effort: DynamicEffort, seed: int, tx40: Path | None = None) -> list[Case]:
+    """Return all cases, in the order in which they are reported; tx40: folder of a real arm's recording."""
+    return [
+        *regressor_cases(seed),
+        *inertia_cases(effort.inertias, seed, effort.shortened),
+        *reassembly_cases(effort.reassemblies, seed),
+        *payload_cases(effort.payloads, seed, effort.shortened),
+        *assistance_cases(seed, effort.shortened),
+        *float_cases(effort.floats, seed, effort.shortened),
+        *watch_cases(effort.watches, effort.stretches, seed, effort.shortened),
+        *([] if tx40 is None else recorded_cases(tx40)),
+    ]

@@ -1,0 +1,81 @@
+"""Torque assistance: calculated torque follows best where it is stable; six joints gain threefold."""
+
+from collections.abc import Sequence
+from functools import partial
+
+from sim.benchmark.case import Case, Summary, Trial
+from sim.benchmark.row import Row, count
+from sim.imperfections.noise_profile import noise_profile
+from sim.thesis.torque_assistance import identified_model, standing_robot
+from sim.thesis.torque_assistance_cases import Case as Combined
+from sim.thesis.torque_assistance_cases import cases as combinations
+from sim.thesis.torque_assistance_report import LEAST_GAIN, AssistanceRow, assistance_rows
+
+NOISE = "x5"
+_IDENTIFY_COST_S, _CASE_COST_S = 12.0, 4.0
+# One with which both arms are stable.
+_QUICK_SETTING = "#4"
+
+
+def assistance_cases(seed: int, shortened: bool = False) -> list[Case]:
+    """Return a case for every robot and kind of gains: the thesis' arm, and arms of six joints.
+
+    `shortened`: of every case one combination, on a robot that is known without error.
+    """
+    groups: dict[str, list[Combined]] = {}
+    for combined in combinations(quick=shortened):
+        groups.setdefault(_name(combined), []).append(combined)
+    found = []
+    for name, own in groups.items():
+        chosen = [one for one in own if one.gains.setting in (None, _QUICK_SETTING)][:1] if shortened else own
+        # Every robot is identified once for all of its combinations.
+        robots = dict.fromkeys(one.robot for one in chosen)
+        work = tuple(
+            Trial(
+                assistance_of_robot,
+                (robot, tuple(one for one in chosen if one.robot == robot), seed, shortened),
+                _CASE_COST_S * len(chosen) + (0.0 if shortened else _IDENTIFY_COST_S),
+            )
+            for robot in robots
+        )
+        name += ", known without error" if shortened else ""
+        found.append(Case(name, work, partial(_summary, name, _limit(chosen[0]))))
+    return found
+
+
+def assistance_of_robot(
+    robot: str, chosen: Sequence[Combined], seed: int, shortened: bool
+) -> list[AssistanceRow]:
+    """Let a robot find out its inertia, then try combinations with what came of it."""
+    noise = noise_profile(NOISE)
+    if shortened:
+        return assistance_rows(chosen, noise, seed)
+    model = identified_model(standing_robot(robot, seed), noise, seed)
+    return assistance_rows(chosen, noise, seed, {robot: model})
+
+
+def _name(combined: Combined) -> str:
+    if combined.alignment is None:
+        return f"assistance, six joints, strategy {combined.gains.strategy}"
+    whose = "the factory's" if combined.gains.setting is None else "the thesis'"
+    return f"assistance, {combined.alignment}, {whose} gains"
+
+
+def _limit(combined: Combined) -> float | None:
+    """Return what the error by calculated torque must not exceed of that without."""
+    if combined.alignment is None:
+        return 1.0 / LEAST_GAIN
+    return 1.0 if combined.gains.setting is not None else None
+
+
+def _summary(case: str, limit: float | None, trials: Sequence[list[AssistanceRow]]) -> Summary:
+    rows = [row for trial in trials for row in trial]
+    stable = [row for row in rows if row.is_stable]
+    most = max((1.0 / row.gain for row in stable), default=None)
+    found = [
+        Row(case, "error by calculated torque over that without, most", None, most, None, limit),
+        Row(case, f"unstable with it, of {len(rows)}", None, float(len(rows) - len(stable)), None, None),
+    ]
+    if limit == 1.0:
+        found.insert(0, count(case, "stable, and not the best of three modes", [not r.helps for r in stable]))
+    return Summary(tuple(found))

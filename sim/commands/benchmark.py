@@ -1,0 +1,182 @@
+"""`x5-sim benchmark`: figures of the whole system on simulated robots, against the bars set for it."""
+
+import os
+import signal
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coordinator.excitation.plan import Motions
+from coordinator.runtime.event_loop import SIGNALS
+from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
+from coordinator.runtime.terminal import Terminal
+from sim.benchmark.case import Case, CaseResult
+from sim.benchmark.cases.staubli_tx40 import MOTION, URDF
+from sim.benchmark.cases.suites import (
+    DYNAMIC_TRIALS,
+    KINEMATIC_TRIALS,
+    QUICK_DYNAMICS,
+    QUICK_KINEMATICS,
+    chosen,
+    dynamic_cases,
+    full_dynamics,
+    full_kinematics,
+    kinematic_cases,
+    over_all,
+)
+from sim.benchmark.report import Results, gathered, plot, print_rows, write_results
+from sim.benchmark.workers import run_cases
+from sim.commands.options import Seed, fail
+
+EXIT_MISSED = 4
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    help="Measure the whole system on simulated robots, against the bars that are set for it.",
+)
+
+
+JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file to write.")]
+Only = Annotated[str, typer.Option(help="Cases whose name holds this; * and ? stand for anything.")]
+Processes = Annotated[
+    int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
+]
+
+
+@app.command()
+def dynamics(
+    json_file: JsonFile = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Every row in a minute on two cores: one trial each, with motions cut short."
+        ),
+    ] = False,
+    trials: Annotated[int | None, typer.Option(min=1, help=f"Trials a case [{DYNAMIC_TRIALS}].")] = None,
+    seed: Seed = 0,
+    tx40: Annotated[
+        Path | None,
+        typer.Option(help="Folder with a Staubli TX40's recording too: tx40.urdf and motion.npz."),
+    ] = None,
+    only: Only = "",
+    processes: Processes = None,
+) -> None:
+    """Measure regressor, inertia, payloads, shared work, assistance and watching, against the truth.
+
+    Exit codes as of `kinematics`.
+    """
+    if quick and trials is not None:
+        fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
+    effort = QUICK_DYNAMICS if quick else full_dynamics(trials or DYNAMIC_TRIALS)
+    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only} | effort._asdict()
+    for name in (URDF, MOTION):
+        if tx40 is not None and not (tx40 / name).is_file():
+            fail(f"--tx40 {tx40}: there is no {name} in it", EXIT_USAGE)
+    cases = dynamic_cases(effort, seed, tx40)
+    _benchmark("dynamics", cases, settings, only, processes, json_file, None)
+
+
+@app.command()
+def kinematics(
+    json_file: JsonFile = None,
+    plot_file: Annotated[Path | None, typer.Option("--plot", help="Picture to write: PNG, SVG, PDF.")] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="Every row in a minute on two cores: one trial each, the thesis' motions cut short for "
+            "arms, the smallest of ten random robots, wear by all joints at once.",
+        ),
+    ] = False,
+    trials: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help=f"Trials a case; 200 robots and 100 unchanged checks besides [{KINEMATIC_TRIALS}]."
+        ),
+    ] = None,
+    seed: Seed = 0,
+    motions: Annotated[Motions, typer.Option(help="How whole arms explore joint by joint.")] = "designed",
+    only: Only = "",
+    processes: Processes = None,
+) -> None:
+    """Compare the thesis' estimator, ours and the physical limit on the same recordings of simulated robots.
+
+    Exit code 0 if all bars are met, 4 if one is missed, 1 if a file cannot be written, 2 for wrong usage,
+    130 if interrupted; nothing is written then.
+    """
+    if quick and trials is not None:
+        fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
+    effort = QUICK_KINEMATICS if quick else full_kinematics(trials or KINEMATIC_TRIALS)
+    settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "motions": motions}
+    settings |= effort._asdict()
+    cases = kinematic_cases(effort, seed, motions)
+    _benchmark("kinematics", cases, settings, only, processes, json_file, plot_file)
+
+
+def _benchmark(
+    name: str,
+    cases: list[Case],
+    settings: dict[str, object],
+    only: str,
+    processes: int | None,
+    json_file: Path | None,
+    plot_file: Path | None,
+) -> None:
+    """Run the cases that are wanted, report, and end with the exit code that they earn."""
+    for file in (json_file, plot_file):
+        if file is not None and not file.parent.is_dir():
+            fail(f"{file}: there is no folder {file.parent}", EXIT_USAGE)
+    wanted = chosen(cases, only)
+    if not wanted:
+        fail(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases), EXIT_USAGE)
+    started_s = time.monotonic()
+    found = _run(wanted, processes or os.cpu_count() or 1)
+    results = gathered(name, settings, found, over_all(found), time.monotonic() - started_s)
+    _report(results, json_file, plot_file)
+    if results.missed:
+        raise typer.Exit(EXIT_MISSED)
+
+
+def _run(cases: list[Case], processes: int) -> list[CaseResult]:
+    total = sum(len(case.trials) for case in cases)
+    done = 0
+
+    def show(case: Case, left: int) -> None:
+        nonlocal done
+        done += 1
+        # A pipe is told of whole cases only.
+        if terminal.console.is_terminal or not left:
+            terminal.step(done, total, case.name)
+
+    # Processes that share the cores already must not each start as many threads; they inherit this.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        with Terminal() as terminal:
+            return run_cases(cases, processes, show)
+    except KeyboardInterrupt:
+        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
+
+
+def _report(results: Results, json_file: Path | None, plot_file: Path | None) -> None:
+    print_rows(results.rows, f"Benchmark of {results.benchmark}")
+    for text in results.failures:
+        typer.echo(f"failed: {text}", err=True)
+    held = sum(row.holds is True for row in results.rows)
+    cost = f"{results.wall_time_s:.0f} s, of processors {results.cpu_time_s:.0f} s"
+    typer.echo(f"{held} bars met, {len(results.missed)} missed; {cost}")
+    try:
+        if json_file is not None:
+            write_results(json_file, results)
+        if plot_file is not None:
+            plot(results.rows, plot_file)
+    except OSError as error:
+        fail(f"cannot write {error.filename}: {error.strerror}", EXIT_FAILED)
+    except ValueError as error:
+        fail(f"cannot draw {plot_file}: {error}", EXIT_FAILED)

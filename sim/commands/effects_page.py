@@ -1,0 +1,192 @@
+"""The table of effects as a page of Markdown: what `docs/effects.md` holds."""
+
+from module_agent.model.catalogue import module_type
+from module_agent.network_emulation.profile import PROFILES
+from sim.actuator.actuator import BUS_VOLTAGE_V, SPRING_LOSS_S, STOP_NM_RAD
+from sim.imperfections.effects import EFFECTS, Effect
+from sim.imperfections.noise_profile import DEFAULT_PROFILE, NOISE_PROFILES, NoiseProfile
+
+# How a field's name ends, the unit of its number, and whether small numbers are shown in thousandths of it.
+_UNITS = (
+    ("_s_m", "rad/s per m/s²", True),
+    ("_m_s2", "m/s²", True),
+    ("_rad_s", "rad/s", True),
+    ("_rad", "rad", True),
+    ("_hz", "Hz", False),
+    ("_ppm", "ppm", False),
+    ("_s", "s", True),
+)
+OFF = "off"
+_PERCENT = ("_fraction", "_spread", "_scale")
+
+_HEAD = f"""# What the simulated module does as a real one does
+
+Every effect can be switched on its own: `--with NAME` and `--without NAME` of `x5-sim run`, `launch` and
+`world`. A noise profile (`--noise`) is a set of them: `ideal` has perfect sensors on a rigid robot, `x5` is a
+module with a calibrated IMU, `{DEFAULT_PROFILE}` (the default) one as delivered, `poor` has everything, and
+larger. Sizes are one standard deviation where they differ between modules or samples, unless the model says
+otherwise; they are drawn once per module from the seed. The network is chosen by `--network NAME|FILE`, the
+robot's structure is in its file. `x5-sim effects` prints the same table.
+
+"""
+
+
+def page() -> str:
+    """Return the whole page, one table per part of a module, rows in the order of `EFFECTS`."""
+    parts = dict.fromkeys(effect.part for effect in EFFECTS.values())
+    return _HEAD + "\n".join([*(_table(part) for part in parts), _always(), _network()])
+
+
+def sizes(effect: Effect, profile: NoiseProfile) -> str:
+    """Return an effect's sizes in a profile with their units, or "off"."""
+    shown = {field: getattr(profile, field) for field in effect.sizes}
+    return ", ".join(_size(field, value) for field, value in shown.items()) if any(shown.values()) else OFF
+
+
+def profiles_with(effect: Effect) -> str:
+    """Return the names of the profiles that have an effect."""
+    return ", ".join(name for name, profile in NOISE_PROFILES.items() if sizes(effect, profile) != OFF)
+
+
+def _always() -> str:
+    rows = (
+        (
+            "reflected inertia",
+            "the rotor's, times the gear ratio squared",
+            f"{module_type('X5-1').motor.rotor_inertia_kg_m2:.2g} kg m² at the rotor",
+            "real X5-1 log: the first step",
+        ),
+        (
+            "spring loss",
+            "damping over stiffness of the spring",
+            f"{1e3 * SPRING_LOSS_S:g} ms",
+            "an assumption: rubber's loss factor of 0.1 at 5 Hz, chosen as light arms then ring as little as "
+            "the thesis' did; with a third of it their lengths come out 10 % longer",
+        ),
+        (
+            "end stops",
+            "stiff and lossy, where a type's rotation is limited",
+            f"{STOP_NM_RAD:g} Nm/rad",
+            "an assumption",
+        ),
+        (
+            "voltage and PWM limits",
+            "duty = u x 48 V / bus voltage, cut off at 1",
+            f"{BUS_VOLTAGE_V:g} V",
+            "real X5-1 log",
+        ),
+        (
+            "winding's PWM ceiling",
+            "in the firmware: 1 - 1 / (155 - temperature)",
+            "0.9923 at 25 °C",
+            "published; real X5-1 log: 0.9636 at 127.6 °C",
+        ),
+        (
+            "velocity cut-off",
+            "in the firmware: the velocity target is clamped",
+            "by type: 9.62, 3.43, 1.50 rad/s",
+            "published gains",
+        ),
+    )
+    head = ["## Always there", "", "| effect | model | size | source |", "|---|---|---|---|"]
+    return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows), ""])
+
+
+def _network() -> str:
+    lan, wifi = PROFILES["lan"], PROFILES["wifi"]
+    up, burst, stall = wifi.path("coordinator"), wifi.loss_burst, wifi.stall
+    assert burst is not None
+    assert stall is not None
+    rows = (
+        (
+            "delay and jitter",
+            "least delay, and what a gamma, lognormal or Pareto adds; order kept as by one TCP link",
+            f"{lan.delay_ms:g} ms and {lan.jitter_ms:g} ms (`lan`); {wifi.delay_ms:g} ms and "
+            f"{wifi.jitter_ms:g} ms (`wifi`)",
+            "real X5-1: round trip 0.70 ms; `wifi`: Huitema 2023",
+        ),
+        (
+            "loss in bursts",
+            "Gilbert-Elliott channel in continuous time",
+            f"`wifi`: {wifi.loss:.1%}; {burst.loss:.0%} for {burst.mean_ms:g} ms every {burst.apart_s:g} s",
+            "Gilbert 1960, Elliott 1963; sizes: a busy room",
+        ),
+        (
+            "stalls",
+            "nothing passes for a while, then all that has waited",
+            f"`wifi`: {stall.mean_ms:g} ms every {stall.apart_s:g} s",
+            "Huitema 2023: latency spikes of Wi-Fi",
+        ),
+        (
+            "asymmetry",
+            "another path in each direction",
+            f"`wifi`: jitter {wifi.jitter_ms:g} ms down, {up.jitter_ms:g} ms up; see `asymmetric`",
+            "stations contend for the channel, the access point has it more often",
+        ),
+        (
+            "reordering and duplication",
+            "a message overtakes, or arrives twice",
+            f"`wifi`: {wifi.reorder:.1%} and {wifi.duplicate:.1%}",
+            "an assumption: what retransmission below the transport leaves",
+        ),
+        ("partition", "nothing passes in given intervals", "off; in a network file", "chosen by who tests"),
+        (
+            "recorded trace",
+            "delays and losses as measured, repeated",
+            "off; in a network file",
+            "`ping -D -O`",
+        ),
+    )
+    head = [
+        "## Network",
+        "",
+        "| effect | model | size | source | switch |",
+        "|---|---|---|---|---|",
+    ]
+    return "\n".join([*head, *(f"| {' | '.join(row)} | `--network` |" for row in rows), ""])
+
+
+def default_size(effect: Effect) -> str:
+    """Return an effect's sizes in the default profile; where it is off there, those that the switch gives."""
+    profile = NOISE_PROFILES[DEFAULT_PROFILE]
+    size = sizes(effect, profile)
+    if size != OFF:
+        return size
+    return f"{OFF}; switched on: {sizes(effect, profile.model_copy(update=dict(effect.sizes)))}"
+
+
+def _table(part: str) -> str:
+    rows = [
+        f"## {part[0].upper()}{part[1:]}",
+        "",
+        "| effect | model | default size | profiles | source | switch |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, effect in EFFECTS.items():
+        if effect.part != part:
+            continue
+        size, where = default_size(effect), profiles_with(effect)
+        cells = (_title(name), effect.model, size, where, effect.source, f"`{name}`")
+        rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*rows, ""])
+
+
+def _title(name: str) -> str:
+    return name.replace("-", " ").replace("imu", "IMU")
+
+
+def _size(field: str, value: float) -> str:
+    for ending in _PERCENT:
+        if field.endswith(ending):
+            of_what = " of the largest" if ending == "_fraction" else ""
+            return f"{_words(field, ending)} {100.0 * value:.3g} %{of_what}"
+    for ending, unit, small in _UNITS:
+        if field.endswith(ending):
+            thousandths = small and value < 0.1
+            shown = f"{1e3 * value:.3g} m" if thousandths else f"{value:.3g} "
+            return f"{_words(field, ending)} {shown}{unit}"
+    return "as described" if value == 1.0 else f"{value:.3g} times as described"
+
+
+def _words(field: str, ending: str) -> str:
+    return field.removesuffix(ending).replace("_", " ")

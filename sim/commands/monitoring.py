@@ -1,0 +1,210 @@
+"""`x5-sim watching`: what the watch makes of simulated robots to which something happens, or nothing."""
+
+import json
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from coordinator.monitoring.findings import KINDS, UNITS, Kind
+from coordinator.runtime.event_loop import SIGNALS
+from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
+from coordinator.runtime.terminal import Terminal, print_table
+from sim.benchmark.case import Failed, Trial
+from sim.benchmark.cases.monitoring import (
+    AFTER_S,
+    ARM,
+    Alarms,
+    Found,
+    Subject,
+    WatchTrial,
+    confusion,
+    false_alarms,
+    watch_trial,
+)
+from sim.benchmark.workers import run_trials
+from sim.commands.options import Seed, fail
+from sim.imperfections.noise_profile import NOISE_PROFILES, noise_profile
+from sim.robot.robot_file import RobotFileError, load_robot
+
+_KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
+# A false alarm's trial: long ones would leave a process idle at the end.
+_STRETCH_S = 300.0
+# Of the quick form.
+_QUICK_AFTER_S, _QUICK_STRETCH_S = 5.0, 8.0
+_COST_SHARE = 0.2
+# Trials of unchanged robots are days of their own.
+_UNCHANGED_DAY = 500
+
+
+def watching(
+    seed: Seed = 0,
+    robot: Annotated[str, typer.Option(help="A robot of `x5-sim robots`, or a file.")] = ARM.robot,
+    noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = ARM.noise,
+    trials: Annotated[int, typer.Option(min=1, max=400, help="Trials of each kind.")] = 10,
+    hours: Annotated[
+        float, typer.Option(min=0.01, max=30.0, help="How long unchanged robots are watched.")
+    ] = 1.0,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One short trial of each kind, and some seconds of no change.")
+    ] = False,
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON too.")] = None,
+) -> None:
+    """Let something happen to a known robot while it moves, or nothing, and count what the watch says."""
+    subject = _subject(robot, noise, seed)._replace(brief=quick)
+    if json_file is not None and not json_file.parent.is_dir():
+        fail(f"{json_file}: there is no folder {json_file.parent}", EXIT_USAGE)
+    if quick:
+        trials, after_s, stretches = 1, _QUICK_AFTER_S, [_QUICK_STRETCH_S]
+    else:
+        after_s, stretches = AFTER_S, [_STRETCH_S] * max(1, round(3600.0 * hours / _STRETCH_S))
+    found = _run(subject, trials, after_s, stretches, processes or os.cpu_count() or 1)
+    happened = [one for one in found if isinstance(one, WatchTrial)]
+    quiet = [one for one in found if isinstance(one, Alarms)]
+    alarms = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
+    print_table(confusion_table(happened))
+    print_table(size_table(happened))
+    low, high = alarms.interval_per_hour()
+    typer.echo(
+        f"{alarms.alarms} false alarms in {alarms.watched_s / 3600.0:.2f} h of motion: {alarms.per_hour:.2f} "
+        f"an hour, 95 % interval {low:.2f} to {high:.2f}"
+    )
+    if json_file is not None:
+        try:
+            json_file.write_text(json.dumps(figures(happened, alarms), indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            fail(f"cannot write {json_file}: {error.strerror or error}", EXIT_FAILED)
+
+
+def confusion_table(trials: Sequence[WatchTrial]) -> Table:
+    """Return what happened, by what the watch took it for."""
+    counted = confusion(trials)
+    columns: tuple[Found, ...] = ("nothing", *KINDS)
+    table = Table("happened", *columns, "right module", title="What was found")
+    for happened, row in counted.items():
+        own = [trial for trial in trials if trial.happened == happened]
+        cells = [str(row[column]) if column in row else "-" for column in columns]
+        table.add_row(happened, *cells, f"{sum(t.located for t in own)} of {len(own)}")
+    return table
+
+
+def size_table(trials: Sequence[WatchTrial]) -> Table:
+    """Return how soon things were said, and how large they were said to be."""
+    table = Table(
+        "happened",
+        "first word [s]",
+        "its kind [s]",
+        "size",
+        "error, rms",
+        "largest",
+        title="Median; how large",
+    )
+    for kind, one in summary(trials).items():
+        sizes = f"{one['least']:.2f} to {one['largest']:.2f} {UNITS[kind]}" if one["sized"] else "-"
+        table.add_row(
+            kind,
+            _number(one["first_word_s"], 3),
+            _number(one["named_s"], 2),
+            sizes,
+            _number(one["error_rms"], 3),
+            _number(one["error_largest"], 3),
+        )
+    return table
+
+
+def summary(trials: Sequence[WatchTrial]) -> dict[Kind, dict[str, Any]]:
+    """Return the figures of every kind; None where there is nothing to measure."""
+    found: dict[Kind, dict[str, Any]] = {}
+    for kind in _KINDS:
+        own = [trial for trial in trials if trial.happened == kind]
+        if not own:
+            continue
+        errors = np.array([t.size_error for t in own if t.size_error is not None])
+        found[kind] = {
+            "trials": len(own),
+            "right": sum(t.found == kind for t in own),
+            "located": sum(t.located for t in own),
+            "false_alarms": sum(t.false_alarms for t in own),
+            "first_word_s": _median([t.latency_s for t in own]),
+            "named_s": _median([t.named_s for t in own]),
+            "sized": bool(errors.size),
+            "least": min(t.size for t in own),
+            "largest": max(t.size for t in own),
+            "error_rms": float(np.sqrt(np.mean(errors**2))) if errors.size else None,
+            "error_largest": float(np.abs(errors).max()) if errors.size else None,
+        }
+    return found
+
+
+def figures(trials: Sequence[WatchTrial], alarms: Alarms) -> dict[str, object]:
+    """Return everything as it stands in JSON."""
+    return {
+        "confusion": confusion(trials),
+        "kinds": summary(trials),
+        "false_alarms": alarms.alarms,
+        "watched_s": alarms.watched_s,
+        "per_hour": alarms.per_hour,
+        "per_hour_interval_95": alarms.interval_per_hour(),
+        "trials": [trial._asdict() for trial in trials],
+    }
+
+
+def _subject(robot: str, noise: str, seed: int) -> Subject:
+    try:
+        load_robot(robot)
+        noise_profile(noise)
+    except (RobotFileError, KeyError, OSError) as error:
+        fail(error.args[0] if isinstance(error, KeyError) else error, EXIT_USAGE)
+    return Subject(robot=robot, noise=noise, seed=seed)
+
+
+def _run(
+    subject: Subject, trials: int, after_s: float, stretches: Sequence[float], processes: int
+) -> list[WatchTrial | Alarms]:
+    # Processes that share the cores already must not each start as many threads; they inherit this.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for number in SIGNALS:
+        signal.signal(number, signal.default_int_handler)
+    work = [
+        Trial(watch_trial, (kind, day, subject, after_s), _COST_SHARE * (after_s + 10.0))
+        for kind in _KINDS
+        for day in range(trials)
+    ]
+    work += [
+        Trial(false_alarms, (_UNCHANGED_DAY + k, for_s, subject), _COST_SHARE * for_s)
+        for k, for_s in enumerate(stretches)
+    ]
+    done = 0
+    try:
+        with Terminal() as terminal:
+
+            def show(index: int, result: Any) -> None:
+                nonlocal done
+                done += 1
+                if terminal.console.is_terminal or done == len(work):
+                    terminal.step(done, len(work), "watching")
+
+            results = [found.result for found in run_trials(work, processes, show)]
+    except KeyboardInterrupt:
+        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
+    for failure in (found for found in results if isinstance(found, Failed)):
+        fail(failure.text, EXIT_FAILED)
+    return results
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,1 @@
+"""Poses, rigid bodies and the parts of links."""

@@ -1,0 +1,189 @@
+"""The passive parts of a link: tubes, brackets and free poses; each leads from one frame to the next.
+
+Masses and lengths of tubes and brackets are the manufacturer's published ones; their inertia tensors are
+those of the simple solids named below.
+"""
+
+from collections.abc import Sequence
+from math import cos, pi, radians, sin, sqrt
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from sim.geometry.pose import Array, pose, read_only
+from sim.geometry.rigid_body import RigidBody, joined, tensor
+
+Length = Annotated[float, Field(ge=-10.0, le=10.0)]
+Xyz = tuple[Length, Length, Length]
+Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
+Moment = Annotated[float, Field(ge=-100.0, le=100.0)]
+
+_TUBE_RADIUS_M = 0.016
+# 0.4 kg/m of aluminium (2700 kg/m^3) at that outer radius makes a wall of 1.6 mm.
+_TUBE_INNER_RADIUS_M = sqrt(_TUBE_RADIUS_M**2 - 0.4 / 2700.0 / pi)
+_ALUMINIUM_E_PA, _ALUMINIUM_G_PA = 69e9, 26e9
+# Bolted and clamped aluminium structures lose 1-3 % of critical; this is 2 % at 40 Hz: c = 2 zeta k / omega.
+STRUCTURE_LOSS_S = 2.0 * 0.02 / (2.0 * pi * 40.0)
+# Pseudo-rigid-body model of a clamped beam (Howell, Compliant Mechanisms, 2001, section 5): a rigid bar of
+# 0.85 L on a hinge of 2.25 EI/L, exact to 0.5 % up to large deflections.
+_HOWELL_HINGE, _HOWELL_STIFFNESS = 0.15, 2.25
+
+
+class Hinge(NamedTuple):
+    """A place about which a part gives: its pose (4, 4), and its stiffness and damping about x, y, z, (3,).
+
+    A stiffness of zero stands for a rigid direction.
+    """
+
+    pose: Array
+    stiffness_nm_rad: Array
+    damping_nm_s_rad: Array
+
+
+class PlacedPart(NamedTuple):
+    """A part seen from its input frame: the pose of its output frame (4, 4), its body, and where it gives."""
+
+    output: Array
+    body: RigidBody
+    hinge: Hinge | None = None
+
+
+class Bracket(NamedTuple):
+    """A bracket: mass [kg], output position [m] and the angle by which the output is turned about x [rad]."""
+
+    mass_kg: float
+    output_xyz: tuple[float, float, float]
+    turn_rad: float
+
+
+BRACKETS: dict[str, Bracket] = {
+    f"{kind}{hand}{side}": Bracket(mass, (0.0, sign * y, z), -sign * pi / 2)
+    for hand, sign in (("Right", -1.0), ("Left", 1.0))
+    for kind, side, mass, y, z in (
+        ("X5Light", "", 0.100, 0.043, 0.040),
+        ("Heavy", "Outside", 0.215, 0.0375, 0.055),
+        # An inside bracket turns the output as its outside twin does but sets it off to the other side.
+        ("Heavy", "Inside", 0.215, -0.0225, 0.055),
+    )
+}
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Tube(_Strict):
+    """An X5 tube with right-angle ends; the far end is twisted about the tube."""
+
+    length_m: Annotated[float, Field(gt=0.0, le=3.0)]
+    twist_rad: Annotated[float, Field(ge=-2 * pi, le=2 * pi)] = 0.0
+
+
+def check_inertia(mass_kg: float, inertia: tuple[float, float, float, float, float, float]) -> None:
+    """Check that some solid of that mass has that inertia (ixx, iyy, izz, ixy, ixz, iyz) about its centre.
+
+    Raises:
+        ValueError: none has; the message gives the principal moments.
+    """
+    moments = np.linalg.eigvalsh(tensor(*inertia))
+    if mass_kg == 0.0 and any(inertia):
+        raise ValueError("an inertia needs a mass_kg")
+    if moments[0] < -1e-15 or moments[0] + moments[1] < moments[2] * (1 - 1e-9):
+        raise ValueError(
+            f"no solid has these moments of inertia: principal {moments.round(9).tolist()} kg m^2; "
+            "each must be at least 0 and at most the sum of the other two"
+        )
+
+
+class FreePose(_Strict):
+    """Any rigid part: the pose of its output, and its mass, centre and inertia about that centre.
+
+    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) [kg m^2]; all is in the part's input frame. A part without
+    mass only leads from one frame to the next.
+    """
+
+    xyz_m: Xyz = (0.0, 0.0, 0.0)
+    rpy_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    com_xyz_m: Xyz = (0.0, 0.0, 0.0)
+    inertia: tuple[Moment, Moment, Moment, Moment, Moment, Moment] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _possible_inertia(self) -> "FreePose":
+        check_inertia(self.mass_kg, self.inertia)
+        return self
+
+
+class Part(_Strict):
+    """One part of a link: exactly one of `tube`, `bracket` and `pose`."""
+
+    tube: Tube | None = None
+    bracket: str | None = None
+    pose: FreePose | None = None
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> "Part":
+        if sum(x is not None for x in (self.tube, self.bracket, self.pose)) != 1:
+            raise ValueError("a part of a link is exactly one of: tube, bracket, pose")
+        return self
+
+    @field_validator("bracket")
+    @classmethod
+    def _known_bracket(cls, name: str | None) -> str | None:
+        if name is not None and name not in BRACKETS:
+            raise ValueError(f"unknown bracket {name!r}; known are {', '.join(BRACKETS)}")
+        return name
+
+
+def placed(part: Part) -> PlacedPart:
+    """Return where a part leads and what it weighs."""
+    if part.tube is not None:
+        return _tube(part.tube)
+    if part.bracket is not None:
+        return _bracket(BRACKETS[part.bracket])
+    if part.pose is None:
+        raise ValueError("a part of a link is exactly one of: tube, bracket, pose")
+    return _free(part.pose)
+
+
+def _body(mass_kg: float, com: Sequence[float], inertia: Array) -> RigidBody:
+    return RigidBody(mass_kg, read_only(np.array(com, dtype=float)), inertia)
+
+
+def _tube(tube: Tube) -> PlacedPart:
+    length, twist = tube.length_m, tube.twist_rad
+    output = pose((length, -0.02 * sin(twist), 0.02 * (1.0 + cos(twist))), (twist, 0.0, 0.0))
+    # A thin-walled tube, and its two cast ends as point masses, which together give the published mass
+    # 0.4 L + 0.199 kg with its centre in the middle.
+    walls, ends = 0.4 * length, 0.199
+    along = walls * _TUBE_RADIUS_M**2 + ends * _TUBE_RADIUS_M**2
+    across = walls * (length**2 / 12 + _TUBE_RADIUS_M**2 / 2) + ends * (length / 2) ** 2
+    body = _body(walls + ends, (length / 2, 0.0, 0.02), tensor(along, across, across, 0.0, 0.0, 0.0))
+    return PlacedPart(output, body, _tube_hinge(length))
+
+
+def _tube_hinge(length_m: float) -> Hinge:
+    """Return where a tube clamped at its input bends (about y and z) and twists (about x) by beam theory."""
+    area_moment = pi / 4.0 * (_TUBE_RADIUS_M**4 - _TUBE_INNER_RADIUS_M**4)
+    bending = _HOWELL_STIFFNESS * _ALUMINIUM_E_PA * area_moment / length_m
+    twisting = _ALUMINIUM_G_PA * 2.0 * area_moment / length_m
+    stiffness = np.array([twisting, bending, bending])
+    place = pose((_HOWELL_HINGE * length_m, 0.0, 0.02))
+    return Hinge(place, read_only(stiffness), read_only(stiffness * STRUCTURE_LOSS_S))
+
+
+def _bracket(bracket: Bracket) -> PlacedPart:
+    x, y, z = bracket.output_xyz
+    # Two square plates of 50 mm at a right angle, half the mass each: one at the input, one at the output.
+    half, side = bracket.mass_kg / 2, 0.05
+    foot = tensor(half * side**2 / 12, half * side**2 / 12, half * side**2 / 6, 0.0, 0.0, 0.0)
+    wall = tensor(half * side**2 / 12, half * side**2 / 6, half * side**2 / 12, 0.0, 0.0, 0.0)
+    plates = (_body(half, (x, y / 2, 0.003), foot), _body(half, (x, y, z * 0.7), wall))
+    return PlacedPart(pose(bracket.output_xyz, (bracket.turn_rad, 0.0, 0.0)), joined(plates))
+
+
+def _free(free: FreePose) -> PlacedPart:
+    roll, pitch, yaw = free.rpy_deg
+    output = pose(free.xyz_m, (radians(roll), radians(pitch), radians(yaw)))
+    return PlacedPart(output, _body(free.mass_kg, free.com_xyz_m, tensor(*free.inertia)))

@@ -1,0 +1,1 @@
+"""How modules differ from their catalogue: effects, noise profiles, errors per module."""

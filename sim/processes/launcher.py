@@ -1,0 +1,236 @@
+"""World, agents and coordinator as processes: started and stopped in order, nothing left behind."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from module_agent.main import ATTACHED
+from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from sim.robot.noise_choice import NoiseChoice
+
+START_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 5.0
+WATCH_S = 0.1
+LOGS = "logs"
+# The file systems' limit is 255 bytes.
+_LONGEST_NAME = 100
+_PR_SET_PDEATHSIG = 1
+
+
+class LaunchError(RuntimeError):
+    """A process did not come up or died; the message says which and what it printed last."""
+
+
+def _nowhere_else(process: str) -> tuple[str, ...]:
+    return ()
+
+
+class LaunchConfig(NamedTuple):
+    """What is started; `processes` is how many agent processes share the modules (None: one each).
+
+    `pushes` are on the world, as its option `--push` takes them.
+    `within` is told the name of a process ("world", "coordinator", or "agent" and its serials) and returns
+    the words that go before its command, such as `nsenter` and a network namespace.
+    """
+
+    robot_file: str
+    robot_name: str
+    serials: tuple[str, ...]
+    out: Path
+    seed: int = 0
+    network: str = "lan"
+    noise: NoiseChoice = NoiseChoice()
+    speed: float = 1.0
+    endpoint: str = DEFAULT_ENDPOINT
+    processes: int | None = None
+    coordinator_options: tuple[str, ...] = ()
+    agent_options: tuple[str, ...] = ()
+    within: Callable[[str], tuple[str, ...]] = _nowhere_else
+    pushes: tuple[str, ...] = ()
+
+
+class Child(NamedTuple):
+    """A started process, where its output goes, and what it prints there when it is up."""
+
+    name: str
+    process: "subprocess.Popen[bytes]"
+    log: Path | None
+    up: str = ""
+
+
+def _die_with_parent() -> None:
+    # A launcher that is killed outright cannot stop its children; the kernel does it then.
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class Launcher:
+    """Starts, watches and stops the processes of one robot. Use as a context manager.
+
+    What a process prints is kept in `logs/` of the run's folder; `say` is told who is up and who has ended.
+    """
+
+    def __init__(self, config: LaunchConfig, say: Callable[[str], None]):
+        self.config = config
+        self._say = say
+        self._folder = tempfile.TemporaryDirectory(prefix="x5-")
+        self.bus = str(Path(self._folder.name) / "bus")
+        self.children: list[Child] = []
+        self._waited_for: list[Child] = []
+        self._ended: list[Child] = []
+
+    def __enter__(self) -> "Launcher":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    # ------------------------------------------------------------------ starting
+
+    def start_world(self) -> Child:
+        """Start the world and wait until its bus listens."""
+        config = self.config
+        arguments = ["sim.main", "world", config.robot_file, "--bus", self.bus, "--seed", str(config.seed)]
+        arguments += ["--speed", str(config.speed), "--truth", str(config.out)]
+        arguments += config.noise.arguments
+        for push in config.pushes:
+            arguments += ["--push", push]
+        world = self._start("world", arguments)
+        self._wait(lambda: os.path.exists(self.bus), world, "its bus")
+        self._say("world: bus open")
+        return world
+
+    def start_agents(self) -> list[Child]:
+        """Start the agent processes; they wait for the coordinator by themselves."""
+        config = self.config
+        count = config.processes or len(config.serials)
+        shares = [config.serials[i::count] for i in range(min(count, len(config.serials)))]
+        return [self.start_agent(share, index) for index, share in enumerate(shares)]
+
+    def start_agent(self, serials: Sequence[str], index: int = 0) -> Child:
+        """Start one agent process that hosts these modules."""
+        config = self.config
+        arguments = ["module_agent.main", "--bus", self.bus, "--robot", config.robot_name]
+        arguments += ["--connect", config.endpoint, "--network", config.network]
+        arguments += ["--seed", str(1000 * config.seed + index + 1), *config.agent_options]
+        for serial in serials:
+            arguments += ["--serial", serial]
+        agent = self._start(f"agent {','.join(serials)}", arguments, up=ATTACHED)
+        self._waited_for.append(agent)
+        return agent
+
+    def start_coordinator(self, options: Sequence[str] = (), quiet: bool = False) -> Child:
+        """Start the coordinator; its output goes to this terminal, or to its log when `quiet`."""
+        config = self.config
+        arguments = ["coordinator.main", "run", "--out", str(config.out), "--robot", config.robot_name]
+        arguments += ["--listen", config.endpoint, "--network", config.network]
+        arguments += ["--seed", str(1000 * config.seed), "--expect", str(len(config.serials))]
+        arguments += ["--speed", str(config.speed), *config.coordinator_options, *options]
+        return self._start("coordinator", arguments, quiet)
+
+    def _log(self, name: str) -> Path:
+        folder = self.config.out / LOGS
+        folder.mkdir(parents=True, exist_ok=True)
+        stem = name.replace(" ", "-").replace("/", "-")[:_LONGEST_NAME]
+        taken = [child.log for child in self.children]
+        paths = [folder / f"{stem}.log", *(folder / f"{stem}-{k}.log" for k in range(2, len(taken) + 3))]
+        return next(path for path in paths if path not in taken)
+
+    def _start(self, name: str, arguments: Sequence[str], quiet: bool = True, up: str = "") -> Child:
+        log = self._log(name) if quiet else None
+        with open(log if log is not None else os.devnull, "wb") as output:
+            # Its own session: Ctrl-C reaches the launcher alone, which then stops the others in order.
+            process = subprocess.Popen(
+                [*self.config.within(name), sys.executable, "-m", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=output if quiet else None,
+                stderr=subprocess.STDOUT if quiet else None,
+                start_new_session=True,
+                preexec_fn=_die_with_parent,
+                env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            )
+        child = Child(name, process, log, up)
+        self.children.append(child)
+        self._say(f"{name}: process {process.pid}")
+        return child
+
+    def _wait(self, ready: Callable[[], bool], child: Child, what: str) -> None:
+        end = time.monotonic() + START_TIMEOUT_S
+        while not ready():
+            if child.process.poll() is not None:
+                raise LaunchError(_obituary(child))
+            if time.monotonic() > end:
+                raise LaunchError(f"{child.name} did not open {what} within {START_TIMEOUT_S:.0f} s")
+            time.sleep(0.02)
+
+    # ------------------------------------------------------------------ watching and stopping
+
+    def dead(self) -> list[Child]:
+        """Return the processes that have ended."""
+        return [child for child in self.children if child.process.poll() is not None]
+
+    def watch(self, coordinator: Child) -> int:
+        """Watch until the coordinator ends, and return its exit code (128 + n if signal n ended it).
+
+        An agent that ends early is named with its last words, and how the run ends is the coordinator's to
+        say.
+
+        Raises:
+            LaunchError: the world ended early, so that there is no robot any more.
+        """
+        while (code := coordinator.process.poll()) is None:
+            self.look(coordinator)
+            time.sleep(WATCH_S)
+        return code if code >= 0 else 128 - code
+
+    def look(self, coordinator: Child) -> None:
+        """Say once of every process that it has come up, and that it has ended; see `watch`."""
+        for child in [each for each in self._waited_for if each.up in whole_log(each)]:
+            self._waited_for.remove(child)
+            self._say(f"{child.name}: {child.up}")
+        for child in [each for each in self.dead() if each not in self._ended and each != coordinator]:
+            self._ended.append(child)
+            if child.name == "world":
+                raise LaunchError(_obituary(child))
+            self._say(_obituary(child))
+
+    def stop(self) -> None:
+        """Stop everything, coordinator first and world last, and remove the bus. May be called twice."""
+        for child in reversed(self.children):
+            stop_child(child)
+        self.children.clear()
+        self._folder.cleanup()
+
+
+def stop_child(child: Child) -> None:
+    """End one process: interrupt, then kill after a while."""
+    if child.process.poll() is None:
+        child.process.send_signal(signal.SIGCONT)
+        child.process.send_signal(signal.SIGTERM)
+        try:
+            child.process.wait(STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            child.process.kill()
+    child.process.wait()
+
+
+def whole_log(child: Child) -> str:
+    """Return all that a process has printed."""
+    if child.log is None or not child.log.exists():
+        return ""
+    return child.log.read_text(errors="replace")
+
+
+def last_words(child: Child) -> str:
+    """Return the last lines that a process printed."""
+    return " / ".join(whole_log(child).strip().splitlines()[-3:])
+
+
+def _obituary(child: Child) -> str:
+    return f"{child.name} ended with {child.process.returncode}: {last_words(child) or 'without a word'}"

@@ -1,0 +1,121 @@
+"""`python -m sim.link_emulator`: a network in user space between network namespaces.
+
+Every host is a namespace with a TUN interface; what it sends is read here and written to the host that it is
+for, at the time and if the profile has it so. So TCP itself meets delay, loss and reordering, and no queueing
+discipline of the kernel is needed.
+"""
+
+import json
+import os
+import select
+import signal
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from ipaddress import IPv4Address, IPv4Interface
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, NamedTuple
+
+import typer
+
+from module_agent.network_emulation.profile_file import network as network_named
+from sim.processes.network_namespace import open_tun
+from sim.processes.packet_switch import LinkCounts, PacketSwitch
+
+# What it says when packets pass.
+UP = "the links are up"
+EXIT_USAGE, EXIT_LOST = 2, 3
+_LONGEST_PACKET_BYTES = 65_535
+# How long it may take to notice that it is to end.
+_LOOK_S = 0.1
+
+
+class Host(NamedTuple):
+    """A namespace's file, and the address and network of the interface that it gets."""
+
+    namespace: Path
+    interface: IPv4Interface
+
+
+def host(text: str) -> Host:
+    """Read a host as it is given on the command line, such as `/proc/4711/ns/net=10.77.0.1/24`.
+
+    Raises:
+        ValueError: it is of another form; the message says what would be right.
+    """
+    namespace, _, address = text.rpartition("=")
+    try:
+        interface = IPv4Interface(address)
+    except ValueError:
+        namespace = ""
+    if not namespace:
+        raise ValueError(f"host {text!r}: it must look like /proc/4711/ns/net=10.77.0.1/24")
+    return Host(Path(namespace), interface)
+
+
+def forward(tuns: Sequence[int], switch: PacketSwitch, ended: Callable[[], bool]) -> None:
+    """Pass packets between the hosts' descriptors until it is ended.
+
+    Raises:
+        OSError: a host's interface is gone.
+    """
+    index_of = {tun: index for index, tun in enumerate(tuns)}
+    start_s = time.monotonic()
+    while not ended():
+        now_s = time.monotonic() - start_s
+        for destination, packet in switch.due(now_s):
+            with suppress(BlockingIOError):  # a full queue drops, as any link's does
+                os.write(tuns[destination], packet)
+        wait_s = _LOOK_S if switch.next_s is None else min(_LOOK_S, max(0.0, switch.next_s - now_s))
+        readable, _, _ = select.select(tuns, (), (), wait_s)
+        now_s = time.monotonic() - start_s
+        for tun in readable:
+            with suppress(BlockingIOError):
+                switch.take(now_s, index_of[tun], os.read(tun, _LONGEST_PACKET_BYTES))
+
+
+def counts_by_address(
+    counts: dict[tuple[int, int], LinkCounts], addresses: Sequence[IPv4Address]
+) -> dict[str, dict[str, float]]:
+    """Return the counts of every direction, called `FROM > TO`, ready for JSON."""
+    return {f"{addresses[a]} > {addresses[b]}": each._asdict() for (a, b), each in counts.items()}
+
+
+def main(
+    hosts: Annotated[
+        list[str], typer.Argument(help="NAMESPACE=ADDRESS/PREFIX of every host, the coordinator's first.")
+    ],
+    network: Annotated[str, typer.Option(help="Network profile, or a TOML file.")],
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the network.")] = 0,
+    counts: Annotated[Path | None, typer.Option(help="JSON file for what became of the packets.")] = None,
+) -> None:
+    """Connect network namespaces by links that delay and lose, until a signal comes."""
+    ended: list[int] = []
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        ended.append(number)
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    try:
+        found = [host(text) for text in hosts]
+        addresses = [each.interface.ip for each in found]
+        switch = PacketSwitch(addresses, network_named(network), seed)
+        tuns = [open_tun(*each) for each in found]
+    except (ValueError, OSError) as error:
+        typer.echo(f"link emulator: {error}", err=True)
+        raise typer.Exit(EXIT_USAGE) from error
+    typer.echo(UP, err=True)
+    try:
+        forward(tuns, switch, lambda: bool(ended))
+    except OSError as error:
+        typer.echo(f"link emulator: a host is gone: {error}", err=True)
+        raise typer.Exit(EXIT_LOST) from error
+    finally:
+        if counts is not None:
+            counts.write_text(json.dumps(counts_by_address(switch.counts, addresses), indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)

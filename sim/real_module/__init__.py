@@ -1,0 +1,1 @@
+"""Comparing the simulated module with a real module's log."""

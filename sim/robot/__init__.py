@@ -1,0 +1,1 @@
+"""Robot files and the robots they describe."""

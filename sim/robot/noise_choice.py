@@ -1,0 +1,31 @@
+"""What a person asks for on the command line: a noise profile, and effects switched on and off in it."""
+
+from typing import NamedTuple
+
+from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
+from sim.robot.robot_file import Robot
+
+
+class NoiseChoice(NamedTuple):
+    """A profile's name (None: the robot's own) and the effects switched on and off in it."""
+
+    profile: str | None = None
+    on: tuple[str, ...] = ()
+    off: tuple[str, ...] = ()
+
+    def of(self, robot: Robot) -> NoiseProfile:
+        """Return the profile that this choice means for a robot.
+
+        Raises:
+            KeyError: unknown profile or effect; the message lists the known ones.
+            ValueError: an effect is switched both on and off.
+        """
+        return switched(noise_profile(self.profile or robot.noise), self.on, self.off)
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """The same choice as arguments for another program."""
+        words = [] if self.profile is None else ["--noise", self.profile]
+        words += [word for name in self.on for word in ("--with", name)]
+        words += [word for name in self.off for word in ("--without", name)]
+        return tuple(words)

@@ -1,0 +1,332 @@
+"""Robot files: which modules a robot has and how they are joined, as TOML.
+
+A link leads from the distal frame of the parent (its output; its housing if the parent is mounted reversed)
+to the proximal frame of the child (its housing; its output if the child is mounted reversed).
+"""
+
+import tomllib
+from math import radians
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from module_agent.model.catalogue import module_type
+from module_agent.network_emulation.profile_file import network, network_beside
+from module_agent.network_emulation.toml_location import Location, line_of, syntax_error_line
+from module_agent.wire.keys import check_chunk
+from sim.geometry.link_parts import Angle, FreePose, Moment, Part, Xyz, check_inertia
+from sim.geometry.pose import Array, pose
+from sim.imperfections.noise_profile import DEFAULT_PROFILE, noise_profile
+
+ROBOTS = Path(__file__).parents[1] / "robots"
+BASE = "base"
+
+MountName = Literal["floor", "ceiling", "wall"]
+# Roll, pitch, yaw of the base frame in a world with z up. On the wall its z is horizontal, its y points up.
+MOUNTS: dict[MountName, tuple[float, float, float]] = {
+    "floor": (0.0, 0.0, 0.0),
+    "ceiling": (180.0, 0.0, 0.0),
+    "wall": (90.0, 0.0, 0.0),
+}
+
+
+class RobotFileError(ValueError):
+    """A robot file that describes no robot; the message names file, line and key."""
+
+
+def _in_a_list(value: Any) -> Any:
+    return [value] if isinstance(value, dict) else value
+
+
+def _known(value: str, lookup: Any) -> str:
+    try:
+        lookup(value)
+    except KeyError as error:
+        raise ValueError(error.args[0]) from error
+    return value
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+Stiffness = Annotated[float, Field(ge=0.0, le=1e9)]
+Damping = Annotated[float, Field(ge=0.0, le=1e6)]
+Stiffnesses = tuple[Stiffness, Stiffness, Stiffness]
+Dampings = tuple[Damping, Damping, Damping]
+_RIGID = (0.0, 0.0, 0.0)
+_AXES = "xyz"
+
+
+def _check_springs(kind: str, stiffness: Stiffnesses, damping: Dampings) -> None:
+    for axis, k, c in zip(_AXES, stiffness, damping, strict=True):
+        if c > 0.0 and k == 0.0:
+            raise ValueError(
+                f"the {kind} {axis} has a damping of {c} but a stiffness of 0, which stands for rigid; "
+                "give it a stiffness or leave the damping out"
+            )
+
+
+class BaseCompliance(_Strict):
+    """How the base gives: springs and dampers in base axes, in up to six directions.
+
+    A stiffness of 0, or none, stands for a rigid direction. The rotations are about `pivot_m`, a point of the
+    base frame. `mass_kg`, `com_xyz_m` (base frame) and `inertia` (ixx, iyy, izz, ixy, ixz, iyz about that
+    centre, base axes) describe what shakes with the base beside the modules' own parts.
+    """
+
+    mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    com_xyz_m: Xyz = (0.0, 0.0, 0.0)
+    inertia: tuple[Moment, Moment, Moment, Moment, Moment, Moment] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    pivot_m: Xyz = (0.0, 0.0, 0.0)
+    stiffness_n_m: Stiffnesses = _RIGID
+    damping_n_s_m: Dampings = _RIGID
+    stiffness_nm_rad: Stiffnesses = _RIGID
+    damping_nm_s_rad: Dampings = _RIGID
+
+    @model_validator(mode="after")
+    def _springs_somewhere(self) -> "BaseCompliance":
+        if not any((*self.stiffness_n_m, *self.stiffness_nm_rad)):
+            raise ValueError(
+                "every direction is rigid; give a stiffness_n_m or stiffness_nm_rad, or leave compliance out"
+            )
+        _check_springs("translation along", self.stiffness_n_m, self.damping_n_s_m)
+        _check_springs("rotation about", self.stiffness_nm_rad, self.damping_nm_s_rad)
+        return self
+
+    @model_validator(mode="after")
+    def _possible_inertia(self) -> "BaseCompliance":
+        check_inertia(self.mass_kg, self.inertia)
+        return self
+
+
+class Flex(_Strict):
+    """How a link gives about its held end: springs and dampers about x, y, z of the parent's distal frame.
+
+    A stiffness of 0 stands for a rigid direction; with all three the link is rigid, tubes included.
+    """
+
+    stiffness_nm_rad: Stiffnesses
+    damping_nm_s_rad: Dampings = _RIGID
+
+    @model_validator(mode="after")
+    def _springs_damped(self) -> "Flex":
+        _check_springs("rotation about", self.stiffness_nm_rad, self.damping_nm_s_rad)
+        return self
+
+
+class Base(_Strict):
+    """How the base frame stands in gravity: a named mount, or roll, pitch, yaw in a world with z up.
+
+    `gravity_m_s2` is how strong it is there: 9.764 to 9.834 on the Earth.
+    """
+
+    mount: MountName | None = None
+    gravity_m_s2: Annotated[float, Field(ge=0.1, le=30.0)] = 9.81
+    rpy_deg: tuple[Angle, Angle, Angle] | None = None
+    compliance: BaseCompliance | None = None
+
+    @model_validator(mode="after")
+    def _one_or_the_other(self) -> "Base":
+        if self.mount is not None and self.rpy_deg is not None:
+            raise ValueError("give either mount or rpy_deg, not both")
+        return self
+
+    @property
+    def world_pose(self) -> Array:
+        """The base frame in the world, (4, 4)."""
+        roll, pitch, yaw = self.rpy_deg or MOUNTS[self.mount or "floor"]
+        return pose((0.0, 0.0, 0.0), (radians(roll), radians(pitch), radians(yaw)))
+
+
+class Module(_Strict):
+    """One module and the link that holds it: a list of parts, from the parent on.
+
+    Without `flex` tubes give by beam theory, and all else is rigid. `payload` is carried by what the module's
+    joint turns: mass, centre and inertia in its output's frame, or the housing's if it is mounted reversed.
+    """
+
+    serial: str
+    type: str
+    parent: str
+    mounted: Literal["forward", "reversed"] = "forward"
+    start_rad: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
+    link: Annotated[tuple[Part, ...], BeforeValidator(_in_a_list)] = ()
+    payload: FreePose | None = None
+    flex: Flex | None = None
+
+    @field_validator("serial")
+    @classmethod
+    def _fits_a_key(cls, serial: str) -> str:
+        if serial == BASE:
+            raise ValueError(f"{BASE!r} is the base's own name; call the module otherwise")
+        return check_chunk("serial", serial)
+
+    @field_validator("type")
+    @classmethod
+    def _in_the_catalogue(cls, name: str) -> str:
+        return _known(name, module_type)
+
+
+class Robot(_Strict):
+    """A robot as its file describes it; `modules` is ordered depth first, so parents precede children.
+
+    `network` is a profile's name, or the path of a network file, in the robot's file from its own folder.
+    """
+
+    name: str
+    network: str = "none"
+    noise: str = DEFAULT_PROFILE
+    base: Base = Base()
+    modules: Annotated[tuple[Module, ...], Field(alias="module", min_length=1, max_length=64)]
+
+    @field_validator("name")
+    @classmethod
+    def _fits_a_key(cls, name: str) -> str:
+        return check_chunk("robot", name)
+
+    @field_validator("network")
+    @classmethod
+    def _known_network(cls, name: str, info: ValidationInfo) -> str:
+        found = network_beside(name, (info.context or {}).get("folder", Path()))
+        network(found)
+        return found
+
+    @field_validator("noise")
+    @classmethod
+    def _known_noise(cls, name: str) -> str:
+        return _known(name, noise_profile)
+
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """The modules' serials, in order."""
+        return tuple(m.serial for m in self.modules)
+
+    @property
+    def parents(self) -> tuple[int, ...]:
+        """The index of every module's parent, -1 for a module on the base."""
+        index = {m.serial: i for i, m in enumerate(self.modules)} | {BASE: -1}
+        return tuple(index[m.parent] for m in self.modules)
+
+    @property
+    def start_rad(self) -> Array:
+        """The joint positions in which the world begins, (n,) [rad]."""
+        return np.array([m.start_rad for m in self.modules])
+
+
+class _Fault(NamedTuple):
+    location: Location
+    reason: str
+
+
+def shipped_robots() -> tuple[str, ...]:
+    """Return the names of the robots that come with the simulator."""
+    return tuple(sorted(path.stem for path in ROBOTS.glob("*.toml")))
+
+
+def load_robot(name_or_path: str | Path) -> Robot:
+    """Load a shipped robot by name, or a robot file by path.
+
+    Raises:
+        RobotFileError: the file describes no robot; the message names file, line and key.
+        FileNotFoundError: neither a shipped robot nor a file; the message lists the shipped ones.
+    """
+    path = ROBOTS / f"{name_or_path}.toml" if str(name_or_path) in shipped_robots() else Path(name_or_path)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{name_or_path} is neither a robot file nor a shipped robot; "
+            f"shipped are {', '.join(shipped_robots())}"
+        )
+    return parse_robot(path.read_text(encoding="utf-8"), str(path))
+
+
+def parse_robot(text: str, name: str) -> Robot:
+    """Parse the text of a robot file; `name` is what errors call it.
+
+    Raises:
+        RobotFileError: as `load_robot`.
+    """
+    try:
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        line, reason = syntax_error_line(error, text)
+        raise RobotFileError(f"{name}:{line}: not TOML: {reason}") from error
+    try:
+        robot = Robot.model_validate(data, context={"folder": Path(name).parent})
+    except ValidationError as error:
+        faults = [_Fault(tuple(e["loc"]), _reason(dict(e))) for e in error.errors(include_url=False)]
+        raise _error(name, text, faults) from error
+    faults = _tree_faults(robot.modules)
+    if faults:
+        raise _error(name, text, faults)
+    return robot.model_copy(update={"modules": _depth_first(robot.modules)})
+
+
+def _reason(error: dict[str, Any]) -> str:
+    if error["type"] == "extra_forbidden":
+        return "unknown key"
+    if error["type"] == "missing":
+        return "is missing"
+    return str(error["msg"]).removeprefix("Value error, ")
+
+
+def _error(name: str, text: str, faults: list[_Fault]) -> RobotFileError:
+    lines = []
+    for fault in faults:
+        key = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in fault.location).lstrip(".")
+        lines.append(f"{name}:{line_of(text, fault.location)}: {key + ': ' if key else ''}{fault.reason}")
+    return RobotFileError("\n".join(lines))
+
+
+def _tree_faults(modules: tuple[Module, ...]) -> list[_Fault]:
+    faults: list[_Fault] = []
+    first: dict[str, int] = {}
+    for i, module in enumerate(modules):
+        if module.serial in first:
+            reason = f"serial {module.serial!r} is already that of module[{first[module.serial]}]"
+            faults.append(_Fault(("module", i, "serial"), reason))
+        first.setdefault(module.serial, i)
+    for i, module in enumerate(modules):
+        if module.parent == module.serial:
+            faults.append(_Fault(("module", i, "parent"), f"module {module.serial!r} is its own parent"))
+        elif module.parent != BASE and module.parent not in first:
+            reason = f"unknown parent {module.parent!r}; known are {', '.join((BASE, *first))}"
+            faults.append(_Fault(("module", i, "parent"), reason))
+    return faults or _cycle_faults(modules)
+
+
+def _cycle_faults(modules: tuple[Module, ...]) -> list[_Fault]:
+    parent_of = {m.serial: m.parent for m in modules}
+    for i, module in enumerate(modules):
+        path = [module.serial]
+        while path[-1] != BASE and parent_of[path[-1]] not in path:
+            path.append(parent_of[path[-1]])
+        if path[-1] != BASE:
+            loop = " -> ".join([*path, parent_of[path[-1]]])
+            return [
+                _Fault(
+                    ("module", i, "parent"), f"the parents of {module.serial!r} never reach the base: {loop}"
+                )
+            ]
+    return []
+
+
+def _depth_first(modules: tuple[Module, ...]) -> tuple[Module, ...]:
+    """Order modules as a physics engine numbers its links: depth first, siblings as in the file."""
+    ordered: list[Module] = []
+    waiting = [m for m in reversed(modules) if m.parent == BASE]
+    while waiting:
+        ordered.append(waiting.pop())
+        waiting += [m for m in reversed(modules) if m.parent == ordered[-1].serial]
+    return tuple(ordered)

@@ -1,0 +1,1 @@
+"""Comparing a result with the simulator's truth."""

@@ -1,0 +1,106 @@
+"""How near an identified chain comes to the true one: topology, links, tips.
+
+Modules are matched by serial number. Directions in which a chain is unidentifiable are removed before the
+tips are compared, and nothing else is.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.model.chain import Array, Chain
+from sim.scoring.gauge_alignment import align_gauge, move_root, reorder, reorder_basis, tip_error
+
+POSES = 1000
+_SEED = 1
+
+
+class LinkErrors(NamedTuple):
+    """How far a link is off: estimate - truth of its length, and sizes of the errors of vector and axis.
+
+    The length is the perpendicular distance from the parent's joint axis to the child's IMU at q = 0, the
+    vector that distance with its direction; vector and axis are compared in the child's IMU frame at q = 0.
+    """
+
+    length_m: float
+    vector_m: float
+    axis_deg: float
+
+
+def topology_differences(estimated: Chain, truth: Chain) -> list[str]:
+    """Say in words where parents or mounting differ, in the order of the truth; empty if all is right."""
+    words = [f"module {s} was not found" for s in truth.serials if s not in estimated.serials]
+    words += [f"module {s} does not exist" for s in estimated.serials if s not in truth.serials]
+    for true_index, serial in enumerate(truth.serials):
+        if serial not in estimated.serials:
+            continue
+        index = estimated.serials.index(serial)
+        is_on, found_on = _parent(truth, true_index), _parent(estimated, index)
+        if is_on != found_on:
+            words.append(f"module {serial} is mounted on {is_on}, the result says on {found_on}")
+        if truth.reversed[true_index] != estimated.reversed[index]:
+            is_so, found_so = _mounting(truth, true_index), _mounting(estimated, index)
+            words.append(f"module {serial} is mounted {is_so}, the result says {found_so}")
+    return words
+
+
+def link_length_m(chain: Chain, child: int) -> float:
+    """Return the perpendicular distance from the axis of a module's parent to its IMU at q = 0."""
+    parent = chain.parent[child]
+    arm = chain.imu_home[child, :3, 3] - chain.point[parent]
+    return float(np.linalg.norm(np.cross(chain.axis[parent], arm)))
+
+
+def tip_errors(estimated: Chain, truth: Chain, basis: Array) -> tuple[float, float]:
+    """Return rms errors of position [mm] and orientation [deg] of the leaves over random configurations.
+
+    Args:
+        estimated, truth: chains of the same modules with the same parents, in any order.
+        basis: (6 n, k) directions of `estimated` that are unidentifiable.
+    """
+    root = estimated.parent.index(-1)
+    basis = reorder_basis(estimated, basis, truth.serials)
+    origin = truth.serials.index(estimated.serials[root])
+    estimated = reorder(estimated, truth.serials)
+    if origin != truth.parent.index(-1):
+        # With several modules on the base the two chains may begin at different ones, and the root frame is
+        # the first one's housing, in which the catalogue places the IMU.
+        pose = truth.imu_home[origin] @ np.linalg.inv(estimated.imu_home[origin])
+        estimated, basis = move_root(estimated, basis, pose)
+    q = np.random.default_rng(_SEED).uniform(-np.pi, np.pi, (POSES, len(truth.serials)))
+    error = tip_error(align_gauge(estimated, truth, basis, q), truth, q)
+    return 1e3 * error.position_m, float(np.degrees(error.orientation_rad))
+
+
+def link_errors(estimated: Chain, truth: Chain, child: int) -> LinkErrors | None:
+    """Return the errors of the link to a child of the truth, by its index; None if there is no such link."""
+    serial = truth.serials[child]
+    if serial not in estimated.serials:
+        return None
+    own = estimated.serials.index(serial)
+    if _parent(estimated, own) != _parent(truth, child):
+        return None
+    (axis, vector), (true_axis, true_vector) = _seen(estimated, own), _seen(truth, child)
+    angle = np.arctan2(np.linalg.norm(np.cross(axis, true_axis)), axis @ true_axis)
+    return LinkErrors(
+        length_m=float(np.linalg.norm(vector) - np.linalg.norm(true_vector)),
+        vector_m=float(np.linalg.norm(vector - true_vector)),
+        axis_deg=float(np.degrees(angle)),
+    )
+
+
+def _seen(chain: Chain, child: int) -> tuple[Array, Array]:
+    """Return the parent's axis, and the vector from it to the child's IMU, in that IMU's frame at q = 0."""
+    parent, home = chain.parent[child], chain.imu_home[child]
+    arm = home[:3, 3] - chain.point[parent]
+    axis = chain.axis[parent]
+    turn = home[:3, :3].T
+    return turn @ axis, turn @ (arm - axis * (axis @ arm))
+
+
+def _parent(chain: Chain, index: int) -> str:
+    return "the base" if chain.parent[index] < 0 else chain.serials[chain.parent[index]]
+
+
+def _mounting(chain: Chain, index: int) -> str:
+    return "reversed" if chain.reversed[index] else "forward"

@@ -1,0 +1,346 @@
+"""How near a run's result comes to the simulator's truth: `score.json`.
+
+Modules are matched by serial number. What the result itself lists as unidentifiable is removed before the
+tips are compared, and nothing else is.
+"""
+
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from rich.table import Table
+
+from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, UnresolvedPart
+from module_agent.model.chain import Array, Chain
+from module_agent.model.perturbation import frozen
+from module_agent.signals.filtering import resample
+from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
+from sim.world.truth import Motion, read_motion, read_truth
+
+# A torque below what the sensor resolves is no scale to measure errors by: a bare output turns against next
+# to nothing.
+LEAST_TORQUE_NM = 0.02
+
+
+class ScoreError(ValueError):
+    """A run that cannot be scored; the message names the file and what is wrong with it."""
+
+
+class LinkScore(BaseModel):
+    """One link; a value is None if the result has no such link.
+
+    The length is the perpendicular distance from the parent's joint axis to the child's IMU at q = 0, its
+    error is estimate - truth. The vector is that from the axis to the IMU, across the axis; its error and the
+    angle between true and estimated axis are those in the child's IMU frame at q = 0.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    parent: str
+    child: str
+    link_length_true_mm: float
+    link_length_error_mm: float | None
+    link_length_sigma_mm: float | None
+    link_vector_error_mm: float | None
+    axis_error_deg: float | None
+
+
+class Score(BaseModel):
+    """What `score.json` holds; None where nothing could be compared.
+
+    Tip errors are root mean squares over 1000 random poses of all leaf IMUs in the root frame. Torque errors
+    are |e| / |tau| on the held-out motion, against the true torque and against the measured one; None for a
+    joint whose true torque is below `LEAST_TORQUE_NM` (rms), whose error in Nm is there all the same.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    topology_correct: bool
+    topology_differences: list[str]
+    links: list[LinkScore]
+    tip_position_rms_mm: float | None
+    tip_orientation_rms_deg: float | None
+    unidentifiable: list[str]
+    torque_relative_error: float | None
+    torque_relative_error_per_joint: dict[str, float | None] | None
+    torque_rms_error_nm_per_joint: dict[str, float] | None
+    torque_relative_error_measured: float | None
+    robot_time_s: float
+    wall_time_s: float | None
+
+
+class _ResultFile(BaseModel):
+    """What scoring needs of `result.json`."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    schema_version: int = Field(alias="schema")
+    serials: list[str]
+    chain: ChainPart
+    unresolved: list[UnresolvedPart]
+    null_basis: list[list[float]]
+    links: list[LinkPart]
+    dynamics: dict[str, Any] | None
+    robot_time_s: float
+    wall_time_s: float | None
+
+
+class _HeldOut(NamedTuple):
+    """`held_out.npz`, columns in the order of the result's serials."""
+
+    t_ns: NDArray[np.int64]
+    tau_measured_nm: Array
+    tau_predicted_nm: Array
+
+
+class _TorqueScore(NamedTuple):
+    overall: float | None
+    per_joint: dict[str, float | None] | None
+    rms_error_nm: dict[str, float] | None
+    measured: float | None
+
+
+def score(run: Path) -> Score:
+    """Compare the result in the folder `run` with the truth beside it.
+
+    Raises:
+        ScoreError: a file is missing, broken or does not fit the others; the message says which and how.
+    """
+    result = _read_result(run / "result.json")
+    estimated = _chain(result.chain, run / "result.json")
+    truth = _read_truth(run / "truth.json")
+    differences = topology_differences(estimated, truth)
+    basis = _null_basis(result, run / "result.json")
+    tip = (None, None) if differences else tip_errors(estimated, truth, basis)
+    torque = _torque(run, result)
+    return Score(
+        topology_correct=not differences,
+        topology_differences=differences,
+        links=_links(estimated, truth, result.links),
+        tip_position_rms_mm=tip[0],
+        tip_orientation_rms_deg=tip[1],
+        unidentifiable=[item.words for item in result.unresolved],
+        torque_relative_error=torque.overall,
+        torque_relative_error_per_joint=torque.per_joint,
+        torque_rms_error_nm_per_joint=torque.rms_error_nm,
+        torque_relative_error_measured=torque.measured,
+        robot_time_s=result.robot_time_s,
+        wall_time_s=result.wall_time_s,
+    )
+
+
+def write_score(path: Path, found: Score) -> None:
+    """Write `score.json`; the file is the complete old or the complete new one."""
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def table(found: Score) -> Table:
+    """Return the score as a table to print."""
+    excused = "\n".join(f"Not identifiable: {words}" for words in found.unidentifiable)
+    shown = Table(title="Result against truth", caption=excused or None, caption_justify="left")
+    for name in ("", "truth", "error", "claimed sigma", "axis error"):
+        shown.add_column(name, justify="left" if not name else "right")
+    shown.add_row("topology", "", "correct" if found.topology_correct else "WRONG", "", "")
+    for line in found.topology_differences:
+        shown.add_row(f"  {line}", "", "", "", "")
+    for link in found.links:
+        shown.add_row(
+            f"link {link.parent} - {link.child}",
+            f"{link.link_length_true_mm:.2f} mm",
+            _shown(link.link_length_error_mm, "+.2f", " mm"),
+            _shown(link.link_length_sigma_mm, ".2f", " mm"),
+            _shown(link.axis_error_deg, ".3f", " deg"),
+        )
+    shown.add_section()
+    shown.add_row("tip position, rms", "", _shown(found.tip_position_rms_mm, ".2f", " mm"), "", "")
+    shown.add_row("tip orientation, rms", "", _shown(found.tip_orientation_rms_deg, ".3f", " deg"), "", "")
+    shown.add_row("held-out torque against the true", "", _shown(found.torque_relative_error, ".2%"), "", "")
+    for serial, error in (found.torque_relative_error_per_joint or {}).items():
+        absolute = (found.torque_rms_error_nm_per_joint or {}).get(serial)
+        words = _shown(absolute, ".3f", " Nm") if error is None else _shown(error, ".2%")
+        shown.add_row(f"  of {serial}", "", words, "", "")
+    measured = _shown(found.torque_relative_error_measured, ".2%")
+    shown.add_row("held-out torque against the measured", "", measured, "", "")
+    shown.add_section()
+    shown.add_row("robot time", _shown(found.robot_time_s, ".1f", " s"), "", "", "")
+    shown.add_row("wall time", _shown(found.wall_time_s, ".1f", " s"), "", "", "")
+    return shown
+
+
+def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[LinkScore]:
+    sigma = {(link.parent, link.child): link.link_length_sigma_mm for link in claimed}
+    found = []
+    for child, serial in enumerate(truth.serials):
+        if truth.parent[child] < 0:
+            continue
+        parent = truth.serials[truth.parent[child]]
+        error = link_errors(estimated, truth, child)
+        found.append(
+            LinkScore(
+                parent=parent,
+                child=serial,
+                link_length_true_mm=1e3 * link_length_m(truth, child),
+                link_length_error_mm=None if error is None else 1e3 * error.length_m,
+                link_length_sigma_mm=sigma.get((parent, serial)),
+                link_vector_error_mm=None if error is None else 1e3 * error.vector_m,
+                axis_error_deg=None if error is None else error.axis_deg,
+            )
+        )
+    return found
+
+
+def _torque(run: Path, result: _ResultFile) -> _TorqueScore:
+    if result.dynamics is None or result.dynamics.get("held_out") is None:
+        return _TorqueScore(None, None, None, None)
+    held_out = _read_held_out(run / "held_out.npz", len(result.serials))
+    motion = _read_motion(run / "truth.npz")
+    known = [column for column, serial in enumerate(result.serials) if serial in motion.serials]
+    if not known:
+        return _TorqueScore(None, None, None, _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm))
+    true = np.column_stack(
+        [_true_torque(motion, result.serials[c], held_out.t_ns[:, c], run / "truth.npz") for c in known]
+    )
+    predicted = held_out.tau_predicted_nm[:, known]
+    serials = [result.serials[c] for c in known]
+    size, error = _rms(true), _rms(predicted - true)
+    relative = [e / s if s >= LEAST_TORQUE_NM else None for e, s in zip(error, size, strict=True)]
+    return _TorqueScore(
+        _ratio(predicted, true),
+        dict(zip(serials, relative, strict=True)),
+        dict(zip(serials, error, strict=True)),
+        _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm),
+    )
+
+
+def _true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], path: Path) -> Array:
+    """Interpolate a module's true torque at times of its own clock."""
+    column = motion.serials.index(serial)
+    try:
+        found = resample([motion.clock_ns[:, column]], [motion.spring_torque_nm[:, column]], t_ns)
+    except ValueError as error:
+        raise ScoreError(f"{path} does not cover the held-out motion of module {serial}: {error}") from error
+    return found[:, 0]
+
+
+def _ratio(predicted: Array, true: Array) -> float | None:
+    size = float(np.linalg.norm(true))
+    return float(np.linalg.norm(predicted - true)) / size if size > 0.0 else None
+
+
+def _rms(columns: Array) -> list[float]:
+    return [float(value) for value in np.sqrt((columns**2).mean(axis=0))]
+
+
+def _shown(value: float | None, form: str, unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"
+
+
+# ---------------------------------------------------------------------- files
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        hints = {
+            "result.json": "the run has not come to its end, or this is no run's folder",
+            "held_out.npz": "result.json tells of a held-out motion",
+        }
+        raise ScoreError(f"{path} is missing: {hints.get(path.name, 'only simulated runs can be scored')}")
+    return path
+
+
+def _read_result(path: Path) -> _ResultFile:
+    try:
+        document = json.loads(_existing(path).read_text(encoding="utf-8"))
+        found = _ResultFile.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ScoreError(f"{path}: {where or 'the document'}: {first['msg']}") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ScoreError(f"{path} is not JSON: {error}") from error
+    if found.schema_version != SCHEMA:
+        raise ScoreError(f"{path} has schema {found.schema_version}; this program scores schema {SCHEMA}")
+    if found.serials != found.chain.serials:
+        raise ScoreError(f"{path}: serials and chain.serials differ")
+    return found
+
+
+def _chain(part: ChainPart, path: Path) -> Chain:
+    n = len(part.serials)
+    shapes = {
+        "parent": (n,),
+        "reversed": (n,),
+        "axis": (n, 3),
+        "point": (n, 3),
+        "imu_home": (n, 4, 4),
+        "gravity": (3,),
+    }
+    for name, shape in shapes.items():
+        try:
+            found = np.shape(getattr(part, name))
+        except ValueError as error:
+            raise ScoreError(f"{path}: chain.{name} has rows of different lengths") from error
+        if found != shape:
+            raise ScoreError(f"{path}: chain.{name} has shape {found}, {n} modules need {shape}")
+    if any(not -1 <= parent < i for i, parent in enumerate(part.parent)):
+        raise ScoreError(f"{path}: chain.parent {part.parent} does not put every parent before its children")
+    return Chain(
+        tuple(part.serials),
+        tuple(part.parent),
+        tuple(part.reversed),
+        *(frozen(value) for value in (part.axis, part.point, part.imu_home, part.gravity)),
+    )
+
+
+def _null_basis(result: _ResultFile, path: Path) -> Array:
+    rows = 6 * len(result.serials)
+    if not result.null_basis:
+        return np.zeros((rows, 0))
+    if len(result.null_basis) != rows or len({len(row) for row in result.null_basis}) != 1:
+        raise ScoreError(f"{path}: null_basis must have {rows} rows of one length, 6 per module")
+    return np.array(result.null_basis, dtype=float)
+
+
+def _read_truth(path: Path) -> Chain:
+    try:
+        return read_truth(_existing(path)).chain
+    except KeyError as error:
+        raise ScoreError(f"{path} lacks {error}") from error
+    except ScoreError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise ScoreError(f"{path} is broken: {error}") from error
+
+
+def _read_motion(path: Path) -> Motion:
+    try:
+        return read_motion(_existing(path))
+    except KeyError as error:
+        raise ScoreError(f"{path} lacks the array {error}") from error
+    except ScoreError:
+        raise
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        raise ScoreError(f"{path} is broken: {error}") from error
+
+
+def _read_held_out(path: Path, joints: int) -> _HeldOut:
+    try:
+        with np.load(_existing(path), allow_pickle=False) as file:
+            found = _HeldOut(*(np.asarray(file[name]) for name in _HeldOut._fields))
+    except KeyError as error:
+        raise ScoreError(f"{path} lacks an array: {error}") from error
+    except ScoreError:
+        raise
+    except (ValueError, OSError, zipfile.BadZipFile) as error:
+        raise ScoreError(f"{path} is broken: {error}") from error
+    for name, array in zip(_HeldOut._fields, found, strict=True):
+        if array.shape != (len(found.t_ns), joints):
+            raise ScoreError(f"{path}: {name} has shape {array.shape}, (samples, {joints}) is needed")
+    return found

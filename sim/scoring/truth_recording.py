@@ -1,0 +1,98 @@
+"""The truth in the recording of a run whose processes did not know it: added when the run is over.
+
+The motion is the true one, at the times that the viewer shows; the robot is drawn from when all joints had
+been explored, so that the identified one beside it is the whole one.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.identification.result import Result
+from coordinator.kinematics.null_space import name_null_space
+from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import RESULT, SESSION, VIEW, load_recording
+from coordinator.synchronisation.round_trips import map_clocks
+from coordinator.viewer.targets import ViewerTargets
+from coordinator.viewer.viewer import Viewer
+from coordinator.viewer.viewer_process import MergeFailed, merge_into
+from module_agent.model.chain import Chain
+from sim.geometry.pose import Array
+from sim.scoring.truth_view import TruthView
+from sim.world.truth import Motion, read_motion, read_truth
+
+PERIOD_NS = 33_000_000
+ADDITION = "truth.rrd"
+
+
+class _Shown(NamedTuple):
+    """True positions (k, n) of `serials` at times of the viewer (k,)."""
+
+    serials: tuple[str, ...]
+    t_ns: NDArray[np.int64]
+    q_rad: Array
+
+
+def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None:
+    """Draw the true robot in a run's recording, and in the viewer at an address if it still is there.
+
+    What cannot be added is said, and the recording is as it was.
+    """
+    try:
+        recording, result = load_recording(run / SESSION), _result(run)
+        truth, shown = read_truth(run / "truth.json"), _motion(recording, read_motion(run / "truth.npz"))
+        view = TruthView(truth.chain, truth.module_types)
+        targets = ViewerTargets(rrd=run / ADDITION, connect=viewer)
+        drawn = Viewer(truth.robot, run.name, targets, waits=True, lays_out=False)
+        start_ns, end_ns = int(shown.t_ns[0]), int(shown.t_ns[-1])
+        view.values(drawn, (0, end_ns))
+        chain = _chain(result)
+        view.chain(drawn, start_ns, chain, name_null_space(chain, np.array(result.null_basis)))
+        drawn.poses(shown.t_ns, shown.q_rad, shown.serials)
+        drawn.close()
+        merge_into(run / VIEW, run / ADDITION)
+    except (OSError, ValueError, KeyError, MergeFailed) as failure:
+        say(f"the true robot is not in {run / VIEW}: {failure}")
+    finally:
+        (run / ADDITION).unlink(missing_ok=True)
+
+
+def _result(run: Path) -> Result:
+    return Result.model_validate_json((run / RESULT).read_bytes())
+
+
+def _chain(result: Result) -> Chain:
+    part = result.chain
+    return Chain(
+        serials=tuple(part.serials),
+        parent=tuple(part.parent),
+        reversed=tuple(part.reversed),
+        axis=np.array(part.axis),
+        point=np.array(part.point),
+        imu_home=np.array(part.imu_home),
+        gravity=np.array(part.gravity),
+    )
+
+
+def _motion(recording: Recording, motion: Motion) -> _Shown:
+    """Return the true motion from the last exploration on, thirty times a second.
+
+    Raises:
+        ValueError: the session does not say when it began, or nothing of the motion is after its exploration.
+    """
+    begun = [event.t_ns for event in recording.journal if event.what == "session"]
+    explored = [e.t_ns for e in recording.journal if e.what == "done" and e.step.startswith("explore/")]
+    if not begun or not explored:
+        raise ValueError("its journal has no beginning, or no exploration that was done")
+    serial = next(s for s in motion.serials if recording.modules[s].round_trips)
+    clock = map_clocks({serial: recording.modules[serial].round_trips})[serial]
+    session_ns = clock.to_session(motion.clock_ns[:, motion.serials.index(serial)])
+    kept = np.flatnonzero((session_ns >= explored[-1]) & (session_ns <= recording.journal[-1].t_ns))
+    if not kept.size:
+        raise ValueError("the true motion ends before the exploration")
+    step = max(1, round(PERIOD_NS / float(np.median(np.diff(session_ns)))))
+    rows = kept[::step]
+    return _Shown(motion.serials, session_ns[rows] - begun[-1], motion.q_rad[rows])

@@ -1,0 +1,1 @@
+"""Simulated encoders, IMUs, torque sensors and clocks."""

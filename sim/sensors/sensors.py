@@ -1,0 +1,96 @@
+"""What the modules' sensors make of the truth: one `SensorSample` per module and tick."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.hardware.hardware import SensorSample
+from module_agent.model.catalogue import ModuleType
+from sim.geometry.pose import Array
+from sim.imperfections.module_errors import SensorErrors, draw_sensor_errors
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.imperfections.random_streams import generator
+from sim.sensors.imu import Imus
+from sim.sensors.joint import JointSensors
+from sim.sensors.module_clock import ModuleClock, draw_clock, module_time
+
+
+class Instant(NamedTuple):
+    """The truth at one instant, arrays (n,) or (n, 3); read only.
+
+    motor_rad_s is seen at the output, as motor positions are; elastic_nm is what the spring's elasticity
+    exerts on the output. gyro_rad_s and specific_force_m_s2 are in IMU axes; they are those of an earlier
+    instant where the IMU is not due.
+    """
+
+    t_ns: int
+    q_rad: Array
+    qd_rad_s: Array
+    motor_rad_s: Array
+    elastic_nm: Array
+    current_a: Array
+    winding_c: Array
+    voltage_v: float
+    gyro_rad_s: Array
+    specific_force_m_s2: Array
+
+
+class Sensors:
+    """The sensors and clocks of n modules under one profile.
+
+    The IMU is read every `imu_ticks` ticks; in between its last values are repeated with their own time.
+    Sampling jitter moves a reading off its stamp, to first order and never the stamp itself, so the stamps of
+    successive ticks stay a tick of the module's clock apart. What is constant in a module hangs on `seed`,
+    what comes and goes on `noise_seed`, which is the same number if it is not given.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        serials: Sequence[str],
+        types: Sequence[ModuleType],
+        profile: NoiseProfile,
+        imu_ticks: int,
+        tick_s: float,
+        noise_seed: int | None = None,
+    ):
+        self.clocks: tuple[ModuleClock, ...] = tuple(
+            draw_clock(generator(seed, s, "clock"), profile) for s in serials
+        )
+        self.errors: SensorErrors = draw_sensor_errors(seed, serials, types, profile)
+        self._imu_ticks = imu_ticks
+        self._gear = np.array([t.gear_ratio for t in types])
+        noise = seed if noise_seed is None else noise_seed
+        self._joints = JointSensors(noise, serials, types, profile, self.errors, tick_s)
+        self._imus = Imus(noise, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
+        self._imu_values = np.zeros((len(types), 6))
+        self._imu_ns = [0] * len(types)
+
+    @property
+    def imu_bias(self) -> Array:
+        """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
+        return self.errors.imu_bias
+
+    def imu_due(self, tick: int) -> bool:
+        """Whether `read` at this tick needs the IMU's truth of this instant."""
+        return self._imus.every_tick or tick % self._imu_ticks == 0
+
+    def read(self, tick: int, truth: Instant) -> list[SensorSample]:
+        """Return one sample per module. To be called once a tick, in order."""
+        now = [module_time(clock, truth.t_ns) for clock in self.clocks]
+        if self.imu_due(tick):
+            self._imus.feel(truth.gyro_rad_s, truth.specific_force_m_s2)
+        if tick % self._imu_ticks == 0:
+            self._imu_values = self._imus.read(truth.motor_rad_s)
+            self._imu_ns = now
+        joint = self._joints.read(truth.q_rad, truth.qd_rad_s, truth.motor_rad_s, truth.elastic_nm)
+        values = np.empty((len(joint), 14))
+        values[:, :5] = joint
+        values[:, 4] *= self._gear
+        values[:, 5] = truth.current_a
+        values[:, 6] = truth.winding_c
+        values[:, 7] = truth.voltage_v
+        values[:, 8:] = self._imu_values
+        rows = values.tolist()
+        return [SensorSample(t, imu, *row) for t, imu, row in zip(now, self._imu_ns, rows, strict=True)]

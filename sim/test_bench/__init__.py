@@ -1,0 +1,1 @@
+"""Modules and robots on a bench: driven without agents or network."""

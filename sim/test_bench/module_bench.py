@@ -1,0 +1,140 @@
+"""One module's firmware and who commands it: a lease held, gains set and motions started, with no network.
+
+All that is sent goes through the firmware's inbox, encoded, as it would come from a network.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, Publication
+from module_agent.hardware.hardware import SensorSample
+from module_agent.wire.codec import decode, encode
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import (
+    Ack,
+    EffortProfile,
+    GainsCommand,
+    GainSet,
+    LeaseRequest,
+    MotionCommand,
+    MotionRecord,
+    Pattern,
+    Setpoint,
+    Status,
+)
+
+SENDER = "experiment"
+# As often as the coordinator does; a lease without it lapses.
+_KEEP_ALIVE_NS = 60_000_000
+_ASKED = 1
+
+
+class ExperimentFailed(RuntimeError):
+    """A module refused a command or broke a motion off; the message says which module, and why."""
+
+
+class ModuleBench:
+    """A module under command from its first tick to its last."""
+
+    def __init__(self, firmware: Firmware):
+        self.firmware = firmware
+        self.serial = firmware.config.serial
+        self.now_ns = 0
+        self.published_rows = False
+        self.winding_c = 0.0
+        self._record: MotionRecord | None = None
+        self._waiting: list[Incoming] = []
+        self._motions = 0
+        self._seq = 0
+        self._renewed_ns: int | None = None
+
+    def step(self, sample: SensorSample, arrived: Sequence[Incoming] = ()) -> float:
+        """Run one tick of the firmware and return its PWM; `arrived` has come from elsewhere.
+
+        `published_rows` says afterwards whether feedback went out in this tick.
+
+        Raises:
+            ExperimentFailed: the module refused what it was told since the last tick.
+        """
+        self.now_ns, self.winding_c = sample.t_ns, sample.winding_temperature_c
+        self._keep_alive()
+        waiting, self._waiting = self._waiting, []
+        pwm, out = self.firmware.step(sample.t_ns, sample, [*waiting, *arrived])
+        self.published_rows = any(isinstance(one, Publication) and one.leaf is Leaf.FEEDBACK for one in out)
+        for outgoing in out:
+            self._hear(outgoing)
+        return pwm
+
+    def start(self, pattern: Pattern, effort: EffortProfile | None = None) -> None:
+        """Start a motion in the next tick, with the efforts that it is fed forward if there are any."""
+        self._motions += 1
+        command = MotionCommand(**self._head(), motion_id=self._motions, pattern=pattern, effort=effort)
+        self._record = None
+        self._waiting.append(Incoming(Leaf.MOTION, encode(command), _ASKED))
+
+    def set_gains(self, gains: GainSet) -> None:
+        """Replace the gains in the next tick."""
+        self._waiting.append(Incoming(Leaf.GAINS, encode(GainsCommand(**self._head(), gains=gains)), _ASKED))
+
+    def setpoint(
+        self, position_rad: float | None, velocity_rad_s: float | None, effort_nm: float | None, echo_ns: int
+    ) -> Incoming:
+        """Return a set-point to hand to `step` when it arrives; `echo_ns` is what its sender knew."""
+        message = Setpoint(
+            **self._head() | {"echo_ns": echo_ns},
+            position_rad=position_rad,
+            velocity_rad_s=velocity_rad_s,
+            effort_nm=effort_nm,
+        )
+        return Incoming(Leaf.SETPOINT, encode(message), None)
+
+    def finished(self) -> MotionRecord | None:
+        """Return the record of the last motion that was started, None while it runs.
+
+        Raises:
+            ExperimentFailed: the motion was broken off.
+        """
+        record = self._record
+        if record is None or record.outcome == "running":
+            return None
+        if record.outcome != "done":
+            raise ExperimentFailed(f"a motion of module {self.serial} was broken off: {record.outcome}")
+        return record
+
+    def rows(self, first: int, end: int) -> Rows:
+        """Return feedback rows."""
+        return self.firmware.history.rows(first, end)
+
+    def _keep_alive(self) -> None:
+        if self._renewed_ns is None:
+            self._send_lease("acquire", _ASKED)
+        elif self.now_ns - self._renewed_ns >= _KEEP_ALIVE_NS:
+            self._send_lease("renew", None)
+
+    def _send_lease(self, action: Literal["acquire", "renew"], request: int | None) -> None:
+        lease = LeaseRequest(**self._head(), action=action)
+        self._waiting.append(Incoming(Leaf.LEASE, encode(lease), request))
+        self._renewed_ns = self.now_ns
+
+    def _head(self) -> dict[str, Any]:
+        """Return what every command carries."""
+        self._seq += 1
+        return {
+            "serial": self.serial,
+            "boot": self.firmware.config.boot,
+            "seq": self._seq,
+            "sender": SENDER,
+            "token": self.firmware.lease.token,
+            "echo_ns": self.now_ns,
+        }
+
+    def _hear(self, outgoing: Outgoing) -> None:
+        if isinstance(outgoing, Answer):
+            ack = decode(Ack, outgoing.payload)
+            if not ack.accepted:
+                raise ExperimentFailed(f"module {self.serial} refused: {ack.reason}: {ack.detail}")
+        elif outgoing.leaf is Leaf.STATUS:
+            record = decode(Status, outgoing.payload).motion
+            if record is not None and record.motion_id == self._motions:
+                self._record = record

@@ -1,0 +1,213 @@
+"""One direction of a network for messages that keep their order, asked tick by tick.
+
+A robot of any number of modules on the bench: its world, and every module's firmware under command.
+
+Motions run on the modules, or a host streams set-points to them through a network. Leases are kept without
+one: it is the set-points that are on trial.
+"""
+
+import heapq
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from coordinator.torque_control.feed_forward import SetPoints
+from module_agent.firmware.config import config_of
+from module_agent.firmware.firmware import Firmware, Incoming
+from module_agent.network_emulation.channel import Channel
+from module_agent.network_emulation.profile import NetworkProfile, PathProfile
+from module_agent.wire.messages import EffortProfile, GainSet, Pattern
+from sim.geometry.pose import Array, read_only
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.robot.robot_file import Robot
+from sim.test_bench.module_bench import ModuleBench
+from sim.world.world import TICK_NS, World
+
+T = TypeVar("T")
+
+
+class MessagePath(Generic[T]):
+    """What is sent comes out late, twice or not at all, as a path's profile has it (see `PathProfile`)."""
+
+    def __init__(self, path: PathProfile, rng: np.random.Generator):
+        self._channel = Channel(path, rng)
+        self._under_way: list[tuple[int, int, T]] = []
+        self._count = 0
+        self._newest_ns = 0
+
+    def send(self, t_ns: int, message: T) -> None:
+        """Send a message; times must not decrease."""
+        fate = self._channel.fate(t_ns * 1e-9)
+        if fate.lost:
+            return
+        at_ns = t_ns + round(fate.delay_s * 1e9)
+        if not fate.reordered:
+            # It waits for all that was sent before it, as on one connection.
+            at_ns = self._newest_ns = max(self._newest_ns, at_ns)
+        self._put(at_ns, message)
+        if fate.copy_delay_s is not None:
+            self._put(t_ns + round(fate.copy_delay_s * 1e9), message)
+
+    def arrived(self, t_ns: int) -> list[T]:
+        """Return what has come since the last call, in the order in which it came."""
+        found = []
+        while self._under_way and self._under_way[0][0] <= t_ns:
+            found.append(heapq.heappop(self._under_way)[2])
+        return found
+
+    def _put(self, at_ns: int, message: T) -> None:
+        # The count keeps messages that come at the same time in order, and from being compared themselves.
+        self._count += 1
+        heapq.heappush(self._under_way, (at_ns, self._count, message))
+
+
+class Track(NamedTuple):
+    """What the joints really did, tick by tick, (m, n) each and read-only; duty as the bridges applied it."""
+
+    q_rad: Array
+    spring_torque_nm: Array
+    duty: Array
+
+
+class Streaming(NamedTuple):
+    """How a host streams set-points: through which network, how often, and which of their values.
+
+    velocity, effort: whether set-points have them; without, their loops are off.
+    """
+
+    network: NetworkProfile
+    rate_hz: float
+    velocity: bool
+    effort: bool
+
+
+class BenchRobot:
+    """All modules of a robot, held from the first tick on; `seed` as in `World`, `noise_seed` the day.
+
+    Raises:
+        KeyError: unknown noise profile.
+        ValueError: the robot's base or links are too soft to carry it.
+    """
+
+    def __init__(
+        self, robot: Robot, seed: int, noise: str | NoiseProfile | None = None, noise_seed: int | None = None
+    ):
+        self.world = World(robot, seed, noise, noise_seed=noise_seed)
+        self.modules = tuple(
+            ModuleBench(Firmware(config_of(module, boot)))
+            for boot, module in enumerate(self.world.modules, start=1)
+        )
+        self.by_serial = {module.serial: module for module in self.modules}
+        self._pwm = [0.0] * len(self.modules)
+        self._taken: list[tuple[Array, Array, Array]] = []
+        # In their first tick all modules are taken under command, and hold still.
+        self.tick()
+
+    def __enter__(self) -> "BenchRobot":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the world."""
+        self.world.close()
+
+    def tick(self, arrived: Mapping[str, Sequence[Incoming]] | None = None) -> None:
+        """Advance world and firmware by one tick; the PWM acts in the next, as on the bus."""
+        samples = self.world.step(self._pwm)
+        mail = arrived or {}
+        self._pwm = [
+            module.step(sample, mail.get(module.serial, ()))
+            for module, sample in zip(self.modules, samples, strict=True)
+        ]
+        plant = self.world.plant
+        self._taken.append((plant.q_rad, plant.spring_torque_nm, plant.duty))
+
+    def wait(self, duration_s: float) -> None:
+        """Let time pass."""
+        for _ in range(round(duration_s * 1e9 / TICK_NS)):
+            self.tick()
+
+    def set_gains(self, gains: Mapping[str, GainSet]) -> None:
+        """Set gains by serial."""
+        for serial, one in gains.items():
+            self.by_serial[serial].set_gains(one)
+        self.tick()
+
+    def run(
+        self, patterns: Mapping[str, Pattern], efforts: Mapping[str, EffortProfile] | None = None
+    ) -> Track:
+        """Run one motion on each of some modules, by serial, beginning in the same tick.
+
+        Raises:
+            ExperimentFailed: a module refused its motion, or it was broken off.
+        """
+        for serial, pattern in patterns.items():
+            self.by_serial[serial].start(pattern, (efforts or {}).get(serial))
+        running = [self.by_serial[serial] for serial in patterns]
+        self._taken.clear()
+        while True:
+            self.tick()
+            # Every one is asked in every tick, so that one that is broken off is heard at once.
+            if None not in [module.finished() for module in running]:
+                return self._track()
+
+    def stream(self, serials: Sequence[str], points: SetPoints, how: Streaming, seed: int) -> Track:
+        """Stream set-points to some modules, in the order of the points' columns.
+
+        Every one holds what the reference says at the moment when it is sent.
+
+        Raises:
+            ExperimentFailed: a module refused what it was asked.
+        """
+        host = _Host([self.by_serial[serial] for serial in serials], points, how, seed)
+        self._taken.clear()
+        for row in range(len(points.reference.t_s)):
+            self.tick(host.exchange(self.world.t_ns, row))
+            host.listen(self.world.t_ns)
+        return self._track()
+
+    def _track(self) -> Track:
+        q, torque, duty = np.array(self._taken).transpose(1, 0, 2)
+        return Track(read_only(q), read_only(torque), read_only(duty))
+
+
+class _Host:
+    """Who streams: it hears the modules' feedback, and echoes in every set-point the newest that it knows."""
+
+    def __init__(self, modules: Sequence[ModuleBench], points: SetPoints, how: Streaming, seed: int):
+        self._modules, self._points, self._how = modules, points, how
+        self._every = max(1, round(1e9 / (how.rate_hz * TICK_NS)))
+        down, up = np.random.default_rng((seed, 0x5E7)).spawn(2)
+        to_module, to_host = how.network.path("module"), how.network.path("coordinator")
+        self._down = [MessagePath[Incoming](to_module, rng) for rng in down.spawn(len(modules))]
+        self._up = [MessagePath[int](to_host, rng) for rng in up.spawn(len(modules))]
+        self._heard_ns = [module.now_ns for module in modules]
+
+    def exchange(self, t_ns: int, row: int) -> dict[str, list[Incoming]]:
+        """Send what is due, and return what arrives at every module in this tick."""
+        reference, effort = self._points.reference, self._points.effort_nm
+        for column, module in enumerate(self._modules):
+            self._heard_ns[column] = max([self._heard_ns[column], *self._up[column].arrived(t_ns)])
+            if row % self._every == 0:
+                message = module.setpoint(
+                    float(reference.q_rad[row, column]),
+                    float(reference.qd_rad_s[row, column]) if self._how.velocity else None,
+                    float(effort[row, column]) if self._how.effort else None,
+                    self._heard_ns[column],
+                )
+                self._down[column].send(t_ns, message)
+        return {
+            module.serial: path.arrived(t_ns) for module, path in zip(self._modules, self._down, strict=True)
+        }
+
+    def listen(self, t_ns: int) -> None:
+        """Send off the modules' feedback that was published in this tick, as far as it matters: its time."""
+        for module, path in zip(self._modules, self._up, strict=True):
+            if module.published_rows:
+                path.send(t_ns, module.now_ns)

@@ -1,0 +1,1 @@
+"""The thesis' experiments on simulated modules."""

@@ -1,0 +1,229 @@
+"""The thesis' amplitude experiment: trials on a rig one after the other, and many rigs at once.
+
+A series is one rig, put up once, on which trials of given amplitudes are run in turn, as the thesis ran them:
+the same modules, with the same errors, that get warmer. Rigs differ in their seed.
+"""
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from multiprocessing.synchronize import Event
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from coordinator.excitation.plan import Plan
+from module_agent.estimate.circle_point_analysis import CircleFit
+from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
+from module_agent.wire.feedback_rows import Rows
+from sim.robot.noise_choice import NoiseChoice
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.robot_tree import true_chain
+from sim.scoring.chain_score import link_length_m
+from sim.test_bench.one_joint_rig import JOINT, OneJointRig, TrialRows, analyse
+from sim.thesis.published import ALIGNMENTS, Alignment, thesis_length
+
+Purpose = Literal["sweep", "repeats"]
+ROBOTS_OWN_NOISE = NoiseChoice()
+
+
+class Series(NamedTuple):
+    """The trials of one rig; `rig` is its number, `seed` its own."""
+
+    purpose: Purpose
+    alignment: Alignment
+    length_mm: int
+    rig: int
+    seed: int
+    amplitudes_rad: tuple[float, ...]
+    noise: NoiseChoice = ROBOTS_OWN_NOISE
+
+    @property
+    def robot(self) -> Robot:
+        """The shipped robot that is this arm."""
+        return load_robot(f"thesis_{self.length_mm}_{self.alignment}")
+
+
+class Trial(NamedTuple):
+    """One trial: the estimated distance from the joint's axis to the second IMU, and how the joint moved.
+
+    estimated_mm, sigma_mm: by the thesis' analysis; unfiltered_mm: the same data without its filter. None
+        where the analysis found too little motion; `note` says so.
+    commanded_rad_s, reached_rad_s: peak speeds of the windowed sine; the latter as measured and smoothed.
+    saturated: the commanded speed is beyond what the module's velocity loop takes.
+    stroke: size of the motion over that of the commanded one, both rms.
+    """
+
+    purpose: Purpose
+    alignment: Alignment
+    length_mm: int
+    rig: int
+    trial: int
+    amplitude_rad: float
+    true_mm: float
+    estimated_mm: float | None
+    sigma_mm: float | None
+    unfiltered_mm: float | None
+    commanded_rad_s: float
+    reached_rad_s: float
+    saturated: bool
+    stroke: float
+    note: str
+
+    def error(self, filtered: bool = True) -> float | None:
+        """Return the relative error of the estimate, with the thesis' filter or without."""
+        found = self.estimated_mm if filtered else self.unfiltered_mm
+        return None if found is None else found / self.true_mm - 1.0
+
+
+class Interrupted(RuntimeError):
+    """The experiment was stopped before its end."""
+
+
+def sweep_series(
+    lengths_mm: Sequence[int],
+    amplitudes_rad: Sequence[float],
+    rigs: int,
+    seed: int,
+    noise: NoiseChoice = ROBOTS_OWN_NOISE,
+) -> list[Series]:
+    """Return the sweep over amplitudes: every length in both alignments, on `rigs` rigs each."""
+    return [
+        Series("sweep", alignment, length, rig, _seed(seed, 0, a, length, rig), tuple(amplitudes_rad), noise)
+        for a, alignment in enumerate(ALIGNMENTS)
+        for length in lengths_mm
+        for rig in range(rigs)
+    ]
+
+
+def repeat_series(
+    lengths_mm: Sequence[int],
+    trials: int,
+    seed: int,
+    noise: NoiseChoice = ROBOTS_OWN_NOISE,
+) -> list[Series]:
+    """Return the repeated trials at the amplitudes that the thesis chose (its tables 4 and 5)."""
+    return [
+        Series(
+            "repeats",
+            alignment,
+            length,
+            0,
+            _seed(seed, 1, a, length, 0),
+            (thesis_length(alignment, length).amplitude_rad,) * trials,
+            noise,
+        )
+        for a, alignment in enumerate(ALIGNMENTS)
+        for length in lengths_mm
+    ]
+
+
+def _seed(seed: int, *key: int) -> int:
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
+
+
+# ---------------------------------------------------------------------- one rig
+
+
+def run_series(series: Series, stopping: Callable[[], bool] = lambda: False) -> list[Trial]:
+    """Put up the rig and run its trials; `stopping` is asked before each.
+
+    Raises:
+        ExperimentFailed: a module refused a motion or broke it off.
+        Interrupted: `stopping` said so.
+        KeyError, ValueError: no such noise profile or effect, no such robot.
+    """
+    robot = series.robot
+    true_mm = 1e3 * link_length_m(true_chain(robot), child=1)
+    found = []
+    with OneJointRig(robot, series.seed, series.noise.of(robot)) as rig:
+        clamp = rig.modules[JOINT].firmware.config.kind.velocity_clamp_rad_s
+        for number, amplitude in enumerate(series.amplitudes_rad):
+            if stopping():
+                raise Interrupted(f"stopped before the end of {series.length_mm} mm {series.alignment}")
+            rows = rig.trial(Plan(sine_amplitude_rad=amplitude))
+            found.append(_trial(series, number, amplitude, true_mm, rows, clamp))
+    return found
+
+
+def _trial(
+    series: Series, number: int, amplitude: float, true_mm: float, rows: TrialRows, clamp_rad_s: float
+) -> Trial:
+    filtered, note = _fit(rows, TAPS)
+    unfiltered, _ = _fit(rows, taps=1)
+    joint = rows.sine.joint
+    commanded = float(np.nanmax(np.abs(joint["velocity_command_rad_s"])))
+    return Trial(
+        purpose=series.purpose,
+        alignment=series.alignment,
+        length_mm=series.length_mm,
+        rig=series.rig,
+        trial=number,
+        amplitude_rad=amplitude,
+        true_mm=true_mm,
+        estimated_mm=filtered and 1e3 * filtered.distance_m,
+        sigma_mm=filtered and 1e3 * filtered.sigma_distance_m,
+        unfiltered_mm=unfiltered and 1e3 * unfiltered.distance_m,
+        commanded_rad_s=commanded,
+        reached_rad_s=float(np.abs(gaussian_filter(joint["velocity_rad_s"])).max()),
+        saturated=commanded > clamp_rad_s,
+        stroke=_stroke(joint),
+        note=note,
+    )
+
+
+def _fit(rows: TrialRows, taps: int) -> tuple[CircleFit | None, str]:
+    """Return the fit, or why there is none."""
+    try:
+        return analyse(rows, taps), ""
+    except ValueError as error:
+        return None, str(error)
+
+
+def _stroke(joint: Rows) -> float:
+    """Return the size of a motion over that of the commanded one; the sag under a load counts for neither."""
+    moving = joint[np.isfinite(joint["position_command_rad"])]
+    return float(np.std(moving["position_rad"]) / np.std(moving["position_command_rad"]))
+
+
+# ---------------------------------------------------------------------- many rigs
+
+_stop: Event | None = None
+
+
+def _start_worker(stop: Event) -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
+    global _stop
+    _stop = stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _run_in_worker(series: Series) -> list[Trial]:
+    return run_series(series, lambda: _stop is not None and _stop.is_set())
+
+
+def run_all(
+    series: Sequence[Series], processes: int, on_done: Callable[[Series], None] = lambda _: None
+) -> list[Trial]:
+    """Run series in several processes; return their trials in the order of the series.
+
+    The result does not depend on the number of processes. Whatever ends this early - Ctrl-C, or the failure
+    of one series - ends the others after the trial that they are at.
+
+    Raises:
+        ExperimentFailed, KeyError, ValueError: as `run_series`.
+    """
+    context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    with ProcessPoolExecutor(processes, context, _start_worker, (stop,)) as pool:
+        work: dict[Future[list[Trial]], Series] = {pool.submit(_run_in_worker, each): each for each in series}
+        try:
+            for done in as_completed(work):
+                done.result()
+                on_done(work[done])
+        except BaseException:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+        return [trial for future in work for trial in future.result()]

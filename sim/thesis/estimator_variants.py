@@ -1,0 +1,272 @@
+"""Where the joint regression may take the joint's motion from, and what each source makes of one trial.
+
+The encoder counts in steps, the gyro drifts and sees the link's bending too, the command is what the joint
+was told and not what it did. All variants solve the same equations (`joint_regression`); they differ in the
+angle that these are written in, and in what weighs them:
+
+    encoder   the encoder's angle; the gyro is a reading, which tells the axis and how the link bends
+    gyro      the gyro's integral, of which the encoder tells offset and slope only
+    fused     the gyro's integral where it is fast, the encoder's angle where it is slow
+    command   the encoder's angle, the equations weighed with the command behind the filter that fits it
+
+Gyro and fused see the bending and a base's swing as they are, but not how a swinging base pushes; of a gyro
+whose scale is wrong they take the error. The agents use `encoder`.
+
+What came of comparing estimators: one row for each arm and estimator, to print and as JSON.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rich.table import Table
+
+from module_agent.estimate.circle_point_analysis import rest_reading
+from module_agent.estimate.gaussian_filter import gaussian_filter
+from module_agent.estimate.joint_regression import JointRegression, regress_joint
+from module_agent.estimate.observed_motion import MotionWindows, SeenMotion, seen_motions
+from module_agent.estimate.smoothing import SmoothMotion
+from module_agent.estimate.windows import Array, ImuWindow, JointWindow, imu_window
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
+from sim.scoring.chain_score import link_length_m
+from sim.test_bench.one_joint_rig import IMU, OneJointRig, TrialRows, analyse, regress, windows
+from sim.thesis.joint_trial import bound_m, imu_knowledge, trial_plan
+from sim.thesis.published import Alignment, thesis_length
+
+# The encoder tells what is slower than this Gaussian low-pass, the gyro the rest: 96 % of 2 Hz, so that a
+# link's bending is all in the angle.
+CROSSOVER_S = 0.2
+# The joint follows its command within this many rows of 4 ms either way.
+FOLLOWS_ROWS = 24
+
+
+class Found(NamedTuple):
+    """An estimator's error of the distance, and one sigma as it states it, both in metres."""
+
+    error_m: float
+    sigma_m: float
+
+
+class Comparison(NamedTuple):
+    """What every estimator made of one trial, by name, and the bound of that recording [m]."""
+
+    found: dict[str, Found]
+    bound_m: float
+
+
+Variant = Callable[[TrialRows, NoiseProfile], tuple[float, float]]
+
+
+def compare(length_mm: int, alignment: Alignment, profile: NoiseProfile, seed: int) -> Comparison:
+    """Run one trial of the thesis' arm and all estimators on it, without those that find too little motion.
+
+    Raises:
+        KeyError: the thesis had no such arm.
+        ExperimentFailed: a module refused a motion, or broke it off.
+    """
+    robot = load_robot(f"thesis_{length_mm}_{alignment}")
+    with OneJointRig(robot, seed, profile) as rig:
+        trial = rig.trial(trial_plan(thesis_length(alignment, length_mm), profile))
+    return judge_all(trial, profile, link_length_m(true_chain(robot), child=IMU))
+
+
+def judge_all(trial: TrialRows, profile: NoiseProfile, true_m: float) -> Comparison:
+    """Run all estimators on one recording whose true distance is known."""
+    found: dict[str, Found] = {}
+    for name, variant in VARIANTS.items():
+        try:
+            distance_m, sigma_m = variant(trial, profile)
+        except ValueError:
+            continue
+        found[name] = Found(distance_m - true_m, sigma_m)
+    return Comparison(found, bound_m(trial, profile))
+
+
+# ---------------------------------------------------------------------- the variants
+
+
+def _thesis(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    fit = analyse(trial)
+    return fit.distance_m, fit.sigma_distance_m
+
+
+def _encoder(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    return _told(regress(trial, imu_knowledge(profile)))
+
+
+def _gyro(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    return _regressed(trial, profile, [_by_gyro(trial, window, None) for window in windows(trial)])
+
+
+def _fused(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    return _regressed(trial, profile, [_by_gyro(trial, window, CROSSOVER_S) for window in windows(trial)])
+
+
+def _command(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
+    motions = [
+        seen._replace(instrument=SmoothMotion(_commanded(window.joint, motion.joint["position_command_rad"])))
+        for seen, window, motion in zip(
+            seen_motions(windows(trial)), windows(trial), (trial.constant, trial.sine), strict=True
+        )
+    ]
+    return _regressed(trial, profile, motions)
+
+
+VARIANTS: Mapping[str, Variant] = {
+    "thesis": _thesis,
+    "encoder": _encoder,
+    "gyro": _gyro,
+    "fused": _fused,
+    "command": _command,
+}
+
+
+def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[SeenMotion]) -> tuple[float, float]:
+    rest = rest_reading(imu_window(trial.rest))
+    return _told(regress_joint(motions, rest, imu_knowledge(profile)))
+
+
+def _told(found: JointRegression) -> tuple[float, float]:
+    return found.distance_m, found.sigma_distance_m
+
+
+def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None) -> SeenMotion:
+    """Return the motion with an angle from the gyro; the encoder gives its slow part, or offset and slope."""
+    since_ns = window.imu.t_ns - window.offset_ns
+    inside = (since_ns >= window.joint.t_ns[0]) & (since_ns <= window.joint.t_ns[-1])
+    imu = ImuWindow(*(column[inside] for column in window.imu))
+    t_s = 1e-9 * (imu.t_ns - imu.t_ns[0])
+    encoder = np.interp(since_ns[inside], window.joint.t_ns, window.joint.position_rad)
+    rest = rest_reading(imu_window(trial.rest))
+    gyro = imu.gyro_rad_s - rest.gyro_offset_rad_s
+    rate = np.gradient(encoder, t_s)
+    axis = rate @ gyro
+    along = gyro @ axis / np.linalg.norm(axis)
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (along[1:] + along[:-1]) * np.diff(t_s))])
+    rest_of = encoder - turned
+    if crossover_s is None:
+        turned = turned + np.polyval(np.polyfit(t_s, rest_of, 1), t_s)
+    else:
+        spread = crossover_s * (t_s.size - 1) / t_s[-1]
+        turned = turned + gaussian_filter(rest_of, 2 * round(4.0 * spread) + 1, spread)
+    joint = JointWindow(since_ns[inside], turned, along)
+    return seen_motions([window._replace(joint=joint)])[0]._replace(base=None)
+
+
+def _commanded(joint: JointWindow, command_rad: Array) -> JointWindow:
+    """Return the joint's motion as its command tells it: the command behind the filter that fits it best."""
+    command = np.where(np.isfinite(command_rad), command_rad, joint.position_rad)
+    padded = np.pad(command, (FOLLOWS_ROWS, 0), mode="edge")
+    lags = np.lib.stride_tricks.sliding_window_view(padded, FOLLOWS_ROWS + 1)[:, ::4]
+    columns = np.hstack([lags, np.ones((len(lags), 1))])
+    weights, *_ = np.linalg.lstsq(columns, joint.position_rad, rcond=1e-9)
+    return joint._replace(position_rad=columns @ weights)
+
+
+# Of a normal error 95 in 100 are within this many standard deviations.
+_WITHIN = 1.96
+
+
+class Arm(NamedTuple):
+    """One of the thesis' arms."""
+
+    alignment: Alignment
+    length_mm: int
+
+
+class EstimatorRow(NamedTuple):
+    """An estimator on an arm: figures over all trials, lengths in millimetres.
+
+    ratio: rms error over the bound, both over all trials. covered: the share of 95 % intervals that hold the
+    truth.
+    """
+
+    alignment: Alignment
+    length_mm: int
+    estimator: str
+    trials: int
+    mean_error_mm: float
+    bias_mm: float
+    rms_mm: float
+    sigma_mm: float
+    bound_mm: float
+    ratio: float
+    covered: float
+
+
+def estimator_rows(arm: Arm, comparisons: Sequence[Comparison]) -> list[EstimatorRow]:
+    """Return a row for every estimator that found something in any trial of an arm."""
+    bound = _rms(np.array([each.bound_m for each in comparisons]))
+    rows = []
+    for name in VARIANTS:
+        found = [each.found[name] for each in comparisons if name in each.found]
+        if not found:
+            continue
+        error, sigma = np.array(found).T
+        rows.append(
+            EstimatorRow(
+                arm.alignment,
+                arm.length_mm,
+                name,
+                len(found),
+                1e3 * float(np.abs(error).mean()),
+                1e3 * float(error.mean()),
+                1e3 * _rms(error),
+                1e3 * _rms(sigma),
+                1e3 * bound,
+                _rms(error) / bound,
+                float(np.mean(np.abs(error) < _WITHIN * sigma)),
+            )
+        )
+    return rows
+
+
+def estimator_table(rows: Sequence[EstimatorRow]) -> Table:
+    """Return the rows as a table, a section for each arm."""
+    titles = (
+        "arm",
+        "estimator",
+        "trials",
+        "mean |e|",
+        "bias",
+        "rms",
+        "sigma",
+        "bound",
+        "rms / bound",
+        "in 95 %",
+    )
+    shown = Table(*titles, title="Errors of the radial distance [mm]")
+    for row, following in zip(rows, [*rows[1:], None], strict=True):
+        last = following is None or (following.alignment, following.length_mm) != (
+            row.alignment,
+            row.length_mm,
+        )
+        shown.add_row(
+            f"{row.length_mm} mm {row.alignment}",
+            row.estimator,
+            str(row.trials),
+            *(f"{value:.3f}" for value in (row.mean_error_mm, row.bias_mm, row.rms_mm, row.sigma_mm)),
+            f"{row.bound_mm:.3f}",
+            f"{row.ratio:.2f}",
+            f"{100.0 * row.covered:.0f} %",
+            end_section=last,
+        )
+    return shown
+
+
+def write_estimators(path: Path, settings: dict[str, object], rows: Sequence[EstimatorRow]) -> None:
+    """Write settings and rows as JSON.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    text = json.dumps({"settings": settings, "rows": [row._asdict() for row in rows]}, indent=2)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def _rms(values: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> float:
+    return float(np.sqrt(np.mean(values**2)))

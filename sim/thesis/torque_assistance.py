@@ -1,0 +1,287 @@
+"""Torque assistance (thesis 6.3.2, 6.3.3): how joints follow a motion with and without calculated torque.
+
+The efforts come from chain and parameters as the system identifies them on the same modules on another day,
+and make up for what the motors take by the catalogue (`coordinator.torque_control.motor_compensation`). The
+true motion of the joints is compared with the commanded motion.
+"""
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identify import identify
+from coordinator.torque_control.feed_forward import (
+    Reference,
+    SetPoints,
+    feed_forward,
+    joint_reference,
+    on_module,
+    standing,
+)
+from coordinator.torque_control.motor_compensation import with_drive
+from module_agent.control.gains import default_gains
+from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.chain import Array, Chain
+from module_agent.network_emulation.profile_file import network
+from module_agent.wire.messages import GainSet, GoTo, Pattern, Rest
+from sim.geometry.pose import read_only
+from sim.imperfections.noise_profile import NoiseProfile, imu_kind
+from sim.robot.robot_file import Robot, load_robot
+from sim.robot.variants import somewhere
+from sim.test_bench.module_bench import ExperimentFailed
+from sim.test_bench.robot_bench import BenchRobot, Streaming, Track
+from sim.thesis.published import Reading, setting, thesis_gains, without_velocity
+from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.session import record_session
+
+# What a set-point holds: position; position and velocity; position, velocity and calculated torque.
+InputMode = Literal[1, 2, 3]
+MODES: tuple[InputMode, ...] = (1, 2, 3)
+
+# The day of the identification is 0, that of the trial another one.
+TRIAL_DAY = 1
+TRAVEL_RAD_S = 1.0
+# How long a joint is given to settle under new gains, and to come to rest after the motion.
+SETTLE_S = 1.5
+_STILL_S = 0.5
+# A joint that still moves by so much in the last half second of its rest is unstable: 1 mm rms at the end of
+# the thesis' arm of 484 mm.
+MOST_RINGING_RAD = 2e-3
+# So is one whose bridge is at its limit for more than this share of the motion: no loop is closed then.
+MOST_SATURATED = 0.25
+_SATURATED_DUTY = 0.98
+# And so is one whose loops answer single counts of the encoder with all that the bridge has: its duty jumps
+# by half of its range or more from one tick to the next. Where that happens at all, it does in 34 to 57 % of
+# the ticks; in the others in 6 % at most.
+MOST_THROWN = 0.20
+_THROWN_DUTY = 1.0
+
+
+class Delivery(NamedTuple):
+    """How set-points come to the loops: in the module itself, or streamed by a host through a network."""
+
+    name: str
+    network: str | None = None
+    rate_hz: float = 0.0
+
+
+ON_MODULE = Delivery("on the module")
+
+
+class Gains(NamedTuple):
+    """Which gains: the factory's of a strategy, or one of the thesis' settings in one reading of it."""
+
+    strategy: int
+    setting: str | None = None
+    reading: Reading | None = None
+
+    @property
+    def name(self) -> str:
+        """The setting in a word."""
+        return f"factory S{self.strategy}" if self.setting is None else self.setting
+
+
+class Model(NamedTuple):
+    """What is known of a robot: chain and inertial parameters (10 n,), as identified."""
+
+    chain: Chain
+    phi: Array
+
+
+class Stage(NamedTuple):
+    """A robot and the motion that it is asked for; joints without a pattern hold where they start."""
+
+    robot: Robot
+    start_rad: Mapping[str, float]
+    patterns: Mapping[str, Pattern]
+
+
+class Follow(NamedTuple):
+    """How a motion was followed, over the joints that were asked to move.
+
+    rms_error_rad: of the true position, over the whole motion. motion_rms_rad: of the motion about its mean.
+    ringing_rad: the largest standard deviation of a joint at the end of its rest afterwards. saturated: the
+    largest share of the motion that a bridge was at its limit, thrown: of it that a duty jumped by half its
+    range or more within a tick. unstable: why it counts as such, empty if not.
+    asked_rad, done_rad: (m, k) of the joints that moved, at 250 Hz; empty if the motion was broken off.
+    """
+
+    rms_error_rad: float
+    motion_rms_rad: float
+    ringing_rad: float
+    saturated: float
+    thrown: float
+    unstable: str
+    asked_rad: Array
+    done_rad: Array
+
+
+def identified_model(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> Model:
+    """Run one whole session on a simulated robot, and return what the coordinator makes of it.
+
+    Raises:
+        what `record_session` and `identify` raise.
+    """
+    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
+    found = identify(record_session(settings, plan or Plan(imu=imu_kind(noise))))
+    if found.inertia is None:
+        raise ValueError(
+            f"the plan leaves out the dynamics of {robot.name}: there is nothing to calculate from"
+        )
+    return Model(found.kinematics.fit.chain, found.inertia.seen.fit.phi)
+
+
+def standing_robot(name: str, seed: int) -> Robot:
+    """Return a shipped robot at the place that the seed draws."""
+    return somewhere(load_robot(name), seed)
+
+
+def follow(
+    stage: Stage,
+    gains: Gains,
+    mode: InputMode,
+    delivery: Delivery,
+    model: Model,
+    noise: NoiseProfile,
+    seed: int,
+) -> Follow:
+    """Let a robot follow a motion, and judge how it does.
+
+    The joints go to the start under the factory's gains and settle under those of the trial, in the same
+    input mode; then comes the motion, and a rest after it.
+    """
+    movers = list(stage.patterns)
+    types = {module.serial: module_type(module.type) for module in stage.robot.modules}
+    kinds = [types[serial] for serial in movers]
+    sets = [_gain_set(kind, gains, mode) for kind in kinds]
+    points = _phases(stage, model)
+    try:
+        with BenchRobot(stage.robot, seed, noise, noise_seed=TRIAL_DAY) as bench:
+            bench.run(
+                {s: GoTo(target_rad=q, max_speed_rad_s=TRAVEL_RAD_S) for s, q in stage.start_rad.items()}
+            )
+            points = _driven(points, kinds, sets, [bench.by_serial[s].winding_c for s in movers])
+            bench.set_gains(dict(zip(movers, sets, strict=True)))
+            if delivery.network is None:
+                tracks = _on_module(bench, stage, points, mode)
+            else:
+                tracks = _streamed(bench, movers, points, mode, delivery, seed)
+    except ExperimentFailed as error:
+        return _broken_off(points[1].reference, str(error))
+    columns = [stage.robot.serials.index(serial) for serial in movers]
+    return judge(points[1].reference, *(_of(track, columns) for track in tracks[1:]))
+
+
+def judge(asked: Reference, moving: Track, after: Track) -> Follow:
+    """Return how a motion was followed; columns are the joints that moved, `after` is the rest behind it."""
+    q = asked.q_rad
+    error = moving.q_rad[: len(q)] - q
+    still = round(_STILL_S * 1e3)
+    ringing = float(after.q_rad[-still:].std(axis=0).max())
+    saturated = _largest_share(np.abs(moving.duty) > _SATURATED_DUTY)
+    thrown = _largest_share(np.abs(np.diff(moving.duty, axis=0)) > _THROWN_DUTY)
+    return Follow(
+        rms_error_rad=_rms(error),
+        motion_rms_rad=_rms(q - q.mean(axis=0)),
+        ringing_rad=ringing,
+        saturated=saturated,
+        thrown=thrown,
+        unstable=_unstable(ringing, saturated, thrown),
+        asked_rad=read_only(q[::4].copy()),
+        done_rad=read_only(moving.q_rad[: len(q) : 4].copy()),
+    )
+
+
+def _largest_share(when: NDArray[np.bool_]) -> float:
+    return float(np.mean(when, axis=0).max())
+
+
+def _unstable(ringing_rad: float, saturated: float, thrown: float) -> str:
+    found = []
+    if ringing_rad > MOST_RINGING_RAD:
+        found.append(f"rings by {1e3 * ringing_rad:.1f} mrad")
+    if saturated > MOST_SATURATED:
+        found.append(f"saturates {100.0 * saturated:.0f} % of the time")
+    if thrown > MOST_THROWN:
+        found.append(f"is thrown to and fro in {100.0 * thrown:.0f} % of the ticks")
+    return ", ".join(found)
+
+
+def _broken_off(asked: Reference, why: str) -> Follow:
+    nothing = read_only(np.empty((0, asked.q_rad.shape[1])))
+    motion = _rms(asked.q_rad - asked.q_rad.mean(axis=0))
+    return Follow(np.inf, motion, np.inf, 1.0, 1.0, f"broken off: {why}", nothing, nothing)
+
+
+def _phases(stage: Stage, model: Model) -> list[SetPoints]:
+    """Return the set-points of the joints that move: settling, the motion, the rest after it."""
+    serials = model.chain.serials
+    motion = joint_reference(serials, stage.patterns, stage.start_rad)
+    phases = (standing(motion, 0, SETTLE_S), motion, standing(motion, -1, SETTLE_S))
+    columns = [serials.index(serial) for serial in stage.patterns]
+    return [_picked(feed_forward(model.chain, model.phi, each), columns) for each in phases]
+
+
+def _driven(
+    phases: list[SetPoints], kinds: list[ModuleType], gains: list[GainSet], winding_c: list[float]
+) -> list[SetPoints]:
+    """Return phases that follow on each other with what the motors take, as they get warm on the way."""
+    driven = with_drive(_joined(phases), kinds, gains, winding_c).effort_nm
+    ends = np.cumsum([len(phase.effort_nm) for phase in phases])[:-1]
+    parts = np.split(driven, ends)
+    return [phase._replace(effort_nm=part) for phase, part in zip(phases, parts, strict=True)]
+
+
+def _joined(phases: list[SetPoints]) -> SetPoints:
+    signals = zip(*(phase.reference for phase in phases), strict=True)
+    reference = Reference(*(np.concatenate(signal) for signal in signals))
+    return SetPoints(reference, np.concatenate([phase.effort_nm for phase in phases]))
+
+
+def _picked(points: SetPoints, columns: list[int]) -> SetPoints:
+    t_s, *motion = points.reference
+    chosen = Reference(t_s, *(read_only(signal[:, columns].copy()) for signal in motion))
+    return SetPoints(chosen, read_only(points.effort_nm[:, columns].copy()))
+
+
+def _gain_set(kind: ModuleType, gains: Gains, mode: InputMode) -> GainSet:
+    if gains.setting is None or gains.reading is None:
+        chosen = default_gains(kind, gains.strategy)
+    else:
+        chosen = thesis_gains(kind, setting(gains.setting), gains.reading)
+    return without_velocity(chosen) if mode == 1 else chosen
+
+
+def _on_module(bench: BenchRobot, stage: Stage, points: list[SetPoints], mode: InputMode) -> list[Track]:
+    rest = dict.fromkeys(stage.patterns, Rest(duration_s=SETTLE_S))
+    tracks = []
+    for patterns, phase in zip((rest, stage.patterns, rest), points, strict=True):
+        efforts = dict(zip(stage.patterns, on_module(phase), strict=True)) if mode == 3 else None
+        tracks.append(bench.run(patterns, efforts))
+    return tracks
+
+
+def _streamed(
+    bench: BenchRobot,
+    movers: list[str],
+    points: list[SetPoints],
+    mode: InputMode,
+    delivery: Delivery,
+    seed: int,
+) -> list[Track]:
+    assert delivery.network is not None
+    how = Streaming(network(delivery.network), delivery.rate_hz, velocity=mode > 1, effort=mode == 3)
+    track = bench.stream(movers, _joined(points), how, seed)
+    ends = np.cumsum([len(phase.effort_nm) for phase in points])[:-1]
+    return [Track(*part) for part in zip(*(np.split(signal, ends) for signal in track), strict=True)]
+
+
+def _of(track: Track, columns: list[int]) -> Track:
+    return Track(*(signal[:, columns] for signal in track))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

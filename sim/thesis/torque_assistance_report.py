@@ -1,0 +1,330 @@
+"""What torque assistance came to: a table of rms tracking errors, the bars, and both as JSON.
+
+Torque assistance as plain figures: of every combination the rms errors of all modes, and who is unstable.
+
+Each combination is one piece of work; robots are identified beforehand, or known without error.
+
+How the thesis' arm follows in the three input modes, as a picture: its figures 52 to 61.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from rich.table import Table
+
+from sim.geometry.pose import read_only
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.robot.robot_tree import true_chain, true_inertia
+from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
+from sim.thesis.torque_assistance import MODES, ON_MODULE, Follow, Model, standing_robot
+from sim.thesis.torque_assistance_cases import Case, Combination, robots_of, try_case
+
+# What the six joints of an arm are to gain under torque control.
+LEAST_GAIN = 3.0
+
+
+class Bar(NamedTuple):
+    """What is asked of all combinations of some kind, of how many it is true, and of which it is not."""
+
+    asked: str
+    stable: int
+    kept: int
+    missed: tuple[str, ...]
+    unstable: tuple[str, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether every stable combination keeps it."""
+        return self.kept == self.stable > 0
+
+
+def bars(found: Sequence[Combination]) -> list[Bar]:
+    """Judge all combinations: the thesis' arm under its gains and the factory's, and arms of six joints.
+
+    Under strategy 3 calculated torque has its limits: an effort loop that is on gives way to what it does
+    not know. With P the position's gain, E the effort's and F its feed-forward, a joint is as stiff as
+    P / (E + F) [Nm/rad], and P / F without one. An arm that stands upright and whose weight turns it over
+    faster than that falls, whatever it is told: it is unstable.
+    """
+    one = [each for each in found if each.case.alignment is not None]
+    six = [each for each in found if each.case.alignment is None]
+    judged = []
+    for whose, thesis in (("thesis'", True), ("factory's", False)):
+        own = [each for each in one if (each.case.gains.setting is not None) == thesis]
+        asked = f"one joint, the {whose} gains: mode 3 has the lowest rms error"
+        judged.append(_bar(asked, own, lambda each: each.helps))
+    for strategy in (4, 3):
+        own = [each for each in six if each.case.gains.strategy == strategy]
+        asked = f"six joints, strategy {strategy}: mode 3 is {LEAST_GAIN:g} times lower than mode 2"
+        judged.append(_bar(asked, own, lambda each: each.gain >= LEAST_GAIN))
+    return [bar for bar in judged if bar.stable + len(bar.unstable)]
+
+
+def _bar(asked: str, found: Sequence[Combination], keeps: Callable[[Combination], bool]) -> Bar:
+    stable = [each for each in found if each.is_stable]
+    missed = tuple(combination_words(each) for each in stable if not keeps(each))
+    unstable = tuple(
+        f"{combination_words(each)}: {each.follows[2].unstable}" for each in found if not each.is_stable
+    )
+    return Bar(asked, len(stable), len(stable) - len(missed), missed, unstable)
+
+
+def assistance_table(found: Sequence[Combination]) -> Table:
+    """Return the combinations as a table, a section for each robot; * marks what is unstable."""
+    titles = (
+        "robot",
+        "gains",
+        "read",
+        "motion",
+        "set-points",
+        "asked",
+        "mode 1",
+        "mode 2",
+        "mode 3",
+        "2 / 3",
+    )
+    shown = Table(*titles, title="Rms tracking error by input mode in mrad, * unstable")
+    for each, following in zip(found, [*found[1:], None], strict=True):
+        case = each.case
+        shown.add_row(
+            _robot(each),
+            case.gains.name,
+            case.gains.reading or "",
+            case.motion,
+            case.delivery.name,
+            f"{1e3 * each.follows[0].motion_rms_rad:.1f}",
+            *(_error(one) for one in each.follows),
+            f"{each.gain:.1f}" if isfinite(each.gain) else "",
+            end_section=following is None or following.case.robot != case.robot,
+        )
+    return shown
+
+
+def bar_lines(judged: Sequence[Bar]) -> list[str]:
+    """Return the bars in words, and what is unstable below them."""
+    lines = []
+    for bar in judged:
+        verdict = "holds" if bar.holds else "does not hold"
+        lines.append(f"{bar.asked}: {verdict}, in {bar.kept} of {bar.stable} stable combinations")
+        lines += [f"  not so: {words}" for words in bar.missed]
+        lines += [f"  unstable: {words}" for words in bar.unstable]
+    return lines
+
+
+def write_assistance(path: Path, settings: dict[str, object], found: Sequence[Combination]) -> None:
+    """Write settings, combinations and bars as JSON; an error that is infinite, as null.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    document = {
+        "settings": settings,
+        "rows": [_row(each) for each in found],
+        "bars": [bar._asdict() | {"holds": bar.holds} for bar in bars(found)],
+    }
+    path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _row(each: Combination) -> dict[str, object]:
+    case = each.case
+    modes = {
+        str(mode): {
+            "rms_error_rad": _number(one.rms_error_rad),
+            "ringing_rad": _number(one.ringing_rad),
+            "saturated": one.saturated,
+            "thrown": one.thrown,
+            "unstable": one.unstable,
+        }
+        for mode, one in zip(MODES, each.follows, strict=True)
+    }
+    return {
+        "robot": case.robot,
+        "pose": case.pose,
+        "strategy": case.gains.strategy,
+        "gains": case.gains.name,
+        "reading": case.gains.reading,
+        "motion": case.motion,
+        "delivery": case.delivery._asdict(),
+        "motion_rms_rad": each.follows[0].motion_rms_rad,
+        "modes": modes,
+        "mode_2_over_3": _number(each.gain),
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if isfinite(value) else None
+
+
+def _error(one: Follow) -> str:
+    words = f"{1e3 * one.rms_error_rad:.2f}" if isfinite(one.rms_error_rad) else "-"
+    return f"{words} *" if one.unstable else words
+
+
+def _robot(each: Combination) -> str:
+    return each.case.alignment or f"{each.case.robot} {each.case.pose}"
+
+
+def combination_words(each: Combination) -> str:
+    """Return a combination in words: robot, gains, motion, and where set-points come from if from a host."""
+    case = each.case
+    read = f" {case.gains.reading}" if case.gains.reading else ""
+    delivered = "" if case.delivery == ON_MODULE else f", {case.delivery.name}"
+    return f"{_robot(each)}, {case.gains.name}{read}, {case.motion}{delivered}"
+
+
+class AssistanceRow(NamedTuple):
+    """What came of one combination, by input modes 1, 2 and 3.
+
+    name: the combination in words. is_thesis: the thesis' arm, as against an arm of several joints; setting:
+    the thesis' PID setting, None of the factory's gains. unstable: why a mode counts as such, empty if not.
+    """
+
+    name: str
+    robot: str
+    is_thesis: bool
+    strategy: int
+    setting: str | None
+    rms_error_rad: tuple[float, float, float]
+    unstable: tuple[str, str, str]
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether input mode 3 is."""
+        return not self.unstable[2]
+
+    @property
+    def helps(self) -> bool:
+        """Whether input mode 3 has the lowest error."""
+        return self.rms_error_rad[2] < min(self.rms_error_rad[:2])
+
+    @property
+    def gain(self) -> float:
+        """By how much mode 3 is better than mode 2."""
+        return self.rms_error_rad[1] / self.rms_error_rad[2]
+
+
+def true_model(name: str, seed: int) -> Model:
+    """Return what a shipped robot is, where the seed puts it, as if it had been identified without error."""
+    robot = standing_robot(name, seed)
+    return Model(true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
+
+
+def assistance_row(case: Case, model: Model, noise: NoiseProfile, seed: int) -> AssistanceRow:
+    """Try one combination in all input modes."""
+    return row_of(try_case(case, model, noise, seed))
+
+
+def assistance_rows(
+    chosen: Sequence[Case], noise: NoiseProfile, seed: int, models: Mapping[str, Model] | None = None
+) -> list[AssistanceRow]:
+    """Try some combinations (see `torque_assistance_cases.cases`), one after the other.
+
+    Robots that `models` does not have by name are known without error.
+    """
+    known = {name: true_model(name, seed) for name in robots_of(list(chosen)) if name not in (models or {})}
+    known.update(models or {})
+    return [assistance_row(case, known[case.robot], noise, seed) for case in chosen]
+
+
+def row_of(found: Combination) -> AssistanceRow:
+    """Return the plain figures of a combination."""
+    first, second, third = found.follows
+    return AssistanceRow(
+        name=combination_words(found),
+        robot=found.case.robot,
+        is_thesis=found.case.alignment is not None,
+        strategy=found.case.gains.strategy,
+        setting=found.case.gains.setting,
+        rms_error_rad=(first.rms_error_rad, second.rms_error_rad, third.rms_error_rad),
+        unstable=(first.unstable, second.unstable, third.unstable),
+    )
+
+
+_ASKED = "#202020"
+_COLOURS = ("#d07a1f", "#1f5fa8", "#2c8a4b")
+_LABELS = (
+    "mode 1: position",
+    "mode 2: position and velocity",
+    "mode 3: position, velocity and calculated torque",
+)
+# The thesis' figures by alignment and setting; where it found nothing stable it has none.
+_FIGURES = {("vertical", f"#{k}"): 51 + k for k in range(1, 7)} | {
+    ("horizontal", f"#{k}"): 55 + k for k in range(4, 7)
+}
+_SAMPLE_S = 0.004
+_COLUMNS = 3
+
+
+def plot_assistance(found: Sequence[Combination], path: Path, title: str) -> None:
+    """Draw the thesis' settings and save (PNG, SVG or PDF by suffix): a panel for each with all modes.
+
+    Raises:
+        ValueError: none of the combinations is one of the thesis', or matplotlib cannot write the suffix.
+    """
+    panels = [_first(found, alignment, each.name) for alignment in ALIGNMENTS[::-1] for each in SETTINGS]
+    if not any(panels):
+        raise ValueError("no combination of the thesis' arm and settings: nothing to draw")
+    figure = Figure(figsize=(13.5, 12.0), dpi=120)
+    FigureCanvasAgg(figure)
+    grid: Any = figure.subplots(len(panels) // _COLUMNS, _COLUMNS, squeeze=False)
+    for axes, one in zip(grid.flat, panels, strict=True):
+        if one is None:
+            axes.set_axis_off()
+        else:
+            _panel(axes, one)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+    for row in grid:
+        row[0].set_ylabel("position [rad]")
+    figure.suptitle(title, fontsize=12, y=0.99)
+    figure.legend(handles=_legend(), loc="lower center", ncol=4, fontsize=10, frameon=False)
+    figure.subplots_adjust(left=0.06, right=0.985, top=0.94, bottom=0.075, wspace=0.18, hspace=0.33)
+    figure.savefig(path)
+
+
+def _legend() -> list[Line2D]:
+    modes = [
+        Line2D([], [], color=colour, label=label) for colour, label in zip(_COLOURS, _LABELS, strict=True)
+    ]
+    return [Line2D([], [], color=_ASKED, linewidth=1.0, linestyle="--", label="asked for"), *modes]
+
+
+def _first(found: Sequence[Combination], alignment: str, setting: str) -> Combination | None:
+    """Return the first combination of an alignment and a setting, on the module and in the first reading."""
+    for each in found:
+        gains = each.case.gains
+        if (each.case.alignment, gains.setting) == (alignment, setting) and (
+            gains.reading == READINGS[0] and each.case.delivery == ON_MODULE
+        ):
+            return each
+    return None
+
+
+def _panel(axes: Any, one: Combination) -> None:
+    case = one.case
+    axes.grid(True, linewidth=0.4, color="#d5d5d5")
+    for each, colour in zip(one.follows, _COLOURS, strict=True):
+        t_s = _SAMPLE_S * np.arange(len(each.done_rad))
+        # What rings hides the others: it is drawn thin and pale.
+        look = {"linewidth": 0.6, "alpha": 0.6} if each.unstable else {"linewidth": 1.3}
+        axes.plot(t_s, each.done_rad[:, :1], color=colour, **look)
+    longest = max(one.follows, key=lambda each: len(each.asked_rad))
+    t_s = _SAMPLE_S * np.arange(len(longest.asked_rad))
+    axes.plot(t_s, longest.asked_rad[:, :1], color=_ASKED, linewidth=1.0, linestyle="--")
+    rms = " / ".join(
+        f"{1e3 * each.rms_error_rad:.1f}" + ("*" if each.unstable else "") for each in one.follows
+    )
+    number = _FIGURES.get((case.alignment or "", case.gains.name))
+    beside = f"figure {number}" if number is not None else "no figure"
+    axes.set_title(
+        f"{case.alignment}, strategy {case.gains.strategy}, {case.gains.name} ({beside})\n"
+        f"{case.motion}, rms error {rms} mrad",
+        fontsize=9,
+    )

@@ -1,0 +1,1 @@
+"""World, agents and coordinator in one process on a virtual clock and network."""

@@ -1,0 +1,107 @@
+"""A whole run in virtual time: the same agents, coordinator and world in one process."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from coordinator.excitation.plan import Plan
+from coordinator.identification.result import Result
+from coordinator.runtime.event_loop import Interruption, run_to_end
+from coordinator.session.run import Run, RunConfig
+from coordinator.viewer.feed import Screen
+from module_agent.network_emulation.profile_file import network
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.robot.robot_file import Robot
+from sim.robot.robot_tree import true_chain
+from sim.scoring.truth_view import TruthView
+from sim.virtual_time.loop import VirtualLoop
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.world.external_force import Push
+from sim.world.truth import write_truth
+
+COORDINATOR = "coordinator"
+
+
+class VirtualConfig(NamedTuple):
+    """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given.
+
+    `known` and `refined_looks` as in `RunConfig`: nobody watches a virtual run, so that none is the rule.
+    `pushes` act on the robot from outside.
+    """
+
+    robot: Robot
+    out: Path
+    seed: int = 0
+    network: str = "lan"
+    noise: str | NoiseProfile | None = None
+    plan: Plan = Plan()
+    connect_viewer: str | None = None
+    feedback_rate_hz: float = 250.0
+    noise_seed: int | None = None
+    refined_looks: int = 0
+    known: Path | None = None
+    pushes: tuple[Push, ...] = ()
+
+
+def run_virtual(
+    config: VirtualConfig,
+    screen: Screen,
+    between: Callable[[VirtualRobot], None] | None = None,
+    on_signal: Callable[[Interruption], None] = lambda interruption: None,
+) -> Result:
+    """Run one identification in virtual time and write the run's folder, truth included.
+
+    `between` is handed the robot before the run begins, to schedule faults on its loop; `on_signal` is handed
+    what a signal handler is to call, and the run then ends with `asyncio.CancelledError` after its clean-up.
+    """
+    loop = VirtualLoop()
+    settings = VirtualSettings(
+        config.robot,
+        network(config.network),
+        config.seed,
+        config.noise,
+        config.feedback_rate_hz,
+        config.noise_seed,
+        config.pushes,
+    )
+    robot = VirtualRobot(settings, loop)
+    try:
+        run = Run(
+            RunConfig(
+                robot=config.robot.name,
+                out=config.out,
+                sender=COORDINATOR,
+                plan=config.plan,
+                expect=len(robot.world.modules),
+                connect_viewer=config.connect_viewer,
+                inline=True,
+                refined_looks=config.refined_looks,
+                known=config.known,
+            ),
+            robot.endpoint(COORDINATOR),
+            lambda: loop.now_ns,
+            loop.call_soon,
+            screen,
+            TruthView(true_chain(config.robot), [module.type for module in config.robot.modules]),
+        )
+        if between is not None:
+            between(robot)
+        robot.start()
+        task = loop.create_task(_to_end(run, robot))
+        on_signal(Interruption(loop, task))
+        result = run_to_end(loop, task)
+        write_truth(config.out / "truth.json", config.robot, robot.world)
+        robot.truth.save(config.out / "truth.npz")
+        return result
+    finally:
+        robot.close()
+        loop.close()
+
+
+async def _to_end(run: Run, robot: VirtualRobot) -> Result:
+    try:
+        return await run.run()
+    finally:
+        robot.stop()
+        await asyncio.sleep(0)

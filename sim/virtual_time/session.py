@@ -1,0 +1,120 @@
+"""A session in virtual time that is kept in memory: the same agents, coordinator and world, and no files.
+
+What it records is what a run's `session.mcap` holds, for experiments that need many sessions and no folder.
+"""
+
+import asyncio
+from collections.abc import Callable
+
+from coordinator.excitation.plan import Plan
+from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
+from coordinator.excitation.segment import RobotMotion
+from coordinator.identification.identify import identify_kinematics
+from coordinator.identification.topology_search import doubtful_motions
+from coordinator.live_robot.messenger import Radio
+from coordinator.live_robot.module_group import RobotLink
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
+from coordinator.runtime.event_loop import run_to_end
+from coordinator.session.session import Session
+from coordinator.topology.next_motion import NextMotion
+from module_agent.model.catalogue import module_type
+from module_agent.wire.messages import Message
+from module_agent.wire.refusal import WireError
+from sim.virtual_time.loop import VirtualLoop
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+
+COORDINATOR = "coordinator"
+
+
+def record_session(
+    settings: VirtualSettings, plan: Plan, at_end: Callable[[VirtualRobot], None] | None = None
+) -> Recording:
+    """Run one session from discovery to its end and return what the coordinator has recorded of it.
+
+    `at_end` is handed the robot when the session is over, for whoever compares it with the truth.
+
+    Raises:
+        what `coordinator.session.session` raises: no module found, an unfit link, a module lost, a motion
+            interrupted.
+    """
+    loop = VirtualLoop()
+    robot = VirtualRobot(settings, loop)
+    keeper = _Keeper(plan)
+    endpoint = robot.endpoint(COORDINATOR)
+    radio = Radio(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
+    link = RobotLink(radio, keeper.recording, lambda: loop.now_ns, COORDINATOR)
+    session = Session(link, radio, keeper.recording, plan, lambda: loop.now_ns, keeper.journal, keeper)
+    robot.start()
+    try:
+        keeper.journal(
+            JournalEvent(
+                t_ns=loop.now_ns,
+                what="session",
+                robot=settings.robot.name,
+                imu=plan.imu,
+                torque=plan.torque,
+            )
+        )
+        run_to_end(loop, loop.create_task(_to_end(session, radio, robot)))
+        keeper.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))
+        if at_end is not None:
+            at_end(robot)
+        return keeper.recording
+    finally:
+        robot.close()
+        loop.close()
+
+
+async def _to_end(session: Session, radio: Radio, robot: VirtualRobot) -> None:
+    radio.start()
+    try:
+        await session.run(len(robot.world.modules))
+    finally:
+        radio.close()
+        robot.stop()
+        await asyncio.sleep(0)
+
+
+class _Keeper:
+    """Keeps what is recorded; nobody watches the session."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.recording = Recording()
+        self._plan = plan
+
+    def record(self, entry: Entry) -> Message | None:
+        try:
+            message = self.recording.add(entry)
+        except (WireError, ValueError):
+            return None  # counted by the recording, by reason
+        return message if isinstance(message, Message) else None
+
+    def journal(self, event: JournalEvent) -> None:
+        self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """Nobody watches."""
+
+    def note(self, text: str) -> None:
+        """Nobody reads."""
+
+    def estimates(self, joint: str) -> None:
+        """Nothing is drawn."""
+
+    async def doubts(self) -> tuple[NextMotion, ...]:
+        """Look for doubts about the topology, as a run does."""
+        return doubtful_motions(self.recording)
+
+    async def explored(self) -> None:
+        """What follows from the recording is computed from it afterwards."""
+
+    async def excitation(self) -> tuple[RobotMotion, ...]:
+        """Design motions of all joints at once, as a run does; none if the robot could run none."""
+        chain = identify_kinematics(self.recording).fit.chain
+        told = [self.recording.modules[serial].info for serial in chain.serials]
+        modules = [RobotModule(module_type(one.module_type), one.limits) for one in told if one is not None]
+        try:
+            return robot_excitation(chain, modules, self._plan)
+        except ValueError:
+            return ()

@@ -1,0 +1,1 @@
+"""The world in which modules move, its bus, and its truth."""

@@ -1,0 +1,89 @@
+"""Pushes: what somebody's hand, or an obstacle, does to a simulated robot from outside for a while."""
+
+import re
+import tomllib
+from collections.abc import Sequence
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sim.geometry.link_parts import Xyz
+
+_NOTHING = (0.0, 0.0, 0.0)
+_EXAMPLE = "serial=X-00011,force_n=[0,0,-10],from_s=2,for_s=0.5"
+# A bare serial is no TOML; on a command line its quotation marks would have to be protected from the shell.
+_BARE_SERIAL = re.compile(r"(?<![\w-])serial\s*=\s*(?![\s\"'])([^,\s]+)")
+
+Newton = Annotated[float, Field(ge=-1e4, le=1e4)]
+NewtonMetre = Annotated[float, Field(ge=-1e4, le=1e4)]
+Second = Annotated[float, Field(ge=0.0, le=1e6)]
+
+
+class Push(BaseModel):
+    """A wrench on what the joint of module `serial` turns, from `from_s` on for `for_s` of world time [s].
+
+    `force_n` and `torque_nm` are in world axes (z up) and keep their directions while the robot moves. The
+    force acts at `at_m`: a point that moves with the body, in the body's frame of `sim.robot.robot_tree` (the
+    output's frame of a module that is mounted forward).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    serial: str
+    force_n: tuple[Newton, Newton, Newton] = _NOTHING
+    torque_nm: tuple[NewtonMetre, NewtonMetre, NewtonMetre] = _NOTHING
+    at_m: Xyz = _NOTHING
+    from_s: Second = 0.0
+    for_s: Annotated[float, Field(gt=0.0, le=1e6)]
+
+    @model_validator(mode="after")
+    def _some_force(self) -> "Push":
+        if not any((*self.force_n, *self.torque_nm)):
+            raise ValueError("nothing pushes: give force_n, torque_nm or both")
+        return self
+
+    def acts(self, t_ns: int) -> bool:
+        """Whether it pushes at a world time [ns]."""
+        return round(self.from_s * 1e9) <= t_ns and not self.is_over(t_ns)
+
+    def is_over(self, t_ns: int) -> bool:
+        """Whether it has pushed for its time at a world time [ns]."""
+        return t_ns >= round((self.from_s + self.for_s) * 1e9)
+
+
+def parse_push(text: str) -> Push:
+    """Parse keys and values as of a TOML table in one line, such as the example in every error's message.
+
+    Raises:
+        ValueError: the text describes no push; the message says which key is wrong.
+    """
+    quoted = _BARE_SERIAL.sub(r'serial="\1"', text)
+    try:
+        found: object = tomllib.loads(f"push = {{{quoted}}}")["push"]
+        return Push.model_validate(found)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{text!r} is no push: {error}; one is {_EXAMPLE}") from error
+    except ValidationError as error:
+        faults = "; ".join(_fault(dict(e)) for e in error.errors(include_url=False))
+        raise ValueError(f"{text!r} is no push: {faults}; one is {_EXAMPLE}") from error
+
+
+def _fault(error: dict[str, object]) -> str:
+    place = error["loc"]
+    key = str(place[0]) if isinstance(place, tuple) and place else ""
+    reason = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(
+        str(error["type"]), str(error["msg"]).removeprefix("Value error, ")
+    )
+    return f"{key}: {reason}" if key else reason
+
+
+def check_pushed(push: Push, serials: Sequence[str]) -> None:
+    """Make sure that a push is on one of the modules.
+
+    Raises:
+        ValueError: it is not; the message lists them.
+    """
+    if push.serial not in serials:
+        raise ValueError(
+            f"a push on {push.serial!r}, which is no module here; there are {', '.join(serials)}"
+        )

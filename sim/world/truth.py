@@ -1,0 +1,214 @@
+"""What the simulator knows and the coordinator must find out, in files for whoever scores a run.
+
+`truth.json` holds the robot's constants, `truth.npz` the true motion. A file is the complete old or new one.
+
+A world that takes down its own truth with every step, to be served on the bus.
+"""
+
+import io
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from module_agent.hardware.hardware import HardwareModule, SensorSample
+from module_agent.model.chain import Chain
+from sim.geometry.pose import Array, read_only
+from sim.imperfections.module_errors import SensorErrors
+from sim.robot.robot_file import Robot
+from sim.robot.robot_tree import true_chain, true_inertia
+from sim.sensors.module_clock import ModuleClock, module_time
+from sim.world.world import World
+
+VERSION = 1
+
+
+class Truth(NamedTuple):
+    """A robot's constants; frames and order as in `chain`.
+
+    inertia: (n, 10) every body's parameters in the root frame at q = 0 (see
+    `sim.robot.robot_tree.true_inertia`).
+    clocks, imu_bias (n, 6; gyro, accelerometer) and sensor_errors are those of one world, or None.
+    """
+
+    robot: str
+    module_types: tuple[str, ...]
+    chain: Chain
+    inertia: Array
+    clocks: tuple[ModuleClock, ...] | None
+    imu_bias: Array | None
+    sensor_errors: SensorErrors | None = None
+
+
+class Motion(NamedTuple):
+    """The true motion of T instants, n joints, read-only; all of one row belongs to one instant.
+
+    t_ns: (T,) world time. clock_ns: (T, n) the modules' clocks. q_rad, qd_rad_s, spring_torque_nm: (T, n).
+    """
+
+    serials: tuple[str, ...]
+    t_ns: np.ndarray[Any, np.dtype[np.int64]]
+    clock_ns: np.ndarray[Any, np.dtype[np.int64]]
+    q_rad: Array
+    qd_rad_s: Array
+    spring_torque_nm: Array
+
+
+def truth_of(robot: Robot, world: World | None = None) -> Truth:
+    """Return the constants of a robot, and of the world it lives in if there is one."""
+    return Truth(
+        robot=robot.name,
+        module_types=tuple(m.type for m in robot.modules),
+        chain=true_chain(robot),
+        inertia=true_inertia(robot),
+        clocks=None if world is None else world.clocks,
+        imu_bias=None if world is None else world.imu_bias,
+        sensor_errors=None if world is None else world.sensor_errors,
+    )
+
+
+def write_truth(path: Path, robot: Robot, world: World | None = None) -> None:
+    """Write `truth_of` as JSON, atomically."""
+    truth = truth_of(robot, world)
+    errors = truth.sensor_errors
+    chain = {
+        k: v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in truth.chain._asdict().items()
+    }
+    document = {
+        "version": VERSION,
+        "robot": truth.robot,
+        "module_types": list(truth.module_types),
+        "chain": chain,
+        "inertia": truth.inertia.tolist(),
+        "clocks": None if truth.clocks is None else [clock._asdict() for clock in truth.clocks],
+        "imu_bias": None if truth.imu_bias is None else truth.imu_bias.tolist(),
+        "sensor_errors": None if errors is None else {k: v.tolist() for k, v in errors._asdict().items()},
+    }
+    _replace(path, json.dumps(document, indent=1).encode())
+
+
+def read_truth(path: Path) -> Truth:
+    """Read what `write_truth` wrote.
+
+    Raises:
+        ValueError: not such a file, or of another version.
+    """
+    document = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(document, dict) or document.get("version") != VERSION:
+        raise ValueError(f"{path}: not a truth file of version {VERSION}")
+    # Files of runs before sensors had more than biases lack the rest of their errors.
+    clocks, bias, errors = document["clocks"], document["imu_bias"], document.get("sensor_errors")
+    return Truth(
+        robot=document["robot"],
+        module_types=tuple(document["module_types"]),
+        chain=_chain(document["chain"]),
+        inertia=read_only(np.array(document["inertia"])),
+        clocks=None if clocks is None else tuple(ModuleClock(**clock) for clock in clocks),
+        imu_bias=None if bias is None else read_only(np.array(bias)),
+        sensor_errors=None
+        if errors is None
+        else SensorErrors(**{k: read_only(np.array(v)) for k, v in errors.items()}),
+    )
+
+
+def _chain(fields: dict[str, Any]) -> Chain:
+    return Chain(
+        serials=tuple(fields["serials"]),
+        parent=tuple(fields["parent"]),
+        reversed=tuple(fields["reversed"]),
+        axis=read_only(np.array(fields["axis"])),
+        point=read_only(np.array(fields["point"])),
+        imu_home=read_only(np.array(fields["imu_home"])),
+        gravity=read_only(np.array(fields["gravity"])),
+    )
+
+
+class TruthLog:
+    """Records the true motion of a world, every `every` ticks; call `record` after every step."""
+
+    def __init__(self, world: World, every: int = 4):
+        if every < 1:
+            raise ValueError(f"every {every} ticks: at least 1")
+        self._world = world
+        self._every = every
+        self._ticks = 0
+        self._t_ns: list[int] = []
+        self._rows: list[tuple[Array, Array, Array]] = []
+
+    def record(self) -> None:
+        """Take down the instant of the last samples if it is due."""
+        if self._ticks % self._every == 0:
+            plant = self._world.plant
+            self._t_ns.append(plant.t_ns)
+            self._rows.append((plant.q_rad, plant.qd_rad_s, plant.spring_torque_nm))
+        self._ticks += 1
+
+    def motion(self) -> Motion:
+        """Return what has been recorded."""
+        n = len(self._world.modules)
+        stamps = np.array(self._t_ns, dtype=np.int64)
+        clocks = [[module_time(clock, t) for clock in self._world.clocks] for t in self._t_ns]
+        clock_ns = np.array(clocks, dtype=np.int64).reshape(-1, n)
+        columns = np.array(self._rows, dtype=np.float64).reshape(-1, 3, n)
+        for array in (stamps, clock_ns, columns):
+            array.flags.writeable = False
+        return Motion(
+            self._world.robot.serials, stamps, clock_ns, columns[:, 0], columns[:, 1], columns[:, 2]
+        )
+
+    def save(self, path: Path) -> None:
+        """Write the motion as an npz file, atomically; the fields are those of `Motion`."""
+        buffer = io.BytesIO()
+        fields: dict[str, Any] = self.motion()._asdict()
+        np.savez(buffer, **fields)
+        _replace(path, buffer.getvalue())
+
+
+def read_motion(path: Path) -> Motion:
+    """Read what `TruthLog.save` wrote."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in Motion._fields}
+    serials = tuple(str(s) for s in arrays.pop("serials"))
+    for array in arrays.values():
+        array.flags.writeable = False
+    return Motion(serials, **arrays)
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Put the content in place in one step: a reader, or a crash, sees the old file or the new one."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
+    temporary = Path(name)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        # mkstemp makes the file private; a result is for everyone to read.
+        temporary.chmod(0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+class LoggedWorld:
+    """Steps a world and records it in a `TruthLog`."""
+
+    def __init__(self, world: World):
+        self._world = world
+        self.log = TruthLog(world)
+
+    @property
+    def modules(self) -> Sequence[HardwareModule]:
+        """The modules, in the order of `step`."""
+        return self._world.modules
+
+    def step(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        """Advance by one tick and return one sample per module."""
+        samples = self._world.step(pwm)
+        self.log.record()
+        return samples

@@ -1,0 +1,300 @@
+"""The simulated world: a robot in gravity, its motors, sensors and module clocks, in ticks of 1 ms."""
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+
+from module_agent.hardware.hardware import HardwareLost, HardwareModule, SensorSample
+from sim.actuator.actuator import BUS_VOLTAGE_V, Actuators
+from sim.actuator.thermal import Windings
+from sim.geometry.pose import Array, read_only
+from sim.imperfections.module_errors import SensorErrors, draw_variation
+from sim.imperfections.noise_profile import NoiseProfile, noise_profile
+from sim.physics.equilibrium import equilibrium
+from sim.physics.multibody import Multibody
+from sim.physics.rigid_tree import RigidTree
+from sim.physics.skeleton import build_skeleton
+from sim.robot.robot_file import Robot
+from sim.robot.robot_tree import build_tree
+from sim.sensors.module_clock import ModuleClock
+from sim.sensors.sensors import Instant, Sensors
+from sim.world.external_force import Push, check_pushed
+
+TICK_NS = 1_000_000
+TICK_S = 1e-3
+
+
+class Plant(NamedTuple):
+    """The true state of the modules' joints at the instant of the last samples, (n,) each, read-only.
+
+    duty is what the bridges apply for `pwm`; motor positions and rates are seen at the output;
+    spring_torque_nm is what the springs exert on the outputs; with q, qd, qdd and what pushes from outside it
+    fulfils the equations of motion.
+    structure (p,) is how far the base and the links give: the positions [m, rad] of the passive joints.
+    """
+
+    t_ns: int
+    pwm: Array
+    duty: Array
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+    motor_rad: Array
+    motor_rad_s: Array
+    spring_torque_nm: Array
+    structure: Array
+
+
+class World:
+    """A robot that lives in virtual time; the same seed and PWM give the same samples, bit by bit.
+
+    Position, velocity, effort and IMU of a sample belong to one instant, the beginning of the tick: `t_ns` is
+    that instant on the module's clock, and so is `imu_t_ns` in the ticks in which the IMU is read. In between
+    the last IMU values are repeated with their own time.
+
+    The world begins at rest, the modules' joints where the robot file has them and everything that gives
+    sagged under its weight. `noise_seed` draws the sensors' noise and drift anew for the same modules, as on
+    another day; what the modules are hangs on `seed` alone. `pushes` act from outside, each in its time.
+
+    Raises:
+        ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number, a push is on no module, or the
+            robot's base or links are too soft to carry it.
+        KeyError: unknown noise profile.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        seed: int,
+        noise: str | NoiseProfile | None = None,
+        imu_rate_hz: float = 250.0,
+        voltage_v: float = BUS_VOLTAGE_V,
+        noise_seed: int | None = None,
+        pushes: Sequence[Push] = (),
+    ):
+        self.robot = robot
+        wanted = robot.noise if noise is None else noise
+        self.profile = noise_profile(wanted) if isinstance(wanted, str) else wanted
+        tree = build_tree(robot)
+        imu_ticks = _whole_ticks(imu_rate_hz)
+        drawn = seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S, noise_seed
+        self._sensors = Sensors(*drawn)
+        self._skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
+        self._joints = np.array(self._skeleton.module)
+        self._passive = np.array(self._skeleton.passive, dtype=np.int64)
+        self._tree = RigidTree(self._skeleton)
+        self._windings = Windings(len(tree.types), TICK_S, self.profile.heat)
+        variation = draw_variation(seed, robot.serials, self.profile)
+        self._actuators = Actuators(tree.types, TICK_S, self.profile, variation, self._skeleton, voltage_v)
+        self._tick = 0
+        self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
+        self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
+        self._rates = np.zeros((2, len(self._q)))
+        self._pushes: list[Push] = []
+        for push in pushes:
+            self.push(push)
+        self._actuators.reset(robot.start_rad, load)
+        self._rehearse(Sensors(*drawn))
+        self._body = Multibody(robot.name, self._skeleton, TICK_S)
+        self._body.place(self._q)
+        zero = np.zeros_like(robot.start_rad)
+        q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.motor_rad
+        self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.torque_nm, structure)
+        self.modules = tuple(
+            HardwareModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
+        )
+
+    @property
+    def t_ns(self) -> int:
+        """The world's time [ns]: the end of the last tick."""
+        return self._tick * TICK_NS
+
+    @property
+    def plant(self) -> Plant:
+        """The true state at the instant of the last samples; at the start before the first tick."""
+        t_ns, *arrays = self._plant
+        return Plant(t_ns, *(read_only(a.copy()) for a in arrays))
+
+    @property
+    def clocks(self) -> tuple[ModuleClock, ...]:
+        """The modules' clocks."""
+        return self._sensors.clocks
+
+    @property
+    def imu_bias(self) -> Array:
+        """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
+        return self._sensors.imu_bias
+
+    @property
+    def sensor_errors(self) -> SensorErrors:
+        """The constant errors of all sensors, read-only."""
+        return self._sensors.errors
+
+    def warm(self, above_ambient_k: Array) -> None:
+        """Set the modules' temperatures above the ambient: rows winding, housing, body, (3, n) [K]."""
+        self._windings.above_k[:] = above_ambient_k
+
+    def push(self, push: Push) -> None:
+        """Push from outside, in its time; may be called between any two steps.
+
+        Raises:
+            ValueError: on no module of this robot.
+        """
+        check_pushed(push, self.robot.serials)
+        self._pushes.append(push)
+
+    def become(self, robot: Robot) -> None:
+        """Go on as a robot with the same modules and joints but other links or payloads, moving as before.
+
+        Whatever is added is taken to move along already: it comes on without a blow.
+
+        Raises:
+            ValueError: other modules, or another number of joints that give.
+        """
+        skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
+        if robot.serials != self.robot.serials or skeleton.names != self._skeleton.names:
+            raise ValueError(
+                f"robot {robot.name} has joints {', '.join(skeleton.names)}; those of {self.robot.name} are "
+                f"{', '.join(self._skeleton.names)}, and a world keeps its joints"
+            )
+        body = Multibody(robot.name, skeleton, TICK_S)
+        body.place(self._q, self._qd)
+        self._body.close()
+        self.robot, self._skeleton, self._body, self._tree = robot, skeleton, body, RigidTree(skeleton)
+
+    def change_friction(self, serial: str, factor: float) -> None:
+        """Multiply the friction of a module's motor and gear, Coulomb and viscous, from the next tick on.
+
+        Raises:
+            ValueError: no such module, or a factor that is negative or not finite.
+        """
+        if serial not in self.robot.serials:
+            raise ValueError(f"no module {serial} here; there are {', '.join(self.robot.serials)}")
+        if not (math.isfinite(factor) and factor >= 0.0):
+            raise ValueError(f"friction times {factor} is no friction; a number from 0 on is needed")
+        self._actuators.change_friction(self.robot.serials.index(serial), factor)
+
+    def step(self, pwm: Sequence[float]) -> list[SensorSample]:
+        """Advance by one tick of 1 ms under one PWM in [-1, 1] per module; return one sample per module.
+
+        Raises:
+            ValueError: a PWM is missing, too many or not finite.
+            HardwareLost: the world is closed.
+        """
+        u = self._checked(pwm)
+        actuators, q, qd = self._actuators, self._q, self._qd
+        motor = actuators.motor_rad
+        # The integrator is a leapfrog: its velocities live half a tick before its positions, but it takes
+        # velocity forces as if they were of the same instant. So it is handed what they lack of those at the
+        # velocity that the last acceleration predicts for this instant.
+        self._rates[0], self._rates[1] = qd + self._ahead, qd
+        mass, biases = self._tree.mass_and_biases(q, self._rates)
+        if self._pushes:
+            biases[0] -= self._pushed(q)
+        force = actuators.step(u, q, qd, mass, biases[0], self._windings.resistance_factor)
+        self._q, self._qd = self._body.step((force - biases[0] + biases[1]).tolist())
+        # The velocity at this instant is the mean of the two around it, the acceleration their difference.
+        rate = (qd + self._qd) * 0.5
+        self._ahead = rate - qd
+        change = (self._qd - qd) * (1.0 / TICK_S)
+        own = self._joints
+        self._plant = (
+            *(self.t_ns, u, actuators.duty, q[own], rate[own], change[own], motor),
+            *(actuators.motor_rate_rad_s, actuators.torque_nm, q[self._passive]),
+        )
+        samples = self._samples(q, rate, change)
+        self._windings.step(actuators.copper_w)
+        self._tick += 1
+        return samples
+
+    def close(self) -> None:
+        """End the world. May be called twice."""
+        self._body.close()
+
+    def _checked(self, pwm: Sequence[float]) -> Array:
+        if self._body.closed:
+            raise HardwareLost("the world is closed")
+        if len(pwm) != len(self.modules):
+            raise ValueError(f"{len(pwm)} PWM values for {len(self.modules)} modules")
+        for module, value in zip(self.modules, pwm, strict=True):
+            if not math.isfinite(value):
+                raise ValueError(f"PWM of module {module.serial} is {value}; it must be a number in [-1, 1]")
+        return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
+
+    def _pushed(self, q: Array) -> Array:
+        """Return what the pushes of this instant do to all joints (m,), and forget those that are over."""
+        self._pushes = [push for push in self._pushes if not push.is_over(self.t_ns)]
+        load = np.zeros_like(q)
+        for push in (one for one in self._pushes if one.acts(self.t_ns)):
+            body = int(self._joints[self.robot.serials.index(push.serial)])
+            wrench = np.array(push.at_m), np.array(push.force_n), np.array(push.torque_nm)
+            load += self._tree.reach(q, body, *wrench)
+        return load
+
+    def _rehearse(self, sensors: Sensors) -> None:
+        """Call all that is compiled at its first call, which would take seconds out of real time."""
+        still, idle = np.zeros_like(self._q), np.zeros(len(self._joints))
+        self._felt = self._tree.feel(self._q, still, still)
+        mass, biases = self._tree.mass_and_biases(self._q, self._rates)
+        self._tree.reach(self._q, 0, *np.zeros((3, 3)))
+        actuators = copy(self._actuators)
+        actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
+        copy(self._windings).step(actuators.copper_w)
+        sensors.read(0, self._instant(self._q, still))
+
+    def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:
+        if self._sensors.imu_due(self._tick):
+            self._felt = self._tree.feel(q, rate, change)
+        return self._sensors.read(self._tick, self._instant(q, rate))
+
+    def _instant(self, q: Array, rate: Array) -> Instant:
+        actuators = self._actuators
+        return Instant(
+            t_ns=self.t_ns,
+            q_rad=q[self._joints],
+            qd_rad_s=rate[self._joints],
+            motor_rad_s=actuators.motor_rate_rad_s,
+            elastic_nm=actuators.elastic_nm,
+            current_a=actuators.current_a,
+            winding_c=self._windings.winding_c,
+            voltage_v=actuators.voltage_v,
+            gyro_rad_s=self._felt[0],
+            specific_force_m_s2=self._felt[1],
+        )
+
+
+class InProcessHardware:
+    """The `Hardware` of an agent that lives in the world's own process; the world stays the caller's."""
+
+    def __init__(self, world: World):
+        self._world = world
+        self._open = True
+
+    @property
+    def modules(self) -> Sequence[HardwareModule]:
+        """All modules of the world."""
+        return self._world.modules
+
+    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        """Step the world.
+
+        Raises:
+            HardwareLost: this or the world is closed.
+        """
+        if not self._open:
+            raise HardwareLost("this hardware has been closed")
+        return self._world.step(pwm)
+
+    def close(self) -> None:
+        """Let go of the world."""
+        self._open = False
+
+
+def _whole_ticks(imu_rate_hz: float) -> int:
+    ticks = round(1.0 / (TICK_S * imu_rate_hz)) if imu_rate_hz > 0.0 else 0
+    if ticks < 1 or not math.isclose(ticks * TICK_S * imu_rate_hz, 1.0, rel_tol=1e-9):
+        raise ValueError(f"imu_rate_hz {imu_rate_hz} is not 1000 Hz divided by a whole number")
+    return ticks

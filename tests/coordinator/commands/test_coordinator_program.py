@@ -1,0 +1,319 @@
+"""What `x5-coordinator` says when it cannot work, when a run ends early, and how its clean-up is kept."""
+
+import asyncio
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from coordinator.live_robot.discovery import Search, listed, stop_robot
+from coordinator.live_robot.errors import ModuleLost
+from coordinator.live_robot.messenger import NoAnswer
+from coordinator.main import app, resuming
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import JOURNAL_TOPIC, Entry
+from coordinator.recording.run_folder import SESSION, RunFolderError, check_free, open_run_folder
+from coordinator.recording.session_file import SessionWriter
+from coordinator.runtime.event_loop import Interruption, run_to_end
+from coordinator.runtime.exit_codes import explain
+from coordinator.viewer.targets import ViewerChoice, viewer_choice
+from module_agent.model.catalogue import CATALOGUE, module_type
+from module_agent.transport.transport import Event, Liveness, Reply, Sink
+from module_agent.wire.codec import decode, encode
+from module_agent.wire.keys import Leaf, key
+from module_agent.wire.messages import Ask, Status, Stop
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+# --------------------------------------------------------------------------- wrong usage
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("run", "--seed", "-1"), "greater than or equal to 0"),
+        (("run", "--speed", "0"), "speed 0.0: it must be a positive number"),
+        (("run", "--speed", "nan"), "speed nan: it must be a positive number"),
+        (("run", "--expect", "0"), "greater than or equal to 1"),
+        (("run", "--robot", "a/b"), "robot 'a/b' cannot be part of a key"),
+        (("run", "--network", "pigeons"), "known are none, lan, lossy, wifi, bad"),
+        (("run", "--viewer", "foo"), "it must be none, spawn, serve or an address like rerun+http://"),
+        (("run", "--viewer", "http://x"), "it must be none, spawn, serve or an address like rerun+http://"),
+        (("run", "--listen", "tcp/127.0.0.1"), "an address of tcp is HOST:PORT"),
+        (("run", "--connect", "carrier/pigeon:1"), "unknown protocol 'carrier'"),
+        (("list", "--robot", "a/b"), "robot 'a/b' cannot be part of a key"),
+        (("stop", "--robot", "a/b"), "robot 'a/b' cannot be part of a key"),
+        (("list", "--listen", "nonsense"), "endpoint 'nonsense': it must look like tcp/"),
+    ],
+)
+def test_wrong_usage_is_answered_with_what_is_right_and_nothing_is_made(
+    tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    out = tmp_path / "run"
+    place = ("--out", str(out)) if arguments[0] == "run" else ()
+    done = CliRunner().invoke(app, [*arguments, *place])
+    assert done.exit_code == 2, done.output
+    assert words in done.output
+    assert not out.exists()
+
+
+def test_a_plan_without_fast_motions_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    (tmp_path / "plan.toml").write_text("topology_only = true\n")
+    arguments = ["run", "--out", str(tmp_path / "run"), "--plan", str(tmp_path / "plan.toml")]
+    done = CliRunner().invoke(app, [*arguments, "--listen", free_endpoint()])
+    assert done.exit_code == 2
+    assert "topology_only" in done.output
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_robot_that_nobody_announces_leaves_a_folder_that_may_be_used_again(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.toml"
+    plan.write_text("discover_s = 0.1\n")
+    out = tmp_path / "a run"
+    given = ["run", "--out", str(out), "--robot", "lonely", "--listen", free_endpoint()]
+    given += ["--no-dynamics", "--plan", str(plan), "--speed", "8", "--quiet"]
+    # In a process of its own: the program takes over signals and the event loop.
+    done = subprocess.run(
+        [sys.executable, "-m", "coordinator.main", *given],
+        capture_output=True,
+        text=True,
+        timeout=60.0,
+        check=False,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "expected, found 0: none; the robot was not moving; recorded up to here" in done.stderr
+    assert "Traceback" not in done.stderr
+    resume = done.stderr.partition("to go on: ")[2].strip()
+    assert resume.startswith("x5-coordinator run ")
+    assert f"--out '{out}'" in resume
+    for words in ("--robot lonely", given[6], "--no-dynamics", str(plan), "--speed 8", "--resume"):
+        assert words in resume
+    assert (out / SESSION).exists()
+    check_free(out)
+
+
+# --------------------------------------------------------------------------- folders
+
+
+def record(folder: Path, *events: JournalEvent) -> Path:
+    folder.mkdir(exist_ok=True)
+    writer = SessionWriter(folder / SESSION)
+    for event in events:
+        writer.write(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
+    writer.close()
+    return folder
+
+
+def test_a_recording_in_which_no_step_began_is_no_run(tmp_path: Path) -> None:
+    folder = record(tmp_path, JournalEvent(t_ns=1, what="session", robot="arm"))
+    check_free(folder)
+    assert open_run_folder(folder, resume=False) is None
+    assert not (folder / SESSION).exists()
+
+
+def test_a_recording_in_which_a_step_began_is_kept(tmp_path: Path) -> None:
+    folder = record(
+        tmp_path,
+        JournalEvent(t_ns=1, what="session", robot="arm"),
+        JournalEvent(t_ns=2, what="begin", step="home"),
+    )
+    before = (folder / SESSION).read_bytes()
+    with pytest.raises(RunFolderError, match="holds a run already"):
+        open_run_folder(folder, resume=False)
+    assert (folder / SESSION).read_bytes() == before
+
+
+def test_another_robot_s_run_is_not_resumed_and_not_touched(tmp_path: Path) -> None:
+    folder = record(tmp_path, JournalEvent(t_ns=1, what="session", robot="arm"))
+    before = (folder / SESSION).read_bytes()
+    with pytest.raises(RunFolderError, match="holds a run of robot 'arm', not of 'leg': give --robot arm"):
+        open_run_folder(folder, resume=True, robot="leg")
+    assert [path.name for path in folder.iterdir()] == [SESSION]
+    assert (folder / SESSION).read_bytes() == before
+    assert open_run_folder(folder, resume=True, robot="arm") is not None
+
+
+# --------------------------------------------------------------------------- words
+
+
+def test_every_end_of_a_run_has_a_sentence_and_a_code_and_a_defect_has_none() -> None:
+    codes = {
+        3: ModuleLost("A-1", "no feedback for 1.2 s"),
+        2: RunFolderError("holds a run already"),
+        1: NoAnswer("A-1", Leaf.INFO, "Timeout"),
+        130: asyncio.CancelledError(),
+    }
+    for code, error in codes.items():
+        failure = explain(error)
+        assert failure is not None
+        assert failure.exit_code == code
+    with pytest.raises(KeyError) as unknown:
+        module_type("X5-7")
+    failure = explain(unknown.value)
+    assert failure is not None
+    assert failure.text == f"unknown module type 'X5-7'; the catalogue knows {', '.join(CATALOGUE)}"
+    assert explain(KeyError("a bug")) is None
+    assert explain(ZeroDivisionError()) is None
+
+
+def test_a_viewer_is_a_word_or_an_address() -> None:
+    assert viewer_choice("none") == ViewerChoice()
+    assert viewer_choice("spawn").spawn
+    assert viewer_choice("serve").serve
+    assert viewer_choice("rerun+http://host:9876/proxy").connect == "rerun+http://host:9876/proxy"
+    for nonsense in ("", "rerun+http://", "ftp://host", "spawned"):
+        with pytest.raises(ValueError, match="it must be none, spawn, serve"):
+            viewer_choice(nonsense)
+
+
+def test_the_command_that_resumes_repeats_what_was_given_and_nothing_else() -> None:
+    program = typer.Typer()
+    said = []
+
+    @program.command()
+    def run(
+        context: typer.Context,
+        out: str,
+        connect: list[str] | None = None,
+        dynamics: bool = True,
+        resume: bool = False,
+        seed: int = 0,
+    ) -> None:
+        said.append(resuming(context))
+
+    program.registered_commands[0].callback = run
+    runner = CliRunner()
+    assert runner.invoke(program, ["a b", "--connect", "x", "--connect", "y", "--no-dynamics"]).exit_code == 0
+    assert runner.invoke(program, ["plain", "--resume", "--seed", "3"]).exit_code == 0
+    assert said[0].endswith("--connect x --connect y --no-dynamics --resume")
+    assert said[1].endswith("--seed 3 --resume")
+    assert said[1].count("--resume") == 1
+
+
+# --------------------------------------------------------------------------- signals
+
+
+def test_a_second_signal_does_not_disturb_the_clean_up() -> None:
+    loop = asyncio.new_event_loop()
+    done: list[str] = []
+
+    async def work() -> None:
+        try:
+            await asyncio.sleep(30.0)
+        finally:
+            interruption()
+            await asyncio.sleep(0.01)
+            done.append("cleaned up")
+
+    task = loop.create_task(work())
+    interruption = Interruption(loop, task)
+    interruption()
+    interruption()
+    with pytest.raises(asyncio.CancelledError, match="interrupted"):
+        run_to_end(loop, task)
+    loop.close()
+    assert done == ["cleaned up"]
+
+
+def test_what_a_task_leaves_behind_is_ended_with_it() -> None:
+    loop = asyncio.new_event_loop()
+    left: list[asyncio.Task[Any]] = []
+
+    async def work() -> int:
+        left.append(asyncio.create_task(asyncio.sleep(30.0)))
+        return 7
+
+    assert run_to_end(loop, loop.create_task(work())) == 7
+    assert left[0].cancelled()
+    loop.close()
+
+
+# --------------------------------------------------------------------------- list and stop
+
+
+class Robot:
+    """The network of a robot whose modules announce themselves one after the other and answer as told."""
+
+    def __init__(self, wire: Any, serials: tuple[str, ...], deaf: tuple[str, ...] = ()):
+        self.wire = wire
+        self.serials = serials
+        self.deaf = deaf
+        self.closed = False
+        self.stopped: list[str] = []
+
+    def watch_alive(self, key_expr: str, sink: Sink) -> "Robot":
+        for serial in self.serials:
+            sink(Liveness(key("arm", serial, Leaf.ALIVE), True))
+        return self
+
+    def undeclare(self) -> None:
+        pass
+
+    def query(self, at: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
+        serial = at.split("/")[2]
+        event: Event = Reply(tag, at, None, "Timeout")
+        if serial not in self.deaf:
+            event = Reply(tag, at, self.answer(serial, at, payload))
+        sink(event)
+
+    def answer(self, serial: str, at: str, payload: bytes) -> bytes:
+        if at.endswith("status"):
+            assert decode(Ask, payload).serial == serial
+            return encode(self.wire.status().model_copy(update={"serial": serial}))
+        self.stopped.append(decode(Stop, payload).serial)
+        return encode(self.wire.ack(serial=serial))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+QUICK = Search(quiet_s=0.02)
+
+
+def test_every_module_is_listed_and_who_does_not_answer_is_named(wire: Any) -> None:
+    robot: Any = Robot(wire, ("B", "A", "C"), deaf=("C",))
+    statuses, deaf = listed(robot, "arm", QUICK)
+    assert [status.serial for status in statuses] == ["A", "B"]
+    assert all(isinstance(status, Status) for status in statuses)
+    assert deaf == ["C"]
+    assert robot.closed
+
+
+def test_every_module_is_stopped_and_who_does_not_confirm_is_named(wire: Any) -> None:
+    robot: Any = Robot(wire, ("B", "A", "C"), deaf=("C",))
+    assert stop_robot(robot, "arm", "tester", QUICK) == (["A", "B"], ["C"])
+    assert robot.stopped == ["A", "B"]
+
+
+def test_a_search_ends_with_the_last_module_that_is_expected(wire: Any) -> None:
+    robot: Any = Robot(wire, ("A", "B", "C"))
+    statuses, _ = listed(robot, "arm", QUICK._replace(expect=2))
+    assert [status.serial for status in statuses] == ["A", "B"]
+
+
+def test_a_hub_waits_for_agents_that_try_once_a_second(wire: Any) -> None:
+    class Late(Robot):
+        """Its module comes long after all has been quiet."""
+
+        def watch_alive(self, key_expr: str, sink: Sink) -> "Robot":
+            event = Liveness(key("arm", self.serials[0], Leaf.ALIVE), True)
+            threading.Timer(0.3, sink, [event]).start()
+            return self
+
+    late: Any = Late(wire, ("A",))
+    statuses, _ = listed(late, "arm", QUICK)
+    assert statuses == []
+    late = Late(wire, ("A",))
+    statuses, _ = listed(late, "arm", Search(quiet_s=0.02, least_s=20.0, expect=1))
+    assert [status.serial for status in statuses] == ["A"]

@@ -1,0 +1,96 @@
+"""Looks at a robot that is still being explored, from the recording of a run: they come nearer and nearer."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.identification.preview import Looks, RobotSoFar, robot_so_far
+from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import load_recording
+
+BASE, TIP = "X-00009", "X-00010"
+TRUE_M = 0.35
+# One process makes the recording that all tests here work on.
+pytestmark = pytest.mark.xdist_group("look")
+
+
+@pytest.fixture(scope="module")
+def kept() -> list[Path]:
+    return []
+
+
+@pytest.fixture
+def recording(
+    kept: list[Path], rigs: Callable[..., Any], quick_plan: Any, tmp_path_factory: pytest.TempPathFactory
+) -> Recording:
+    """A run on an arm of two modules; made once, read anew."""
+    if not kept:
+        out = tmp_path_factory.mktemp("look") / "run"
+        rigs("thesis_350_vertical", "lan", 3).session(out, quick_plan)
+        kept.append(out / "session.mcap")
+    return load_recording(kept[0])
+
+
+def until(recording: Recording, explored: Sequence[str]) -> Recording:
+    """What was recorded when only these joints had been explored."""
+    recording.journal = [
+        e for e in recording.journal if e.purpose not in ("constant", "windowed_sine") or e.serial in explored
+    ]
+    recording.estimates = {pair: found for pair, found in recording.estimates.items() if pair[0] in explored}
+    return recording
+
+
+def sigma(found: RobotSoFar | None) -> float:
+    assert found is not None
+    return float(found.fit.link_length_sigma_m[1])
+
+
+def test_one_joint_tells_the_link_beyond_it_within_what_it_claims(recording: Recording) -> None:
+    found = Looks(until(recording, [BASE])).look([BASE])
+    assert found is not None
+    assert found.fit.chain.serials == (BASE, TIP)
+    assert found.beside == (False, True)
+    # Three sigma: a thing of 3 in 1000.
+    assert abs(found.fit.link_length_m[1] - TRUE_M) < 3.0 * sigma(found)
+    assert sigma(found) < 0.02
+
+
+def test_samples_move_the_robot_within_what_the_circles_leave_open(recording: Recording) -> None:
+    explored = [BASE, TIP]
+    circles, samples = robot_so_far(recording, explored), Looks(recording).look(explored)
+    assert circles is not None
+    assert samples is not None
+    apart = samples.fit.link_length_m[1] - circles.fit.link_length_m[1]
+    assert 0.0 < abs(apart) < 3.0 * np.hypot(sigma(circles), sigma(samples))
+    assert {u.kind for u in samples.fit.unresolved} == {"offset_along_axis"}
+
+
+def test_a_robot_of_more_modules_than_are_to_be_refined_is_as_assembled(recording: Recording) -> None:
+    found, assembled = Looks(recording, most_refined=1).look([BASE]), robot_so_far(recording, [BASE])
+    assert found is not None
+    assert assembled is not None
+    np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
+
+
+def test_where_samples_are_missing_the_robot_is_as_assembled(recording: Recording) -> None:
+    assembled = robot_so_far(recording, [BASE])
+    recording.modules[TIP].round_trips.clear()
+    found = Looks(recording).look([BASE])
+    assert found is not None
+    assert assembled is not None
+    np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
+
+
+def test_the_same_look_twice_is_the_same_to_the_last_bit(recording: Recording) -> None:
+    looks = Looks(recording)
+    one, two = (looks.look([BASE, TIP]) for _ in range(2))
+    assert one is not None
+    assert two is not None
+    np.testing.assert_array_equal(one.fit.chain.imu_home, two.fit.chain.imu_home)
+
+
+def test_before_anything_has_moved_there_is_nothing_to_see(recording: Recording) -> None:
+    assert Looks(until(recording, [])).look([]) is None

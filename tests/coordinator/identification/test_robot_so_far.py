@@ -1,0 +1,155 @@
+"""What is known of a robot while joints are still being explored: no more than what has moved can tell."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.identification.preview import beside, robot_so_far
+from coordinator.kinematics.assembly import link_lengths
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import ancestors, carrier
+from module_agent.wire.feedback_rows import ROW
+
+RESTED, MOVED = 100, 200
+
+
+class Seen:
+    """A recording of a robot at rest and of perfect circles, of those joints that have moved."""
+
+    def __init__(self, robots: Any, chain: Chain, types: Any, explored: Sequence[str]):
+        self._chain = chain
+        self._rest = robots.rest(chain, np.zeros(len(chain.serials)))
+        self.modules = {
+            s: SimpleNamespace(info=SimpleNamespace(module_type=kind.name))
+            for s, kind in zip(chain.serials, types, strict=True)
+        }
+        self.journal = [self._motion(s, "rest", 1, 0, RESTED) for s in chain.serials]
+        self.journal += [self._motion(s, "windowed_sine", 2, RESTED, MOVED) for s in explored]
+        self.estimates = {
+            (joint, observer): {(2,): self._estimate(robots, joint, observer)}
+            for joint in explored
+            for observer in chain.serials
+        }
+
+    def _motion(self, serial: str, purpose: str, number: int, first: int, end: int) -> Any:
+        motion = SimpleNamespace(motion_id=number, start_row=first, end_row=end)
+        return SimpleNamespace(what="motion", serial=serial, purpose=purpose, motion=motion)
+
+    def _estimate(self, robots: Any, joint: str, observer: str) -> Any:
+        chain = self._chain
+        i, k = chain.serials.index(joint), chain.serials.index(observer)
+        moved = i in ancestors(chain, carrier(chain, k))
+        circle = None
+        if moved:
+            axis, radial = robots.circle(chain, i, k, np.zeros(len(chain.serials)))
+            circle = SimpleNamespace(
+                axis=tuple(axis),
+                radial_m=tuple(radial),
+                sigma_axis_rad=1e-4,
+                sigma_distance_m=1e-4,
+                distance_m=float(np.linalg.norm(radial)),
+            )
+        return SimpleNamespace(
+            serial=observer,
+            joint=joint,
+            moved=moved,
+            rate_ratio=float(moved),
+            circle=circle,
+            motion_ids=(2,),
+        )
+
+    def rows(self, serial: str, first: int, end: int) -> np.ndarray:
+        found = np.zeros(end - first, ROW)
+        found["accel_m_s2"] = self._rest.specific_force_m_s2[self._chain.serials.index(serial)]
+        return found
+
+
+def forward(robots: Any, seed: int, joints: int) -> tuple[Chain, Any]:
+    """A tree of modules that are all mounted forward, so that the last ones move nothing."""
+    chain, types = robots.random(seed, joints)
+    straight = [False] * joints
+    return robots.build(list(chain.parent), straight, chain.imu_home, types, chain.gravity), types
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_when_all_joints_have_moved_the_robot_is_the_whole_one(robots: Any, seed: int) -> None:
+    chain, types = robots.random(seed, joints=2 + seed)
+    recording: Any = Seen(robots, chain, types, chain.serials)
+    found = robot_so_far(recording, chain.serials)
+    assert found is not None
+    so_far = found.fit.chain
+    parents = {
+        s: so_far.serials[p] if p >= 0 else None for s, p in zip(so_far.serials, so_far.parent, strict=True)
+    }
+    assert parents == {
+        s: chain.serials[p] if p >= 0 else None for s, p in zip(chain.serials, chain.parent, strict=True)
+    }
+    assert found.beside == tuple(p >= 0 for p in so_far.parent)
+    lengths, _ = link_lengths(chain, np.zeros((6 * len(types),) * 2))
+    expected = [lengths[chain.serials.index(s)] for s in so_far.serials]
+    # Work ends when the squares shrink by a thousandth: far below the 0.3 mm that circles are believed to.
+    np.testing.assert_allclose(found.fit.link_length_m, expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_module_stands_on_the_nearest_joint_that_has_moved_and_moves_it(robots: Any, seed: int) -> None:
+    chain, types = forward(robots, seed, joints=6)
+    order = np.random.default_rng(seed).permutation(6)
+    for count in range(1, 7):
+        explored = [chain.serials[i] for i in order[:count]]
+        recording: Any = Seen(robots, chain, types, explored)
+        found = robot_so_far(recording, explored)
+        nearest = {}
+        for k, serial in enumerate(chain.serials):
+            above = [chain.serials[i] for i in ancestors(chain, carrier(chain, k))]
+            moved = [s for s in above if s in explored]
+            nearest[serial] = moved[-1] if moved else None
+        tied = set(nearest.values()) - {None} | {s for s, p in nearest.items() if p is not None}
+        if found is None:
+            assert not tied
+            continue
+        so_far = found.fit.chain
+        assert set(so_far.serials) == tied
+        for k, serial in enumerate(so_far.serials):
+            on = so_far.serials[so_far.parent[k]] if so_far.parent[k] >= 0 else None
+            assert on == nearest[serial]
+            if found.beside[k]:
+                assert on == chain.serials[chain.parent[chain.serials.index(serial)]]
+
+
+def test_a_link_is_one_link_only_when_nothing_unexplored_can_lie_on_it(robots: Any) -> None:
+    chain, _ = forward(robots, 3, joints=4)
+    star = chain._replace(parent=(-1, 0, 0, 0))
+    assert beside(star, chain.serials[:1]) == (False,) * 4
+    # One that is open itself can only be at the end.
+    assert beside(star, chain.serials[:3]) == (False, False, False, True)
+    assert beside(star, chain.serials) == (False, True, True, True)
+
+
+def test_bands_grow_narrower_the_more_joints_have_moved(robots: Any) -> None:
+    chain, types = robots.random(4, joints=5, serial=True)
+    sigmas = []
+    for count in range(1, 6):
+        recording: Any = Seen(robots, chain, types, chain.serials[:count])
+        found = robot_so_far(recording, chain.serials[:count])
+        assert found is not None
+        sigmas.append(float(found.fit.link_length_sigma_m[1]))
+    assert all(later <= sooner * (1 + 1e-6) for sooner, later in pairwise(sigmas))
+
+
+def test_before_anything_has_moved_there_is_no_robot(robots: Any) -> None:
+    chain, types = robots.random(1, joints=3)
+    recording: Any = Seen(robots, chain, types, [])
+    assert robot_so_far(recording, []) is None
+
+
+def test_a_module_that_has_not_told_its_type_is_named(robots: Any) -> None:
+    chain, types = robots.random(1, joints=3)
+    recording: Any = Seen(robots, chain, types, chain.serials)
+    recording.modules[chain.serials[1]].info = None
+    with pytest.raises(ValueError, match=f"module {chain.serials[1]} has not told its type"):
+        robot_so_far(recording, chain.serials)

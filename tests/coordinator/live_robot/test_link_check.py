@@ -1,0 +1,71 @@
+"""A network is judged before anything moves: by what it can carry, and not by its worst moment."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from coordinator.live_robot.errors import UnfitLink
+from coordinator.live_robot.link_check import LOOKS, check_link
+from module_agent.network_emulation.profile import NetworkProfile, profile
+
+ARM = "thesis_171_horizontal"
+BASE, TIP = "X-00009", "X-00010"
+LOOK_S = 0.4
+SECOND_S = 1.0
+
+
+def _checked(rig: Any, look_s: float = LOOK_S) -> list[str]:
+    """Meet both modules, check the link, and return what was noted."""
+    _, _, link = rig.link()
+    notes: list[str] = []
+
+    async def work() -> None:
+        await asyncio.sleep(0.2)
+        await link.meet((BASE, TIP))
+        await check_link(link, lambda: rig.loop.now_ns, look_s, notes.append)
+
+    rig.run(work())
+    return notes
+
+
+def test_every_module_is_noted_with_its_rate_and_round_trips(rigs: Callable[..., Any]) -> None:
+    notes = _checked(rigs(ARM, "lan"))
+    assert [note.split(" ")[0] for note in notes] == [BASE, TIP]
+    assert all("rows/s, round trip" in note for note in notes)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_bad_network_that_carries_keep_alives_is_fit(rigs: Callable[..., Any], seed: int) -> None:
+    # Round trips of 60 ms in the mean; one in twenty takes more than half of the 250 ms that commands live.
+    assert len(_checked(rigs(ARM, "bad", seed), SECOND_S)) == 2
+
+
+def test_trips_of_which_too_many_are_slow_are_unfit_by_name_and_number(rigs: Callable[..., Any]) -> None:
+    with pytest.raises(UnfitLink, match=rf"to module {BASE} one in five takes more than 30\d ms"):
+        _checked(rigs(ARM, NetworkProfile(name="slow", delay_ms=150.0)))
+
+
+def test_a_module_whose_rows_come_slower_than_it_says_is_unfit(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, recording, link = rig.link()
+
+    async def work() -> None:
+        await asyncio.sleep(0.2)
+        await link.meet((BASE, TIP))
+        # As from a module on a machine that is too slow for what it was told to do.
+        told = recording.modules[TIP].info
+        recording.modules[TIP].info = told.model_copy(update={"feedback_rate_hz": 1000.0})
+        await check_link(link, lambda: rig.loop.now_ns, LOOK_S, lambda note: None)
+
+    with pytest.raises(UnfitLink, match=rf"unfit: module {TIP} delivers 2\d\d rows/s of 1000"):
+        rig.run(work())
+
+
+def test_a_bad_moment_is_looked_past(rigs: Callable[..., Any]) -> None:
+    # Cut off for most of the first look, and for none of the two that follow.
+    parted = profile("lan").model_copy(update={"partitions": ((0.25, 0.55),)})
+    rig = rigs(ARM, parted)
+    assert len(_checked(rig)) == 2
+    assert 0.2 + LOOK_S < rig.loop.time() < 0.4 + (LOOKS + 1) * LOOK_S

@@ -1,0 +1,206 @@
+"""Questions, answers, refusals and silence in virtual time; everything that passes is recorded."""
+
+import asyncio
+from collections.abc import Callable, Coroutine, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from coordinator.live_robot.messenger import NoAnswer, Radio, Refused
+from coordinator.recording.recording import Entry, Recording
+from module_agent.transport.transport import Request, TransportError
+from module_agent.wire.codec import encode
+from module_agent.wire.keys import Leaf, key
+from module_agent.wire.messages import Ack, Message, Stop
+from module_agent.wire.refusal import WireError
+from sim.virtual_time.loop import VirtualLoop
+from sim.virtual_time.network import VirtualEndpoint, VirtualNetwork
+
+
+class Bench:
+    """A radio, and a module `A` that answers what the test tells it to."""
+
+    def __init__(self, wire: SimpleNamespace):
+        self.wire = wire
+        self.loop = VirtualLoop()
+        self.network = VirtualNetwork(self.loop)
+        self.module: VirtualEndpoint = self.network.endpoint("module")
+        self.entries: list[Entry] = []
+        self.recording = Recording()
+        self.radio = Radio(
+            self.network.endpoint("coordinator"),
+            wire.robot,
+            lambda: self.loop.now_ns,
+            self.loop.call_soon,
+            self._record,
+        )
+
+    def _record(self, entry: Entry) -> Message | None:
+        self.entries.append(entry)
+        try:
+            found = self.recording.add(entry)
+        except WireError:
+            return None
+        return found if isinstance(found, Message) else None
+
+    def serve(self, leaf: Leaf, answer: Callable[[Request], bytes | None]) -> None:
+        def on_request(event: Any) -> None:
+            payload = answer(event)
+            if payload is not None:
+                event.reply(payload)
+
+        self.module.serve(key(self.wire.robot, "A", leaf), on_request)
+
+    def run(self, work: Coroutine[Any, Any, Any]) -> Any:
+        return self.loop.run_until_complete(work)
+
+    def stop(self) -> Coroutine[Any, Any, Ack]:
+        message = Stop(serial="A", boot=0, seq=self.radio.next_seq(), sender="tester")
+        return self.radio.command("A", Leaf.STOP, message)
+
+
+@pytest.fixture
+def bench(wire: SimpleNamespace) -> Iterator[Bench]:
+    made = Bench(wire)
+    yield made
+    made.loop.close()
+
+
+def test_question_and_answer_are_recorded_as_they_pass(bench: Bench) -> None:
+    wire = bench.wire
+    bench.serve(Leaf.STATUS, lambda _: encode(wire.status(re=1, t_ns=9)))
+    found = bench.run(bench.radio.ask("A", Leaf.STATUS, wire.ask(seq=1)))
+    assert found == wire.status(re=1, t_ns=9)
+    assert [(e.kind, e.payload) for e in bench.entries] == [
+        ("request", encode(wire.ask(seq=1))),
+        ("reply", encode(found)),
+    ]
+    assert len(bench.recording.modules["A"].round_trips) == 1
+
+
+def test_answers_find_their_own_questions_in_whatever_order_they_come(bench: Bench) -> None:
+    wire = bench.wire
+
+    def later(event: Any) -> None:
+        number = len(held)
+        held.append(event)
+        bench.loop.call_later(0.1 - 0.01 * number, lambda: event.reply(encode(wire.status(re=number))))
+
+    held: list[Any] = []
+    bench.module.serve(key(wire.robot, "A", Leaf.STATUS), later)
+
+    async def work() -> list[Any]:
+        asks = [bench.radio.ask("A", Leaf.STATUS, wire.ask(seq=i)) for i in range(5)]
+        return await asyncio.gather(*asks)
+
+    assert [status.re for status in bench.run(work())] == [0, 1, 2, 3, 4]
+
+
+def test_silence_is_an_error_that_names_module_and_question_when_the_time_is_up(bench: Bench) -> None:
+    bench.serve(Leaf.STATUS, lambda _: None)
+    with pytest.raises(NoAnswer, match="module A did not answer on status: Timeout"):
+        bench.run(bench.radio.ask("A", Leaf.STATUS, bench.wire.ask(), timeout_s=0.25))
+    assert bench.loop.time() == pytest.approx(0.25, abs=1e-6)
+
+
+def test_a_module_that_is_not_there_is_not_waited_for(bench: Bench) -> None:
+    with pytest.raises(NoAnswer, match="module B did not answer on info"):
+        bench.run(bench.radio.ask("B", Leaf.INFO, bench.wire.ask("B"), timeout_s=60.0))
+    assert bench.loop.time() < 1.0
+
+
+def test_an_answer_that_cannot_be_read_is_no_answer(bench: Bench) -> None:
+    wire = bench.wire
+    bench.serve(Leaf.STATUS, lambda _: b"noise")
+    with pytest.raises(NoAnswer, match="its answer could not be read"):
+        bench.run(bench.radio.ask("A", Leaf.STATUS, wire.ask()))
+    bench.serve(Leaf.INFO, lambda _: encode(wire.info("B")))
+    with pytest.raises(NoAnswer, match="could not be read"):
+        bench.run(bench.radio.ask("A", Leaf.INFO, wire.ask()))
+    assert bench.recording.refused == {"malformed": 1, "wrong_serial": 1}
+
+
+def test_a_refusal_names_module_command_and_reason(bench: Bench) -> None:
+    no = bench.wire.ack(accepted=False).model_copy(update={"reason": "held", "detail": "held by C"})
+    bench.serve(Leaf.STOP, lambda _: encode(no))
+    with pytest.raises(Refused, match="module A refused stop: held: held by C") as caught:
+        bench.run(bench.stop())
+    assert caught.value.ack == no
+    assert caught.value.serial == "A"
+
+
+def test_an_accepted_command_returns_its_acknowledgement(bench: Bench) -> None:
+    bench.serve(Leaf.STOP, lambda _: encode(bench.wire.ack(re=1)))
+    assert bench.run(bench.stop()) == bench.wire.ack(re=1)
+
+
+def test_tokens_tell_who_is_there(bench: Bench) -> None:
+    bench.radio.start()
+    token = bench.module.declare_alive(key(bench.wire.robot, "A", Leaf.ALIVE))
+    bench.module.declare_alive(key(bench.wire.robot, "B", Leaf.ALIVE))
+    bench.module.declare_alive(key("other", "C", Leaf.ALIVE))
+    bench.run(asyncio.sleep(0.01))
+    assert sorted(bench.radio.alive) == ["A", "B"]
+    token.undeclare()
+    bench.run(asyncio.sleep(0.01))
+    assert sorted(bench.radio.alive) == ["B"]
+    bench.network.kill("module")
+    bench.run(asyncio.sleep(0.01))
+    assert bench.radio.alive == set()
+
+
+def test_a_burst_larger_than_one_turn_of_the_loop_is_heard_to_the_end_and_in_order(bench: Bench) -> None:
+    wire = bench.wire
+    bench.radio.start()
+    topic = key(wire.robot, "A", Leaf.STATUS)
+    for number in range(10_000):
+        bench.module.publish(topic, encode(wire.status(t_ns=number)))
+    bench.run(asyncio.sleep(0.01))
+    assert len(bench.entries) == 10_000
+    assert [e.payload for e in bench.entries[::999]] == [
+        encode(wire.status(t_ns=number)) for number in range(0, 10_000, 999)
+    ]
+    assert bench.radio.dropped == 0
+
+
+def test_what_a_loop_that_hangs_cannot_take_is_counted(bench: Bench) -> None:
+    wire, posted = bench.wire, []
+    radio = Radio(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
+    radio.start()
+    payload = encode(wire.status())
+    for _ in range(100_007):
+        bench.module.publish(key(wire.robot, "A", Leaf.STATUS), payload)
+    bench.run(asyncio.sleep(0.01))
+    assert radio.dropped == 7
+    assert len(posted) == 1  # one call is under way however many events wait
+
+
+def test_numbers_grow(bench: Bench) -> None:
+    numbers = [bench.radio.next_seq() for _ in range(5)]
+    assert numbers == sorted(set(numbers))
+
+
+def test_after_closing_nothing_is_heard_and_nothing_can_be_asked(bench: Bench) -> None:
+    bench.radio.start()
+    bench.radio.close()
+    bench.module.publish(key(bench.wire.robot, "A", Leaf.STATUS), encode(bench.wire.status()))
+    bench.run(asyncio.sleep(0.01))
+    assert bench.entries == []
+    with pytest.raises(TransportError):
+        bench.run(bench.radio.ask("A", Leaf.STATUS, bench.wire.ask()))
+    bench.radio.close()
+
+
+def test_closing_ends_the_questions_under_way(bench: Bench) -> None:
+    bench.serve(Leaf.STATUS, lambda _: None)
+
+    async def work() -> None:
+        question = asyncio.create_task(bench.radio.ask("A", Leaf.STATUS, bench.wire.ask(), timeout_s=60.0))
+        await asyncio.sleep(0.01)
+        bench.radio.close()
+        with pytest.raises(NoAnswer):
+            await question
+
+    bench.run(work())
+    assert bench.loop.time() < 1.0

@@ -1,0 +1,507 @@
+"""Leases, keep-alives and motions on simulated modules, over networks that lose, and modules that vanish."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.live_robot.errors import ModuleLost, MotionInterrupted
+from coordinator.live_robot.messenger import NoAnswer, Radio, Refused
+from coordinator.live_robot.module_group import RobotLink
+from module_agent.control.motion import effort_profile
+from module_agent.network_emulation.profile import NetworkProfile
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import Ack, ConstantMotion, GoTo, Message, MotionCommand, Rest
+
+ARM = "thesis_171_horizontal"
+BASE, TIP = "X-00009", "X-00010"
+# With 30 ms a way in the mean and long tails, the default of 250 ms expires every few seconds.
+PATIENT_NS = 500_000_000
+SLOW = GoTo(target_rad=1.0, max_speed_rad_s=0.6)
+
+
+async def _met(link: RobotLink, *serials: str) -> None:
+    await asyncio.sleep(0.1)
+    await link.meet(serials or (BASE, TIP))
+
+
+async def _armed(link: RobotLink, *serials: str) -> asyncio.Task[None]:
+    """Meet, take, and keep alive until the task is cancelled."""
+    await _met(link, *serials)
+    for serial in link.serials:
+        await link.acquire(serial)
+    return asyncio.create_task(link.keep_alive())
+
+
+def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, recording, link = rig.link()
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        there = await link.run({BASE: GoTo(target_rad=0.4, max_speed_rad_s=0.8)})
+        both = await link.run(
+            {BASE: ConstantMotion(velocity_rad_s=0.5, duration_s=0.3), TIP: Rest(duration_s=0.2)}
+        )
+        await link.complete_rows()
+        assert list(both) == [BASE, TIP]
+        for serial, record in {**there, **both}.items():
+            assert record.outcome == "done"
+            rows = recording.rows(serial, record.start_row, record.end_row)
+            assert len(rows) == record.end_row - record.start_row
+            assert set(rows["motion_id"].tolist()) == {record.motion_id}
+        keeper.cancel()
+        await link.release_all()
+
+    rig.run(work())
+    assert [rig.state(s) for s in rig.serials] == ["idle", "idle"]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
+    rigs: Callable[..., Any], seed: int
+) -> None:
+    rig = rigs(ARM, "bad", seed, lifetime_ns=PATIENT_NS)
+    _, recording, link = rig.link()
+    interrupted = 0
+
+    async def work() -> dict[str, int]:
+        nonlocal interrupted
+        keeper = await _armed(link)
+        for target in (0.3, 0.0, 0.3, 0.0):
+            for _ in range(5):
+                try:
+                    await link.run({BASE: GoTo(target_rad=target, max_speed_rad_s=0.8)})
+                    break
+                except MotionInterrupted:
+                    interrupted += 1
+                    for serial in link.serials:
+                        await link.acquire(serial)
+        heard = {serial: recording.modules[serial].rows.end_row for serial in link.serials}
+        await link.complete_rows()
+        keeper.cancel()
+        await link.release_all()
+        return heard
+
+    for serial, end in rig.run(work()).items():
+        rows = recording.modules[serial].rows
+        assert rows.missing(rows.first_row, end) == []
+        assert (np.diff(rows.rows(rows.first_row, end)["t_ns"]) > 0).all()
+    assert interrupted == 0
+    assert abs(rig.world.plant.q_rad[0]) < 0.05
+
+
+def test_when_everything_comes_twice_nothing_is_done_twice(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, NetworkProfile(name="echo", delay_ms=2.0, jitter_ms=5.0, duplicate=1.0))
+    _, recording, link = rig.link()
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        for target in (0.3, 0.0):
+            assert (await link.run({BASE: GoTo(target_rad=target, max_speed_rad_s=0.8)}))[
+                BASE
+            ].outcome == "done"
+        await link.set_gains(BASE, link.info(BASE).gains)
+        assert recording.modules[BASE].status.token == 1
+        keeper.cancel()
+        await link.release_all()
+
+    rig.run(work())
+
+
+def test_of_two_commanders_the_second_is_told_who_holds_the_module_and_for_how_long(
+    rigs: Callable[..., Any],
+) -> None:
+    rig = rigs(ARM, "lan")
+    _, _, first = rig.link("first")
+    _, _, second = rig.link("second")
+
+    async def work() -> None:
+        keeper = await _armed(first)
+        await _met(second)
+        with pytest.raises(Refused, match=r"refused lease: held: held by first for another \d\.\d\d s"):
+            await second.acquire(BASE)
+        with pytest.raises(Refused, match="held by first, not by second"):
+            await second.run({BASE: SLOW})
+        # Once the first lets go, or dies, the second gets it.
+        keeper.cancel()
+        await asyncio.sleep(1.2)
+        await second.acquire(BASE)
+        with pytest.raises(MotionInterrupted):
+            await first.run({TIP: SLOW})
+
+    rig.run(work())
+
+
+def test_a_holder_whose_lease_is_taken_notices(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    _, _, first = rig.link("first")
+    _, _, second = rig.link("second")
+
+    async def work() -> None:
+        keeper = await _armed(first)
+        await _met(second)
+        keeper.cancel()
+        await asyncio.sleep(1.1)
+        await second.acquire(BASE)
+        keeper = asyncio.create_task(first.keep_alive())
+        with pytest.raises(ModuleLost, match=f"module {BASE} is lost: its lease was taken: held by second"):
+            await first.wait(lambda: False, 1.0)
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_a_killed_agent_is_missed_within_a_third_of_a_second_of_its_token(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, _, link = rig.link()
+
+    async def work() -> int:
+        await _armed(link)
+        rig.kill(TIP)
+        killed = rig.loop.now_ns
+        with pytest.raises(ModuleLost, match=f"module {TIP} is lost: its agent has left the network"):
+            await link.run({BASE: SLOW})
+        return int(rig.loop.now_ns - killed)
+
+    # 300 ms that a token may be gone (a router restarts), one poll, one batch of feedback.
+    assert 280e6 < rig.run(work()) < 360e6
+
+
+def test_a_frozen_agent_is_missed_by_its_silence_though_its_token_stays(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, _, link = rig.link()
+
+    async def work() -> int:
+        await _armed(link)
+        rig.freeze(TIP)
+        frozen = rig.loop.now_ns
+        with pytest.raises(ModuleLost, match=rf"module {TIP} is lost: no feedback for 1\.\d s"):
+            await link.run({BASE: SLOW})
+        return int(rig.loop.now_ns - frozen)
+
+    assert 0.9e9 < rig.run(work()) < 1.1e9
+
+
+def test_an_agent_that_boots_anew_is_another_module(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, recording, link = rig.link()
+
+    async def work() -> None:
+        await _armed(link)
+        rig.kill(TIP)
+        rig.boot(TIP)
+        with pytest.raises(ModuleLost, match=f"module {TIP} is lost: it has booted anew"):
+            await link.run({BASE: SLOW})
+
+    rig.run(work())
+    assert [boot for serial, boot in recording.past if serial == TIP] == [102, 103]
+
+
+def test_commands_to_a_module_that_is_not_there_end_in_a_named_error(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    _, _, link = rig.link()
+
+    async def work() -> None:
+        with pytest.raises(NoAnswer, match="module X-99999 did not answer on info"):
+            await link.meet(["X-99999"])
+
+    rig.run(work())
+
+
+def test_a_motion_is_not_started_unarmed(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    _, _, link = rig.link()
+
+    async def work() -> None:
+        await _met(link)
+        with pytest.raises(MotionInterrupted, match=r"refused: .* holds no lease: acquire it first"):
+            await link.run({BASE: SLOW})
+
+    rig.run(work())
+
+
+def test_a_refusal_that_no_repetition_can_mend_is_passed_on_at_once(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, recording, link = rig.link()
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        running = asyncio.create_task(link.run({BASE: SLOW}))
+        await asyncio.sleep(0.5)
+        with pytest.raises(Refused, match=r"refused motion: busy: motion .* is running"):
+            await link.run({BASE: Rest(duration_s=0.1)})
+        # The motion that runs is none the worse for it.
+        assert (await running)[BASE].outcome == "done"
+        assert recording.modules[BASE].status.refusals == {"busy": 1}
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, _, link = rig.link()
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        keeper.cancel()
+        # Either may expire first, by the age of its last feedback.
+        why = f"the motion of module {BASE} was (expired|spoilt: module {TIP} expired and let go)"
+        with pytest.raises(MotionInterrupted, match=why):
+            await link.run({BASE: SLOW})
+        await asyncio.sleep(0.05)
+        assert rig.state(BASE) == "expired"
+        for serial in link.serials:
+            await link.acquire(serial)
+        keeper = asyncio.create_task(link.keep_alive())
+        assert (await link.run({BASE: SLOW}))[BASE].outcome == "done"
+        keeper.cancel()
+
+    rig.run(work())
+    assert rig.world.plant.q_rad[0] == pytest.approx(1.0, abs=0.05)
+
+
+def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_again(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM, "lan")
+    radio, recording, link = rig.link()
+    lost: list[Ack] = []
+
+    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+        ack = await Radio.command(radio, serial, leaf, message, timeout_s)
+        if leaf is Leaf.MOTION and not lost:
+            lost.append(ack)
+            # The answer is lost, and for longer than a command lives so are the keep-alives.
+            rig.cut = True
+            await asyncio.sleep(0.4)
+            rig.cut = False
+            raise NoAnswer(serial, leaf, "Timeout")
+        return ack
+
+    monkeypatch.setattr(radio, "command", command)
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        with pytest.raises(MotionInterrupted, match="was expired: use a new number"):
+            await link.run({BASE: SLOW})
+        for serial in link.serials:
+            await link.acquire(serial)
+        assert (await link.run({BASE: SLOW}))[BASE].outcome == "done"
+        keeper.cancel()
+
+    rig.run(work())
+    assert [ack.accepted for ack in lost] == [True]
+    assert recording.modules[BASE].status.expiries == 1
+
+
+def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    _, _, link = rig.link()
+
+    async def work() -> list[str]:
+        await _armed(link)
+        rig.freeze(TIP)
+        return await link.stop_all("enough")
+
+    assert rig.run(work()) == [TIP]
+    assert rig.state(BASE) == "stopped"
+
+
+def test_what_the_network_drops_of_feedback_and_estimates_is_fetched(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "bad", 3, lifetime_ns=PATIENT_NS)
+    _, recording, link = rig.link()
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        await asyncio.sleep(1.0)
+        rows = recording.modules[BASE].rows
+        assert rows.missing(rows.first_row, rows.end_row)  # 5 % are lost: the test would test nothing
+        records = await link.run(dict.fromkeys(link.serials, Rest(duration_s=1.0)))
+        await link.complete_rows()
+        for serial, record in records.items():
+            assert (
+                len(recording.rows(serial, record.start_row, record.end_row))
+                == record.end_row - record.start_row
+            )
+        moved = await link.run({BASE: ConstantMotion(velocity_rad_s=0.5, duration_s=0.5)})
+        found = await link.estimate(TIP, BASE, moved[BASE].motion_id, 1.0)
+        assert found is not None
+        assert found.moved
+        assert await link.estimate(TIP, BASE, 12345, 0.01) is None
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_motion_numbers_grow_from_one_coordinator_to_the_next(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM)
+    _, _, first = rig.link("first")
+    _, _, second = rig.link("second")
+
+    async def work() -> None:
+        keeper = await _armed(first, BASE)
+        pattern = Rest(duration_s=0.05)
+        mine = [(await first.run({BASE: pattern}))[BASE].motion_id for _ in range(3)]
+        keeper.cancel()
+        await first.release_all()
+        keeper = await _armed(second, BASE)
+        theirs = (await second.run({BASE: pattern}))[BASE].motion_id
+        keeper.cancel()
+        assert mine[0] < mine[1] < mine[2] < theirs
+
+    rig.run(work())
+
+
+def _commands(monkeypatch: pytest.MonkeyPatch, radio: Radio) -> list[MotionCommand]:
+    """Return a list that fills with the motion commands that go out."""
+    sent: list[MotionCommand] = []
+
+    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+        if isinstance(message, MotionCommand):
+            sent.append(message)
+        return await Radio.command(radio, serial, leaf, message, timeout_s)
+
+    monkeypatch.setattr(radio, "command", command)
+    return sent
+
+
+def _fed(recording: Any, record: Any, serial: str) -> np.ndarray:
+    """Return the effort commands of a motion's rows, NaN where the effort loop was off."""
+    rows = recording.rows(serial, record.start_row, record.end_row)
+    return np.asarray(rows["effort_command_nm"], dtype=float)
+
+
+@pytest.mark.parametrize("network", ["none", NetworkProfile(name="slow", delay_ms=52.0)])
+def test_efforts_go_with_the_motion_they_are_for_and_with_no_other(
+    rigs: Callable[..., Any], network: str | NetworkProfile
+) -> None:
+    rig = rigs(ARM, network)
+    _, recording, link = rig.link()
+    # 0 to 1.2 Nm in 0.6 s, and so until the end of 0.8 s.
+    ramp = effort_profile(np.linspace(0.0, 1.2, 61), 10_000_000)
+    rest = Rest(duration_s=0.8)
+
+    async def work() -> None:
+        await _met(link)
+        # First, as in a session: what is armed must hear renewals while the next answers slowly.
+        keeper = asyncio.create_task(link.keep_alive())
+        for serial in link.serials:
+            await link.acquire(serial)
+        both = await link.run({BASE: rest, TIP: rest}, {BASE: ramp})
+        after = await link.run({BASE: rest, TIP: rest})
+        await link.complete_rows()
+        t_s = 4e-3 * np.arange(len(_fed(recording, both[BASE], BASE)))
+        # A row tells of the last tick before it.
+        wanted = np.minimum(2.0 * t_s, 1.2)
+        np.testing.assert_allclose(_fed(recording, both[BASE], BASE)[1:], wanted[1:], atol=2.0 * 4e-3)
+        for record, serial in ((both[TIP], TIP), (after[BASE], BASE), (after[TIP], TIP)):
+            assert np.isnan(_fed(recording, record, serial)[1:]).all()
+        keeper.cancel()
+        await link.release_all()
+
+    rig.run(work())
+
+
+def test_efforts_for_a_module_without_a_motion_are_refused_before_anything_moves(
+    rigs: Callable[..., Any],
+) -> None:
+    rig = rigs(ARM)
+    _, _, link = rig.link()
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        with pytest.raises(
+            KeyError, match=f"efforts for {TIP}, which has no motion; of those that have one: {BASE}"
+        ):
+            await link.run({BASE: SLOW}, {TIP: effort_profile([0.0, 1.0], 10_000_000)})
+        keeper.cancel()
+        await link.release_all()
+
+    rig.run(work())
+    assert abs(rig.world.plant.q_rad[0]) < 1e-2
+
+
+@pytest.mark.parametrize(("delay_ms", "is_poor"), [(5.0, False), (52.0, True)])
+def test_where_renewals_are_slow_motions_are_told_again_and_run_once(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, delay_ms: float, is_poor: bool
+) -> None:
+    rig = rigs(ARM, NetworkProfile(name="slow", delay_ms=delay_ms))
+    radio, recording, link = rig.link()
+    sent = _commands(monkeypatch, radio)
+
+    async def work() -> None:
+        await _met(link)
+        # First, as in a session: what is armed must hear renewals while the next answers slowly.
+        keeper = asyncio.create_task(link.keep_alive())
+        for serial in link.serials:
+            await link.acquire(serial)
+        record = (await link.run({BASE: SLOW}))[BASE]
+        assert record.outcome == "done"
+        assert link.is_poor == is_poor
+        assert {command.motion_id for command in sent} == {record.motion_id}
+        assert (len(sent) > 1) == is_poor
+        # Newer than each other, as renewals are: a copy that is late has no say.
+        assert [command.seq for command in sent] == sorted({command.seq for command in sent})
+        keeper.cancel()
+        await link.complete_rows()
+
+    rig.run(work())
+    moved = recording.modules[BASE].rows.rows(0, recording.modules[BASE].rows.end_row)["motion_id"]
+    # It begins once, and ends once.
+    assert np.count_nonzero(np.diff((moved > 0).astype(int)) > 0) == 1
+
+
+def test_a_motion_during_which_another_joint_let_go_is_spoilt(
+    rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = rigs(ARM, "lan")
+    radio, _, link = rig.link()
+
+    async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
+        if serial == TIP and leaf is Leaf.LEASE and rig.state(BASE) == "moving":
+            raise NoAnswer(serial, leaf, "Timeout")
+        return await Radio.command(radio, serial, leaf, message, timeout_s)
+
+    monkeypatch.setattr(radio, "command", command)
+
+    async def work() -> None:
+        keeper = await _armed(link)
+        why = f"the motion of module {BASE} was spoilt: module {TIP} expired and let go"
+        with pytest.raises(MotionInterrupted, match=why):
+            await link.run({BASE: SLOW})
+        # Armed again, both move as before.
+        for serial in link.serials:
+            await link.acquire(serial)
+        keeper.cancel()
+
+    rig.run(work())
+
+
+def test_many_holes_of_all_modules_are_fetched_together(rigs: Callable[..., Any]) -> None:
+    """One after the other 40 holes at 60 ms a round trip would take the longer half of a motion."""
+    rig = rigs(ARM, NetworkProfile(name="far", delay_ms=30.0))
+    _, recording, link = rig.link()
+
+    async def work() -> float:
+        keeper = await _armed(link)
+        await link.complete_rows()
+        for _ in range(20):
+            rig.cut = True
+            await asyncio.sleep(0.02)
+            rig.cut = False
+            await asyncio.sleep(0.06)
+        begun_s = rig.loop.time()
+        await link.complete_rows()
+        keeper.cancel()
+        return rig.loop.time() - begun_s
+
+    taken_s = rig.run(work())
+    for serial in link.serials:
+        log = recording.modules[serial].rows
+        assert log.missing(0, log.end_row - 50) == [] or log.first_row > 0
+    # A question for the status and at most six rounds of eight holes, each within 80 ms by the ticks.
+    assert taken_s < 0.08 * 7

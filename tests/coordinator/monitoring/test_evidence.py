@@ -1,0 +1,111 @@
+"""A change is found by as much as least squares with it fits better, and by chance as chance has it."""
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+from scipy.stats import chi2
+
+from coordinator.monitoring.likelihood_ratio import (
+    Evidence,
+    compressed,
+    find_change,
+    gain_above,
+    joined,
+    without_own,
+)
+
+PARAMETERS, WIDE = 6, np.full(6, 10.0)
+CHANGE = np.eye(PARAMETERS)[:, :2] * 100.0
+
+
+@pytest.fixture
+def rng() -> Generator:
+    return np.random.default_rng(7)
+
+
+def measured(rng: Generator, theta: np.ndarray, samples: int = 200) -> tuple[np.ndarray, np.ndarray]:
+    rows = rng.normal(size=(samples, PARAMETERS))
+    return rows, rows @ theta + rng.normal(size=samples)
+
+
+def test_gain_and_size_are_those_of_least_squares_over_all_samples_at_once(rng: Generator) -> None:
+    theta = rng.normal(size=PARAMETERS)
+    changed = theta + CHANGE @ [0.004, -0.002]
+    (b, y), (later, z) = measured(rng, theta), measured(rng, changed)
+    found = find_change(compressed(b, y), compressed(later, z), WIDE, (CHANGE,)).changes[0]
+    # All samples, the prior of theta and that of the change as rows of their own.
+    none = np.zeros((len(b), 2))
+    rows = np.vstack(
+        [
+            np.column_stack([b, none]),
+            np.column_stack([later, later @ CHANGE]),
+            np.column_stack([np.eye(PARAMETERS) / 10.0, np.zeros((PARAMETERS, 2))]),
+            np.column_stack([np.zeros((2, PARAMETERS)), np.eye(2)]),
+        ]
+    )
+    target = np.concatenate([y, z, np.zeros(PARAMETERS + 2)])
+    best = np.linalg.lstsq(rows, target, rcond=None)[0]
+    without = np.linalg.lstsq(rows[:, :PARAMETERS], target, rcond=None)[0]
+    misfits = [np.sum((rows[:, : len(x)] @ x - target) ** 2) for x in (without, best)]
+    np.testing.assert_allclose(found.size, best[PARAMETERS:], rtol=1e-8)
+    assert found.gain == pytest.approx(misfits[0] - misfits[1], rel=1e-8)
+    covariance = np.linalg.inv(rows.T @ rows)[PARAMETERS:, PARAMETERS:]
+    np.testing.assert_allclose(found.covariance, covariance, rtol=1e-8)
+
+
+def test_chance_exceeds_a_level_as_seldom_as_was_asked_for(rng: Generator) -> None:
+    theta = rng.normal(size=PARAMETERS)
+    before = compressed(*measured(rng, theta, 2000))
+    gains = np.array(
+        [
+            find_change(before, compressed(*measured(rng, theta, 50)), WIDE, (CHANGE,)).changes[0].gain
+            for _ in range(1500)
+        ]
+    )
+    # Of 1500 draws 150 exceed what one in ten does, give or take 3.5 binomial sigmas of 12.
+    level = gain_above(2, 10.0, 1.0)
+    assert level == pytest.approx(chi2.isf(0.1, 2))
+    assert 150 - 42 < np.count_nonzero(gains > level) < 150 + 42
+
+
+def test_what_neither_stretch_tells_makes_no_gain(rng: Generator) -> None:
+    rows = rng.normal(size=(100, PARAMETERS))
+    rows[:, :2] = 0.0
+    quiet = compressed(rows, rng.normal(size=100))
+    assert find_change(quiet, quiet, WIDE, (CHANGE,)).changes[0].gain == pytest.approx(0.0, abs=1e-9)
+
+
+def test_joined_evidence_is_that_of_all_samples_in_any_order(rng: Generator) -> None:
+    parts = [compressed(*measured(rng, np.ones(PARAMETERS))) for _ in range(3)]
+    one, other = joined(parts), joined(parts[::-1])
+    for a, b in ((one, other), (one, joined([joined(parts[:2]), parts[2]]))):
+        np.testing.assert_allclose(a.rows.T @ a.rows, b.rows.T @ b.rows, rtol=1e-10)
+        np.testing.assert_allclose(a.rows.T @ a.target, b.rows.T @ b.target, rtol=1e-10)
+
+
+def test_own_parameters_are_left_out_as_a_schur_complement_does(rng: Generator) -> None:
+    rows, target = measured(rng, np.ones(PARAMETERS))
+    left = without_own(compressed(rows, target), [0.5, 0.5])
+    normal = rows.T @ rows
+    normal[:2, :2] += 4.0 * np.eye(2)
+    expected = normal[2:, 2:] - normal[2:, :2] @ np.linalg.solve(normal[:2, :2], normal[:2, 2:])
+    np.testing.assert_allclose(left.rows.T @ left.rows, expected, rtol=1e-9)
+
+
+def test_evidence_about_other_parameters_is_refused() -> None:
+    one = Evidence(np.eye(3), np.zeros(3))
+    other = Evidence(np.eye(4), np.zeros(4))
+    with pytest.raises(ValueError, match="cannot be joined"):
+        joined([one, other])
+    with pytest.raises(ValueError, match="prior of 3"):
+        find_change(one, other, np.ones(3), (np.eye(3),))
+    with pytest.raises(ValueError, match="not finite"):
+        compressed([[np.nan]], [0.0])
+
+
+def test_where_nothing_could_have_changed_there_is_a_misfit_and_no_change(rng: Generator) -> None:
+    """A robot of one module has no link."""
+    evidence = compressed(*measured(rng, rng.normal(size=PARAMETERS)))
+    found = find_change(evidence, evidence, WIDE, ())
+    assert found.changes == ()
+    assert found.misfit > 0.0

@@ -1,0 +1,202 @@
+"""What a session has heard, by module, boot, joint and observer; and a hash that notices every change."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording, RoundTrip
+from module_agent.wire.codec import encode
+from module_agent.wire.keys import Leaf, key
+from module_agent.wire.messages import Ack, Rest, Status, Stop
+from module_agent.wire.refusal import WireError
+
+
+@pytest.fixture
+def heard() -> Recording:
+    return Recording()
+
+
+def test_rows_that_come_out_of_order_and_twice_are_kept_once_in_order(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    for first in (10, 0, 5, 5, 15):
+        heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first)))
+    np.testing.assert_array_equal(heard.rows("A", 3, 18)["position_rad"], np.arange(3, 18))
+    assert heard.modules["A"].rows.missing(0, 20) == []
+
+
+def test_rows_of_two_boots_of_one_module_are_kept_apart(heard: Recording, wire: SimpleNamespace) -> None:
+    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=1000)))
+    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=8, first=0)))
+    assert heard.modules["A"].boot == 8
+    assert (heard.modules["A"].rows.first_row, heard.modules["A"].rows.end_row) == (0, 5)
+    old = heard.past["A", 7].rows
+    assert (old.first_row, old.end_row) == (1000, 1005)
+
+
+def test_a_straggler_of_an_old_boot_does_not_bring_that_boot_back(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    heard.add(wire.publication(Leaf.STATUS, wire.status(boot=7)))
+    heard.add(wire.publication(Leaf.STATUS, wire.status(boot=8)))
+    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=20)))
+    assert heard.modules["A"].boot == 8
+    # It belongs to its own boot all the same.
+    assert heard.past["A", 7].rows.end_row == 25
+
+
+def test_a_round_trip_joins_a_question_to_its_answer_by_key_and_number(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    heard.add(wire.request(Leaf.STATUS, wire.ask(seq=3), t_ns=100))
+    heard.add(wire.request(Leaf.STATUS, wire.ask(seq=4), t_ns=200))
+    heard.add(wire.request(Leaf.STATUS, wire.ask("B", seq=5), t_ns=250))
+    heard.add(wire.reply(Leaf.STATUS, wire.status(re=4, t_ns=77), t_ns=300))
+    heard.add(wire.reply(Leaf.STATUS, wire.status(re=4, t_ns=77), t_ns=301))  # a copy is no second trip
+    heard.add(wire.reply(Leaf.STATUS, wire.status(re=9, t_ns=78), t_ns=302))  # nobody asked
+    assert heard.modules["A"].round_trips == [RoundTrip(200, 300, 77)]
+    assert "B" not in heard.modules
+
+
+def test_once_it_is_settled_what_is_known_no_later_round_trip_counts(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    def trip(number: int, t_ns: int) -> None:
+        heard.add(wire.request(Leaf.STATUS, wire.ask(seq=number), t_ns=t_ns))
+        heard.add(wire.reply(Leaf.STATUS, wire.status(re=number, t_ns=77), t_ns=t_ns + 10))
+
+    def journal(what: str) -> None:
+        event = JournalEvent.model_validate({"t_ns": 500, "what": what})
+        heard.add(Entry("journal", JOURNAL_TOPIC, 500, event.encode()))
+
+    trip(1, 100)
+    journal("settled")
+    # At the very same time: what counts is the order of the recording.
+    trip(2, 490)
+    module = heard.modules["A"]
+    assert [t.sent_ns for t in module.trips] == [100]
+    assert [t.sent_ns for t in module.round_trips] == [100, 490]
+    # A session that goes on after a crash settles anew.
+    journal("session")
+    assert module.trips == module.round_trips
+
+
+def test_a_published_status_is_no_answer(heard: Recording, wire: SimpleNamespace) -> None:
+    heard.add(wire.request(Leaf.STATUS, wire.ask(seq=0), t_ns=100))
+    heard.add(wire.publication(Leaf.STATUS, wire.status(t_ns=5, re=0), t_ns=120))
+    assert heard.modules["A"].round_trips == []
+
+
+def test_a_refusal_in_place_of_an_answer_is_understood(heard: Recording, wire: SimpleNamespace) -> None:
+    for leaf in (Leaf.HISTORY, Leaf.ESTIMATE, Leaf.INFO, Leaf.STATUS, Leaf.LEASE, Leaf.MOTION):
+        assert isinstance(heard.add(wire.reply(leaf, wire.ack(accepted=False))), Ack)
+
+
+def test_whoever_speaks_on_anothers_key_is_counted_and_not_believed(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    for entry in (
+        wire.publication(Leaf.STATUS, wire.status("B"), on="A"),
+        wire.publication(Leaf.FEEDBACK, wire.feedback("B"), on="A"),
+        wire.reply(Leaf.LEASE, wire.ack("B"), on="A"),
+    ):
+        with pytest.raises(WireError, match="B speaks on the key of A"):
+            heard.add(entry)
+    assert heard.refused == {"wrong_serial": 3}
+    assert heard.modules == {}
+
+
+def test_what_cannot_be_read_is_counted_by_reason(heard: Recording, wire: SimpleNamespace) -> None:
+    topic = key(wire.robot, "A", Leaf.STATUS)
+    other_version = encode(wire.status().model_copy(update={"v": 2}))
+    for payload in (b"", b"\xc1", other_version):
+        with pytest.raises(WireError):
+            heard.add(Entry("publication", topic, 0, payload))
+    with pytest.raises(WireError, match="nothing is publication on info"):
+        heard.add(wire.publication(Leaf.INFO, wire.info()))
+    assert heard.refused == {"malformed": 3, "version": 1}
+
+
+def test_the_newest_time_that_was_heard_never_goes_back(heard: Recording, wire: SimpleNamespace) -> None:
+    for t_ns in (50, 90, 70):
+        heard.add(wire.publication(Leaf.STATUS, wire.status(t_ns=t_ns)))
+    assert heard.modules["A"].newest_ns == 90
+    heard.add(wire.reply(Leaf.LEASE, wire.ack(t_ns=120)))
+    assert heard.modules["A"].newest_ns == 120
+
+
+def test_only_published_rows_tell_when_a_module_was_heard_last(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=10), t_ns=1000))
+    heard.add(wire.reply(Leaf.HISTORY, wire.feedback(first=0), t_ns=2000))
+    assert heard.modules["A"].arrivals == [(1000, 14 * 4_000_000)]
+
+
+def test_estimates_are_found_by_joint_observer_and_motion(heard: Recording, wire: SimpleNamespace) -> None:
+    for joint, observer, ids in (("A", "B", (1,)), ("A", "B", (1, 2)), ("A", "C", (1,)), ("B", "A", (3,))):
+        heard.add(wire.publication(Leaf.ESTIMATE, wire.estimate(joint, observer, ids=ids)))
+    again = wire.estimate("A", "B", ids=(1, 2), rate_ratio=0.25)
+    heard.add(wire.reply(Leaf.ESTIMATE, again))
+    assert list(heard.estimates) == [("A", "B"), ("A", "C"), ("B", "A")]
+    assert list(heard.estimates["A", "B"]) == [(1,), (1, 2)]
+    assert heard.estimates["A", "B"][1, 2].rate_ratio == 0.25
+
+
+def test_the_journal_is_kept_but_is_no_part_of_the_trace(heard: Recording, wire: SimpleNamespace) -> None:
+    before = heard.trace_hash
+    motion = wire.record(5, Rest(duration_s=1.0), 0, 250)
+    heard.add(wire.journal("motion", serial="A", purpose="rest", motion=motion))
+    assert [e.motion for e in heard.journal] == [motion]
+    assert heard.trace_hash == before
+
+
+def test_requests_say_what_was_sent_and_make_no_module_known(heard: Recording, wire: SimpleNamespace) -> None:
+    stop = Stop(serial="A", boot=0, seq=1, sender="tester", why="test")
+    assert heard.add(wire.request(Leaf.STOP, stop)) == stop
+    assert heard.modules == {}
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    times=st.lists(st.integers(0, 2**62), min_size=1, max_size=5),
+    where=st.integers(0, 10**6),
+    change=st.sampled_from(["time", "kind", "topic", "payload", "drop", "repeat"]),
+)
+def test_the_trace_hash_changes_with_any_change(
+    wire: SimpleNamespace, times: list[int], where: int, change: str
+) -> None:
+    entries = [wire.publication(Leaf.STATUS, wire.status(t_ns=t), t) for t in times]
+    index = where % len(entries)
+    old = entries[index]
+    changed: dict[str, list[Entry]] = {
+        "time": [old._replace(t_ns=old.t_ns + 1)],
+        "kind": [old._replace(kind="reply")],
+        "topic": [old._replace(topic=key(wire.robot, "B", Leaf.STATUS))],
+        "payload": [old._replace(payload=encode(wire.status(t_ns=times[index], token=1)))],
+        "drop": [],
+        "repeat": [old, old],
+    }
+    others = entries[:index] + changed[change] + entries[index + 1 :]
+    hashes = []
+    for each in (entries, entries, others):
+        recording = Recording()
+        for entry in each:
+            try:
+                recording.add(entry)
+            except WireError:
+                assert change == "topic"  # what is refused is part of the trace too
+        hashes.append(recording.trace_hash)
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_a_status_is_decoded_as_it_was_sent(heard: Recording, wire: SimpleNamespace) -> None:
+    sent = wire.status(refusals={"stale": 3}, note="x" * 512)
+    found = heard.add(wire.publication(Leaf.STATUS, sent))
+    assert isinstance(found, Status)
+    assert found == sent
+    assert heard.modules["A"].status == sent

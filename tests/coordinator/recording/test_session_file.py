@@ -1,0 +1,147 @@
+"""A recording comes back as it was written, up to wherever a crash has cut it."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from coordinator.recording.recording import Entry
+from coordinator.recording.session_file import CHUNK_BYTES, SessionFileError, SessionWriter, read_session
+from module_agent.wire.keys import Leaf
+
+PERIOD_NS = 20_000_000
+
+
+def _entries(wire: SimpleNamespace, count: int) -> list[Entry]:
+    """Entries of every kind, 50 a second: five flushes for every 50."""
+    found = [wire.journal("session", robot="robot")]
+    for i in range(1, count):
+        t_ns = i * PERIOD_NS
+        found.append(
+            (
+                wire.publication(Leaf.FEEDBACK, wire.feedback(first=5 * i), t_ns),
+                wire.request(Leaf.STATUS, wire.ask(seq=i), t_ns),
+                wire.reply(Leaf.STATUS, wire.status(re=i - 1), t_ns),
+                wire.reply(Leaf.HISTORY, wire.feedback(first=5 * i, count=200), t_ns),
+                wire.journal("note", t_ns, text=f"note {i}"),
+            )[i % 5]
+        )
+    return found
+
+
+def _write(path: Path, entries: list[Entry]) -> SessionWriter:
+    writer = SessionWriter(path)
+    for entry in entries:
+        writer.write(entry)
+    return writer
+
+
+def test_what_was_written_is_read_in_the_same_order(tmp_path: Path, wire: SimpleNamespace) -> None:
+    entries = _entries(wire, 120)
+    # Messages that share an instant keep their order, and a clock that was set back does not sort them.
+    entries += [entry._replace(t_ns=0) for entry in entries[:30]]
+    _write(tmp_path / "session.mcap", entries).close()
+    assert list(read_session(tmp_path / "session.mcap")) == entries
+
+
+def test_without_being_closed_at_most_a_fifth_of_a_second_is_missing(
+    tmp_path: Path, wire: SimpleNamespace
+) -> None:
+    entries = _entries(wire, 200)
+    writer = _write(tmp_path / "session.mcap", entries)
+    crashed = tmp_path / "crashed.mcap"
+    crashed.write_bytes((tmp_path / "session.mcap").read_bytes())
+    writer.close()
+    found = list(read_session(crashed))
+    assert found == entries[: len(found)]
+    assert len(found) >= len(entries) - 200_000_000 // PERIOD_NS
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_a_file_cut_at_any_byte_is_read_up_to_the_cut(
+    tmp_path: Path, wire: SimpleNamespace, data: st.DataObject
+) -> None:
+    whole = tmp_path / "session.mcap"
+    entries = _entries(wire, 60)
+    if not whole.exists():
+        _write(whole, entries).close()
+    content = whole.read_bytes()
+    cut = data.draw(st.integers(0, len(content)))
+    (tmp_path / "cut.mcap").write_bytes(content[:cut])
+    found = list(read_session(tmp_path / "cut.mcap"))
+    assert found == entries[: len(found)]
+    # What is lost is what lies behind the cut, and at most the chunk that it goes through.
+    behind = sum(len(e.payload) for e in entries[len(found) :])
+    largest = max(len(e.payload) for e in entries)
+    assert behind <= len(content) - cut + CHUNK_BYTES + largest
+
+
+@pytest.mark.parametrize("cut", range(12))
+def test_a_file_of_a_few_bytes_is_an_empty_recording(tmp_path: Path, cut: int, wire: SimpleNamespace) -> None:
+    _write(tmp_path / "session.mcap", _entries(wire, 3)).close()
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "session.mcap").read_bytes()[:cut])
+    assert list(read_session(tmp_path / "cut.mcap")) == []
+
+
+def test_any_mcap_tool_finds_the_schemas_and_the_index(tmp_path: Path, wire: SimpleNamespace) -> None:
+    _write(tmp_path / "session.mcap", _entries(wire, 50)).close()
+    with (tmp_path / "session.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == 50
+    assert sorted(s.name for s in summary.schemas.values()) == [
+        "x5.Ask",
+        "x5.Feedback",
+        "x5.JournalEvent",
+        "x5.Status",
+    ]
+    kinds = {(c.topic.rsplit("/")[-1], c.metadata["kind"]) for c in summary.channels.values()}
+    assert ("status", "request") in kinds
+    assert ("status", "reply") in kinds
+
+
+def test_foreign_files_are_refused_by_name(tmp_path: Path) -> None:
+    text = tmp_path / "notes.txt"
+    text.write_text("no recording")
+    with pytest.raises(SessionFileError, match=r"notes\.txt: not an MCAP file; give the session\.mcap"):
+        list(read_session(text))
+    with pytest.raises(SessionFileError, match=r"missing\.mcap: No such file"):
+        list(read_session(tmp_path / "missing.mcap"))
+    with pytest.raises(SessionFileError, match="directory"):
+        list(read_session(tmp_path))
+
+
+def test_an_mcap_file_of_something_else_is_refused_by_its_topic(tmp_path: Path) -> None:
+    path = tmp_path / "camera.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel(topic="/camera", message_encoding="json", schema_id=0)
+        writer.add_message(channel, log_time=0, data=b"{}", publish_time=0)
+        writer.finish()
+    with pytest.raises(SessionFileError, match=r"camera\.mcap: topic /camera is not of a session"):
+        list(read_session(path))
+
+
+def test_a_damaged_file_is_called_damaged(tmp_path: Path, wire: SimpleNamespace) -> None:
+    path = tmp_path / "session.mcap"
+    _write(path, _entries(wire, 30)).close()
+    content = bytearray(path.read_bytes())
+    content[8:20] = b"\xff" * 12  # the first record's kind and length
+    path.write_bytes(content)
+    with pytest.raises(SessionFileError, match=r"session\.mcap: damaged"):
+        list(read_session(path))
+
+
+def test_closing_twice_is_once(tmp_path: Path, wire: SimpleNamespace) -> None:
+    writer = _write(tmp_path / "session.mcap", _entries(wire, 10))
+    writer.close()
+    size = (tmp_path / "session.mcap").stat().st_size
+    writer.close()
+    assert (tmp_path / "session.mcap").stat().st_size == size

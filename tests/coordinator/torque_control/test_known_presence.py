@@ -1,0 +1,87 @@
+"""Is the robot on the network the one that is known, and does it stand as it stood?"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coordinator.torque_control.gravity_model import KnownWeight
+from coordinator.torque_control.preconditions import Felt, NotTheKnownRobot, check_mounting, find_known
+from module_agent.model.chain import Chain
+from module_agent.model.forward_kinematics import imu_poses
+from sim.benchmark.cases.gravity_compensation import true_weight
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
+
+ARM = "thesis_171_horizontal"
+
+
+def felt(chain: Chain, q: np.ndarray, tilt_rad: float = 0.0, lost_zero_rad: float = 0.0) -> Felt:
+    """What IMUs feel at rest if the base is tilted about x, or the last joint counts from another zero."""
+    turned = Rotation.from_rotvec([tilt_rad, 0.0, 0.0]).as_matrix() @ chain.gravity
+    poses = imu_poses(chain, q[None])[0]
+    told = q.copy()
+    told[-1] += lost_zero_rad
+    return Felt(told, np.swapaxes(poses[:, :3, :3], 1, 2) @ turned)
+
+
+def test_a_robot_that_stands_as_it_stood_is_known_by_where_its_imus_feel_gravity() -> None:
+    chain = true_chain(load_robot("arm6"))
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        q = rng.uniform(-3.0, 3.0, 6)
+        check_mounting(chain, felt(chain, q))
+        # Errors of IMUs as delivered: 3 % of scale, 0.3 m/s^2 of offset.
+        at = felt(chain, q)
+        check_mounting(chain, at._replace(accel_m_s2=1.03 * at.accel_m_s2 + rng.normal(0.0, 0.3, (6, 3))))
+
+
+@pytest.mark.parametrize("change", [{"tilt_rad": 0.35}, {"tilt_rad": -np.pi}])
+def test_a_base_that_stands_otherwise_is_noticed_and_the_module_is_named(change: dict[str, float]) -> None:
+    chain = true_chain(load_robot("arm6"))
+    with pytest.raises(NotTheKnownRobot, match=r"the IMU of module A-\d feels gravity \d+ degrees from"):
+        check_mounting(chain, felt(chain, np.full(6, 0.2), **change))
+
+
+def test_a_joint_that_has_lost_its_zero_is_noticed_where_its_imu_turns_with_it() -> None:
+    chain = true_chain(load_robot("arm6"))
+    q = np.array([0.0, 0.3, -0.4, 0.2, 0.0, 0.0])
+    at = felt(chain, q)
+    wrong = at.q_rad.copy()
+    wrong[1] += 0.5
+    with pytest.raises(NotTheKnownRobot, match="feels gravity 29 degrees"):
+        check_mounting(chain, at._replace(q_rad=wrong))
+
+
+# --------------------------------------------------------------------------- on a network
+
+
+def known(**changes: object) -> KnownWeight:
+    return true_weight(load_robot(ARM))._replace(**changes)
+
+
+def test_the_known_robot_is_found_and_met(rigs: Callable[..., Any]) -> None:
+    rig = rigs(ARM, "lan")
+    radio, recording, link = rig.link()
+    rig.run(find_known(link, radio, known(), lambda: rig.loop.now_ns))
+    assert link.serials == ("X-00009", "X-00010")
+    assert all(recording.modules[serial].arrivals for serial in link.serials)
+
+
+def test_a_module_that_is_missing_of_another_type_or_no_part_of_it_is_named(
+    rigs: Callable[..., Any],
+) -> None:
+    rig = rigs(ARM, "lan")
+    radio, _, link = rig.link()
+    whole = known()
+    rename = whole.chain._replace(serials=("X-00009", "gone"))
+    less = whole.chain._replace(serials=("X-00009",))
+    for weight, words in (
+        (known(chain=rename), "module gone is not there, 1 of 2 are missing; there are X-00009, X-00010"),
+        (known(chain=less), "module X-00010 is no part of the robot that is known, X-00009"),
+        (known(types=("X5-9", "X5-1")), "module X-00009 is an X5-"),
+    ):
+        with pytest.raises(NotTheKnownRobot, match=words):
+            rig.run(find_known(link, radio, weight, lambda: rig.loop.now_ns))

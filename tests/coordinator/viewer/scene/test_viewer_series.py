@@ -1,0 +1,71 @@
+"""States, colours and ranges of plots: what is worked out before anything is logged."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coordinator.viewer.scene.entity_paths import Palette, axis_shades, nth_colour
+from coordinator.viewer.scene.parameter_plot import Estimate, Parameter, fitting, with_estimate
+from coordinator.viewer.scene.time_series import Batch, StateChanges
+from module_agent.wire.feedback_rows import ROW
+
+
+def test_states_change_across_batches_and_an_unknown_state_is_shown_by_number() -> None:
+    changes = StateChanges()
+    found = []
+    for states in ([0, 0, 1], [1, 1], [9, 0]):
+        rows = np.zeros(len(states), ROW)
+        rows["state"] = states
+        found.append(changes.of(Batch("a", np.arange(len(states)), rows))[1])
+    assert found == [["idle", "armed"], [], ["state 9", "idle"]]
+
+
+@given(st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(1e-6, 1.0)), min_size=2, max_size=40))
+def test_the_newest_estimate_and_its_band_can_always_be_seen(estimates: list[tuple[float, float]]) -> None:
+    seen, previous = None, None
+    for value, sigma in estimates:
+        seen = fitting(seen, value, sigma, previous)
+        assert seen is not None
+        low, high = seen
+        assert low <= value - sigma < value + sigma <= high
+        if previous is not None and abs(value - previous) < sigma:
+            # A band below a thirtieth of the plot cannot be told from a line.
+            assert 2.0 * sigma > (high - low) / 30.001
+        previous = value
+
+
+def test_a_jump_of_many_sigmas_is_not_zoomed_away() -> None:
+    low, high = fitting((0.2, 0.4), 0.3, 1e-5, previous=0.29) or (0.0, 0.0)
+    assert low < 0.29 < 0.3 < high
+
+
+def test_a_converging_estimate_changes_its_plot_seldom() -> None:
+    ranges = []
+    seen = None
+    for k in range(1, 1001):
+        seen = fitting(seen, 0.3, 0.1 / k, 0.3)
+        ranges.append(seen)
+    # From 0.1 down to 0.0001 by zooms of a factor of about two and more.
+    assert 1 < len(dict.fromkeys(ranges)) < 12
+
+
+def test_an_estimate_without_a_sigma_leaves_the_range_to_the_viewer() -> None:
+    assert fitting(None, 1.0, float("inf"), None) is None
+    parameters = with_estimate((), Estimate("mass", "a", 1.0, float("nan"), "kg"), None)
+    assert parameters == (Parameter("mass", "kg", (("a", None),)),)
+
+
+def test_a_module_keeps_its_colour_and_no_two_of_64_share_one() -> None:
+    palette = Palette()
+    first = palette.colour("a")
+    others = [palette.colour(f"m{k}") for k in range(63)]
+    assert palette.colour("a") == first
+    assert len(dict.fromkeys([first, *others])) == 64
+    assert len(dict.fromkeys(axis_shades(first))) == 3
+
+
+def test_colours_of_modules_are_neither_the_estimates_orange_nor_the_truths_grey() -> None:
+    for k in range(64):
+        red, green, blue, _ = nth_colour(k)
+        assert max(red, green, blue) - min(red, green, blue) > 40
+        assert abs(red - 255) + abs(green - 150) + abs(blue - 40) > 90

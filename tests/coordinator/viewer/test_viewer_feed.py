@@ -1,0 +1,165 @@
+"""What the viewer is handed of a session: every published row, once and at its time, and the poses."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.kinematics.assembly import ChainFit
+from coordinator.recording.recording import Entry, Recording
+from coordinator.viewer.feed import FILE, LIVE, Pace, ViewerFeed
+from module_agent.model.chain import Chain
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import Message
+
+MS = 1_000_000
+# The module booted this long before the session began.
+AHEAD_NS = 7_000 * MS
+
+
+class Shown:
+    """A viewer that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.rows_of: dict[str, list[tuple[int, float]]] = {}
+        self.calls: list[str] = []
+        self.turned: list[tuple[int, list[float]]] = []
+
+    def rows(self, serial: str, t_ns: np.ndarray, rows: np.ndarray) -> None:
+        self.calls.append("rows")
+        found = zip(t_ns.tolist(), rows["position_rad"].tolist(), strict=True)
+        self.rows_of.setdefault(serial, []).extend(found)
+
+    def poses(self, t_ns: Any, q_rad: Any, serials: Any) -> None:
+        self.calls.append("poses")
+        self.turned += [(int(t), list(q)) for t, q in zip(t_ns, q_rad, strict=True)]
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *arguments: self.calls.append(name)
+
+
+class Rig:
+    """A recording and the feed of a viewer, as a run feeds them."""
+
+    def __init__(self, wire: SimpleNamespace, pace: Pace):
+        self.wire = wire
+        self.recording = Recording()
+        self.viewer: Any = Shown()
+        self.feed = ViewerFeed(self.viewer, self.recording, pace)
+        self.feed.since_start(0)
+
+    def hear(self, entry: Entry) -> None:
+        message = self.recording.add(entry)
+        assert isinstance(message, Message)
+        self.feed.on_message(entry, message)
+
+    def meet(self, *serials: str) -> None:
+        """Make modules known, with a round trip that says how far their clocks are ahead."""
+        for serial in serials:
+            self.hear(self.wire.request(Leaf.STATUS, self.wire.ask(serial, seq=4), 0))
+            answer = self.wire.status(serial, re=4, t_ns=AHEAD_NS)
+            self.hear(self.wire.reply(Leaf.STATUS, answer, 0))
+        self.feed.met(dict.fromkeys(serials, "X5-4"), 0)
+
+    def publish(self, first: int, serial: str = "A", late_ns: int = 0) -> None:
+        """Five rows, which arrive 2 ms after the last of them and `late_ns`."""
+        block = self.wire.rows(first, 5)
+        block["t_ns"] += AHEAD_NS
+        arrival_ns = 4 * MS * (first + 4) + 2 * MS + late_ns
+        feedback = self.wire.feedback(serial, first=first, rows=block)
+        self.hear(self.wire.publication(Leaf.FEEDBACK, feedback, arrival_ns))
+
+
+@pytest.fixture(params=[LIVE, FILE], ids=["live", "file"])
+def rig(wire: SimpleNamespace, request: pytest.FixtureRequest) -> Rig:
+    return Rig(wire, request.param)
+
+
+def _fit(chain: Chain) -> ChainFit:
+    count = len(chain.serials)
+    nothing = np.zeros((6 * count,) * 2)
+    return ChainFit(
+        chain=chain,
+        covariance=nothing,
+        rank=0,
+        unknowns=0,
+        singular_values=np.zeros(0),
+        condition=1.0,
+        unresolved=(),
+        null_basis=nothing[:, :0],
+        link_length_m=np.full(count, 0.3),
+        link_length_sigma_m=np.full(count, 0.001),
+        reduced_chi2=1.0,
+        misfit_sigma=np.zeros(0),
+    )
+
+
+def _rows(*numbers: int) -> list[tuple[int, float]]:
+    return [(4 * MS * number, float(number)) for number in numbers]
+
+
+def test_every_row_is_shown_once_at_the_time_of_its_own_clock(rig: Rig) -> None:
+    rig.meet("A", "B")
+    for first in range(0, 2000, 5):
+        rig.publish(first, "A")
+        rig.publish(first, "B")
+    rig.feed.close()
+    assert rig.viewer.rows_of == {"A": _rows(*range(2000)), "B": _rows(*range(2000))}
+
+
+def test_rows_that_come_late_are_shown_when_they_come_and_lost_ones_are_not(rig: Rig) -> None:
+    rig.meet("A")
+    for first in (0, 10, 5, 15, 25, 30):
+        rig.publish(first)
+    # Far behind whatever is gathered together.
+    rig.publish(5000)
+    rig.publish(20, late_ns=25_000 * MS)
+    rig.feed.close()
+    numbers = [*range(5), *range(10, 15), *range(5, 10), *range(15, 20), *range(25, 35)]
+    assert rig.viewer.rows_of["A"] == _rows(*numbers, *range(5000, 5005), *range(20, 25))
+
+
+def test_rows_are_handed_over_in_as_many_calls_as_the_pace_says(rig: Rig) -> None:
+    rig.meet("A", "B")
+    for first in range(0, 5000, 5):
+        rig.publish(first, "A")
+        rig.publish(first, "B")
+    # 20 s of messages every 20 ms, of two modules; in each call whatever came since the last one.
+    expected = {LIVE.rows_ns: 2 * 200, FILE.rows_ns: 2 * 5}[rig.feed.pace.rows_ns]
+    assert abs(rig.viewer.calls.count("rows") - expected) <= 2
+
+
+def test_rows_of_a_module_that_fell_silent_are_shown_with_those_of_the_others(rig: Rig) -> None:
+    rig.meet("A", "B")
+    rig.publish(0, "A")
+    for first in range(0, 2000, 5):
+        rig.publish(first, "B")
+    assert rig.viewer.rows_of["A"] == _rows(*range(5))
+
+
+def test_nothing_is_shown_of_a_module_whose_clock_is_not_known(rig: Rig) -> None:
+    rig.feed.met({"A": "X5-4"}, 0)
+    for first in range(0, 2000, 5):
+        rig.publish(first)
+    rig.feed.close()
+    assert rig.viewer.rows_of == {}
+
+
+def test_the_robot_turns_thirty_times_a_second_as_its_newest_rows_say(rig: Rig) -> None:
+    rig.meet("A")
+    arm = Chain(("A",), (-1,), (False,), np.eye(3)[:1], np.zeros((1, 3)), np.eye(4)[None], np.eye(3)[2])
+    fit = _fit(arm)
+    rig.feed.chain(0, fit)
+    for first in range(0, 1000, 5):
+        rig.publish(first)
+    live = rig.viewer.calls.count("poses")
+    rig.feed.close()
+    times = np.array([t_ns for t_ns, _ in rig.viewer.turned])
+    # Messages come every 20 ms, so that every second one is the first after 33 ms.
+    np.testing.assert_array_equal(np.diff(times), 40 * MS)
+    assert times[-1] > 3_900 * MS
+    assert [q for _, q in rig.viewer.turned] == [[round((t - 2 * MS) / (4 * MS))] for t in times.tolist()]
+    # One by one where somebody is watching.
+    assert (live == len(times)) == (rig.feed.pace == LIVE)
+    assert rig.viewer.calls[-1] == "close"

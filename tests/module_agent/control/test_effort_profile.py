@@ -1,0 +1,139 @@
+"""A motion may bring the efforts that it is fed forward; the module plays them by its own clock."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from module_agent.control.motion import MOST_SAMPLES, effort_at, effort_profile, profile_period_ns
+from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.firmware.firmware import Answer, Firmware, Incoming, Publication
+from module_agent.hardware.hardware import SensorSample
+from module_agent.model.catalogue import CATALOGUE
+from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.feedback_rows import unpack
+from module_agent.wire.keys import Leaf
+from module_agent.wire.messages import (
+    Ack,
+    EffortProfile,
+    Feedback,
+    LeaseRequest,
+    Message,
+    MotionCommand,
+    Rest,
+)
+from module_agent.wire.refusal import Refusal
+
+MS = 1_000_000
+KIND = CATALOGUE["X5-9"]
+RAMP = effort_profile([1.0, 3.0, -1.0], 100 * MS)
+
+
+class HeldModule:
+    """A module under command, and what it says; its joint stands still."""
+
+    def __init__(self) -> None:
+        self.firmware = Firmware(
+            FirmwareConfig("A", KIND, 1, catalogue_limits(KIND), feedback_rate_hz=1000.0)
+        )
+        self.now, self.seq = 0, 0
+        self.commands: list[float] = []
+        self.tell(Leaf.LEASE, LeaseRequest(**self.head(action="acquire")))
+
+    def head(self, **more: Any) -> dict[str, Any]:
+        self.seq += 1
+        own = {"serial": "A", "boot": 1, "seq": self.seq, "sender": "me", "echo_ns": self.now}
+        return {**own, "token": self.firmware.lease.token, **more}
+
+    def tell(self, leaf: Leaf, message: Message) -> Ack:
+        return decode(Ack, self.tick(Incoming(leaf, encode(message), 1))[0])
+
+    def move(self, effort: EffortProfile | None) -> Ack:
+        command = MotionCommand(**self.head(motion_id=self.seq, pattern=Rest(duration_s=0.2), effort=effort))
+        return self.tell(Leaf.MOTION, command)
+
+    def tick(self, *incoming: Incoming) -> list[bytes]:
+        self.now += MS
+        imu = self.now // (4 * MS) * 4 * MS
+        sample = SensorSample(self.now, imu, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 25.0, 24.0, 0, 0, 0, 0, 0, 9.8)
+        _, out = self.firmware.step(self.now, sample, incoming)
+        for said in out:
+            if isinstance(said, Publication) and said.leaf is Leaf.FEEDBACK:
+                feedback = decode(Feedback, said.payload, MAX_MESSAGE_BYTES)
+                self.commands += unpack(feedback)["effort_command_nm"].tolist()
+        return [said.payload for said in out if isinstance(said, Answer)]
+
+    def played(self, ticks: int) -> list[float]:
+        """Return the effort commands of the next ticks."""
+        self.commands.clear()
+        for _ in range(ticks):
+            self.tick()
+        return self.commands
+
+
+def test_the_efforts_of_a_motion_are_played_between_its_samples_and_the_last_one_holds_on() -> None:
+    module = HeldModule()
+    assert module.move(RAMP).accepted
+    played = np.array(module.played(150))
+    # The row of the tick before the motion began has no effort.
+    played = played[np.isfinite(played)]
+    assert len(played) > 140
+    expected = np.interp(np.arange(len(played)), [0.0, 100.0, 200.0], [1.0, 3.0, -1.0])
+    # Rows hold 4-byte floats.
+    np.testing.assert_allclose(played, expected, atol=1e-6)
+    # The motion ends after 200 ms; without a keep-alive the module goes on until 250 ms.
+    assert module.played(80)[-1] == -1.0
+
+
+def test_a_motion_that_is_broken_off_is_not_fed_forward_any_more() -> None:
+    module = HeldModule()
+    module.move(RAMP)
+    module.played(50)
+    assert module.tell(Leaf.LEASE, LeaseRequest(**module.head(action="acquire"))).accepted
+    assert np.isnan(module.played(20)[-1])
+
+
+def test_a_motion_without_efforts_leaves_the_effort_loop_off() -> None:
+    module = HeldModule()
+    module.move(None)
+    assert np.isnan(module.played(100)).all()
+
+
+@pytest.mark.parametrize(
+    ("samples", "reason", "words"),
+    [
+        (b"123456789", Refusal.TYPES, "an effort profile of 9 bytes; a sample is 4 bytes long"),
+        (
+            np.array([0.0, np.nan], "<f4").tobytes(),
+            Refusal.NOT_FINITE,
+            "sample 1 of the effort profile is nan",
+        ),
+        (
+            np.array([np.inf, 0.0], "<f4").tobytes(),
+            Refusal.NOT_FINITE,
+            "sample 0 of the effort profile is inf",
+        ),
+    ],
+)
+def test_efforts_that_are_no_numbers_are_refused_and_nothing_moves(
+    samples: bytes, reason: Refusal, words: str
+) -> None:
+    module = HeldModule()
+    ack = module.move(EffortProfile(period_ns=10 * MS, samples=samples))
+    assert (ack.accepted, ack.reason, ack.detail) == (False, reason.value, words)
+    assert module.firmware.state == "armed"
+
+
+@pytest.mark.parametrize("total_s", [0.2, 5.6, 7.99, 8.0, 60.0])
+def test_every_motion_that_a_module_takes_fits_a_profile(total_s: float) -> None:
+    period_ns = profile_period_ns(total_s)
+    count = int(np.ceil(total_s * 1e9 / period_ns)) + 1
+    assert count <= MOST_SAMPLES
+    assert period_ns % MS == 0
+    profile = effort_profile(np.zeros(max(count, 2)), period_ns)
+    assert effort_at(profile, np.array([0.0, total_s])).tolist() == [0.0, 0.0]
+
+
+def test_too_many_efforts_are_refused_with_how_many_there_may_be() -> None:
+    with pytest.raises(ValueError, match=r"shape \(801,\); a profile is 2 to 800 finite numbers"):
+        effort_profile(np.zeros(801), 10 * MS)

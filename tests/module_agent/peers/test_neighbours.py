@@ -1,0 +1,317 @@
+"""A motion is handed over once and whole, whatever order its messages come in and whichever are lost."""
+
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from module_agent.peers.motion_listener import (
+    ANSWER_TIMEOUT_NS,
+    GIVE_UP_NS,
+    ROWS_PER_QUESTION,
+    AskHistory,
+    JointMotion,
+    Listen,
+    Neighbours,
+    Wish,
+)
+from module_agent.wire.feedback_rows import ROW
+from module_agent.wire.messages import ConstantMotion, Feedback, GoTo, MotionRecord, Pattern, Status
+
+MS = 1_000_000
+BATCH = 5
+CONSTANT = ConstantMotion(velocity_rad_s=1.0, duration_s=0.75)
+OWN = {"ME": 0}
+
+
+def _status(
+    motion: MotionRecord | None, seq: int = 1, t_ns: int = 0, boot: int = 1, serial: str = "J"
+) -> Status:
+    return Status(
+        serial=serial,
+        boot=boot,
+        seq=seq,
+        t_ns=t_ns,
+        state="moving",
+        holder="C",
+        lease_left_ns=0,
+        token=1,
+        next_row=0,
+        motion=motion,
+        refusals={},
+        expiries=0,
+        dropped_events=0,
+    )
+
+
+def _record(
+    motion_id: int = 1,
+    start: int = 100,
+    end: int | None = 400,
+    outcome: str = "done",
+    pattern: Pattern = CONSTANT,
+) -> MotionRecord:
+    return MotionRecord.model_validate(
+        {
+            "motion_id": motion_id,
+            "pattern": pattern,
+            "outcome": outcome,
+            "start_ns": start * 4 * MS,
+            "start_row": start,
+            "end_row": end,
+            "origin_rad": 0.0,
+        }
+    )
+
+
+def _running(motion_id: int = 1, start: int = 100) -> MotionRecord:
+    return _record(motion_id, start, None, "running")
+
+
+def _feedback(first: int, count: int = BATCH, boot: int = 1, serial: str = "J") -> Feedback:
+    rows = np.zeros(count, dtype=ROW)
+    rows["t_ns"] = np.arange(first, first + count) * 4 * MS
+    rows["position_rad"] = np.arange(first, first + count)
+    return Feedback(serial=serial, boot=boot, seq=first, first_row=first, count=count, rows=rows.tobytes())
+
+
+class Checked(Neighbours):
+    """Neighbours that have nothing to say unless they are restless."""
+
+    def poll(self, now_ns: int) -> tuple[list[Wish], list[JointMotion]]:
+        restless = self.restless
+        said = super().poll(now_ns)
+        assert restless or said == ([], [])
+        return said
+
+
+def _questions(wishes: list[Wish]) -> list[AskHistory]:
+    return [w for w in wishes if isinstance(w, AskHistory)]
+
+
+def _whole(motion: JointMotion, record: MotionRecord) -> bool:
+    numbers = np.arange(record.start_row, record.end_row or 0)
+    return motion.record == record and bool(np.array_equal(motion.rows["position_rad"], numbers))
+
+
+# ---------------------------------------------------------------------- one motion, step by step
+
+
+def test_a_joint_that_moves_is_listened_to_until_its_motion_is_complete() -> None:
+    neighbours = Checked()
+    neighbours.on_status(_status(_running()), 0, OWN)
+    assert neighbours.poll(0) == ([Listen("J", True)], [])
+    for first in range(100, 400, BATCH):
+        neighbours.on_feedback(_feedback(first), OWN)
+        assert neighbours.poll(0) == ([], [])
+    neighbours.on_status(_status(_record(), 2), 0, OWN)
+    wishes, motions = neighbours.poll(0)
+    assert wishes == [Listen("J", False)]
+    assert [_whole(m, _record()) for m in motions] == [True]
+    assert neighbours.poll(MS) == ([], [])
+
+
+def test_rows_that_were_dropped_are_asked_for_in_pieces_that_a_message_can_carry() -> None:
+    neighbours = Checked()
+    record = _record(end=100 + 600)
+    neighbours.on_status(_status(record), 0, OWN)
+    now, asked = 0, []
+    for _ in range(3):
+        (question,) = _questions(neighbours.poll(now)[0])
+        asked.append(question.end_row - question.first_row)
+        neighbours.on_feedback(_feedback(question.first_row, asked[-1]), OWN, live=False)
+    _, motions = neighbours.poll(now)
+    assert asked == [ROWS_PER_QUESTION, ROWS_PER_QUESTION, 600 - 2 * ROWS_PER_QUESTION]
+    assert [_whole(m, record) for m in motions] == [True]
+
+
+def test_who_only_listens_rests_until_something_is_heard_and_who_misses_rows_does_not() -> None:
+    neighbours = Checked()
+    assert not neighbours.restless
+    neighbours.on_status(_status(_running()), 0, OWN)
+    assert neighbours.restless
+    neighbours.poll(0)
+    assert not neighbours.restless
+    neighbours.on_feedback(_feedback(100), OWN)
+    assert neighbours.restless
+    neighbours.on_status(_status(_record(), 2), 0, OWN)
+    neighbours.poll(0)
+    assert neighbours.restless
+
+
+def test_an_unanswered_question_is_asked_again_but_not_at_every_tick() -> None:
+    neighbours = Checked()
+    neighbours.on_status(_status(_record()), 0, OWN)
+    questions = [q for now in range(0, 1000 * MS, MS) for q in _questions(neighbours.poll(now)[0])]
+    assert len(questions) == 1000 * MS // ANSWER_TIMEOUT_NS + 1
+    assert len(set(questions)) == 1
+
+
+def test_rows_that_never_come_are_given_up_though_the_module_goes_on_telling_of_its_last_motion() -> None:
+    neighbours = Checked()
+    last_question = 0
+    for number, now in enumerate(range(0, 4 * GIVE_UP_NS, 100 * MS)):
+        neighbours.on_status(_status(_record(), 1 + number), now, OWN)
+        wishes, motions = neighbours.poll(now)
+        assert motions == []
+        if _questions(wishes):
+            last_question = now
+    assert last_question <= GIVE_UP_NS
+
+
+def test_a_long_motion_is_not_given_up_while_it_runs() -> None:
+    neighbours = Checked()
+    for number, now in enumerate(range(0, 3 * GIVE_UP_NS, 400 * MS)):
+        neighbours.on_status(_status(_running(), 1 + number), now, OWN)
+        neighbours.poll(now)
+    neighbours.on_status(_status(_record(), 1000), now, OWN)
+    assert _questions(neighbours.poll(now)[0])
+
+
+def test_a_motion_that_was_stopped_is_dropped() -> None:
+    for outcome in ("stopped", "expired", "superseded"):
+        neighbours = Checked()
+        neighbours.on_status(_status(_running()), 0, OWN)
+        neighbours.on_status(_status(_record(outcome=outcome), 2), 0, OWN)
+        assert neighbours.poll(0) == ([Listen("J", True), Listen("J", False)], [])
+        # One of which nothing but the end was heard is not even listened to.
+        neighbours.on_status(_status(_record(2, outcome=outcome), 3), 0, OWN)
+        assert neighbours.poll(0) == ([], [])
+
+
+def test_journeys_are_no_exploration() -> None:
+    neighbours = Checked()
+    journey = GoTo(target_rad=1.0, max_speed_rad_s=1.0)
+    neighbours.on_status(_status(_record(pattern=journey)), 0, OWN)
+    neighbours.on_status(_status(None, 2), 0, OWN)
+    assert neighbours.poll(0) == ([], [])
+
+
+def test_a_joint_that_boots_anew_in_mid_motion_does_not_mix_its_rows() -> None:
+    neighbours = Checked()
+    neighbours.on_status(_status(_running(), 50), 0, OWN)
+    neighbours.on_feedback(_feedback(100, 250), OWN)
+    neighbours.on_status(_status(_record(start=0, end=100), 1, boot=2), 0, OWN)
+    neighbours.on_feedback(_feedback(0, 50, boot=1), OWN)
+    assert neighbours.poll(0)[1] == []
+    # A straggler of the old boot changes nothing.
+    neighbours.on_status(_status(_record(), 51), 0, OWN)
+    neighbours.on_feedback(_feedback(0, 100, boot=2), OWN)
+    motions = neighbours.poll(0)[1]
+    assert [(m.boot, len(m.rows)) for m in motions] == [(2, 100)]
+
+
+def test_joints_that_move_at_once_are_kept_apart() -> None:
+    neighbours = Checked()
+    for serial in ("J", "K"):
+        neighbours.on_status(_status(_record(), serial=serial), 0, OWN)
+        neighbours.on_feedback(_feedback(100, 300, serial=serial), OWN)
+    assert [m.serial for m in neighbours.poll(0)[1]] == ["J", "K"]
+
+
+def test_the_clock_is_mapped_by_the_message_that_was_least_delayed() -> None:
+    neighbours = Checked()
+    neighbours.on_status(_status(_record(), t_ns=0), 0, {"ME": 10_000 * MS, "YOU": 20 * MS})
+    for first, delay in ((100, 9), (200, 2), (300, 30)):
+        sent = (first + 99) * 4 * MS
+        own = {"ME": sent + 10_000 * MS + delay * MS, "YOU": sent + delay * MS}
+        neighbours.on_feedback(_feedback(first, 100), own)
+    (motion,) = neighbours.poll(0)[1]
+    # The status came without delay for ME, with 20 ms for YOU.
+    assert motion.rough_offset_ns == {"ME": 10_000 * MS, "YOU": 2 * MS}
+
+
+def test_rows_from_history_tell_nothing_of_the_clock() -> None:
+    neighbours = Checked()
+    neighbours.on_status(_status(_record(), t_ns=0), 0, {"ME": 50 * MS})
+    neighbours.on_feedback(_feedback(100, 300), {"ME": 0}, live=False)
+    (motion,) = neighbours.poll(0)[1]
+    assert motion.rough_offset_ns == {"ME": 50 * MS}
+
+
+# ---------------------------------------------------------------------- any network
+
+
+class _Net:
+    """A network that delays, loses and repeats whatever it is given."""
+
+    def __init__(self, rng: np.random.Generator, loss: float):
+        self.rng = rng
+        self.loss = loss
+        self.queue: list[tuple[int, int, Any]] = []
+        self.count = 0
+
+    def send(self, now: int, message: Any) -> None:
+        for _ in range(1 + int(self.rng.random() < 0.1)):
+            self.count += 1
+            if self.rng.random() >= self.loss:
+                delay = int(self.rng.choice([0, 1, 5, 40, 900, 2500]))
+                self.queue.append((now + delay * MS, self.count, message))
+
+    def arrived(self, now: int) -> list[Any]:
+        due = sorted(x for x in self.queue if x[0] <= now)
+        self.queue = [x for x in self.queue if x[0] > now]
+        return [message for _, _, message in due]
+
+
+def _news(now: int, seq: int) -> Status | None:
+    """What the joint says of itself: two constant motions of 1 s, each with a second of quiet after it."""
+    row = now // (4 * MS)
+    for motion_id, start in ((11, 100), (12, 1100)):
+        if start <= row < start + 250:
+            return _status(_running(motion_id, start), seq, now)
+        if start + 250 <= row < start + 900:
+            return _status(_record(motion_id, start, start + 250), seq, now)
+    return None
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    loss=st.sampled_from([0.0, 0.1, 0.5, 1.0]),
+    silent=st.booleans(),
+    holes=st.integers(0, 9),
+)
+def test_whatever_the_network_does_a_motion_is_handed_over_whole_and_once_or_not_at_all(
+    seed: int, loss: float, silent: bool, holes: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    neighbours, net = Checked(), _Net(rng, loss)
+    found: list[JointMotion] = []
+    listening = False
+    lost_rows = rng.integers(0, 1400 // 50, holes).tolist()
+    for tick in range(900):
+        now = tick * 20 * MS
+        row = now // (4 * MS)
+        status = _news(now, 1 + tick)
+        if status is not None and tick % 10 == 0:
+            net.send(now, status)
+        if listening and row < 1400 and row // 50 not in lost_rows:
+            neighbours.on_feedback(_feedback(row, 5), {"ME": now})
+        for message in net.arrived(now):
+            if isinstance(message, Status):
+                neighbours.on_status(message, now, {"ME": now})
+            elif isinstance(message, AskHistory):
+                if not silent and message.end_row <= row:
+                    count = message.end_row - message.first_row
+                    net.send(now, _feedback(message.first_row, count))
+            else:
+                neighbours.on_feedback(message, {"ME": now}, live=False)
+        wishes, motions = neighbours.poll(now)
+        for wish in wishes:
+            if isinstance(wish, Listen):
+                assert wish.on != listening  # never told twice
+                listening = wish.on
+            else:
+                net.send(now, wish)
+        found += motions
+    numbers = [m.record.motion_id for m in found]
+    assert len(set(numbers)) == len(numbers)
+    for motion in found:
+        start = 100 if motion.record.motion_id == 11 else 1100
+        assert _whole(motion, _record(motion.record.motion_id, start, start + 250))
+    # In the end nothing is left to wait for, and nobody is listened to.
+    assert not listening
+    if loss == 0.0 and not silent and not lost_rows:
+        assert numbers == [11, 12]

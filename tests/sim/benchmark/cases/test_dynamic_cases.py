@@ -1,0 +1,188 @@
+"""The benchmark of dynamics: what a bar is about reaches its row, and what misses it is seen to."""
+
+from typing import Any
+
+import pytest
+
+from sim.benchmark.case import Case, Summary
+from sim.benchmark.cases.gravity_compensation import FloatTrial
+from sim.benchmark.cases.inertia import InertiaTrial
+from sim.benchmark.cases.monitoring import Alarms, Watches, WatchTrial
+from sim.benchmark.cases.payload import PayloadTrial
+from sim.benchmark.cases.reassembly import Reassembly
+from sim.benchmark.cases.regressor import RegressorTrial
+from sim.benchmark.cases.suites import DYNAMIC_TRIALS, QUICK_DYNAMICS, dynamic_cases, full_dynamics
+from sim.benchmark.row import Row
+from sim.thesis.torque_assistance_report import AssistanceRow
+
+CASES = {case.name: case for case in dynamic_cases(full_dynamics(), seed=0)}
+
+
+def rows(name: str, *trials: Any) -> dict[str, Row]:
+    summary: Summary = CASES[name].summarise(trials)
+    found = {row.figure: row for row in summary.rows}
+    assert len(found) == len(summary.rows)
+    return found
+
+
+def missed(found: dict[str, Row]) -> list[str]:
+    return [figure for figure, row in found.items() if row.holds is False]
+
+
+def test_the_quick_benchmark_has_every_case_and_says_where_it_does_less() -> None:
+    quick = [case.name for case in dynamic_cases(QUICK_DYNAMICS, seed=0)]
+    left = [name for name in CASES if not any(one.startswith(name) for one in quick)]
+    # That nothing is taken for something is tried where there is time for it.
+    assert left == ["a2085_06, no payload"]
+    assert all(name in CASES or name.endswith(", known without error") for name in quick)
+
+
+def test_the_full_benchmark_watches_for_an_hour_and_tries_everything_several_times() -> None:
+    (watched,) = (case for case in CASES.values() if case.name.endswith("watched"))
+    drawn = [one for trial in watched.trials for one in trial.arguments[0]]
+    quiet = [day for trial in watched.trials for day in trial.arguments[1]]
+    stretch_s = {trial.arguments[3] for trial in watched.trials}
+    assert len(set(drawn)) == len(drawn) == 4 * 2 * DYNAMIC_TRIALS
+    assert len(set(quiet)) * stretch_s.pop() == 3600.0
+    assert len(CASES["a2085_06, x5, inertia"].trials) == DYNAMIC_TRIALS
+
+
+def inertia(**changed: Any) -> InertiaTrial:
+    good: dict[str, Any] = {
+        "rank": 36,
+        "most_rank": 36,
+        "known": 12,
+        "sigmas_off": (0.5, -1.0, 2.0),
+        "largest": (0.001, 0.002, 0.04),
+        "largest_sigma": (0.001, 0.002, 0.03),
+        "held_out": 0.007,
+        "with_true_chain": 0.0065,
+        "thesis": 0.01,
+        "bodies": 0.0071,
+        "poses": 10,
+    }
+    return InertiaTrial("a2085_06", "x5", 0, "")._replace(**(good | changed))
+
+
+@pytest.mark.parametrize(
+    ("changed", "figure"),
+    [
+        ({"rank": 35}, "runs with fewer parameters than there are, of 1"),
+        ({"sigmas_off": (0.1, 3.4)}, "base parameters known to 10 %, beyond 3 sigma, of 2"),
+        ({"largest": (0.012, 0.0, 0.0)}, "largest ten, of those noise tells to 1 %: worst error [%]"),
+        ({"held_out": 0.031, "with_true_chain": 0.03, "bodies": 0.03}, "held-out torque, worst [%]"),
+        ({"with_true_chain": 0.005}, "the same over that with the true chain"),
+        ({"bodies": 0.0085}, "real bodies worse by [points]"),
+        ({"not_definite": 1}, "poses with a mass matrix that is not definite, of 10"),
+    ],
+)
+def test_each_bar_of_inertia_is_missed_by_what_it_is_about(changed: dict[str, Any], figure: str) -> None:
+    name = "a2085_06, x5, inertia"
+    assert missed(rows(name, inertia())) == []
+    assert missed(rows(name, inertia(**changed))) == [figure]
+
+
+def test_a_session_that_did_not_come_to_its_end_is_counted() -> None:
+    found = rows("a2085_06, x5, inertia", inertia(), inertia(why="module elbow was lost"))
+    assert found["runs without inertia, of 2"].ours == 1.0
+    assert found["held-out torque, worst [%]"].ours == pytest.approx(0.7)
+
+
+def test_the_rigid_arms_bar_is_the_tighter_one() -> None:
+    limits = {
+        name: rows(f"a2085_06, {name}, inertia", inertia())["held-out torque, worst [%]"].limit
+        for name in ("rigid", "x5")
+    }
+    assert limits == {"rigid": 1.0, "x5": 3.0}
+
+
+def test_a_payload_on_another_body_or_of_another_mass_misses() -> None:
+    name = "a2085_06, payload of 0.2 kg"
+    good = PayloadTrial("a2085_06", 0, True, True, 0.001, 2e-4, 11.0)
+    assert missed(rows(name, good)) == []
+    assert missed(rows(name, good._replace(mass_error=-0.04))) == ["mass, worst [%]"]
+    assert missed(rows(name, good._replace(com_error_m=6e-3, motion_s=16.0))) == [
+        "centre, worst [mm]",
+        "motion, longest [s]",
+    ]
+    lost = rows(name, good._replace(found=False, on_its_body=False))
+    assert lost["payloads not found, or on another body, of 1"].holds is False
+    bare = rows("a2085_06, no payload", good)
+    assert missed(bare) == ["payloads found where none is, of 1"]
+
+
+def test_without_pinocchio_only_our_own_cost_is_judged() -> None:
+    (name,) = (name for name in CASES if name.startswith("regressor"))
+    assert len(rows(name, RegressorTrial(1.0, 1.0, None, None))) == 1
+    assert missed(rows(name, RegressorTrial(2.0, 21.0, 3.0, 1e-8))) == [
+        "in chunks of 50 [us a sample]",
+        "difference from pinocchio's [relative]",
+        "cost of a batch over pinocchio's loop",
+    ]
+
+
+def test_assemblies_that_tell_nothing_new_together_miss() -> None:
+    name = "a2085_03, three assemblies"
+    told = Reassembly(60, (15, 15, 15), 29, 0.7, (0.7, 0.7, 0.7), 1e-15, (1.0, 1.0, 1.0))
+    assert missed(rows(name, told)) == []
+    assert missed(rows(name, told._replace(rank_merged=15))) == [
+        "rank of the best alone less that of all merged"
+    ]
+    assert missed(rows(name, told._replace(difference=1e-9))) == [
+        "agents' information against the coordinator's [relative]"
+    ]
+
+
+def assisted(rms: tuple[float, float, float], unstable: str = "") -> AssistanceRow:
+    return AssistanceRow("", "arm6", False, 4, None, rms, ("", "", unstable))
+
+
+def test_calculated_torque_must_help_where_it_is_stable() -> None:
+    six = "assistance, six joints, strategy 4"
+    assert missed(rows(six, [assisted((3.0, 2.0, 0.5))])) == []
+    assert missed(rows(six, [assisted((3.0, 2.0, 1.0))])) == [
+        "error by calculated torque over that without, most"
+    ]
+    thesis = "assistance, vertical, the thesis' gains"
+    found = rows(thesis, [assisted((3.0, 2.0, 1.0)), assisted((1.0, 2.0, 3.0), "rings")])
+    assert missed(found) == []
+    assert found["unstable with it, of 2"].ours == 1.0
+    assert "stable, and not the best of three modes, of 1" in missed(
+        rows(thesis, [assisted((1.0, 3.0, 2.0))])
+    )
+
+
+def test_floating_that_is_as_stiff_as_holding_misses() -> None:
+    name = "a2085_04, x5, floating, known without error"
+    light = FloatTrial(0.1, 10.0, 5.0, 0.1, 0.7, 8.0)
+    assert missed(rows(name, light)) == []
+    assert missed(rows(name, light._replace(drift_deg=3.0))) == ["drift left alone, most [deg]"]
+    assert missed(rows(name, light._replace(guiding_n=4.0))) == [
+        "the same over that of an arm held in position"
+    ]
+
+
+def watched(**changed: Any) -> WatchTrial:
+    good = WatchTrial("payload", "payload", True, 0.5, 1.5, 0.2, 0.01, 0, 20.0, ())
+    return good._replace(**changed)
+
+
+def test_what_is_missed_misplaced_or_imagined_is_counted() -> None:
+    (name,) = (name for name in CASES if name.endswith("watched"))
+    quiet = (Alarms(0, 3600.0),)
+    assert missed(rows(name, Watches((watched(),) * 13, quiet))) == []
+    wrong = (watched(found="wear"), watched(located=False), watched(found="nothing")) + (watched(),) * 10
+    assert missed(rows(name, Watches(wrong, quiet))) == []
+    more = (watched(found="collision"),) * 7
+    assert missed(rows(name, Watches(wrong + more, quiet))) == ["payload: missed or misplaced, of 20"]
+    lavish = rows(name, Watches((watched(false_alarms=2),) * 13, quiet))
+    assert lavish["something else said beside it, in 13 trials"].ours == 26.0
+    assert missed(rows(name, Watches((watched(),) * 13, (Alarms(3, 3600.0),)))) == [
+        "false alarms, 95 % sure to be above [1/h]"
+    ]
+
+
+def test_every_case_is_named_once() -> None:
+    names = [case.name for case in dynamic_cases(full_dynamics(), seed=0)]
+    assert len(set(names)) == len(names)
+    assert all(isinstance(case, Case) for case in CASES.values())

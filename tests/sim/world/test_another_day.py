@@ -1,0 +1,36 @@
+"""Another day of the same robot: what its modules are stays, what comes and goes is drawn anew."""
+
+import math
+
+import numpy as np
+
+from sim.robot.robot_file import load_robot
+from sim.world.world import World
+
+
+def _trace(noise_seed: int | None, ticks: int = 80) -> np.ndarray:
+    world = World(load_robot("a2085_03"), 7, "poor", noise_seed=noise_seed)
+    waves = (0.2 * np.sin(2.0 * math.pi * k * 1e-3 + np.arange(3)) for k in range(ticks))
+    found = np.array([[tuple(sample) for sample in world.step(pwm.tolist())] for pwm in waves])
+    world.close()
+    return found
+
+
+def test_another_day_the_modules_have_the_same_errors_and_clocks() -> None:
+    first, second = (World(load_robot("a2085_03"), 7, "poor", noise_seed=day) for day in (1, 2))
+    for name, value in first.sensor_errors._asdict().items():
+        assert np.array_equal(value, getattr(second.sensor_errors, name)), name
+    assert first.clocks == second.clocks
+    first.close()
+    second.close()
+
+
+def test_another_day_the_sensors_noise_is_another() -> None:
+    one, again, other = _trace(1), _trace(1), _trace(2)
+    assert np.array_equal(one, again)
+    # White noise of the accelerometer is 0.035 m/s^2, its resolution 0.002: no axis of any module repeats.
+    assert np.all(np.any(one[..., -3:] != other[..., -3:], axis=0))
+
+
+def test_without_a_day_the_noise_hangs_on_the_seed() -> None:
+    assert np.array_equal(_trace(None), _trace(7))

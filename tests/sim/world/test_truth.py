@@ -1,0 +1,106 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim.robot.robot_file import load_robot
+from sim.sensors.module_clock import module_time
+from sim.world.truth import Truth, TruthLog, read_motion, read_truth, truth_of, write_truth
+from sim.world.world import World
+
+
+def _assert_same(one: Truth, two: Truth) -> None:
+    assert (one.robot, one.module_types, one.clocks) == (two.robot, two.module_types, two.clocks)
+    for a, b in zip(one.chain, two.chain, strict=True):
+        if isinstance(a, np.ndarray):
+            np.testing.assert_array_equal(a, b)
+        else:
+            assert a == b
+    np.testing.assert_array_equal(one.inertia, two.inertia)
+
+
+def test_truth_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
+    robot = load_robot("tree_y")
+    world = World(robot, seed=3)
+    write_truth(tmp_path / "truth.json", robot, world)
+    found = read_truth(tmp_path / "truth.json")
+    _assert_same(found, truth_of(robot, world))
+    assert found.imu_bias is not None
+    np.testing.assert_array_equal(found.imu_bias, world.imu_bias)
+    assert found.sensor_errors is not None
+    for read, drawn in zip(found.sensor_errors, world.sensor_errors, strict=True):
+        np.testing.assert_array_equal(read, drawn)
+        assert not read.flags.writeable
+    assert found.sensor_errors.misalignment.shape == (6, 2, 3, 3)
+    assert not found.inertia.flags.writeable
+
+
+def test_truth_of_a_robot_alone_has_no_clocks(tmp_path: Path) -> None:
+    robot = load_robot("arm6")
+    write_truth(tmp_path / "truth.json", robot)
+    found = read_truth(tmp_path / "truth.json")
+    _assert_same(found, truth_of(robot))
+    assert found.clocks is None
+    assert found.sensor_errors is None
+    assert found.chain.reversed == (False, False, True, False, False, False)
+
+
+def test_truth_written_before_sensors_had_more_errors_than_biases_is_read(tmp_path: Path) -> None:
+    robot = load_robot("tree_y")
+    path = tmp_path / "truth.json"
+    write_truth(path, robot, World(robot, seed=3))
+    document = json.loads(path.read_text())
+    del document["sensor_errors"]
+    path.write_text(json.dumps(document))
+    assert read_truth(path).sensor_errors is None
+
+
+def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "truth.json"
+    path.write_text(json.dumps({"version": 99}))
+    with pytest.raises(ValueError, match="version 1"):
+        read_truth(path)
+
+
+def test_a_crash_while_writing_leaves_the_old_file_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "truth.json"
+    write_truth(path, load_robot("arm6"))
+    old = path.read_bytes()
+
+    def crash(*_: object) -> None:
+        raise OSError("the disk is gone")
+
+    monkeypatch.setattr(os, "replace", crash)
+    with pytest.raises(OSError, match="the disk is gone"):
+        write_truth(path, load_robot("tree_y"))
+    assert path.read_bytes() == old
+    assert [p.name for p in tmp_path.iterdir()] == ["truth.json"]
+
+
+def test_the_log_records_every_fourth_instant_of_the_true_motion(tmp_path: Path) -> None:
+    world = World(load_robot("a2085_03"), seed=3)
+    log = TruthLog(world)
+    q, samples = [], []
+    for k in range(42):
+        samples.append(world.step([0.1, 0.2 * np.sin(0.1 * k), -0.1]))
+        q.append(world.plant.q_rad)
+        log.record()
+    log.save(tmp_path / "truth.npz")
+    motion = read_motion(tmp_path / "truth.npz")
+    assert motion.serials == ("shoulder-yaw", "shoulder-lift", "elbow")
+    np.testing.assert_array_equal(motion.t_ns, np.arange(0, 42, 4) * 1_000_000)
+    np.testing.assert_array_equal(motion.q_rad, q[::4])
+    # On a module's own clock the truth stands where its samples do.
+    np.testing.assert_array_equal(motion.clock_ns, [[s.t_ns for s in row] for row in samples[::4]])
+    assert motion.clock_ns[-1, 2] == module_time(world.clocks[2], 40_000_000)
+    assert not motion.qd_rad_s.flags.writeable
+
+
+def test_a_log_of_nothing_is_empty_but_whole(tmp_path: Path) -> None:
+    log = TruthLog(World(load_robot("a2085_03"), seed=3))
+    log.save(tmp_path / "truth.npz")
+    assert read_motion(tmp_path / "truth.npz").q_rad.shape == (0, 3)
