@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.baseline.known_robot import KnownRobotError, known_within
+from coordinator.baseline.known_robot import BaselineError, baseline_within
 from coordinator.baseline.update import updated
 from coordinator.commands.attended_run import Place, join, run_attended, sender_name
 from coordinator.commands.check import check_robot
-from coordinator.commands.compensate import float_robot
+from coordinator.commands.compensate import compensate_robot
 from coordinator.commands.fit_dynamics import fit_dynamics
 from coordinator.commands.merge import merge
-from coordinator.commands.monitor import watch_robot
+from coordinator.commands.monitor import monitor_robot
 from coordinator.commands.options import Connect, Expect, Listen, Network, Robot, fail, planned
 from coordinator.commands.payload import find_payload
 from coordinator.excitation.plan import Excitation, Mode, Motions
@@ -197,9 +197,9 @@ def replay(
     folder = out if out is not None else session.parent
     try:
         recording: Recording = load_recording(session)
-        before = known_within(session.parent)
+        before = baseline_within(session.parent)
         found = identify(recording, partial(updated, before) if before is not None else None)
-    except (SessionFileError, IdentificationError, UnknownModuleType, KnownRobotError) as error:
+    except (SessionFileError, IdentificationError, UnknownModuleType, BaselineError) as error:
         fail(error, EXIT_FAILED)
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, found)
@@ -286,9 +286,9 @@ def screenshot(
 app.command("check")(check_robot)
 app.command("payload")(find_payload)
 app.command("merge")(merge)
-app.command("watch")(watch_robot)
+app.command("watch")(monitor_robot)
 app.command("fit-dynamics")(fit_dynamics)
-app.command("float")(float_robot)
+app.command("float")(compensate_robot)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
 from module_agent.hardware.hardware import Hardware, SensorSample
-from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, Neighbours
+from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
 from module_agent.torque_information.service import InformationService, Worker
 from module_agent.transport.inbox import Inbox
@@ -36,7 +36,7 @@ SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.ST
 HEARD = (Leaf.SETPOINT, Leaf.STOP)
 HISTORY_TIMEOUT_S = 0.4
 # A question whose answer is dropped on arrival would otherwise be remembered for ever.
-MOST_ASKED = 1024
+MAX_ASKED = 1024
 
 T = TypeVar("T")
 M = TypeVar("M", Status, Feedback, Ack)
@@ -225,7 +225,7 @@ class AgentHost:
         self._transport = transport
         self._worker = worker
         self._pwm = [0.0] * len(self.modules)
-        self._neighbours = Neighbours()
+        self._neighbours = MotionListener()
         self._heard = Inbox(capacity=4096)
         self._found: list[tuple[HostedModule, Finding]] = []
         self._listening: dict[str, Undeclare] = {}
@@ -365,7 +365,7 @@ class AgentHost:
         self._tag += 1
         self._seq += 1
         self._asked[self._tag] = wish
-        if len(self._asked) > MOST_ASKED:
+        if len(self._asked) > MAX_ASKED:
             del self._asked[next(iter(self._asked))]
         question = HistoryRequest(
             serial=wish.serial,

@@ -9,8 +9,8 @@ import numpy as np
 
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
-from coordinator.live_robot.messenger import Radio
-from coordinator.live_robot.module_group import RobotLink
+from coordinator.live_robot.messenger import Messenger
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.session.run import Run, RunConfig
 from module_agent.firmware.config import config_of
@@ -210,7 +210,7 @@ class Rig:
     def run(self, work: Coroutine[Any, Any, T]) -> T:
         return self.loop.run_until_complete(work)
 
-    def link(self, sender: str = "tester") -> tuple[Radio, Recording, RobotLink]:
+    def link(self, sender: str = "tester") -> tuple[Messenger, Recording, ModuleGroup]:
         """A coordinator's hold on the robot."""
         recording = Recording()
 
@@ -221,7 +221,7 @@ class Rig:
                 return None
             return message if isinstance(message, Message) else None
 
-        radio = Radio(
+        radio = Messenger(
             _Cuttable(self, self.endpoint(sender)),
             self.robot.name,
             lambda: self.loop.now_ns,
@@ -229,7 +229,7 @@ class Rig:
             record,
         )
         radio.start()
-        return radio, recording, RobotLink(radio, recording, lambda: self.loop.now_ns, sender)
+        return radio, recording, ModuleGroup(radio, recording, lambda: self.loop.now_ns, sender)
 
     def session(self, out: Path, plan: Plan, resume: bool = False, sender: str = "coordinator") -> Result:
         """Run a whole identification and write its folder, truth included."""

@@ -22,15 +22,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import UNCALIBRATED, ImuIntrinsics
-from coordinator.identification.robot_refinement import CUTOFF_HZ, KEEP_EVERY, MOST_IMU_SAMPLES
+from coordinator.identification.robot_refinement import CUTOFF_HZ, KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, sensor_data, window
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import descendants
-from module_agent.model.perturbation import adjoint, frozen, increments_between
+from module_agent.model.perturbation import adjoint, frozen, perturbation_between
 from module_agent.signals.filtering import settling_samples
 
 # Scale and axes of an IMU that has been corrected for them: for the two sessions they are the same.
@@ -45,7 +45,7 @@ class TiedFits(NamedTuple):
     after: Refinement
 
 
-def tied_fits(known: KnownRobot, later: KnownRobot) -> TiedFits:
+def tied_fits(known: BaselineRobot, later: BaselineRobot) -> TiedFits:
     """Fit the sessions of two runs of one robot, from the known chain, with the IMUs' errors found then.
 
     The later chain may differ from the known one by some 0.2 rad and 0.1 m; its modules must be the same.
@@ -58,7 +58,7 @@ def tied_fits(known: KnownRobot, later: KnownRobot) -> TiedFits:
     return TiedFits(first, second)
 
 
-def exploration(run: KnownRobot, serials: Sequence[str]) -> list[Window]:
+def exploration(run: BaselineRobot, serials: Sequence[str]) -> list[Window]:
     """Return what all modules read during the last exploration of every joint, in the order of `serials`."""
     margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
     moving = run.recording.motions(*MOVING)
@@ -85,7 +85,7 @@ def _turned(matrices: Array, vectors: Array) -> Array:
 
 def _fit(chain: Chain, windows: Sequence[Window]) -> Refinement:
     samples = sum(len(one.t_ns) for one in windows) * len(chain.serials)
-    keep_every = max(KEEP_EVERY, -(-samples // MOST_IMU_SAMPLES))
+    keep_every = max(KEEP_EVERY, -(-samples // MAX_IMU_SAMPLES))
     return refine_chain(chain, sensor_data(windows, CUTOFF_HZ, keep_every), TIED)
 
 
@@ -196,7 +196,7 @@ def _problem(fits: TiedFits) -> _Problem:
     covariance = fits.before.noise_covariance[6:, 6:] + fits.after.noise_covariance[6:, 6:]
     covariance = covariance + sum(slope @ own @ slope.T for slope in slopes.values())
     white = np.linalg.inv(np.linalg.cholesky(kept.T @ covariance @ kept)) @ kept.T
-    difference = increments_between(chain, fits.after.chain)[6:]
+    difference = perturbation_between(chain, fits.after.chain)[6:]
     return _Problem({child: white @ slope for child, slope in slopes.items()}, white @ difference)
 
 
@@ -221,8 +221,8 @@ def _next(problem: _Problem, taken: Sequence[int]) -> LinkChange:
     candidates = []
     for child in problem.slopes:
         if child not in taken:
-            together = _explained(problem, [child, *taken])
-            candidates.append(together.links[0]._replace(gain=together.gain - before))
+            gather_all = _explained(problem, [child, *taken])
+            candidates.append(gather_all.links[0]._replace(gain=gather_all.gain - before))
     return min(candidates, key=lambda c: (c.chance, -c.gain))
 
 

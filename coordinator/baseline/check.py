@@ -2,7 +2,7 @@
 
 from coordinator.baseline.change_detection import find_changes, tied_fits
 from coordinator.baseline.check_report import CheckReport, Session, compared, other_robot
-from coordinator.baseline.known_robot import KnownRobot, hurried
+from coordinator.baseline.known_robot import BaselineRobot, hurried
 from coordinator.excitation.plan import Plan
 from coordinator.topology.topology import Topology
 from module_agent.wire.messages import WindowedSine
@@ -16,7 +16,7 @@ class CheckError(ValueError):
     """The two runs cannot be compared; the message says which of them lacks what."""
 
 
-def check_plan(known: KnownRobot, plan: Plan) -> Plan:
+def check_plan(known: BaselineRobot, plan: Plan) -> Plan:
     """Return a plan as short as a check takes, with the motions that the robot is known from.
 
     What a model leaves out of a motion cancels where the same motion is compared. A joint takes 8 s; motions
@@ -45,14 +45,14 @@ def check_plan(known: KnownRobot, plan: Plan) -> Plan:
     return plan.model_copy(update=short)
 
 
-def _designed(known: KnownRobot) -> bool:
+def _designed(known: BaselineRobot) -> bool:
     """Return whether every joint was moved by itself, and then all at once."""
     moved = {(e.serial, e.purpose) for e in known.recording.journal if e.what == "motion"}
     ways = ("windowed_sine", "whole")
     return all((serial, way) in moved for serial in known.chain.serials for way in ways)
 
 
-def check(known: KnownRobot, later: KnownRobot) -> CheckReport:
+def check(known: BaselineRobot, later: BaselineRobot) -> CheckReport:
     """Say which links of a robot changed from one run to a later one.
 
     Raises:

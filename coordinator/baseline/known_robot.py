@@ -19,11 +19,11 @@ from module_agent.model.chain import Chain
 KNOWN = "known"
 
 
-class KnownRobotError(ValueError):
+class BaselineError(ValueError):
     """The folder holds no run that a robot is known from; the message says what is missing, and where."""
 
 
-class KnownRobot(NamedTuple):
+class BaselineRobot(NamedTuple):
     """A run's folder, its recording, and the kinematics identified from it."""
 
     folder: Path
@@ -46,7 +46,7 @@ class KnownRobot(NamedTuple):
         return self.recording.imu
 
 
-def load_known(folder: Path) -> KnownRobot:
+def load_baseline(folder: Path) -> BaselineRobot:
     """Read a run's folder, and identify its robot again from the recording.
 
     A run that brought a known robot up to date holds that one's recording too, and both together tell it.
@@ -57,27 +57,27 @@ def load_known(folder: Path) -> KnownRobot:
     """
     path = folder / SESSION
     if not path.is_file():
-        raise KnownRobotError(f"{folder} holds no {SESSION}: give the folder of a run that has finished")
+        raise BaselineError(f"{folder} holds no {SESSION}: give the folder of a run that has finished")
     try:
         recording = load_recording(path)
-        kinematics, before = identify_kinematics(recording), known_within(folder)
+        kinematics, before = identify_kinematics(recording), baseline_within(folder)
         if before is not None:
             kinematics = updated(before, kinematics)
-        return KnownRobot(folder, recording, kinematics)
+        return BaselineRobot(folder, recording, kinematics)
     except (SessionFileError, IdentificationError, UnknownModuleType) as error:
-        raise KnownRobotError(f"{path} does not tell the robot: {error}") from error
+        raise BaselineError(f"{path} does not tell the robot: {error}") from error
 
 
-def known_within(folder: Path) -> Kinematics | None:
+def baseline_within(folder: Path) -> Kinematics | None:
     """Return the kinematics of the robot as it was known to the run in a folder; None if it was not.
 
     Raises:
-        KnownRobotError: as `load_known`.
+        KnownRobotError: as `load_baseline`.
     """
-    return load_known(folder / KNOWN).kinematics if (folder / KNOWN).is_dir() else None
+    return load_baseline(folder / KNOWN).kinematics if (folder / KNOWN).is_dir() else None
 
 
-def keep_known(known: KnownRobot, folder: Path) -> None:
+def keep_baseline(known: BaselineRobot, folder: Path) -> None:
     """Copy the recordings that a robot is known from into the folder of a run."""
     there, here = known.folder, folder / KNOWN
     while (there / SESSION).is_file():
@@ -86,7 +86,7 @@ def keep_known(known: KnownRobot, folder: Path) -> None:
         there, here = there / KNOWN, here / KNOWN
 
 
-def hurried(plan: Plan, known: KnownRobot) -> dict[str, object]:
+def hurried(plan: Plan, known: BaselineRobot) -> dict[str, object]:
     """Return settings with which a robot that is known is moved again: only what for, and fast about it."""
     return {
         "dynamics": False,

@@ -1,6 +1,6 @@
 """What a known robot carries: one short motion of all joints, against the run that it is known from."""
 
-from coordinator.baseline.known_robot import KnownRobot, hurried
+from coordinator.baseline.known_robot import BaselineRobot, hurried
 from coordinator.baseline.payload_report import PayloadReport, payload_report
 from coordinator.excitation.plan import Plan
 from coordinator.parameter_fit.least_squares import solve_weighted
@@ -21,12 +21,12 @@ class PayloadError(ValueError):
     """The two runs cannot be compared; the message says which of them lacks what."""
 
 
-def payload_plan(known: KnownRobot, plan: Plan) -> Plan:
+def payload_plan(known: BaselineRobot, plan: Plan) -> Plan:
     """Return a plan of one short motion of all joints at once, with all around it as short as it takes."""
     return plan.model_copy(update=hurried(plan, known) | {"mode": "whole"})
 
 
-def search_payload(known: KnownRobot, later: KnownRobot) -> PayloadReport:
+def search_payload(known: BaselineRobot, later: BaselineRobot) -> PayloadReport:
     """Say what a robot carries in a later run and did not in the one that it is known from.
 
     The chain is the known one. The torques' noise is what is left of them in the known run, so that springs
@@ -62,7 +62,7 @@ def search_payload(known: KnownRobot, later: KnownRobot) -> PayloadReport:
     return payload_report(found, chain, later.name, str(known.folder), spent_s, taken_off)
 
 
-def _motion(run: KnownRobot, chain: Chain) -> JointMotion:
+def _motion(run: BaselineRobot, chain: Chain) -> JointMotion:
     return dynamic_motion(run.recording, run.kinematics.clocks, chain.serials, *_MOVING)
 
 

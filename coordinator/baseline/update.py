@@ -19,7 +19,7 @@ from coordinator.identification.identified import Kinematics
 from coordinator.kinematics.assembly import ChainFit, link_lengths
 from coordinator.kinematics.null_space import name_null_space
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import adjoint, apply_increment, frozen, increments_between
+from module_agent.model.perturbation import adjoint, apply_perturbation, frozen, perturbation_between
 
 # A direction that a known part does not tell is this uncertain, in rad or in m.
 UNTOLD = 1.0
@@ -47,7 +47,7 @@ def placed(known: Refinement, found: Refinement, parts: Sequence[Sequence[str]])
         ValueError: a part has a module that the known robot has not.
     """
     chain = _with_parts(known.chain, found.chain, parts)
-    apart = increments_between(found.chain, chain)
+    apart = perturbation_between(found.chain, chain)
     within, own = _within(known, chain, parts)
     joint = _rigidly(chain, parts)
     session = _information(found)
@@ -57,7 +57,7 @@ def placed(known: Refinement, found: Refinement, parts: Sequence[Sequence[str]])
     spread = (vectors[:, told] / values[told]) @ vectors[:, told].T
     # Of the whole, what the known parts' errors do with the places of the parts.
     carried = own - joint @ spread @ joint.T @ session @ own
-    moved = apply_increment(chain, joint @ (-spread @ joint.T @ session @ apart))
+    moved = apply_perturbation(chain, joint @ (-spread @ joint.T @ session @ apart))
     untold = joint @ vectors[:, ~told]
     return _report(
         moved._replace(gravity=found.chain.gravity),

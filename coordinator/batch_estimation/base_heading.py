@@ -11,7 +11,7 @@ from coordinator.batch_estimation.imu_prediction import body_motions, readings_o
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.null_space import name_null_space
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 
 def faced(chain: Chain, data: SensorData, null_basis: Array) -> Chain:
@@ -26,12 +26,12 @@ def faced(chain: Chain, data: SensorData, null_basis: Array) -> Chain:
         if item.kind == "rotation_about_axis":
             twist = item.directions[:, 0]
             ahead, aside, behind = (
-                _agreement(apply_increment(chain, heading * twist), data)
+                _agreement(apply_perturbation(chain, heading * twist), data)
                 for heading in (0.0, 0.5 * np.pi, np.pi)
             )
             middle = 0.5 * (ahead + behind)
             heading = np.arctan2(aside - middle, ahead - middle)
-            chain = apply_increment(chain, heading * twist)
+            chain = apply_perturbation(chain, heading * twist)
     return chain
 
 

@@ -22,13 +22,13 @@ from coordinator.batch_estimation.imu_intrinsics import (
     read,
     slopes,
 )
-from coordinator.batch_estimation.imu_jacobian import imu_slopes
+from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
-from coordinator.batch_estimation.link_compliance import FlexSlopes, no_flex
+from coordinator.batch_estimation.link_compliance import ComplianceJacobian, rigid
 from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import apply_increment, frozen
+from module_agent.model.perturbation import apply_perturbation, frozen
 
 ITERATIONS = 20
 CONVERGED = 1e-7
@@ -51,7 +51,7 @@ class Refinement(NamedTuple):
     all, without what the model leaves out, which two sessions with the same motions share. null_basis:
     (6 n, k) orthonormal directions that the data does not know. residual_gyro_rad_s, residual_accel_m_s2:
     (n,) rms per axis. intrinsics: the IMUs' own errors; where nothing tells them, they are those expected.
-    compliance: of the links, in the order and units of `FlexSlopes`. late_s: how late all IMUs are alike,
+    compliance: of the links, order and units of `ComplianceJacobian`. late_s: how late all IMUs are alike,
     beside their own delays in `intrinsics`.
     """
 
@@ -95,7 +95,7 @@ class _Normal(NamedTuple):
 
 
 def refine_chain(
-    chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY, flex: FlexSlopes | None = None
+    chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY, flex: ComplianceJacobian | None = None
 ) -> Refinement:
     """Refine a chain that is roughly right (within about 0.2 rad and 0.1 m).
 
@@ -112,7 +112,7 @@ def refine_chain(
     count = len(chain.serials)
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise ValueError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
-    flex = flex if flex is not None else no_flex(count, len(data.q_rad))
+    flex = flex if flex is not None else rigid(count, len(data.q_rad))
     state = _State(chain, perfect(count), np.zeros(len(flex.links)))
     shape = (len(data.motions), count)
     sigmas = np.full(shape, 0.01), np.full(shape, 0.1)
@@ -142,7 +142,7 @@ def refine_chain(
     return _report(state, spectrum, _reduced(by_noise)[0], _rms(gyro), _rms(accel), used)
 
 
-def _expected(state: _State, data: SensorData, flex: FlexSlopes) -> _Expected:
+def _expected(state: _State, data: SensorData, flex: ComplianceJacobian) -> _Expected:
     chain = state.chain
     bodies = body_motions(chain, *data.smooth)
     ideal = readings_on(chain, bodies)
@@ -198,7 +198,7 @@ def _normal_equations(
     state: _State,
     data: SensorData,
     prior: ImuPrior,
-    flex: FlexSlopes,
+    flex: ComplianceJacobian,
     expected: _Expected,
     residuals: tuple[Array, Array],
     sigmas: tuple[Array, Array],
@@ -210,7 +210,7 @@ def _normal_equations(
     bodies, ideal, _, _ = expected
     motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
     for k in range(count):
-        found = imu_slopes(state.chain, bodies, *data.smooth[:2], k)
+        found = imu_jacobian(state.chain, bodies, *data.smooth[:2], k)
         true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity, flex.slopes[..., k]])
         rates = None if data.imu_rates is None else data.imu_rates[:, k]
         own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
@@ -229,7 +229,7 @@ def _normal_equations(
     )
 
 
-def _before(state: _State, prior: ImuPrior, flex: FlexSlopes) -> tuple[Array, Array]:
+def _before(state: _State, prior: ImuPrior, flex: ComplianceJacobian) -> tuple[Array, Array]:
     """Return the information on [increments (6 n), gravity (3), free IMU errors], and its right-hand side.
 
     Before any sample the IMUs' errors are known: they are small; and so is gravity's size, which is what
@@ -297,7 +297,7 @@ def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
 
 
 def _moved(state: _State, step: Array, nuisance: Array, prior: ImuPrior) -> _State:
-    chain, free = apply_increment(state.chain, step), prior.sigmas > 0.0
+    chain, free = apply_perturbation(state.chain, step), prior.sigmas > 0.0
     change = np.zeros_like(state.imus.errors)
     links = 3 + len(state.compliance)
     change[:, free] = nuisance[links:].reshape(len(change), -1)

@@ -17,7 +17,7 @@ from module_agent.model.forward_kinematics import ancestors, carrier
 from module_agent.model.perturbation import cross
 
 
-class ImuSlopes(NamedTuple):
+class ImuJacobian(NamedTuple):
     """Slopes of one IMU's readings [gyro (3), specific force (3)] in its own frame.
 
     modules: k modules whose increments it feels, in the order of the chain. poses: (6 k, 6, m) slopes by the
@@ -37,9 +37,9 @@ class _Seen(NamedTuple):
     velocity: Array
 
 
-def imu_slopes(
+def imu_jacobian(
     chain: Chain, bodies: list[BodyMotion], q_rad: Array, qd_rad_s: Array, module: int
-) -> ImuSlopes:
+) -> ImuJacobian:
     """Differentiate what the IMU of one module reads.
 
     Args:
@@ -60,7 +60,7 @@ def imu_slopes(
     modules = tuple(sorted(poses))
     gravity = np.zeros((3, 6, q_rad.shape[0]))
     gravity[:, 3:] = seen.frame
-    return ImuSlopes(modules, np.concatenate([poses[joint] for joint in modules]), gravity)
+    return ImuJacobian(modules, np.concatenate([poses[joint] for joint in modules]), gravity)
 
 
 def _at_home(home: Array, samples: int) -> _Seen:

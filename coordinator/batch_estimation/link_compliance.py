@@ -184,7 +184,7 @@ def _seen_from_below(chain: Chain, joint: int, q: Array, load: Array) -> Array:
     return np.stack([force, moment + cross(point, force)])
 
 
-class FlexSlopes(NamedTuple):
+class ComplianceJacobian(NamedTuple):
     """How IMU readings change with the links' compliances.
 
     links: (p,) the module that each compliance's link carries. sigmas: (p,) how well each is known before,
@@ -204,7 +204,9 @@ UNIT_RAD_NM = 1e-4
 COMPLIANCE_SIGMA = 5.0
 
 
-def flex_slopes(chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | None]) -> FlexSlopes:
+def compliance_jacobian(
+    chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | None]
+) -> ComplianceJacobian:
     """Return the slopes of all IMUs' readings by every link's compliance in bending and in twisting."""
     still = readings_on(chain, body_motions(chain, *joints))
     links: list[int] = []
@@ -216,9 +218,11 @@ def flex_slopes(chain: Chain, joints: JointTrack, loads: Sequence[LinkLoad | Non
             links.append(module)
             slopes.append(_change(chain, joints, still, module, turn))
     if not links:
-        return no_flex(len(chain.serials), len(joints[0]))
+        return rigid(len(chain.serials), len(joints[0]))
     count = len(links)
-    return FlexSlopes(tuple(links), np.full(count, COMPLIANCE_SIGMA), np.array(slopes), np.zeros(count))
+    return ComplianceJacobian(
+        tuple(links), np.full(count, COMPLIANCE_SIGMA), np.array(slopes), np.zeros(count)
+    )
 
 
 def _change(chain: Chain, joints: JointTrack, still: ImuReadings, module: int, *turn: LinkTurn) -> Array:
@@ -233,10 +237,10 @@ def hinge_slopes(
     chain: Chain,
     joints: JointTrack,
     loads: Sequence[LinkLoad | None],
-    known: FlexSlopes,
+    known: ComplianceJacobian,
     compliance: Array,
     taken: Array | None = None,
-) -> FlexSlopes:
+) -> ComplianceJacobian:
     """Return slopes by the places of the hinges (see `LinkLoad.shifts`), beside those known.
 
     Their size follows from the compliances (2 l,) found with the slopes known, of l links. taken: (3 l,) by
@@ -257,7 +261,7 @@ def hinge_slopes(
             there = load.moved(0.01 * shift).turns(bending, twisting)
             slopes.append(100.0 * (_change(chain, joints, still, module, *there) - here))
             links.append(module)
-    return FlexSlopes(
+    return ComplianceJacobian(
         (*known.links, *links),
         np.concatenate([known.sigmas, np.tile(HINGE_SIGMAS, len(links) // 3)]),
         np.concatenate([known.slopes, np.array(slopes)]),
@@ -288,9 +292,9 @@ def turns_under(
     return found
 
 
-def no_flex(count: int, samples: int) -> FlexSlopes:
+def rigid(count: int, samples: int) -> ComplianceJacobian:
     """Return the slopes of links that do not give, for so many modules and samples."""
-    return FlexSlopes((), np.zeros(0), np.zeros((0, 6, samples, count)), np.zeros(0))
+    return ComplianceJacobian((), np.zeros(0), np.zeros((0, 6, samples, count)), np.zeros(0))
 
 
 def loads_of(

@@ -7,9 +7,9 @@ import typer
 
 from coordinator.baseline.check import CheckError, check, check_plan
 from coordinator.baseline.check_report import CheckReport, table, write_check
-from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.commands.options import Connect, Expect, Listen, Network, Robot, fail, planned
-from coordinator.commands.short_run import known_or_fail, run_again
+from coordinator.commands.short_run import baseline_or_fail, run_again
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import Terminal
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
@@ -46,20 +46,20 @@ def check_robot(
     """
     if (out is None) == (measured is None):
         fail("give either --out, to measure the robot, or --measured, a run to compare with", EXIT_USAGE)
-    before = known_or_fail(known)
+    before = baseline_or_fail(known)
     folder = measured
     if out is not None:
         folder, short = out, check_plan(before, planned(plan))
         run_again(robot or before.name, out, short, listen, connect, network, seed, expect, speed, quiet)
     assert folder is not None
-    report = _compared(before, known_or_fail(folder))
+    report = _compared(before, baseline_or_fail(folder))
     write_check(folder / CHECK, report)
     _print(report, as_json)
     if report.changed:
         raise typer.Exit(EXIT_CHANGED)
 
 
-def _compared(before: KnownRobot, after: KnownRobot) -> CheckReport:
+def _compared(before: BaselineRobot, after: BaselineRobot) -> CheckReport:
     try:
         return check(before, after)
     except CheckError as error:

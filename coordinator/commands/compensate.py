@@ -7,9 +7,9 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from coordinator.baseline.known_robot import KnownRobotError
+from coordinator.baseline.known_robot import BaselineError
 from coordinator.commands.attended_run import Place, join, sender_name
-from coordinator.commands.compensate_view import FloatView
+from coordinator.commands.compensate_view import CompensationView
 from coordinator.commands.options import Connect, Listen, Network, Robot, fail
 from coordinator.runtime.event_loop import (
     SIGNALS,
@@ -22,22 +22,26 @@ from coordinator.runtime.event_loop import (
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_LOST, EXIT_USAGE, explain
 from coordinator.runtime.terminal import Terminal
 from coordinator.torque_control.gains import most_damping_nm_s_rad
-from coordinator.torque_control.gravity_compensation import FloatRefused, FloatSettings, StaleFeedback
-from coordinator.torque_control.gravity_model import KnownWeight, known_weight
-from coordinator.torque_control.preconditions import NotTheKnownRobot
-from coordinator.torque_control.session import FloatPlan, FloatSession
-from coordinator.torque_control.summary import FloatSummary
+from coordinator.torque_control.gravity_compensation import (
+    CompensationRefused,
+    CompensationSettings,
+    StaleFeedback,
+)
+from coordinator.torque_control.gravity_model import GravityModel, gravity_model
+from coordinator.torque_control.preconditions import RobotMismatch
+from coordinator.torque_control.session import CompensationPlan, CompensationSession
+from coordinator.torque_control.summary import CompensationSummary
 from module_agent.model.catalogue import module_type
 from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from module_agent.transport.transport import Transport, TransportError
 from module_agent.wire.keys import check_chunk
 
-LEAST_RATE_HZ, MOST_RATE_HZ = 20.0, 1000.0
-MOST_HOLD_S, MOST_FLOAT_S = 600.0, 86400.0
+MIN_RATE_HZ, MAX_RATE_HZ = 20.0, 1000.0
+MAX_HOLD_S, MAX_COMPENSATION_S = 600.0, 86400.0
 
 
-def float_robot(
+def compensate_robot(
     known: Annotated[
         Path, typer.Argument(help="Folder of the run that the robot is known from, inertia and all.")
     ],
@@ -70,17 +74,17 @@ def float_robot(
     it is. Exit codes: 0 also after Ctrl-C, 1 it was not set free or a limit ended it, others as of `run`.
     """
     try:
-        weight = known_weight(known)
+        weight = gravity_model(known)
         check_chunk("robot", robot or weight.robot)
         check_speed(speed)
         _check_numbers(rate, max_speed)
         _check_times(for_s, hold_s)
         _check_damping(damping, weight)
         place = Place(listen, tuple(connect or ()), network_named(network), seed)
-    except (KnownRobotError, ValueError) as error:
+    except (BaselineError, ValueError) as error:
         fail(error, EXIT_USAGE)
-    settings = FloatSettings(damping, max_speed, velocity_forces=velocity_forces)
-    plan = FloatPlan(settings, rate, for_s, hold_s, back)
+    settings = CompensationSettings(damping, max_speed, velocity_forces=velocity_forces)
+    plan = CompensationPlan(settings, rate, for_s, hold_s, back)
     try:
         transport = join(place, Terminal(quiet)).transport
     except (OSError, TransportError) as error:
@@ -91,19 +95,19 @@ def float_robot(
 
 
 def _check_numbers(rate_hz: float, max_speed_rad_s: float) -> None:
-    if not LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ:
-        raise ValueError(f"--rate {rate_hz}: it must be {LEAST_RATE_HZ:.0f} to {MOST_RATE_HZ:.0f} Hz")
+    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+        raise ValueError(f"--rate {rate_hz}: it must be {MIN_RATE_HZ:.0f} to {MAX_RATE_HZ:.0f} Hz")
     if not (math.isfinite(max_speed_rad_s) and max_speed_rad_s > 0.0):
         raise ValueError(f"--max-speed {max_speed_rad_s}: it must be a positive number of rad/s")
 
 
 def _check_times(for_s: float | None, hold_s: float) -> None:
-    for option, value, most in (("--for", for_s, MOST_FLOAT_S), ("--hold", hold_s, MOST_HOLD_S)):
+    for option, value, most in (("--for", for_s, MAX_COMPENSATION_S), ("--hold", hold_s, MAX_HOLD_S)):
         if value is not None and not 0.0 <= value <= most:
             raise ValueError(f"{option} {value}: it must be 0 to {most:.0f} s")
 
 
-def _check_damping(damping_nm_s_rad: float, weight: KnownWeight) -> None:
+def _check_damping(damping_nm_s_rad: float, weight: GravityModel) -> None:
     most, name = min((most_damping_nm_s_rad(module_type(name)), name) for name in set(weight.types))
     if not 0.0 <= damping_nm_s_rad <= most:
         raise ValueError(
@@ -113,19 +117,19 @@ def _check_damping(damping_nm_s_rad: float, weight: KnownWeight) -> None:
 
 def _attended(
     name: str,
-    weight: KnownWeight,
-    plan: FloatPlan,
+    weight: GravityModel,
+    plan: CompensationPlan,
     transport: Transport,
     speed: float,
     as_json: bool,
     quiet: bool,
-) -> FloatSummary:
+) -> CompensationSummary:
     """Float to the end, or end the command with what went wrong."""
     loop = ScaledLoop(speed)
     interruption: Interruption | None = None
     try:
-        with FloatView(weight.chain.serials, loop.time, as_json, quiet) as view:
-            session = FloatSession(
+        with CompensationView(weight.chain.serials, loop.time, as_json, quiet) as view:
+            session = CompensationSession(
                 transport, name, weight, plan, loop.clock_ns, loop.call_soon_threadsafe, view, sender_name()
             )
             task = loop.create_task(session.run())
@@ -143,7 +147,7 @@ def _attended(
             ignore_signals()
 
 
-def _first_end_then(session: FloatSession, interruption: Interruption) -> Callable[[], None]:
+def _first_end_then(session: CompensationSession, interruption: Interruption) -> Callable[[], None]:
     """Return a signal handler: the first signal asks for the end in order, the next one for that at once."""
 
     def heard() -> None:
@@ -156,7 +160,7 @@ def _first_end_then(session: FloatSession, interruption: Interruption) -> Callab
 
 
 def _give_up(error: BaseException) -> NoReturn:
-    if isinstance(error, FloatRefused | NotTheKnownRobot):
+    if isinstance(error, CompensationRefused | RobotMismatch):
         fail(error, EXIT_FAILED)
     if isinstance(error, StaleFeedback):
         fail(error, EXIT_LOST)

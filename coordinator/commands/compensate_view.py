@@ -10,13 +10,13 @@ from rich.table import Table
 
 from coordinator.runtime.terminal import print_table
 from coordinator.torque_control.session import Moment
-from coordinator.torque_control.summary import FloatSummary
+from coordinator.torque_control.summary import CompensationSummary
 
 # A live table; a pipe is read later, and by line.
 LIVE_S, LINE_S = 0.25, 0.5
 
 
-class FloatView:
+class CompensationView:
     """Shows moments every so often; `now_s` is the clock of the session.
 
     Use as a context manager. Notes, and what is live, go to standard error; lines of JSON and the summary to
@@ -32,7 +32,7 @@ class FloatView:
         self._live = Live(console=self._console, auto_refresh=False, transient=True) if is_live else None
         self._due_s = 0.0
 
-    def __enter__(self) -> "FloatView":
+    def __enter__(self) -> "CompensationView":
         if self._live is not None:
             self._live.start()
         return self
@@ -58,7 +58,7 @@ class FloatView:
         else:
             self._console.print(moment_line(self._serials, now), markup=False, soft_wrap=True)
 
-    def summary(self, found: FloatSummary) -> None:
+    def summary(self, found: CompensationSummary) -> None:
         """It is over."""
         if self._as_json:
             print(json.dumps(summary_fields(found)), flush=True)
@@ -81,7 +81,7 @@ def moment_fields(serials: tuple[str, ...], now: Moment) -> dict[str, object]:
     names = "serial", "position_rad", "velocity_rad_s", "asked_nm", "measured_nm", "age_s"
     return {
         "phase": now.phase,
-        "floated_s": round(now.floated_s, 3),
+        "floated_s": round(now.compensated_s, 3),
         "missed": now.missed,
         "joints": [dict(zip(names, row, strict=True)) for row in columns],
     }
@@ -93,13 +93,13 @@ def moment_line(serials: tuple[str, ...], now: Moment) -> str:
         f"{serial} {degrees(q):.1f} deg {tau:.2f} Nm"
         for serial, q, tau in zip(serials, now.reading.q_rad, now.effort_nm, strict=True)
     )
-    return f"{now.phase} {now.floated_s:.1f} s: {joints}"
+    return f"{now.phase} {now.compensated_s:.1f} s: {joints}"
 
 
 def moment_table(serials: tuple[str, ...], now: Moment) -> RenderableType:
     """Return a moment as a table."""
     titles = "joint", "position [deg]", "speed [deg/s]", "asked for [Nm]", "measured [Nm]", "age [ms]"
-    shown = Table(*titles, title=f"{now.phase}, {now.floated_s:.1f} s, {now.missed} set-points missed")
+    shown = Table(*titles, title=f"{now.phase}, {now.compensated_s:.1f} s, {now.missed} set-points missed")
     reading = now.reading
     for k, serial in enumerate(serials):
         shown.add_row(
@@ -113,12 +113,12 @@ def moment_table(serials: tuple[str, ...], now: Moment) -> RenderableType:
     return shown
 
 
-def summary_fields(found: FloatSummary) -> dict[str, object]:
+def summary_fields(found: CompensationSummary) -> dict[str, object]:
     """Return a summary for programs; SI units."""
     return {**found._asdict(), "joints": [joint._asdict() for joint in found.joints]}
 
 
-def summary_table(found: FloatSummary) -> Table:
+def summary_table(found: CompensationSummary) -> Table:
     """Return a summary as a table."""
     titles = (
         "joint",
@@ -128,7 +128,7 @@ def summary_table(found: FloatSummary) -> Table:
         "torque, rms [Nm]",
         "most [Nm]",
     )
-    title = f"floated for {found.floated_s:.1f} s: {found.why}; {found.missed} set-points missed"
+    title = f"floated for {found.compensated_s:.1f} s: {found.why}; {found.missed} set-points missed"
     shown = Table(*titles, title=title)
     for joint in found.joints:
         shown.add_row(

@@ -162,7 +162,7 @@ def _error(report: FitReport, model: Model, tried_on: str, torque: str, samples:
 def _place(part: TermPart) -> str:
     if part.lumped_with:
         return "within the inertias"
-    return "earns its place" if part.earns_its_place else "could go"
+    return "earns its place" if part.significant else "could go"
 
 
 def _claim(part: BaseParameterPart) -> str:

@@ -14,7 +14,7 @@ from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
 
 # Above this something was not the same in all runs, or a chain is worse than it says.
-STRAINED_ABOVE = 5.0
+INCONSISTENT_ABOVE = 5.0
 
 
 def merge(
@@ -40,8 +40,8 @@ def merge(
         return
     print_table(table(report))
     for run in report.runs:
-        if run.strain > STRAINED_ABOVE:
+        if run.inconsistency_sigma > INCONSISTENT_ABOVE:
             typer.echo(
-                f"{run.run} is {run.strain:.0f} of its standard deviations off: some part of it, or a link, "
-                "is not what it is in the others, or its chain is worse than it says"
+                f"{run.run} is {run.inconsistency_sigma:.0f} sigma off: a part or a link differs from the "
+                "other runs, or the covariance of its chain is too small"
             )

@@ -10,11 +10,11 @@ import typer
 
 from coordinator.commands.attended_run import Place, join, sender_name
 from coordinator.commands.check import EXIT_CHANGED
-from coordinator.commands.monitor_view import WatchScreen
+from coordinator.commands.monitor_view import MonitorScreen
 from coordinator.commands.options import Connect, Listen, Network, Robot, fail
-from coordinator.commands.short_run import known_or_fail
-from coordinator.live_robot.messenger import Radio
-from coordinator.monitoring.live import KEPT_ROWS, LOOK_S, LiveWatch
+from coordinator.commands.short_run import baseline_or_fail
+from coordinator.live_robot.messenger import Messenger
+from coordinator.monitoring.live import KEPT_ROWS, LOOK_S, LiveMonitor
 from coordinator.monitoring.monitor import Watcher
 from coordinator.monitoring.reference import NoReference, Reference, build_reference
 from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
@@ -35,7 +35,7 @@ from module_agent.wire.refusal import WireError
 _FIRST_HEARD_S = 15.0
 
 
-def watch_robot(
+def monitor_robot(
     known: Annotated[
         Path, typer.Argument(help="Folder of the run that the robot is known from, inertia and all.")
     ],
@@ -70,7 +70,7 @@ def watch_robot(
     reference = _reference(known)
     watcher = Watcher(reference, alarms_per_hour)
     try:
-        screen = WatchScreen(watcher, json_file, quiet)
+        screen = MonitorScreen(watcher, json_file, quiet)
     except OSError as error:
         fail(f"{json_file}: {error.strerror or error}", EXIT_USAGE)
     with screen:
@@ -92,12 +92,12 @@ def watch_robot(
 
 def _reference(folder: Path) -> Reference:
     try:
-        return build_reference(known_or_fail(folder))
+        return build_reference(baseline_or_fail(folder))
     except NoReference as error:
         fail(error, EXIT_USAGE)
 
 
-def _watch_file(watcher: Watcher, screen: WatchScreen, path: Path) -> None:
+def _watch_file(watcher: Watcher, screen: MonitorScreen, path: Path) -> None:
     """Watch what a session recorded, as if it happened now."""
     serials = watcher.reference.chain.serials
     try:
@@ -125,7 +125,7 @@ def _watch_file(watcher: Watcher, screen: WatchScreen, path: Path) -> None:
 
 
 def _watch_live(
-    watcher: Watcher, screen: WatchScreen, robot: str, place: Place, for_s: float | None, speed: float
+    watcher: Watcher, screen: MonitorScreen, robot: str, place: Place, for_s: float | None, speed: float
 ) -> None:
     """Watch until the time is up or a signal comes, which ends a watch in order."""
     loop = ScaledLoop(speed)
@@ -136,8 +136,8 @@ def _watch_live(
         fail(error, EXIT_USAGE)
     try:
         screen.start_ns = loop.clock_ns()
-        live = LiveWatch(watcher, loop.clock_ns, sender_name(), screen.say)
-        radio = Radio(transport, robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
+        live = LiveMonitor(watcher, loop.clock_ns, sender_name(), screen.say)
+        radio = Messenger(transport, robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
         task = loop.create_task(_attend(live, radio, watcher, for_s, loop.clock_ns))
         for number in SIGNALS:
             loop.add_signal_handler(number, task.cancel)
@@ -152,7 +152,7 @@ def _watch_live(
 
 
 async def _attend(
-    live: LiveWatch, radio: Radio, watcher: Watcher, for_s: float | None, clock: Callable[[], int]
+    live: LiveMonitor, radio: Messenger, watcher: Watcher, for_s: float | None, clock: Callable[[], int]
 ) -> None:
     start_ns = clock()
     radio.start()

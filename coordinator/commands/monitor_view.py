@@ -17,7 +17,7 @@ from coordinator.monitoring.monitor import Heard, Watcher
 _NOTES = 6
 
 
-class WatchScreen:
+class MonitorScreen:
     """Shows what a watcher says. Times are seconds since `start_ns`, which is set before anything is said."""
 
     def __init__(self, watcher: Watcher, json_file: Path | None, quiet: bool = False):
@@ -30,7 +30,7 @@ class WatchScreen:
             self._live = Live(get_renderable=self._shown, console=self._console, refresh_per_second=4.0)
         self._notes: list[str] = []
 
-    def __enter__(self) -> "WatchScreen":
+    def __enter__(self) -> "MonitorScreen":
         if self._live is not None:
             self._live.start()
         return self
@@ -96,7 +96,7 @@ class WatchScreen:
         table = Table("joint", "from outside [Nm]", "level [Nm]", title=f"{watcher.looked_s:.0f} s watched")
         for k, serial in enumerate(watcher.reference.chain.serials):
             now = "-" if outside is None else f"{outside[k]:+.2f}"
-            table.add_row(serial, now, f"{watcher.levels.contact_nm[k]:.2f}")
+            table.add_row(serial, now, f"{watcher.thresholds.contact_nm[k]:.2f}")
         return Group(table, *_lines(self.sentence(f) for f in watcher.ledger.all), *_lines(self._notes))
 
 

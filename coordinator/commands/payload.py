@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.baseline.payload import PayloadError, payload_plan, search_payload
 from coordinator.baseline.payload_report import PayloadReport, write_payload
 from coordinator.commands.options import Connect, Expect, Listen, Network, Robot, fail, planned
-from coordinator.commands.short_run import known_or_fail, run_again
+from coordinator.commands.short_run import baseline_or_fail, run_again
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 
@@ -41,18 +41,18 @@ def find_payload(
     """
     if (out is None) == (measured is None):
         fail("give either --out, to move the robot, or --measured, a run to compare with", EXIT_USAGE)
-    before = known_or_fail(known)
+    before = baseline_or_fail(known)
     folder = measured
     if out is not None:
         folder, short = out, payload_plan(before, planned(plan))
         run_again(robot or before.name, out, short, listen, connect, network, seed, expect, speed, quiet)
     assert folder is not None
-    report = _searched(before, known_or_fail(folder))
+    report = _searched(before, baseline_or_fail(folder))
     write_payload(folder / PAYLOAD, report)
     typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.words))
 
 
-def _searched(before: KnownRobot, after: KnownRobot) -> PayloadReport:
+def _searched(before: BaselineRobot, after: BaselineRobot) -> PayloadReport:
     try:
         return search_payload(before, after)
     except PayloadError as error:

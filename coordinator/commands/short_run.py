@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from coordinator.baseline.known_robot import KnownRobot, KnownRobotError, load_known
+from coordinator.baseline.known_robot import BaselineError, BaselineRobot, load_baseline
 from coordinator.commands.attended_run import Place, run_attended, sender_name
 from coordinator.commands.options import fail
 from coordinator.excitation.plan import Plan
@@ -15,11 +15,11 @@ from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.wire.keys import check_chunk
 
 
-def known_or_fail(folder: Path) -> KnownRobot:
+def baseline_or_fail(folder: Path) -> BaselineRobot:
     """Return the robot that a run tells of, or end the command."""
     try:
-        return load_known(folder)
-    except KnownRobotError as error:
+        return load_baseline(folder)
+    except BaselineError as error:
         fail(error, EXIT_USAGE)
 
 

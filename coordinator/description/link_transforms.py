@@ -50,7 +50,7 @@ def link_transforms(
     Args:
         chain: n joints.
         types: per joint.
-        covariance: (6 n, 6 n) of the chain's increments (`increments.apply_increment`).
+        covariance: (6 n, 6 n) of the chain's increments (`increments.apply_perturbation`).
         null_basis: (6 n, k) increments of length 1 that no observation tells. Exact motions
             (`null_space.Unresolved`) name parameters sharper than the null vectors of a noisy fit.
 

@@ -21,7 +21,7 @@ OUTPUT_RADIUS_M = 0.02
 # Tubes and brackets of aluminium with their ends, between what joins two modules: 0.3 to 0.8 kg/m.
 LINK_KG_M = 0.5
 # Modules stand apart by at least their screws and a plate.
-LEAST_LINK_KG = 0.02
+MIN_LINK_KG = 0.02
 # Nothing is thinner than this, and no place is known better.
 SMEAR_M = 0.01
 
@@ -83,7 +83,7 @@ def _output(kind: ModuleType, home: Array) -> Array:
 def _link(begin: Array, end: Array) -> Array:
     """Return a straight rod between two faces."""
     along = end - begin
-    mass = max(LINK_KG_M * float(np.linalg.norm(along)), LEAST_LINK_KG)
+    mass = max(LINK_KG_M * float(np.linalg.norm(along)), MIN_LINK_KG)
     return _lump(mass, np.append(0.5 * (begin + end), 1.0), mass / 12.0 * np.outer(along, along))
 
 

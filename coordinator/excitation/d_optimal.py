@@ -26,7 +26,7 @@ RATE_HZ = 20.0
 # 1e-10.
 BASE_TOLERANCE = 1e-13
 # Passes of exchanging each chosen motion for a better one; it settles in two or three.
-MOST_PASSES = 6
+MAX_PASSES = 6
 # A motion that goes too far is tried again smaller, about a pose nearer to home.
 SHRINK = (1.0, 0.7, 0.5, 0.35)
 # Of the torque that a joint has: inertia that is not known yet may be larger than believed.
@@ -174,7 +174,7 @@ def _greedy(within: Array, count: int) -> list[int]:
 def _exchanged(within: Array, chosen: Sequence[int]) -> list[int]:
     """Replace each motion by the one that serves the others best, until none does better."""
     order = list(chosen)
-    for _ in range(MOST_PASSES):
+    for _ in range(MAX_PASSES):
         before = list(order)
         for place in range(len(order)):
             others = within[order[:place] + order[place + 1 :]].sum(axis=0)

@@ -22,7 +22,7 @@ WINDING_RISE_K = 130.0
 HOT_RESISTANCE = 1.0 + 0.00393 * WINDING_RISE_K
 # Gravity may take all of the continuous torque. So much of the type's torque is still given to a motion,
 # which is over before the winding is warm; and so much is never asked for.
-LEAST_SHARE = 0.1
+MIN_SHARE = 0.1
 RESERVE_SHARE = 0.2
 # Of the range of a module that does not turn through; the end stops are felt before they are met.
 RANGE_SHARE = 0.9
@@ -70,7 +70,7 @@ def joint_limits(kind: ModuleType, rest_torque_nm: float, inertia_kg_m2: float) 
     if not inertia_kg_m2 > 0.0:
         raise ValueError(f"an inertia of {inertia_kg_m2} kg m^2; it must be positive")
     held = abs(rest_torque_nm)
-    least = min(LEAST_SHARE * kind.max_effort_nm, (1.0 - RESERVE_SHARE) * kind.max_effort_nm - held)
+    least = min(MIN_SHARE * kind.max_effort_nm, (1.0 - RESERVE_SHARE) * kind.max_effort_nm - held)
     torque = max(continuous_torque_nm(kind) - held, least, 0.0)
     low, high = kind.range_rad or (-np.pi, np.pi)
     return JointLimits(
@@ -104,7 +104,7 @@ def motion_peaks(pattern: Pattern, origin_rad: float = 0.0) -> tuple[float, floa
 # Below what a held spring rings at; the ramps of a slow motion last 0.15 s and more.
 CUTOFF_HZ = 6.0
 # Whatever a joint carries, it has an output and a gear train of its own.
-LEAST_KG_M2 = 2e-3
+MIN_KG_M2 = 2e-3
 
 
 class Load(NamedTuple):
@@ -116,7 +116,7 @@ class Load(NamedTuple):
     @property
     def at_most_kg_m2(self) -> float:
         """What it hardly exceeds: two standard deviations more, and a fifth for what the fit leaves out."""
-        return max(1.2 * (max(self.inertia_kg_m2, 0.0) + 2.0 * self.sigma_kg_m2), LEAST_KG_M2)
+        return max(1.2 * (max(self.inertia_kg_m2, 0.0) + 2.0 * self.sigma_kg_m2), MIN_KG_M2)
 
 
 def measured_load(q_rad: Array, tau_nm: Array, rate_hz: float) -> Load:

@@ -34,13 +34,13 @@ class JointSetting(NamedTuple):
     home_rad: float
 
 
-def whole_duration_s(joints: int) -> float:
+def simultaneous_duration_s(joints: int) -> float:
     """Return how long all joints must turn for their frequencies to be told apart."""
     spacing_hz = (FAST_HZ[1] - FAST_HZ[0]) / max(joints - 1, 1)
     return max(SHORTEST_S, BEATS / spacing_hz / FLAT_SHARE)
 
 
-def whole_patterns(
+def simultaneous_patterns(
     settings: Mapping[str, JointSetting], total_s: float | None = None
 ) -> dict[str, MultiSine]:
     """Return a motion for every joint, to be run at the same time.
@@ -52,7 +52,7 @@ def whole_patterns(
     """
     order = sorted(settings, key=lambda s: (settings[s].limits.speed_rad_s, s))
     slow, fast = np.linspace(*SLOW_HZ, len(order)), np.linspace(*FAST_HZ, len(order))
-    lasting_s = total_s if total_s is not None else whole_duration_s(len(order))
+    lasting_s = total_s if total_s is not None else simultaneous_duration_s(len(order))
     return {
         serial: _pattern(serial, settings[serial], float(slow[k]), float(fast[k]), lasting_s)
         for k, serial in enumerate(order)

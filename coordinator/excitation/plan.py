@@ -37,7 +37,7 @@ class Plan(BaseModel):
     # the information predicted of them, or until more would not help.
     precision_mm: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
     # Of the motion of all joints at once; by their number if not set.
-    whole_duration_s: Seconds | None = None
+    simultaneous_duration_s: Seconds | None = None
     discover_s: Seconds = 1.0
     link_s: Seconds = 1.0
     home_rad: float = 0.0

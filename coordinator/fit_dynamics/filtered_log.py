@@ -17,7 +17,7 @@ _MOTION_POWER, _HARMONICS = 0.99, 5.0
 _KEPT_PER_CUTOFF = 6.0
 # A regressor of so many entries has 120 MB, and a fit holds some copies; a joint brings about so many
 # columns. Of a longer recording neighbours are left out that say nearly the same.
-_MOST_ENTRIES = 1.5e7
+_MAX_ENTRIES = 1.5e7
 _COLUMNS_PER_JOINT = 15
 
 
@@ -76,7 +76,7 @@ def usual_cutoff_hz(log: JointLog) -> float:
 
 def most_samples(joints: int) -> int:
     """Return how many samples of n joints a fit takes, so that their columns fit into memory."""
-    return int(_MOST_ENTRIES / (_COLUMNS_PER_JOINT * joints**2))
+    return int(_MAX_ENTRIES / (_COLUMNS_PER_JOINT * joints**2))
 
 
 def filtered_log(log: JointLog, cutoff_hz: float, most: int | None = None) -> FilteredLog:

@@ -35,12 +35,12 @@ from coordinator.fit_dynamics.report import (
     ErrorPart,
     FitPart,
     FitReport,
+    Identifiability,
     JointNoisePart,
     LengthPart,
     Model,
     TermGainPart,
     TermPart,
-    Verdict,
 )
 from coordinator.parameter_fit.base_parameters import (
     BaseParameters,
@@ -48,7 +48,7 @@ from coordinator.parameter_fit.base_parameters import (
     inertial_units,
     into_frames,
 )
-from coordinator.parameter_fit.identifiability import WEAK_ABOVE, verdicts, words_of_body
+from coordinator.parameter_fit.identifiability import WEAK_ABOVE, identifiabilities, words_of_body
 from coordinator.parameter_fit.physically_consistent import NotSolvedError
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from module_agent.model.chain import Array
@@ -226,7 +226,7 @@ def _fit_part(problem: Problem, fit: WeightedFit, real: RealBodies | None, note:
 def _bodies(problem: Problem, found: BaseParameters, real: RealBodies | None) -> list[BodyPart]:
     robot = problem.robot
     units = (*inertial_units(len(robot.bodies)), *(drive.unit for drive in problem.drives))
-    judged = verdicts(found, units)
+    judged = identifiabilities(found, units)
     parts = []
     for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True)):
         own = None if real is None else real.bodies[i]
@@ -274,7 +274,7 @@ def _claims(problem: Problem, found: BaseParameters) -> Array | None:
     return np.where(np.abs(claims) > _ROUNDING * size, claims, 0.0)
 
 
-def _verdict(relative_sigma: float) -> Verdict:
+def _verdict(relative_sigma: float) -> Identifiability:
     if relative_sigma <= WEAK_ABOVE:
         return "identified"
     return "weak" if relative_sigma < _TOLD_BELOW else "not told from zero"
@@ -300,7 +300,7 @@ def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int
         sigma=sigma,
         f=f,
         chance=chance,
-        earns_its_place=chance < EARNS_BELOW and not others,
+        significant=chance < EARNS_BELOW and not others,
         lumped_with=", ".join(others),
     )
 

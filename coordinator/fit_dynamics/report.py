@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 SCHEMA = 1
 
 Model = Literal["fitted", "bodies", "urdf", "drives_only", "mean"]
-Verdict = Literal["identified", "weak", "not told from zero"]
+Identifiability = Literal["identified", "weak", "not told from zero"]
 
 
 class Part(BaseModel):
@@ -85,7 +85,7 @@ class TermPart(Part):
     sigma: float
     f: float
     chance: float
-    earns_its_place: bool
+    significant: bool
     lumped_with: str
 
 
@@ -103,7 +103,7 @@ class BaseParameterPart(Part):
     sigma: float
     relative_sigma: float | None
     urdf: float | None
-    verdict: Verdict
+    verdict: Identifiability
 
 
 class BodyPart(Part):

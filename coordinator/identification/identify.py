@@ -20,14 +20,14 @@ from coordinator.identification.inertia.inertia import Robot, find_inertia, with
 from coordinator.identification.inertia.robot_bodies import RobotBodies, robot_bodies
 from coordinator.identification.result_builder import build_result
 from coordinator.identification.robot_refinement import CUTOFF_HZ, refine_robot
-from coordinator.identification.simultaneous_exploration import respond, whole_motion
+from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
-from coordinator.kinematics.gauge_fixing import settled
+from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.simultaneous_motion import circles_of_all
-from coordinator.recording.journal import JournalEvent, Purpose, left_out
+from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
 from coordinator.synchronisation.motion_windows import (
@@ -141,9 +141,9 @@ def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) 
 
 
 def _settled(refined: Refinement, reference: Chain) -> Refinement:
-    """Return a refinement with what it does not know where `reference` has it (`free_motions.settled`)."""
+    """Return a refinement whose unobservable directions are fixed at `reference` (`gauge_fixed`)."""
     known, by_noise = (
-        settled(refined.chain, covariance, refined.null_basis, reference)
+        gauge_fixed(refined.chain, covariance, refined.null_basis, reference)
         for covariance in (refined.covariance, refined.noise_covariance)
     )
     return refined._replace(
@@ -179,7 +179,7 @@ def _motions(recording: Recording, *purposes: Purpose) -> list[JournalEvent]:
 def _explored(recording: Recording) -> list[str]:
     rested = sorted({e.serial for e in _motions(recording, "rest")})
     explored = {e.serial for e in _motions(recording, "windowed_sine", "whole")}
-    missing = [s for s in rested if s not in explored and s not in left_out(recording.journal)]
+    missing = [s for s in rested if s not in explored and s not in excluded_modules(recording.journal)]
     if not rested or missing:
         raise IdentificationError(
             "no rest was recorded" if not rested else f"no exploration of {', '.join(missing)} was recorded"
@@ -213,7 +213,7 @@ def _pairs(
     recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str], windows: Sequence[Window]
 ) -> list[PairObservation]:
     """Return the circles as observations."""
-    whole = whole_motion(recording, serials)
+    whole = simultaneous_motion(recording, serials)
     if whole is not None:
         return circles_of_all(serials, respond(recording, clocks, serials, whole))
     sines = {

@@ -16,7 +16,7 @@ import numpy as np
 
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS, ImuPrior
-from coordinator.batch_estimation.link_compliance import flex_slopes, joined, loads_of
+from coordinator.batch_estimation.link_compliance import compliance_jacobian, joined, loads_of
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.assembly import ChainFit, assemble, link_lengths
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
@@ -33,10 +33,10 @@ from module_agent.signals.filtering import settling_samples
 from module_agent.wire.messages import Estimate
 
 # Of the weighted squares: far less than their noise.
-LEAST_GAIN = 1e-3
+MIN_GAIN = 1e-3
 
 
-class RobotSoFar(NamedTuple):
+class Preview(NamedTuple):
     """A chain of the modules that are tied to others by now.
 
     explored: serials of the joints that have been explored. beside: (n,) whether nothing that is still to be
@@ -48,7 +48,7 @@ class RobotSoFar(NamedTuple):
     beside: tuple[bool, ...]
 
 
-def robot_so_far(recording: Recording, explored: Collection[str]) -> RobotSoFar | None:
+def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     """Assemble what the joints explored so far tell; None as long as they tie no module to another.
 
     Raises:
@@ -75,8 +75,8 @@ def robot_so_far(recording: Recording, explored: Collection[str]) -> RobotSoFar 
         and (pair := _pair(recording, joint, observer, topology, rest.q_rad)) is not None
     ]
     types = [module_type(_type(recording, s)) for s in topology.serials]
-    fit = assemble(topology, types, pairs, [rest], LEAST_GAIN)
-    return RobotSoFar(fit, tuple(moved), beside(fit.chain, moved))
+    fit = assemble(topology, types, pairs, [rest], MIN_GAIN)
+    return Preview(fit, tuple(moved), beside(fit.chain, moved))
 
 
 def beside(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
@@ -204,7 +204,7 @@ KEPT_EVERY, FITTED_EVERY = 5, 4
 LOST_ABOVE_M = 0.15
 
 
-class Looks:
+class Previewer:
     """The looks at one robot, one after the other, from its recording as it grows; one at a time.
 
     Robots of more than `most_refined` modules are only assembled: a refinement of seven costs half a second,
@@ -216,15 +216,15 @@ class Looks:
         self._most_refined = most_refined
         self._parts: dict[tuple[str, int, tuple[str, ...]], SensorData] = {}
 
-    def look(self, explored: Collection[str]) -> RobotSoFar | None:
+    def look(self, explored: Collection[str]) -> Preview | None:
         """Return the robot as far as the joints `explored` tell; None as long as they tie nothing together.
 
         Where samples are missing, or do not fit, it is as assembled.
 
         Raises:
-            ValueError: see `robot_so_far`.
+            ValueError: see `preview`.
         """
-        found = robot_so_far(self._recording, explored)
+        found = preview(self._recording, explored)
         if found is None or not self._is_refined(found):
             return found
         try:
@@ -232,18 +232,18 @@ class Looks:
         except (ValueError, np.linalg.LinAlgError):
             return found
 
-    def _is_refined(self, found: RobotSoFar) -> bool:
+    def _is_refined(self, found: Preview) -> bool:
         return self._most_refined is None or len(found.fit.chain.serials) <= self._most_refined
 
     @property
     def _prior(self) -> ImuPrior:
         return IMU_PRIORS[self._recording.imu]
 
-    def _kinds(self, found: RobotSoFar) -> list[ModuleType]:
+    def _kinds(self, found: Preview) -> list[ModuleType]:
         infos = [self._recording.modules[s].info for s in found.fit.chain.serials]
         return [module_type(info.module_type) for info in infos if info is not None]
 
-    def _parts_of(self, found: RobotSoFar) -> list[SensorData]:
+    def _parts_of(self, found: Preview) -> list[SensorData]:
         """Return the samples of every slow and fast motion so far, modules as in the chain."""
         serials = found.fit.chain.serials
         events: dict[tuple[str, str], JournalEvent] = {}
@@ -277,13 +277,13 @@ def _columns(part: SensorData, order: Sequence[int]) -> SensorData:
 
 
 def _refined(
-    found: RobotSoFar, kinds: Sequence[ModuleType], parts: Sequence[SensorData], prior: ImuPrior
-) -> RobotSoFar:
+    found: Preview, kinds: Sequence[ModuleType], parts: Sequence[SensorData], prior: ImuPrior
+) -> Preview:
     """Refine the robot as if it were rigid, and again with links that give under their loads."""
     data = thinned(parts, FITTED_EVERY)
     rigid = refine_chain(found.fit.chain, data, prior)
     loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / KEPT_EVERY), FITTED_EVERY)
-    refined = refine_chain(rigid.chain, data, prior, flex_slopes(rigid.chain, data.joints, loads))
+    refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(rigid.chain, data.joints, loads))
     length, sigma = link_lengths(refined.chain, refined.covariance)
     if _is_lost(found, refined):
         return found
@@ -300,6 +300,6 @@ def _refined(
     return found._replace(fit=fit)
 
 
-def _is_lost(found: RobotSoFar, refined: Refinement) -> bool:
+def _is_lost(found: Preview, refined: Refinement) -> bool:
     off = refined.chain.imu_home[:, :3, 3] - found.fit.chain.imu_home[:, :3, 3]
     return not bool(np.linalg.norm(off, axis=1).max() < LOST_ABOVE_M)

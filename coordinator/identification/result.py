@@ -193,7 +193,7 @@ class BaseParameterPart(Part):
     relative_sigma: float | None
 
 
-class VerdictPart(Part):
+class IdentifiabilityPart(Part):
     """Whether one parameter is known: `identified` by torques alone, within 10 %; `weak` if worse, or by the
     modules' make; `not identifiable` else.
 
@@ -248,7 +248,7 @@ class DynamicsPart(Part):
     held_out: HeldOutPart | None
     bodies: BodiesPart | None = None
     base_parameters: list[BaseParameterPart] = []
-    verdicts: list[VerdictPart] = []
+    identifiabilities: list[IdentifiabilityPart] = []
     words: list[str] = []
     frames: list[list[list[float]]] = []
     seen_by: str = "encoders"

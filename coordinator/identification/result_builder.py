@@ -16,6 +16,7 @@ from coordinator.identification.result import (
     DynamicsPart,
     ExponentialsPart,
     HeldOutPart,
+    IdentifiabilityPart,
     LinkPart,
     MountingPart,
     PairPart,
@@ -26,7 +27,6 @@ from coordinator.identification.result import (
     TransformPart,
     UnknownPart,
     UnresolvedPart,
-    VerdictPart,
     chain_part,
 )
 from coordinator.recording.recording import Recording
@@ -37,12 +37,12 @@ from module_agent.signals.torque_terms import TERMS, UNITS
 
 if TYPE_CHECKING:
     from coordinator.identification.identified import HeldOutMotion, Kinematics
-    from coordinator.identification.inertia.agent_information import Gathered
+    from coordinator.identification.inertia.agent_information import AgentInformation
     from coordinator.identification.inertia.inertia import Inertia
     from coordinator.identification.inertia.robot_bodies import RobotBodies
     from coordinator.kinematics.assembly import ChainFit
     from coordinator.kinematics.null_space import Unresolved
-    from coordinator.parameter_fit.instrumental_variables import SeenFit
+    from coordinator.parameter_fit.instrumental_variables import InstrumentalFit
     from coordinator.topology.topology import Topology
 
 
@@ -259,7 +259,7 @@ def _dynamics(
         held_out=_held_out(serials, held_out) if held_out is not None else None,
         bodies=_bodies(bodies) if bodies is not None else None,
         base_parameters=_base_parameters(bodies) if bodies is not None else [],
-        verdicts=_verdicts(bodies) if bodies is not None else [],
+        identifiabilities=_verdicts(bodies) if bodies is not None else [],
         words=bodies.words() if bodies is not None else [],
         frames=bodies.frames.tolist() if bodies is not None else [],
         seen_by=found.eyes,
@@ -273,13 +273,13 @@ def _dynamics(
     )
 
 
-def _gathered_by(shared: "Gathered | None", joints: int) -> Literal["agents", "coordinator", "both"]:
+def _gathered_by(shared: "AgentInformation | None", joints: int) -> Literal["agents", "coordinator", "both"]:
     if shared is None or not shared.by_agents:
         return "coordinator"
     return "agents" if len(shared.by_agents) == joints else "both"
 
 
-def _torque_terms(serials: tuple[str, ...], seen: "SeenFit") -> list[TorqueTermPart]:
+def _torque_terms(serials: tuple[str, ...], seen: "InstrumentalFit") -> list[TorqueTermPart]:
     terms, scale = seen.terms, seen.scale
     return [
         TorqueTermPart(
@@ -340,9 +340,9 @@ def _base_parameters(found: "RobotBodies") -> list[BaseParameterPart]:
     ]
 
 
-def _verdicts(found: "RobotBodies") -> list[VerdictPart]:
+def _verdicts(found: "RobotBodies") -> list[IdentifiabilityPart]:
     return [
-        VerdictPart(
+        IdentifiabilityPart(
             parameter=one.name,
             serial=found.serials[k // PER_BODY],
             verdict=one.kind,
@@ -350,7 +350,7 @@ def _verdicts(found: "RobotBodies") -> list[VerdictPart]:
             sigma=one.sigma,
             sums=list(one.sums),
         )
-        for k, one in enumerate(found.verdicts)
+        for k, one in enumerate(found.identifiabilities)
     ]
 
 

@@ -11,9 +11,9 @@ from coordinator.batch_estimation.base_heading import faced
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import DELAY, ImuPrior
 from coordinator.batch_estimation.link_compliance import (
-    FlexSlopes,
+    ComplianceJacobian,
     LinkLoad,
-    flex_slopes,
+    compliance_jacobian,
     hinge_slopes,
     joined,
     loads_of,
@@ -31,7 +31,7 @@ CUTOFF_HZ = 12.0
 # Half the time constant of that low-pass: about as many independent samples as there are.
 KEEP_EVERY = 5
 # IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
-MOST_IMU_SAMPLES = 40_000
+MAX_IMU_SAMPLES = 40_000
 # Before the last step a quarter of them will do.
 COARSE = 4
 
@@ -56,7 +56,7 @@ def refine_robot(
     Raises:
         ValueError: as `refine_chain`.
     """
-    keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MOST_IMU_SAMPLES))
+    keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MAX_IMU_SAMPLES))
     parts = _parts(windows, floor)
     rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior)
     # The first IMU may see no motion that would tell how late it is; all are of one make.
@@ -89,8 +89,8 @@ def _hinged(
     loads: Sequence[LinkLoad | None],
     compliance: Array,
     moved: Array | None = None,
-) -> FlexSlopes:
-    flex = flex_slopes(chain, data.smooth, loads)
+) -> ComplianceJacobian:
+    flex = compliance_jacobian(chain, data.smooth, loads)
     return hinge_slopes(chain, data.smooth, loads, flex, compliance, moved)
 
 
@@ -116,7 +116,7 @@ def _giving(
     """
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
-    flex = flex_slopes(rigid.chain, resting.smooth, loads)
+    flex = compliance_jacobian(rigid.chain, resting.smooth, loads)
     at_rest = refine_chain(rigid.chain, resting, prior, flex)
     data = thinned(parts, keep)
     nobody_else = len(rigid.chain.serials) == 1

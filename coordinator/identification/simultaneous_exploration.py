@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from coordinator.kinematics.simultaneous_motion import (
+    SimultaneousMotion,
+    SimultaneousResponse,
     StillReading,
-    WholeMotion,
-    WholeResponse,
-    whole_response,
+    simultaneous_response,
 )
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
@@ -20,7 +20,7 @@ from module_agent.signals.filtering import differentiate, settling_samples, zero
 CUTOFF_HZ = 15.0
 
 
-def whole_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent | None:
+def simultaneous_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent | None:
     """Return the latest motion in which all these joints took part at once, as that of the first of them.
 
     None if not all of them did, or if all were moved one by one as well: those motions tell more clearly.
@@ -34,18 +34,18 @@ def whole_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent |
 
 def respond(
     recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], event: JournalEvent
-) -> WholeResponse:
+) -> SimultaneousResponse:
     """Regress what all modules saw on what all joints did; columns in the order of `serials`.
 
     Raises:
-        ValueError: see `kinematics.whole_motion.whole_response`; also a hole in the recording, or no rest.
+        ValueError: see `simultaneous_response`; also a hole in the recording, or no rest.
     """
     margin_s = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
     one = window(recording, clocks, serials, event, margin_s)
-    return whole_response(_filtered(one), _still(recording, serials), RATE_HZ, CUTOFF_HZ)
+    return simultaneous_response(_filtered(one), _still(recording, serials), RATE_HZ, CUTOFF_HZ)
 
 
-def _filtered(one: Window) -> WholeMotion:
+def _filtered(one: Window) -> SimultaneousMotion:
     edge = settling_samples(RATE_HZ, CUTOFF_HZ)
     q, gyro, accel = (
         zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ)
@@ -53,7 +53,7 @@ def _filtered(one: Window) -> WholeMotion:
     )
     # Velocities from positions, which are not late.
     qd = differentiate(q, RATE_HZ)
-    return WholeMotion(*(s[edge:-edge] for s in (q, qd, differentiate(qd, RATE_HZ), gyro, accel)))
+    return SimultaneousMotion(*(s[edge:-edge] for s in (q, qd, differentiate(qd, RATE_HZ), gyro, accel)))
 
 
 def _still(recording: Recording, serials: Sequence[str]) -> StillReading:

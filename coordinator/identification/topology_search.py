@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from coordinator.identification.simultaneous_exploration import respond, whole_motion
+from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
 from coordinator.identification.topology_observations import Seen, observe, slow_motions
 from coordinator.kinematics.simultaneous_motion import seen_by_all
-from coordinator.recording.journal import left_out
+from coordinator.recording.journal import excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.next_motion import NextMotion, next_motions
@@ -40,7 +40,7 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
     if not seen.observations:
         raise TopologyError(_nothing_seen(seen), tuple(serials))
     topology = find_topology(*_usable(seen))
-    without = [f"{s} took no part: {why}" for s, why in left_out(recording.journal).items()]
+    without = [f"{s} took no part: {why}" for s, why in excluded_modules(recording.journal).items()]
     return TopologyFound(topology, (*without, *_notes(seen, topology)))
 
 
@@ -52,7 +52,7 @@ def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
         doubts = likely_topology(observations, unmoved).doubts
     except ValueError:
         return ()  # nothing to go by; whoever assembles the robot next says what is missing
-    first = 0 if whole_motion(recording, serials) is not None else 1
+    first = 0 if simultaneous_motion(recording, serials) is not None else 1
     repeated = {s: len(slow_motions(recording, s)) - first for s in serials}
     return next_motions(doubts, observations, repeated)
 
@@ -63,7 +63,7 @@ def _seen(recording: Recording, serials: Sequence[str]) -> Seen:
     Raises:
         ValueError: the motion of all joints cannot be evaluated; see `whole_exploration.respond`.
     """
-    slow, whole = observe(recording, serials), whole_motion(recording, serials)
+    slow, whole = observe(recording, serials), simultaneous_motion(recording, serials)
     if whole is None:
         return slow
     clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})

@@ -27,7 +27,7 @@ from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import BASE
-from module_agent.model.perturbation import apply_increment, frozen, skew
+from module_agent.model.perturbation import apply_perturbation, frozen, skew
 
 # A direction counts as resolved if its one sigma is below this (rad or m). A parallel pair of axes is never
 # parallel to the last digit: the noise of the axes would "resolve" the offset along them to half a metre.
@@ -40,7 +40,7 @@ STILL = 1e-13
 class ChainFit(NamedTuple):
     """An assembled chain and what is known of it; arrays read-only.
 
-    covariance: (6 n, 6 n) of the increments of `increments.apply_increment` over what is resolved; zero for
+    covariance: (6 n, 6 n) of the perturbations of `apply_perturbation` over what is resolved; zero for
     the
         first root, which is the root frame, and along unresolved directions.
     rank: of the weighted Jacobian over `unknowns` = 6 (n - 1) + 2 parameters, the last two gravity's
@@ -158,7 +158,7 @@ def _shortened(chain: Chain, seen: ChainObservations, step: Array, cost: float) 
 
 def _stepped(chain: Chain, step: Array) -> Chain:
     tilt = skew(_level(chain) @ step[-2:])
-    moved = apply_increment(chain, np.concatenate([np.zeros(6), step[:-2]]))
+    moved = apply_perturbation(chain, np.concatenate([np.zeros(6), step[:-2]]))
     gravity = chain.gravity + tilt @ chain.gravity
     gravity *= np.linalg.norm(chain.gravity) / np.linalg.norm(gravity)
     return moved._replace(gravity=frozen(gravity))

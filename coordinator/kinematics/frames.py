@@ -22,7 +22,7 @@ PARALLEL_BELOW = 1e-6
 def axis_angles(chain: Chain, covariance: Array) -> tuple[Array, Array]:
     """Return the angles (n,) [rad], 0 to pi, between each joint's axis and its parent's, and their sigmas.
 
-    NaN for roots. `covariance`: (6 n, 6 n) of the chain's increments (`increments.apply_increment`). How a
+    NaN for roots. `covariance`: (6 n, 6 n) of the chain's increments (`increments.apply_perturbation`). How a
     module is turned about its parent's axis, or placed along it, does not matter.
     """
     angle, sigma = np.full((2, len(chain.serials)), np.nan)

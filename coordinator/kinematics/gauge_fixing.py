@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from coordinator.kinematics.null_space import Kind, Unresolved, name_null_space
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import BASE, ancestors, descendants
-from module_agent.model.perturbation import adjoint, apply_increment, frozen
+from module_agent.model.perturbation import adjoint, apply_perturbation, frozen
 
 # What a wrong orientation counts against a wrong place: the displacement at a usual module's reach.
 REACH_M = 0.3
@@ -21,7 +21,7 @@ REACH_M = 0.3
 TURNS_RAD = (0.5 * np.pi, np.pi, 1.5 * np.pi)
 
 
-class FreeMotion(NamedTuple):
+class GaugeFreedom(NamedTuple):
     """What lies beyond `branch` moves as one: along or about the axis of `joint`, or on the base."""
 
     kind: Kind
@@ -29,7 +29,7 @@ class FreeMotion(NamedTuple):
     branch: int
 
 
-class Settled(NamedTuple):
+class GaugeFixed(NamedTuple):
     """A chain with the covariance of its increments (6 n, 6 n) and those that it does not know (6 n, k)."""
 
     chain: Chain
@@ -37,14 +37,14 @@ class Settled(NamedTuple):
     null_basis: Array
 
 
-def settled(chain: Chain, covariance: Array, null_basis: Array, reference: Chain) -> Settled:
+def gauge_fixed(chain: Chain, covariance: Array, null_basis: Array, reference: Chain) -> GaugeFixed:
     """Return a fitted chain with what it does not know as near as can be to where `reference` has it.
 
     A fit of many steps drifts along what it does not know, and nothing calls it back.
     """
-    free = free_motions(chain, name_null_space(chain, null_basis))
+    free = gauge_freedoms(chain, name_null_space(chain, null_basis))
     if not free:
-        return Settled(chain, covariance, null_basis)
+        return GaugeFixed(chain, covariance, null_basis)
     everybody = range(len(chain.serials))
     found = moved(chain, free, nearest(chain, free, everybody, reference.imu_home))
     hidden = carried(chain, found, null_basis)
@@ -53,29 +53,29 @@ def settled(chain: Chain, covariance: Array, null_basis: Array, reference: Chain
     # What is known is what is across the unknown, also in the new place.
     across = np.eye(len(basis)) - basis @ basis.T
     half = across @ carried(chain, found, covariance)
-    return Settled(found, frozen(across @ carried(chain, found, half.T)), frozen(basis))
+    return GaugeFixed(found, frozen(across @ carried(chain, found, half.T)), frozen(basis))
 
 
-def free_motions(chain: Chain, unresolved: Sequence[Unresolved]) -> tuple[FreeMotion, ...]:
+def gauge_freedoms(chain: Chain, unresolved: Sequence[Unresolved]) -> tuple[GaugeFreedom, ...]:
     """Return the unresolved motions as motions of a chain, proximal ones first.
 
     The chain may be another one of the same modules; what is no motion of it, and what has no name, is left
     out.
     """
-    found: list[FreeMotion] = []
+    found: list[GaugeFreedom] = []
     for item in unresolved:
         first = chain.serials.index(item.modules[0])
         path = ancestors(chain, first)
         if item.kind in ("offset_along_axis", "rotation_about_axis"):
             joint = chain.serials.index(item.joint)
             if joint in path[:-1]:
-                found.append(FreeMotion(item.kind, joint, path[path.index(joint) + 1]))
+                found.append(GaugeFreedom(item.kind, joint, path[path.index(joint) + 1]))
         elif item.kind in ("position", "rotation_about_gravity") and chain.parent[first] == BASE:
-            found.append(FreeMotion(item.kind, BASE, first))
+            found.append(GaugeFreedom(item.kind, BASE, first))
     return tuple(sorted(dict.fromkeys(found), key=lambda one: one.branch))
 
 
-def nearest(chain: Chain, free: Sequence[FreeMotion], places: Sequence[int], imu_home: Array) -> Array:
+def nearest(chain: Chain, free: Sequence[GaugeFreedom], places: Sequence[int], imu_home: Array) -> Array:
     """Return the amounts (`moved`) that bring the IMUs of modules `places` nearest to poses (m, 4, 4)."""
     if not free:
         return np.zeros(0)
@@ -88,14 +88,14 @@ def nearest(chain: Chain, free: Sequence[FreeMotion], places: Sequence[int], imu
     return np.asarray(found.x)
 
 
-def moved(chain: Chain, free: Sequence[FreeMotion], amounts: Array) -> Chain:
+def moved(chain: Chain, free: Sequence[GaugeFreedom], amounts: Array) -> Chain:
     """Return the chain after all free motions: offsets in m, turns in rad; a position has three amounts."""
     used = 0
     for one in free:
         twists = _twists(chain, one)
         increment = np.zeros((len(chain.serials), 6))
         increment[list(descendants(chain, one.branch))] = amounts[used : used + len(twists)] @ twists
-        chain = apply_increment(chain, increment.ravel())
+        chain = apply_perturbation(chain, increment.ravel())
         used += len(twists)
     return chain
 
@@ -107,7 +107,7 @@ def carried(before: Chain, after: Chain, increments: Array) -> Array:
     return frozen((adjoint(np.asarray(motions)) @ blocks).reshape(np.shape(increments)))
 
 
-def _twists(chain: Chain, one: FreeMotion) -> Array:
+def _twists(chain: Chain, one: GaugeFreedom) -> Array:
     """Return the twists (k, 6) of a free motion, where the chain stands now."""
     if one.kind == "position":
         return frozen(np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1))
@@ -120,7 +120,7 @@ def _twists(chain: Chain, one: FreeMotion) -> Array:
     return frozen(np.r_[axis, np.cross(point, axis)][None])
 
 
-def _start(misfit: Callable[[Array], Array], free: Sequence[FreeMotion]) -> Array:
+def _start(misfit: Callable[[Array], Array], free: Sequence[GaugeFreedom]) -> Array:
     """Choose where Gauss-Newton begins: a free heading may be off by half a turn, out of its reach."""
     sizes = [3 if one.kind == "position" else 1 for one in free]
     start = np.zeros(sum(sizes))

@@ -34,10 +34,10 @@ TILT_PER_SWING2 = 0.25
 CROSSTALK_SHARE = 0.15
 RADIUS_FLOOR_M = 0.01
 # A joint that turns less than this (rms) hardly says who moves with it: gyros err by some mrad/s.
-LEAST_RATE_RAD_S = 0.005
+MIN_RATE_RAD_S = 0.005
 
 
-class WholeMotion(NamedTuple):
+class SimultaneousMotion(NamedTuple):
     """Uniform samples of n joints (m, n) and their IMUs (m, n, 3), in their frames, through one low-pass."""
 
     q_rad: Array
@@ -54,7 +54,7 @@ class StillReading(NamedTuple):
     force_m_s2: Array
 
 
-class WholeResponse(NamedTuple):
+class SimultaneousResponse(NamedTuple):
     """What IMU k answers to joint i: arrays (n joints, n IMUs, ...), in the IMU's frame, read-only.
 
     axis: (n, n, 3) of the gyro to the joint's rate: the axis if it is carried, else about zero.
@@ -75,9 +75,9 @@ class WholeResponse(NamedTuple):
         return float(np.linalg.norm(self.axis[joint, observer])) > MOVED_ABOVE
 
 
-def whole_response(
-    data: WholeMotion, still: StillReading, rate_hz: float, bandwidth_hz: float
-) -> WholeResponse:
+def simultaneous_response(
+    data: SimultaneousMotion, still: StillReading, rate_hz: float, bandwidth_hz: float
+) -> SimultaneousResponse:
     """Regress all IMUs on the motion of all joints.
 
     Args:
@@ -101,7 +101,7 @@ def whole_response(
     force = data.accel_m_s2 - _gravity(gyro, still.force_m_s2, rate_hz)
     terms = [data.qdd_rad_s2, swing, np.ones(samples), _products(data.qd_rad_s)]
     tangential, sigma_tangential = _regressed(np.column_stack(terms), force, independent)
-    return WholeResponse(
+    return SimultaneousResponse(
         frozen(axis[:count]),
         frozen(tangential[:count]),
         frozen(sigma_axis[:count]),
@@ -111,7 +111,7 @@ def whole_response(
     )
 
 
-def seen_by_all(serials: Sequence[str], response: WholeResponse) -> dict[tuple[str, str], MotionSeen]:
+def seen_by_all(serials: Sequence[str], response: SimultaneousResponse) -> dict[tuple[str, str], MotionSeen]:
     """Return who moved with whom, {(joint, observer): MotionSeen}, the columns named by `serials`."""
     seen: dict[tuple[str, str], MotionSeen] = {}
     for i, joint in enumerate(serials):
@@ -122,7 +122,7 @@ def seen_by_all(serials: Sequence[str], response: WholeResponse) -> dict[tuple[s
     return seen
 
 
-def circles_of_all(serials: Sequence[str], response: WholeResponse) -> list[PairObservation]:
+def circles_of_all(serials: Sequence[str], response: SimultaneousResponse) -> list[PairObservation]:
     """Return the circle of every joint in every other IMU that it carries; `serials` name the columns."""
     tilt = TILT_PER_SWING2 * float(response.swing2_rad2.sum())
     return [
@@ -134,7 +134,7 @@ def circles_of_all(serials: Sequence[str], response: WholeResponse) -> list[Pair
 
 
 def _circle(
-    joint: str, observer: str, response: WholeResponse, i: int, k: int, tilt: float
+    joint: str, observer: str, response: SimultaneousResponse, i: int, k: int, tilt: float
 ) -> PairObservation:
     axis = response.axis[i, k] / np.linalg.norm(response.axis[i, k])
     radial = np.cross(response.tangential_m[i, k], axis)
@@ -157,10 +157,10 @@ def _circle(
 
 def _check_told_apart(qd_rad_s: Array) -> None:
     size = np.sqrt(np.mean(qd_rad_s**2, axis=0))
-    if size.min() < LEAST_RATE_RAD_S:
+    if size.min() < MIN_RATE_RAD_S:
         raise ValueError(
             f"the joint in column {int(size.argmin())} turned at only {size.min():.2g} rad/s rms while all "
-            f"moved; {LEAST_RATE_RAD_S} are needed"
+            f"moved; {MIN_RATE_RAD_S} are needed"
         )
     alike = np.abs(qd_rad_s.T @ qd_rad_s) / len(qd_rad_s) / np.outer(size, size) - np.eye(len(size))
     if alike.max() > 0.9:

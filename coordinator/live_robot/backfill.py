@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Coroutine
 
-from coordinator.live_robot.messenger import Refused, together
+from coordinator.live_robot.messenger import Refused, gather_all
 from module_agent.wire.refusal import Refusal
 from module_agent.wire.row_log import RowLog
 
@@ -41,7 +41,7 @@ class RowCompletion:
                 self._whole_to = end
                 return
             try:
-                await together(self._fetch(*hole) for hole in missing[:HOLES_AT_ONCE])
+                await gather_all(self._fetch(*hole) for hole in missing[:HOLES_AT_ONCE])
             except Refused as refused:
                 # What passed while nobody listened, between a crash and its resumption, may be forgotten by
                 # now; steps that are done had all their rows before.

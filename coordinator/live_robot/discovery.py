@@ -28,7 +28,7 @@ class Search(NamedTuple):
 # Agents without a hub look for one once a second, and each try lasts a second: whoever becomes their hub
 # waits for them.
 AS_HUB_S = 2.5
-MOST_S = 10.0
+MAX_S = 10.0
 
 
 def _present(transport: Transport, robot: str, search: Search) -> list[str]:
@@ -37,7 +37,7 @@ def _present(transport: Transport, robot: str, search: Search) -> list[str]:
     alive: dict[str, bool] = {}
     start = heard = time.monotonic()
     while search.expect is None or sum(alive.values()) < search.expect:
-        end = min(max(start + search.least_s, heard + search.quiet_s), start + MOST_S)
+        end = min(max(start + search.least_s, heard + search.quiet_s), start + MAX_S)
         try:
             event = events.get(timeout=max(0.0, end - time.monotonic()))
         except queue.Empty:

@@ -8,17 +8,17 @@ from collections.abc import Callable, Sequence
 
 from coordinator.live_robot.errors import MotionInterrupted
 from coordinator.live_robot.messenger import NoAnswer, Refused
-from coordinator.live_robot.module_group import RobotLink
+from coordinator.live_robot.module_group import ModuleGroup
 from module_agent.wire.refusal import Refusal
 
 # Feedback begins with the module; whoever has sent none for this long sends none.
 FEEDBACK_WAIT_S = 1.0
 
 
-class LeftOut:
+class ExcludedModules:
     """The modules that a session goes on without, with the reason. `note` keeps and shows a journal event."""
 
-    def __init__(self, link: RobotLink, note: Callable[[str, str], None]):
+    def __init__(self, link: ModuleGroup, note: Callable[[str, str], None]):
         self._link = link
         self._note = note
         self.why: dict[str, str] = {}

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from coordinator.live_robot.errors import UnfitLink
-from coordinator.live_robot.messenger import Clock, together
-from coordinator.live_robot.module_group import RobotLink
+from coordinator.live_robot.messenger import Clock, gather_all
+from coordinator.live_robot.module_group import ModuleGroup
 
 # Of the round trips so many must take at most half a command's life: the keep-alives between them, several to
 # a life, bridge the rest.
@@ -17,7 +17,7 @@ LOOKS = 3
 BETWEEN_S = 0.03
 
 
-async def check_link(link: RobotLink, clock: Clock, seconds: float, note: Callable[[str], None]) -> None:
+async def check_link(link: ModuleGroup, clock: Clock, seconds: float, note: Callable[[str], None]) -> None:
     """Measure rates and round trips of all modules and note them.
 
     Raises:
@@ -28,7 +28,7 @@ async def check_link(link: RobotLink, clock: Clock, seconds: float, note: Callab
     start_ns = clock()
     for look in range(1, LOOKS + 1):
         end_ns = start_ns + look * int(seconds * 1e9)
-        await together(_ask_until(link, serial, clock, end_ns) for serial in link.serials)
+        await gather_all(_ask_until(link, serial, clock, end_ns) for serial in link.serials)
         span_s = (clock() - start_ns) / 1e9
         rates = {s: (link.module(s).rows.end_row - before[s]) / span_s for s in link.serials}
         faults = [fault for s in link.serials if (fault := _fault(link, s, rates[s]))]
@@ -40,23 +40,23 @@ async def check_link(link: RobotLink, clock: Clock, seconds: float, note: Callab
         raise UnfitLink(faults[0])
 
 
-async def _ask_until(link: RobotLink, serial: str, clock: Clock, end_ns: int) -> None:
+async def _ask_until(link: ModuleGroup, serial: str, clock: Clock, end_ns: int) -> None:
     while clock() < end_ns:
         await link.ask_status(serial)
         await asyncio.sleep(BETWEEN_S)
 
 
-def _trips_ms(link: RobotLink, serial: str) -> list[float]:
+def _trips_ms(link: ModuleGroup, serial: str) -> list[float]:
     return [(trip.received_ns - trip.sent_ns) / 1e6 for trip in link.module(serial).round_trips]
 
 
-def _words(link: RobotLink, serial: str, rate: float) -> str:
+def _words(link: ModuleGroup, serial: str, rate: float) -> str:
     median, most = (float(np.percentile(_trips_ms(link, serial), share)) for share in (50, 95))
     kind = link.info(serial).module_type
     return f"{serial} ({kind}): {rate:.0f} rows/s, round trip {median:.2f} ms, 95 % {most:.2f} ms"
 
 
-def _fault(link: RobotLink, serial: str, rate: float) -> str:
+def _fault(link: ModuleGroup, serial: str, rate: float) -> str:
     info = link.info(serial)
     if rate < 0.5 * info.feedback_rate_hz:
         return (

@@ -40,7 +40,7 @@ class Refused(RuntimeError):
         self.ack = ack
 
 
-class Radio:
+class Messenger:
     """Publishes, asks and listens for the coordinator.
 
     `post` runs a function on the event loop from any thread (`call_soon_threadsafe` in real time).
@@ -161,7 +161,7 @@ class Radio:
         self._transport.close()
 
 
-async def together(work: Iterable[Coroutine[None, None, object]]) -> None:
+async def gather_all(work: Iterable[Coroutine[None, None, object]]) -> None:
     """Do all of it at once, all to its end; raise what the first of those that failed raised."""
     for outcome in await asyncio.gather(*work, return_exceptions=True):
         if isinstance(outcome, BaseException):

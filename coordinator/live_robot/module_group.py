@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 
 from coordinator.live_robot.backfill import RowCompletion
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, RobotStopped
-from coordinator.live_robot.messenger import Clock, NoAnswer, Radio, Refused, together
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Refused, gather_all
 from coordinator.recording.recording import ModuleRecord, Recording
 from module_agent.control.waveform import duration_s
 from module_agent.model.catalogue import ModuleType, module_type
@@ -60,10 +60,10 @@ class _Started(NamedTuple):
     effort: EffortProfile | None
 
 
-class RobotLink:
+class ModuleGroup:
     """Commands to the modules of one robot under this sender's leases."""
 
-    def __init__(self, radio: Radio, recording: Recording, clock: Clock, sender: str):
+    def __init__(self, radio: Messenger, recording: Recording, clock: Clock, sender: str):
         self.serials: tuple[str, ...] = ()
         self.sender = sender
         self._radio = radio
@@ -354,7 +354,7 @@ class RobotLink:
             )
         started = {s: _Started(self._next_id(), pattern, fed.get(s)) for s, pattern in patterns.items()}
         numbers = {serial: motion.number for serial, motion in started.items()}
-        await together(self._start(serial, motion) for serial, motion in started.items())
+        await gather_all(self._start(serial, motion) for serial, motion in started.items())
         longest = max(duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items())
         ended = await self.wait(
             lambda: (
@@ -365,7 +365,7 @@ class RobotLink:
         )
         if self.is_poor:
             # What is to tell of a module that let go may itself be lost.
-            await together(self.ask_status(serial) for serial in self._tokens)
+            await gather_all(self.ask_status(serial) for serial in self._tokens)
         limp = self._limp(numbers)
         if limp is not None:
             raise MotionInterrupted(next(iter(patterns)), f"spoilt: module {limp} expired and let go")
@@ -421,7 +421,7 @@ class RobotLink:
 
     async def complete_rows(self) -> None:
         """Fetch whatever feedback rows the network has dropped, of every module, up to now."""
-        await together(self._complete_now(serial) for serial in self.serials)
+        await gather_all(self._complete_now(serial) for serial in self.serials)
 
     async def _complete_now(self, serial: str) -> None:
         status = await self.ask_status(serial)
@@ -437,7 +437,7 @@ class RobotLink:
             gaps = [serial for serial, end in ends.items() if self._rows[serial].has_gap(end)]
             if not gaps:
                 return
-            await together(self._rows[serial].complete(ends[serial]) for serial in gaps)
+            await gather_all(self._rows[serial].complete(ends[serial]) for serial in gaps)
 
     async def _fetch(self, serial: str, first: int, end: int) -> None:
         """Ask for rows until they, or a refusal, have come."""

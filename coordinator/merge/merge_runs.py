@@ -7,7 +7,7 @@ sensor is its module's own in every run, however often that is put together anew
 all runs, of which what is known beforehand counts once. So does every run, which its recording is known by.
 
 What a run claims is taken as claimed. An offset of a torque sensor that it took for the first moment of a
-light body is none of these errors: others that know that body better show it as `RunShare.strain`.
+light body is not one of these errors; runs that know that body better show it (`inconsistency_sigma`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ from coordinator.parameter_fit.systematic_errors import body_shifts, whitened_ef
 from module_agent.model.chain import Array
 
 # Torques without noise, as a simulation may have them, would weigh infinitely.
-_LEAST_SIGMA_NM = 1e-9
+_MIN_SIGMA_NM = 1e-9
 
 
 class RunShare(NamedTuple):
@@ -40,7 +40,7 @@ class RunShare(NamedTuple):
     base: BaseParameters
     sigma_alone: Array
     sigma_merged: Array
-    strain: float
+    inconsistency_sigma: float
 
     @property
     def gain(self) -> float:
@@ -88,8 +88,8 @@ def merge_runs(
     columns = part_columns(parts)
     scales = _scale_sigmas(runs)
     rows = [_rows(run, parts, scales) for run in runs]
-    together = _without_scales(rows, len(scales))
-    whole, spectrum = _base(*together, columns, tolerance), _spectrum(*together, columns)
+    gather_all = _without_scales(rows, len(scales))
+    whole, spectrum = _base(*gather_all, columns, tolerance), _spectrum(*gather_all, columns)
     shares = []
     for run, one in zip(runs, rows, strict=True):
         own = _without_scales([one], len(scales))
@@ -133,7 +133,7 @@ def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float
     z - v z0 = r phi - s z0. In both places z0 is what the run's own parameters say that it shows: readings
     would bring their noise along, and all scales come out too small.
     """
-    sigma = np.maximum(run.sigma_nm, _LEAST_SIGMA_NM)
+    sigma = np.maximum(run.sigma_nm, _MIN_SIGMA_NM)
     rows, target = whitened(run.joints, sigma, run.independent_fraction)
     of_chain = whitened_effects(run.effects, sigma, run.independent_fraction)
     of_chain = of_chain + rows @ body_shifts(run.chain, run.directions, run.phi_parts)
@@ -179,8 +179,8 @@ def _share(run: RunInformation, own: BaseParameters, alone: _Spectrum, whole: _S
     sums = own.grouping * own.columns.scale
     _, sigma_alone = _of(sums, alone)
     value, sigma_merged = _of(sums, whole)
-    strain = float(np.sqrt(np.mean(((value - own.value) / own.sigma) ** 2)))
-    return RunShare(run.name, run.chain.serials, own, sigma_alone, sigma_merged, strain)
+    inconsistency_sigma = float(np.sqrt(np.mean(((value - own.value) / own.sigma) ** 2)))
+    return RunShare(run.name, run.chain.serials, own, sigma_alone, sigma_merged, inconsistency_sigma)
 
 
 def _of(sums: Array, told: _Spectrum) -> tuple[Array, Array]:

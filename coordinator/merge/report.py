@@ -43,7 +43,7 @@ class RunPart(Piece):
     identified_alone: int
     identified_merged: int
     gain: float
-    strain: float
+    inconsistency_sigma: float
 
 
 class MergeReport(Piece):
@@ -88,7 +88,7 @@ def _run(run: RunShare) -> RunPart:
         identified_alone=int(np.sum(run.sigma_alone < size)),
         identified_merged=int(np.sum(run.sigma_merged < size)),
         gain=run.gain,
-        strain=run.strain,
+        inconsistency_sigma=run.inconsistency_sigma,
     )
 
 
@@ -106,7 +106,7 @@ def table(report: MergeReport) -> Table:
             str(run.identified_alone),
             str(run.identified_merged),
             f"{run.gain:.2f}",
-            f"{run.strain:.1f}",
+            f"{run.inconsistency_sigma:.1f}",
         )
     found.add_row("together", "", str(report.rank), "", "", f"{report.gain:.2f}", "")
     return found

@@ -17,7 +17,7 @@ _LADEN_SHARE = 0.2
 _REMEMBER_S = 10.0
 
 
-class Touch:
+class CollisionDetector:
     """Who touches the robot: `contacts` of the last 20 s."""
 
     def __init__(self, reference: Reference, level_nm: Array):

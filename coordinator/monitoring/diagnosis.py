@@ -23,8 +23,8 @@ from coordinator.monitoring.residual_tests import (
     linked,
     torque_evidence,
 )
-from coordinator.monitoring.segments import Stretch
-from coordinator.monitoring.thresholds import Levels
+from coordinator.monitoring.segments import DataSegment
+from coordinator.monitoring.thresholds import Thresholds
 from coordinator.parameter_fit.payload import Payload, find_payload
 from coordinator.parameter_fit.physically_consistent import NotSolvedError
 from module_agent.model.chain import Array
@@ -33,11 +33,11 @@ from module_agent.model.information import JointInformation, merge
 from module_agent.model.regressor import PER_BODY
 
 # What nobody would call a displaced link: IMUs sit on boards, and links give by as much.
-LEAST_SHIFT_M, LEAST_TURN_RAD = 3e-3, 3e-3
+MIN_SHIFT_M, MIN_TURN_RAD = 3e-3, 3e-3
 # Under a payload links give by more than they did; what that is taken for is below.
 LADEN_SHIFT_M, LADEN_TURN_RAD = 6e-3, 6e-3
 # Friction changes by more than that with the weather.
-LEAST_FRICTION = 0.1
+MIN_FRICTION = 0.1
 # A payload leaves no more of the misfit than chance does in one window of so many.
 ONE_IN = 1e4
 
@@ -86,7 +86,7 @@ class LoadShift(NamedTuple):
         return bool(self.change[0] < 0.0)
 
 
-class Judgement(NamedTuple):
+class Diagnosis(NamedTuple):
     """What a window shows; None of what has not changed."""
 
     drives: tuple[DriveShift, ...]
@@ -94,7 +94,7 @@ class Judgement(NamedTuple):
     load: LoadShift | None
 
 
-def piece_of(reference: Reference, stretch: Stretch) -> Piece:
+def piece_of(reference: Reference, stretch: DataSegment) -> Piece:
     """Return what a stretch says."""
     drives = tuple(
         drive_evidence(model, stretch, joint) for joint, model in enumerate(reference.drive_models)
@@ -108,15 +108,17 @@ def piece_of(reference: Reference, stretch: Stretch) -> Piece:
     )
 
 
-def judge(reference: Reference, levels: Levels, pieces: Sequence[Piece], laden: bool = False) -> Judgement:
+def judge(
+    reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece], laden: bool = False
+) -> Diagnosis:
     """Judge a window of one piece at least, of stretches in which no blow met the robot.
 
     laden: whether the robot is known to carry a payload.
     """
-    return Judgement(
-        _drives(reference, levels, pieces),
-        _link(reference, levels, pieces, laden),
-        _load(reference, levels, pieces),
+    return Diagnosis(
+        _drives(reference, thresholds, pieces),
+        _link(reference, thresholds, pieces, laden),
+        _load(reference, thresholds, pieces),
     )
 
 
@@ -145,7 +147,7 @@ def weigh(reference: Reference, pieces: Sequence[Piece], load: LoadShift) -> Pay
         return None
 
 
-def _drives(reference: Reference, levels: Levels, pieces: Sequence[Piece]) -> tuple[DriveShift, ...]:
+def _drives(reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece]) -> tuple[DriveShift, ...]:
     found = []
     for joint, (model, known) in enumerate(zip(reference.drive_models, reference.drives, strict=True)):
         parts = [piece.drives[joint] for piece in pieces]
@@ -156,23 +158,25 @@ def _drives(reference: Reference, levels: Levels, pieces: Sequence[Piece]) -> tu
         slope = np.array([1.0, model.typical_rad_s]) / model.friction_nm(model.typical_rad_s)
         scaled = model.change_of(np.ones(2)) * slope
         sigma, more = float(np.sqrt(scaled @ change.covariance @ scaled)), float(scaled @ change.size)
-        if change.gain > levels.drive and abs(more) > LEAST_FRICTION + 3.0 * sigma:
+        if change.gain > thresholds.drive and abs(more) > MIN_FRICTION + 3.0 * sigma:
             found.append(DriveShift(joint, more, sigma, change.gain))
     return tuple(found)
 
 
-def _link(reference: Reference, levels: Levels, pieces: Sequence[Piece], laden: bool) -> LinkShift | None:
+def _link(
+    reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece], laden: bool
+) -> LinkShift | None:
     children = linked(reference.chain)
     if not children:
         return None
     later = without_own(joined([piece.imu for piece in pieces]), reference.imu_model.own_sigma)
     found = reference.imu.test(later)
     best = found.changes[found.best]
-    if best.gain < levels.link:
+    if best.gain < thresholds.link:
         return None
     child = children[found.best]
     shift_m, sigma_m, turn_rad = _length(reference, child, best)
-    least = (LADEN_SHIFT_M, LADEN_TURN_RAD) if laden else (LEAST_SHIFT_M, LEAST_TURN_RAD)
+    least = (LADEN_SHIFT_M, LADEN_TURN_RAD) if laden else (MIN_SHIFT_M, MIN_TURN_RAD)
     if shift_m < least[0] + 2.0 * sigma_m and turn_rad < least[1]:
         return None
     return LinkShift(child, shift_m, sigma_m, turn_rad, best.gain)
@@ -187,11 +191,11 @@ def _length(reference: Reference, child: int, change: Change) -> tuple[float, fl
     return length, float(np.sqrt(slope @ change.covariance @ slope)), float(np.linalg.norm(turn))
 
 
-def _load(reference: Reference, levels: Levels, pieces: Sequence[Piece]) -> LoadShift | None:
+def _load(reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece]) -> LoadShift | None:
     later = torque_evidence(information_in(pieces), reference.phi, reference.torque_sigma_nm)
     found = reference.torque.test(later)
     best: Change = found.changes[found.best]
-    if best.gain < levels.payload:
+    if best.gain < thresholds.payload:
         return None
     change = LARGE_KG * parameter_scale(1) * best.size
     return LoadShift(found.best, best.gain, found.misfit - best.gain, change)

@@ -6,13 +6,13 @@ from coordinator.monitoring.contact import Contact
 from coordinator.monitoring.diagnosis import DriveShift, LinkShift, LoadShift
 from coordinator.monitoring.findings import UNITS, Finding
 from coordinator.monitoring.reference import Reference
-from coordinator.monitoring.thresholds import Levels
+from coordinator.monitoring.thresholds import Thresholds
 from coordinator.parameter_fit.payload import Payload
 
 
-def collision_finding(reference: Reference, levels: Levels, contact: Contact, now_ns: int) -> Finding:
+def collision_finding(reference: Reference, thresholds: Thresholds, contact: Contact, now_ns: int) -> Finding:
     """Say that something touched the robot, and which joints felt it."""
-    serials, strength = reference.chain.serials, contact.strength(levels.contact_nm)
+    serials, strength = reference.chain.serials, contact.strength(thresholds.contact_nm)
     last = contact.joints[-1] if contact.joints else int(np.argmax(np.abs(contact.peak_nm)))
     strongest = float(np.abs(contact.peak_nm).max())
     felt = ", ".join(serials[k] for k in contact.joints) or serials[last]
@@ -40,7 +40,7 @@ def collision_finding(reference: Reference, levels: Levels, contact: Contact, no
 
 def load_finding(
     reference: Reference,
-    levels: Levels,
+    thresholds: Thresholds,
     load: LoadShift,
     found: Payload,
     since_ns: int,
@@ -61,13 +61,13 @@ def load_finding(
         sigma=found.mass_sigma_kg,
         unit=UNITS["payload"],
         gain=load.gain,
-        level=levels.payload,
+        level=thresholds.payload,
         words=f"{found.mass_kg:.3f} +- {found.mass_sigma_kg:.3f} kg {done} what {serial} turns",
     )
 
 
 def wear_finding(
-    reference: Reference, levels: Levels, link: LinkShift, since_ns: int, now_ns: int
+    reference: Reference, thresholds: Thresholds, link: LinkShift, since_ns: int, now_ns: int
 ) -> Finding:
     """Say which link is not where it was."""
     chain = reference.chain
@@ -83,7 +83,7 @@ def wear_finding(
         sigma=1e3 * link.sigma_m,
         unit=UNITS["wear"],
         gain=link.gain,
-        level=levels.link,
+        level=thresholds.link,
         words=f"the link from {parent} to {serial} is displaced by {1e3 * link.shift_m:.1f} +- "
         f"{1e3 * link.sigma_m:.1f} mm and turned by {1e3 * link.turn_rad:.1f} mrad; `x5-coordinator check` "
         "measures it",
@@ -91,7 +91,7 @@ def wear_finding(
 
 
 def friction_finding(
-    reference: Reference, levels: Levels, drive: DriveShift, since_ns: int, now_ns: int
+    reference: Reference, thresholds: Thresholds, drive: DriveShift, since_ns: int, now_ns: int
 ) -> Finding:
     """Say whose drive turns with more friction, or less."""
     serial = reference.chain.serials[drive.joint]
@@ -107,14 +107,14 @@ def friction_finding(
         sigma=100.0 * drive.sigma,
         unit=UNITS["friction"],
         gain=drive.gain,
-        level=levels.drive,
+        level=thresholds.drive,
         words=f"the drive of {serial} has {abs(100.0 * drive.change):.0f} +- {100.0 * drive.sigma:.0f} % "
         f"{more} friction at half its speed",
     )
 
 
 def unexplained_finding(
-    reference: Reference, levels: Levels, load: LoadShift, since_ns: int, now_ns: int
+    reference: Reference, thresholds: Thresholds, load: LoadShift, since_ns: int, now_ns: int
 ) -> Finding:
     """Say that torques have changed in a way that no payload on one body explains."""
     serial = reference.chain.serials[load.carrier]
@@ -129,7 +129,7 @@ def unexplained_finding(
         sigma=0.0,
         unit=UNITS["unexplained"],
         gain=load.gain,
-        level=levels.payload,
+        level=thresholds.payload,
         words="the torques have changed in a way that no payload on one body explains: something holds the "
         "robot, several things were added, or a joint's torque sensor is off",
     )

@@ -69,7 +69,7 @@ WORTH_SAYING = 0.1
 OVER_NS = 8_000_000_000
 
 
-class Ledger:
+class FindingLog:
     """Findings by key; `ended` are those that were over before the watch was."""
 
     def __init__(self) -> None:

@@ -6,7 +6,7 @@ The watch itself is `watching.watcher`; here is its place on a network and on a 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 
-from coordinator.live_robot.messenger import Clock, NoAnswer, Radio
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer
 from coordinator.monitoring.monitor import Heard, Watcher
 from coordinator.recording.recording import Entry, Recording
 from coordinator.synchronisation.round_trips import map_clocks
@@ -19,14 +19,14 @@ from module_agent.wire.refusal import WireError
 LOOK_S = 0.02
 ASK_S, REMAP_S = 0.25, 5.0
 # What a clock is mapped by: the last minute's trips; so many are enough to begin with.
-MOST_TRIPS, FEWEST_TRIPS = 240, 6
+MAX_TRIPS, FEWEST_TRIPS = 240, 6
 # Rows that are kept, at 250 a second; none is older than the cubic's and the filter's reach.
 KEPT_ROWS = 2000
 
 Say = Callable[[Heard], None]
 
 
-class LiveWatch:
+class LiveMonitor:
     """One watch over a radio. `record` is what the radio is given to hear with."""
 
     def __init__(self, watcher: Watcher, clock: Clock, sender: str, say: Say):
@@ -49,7 +49,7 @@ class LiveWatch:
         return message if isinstance(message, Message) else None
 
     async def watch(
-        self, radio: Radio, until_ns: int | None = None, enough: Callable[[], bool] = lambda: False
+        self, radio: Messenger, until_ns: int | None = None, enough: Callable[[], bool] = lambda: False
     ) -> None:
         """Watch until a time [ns], until it is enough, or until cancelled."""
         asking = asyncio.create_task(self._ask_all(radio))
@@ -79,18 +79,18 @@ class LiveWatch:
             if record is not None:
                 record.rows.forget_before(record.rows.end_row - KEPT_ROWS)
                 del record.arrivals[:-1]
-                del record.round_trips[:-MOST_TRIPS]
+                del record.round_trips[:-MAX_TRIPS]
         for found in self.recording.estimates.values():
             found.clear()
 
-    async def _ask_all(self, radio: Radio) -> None:
+    async def _ask_all(self, radio: Messenger) -> None:
         while True:
             # At once: two modules that are asked at the same moment tell their clocks apart.
             asks = [self._ask(radio, serial) for serial in self._serials if serial in radio.alive]
             await asyncio.gather(*asks)
             await asyncio.sleep(ASK_S if self._clocks is not None else 0.2 * ASK_S)
 
-    async def _ask(self, radio: Radio, serial: str) -> None:
+    async def _ask(self, radio: Messenger, serial: str) -> None:
         ask = Ask(serial=serial, boot=0, seq=radio.next_seq(), sender=self._sender)
         try:
             await radio.ask(serial, Leaf.STATUS, ask)
@@ -109,7 +109,7 @@ class LiveWatch:
         if notes:
             self._say(Heard((), (), tuple(notes)))
 
-    def _note_presence(self, radio: Radio) -> None:
+    def _note_presence(self, radio: Messenger) -> None:
         # Only of those that were there: at the beginning all are on their way.
         left = tuple(s for s in self._serials if s in self.recording.modules and s not in radio.alive)
         if left == self._left:

@@ -8,9 +8,9 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from coordinator.monitoring.collision_detector import Touch
+from coordinator.monitoring.collision_detector import CollisionDetector
 from coordinator.monitoring.contact import Contact
-from coordinator.monitoring.diagnosis import Judgement, Piece, explains, judge, piece_of, weigh
+from coordinator.monitoring.diagnosis import Diagnosis, Piece, explains, judge, piece_of, weigh
 from coordinator.monitoring.finding_text import (
     collision_finding,
     friction_finding,
@@ -18,10 +18,10 @@ from coordinator.monitoring.finding_text import (
     unexplained_finding,
     wear_finding,
 )
-from coordinator.monitoring.findings import Finding, Key, Ledger
+from coordinator.monitoring.findings import Finding, FindingLog, Key
 from coordinator.monitoring.reference import Reference
-from coordinator.monitoring.segments import Alignment, Block, Hole, Stretches
-from coordinator.monitoring.thresholds import ALARMS_PER_HOUR, SPANS, Levels, levels
+from coordinator.monitoring.segments import Alignment, Block, Hole, Segmenter
+from coordinator.monitoring.thresholds import ALARMS_PER_HOUR, SPANS, Thresholds, thresholds
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.chain import Array
@@ -42,7 +42,7 @@ BEGAN_WITHIN_NS = 4_000_000_000
 # A change is called by what explains it after so many stretches in a row; if nothing does, after more.
 CONFIRMED, UNEXPLAINED_AFTER = 2, 10
 # A mass that is not known to this many standard deviations is not said to be there.
-LEAST_SIGMAS = 5.0
+MIN_SIGMAS = 5.0
 # A payload that is held for longer is weighed as seldom.
 SETTLED_AFTER = 12
 # Stretches since a change after which contacts are judged by the changed robot: at once, and for good.
@@ -63,7 +63,7 @@ class _Verdict(NamedTuple):
 
     kind: str
     where: int
-    judged: Judgement
+    judged: Diagnosis
     pieces: Sequence[Piece]
     since_ns: int
 
@@ -76,12 +76,12 @@ class Watcher:
 
     def __init__(self, reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR):
         self.reference = reference
-        self.levels: Levels = levels(reference, alarms_per_hour)
-        self.ledger = Ledger()
+        self.thresholds: Thresholds = thresholds(reference, alarms_per_hour)
+        self.ledger = FindingLog()
         self.looked_s = 0.0
         self._alignment = Alignment(reference.chain.serials)
-        self._stretches = Stretches()
-        self._touch = Touch(reference, self.levels.contact_nm)
+        self._stretches = Segmenter()
+        self._touch = CollisionDetector(reference, self.thresholds.contact_nm)
         self._pieces: deque[Piece] = deque(maxlen=max(SPANS))
         self._agreed: tuple[str, int] | None = None
         self._agreed_for = 0
@@ -118,7 +118,7 @@ class Watcher:
         self.looked_s += len(block.t_ns) / RATE_HZ
         for contact in self._touch.advance(block):
             if not self._untimed:
-                said += self.ledger.put(collision_finding(self.reference, self.levels, contact, now_ns))
+                said += self.ledger.put(collision_finding(self.reference, self.thresholds, contact, now_ns))
         for stretch in self._stretches.add(block):
             self._pieces.append(piece_of(self.reference, stretch))
             judged = self._judged()
@@ -139,7 +139,7 @@ class Watcher:
         blows = [_blow(start, end) for start, end in _together(self._touch.contacts)]
         return [p for p in self._pieces if not any(p.start_ns < b and a < p.end_ns for a, b in blows)]
 
-    def _judged(self) -> list[tuple[Judgement, Sequence[Piece]]]:
+    def _judged(self) -> list[tuple[Diagnosis, Sequence[Piece]]]:
         calm = self._calm()
         newest = self._pieces[-1]
         # A judgement that has been made already is not made again.
@@ -150,9 +150,9 @@ class Watcher:
         if len(since) >= CONFIRMED:
             windows.append(since)
         laden = any(finding.kind == "payload" for finding in self.ledger.held.values())
-        return [(judge(self.reference, self.levels, window, laden), window) for window in windows]
+        return [(judge(self.reference, self.thresholds, window, laden), window) for window in windows]
 
-    def _drives(self, judged: Sequence[tuple[Judgement, Sequence[Piece]]], now_ns: int) -> list[Finding]:
+    def _drives(self, judged: Sequence[tuple[Diagnosis, Sequence[Piece]]], now_ns: int) -> list[Finding]:
         # Friction is in no hurry, and in a short window other things pass for it.
         long = [(one, window) for one, window in judged if len(window) >= max(SPANS)]
         found = {d.joint: (d, window[0].start_ns) for one, window in long for d in one.drives}
@@ -160,11 +160,11 @@ class Watcher:
             said
             for shift, since_ns in found.values()
             for said in self.ledger.put(
-                friction_finding(self.reference, self.levels, shift, since_ns, now_ns)
+                friction_finding(self.reference, self.thresholds, shift, since_ns, now_ns)
             )
         ]
 
-    def _verdict(self, judged: Sequence[tuple[Judgement, Sequence[Piece]]]) -> _Verdict | None:
+    def _verdict(self, judged: Sequence[tuple[Diagnosis, Sequence[Piece]]]) -> _Verdict | None:
         """Return what explains the newest windows; those since the change began come first."""
         found = None
         for one, window in reversed(judged):
@@ -203,8 +203,8 @@ class Watcher:
         if verdict.kind != "wear" and any(f.kind == "wear" for f in self.ledger.held.values()):
             return []
         held = self.ledger.held.get(("load", 0))
-        settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == verdict.kind
-        if settled and verdict.kind == "payload" and self._agreed_for % SETTLED_AFTER:
+        gauge_fixed = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == verdict.kind
+        if gauge_fixed and verdict.kind == "payload" and self._agreed_for % SETTLED_AFTER:
             # It takes a while to weigh it, and it will not be another.
             self.ledger.see(("load", 0), now_ns)
             return []
@@ -214,15 +214,15 @@ class Watcher:
     def _finding(self, verdict: _Verdict, now_ns: int) -> Finding | None:
         reference, link, load = self.reference, verdict.judged.link, verdict.judged.load
         if verdict.kind == "wear" and link is not None:
-            return wear_finding(reference, self.levels, link, verdict.since_ns, now_ns)
+            return wear_finding(reference, self.thresholds, link, verdict.since_ns, now_ns)
         if load is None:
             return None
         if verdict.kind == "unexplained":
-            return unexplained_finding(reference, self.levels, load, verdict.since_ns, now_ns)
+            return unexplained_finding(reference, self.thresholds, load, verdict.since_ns, now_ns)
         found = weigh(reference, verdict.pieces, load)
-        if found is None or not found.explains or found.mass_kg < LEAST_SIGMAS * found.mass_sigma_kg:
+        if found is None or not found.explains or found.mass_kg < MIN_SIGMAS * found.mass_sigma_kg:
             return None
-        return load_finding(reference, self.levels, load, found, verdict.since_ns, now_ns)
+        return load_finding(reference, self.thresholds, load, found, verdict.since_ns, now_ns)
 
     def _adapted(self, verdict: _Verdict | None, now_ns: int) -> list[Key]:
         """Tell contacts from torques as they are since a change; take back those that were told otherwise."""

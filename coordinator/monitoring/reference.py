@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS
 from coordinator.identification.identify import recorded_type
 from coordinator.monitoring.contact import ContactModel, contact_model, fast_part
@@ -35,7 +35,7 @@ from coordinator.monitoring.residual_tests import (
     torque_residual,
     without_delay,
 )
-from coordinator.monitoring.segments import Alignment, Block, Stretch, Stretches, noise_level, part_of
+from coordinator.monitoring.segments import Alignment, Block, DataSegment, Segmenter, noise_level, part_of
 from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ, dynamic_motion
 from module_agent.model.catalogue import ModuleType
@@ -98,7 +98,7 @@ class Reference(NamedTuple):
     contact: ContactModel
 
 
-def build_reference(known: KnownRobot) -> Reference:
+def build_reference(known: BaselineRobot) -> Reference:
     """Learn what is normal from a run of the robot.
 
     Raises:
@@ -119,7 +119,7 @@ def build_reference(known: KnownRobot) -> Reference:
         lost = ", ".join(f"module {h.serial}" for h in aligned.holes) or "a module"
         raise NoReference(f"{known.folder}: its recording has a hole in the rows of {lost}")
     block = part_of(aligned.block, round(_FIRST_S * RATE_HZ), len(aligned.block.t_ns))
-    stretches = Stretches().add(block)
+    stretches = Segmenter().add(block)
     if len(stretches) < FEWEST_WINDOWS * WINDOW:
         raise NoReference(
             f"{known.folder} lasts {0.5 * len(stretches):.0f} s: too short to tell what is normal; "
@@ -145,7 +145,7 @@ def build_reference(known: KnownRobot) -> Reference:
 
 
 def _torque(
-    chain: Chain, phi: Array, stretches: Sequence[Stretch]
+    chain: Chain, phi: Array, stretches: Sequence[DataSegment]
 ) -> tuple[Array, tuple[JointInformation, ...], Known]:
     sigma, counted = noise_level([torque_residual(chain, phi, one) for one in stretches])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
@@ -165,7 +165,7 @@ def _torque(
     return independent, total, _known(evidence, prior, payload_changes(count))
 
 
-def _imu(known: KnownRobot, stretches: Sequence[Stretch]) -> tuple[ImuModel, Known]:
+def _imu(known: BaselineRobot, stretches: Sequence[DataSegment]) -> tuple[ImuModel, Known]:
     chain, refinement = known.chain, known.kinematics.refinement
     count = len(chain.serials)
     rough = ImuModel(
@@ -181,7 +181,7 @@ def _imu(known: KnownRobot, stretches: Sequence[Stretch]) -> tuple[ImuModel, Kno
 
 
 def _drives(
-    types: Sequence[ModuleType], stretches: Sequence[Stretch]
+    types: Sequence[ModuleType], stretches: Sequence[DataSegment]
 ) -> tuple[tuple[DriveModel, ...], tuple[Known | None, ...]]:
     models, found = [], []
     for joint, kind in enumerate(types):
@@ -199,7 +199,7 @@ def _drives(
     return tuple(models), tuple(found)
 
 
-def _drive(model: DriveModel, stretches: Sequence[Stretch], joint: int) -> Known | None:
+def _drive(model: DriveModel, stretches: Sequence[DataSegment], joint: int) -> Known | None:
     evidence = []
     for part in _windows(stretches):
         pieces = [e for one in part if (e := drive_evidence(model, one, joint)) is not None]
@@ -225,7 +225,7 @@ def _known(windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array
     return Known(joined(windows), prior_sigma, changes, MARGIN * largest)
 
 
-def _windows(stretches: Sequence[Stretch]) -> list[Sequence[Stretch]]:
+def _windows(stretches: Sequence[DataSegment]) -> list[Sequence[DataSegment]]:
     whole = len(stretches) // WINDOW
     return [stretches[WINDOW * k : WINDOW * (k + 1)] for k in range(whole)]
 

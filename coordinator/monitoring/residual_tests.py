@@ -33,11 +33,11 @@ from coordinator.batch_estimation.imu_intrinsics import (
     read,
     slopes,
 )
-from coordinator.batch_estimation.imu_jacobian import imu_slopes
+from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.likelihood_ratio import Evidence, compressed, joined, without_own
-from coordinator.monitoring.segments import Stretch
+from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.base_parameters import whitened
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
@@ -51,12 +51,12 @@ PRIOR_KG = 0.5
 LARGE_KG = 1.0
 
 
-def information_of(chain: Chain, stretch: Stretch) -> tuple[JointInformation, ...]:
+def information_of(chain: Chain, stretch: DataSegment) -> tuple[JointInformation, ...]:
     """Return the information of every joint."""
     return gather(chain, stretch.q_rad, stretch.qd_rad_s, stretch.qdd_rad_s2, stretch.tau_nm)
 
 
-def torque_residual(chain: Chain, phi: Array, stretch: Stretch) -> Array:
+def torque_residual(chain: Chain, phi: Array, stretch: DataSegment) -> Array:
     """Return what a model leaves of the torques, (m, n) [Nm]."""
     predicted = inverse_dynamics(chain, phi, stretch.q_rad, stretch.qd_rad_s, stretch.qdd_rad_s2)
     return np.asarray(stretch.tau_nm - predicted)
@@ -121,7 +121,7 @@ def without_delay(intrinsics: ImuIntrinsics) -> ImuIntrinsics:
     return ImuIntrinsics(errors)
 
 
-def imu_residual(model: ImuModel, stretch: Stretch) -> Array:
+def imu_residual(model: ImuModel, stretch: DataSegment) -> Array:
     """Return what the model leaves of the readings, (m, n, 6): rates, then specific forces."""
     at = _thinned(stretch)
     bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
@@ -130,7 +130,7 @@ def imu_residual(model: ImuModel, stretch: Stretch) -> Array:
     return np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
 
 
-def lasting_residual(model: ImuModel, stretches: Sequence[Stretch]) -> list[Array]:
+def lasting_residual(model: ImuModel, stretches: Sequence[DataSegment]) -> list[Array]:
     """Return what the model leaves of the readings but for biases and delays that are the same in all.
 
     Per stretch (m, 6 n).
@@ -142,12 +142,12 @@ def lasting_residual(model: ImuModel, stretches: Sequence[Stretch]) -> list[Arra
     # One delay for all six axes of an IMU, weighed by what each scatters.
     weight = 1.0 / np.maximum(whole.var(axis=0), 1e-12)
     delay = (weight * late * whole).sum(axis=(0, 2)) / np.maximum((weight * late**2).sum(axis=(0, 2)), 1e-12)
-    settled = whole - delay[:, None] * late
+    gauge_fixed = whole - delay[:, None] * late
     ends = np.cumsum([len(one) for one in left])[:-1]
-    return [part.reshape(len(part), -1) for part in np.split(settled, ends)]
+    return [part.reshape(len(part), -1) for part in np.split(gauge_fixed, ends)]
 
 
-def imu_evidence(model: ImuModel, stretch: Stretch) -> Evidence:
+def imu_evidence(model: ImuModel, stretch: DataSegment) -> Evidence:
     """Return the evidence (k, p): own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
     at, count = _thinned(stretch), len(model.chain.serials)
     bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
@@ -157,7 +157,7 @@ def imu_evidence(model: ImuModel, stretch: Stretch) -> Evidence:
     rows = np.zeros((count, samples, 6, own + len(model.prior_sigma)))
     free = np.ones(SIZE, dtype=bool)
     for k in range(count):
-        moved = imu_slopes(model.chain, bodies, at.q_rad, at.qd_rad_s, k)
+        moved = imu_jacobian(model.chain, bodies, at.q_rad, at.qd_rad_s, k)
         mixed = mixing(model.intrinsics, k)
         poses = np.einsum("ij,cjm->mic", mixed, moved.poses)
         for place, module in enumerate(moved.modules):
@@ -203,7 +203,7 @@ def displacement(chain: Chain, child: int, size: Array) -> tuple[Array, Array]:
     return turn, shift + np.cross(turn, chain.imu_home[child, :3, 3])
 
 
-def _thinned(stretch: Stretch) -> Stretch:
+def _thinned(stretch: DataSegment) -> DataSegment:
     kept = slice(None, None, KEEP_EVERY)
     return stretch._replace(
         q_rad=stretch.q_rad[kept],
@@ -271,7 +271,7 @@ class DriveModel(NamedTuple):
         return np.asarray(size * [self.kind.motor.coulomb_nm, self.kind.motor.viscous_nm_s_rad])
 
 
-def drive_rows(kind: ModuleType, stretch: Stretch, joint: int) -> tuple[Array, Array]:
+def drive_rows(kind: ModuleType, stretch: DataSegment, joint: int) -> tuple[Array, Array]:
     """Return the rows (k, 6) and motor torques (k,) [Nm] of the samples in which the motor of a joint turns.
 
     All signals went through the same low-pass, which reaches into what is around a sample.
@@ -287,7 +287,7 @@ def drive_rows(kind: ModuleType, stretch: Stretch, joint: int) -> tuple[Array, A
     return rows[turning], motor[turning]
 
 
-def drive_evidence(model: DriveModel, stretch: Stretch, joint: int) -> Evidence | None:
+def drive_evidence(model: DriveModel, stretch: DataSegment, joint: int) -> Evidence | None:
     """Return the evidence about the drive's deviation from its model; None if the motor stood.
 
     Before the six parameters are those of how torque is passed on, the stretch's own (2,): see `OWN_SIGMA`.

@@ -194,12 +194,12 @@ def part_of(block: Block, begin: int, end: int) -> Block:
     return Block(block.t_ns[begin:end], *(column[begin:end] for column in block[1:]))
 
 
-STRETCH_SAMPLES = 125
-STRETCH_S = STRETCH_SAMPLES / RATE_HZ
+SEGMENT_SAMPLES = 125
+SEGMENT_S = SEGMENT_SAMPLES / RATE_HZ
 _EDGE = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ)
 
 
-class Stretch(NamedTuple):
+class DataSegment(NamedTuple):
     """m samples of n modules; all but `raw` went through the same low-pass.
 
     t_ns: (m,). q_rad, qd_rad_s, qdd_rad_s2, tau_nm: (m, n). gyro_rad_s, accel_m_s2: (m, n, 3), and how fast
@@ -219,7 +219,7 @@ class Stretch(NamedTuple):
     raw: Block
 
 
-class Stretches:
+class Segmenter:
     """Cuts blocks that follow on each other into stretches, a sixth of a second late for the filter."""
 
     def __init__(self) -> None:
@@ -229,21 +229,21 @@ class Stretches:
         """Begin anew: the next block does not follow on the last one."""
         self._held.clear()
 
-    def add(self, block: Block) -> list[Stretch]:
+    def add(self, block: Block) -> list[DataSegment]:
         """Take the next block; return the stretches that are complete with it."""
         self._held.append(block)
-        if sum(len(part.t_ns) for part in self._held) < STRETCH_SAMPLES + 2 * _EDGE:
+        if sum(len(part.t_ns) for part in self._held) < SEGMENT_SAMPLES + 2 * _EDGE:
             return []
         whole = joined_blocks(self._held)
         found, begin = [], 0
-        while begin + STRETCH_SAMPLES + 2 * _EDGE <= len(whole.t_ns):
-            found.append(_stretch(part_of(whole, begin, begin + STRETCH_SAMPLES + 2 * _EDGE)))
-            begin += STRETCH_SAMPLES
+        while begin + SEGMENT_SAMPLES + 2 * _EDGE <= len(whole.t_ns):
+            found.append(_stretch(part_of(whole, begin, begin + SEGMENT_SAMPLES + 2 * _EDGE)))
+            begin += SEGMENT_SAMPLES
         self._held = [part_of(whole, begin, len(whole.t_ns))]
         return found
 
 
-def _stretch(block: Block) -> Stretch:
+def _stretch(block: Block) -> DataSegment:
     kept = slice(_EDGE, len(block.t_ns) - _EDGE)
     q, tau, gyro, accel = (
         zero_phase_low_pass(signal, RATE_HZ, DYNAMIC_CUTOFF_HZ)
@@ -253,7 +253,7 @@ def _stretch(block: Block) -> Stretch:
     qd = differentiate(q, RATE_HZ)
     qdd = differentiate(qd, RATE_HZ)
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
-    return Stretch(
+    return DataSegment(
         t_ns=block.t_ns[kept],
         q_rad=q[kept],
         qd_rad_s=qd[kept],

@@ -7,20 +7,20 @@ import numpy as np
 from coordinator.monitoring.likelihood_ratio import gain_above
 from coordinator.monitoring.reference import Reference
 from coordinator.monitoring.residual_tests import linked
-from coordinator.monitoring.segments import STRETCH_S
+from coordinator.monitoring.segments import SEGMENT_S
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY
 
 # What is asked for, of all tests together.
 ALARMS_PER_HOUR = 0.1
 # A push of less than this share of a joint's largest torque is none.
-LEAST_CONTACT = 0.01
+MIN_CONTACT = 0.01
 # Windows of the last so many stretches are tested: short ones for what is large, long ones for what is small.
 SPANS = (3, 10)
 _DRIVE_FREEDOM, _LINK_FREEDOM = 2, 6
 
 
-class Levels(NamedTuple):
+class Thresholds(NamedTuple):
     """Gains, and torques (n,) of a contact [Nm], that chance exceeds as seldom as asked for."""
 
     payload: float
@@ -29,7 +29,7 @@ class Levels(NamedTuple):
     contact_nm: Array
 
 
-def levels(reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR) -> Levels:
+def thresholds(reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR) -> Thresholds:
     """Share the allowed rate among contacts, payloads, links and drives, and that of each among its tests.
 
     Raises:
@@ -39,10 +39,10 @@ def levels(reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR) -> Le
         raise ValueError(f"{alarms_per_hour} false alarms an hour cannot be asked for; it must be above 0")
     each, count = alarms_per_hour / 4.0, len(reference.chain.serials)
     effort = np.array([kind.max_effort_nm for kind in reference.types])
-    looks = len(SPANS) * 3600.0 / STRETCH_S
-    return Levels(
+    looks = len(SPANS) * 3600.0 / SEGMENT_S
+    return Thresholds(
         gain_above(PER_BODY, looks * count, each),
         gain_above(_LINK_FREEDOM, looks * max(len(linked(reference.chain)), 1), each),
         gain_above(_DRIVE_FREEDOM, looks * count, each),
-        np.maximum(reference.contact.level_nm(each), LEAST_CONTACT * effort),
+        np.maximum(reference.contact.level_nm(each), MIN_CONTACT * effort),
     )

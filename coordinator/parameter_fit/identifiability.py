@@ -22,7 +22,7 @@ WEAK_ABOVE = 0.1
 _NAMED = 6
 
 
-class Verdict(NamedTuple):
+class Identifiability(NamedTuple):
     """What is known of one parameter.
 
     value, sigma: from torques alone if it is known alone, with the prior's help if that settles it, else
@@ -39,12 +39,12 @@ class Verdict(NamedTuple):
     words: str
 
 
-def verdicts(
+def identifiabilities(
     base: BaseParameters,
     units: Sequence[str],
     informed: ArrayLike | None = None,
     informed_sigma: ArrayLike | None = None,
-) -> tuple[Verdict, ...]:
+) -> tuple[Identifiability, ...]:
     """Return a verdict for every one of p columns.
 
     Args:
@@ -84,7 +84,7 @@ def verdicts(
     return tuple(found)
 
 
-def words_of_body(some: Sequence[Verdict]) -> str:
+def words_of_body(some: Sequence[Identifiability]) -> str:
     """Return the verdicts of one body in a line: which are identified, weak, only in sums, without effect."""
     groups: dict[str, list[str]] = {}
     for verdict in some:
@@ -105,24 +105,26 @@ def words_of_base(base: BaseParameters) -> str:
     )
 
 
-def _known_alone(name: str, unit: str, place: int, value: float, sigma: float) -> Verdict:
+def _known_alone(name: str, unit: str, place: int, value: float, sigma: float) -> Identifiability:
     ratio = sigma / abs(value) if value else np.inf
     kind: Kind = "identified" if ratio <= WEAK_ABOVE else "weak"
-    return Verdict(name, kind, value, sigma, (place,), (), f"{kind}: {_figures(value, sigma, unit)}")
+    return Identifiability(name, kind, value, sigma, (place,), (), f"{kind}: {_figures(value, sigma, unit)}")
 
 
 def _in_sums(
     name: str, unit: str, sums: tuple[int, ...], others: tuple[str, ...], value: float, sigma: float
-) -> Verdict:
+) -> Identifiability:
     if not sums:
         words = "not identifiable: without effect on torques"
-        return Verdict(name, "not identifiable", None, None, (), (), words)
+        return Identifiability(name, "not identifiable", None, None, (), (), words)
     more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
     where = f"in sums with {', '.join(others[:_NAMED])}{more}"
     if sigma <= WEAK_ABOVE * abs(value):
         words = f"weak: {_figures(value, sigma, unit)} by the prior, only {where}"
-        return Verdict(name, "weak", value, sigma, sums, others, words)
-    return Verdict(name, "not identifiable", None, None, sums, others, f"not identifiable: only {where}")
+        return Identifiability(name, "weak", value, sigma, sums, others, words)
+    return Identifiability(
+        name, "not identifiable", None, None, sums, others, f"not identifiable: only {where}"
+    )
 
 
 def _figures(value: float, sigma: float, unit: str) -> str:

@@ -39,7 +39,7 @@ EARNS_ABOVE = 25.0
 _ROUNDS, _SETTLED = 8, 1e-9
 # A column that keeps less of its length beside the bodies' is one of theirs.
 _ALIKE = 1e-6
-_LEAST_NM = 1e-9
+_MIN_NM = 1e-9
 
 
 class TermsFit(NamedTuple):
@@ -57,7 +57,7 @@ class TermsFit(NamedTuple):
     spread: Array
 
 
-class SeenFit(NamedTuple):
+class InstrumentalFit(NamedTuple):
     """Inertial parameters, and what else was in the readings.
 
     information: what is left of every joint when terms and the torque of Y - Z are taken off, in the 10 n
@@ -72,12 +72,12 @@ class SeenFit(NamedTuple):
     information: tuple[JointInformation, ...]
 
 
-def solve_seen(
+def solve_instrumental_variables(
     information: Sequence[JointInformation],
     prior_phi: Array,
     independent_fraction: float,
     scale_sigma: float = 0.0,
-) -> SeenFit:
+) -> InstrumentalFit:
     """Fit inertial parameters and terms to the rows of n joints.
 
     Args:
@@ -102,7 +102,7 @@ def solve_seen(
         earned = [_earned(piece, size, independent_fraction) for piece in rigid]
         left = tuple(without_used(piece, size, one.used) for piece, one in zip(rigid, earned, strict=True))
         fit = solve_weighted(left, independent_fraction, ESTIMATED_CHAIN_TOLERANCE)
-        sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _LEAST_NM))
+        sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _MIN_NM))
         informed = solve_information(
             left,
             1.0 / sigma,
@@ -118,7 +118,7 @@ def solve_seen(
             )
         if max(moved, np.abs(scale.value - before.value).max()) < _SETTLED:
             break
-    return SeenFit(fit, _terms(rigid, earned, fit, independent_fraction), scale, phi, left)
+    return InstrumentalFit(fit, _terms(rigid, earned, fit, independent_fraction), scale, phi, left)
 
 
 class _Earned(NamedTuple):
@@ -152,7 +152,7 @@ def _earned(piece: JointInformation, size: int, independent_fraction: float) -> 
         value = inverse @ target
         misfit = target - columns[:, used] @ value
         variance = (float(misfit @ misfit) + piece.rest) / freedom / independent_fraction
-        spread[used] = np.maximum(np.sqrt(np.sum(inverse**2, axis=1) * variance), _LEAST_NM)
+        spread[used] = np.maximum(np.sqrt(np.sum(inverse**2, axis=1) * variance), _MIN_NM)
         gain[used] = (value / spread[used]) ** 2
         weakest = np.flatnonzero(used)[np.argmin(gain[used])]
         if gain[weakest] > EARNS_ABOVE:

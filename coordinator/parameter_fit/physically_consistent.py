@@ -37,11 +37,11 @@ from module_agent.model.regressor import PER_BODY
 WEIGHTS = (10.0, 1.0, 0.1, 0.01)
 # How much the relative torque error may grow from least squares' for the prior's sake: half of what is
 # promised for motions that were not fitted, because those are another sample of the same.
-MOST_COST = 5e-4
+MAX_COST = 5e-4
 # Of the torques' rms: no torque is known better, and a simulated one without noise is not solved better.
 _FINEST = 1e-5
 
-_MOST_STEPS = 200
+_MAX_STEPS = 200
 # Of the prior's weight: the objective is then within 1e-7 divergences of its minimum.
 _DECREMENT = 1e-7
 # Good enough to go on from, to the next smaller barrier: tenth by tenth.
@@ -100,7 +100,7 @@ def fit_physical(
     prior: ArrayLike,
     least_squares: InertialFit,
     independent_fraction: float = 1.0,
-    most_cost: float = MOST_COST,
+    most_cost: float = MAX_COST,
     effects: Sequence[Array] | None = None,
 ) -> PhysicalFit:
     """Fit real bodies to the torques of all joints.
@@ -203,7 +203,7 @@ def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, 
 def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, int]:
     """Return the minimum to within `decrement` times the barrier, from `y`, and Newton's steps."""
     fall = np.inf
-    for step in range(_MOST_STEPS):
+    for step in range(_MAX_STEPS):
         try:
             gradient, triangle = problem.slope(y)
             down = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))
@@ -220,7 +220,7 @@ def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, in
             # Rounding, not descent: nothing lower can be told from here.
             return y, step
         y = y + length * down
-    raise NotSolvedError(f"no real bodies were found in {_MOST_STEPS} steps; the last would gain {fall:.2g}")
+    raise NotSolvedError(f"no real bodies were found in {_MAX_STEPS} steps; the last would gain {fall:.2g}")
 
 
 class _Problem(NamedTuple):

@@ -26,8 +26,8 @@ HUBER_LIMIT = 1.345
 _MAD_TO_SIGMA = 1.4826
 # The window of the autocorrelation's sum, in correlation times (Sokal 1997, Monte Carlo methods, eq. 3.19).
 _WINDOW_TIMES = 5.0
-_MOST_ROUNDS, _SETTLED = 30, 1e-4
-_LEAST_NM = 1e-75
+_MAX_ROUNDS, _SETTLED = 30, 1e-4
+_MIN_NM = 1e-75
 
 
 class WeightedFit(NamedTuple):
@@ -117,7 +117,7 @@ def fit_weighted(
         raise ValueError(f"instruments {other.shape} must be finite and of the regressor's shape {y.shape}")
     weights, sigma = counted.astype(float), np.ones(tau.shape[1])
     joints = _joint_rows(y, tau, other, weights)
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         solution = _solution(joints, sigma, size, other is not None)
         before = sigma
         if robust:
@@ -230,14 +230,14 @@ def _noise(joints: list[_JointRows], solution: _Solution, used: NDArray[np.bool_
     """Return the rms of each joint's residual (n,)."""
     left = [float(np.sum((joint.tau - joint.y @ solution.parameters) ** 2)) for joint in joints]
     # Torques without noise leave rounding; weights must stay finite.
-    found: Array = np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _LEAST_NM)
+    found: Array = np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _MIN_NM)
     return found
 
 
 def _robust_noise(residual: Array, used: NDArray[np.bool_]) -> Array:
     """Return each joint's noise (n,) by the median of its residuals."""
     middle = np.nanmedian(np.where(used, np.abs(residual), np.nan), axis=0)
-    found: Array = np.maximum(_MAD_TO_SIGMA * middle, _LEAST_NM)
+    found: Array = np.maximum(_MAD_TO_SIGMA * middle, _MIN_NM)
     return found
 
 

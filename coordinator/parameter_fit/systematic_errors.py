@@ -15,13 +15,13 @@ from coordinator.parameter_fit.module_parts import bodies_from_parts, parts_of
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale
 from module_agent.model.chain import Array, Chain
 from module_agent.model.information import JointInformation
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
 
 # Of the largest variance of a chain's increments: less makes no difference.
 _NEGLIGIBLE = 1e-8
-_MOST_DIRECTIONS = 128
+_MAX_DIRECTIONS = 128
 
 
 def error_directions(covariance: Array) -> Array:
@@ -30,7 +30,7 @@ def error_directions(covariance: Array) -> Array:
     Those too short to make a difference are left out.
     """
     values, vectors = np.linalg.eigh(covariance)
-    kept = np.flatnonzero(values > _NEGLIGIBLE * max(values[-1], 0.0))[-_MOST_DIRECTIONS:]
+    kept = np.flatnonzero(values > _NEGLIGIBLE * max(values[-1], 0.0))[-_MAX_DIRECTIONS:]
     found = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
     found.flags.writeable = False
     return found
@@ -51,7 +51,7 @@ def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: Joint
     joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
     here = inverse_dynamics(chain, phi, *joints)
     found = [
-        inverse_dynamics(apply_increment(chain, one), phi, *joints) - here
+        inverse_dynamics(apply_perturbation(chain, one), phi, *joints) - here
         for one in error_directions(covariance).T
     ]
     return np.stack(found, axis=2) if found else np.zeros((*here.shape, 0))
@@ -72,7 +72,7 @@ def body_shifts(chain: Chain, directions: ArrayLike, phi_parts: ArrayLike) -> Ar
     parts = parts_of([chain])
     here = bodies_from_parts(chain, parts)
     found = [
-        (bodies_from_parts(apply_increment(chain, one), parts) - here) @ np.asarray(phi_parts, dtype=float)
+        (bodies_from_parts(apply_perturbation(chain, one), parts) - here) @ np.asarray(phi_parts, dtype=float)
         for one in np.asarray(directions, dtype=float).T
     ]
     return np.stack(found, axis=1) if found else np.zeros((len(here), 0))

@@ -58,7 +58,7 @@ def standstill(journal: Sequence[JournalEvent]) -> str:
     return "the robot is stopped"
 
 
-def left_out(journal: Sequence[JournalEvent]) -> dict[str, str]:
+def excluded_modules(journal: Sequence[JournalEvent]) -> dict[str, str]:
     """Return the modules that a session went on without, and that no later one has moved."""
     found: dict[str, str] = {}
     for event in journal:
@@ -69,6 +69,6 @@ def left_out(journal: Sequence[JournalEvent]) -> dict[str, str]:
     return found
 
 
-def left_out_event(t_ns: int, serial: str, why: str) -> JournalEvent:
+def exclusion_event(t_ns: int, serial: str, why: str) -> JournalEvent:
     """Return the journal's note on a module that is left out."""
     return JournalEvent(t_ns=t_ns, what="note", step=STEP + serial, text=why)

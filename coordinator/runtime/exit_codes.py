@@ -8,14 +8,14 @@ from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, RobotSt
 from coordinator.live_robot.messenger import NoAnswer, Refused
 from coordinator.recording.run_folder import RunFolderError
 from coordinator.recording.session_file import SessionFileError
-from coordinator.session.session import NobodyThere
+from coordinator.session.session import NoModulesFound
 from module_agent.model.catalogue import UnknownModuleType
 from module_agent.transport.transport import TransportError
 
 EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 _FAILED = (
-    NobodyThere,
+    NoModulesFound,
     UnfitLink,
     NoAnswer,
     Refused,

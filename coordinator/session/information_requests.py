@@ -7,7 +7,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 
 from coordinator.identification.inertia.agent_information import dynamic_steps, question, rows_to_keep
-from coordinator.live_robot.messenger import Clock, NoAnswer, Radio, together
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, gather_all
 from coordinator.recording.recording import Recording
 from module_agent.model.chain import Chain
 from module_agent.signals.clock_map import ClockMap
@@ -22,11 +22,11 @@ POLL_S = 0.1
 PATIENCE_NS = 40_000_000_000
 
 
-class TorqueQuestions:
+class InformationRequests:
     """Of one session; `note` takes a line for whoever watches."""
 
     def __init__(
-        self, radio: Radio, recording: Recording, clock: Clock, sender: str, note: Callable[[str], None]
+        self, radio: Messenger, recording: Recording, clock: Clock, sender: str, note: Callable[[str], None]
     ):
         self._radio = radio
         self._recording = recording
@@ -48,7 +48,7 @@ class TorqueQuestions:
             except ValueError as error:
                 self._note(f"the agents do not share motion {event.step}: {error}")
                 continue
-            await together(
+            await gather_all(
                 self._collect_one(
                     CollectRequest(
                         serial=serial,
@@ -79,7 +79,7 @@ class TorqueQuestions:
         except ValueError as error:
             self._note(f"the agents are not asked for what their torques say: {error}")
             return
-        await together(self._ask_one(serial, asked) for serial in chain.serials)
+        await gather_all(self._ask_one(serial, asked) for serial in chain.serials)
 
     async def _ask_one(self, serial: str, asked: InformationRequest) -> None:
         end_ns = self._clock() + PATIENCE_NS

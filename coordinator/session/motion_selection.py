@@ -12,7 +12,7 @@ from coordinator.excitation.joint_limits import (
     likely_inertia_kg_m2,
     measured_load,
 )
-from coordinator.excitation.multisine import JointSetting, whole_patterns
+from coordinator.excitation.multisine import JointSetting, simultaneous_patterns
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.single_joint import (
     LIKELY_RADIUS_M,
@@ -37,7 +37,7 @@ SHORTEST_S, LONGEST_S = 5.25, 9.0
 ANSWERS_S = 0.3
 # A repeat that takes less than this off the predicted sigma is not worth its time.
 WORTH_SHARE = 0.05
-MOST_MOTIONS = 8
+MAX_MOTIONS = 8
 
 
 class MotionChoice:
@@ -70,7 +70,7 @@ class MotionChoice:
     def again(self, serial: str, done: Sequence[MotionRecord]) -> WindowedSine | None:
         """Return one more fast motion if the precision asked for needs one and it would help; else None."""
         wanted_mm = self._plan.precision_mm
-        if wanted_mm is None or len(done) >= MOST_MOTIONS:
+        if wanted_mm is None or len(done) >= MAX_MOTIONS:
             return None
         task = self._task(serial, self._moved_limits(serial, done[0]))
         patterns: list[Pattern] = [record.pattern for record in done]
@@ -89,7 +89,7 @@ class MotionChoice:
         """Return the motions of all joints at once."""
         home = self._plan.home_rad
         settings = {s: JointSetting(self._unmoved_limits(s), home) for s in self._serials()}
-        return whole_patterns(settings, self._plan.whole_duration_s)
+        return simultaneous_patterns(settings, self._plan.simultaneous_duration_s)
 
     # ------------------------------------------------------------------ what is known
 

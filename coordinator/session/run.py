@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from coordinator.baseline.difference import difference, joints_to_explore
-from coordinator.baseline.known_robot import keep_known, known_within, load_known
+from coordinator.baseline.known_robot import baseline_within, keep_baseline, load_baseline
 from coordinator.baseline.update import updated
 from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
@@ -22,12 +22,12 @@ from coordinator.identification.identified import IdentificationError, Identifie
 from coordinator.identification.identify import identify, identify_kinematics, write_held_out
 from coordinator.identification.inertia.agent_information import dynamic_steps
 from coordinator.identification.inertia.inertia import Inertia
-from coordinator.identification.preview import Looks, RobotSoFar
+from coordinator.identification.preview import Preview, Previewer
 from coordinator.identification.result import Result, write_result
 from coordinator.identification.topology_search import doubtful_motions
 from coordinator.live_robot.errors import ModuleLost
-from coordinator.live_robot.messenger import Clock, NoAnswer, Post, Radio, Refused
-from coordinator.live_robot.module_group import RobotLink
+from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Post, Refused
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.merge.information_file import RunInformation, write_information
 from coordinator.parameter_fit.module_parts import likely_parts
 from coordinator.parameter_fit.systematic_errors import error_directions
@@ -45,11 +45,11 @@ from coordinator.recording.run_folder import (
     open_run_folder,
 )
 from coordinator.recording.session_file import SessionWriter, read_session
-from coordinator.session.information_requests import TorqueQuestions
+from coordinator.session.information_requests import InformationRequests
 from coordinator.session.session import Session
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION
 from coordinator.topology.next_motion import NextMotion
-from coordinator.viewer.feed import FILE, LIVE, Beside, Screen, ViewerFeed
+from coordinator.viewer.feed import FILE, LIVE, Overlay, Screen, ViewerFeed
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.catalogue import ModuleType, module_type
@@ -65,7 +65,7 @@ logger = logging.getLogger(__name__)
 class RunConfig(NamedTuple):
     """What a run is told. `inline` computes on the event loop, as virtual time needs it.
 
-    `refined_looks`: modules up to which the robot is refined, not only assembled, for every look at it while
+    `refined_previews`: modules up to which the robot is refined, not only assembled, for every preview while
     it is being explored; None for any number, as in a thread beside the run it keeps nobody waiting.
     `known`: the folder of a run that the robot is known from. Then all joints are moved at once for a glance,
     and by themselves only those next to what is other.
@@ -81,7 +81,7 @@ class RunConfig(NamedTuple):
     connect_viewer: str | None = None
     serve_viewer: int | None = None
     inline: bool = False
-    refined_looks: int | None = None
+    refined_previews: int | None = None
     known: Path | None = None
 
 
@@ -100,7 +100,7 @@ class Run:
         clock: Clock,
         post: Post,
         screen: Screen,
-        beside: Beside | None = None,
+        beside: Overlay | None = None,
     ):
         # Before anything is made of the new folder.
         if config.plan.topology_only:
@@ -108,11 +108,11 @@ class Run:
                 "the plan sets topology_only, which leaves out the fast motions; a run identifies the chain "
                 "too, and needs them: set it to false"
             )
-        before = load_known(config.known) if config.known is not None and not config.resume else None
+        before = load_baseline(config.known) if config.known is not None and not config.resume else None
         crashed = open_run_folder(config.out, config.resume, config.robot)
         if before is not None:
-            keep_known(before, config.out)
-        self._known = before.kinematics if before is not None else known_within(config.out)
+            keep_baseline(before, config.out)
+        self._known = before.kinematics if before is not None else baseline_within(config.out)
         if self._known is not None:
             config = config._replace(plan=config.plan.model_copy(update={"mode": "whole"}))
         self._config = config
@@ -127,14 +127,14 @@ class Run:
         )
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
         self._feed = ViewerFeed(viewer, self.recording, FILE if config.inline else LIVE, beside)
-        self._looks = Looks(self.recording, config.refined_looks)
+        self._looks = Previewer(self.recording, config.refined_previews)
         self._looking: asyncio.Task[None] | None = None
         self._chain: Chain | None = None
         if crashed is not None:
             self._take_over(crashed)
-        self._radio = Radio(transport, config.robot, clock, post, self._record)
-        self._link = RobotLink(self._radio, self.recording, clock, config.sender)
-        self._torques = TorqueQuestions(self._radio, self.recording, clock, config.sender, self.note)
+        self._radio = Messenger(transport, config.robot, clock, post, self._record)
+        self._link = ModuleGroup(self._radio, self.recording, clock, config.sender)
+        self._torques = InformationRequests(self._radio, self.recording, clock, config.sender, self.note)
 
     def _take_over(self, crashed: Path) -> None:
         try:
@@ -194,7 +194,7 @@ class Run:
     async def _look(self, explored: list[str]) -> None:
         self._show_so_far(await self._compute(lambda: self._so_far(explored)))
 
-    def _so_far(self, explored: list[str]) -> RobotSoFar | None:
+    def _so_far(self, explored: list[str]) -> Preview | None:
         """Return the robot as far as it is known; only to be looked at, so that a run does not fail by it."""
         try:
             return self._looks.look(explored)
@@ -205,7 +205,7 @@ class Run:
             logger.exception("the robot so far could not be worked out")
         return None
 
-    def _show_so_far(self, found: RobotSoFar | None) -> None:
+    def _show_so_far(self, found: Preview | None) -> None:
         if found is not None:
             self._feed.so_far(self._clock(), found)
 

@@ -12,14 +12,14 @@ from typing import Protocol
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
 from coordinator.live_robot.errors import MotionInterrupted
-from coordinator.live_robot.excluded_modules import LeftOut
+from coordinator.live_robot.excluded_modules import ExcludedModules
 from coordinator.live_robot.link_check import check_link
-from coordinator.live_robot.messenger import Clock, Radio, Refused, together
-from coordinator.live_robot.module_group import RobotLink
-from coordinator.recording.journal import JournalEvent, Purpose, left_out_event
+from coordinator.live_robot.messenger import Clock, Messenger, Refused, gather_all
+from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.recording.journal import JournalEvent, Purpose, exclusion_event
 from coordinator.recording.recording import Recording
 from coordinator.session.motion_selection import MotionChoice
-from coordinator.topology.next_motion import MOST_REPEATS, NextMotion
+from coordinator.topology.next_motion import MAX_REPEATS, NextMotion
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
 # Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
@@ -61,7 +61,7 @@ class Reporter(Protocol):
         ...
 
 
-class NobodyThere(RuntimeError):
+class NoModulesFound(RuntimeError):
     """No module, or not as many as expected, announced itself."""
 
 
@@ -74,8 +74,8 @@ class Session:
 
     def __init__(
         self,
-        link: RobotLink,
-        radio: Radio,
+        link: ModuleGroup,
+        radio: Messenger,
         recording: Recording,
         plan: Plan,
         clock: Clock,
@@ -98,7 +98,7 @@ class Session:
         self._index = 0
         self._total = 4
         self._keeper: asyncio.Task[None] | None = None
-        self._left_out = LeftOut(link, self._note_left_out)
+        self._left_out = ExcludedModules(link, self._note_left_out)
 
     # ------------------------------------------------------------------ the run
 
@@ -143,16 +143,16 @@ class Session:
             await asyncio.sleep(0.05)
             if frozenset(self._radio.alive) != known:
                 known, quiet_since = frozenset(self._radio.alive), self._clock()
-            settled = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
-            if known and settled and (expect is None or len(known) >= expect):
+            gauge_fixed = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
+            if known and gauge_fixed and (expect is None or len(known) >= expect):
                 break
         if not known or (expect is not None and len(known) != expect):
             names = ", ".join(sorted(known)) or "none"
             wanted = "at least one" if expect is None else str(expect)
-            raise NobodyThere(f"{wanted} module expected, found {len(known)}: {names}")
+            raise NoModulesFound(f"{wanted} module expected, found {len(known)}: {names}")
         await self._left_out.meet(sorted(known))
         if not self.link.serials:
-            raise NobodyThere(
+            raise NoModulesFound(
                 f"none of the modules that announced themselves responds: {', '.join(sorted(known))}"
             )
         for serial in self.link.serials:
@@ -180,7 +180,7 @@ class Session:
     async def _arm(self) -> None:
         """Acquire every module, and set gains where the plan wants others than the factory's."""
         # At once: what is armed and has no motion yet expires the more easily.
-        await together(self._arm_one(serial) for serial in self._left_out.movers())
+        await gather_all(self._arm_one(serial) for serial in self._left_out.movers())
 
     async def _arm_one(self, serial: str) -> None:
         await self.link.acquire(serial)
@@ -232,7 +232,7 @@ class Session:
 
     def _note_left_out(self, serial: str, why: str) -> None:
         self._reporter.note(f"going on without {serial}: {why}")
-        self._journal(left_out_event(self._clock(), serial, why))
+        self._journal(exclusion_event(self._clock(), serial, why))
 
     async def _rearm(self) -> None:
         await self._arm()
@@ -314,7 +314,7 @@ class Session:
 
     async def _settle_doubts(self) -> None:
         """Move again what leaves the topology in doubt, until nothing does or trying has no end."""
-        for turn in range(MOST_REPEATS):
+        for turn in range(MAX_REPEATS):
             motions = await self._reporter.doubts()
             self._total += len(motions)
             for motion in motions:

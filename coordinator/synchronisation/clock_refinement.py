@@ -33,7 +33,7 @@ LAG_FLOOR_S = 8e-5
 # How far gyros are off beforehand: bias; and scale, axes and the chain's own axes together. Then their noise.
 BIAS_RAD_S, AXES, FIRST_RAD_S = 0.1, 0.05, 1e-3
 # A gyro that reads otherwise than the joints that carry it, by this share, tells nothing of clocks.
-MOST_OFF = 0.3
+MAX_OFF = 0.3
 # An angular rate that no sensor resolves, and the rounding of 16 bit readings [rad/s].
 STILL_RAD_S, FINEST_RAD_S = 0.02, 3e-4
 # A base clock runs as it does by definition.
@@ -193,7 +193,7 @@ def _lag(chain: Chain, imu: int, joints: tuple[Array, ...], gyro: Array) -> _Nor
         left = rest - common * float(np.vdot(columns[count], rest)) / power
         variance = _variance(left)
     off = nuisance[:, 1:] @ _shares(nuisance, variance, (gyro - rate)[None])[0, 1:] + left
-    if np.vdot(off, off) > MOST_OFF**2 * np.vdot(rate, rate):
+    if np.vdot(off, off) > MAX_OFF**2 * np.vdot(rate, rate):
         return None
     flat = columns.reshape(count + 1, -1)
     normal = flat @ clean.reshape(count + 2, -1).T / variance

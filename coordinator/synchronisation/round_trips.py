@@ -25,7 +25,7 @@ FEWEST_PAIRS = 5
 # What holds up one trip holds up its neighbours: their errors count as one within this.
 TOGETHER_NS = 500_000_000
 # A crystal's rate where no slope is fitted; and what temperature does to it within a session.
-CRYSTAL_DRIFT, LEAST_DRIFT_SIGMA = 1e-4, 1e-7
+CRYSTAL_DRIFT, MIN_DRIFT_SIGMA = 1e-4, 1e-7
 
 
 _Columns = tuple[Times, Times, Times]
@@ -111,7 +111,7 @@ def _fitted(origin_ns: int, base_ns: int, line: _Line, trip_ns: NDArray[np.float
     # There may take any share of the quickest trip: uniform, so that half of it is root three sigmas.
     divided = 0.5 * float(trip_ns.min()) / np.sqrt(3.0)
     sigma = float(np.hypot(divided, line.constant_sigma_ns))
-    drift_sigma = max(line.slope_sigma, LEAST_DRIFT_SIGMA)
+    drift_sigma = max(line.slope_sigma, MIN_DRIFT_SIGMA)
     return ClockMap(origin_ns + line.centre_ns, base_ns + line.constant_ns, line.slope, sigma, drift_sigma)
 
 

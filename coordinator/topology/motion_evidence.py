@@ -20,7 +20,7 @@ ODD = 1e-3
 # the motion. Clean ratios of uncalibrated modules are within 0.03 of 0 and 1.
 RATIO_FLOOR = 0.05
 # Less than this over a motion is no motion: encoders and springs of a joint that is stuck still jitter.
-LEAST_RATE_RAD_S = 0.02
+MIN_RATE_RAD_S = 0.02
 # Six blocks of four samples are the least that tells how much they differ.
 FEWEST_SAMPLES = 4 * BLOCKS
 # What is left of a held joint's motion after it is taken off: its axis in the IMU's frame turns with the
@@ -87,15 +87,15 @@ def motion_evidence(
             where that is not known; None if nothing is.
 
     Raises:
-        NotMoved: the joint's rate is below `LEAST_RATE_RAD_S` rms.
+        NotMoved: the joint's rate is below `MIN_RATE_RAD_S` rms.
         ValueError: fewer than `FEWEST_SAMPLES` samples.
     """
     rate = qd_rad_s[:, joint]
     if rate.size < FEWEST_SAMPLES:
         raise ValueError(f"{rate.size} samples of the motion; at least {FEWEST_SAMPLES} are needed")
     size = float(np.sqrt(np.mean(rate**2)))
-    if size < LEAST_RATE_RAD_S:
-        raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {LEAST_RATE_RAD_S} is needed")
+    if size < MIN_RATE_RAD_S:
+        raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {MIN_RATE_RAD_S} is needed")
     others = np.arange(qd_rad_s.shape[1]) != joint
     given, left = _given(qd_rad_s[:, others], axes[others] if axes is not None else None, gyro_rad_s.shape[1])
     gyro = gyro_rad_s - offset_rad_s - given

@@ -7,7 +7,7 @@ from coordinator.topology.topology import Doubt, Observations
 from module_agent.wire.messages import ConstantMotion
 
 # A joint is asked again this often; what three motions of different kinds leave open, a fourth does too.
-MOST_REPEATS = 3
+MAX_REPEATS = 3
 OTHERS_TURNED_RAD = 0.5
 
 
@@ -46,12 +46,12 @@ def next_motions(
     Args:
         doubts: of a topology, the least certain first.
         observations: what it was made of.
-        repeated: how often every joint was moved again already; a joint is given up after `MOST_REPEATS`.
+        repeated: how often every joint was moved again already; a joint is given up after `MAX_REPEATS`.
     """
     wanted: dict[str, NextMotion] = {}
     for doubt in doubts:
         done = repeated.get(doubt.joint, 0)
-        if doubt.joint in wanted or done >= MOST_REPEATS:
+        if doubt.joint in wanted or done >= MAX_REPEATS:
             continue
         wanted[doubt.joint] = _next(doubt, observations, done)
     return tuple(wanted.values())
@@ -59,7 +59,7 @@ def next_motions(
 
 def _next(doubt: Doubt, observations: Observations, done: int) -> NextMotion:
     seen = observations.get((doubt.joint, doubt.observer))
-    if done == MOST_REPEATS - 1:
+    if done == MAX_REPEATS - 1:
         how = 0.7, 1.0, OTHERS_TURNED_RAD
         words = f"joint {doubt.joint} moves again with all other joints turned by {OTHERS_TURNED_RAD} rad"
     elif seen is None:

@@ -12,15 +12,15 @@ STRATEGY = 2
 HOLDING_TIMES = 6.0
 # The largest damping of a joint, of the factory's in the velocity loop of this strategy: as much as it holds
 # with. At 10 times an X5-1 in the wrist of an arm of six joints rings.
-MOST_DAMPING_TIMES = HOLDING_TIMES
+MAX_DAMPING_TIMES = HOLDING_TIMES
 
 
 def most_damping_nm_s_rad(kind: ModuleType) -> float:
     """Return the largest damping under which a module floats."""
-    return MOST_DAMPING_TIMES * default_gains(kind, STRATEGY).velocity.kp
+    return MAX_DAMPING_TIMES * default_gains(kind, STRATEGY).velocity.kp
 
 
-def floating_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
+def compensation_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
     """Return the gains under which a module floats: the factory's effort loop, and a damper.
 
     Raises:

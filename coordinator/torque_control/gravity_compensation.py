@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from coordinator.torque_control.gravity_model import KnownWeight
+from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.minimum_jerk import Way
 from module_agent.model.chain import Array
 from module_agent.wire.messages import Limits
@@ -41,14 +41,14 @@ UNKNOWN_OF_LARGEST = 0.02
 # How far a joint may go while it is being loaded, and while it is being set free: nobody leads it yet. Heavy
 # arms whose motors were off sink by 9 degrees as they are taken, into the soft gains of the factory, and by 1
 # as they are set free.
-MOST_SUNK_RAD, MOST_GIVEN_RAD = float(np.radians(15.0)), float(np.radians(5.0))
+MAX_SUNK_RAD, MAX_GIVEN_RAD = float(np.radians(15.0)), float(np.radians(5.0))
 # How far a joint may lag on the way back: it is stopped by something then.
-MOST_LAG_RAD = 0.08
+MAX_LAG_RAD = 0.08
 # How fast the way back is gone at most, and as a share of the speed at which a joint is held.
 BACK_RAD_S, BACK_SHARE = 0.5, 0.5
 
 
-class FloatRefused(RuntimeError):
+class CompensationRefused(RuntimeError):
     """The robot is not set free; the message names the joint, what is wrong and what would be right."""
 
 
@@ -63,7 +63,7 @@ class StaleFeedback(RuntimeError):
         self.serial = serial
 
 
-class FloatSettings(NamedTuple):
+class CompensationSettings(NamedTuple):
     """How a robot floats.
 
     damping_nm_s_rad: of every joint against its motion. max_speed_rad_s: a joint that goes faster is held.
@@ -101,13 +101,13 @@ class Targets(NamedTuple):
     effort_nm: Array
 
 
-class Floater:
+class GravityCompensator:
     """The course of one float; `step` is called at the rate of the set-points.
 
     phase: as above. why: why it holds or is held, empty before.
     """
 
-    def __init__(self, weight: KnownWeight, limits: tuple[Limits, ...], settings: FloatSettings):
+    def __init__(self, weight: GravityModel, limits: tuple[Limits, ...], settings: CompensationSettings):
         self.phase: Phase = "loading"
         self.why = ""
         self.is_fault = False
@@ -155,7 +155,7 @@ class Floater:
             or self._strange(reading.effort_nm, reading.effort_nm - weight)
         )
         if reason:
-            raise FloatRefused(reason)
+            raise CompensationRefused(reason)
 
     def step(self, t_s: float, reading: Reading) -> Targets:
         """Return the set-points of this moment.
@@ -201,7 +201,7 @@ class Floater:
         """Whether it is in one of these phases."""
         return self.phase in phases
 
-    def let_go(self, t_s: float) -> None:
+    def release(self, t_s: float) -> None:
         """Set the robot free: the gains of torque control are in force. Only from `loaded`."""
         if self.phase == "loaded":
             self._enter("freeing", t_s)
@@ -286,7 +286,7 @@ class Floater:
     def _guard(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
         if self._way is not None:
             wanted = self._way.at(t_s - self._since_s)[0]
-            reason = self._astray(reading.q_rad - wanted, MOST_LAG_RAD, "behind on its way back")
+            reason = self._astray(reading.q_rad - wanted, MAX_LAG_RAD, "behind on its way back")
             reason = reason or self._too_fast(reading.qd_rad_s) or self._overload(weight_nm)
         elif self.phase in ("freeing", "floating"):
             reason = self._too_fast(reading.qd_rad_s) or self._at_an_end(reading.q_rad)
@@ -295,7 +295,7 @@ class Floater:
             reason = ""
         if self.phase in ("loading", "freeing"):
             given = reading.q_rad - self.place_rad
-            most_rad = MOST_SUNK_RAD if self.phase == "loading" else MOST_GIVEN_RAD
+            most_rad = MAX_SUNK_RAD if self.phase == "loading" else MAX_GIVEN_RAD
             reason = reason or self._astray(given, most_rad, "away before it was free")
         if reason:
             self._fault(t_s, reading, reason)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from coordinator.baseline.known_robot import KnownRobotError
+from coordinator.baseline.known_robot import BaselineError
 from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.pseudo_inertia import parameter_transform
 from coordinator.identification.result import BodiesPart, BodyPart, ChainPart, Result
@@ -16,7 +16,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import inverse_dynamics
 
 
-class KnownWeight(NamedTuple):
+class GravityModel(NamedTuple):
     """A robot of n joints: its name, its modules' types in the chain's order, its parameters (10 n,)."""
 
     robot: str
@@ -35,7 +35,7 @@ class KnownWeight(NamedTuple):
         return found
 
 
-def known_weight(folder: Path) -> KnownWeight:
+def gravity_model(folder: Path) -> GravityModel:
     """Read what a robot weighs from the folder of a run.
 
     The parameters are those of real bodies where any were found: in poses that were never measured they stay
@@ -46,21 +46,21 @@ def known_weight(folder: Path) -> KnownWeight:
     """
     path = folder / RESULT
     if not path.is_file():
-        raise KnownRobotError(f"{folder} holds no {RESULT}: give the folder of a run that has finished")
+        raise BaselineError(f"{folder} holds no {RESULT}: give the folder of a run that has finished")
     try:
         result = Result.model_validate_json(path.read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise KnownRobotError(f"{path} is no result of a run: {place}: {first['msg']}") from error
+        raise BaselineError(f"{path} is no result of a run: {place}: {first['msg']}") from error
     if result.dynamics is None:
-        raise KnownRobotError(
+        raise BaselineError(
             f"{path} does not tell what the robot weighs: it was run with --no-dynamics; identify it again"
         )
     return weight_of(result)
 
 
-def weight_of(result: Result) -> KnownWeight:
+def weight_of(result: Result) -> GravityModel:
     """Return what the robot of a result weighs.
 
     Raises:
@@ -72,7 +72,7 @@ def weight_of(result: Result) -> KnownWeight:
     chain = _chain(result.chain)
     phi = np.array(dynamics.phi) if dynamics.bodies is None else _phi(chain, dynamics.bodies)
     phi.flags.writeable = False
-    return KnownWeight(result.robot, tuple(result.types[s] for s in chain.serials), chain, phi)
+    return GravityModel(result.robot, tuple(result.types[s] for s in chain.serials), chain, phi)
 
 
 def _chain(part: ChainPart) -> Chain:

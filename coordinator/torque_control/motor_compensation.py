@@ -73,7 +73,7 @@ _SLOW_RAD_S = 0.02
 _WARMING_TICKS = 10
 
 
-def with_drive(
+def with_motor_compensation(
     points: SetPoints,
     kinds: Sequence[ModuleType],
     gains: Sequence[GainSet],

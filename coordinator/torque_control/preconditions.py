@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.live_robot.messenger import Clock, Radio
-from coordinator.live_robot.module_group import POLL_S, RobotLink
-from coordinator.torque_control.gravity_model import KnownWeight
+from coordinator.live_robot.messenger import Clock, Messenger
+from coordinator.live_robot.module_group import POLL_S, ModuleGroup
+from coordinator.torque_control.gravity_model import GravityModel
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import imu_poses
 
@@ -20,10 +20,10 @@ STRANGERS_S = 0.5
 FEEDBACK_S = 2.0
 # How far from where the chain has it an IMU may feel gravity: errors as delivered are under 3 degrees, and a
 # joint that has lost its zero is off by more.
-MOST_TILT_RAD = float(np.radians(12.0))
+MAX_TILT_RAD = float(np.radians(12.0))
 
 
-class NotTheKnownRobot(RuntimeError):
+class RobotMismatch(RuntimeError):
     """The robot is another one than the known, or stands otherwise; the message names the module."""
 
 
@@ -34,7 +34,9 @@ class Felt(NamedTuple):
     accel_m_s2: Array
 
 
-async def find_known(link: RobotLink, radio: Radio, weight: KnownWeight, clock: Clock) -> None:
+async def find_baseline_robot(
+    link: ModuleGroup, radio: Messenger, weight: GravityModel, clock: Clock
+) -> None:
     """Wait until the robot is there, meet it, and make sure that it is the one that is known.
 
     Serials and types are to be the same; boots may differ.
@@ -46,12 +48,12 @@ async def find_known(link: RobotLink, radio: Radio, weight: KnownWeight, clock: 
     await _gathered(radio, known, clock)
     if missing := sorted(known - radio.alive):
         there = ", ".join(sorted(radio.alive)) or "none"
-        raise NotTheKnownRobot(
+        raise RobotMismatch(
             f"module {missing[0]} is not there, {len(missing)} of {len(known)} are missing; there are {there}"
         )
     await asyncio.sleep(STRANGERS_S)
     if strange := sorted(radio.alive - known):
-        raise NotTheKnownRobot(
+        raise RobotMismatch(
             f"module {strange[0]} is no part of the robot that is known, {', '.join(weight.chain.serials)}: "
             "what it weighs is not known either; identify the robot again"
         )
@@ -59,14 +61,12 @@ async def find_known(link: RobotLink, radio: Radio, weight: KnownWeight, clock: 
     for serial, kind in zip(weight.chain.serials, weight.types, strict=True):
         told = link.info(serial).module_type
         if told != kind:
-            raise NotTheKnownRobot(
-                f"module {serial} is an {told}, in the robot that is known it was an {kind}"
-            )
+            raise RobotMismatch(f"module {serial} is an {told}, in the robot that is known it was an {kind}")
     if not await link.wait(lambda: not _mute(link), FEEDBACK_S):
-        raise NotTheKnownRobot(f"module {_mute(link)[0]} answers, but sends no feedback")
+        raise RobotMismatch(f"module {_mute(link)[0]} answers, but sends no feedback")
 
 
-async def _gathered(radio: Radio, known: set[str], clock: Clock) -> None:
+async def _gathered(radio: Messenger, known: set[str], clock: Clock) -> None:
     """Wait until all are there, or no more come."""
     present, end_ns = set(radio.alive), clock() + int((QUIET_S if radio.alive else DISCOVER_S) * 1e9)
     while not known <= radio.alive and clock() < end_ns:
@@ -86,13 +86,13 @@ def check_mounting(chain: Chain, felt: Felt) -> None:
     across = np.linalg.norm(np.cross(felt.accel_m_s2, wanted), axis=1)
     tilt = np.arctan2(across, np.sum(felt.accel_m_s2 * wanted, axis=1))
     worst = int(np.argmax(tilt))
-    if tilt[worst] > MOST_TILT_RAD:
-        raise NotTheKnownRobot(
+    if tilt[worst] > MAX_TILT_RAD:
+        raise RobotMismatch(
             f"the IMU of module {chain.serials[worst]} feels gravity {np.degrees(tilt[worst]):.0f} degrees "
             "from where the robot that is known would have it: the base stands otherwise, or a joint has "
             "lost its zero; identify it again"
         )
 
 
-def _mute(link: RobotLink) -> list[str]:
+def _mute(link: ModuleGroup) -> list[str]:
     return [serial for serial in link.serials if not link.module(serial).arrivals]

@@ -11,21 +11,21 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from coordinator.live_robot.errors import ModuleLost, RobotStopped
-from coordinator.live_robot.messenger import Clock, Post, Radio, together
-from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, RobotLink
+from coordinator.live_robot.messenger import Clock, Messenger, Post, gather_all
+from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
 from coordinator.recording.recording import Entry, Recording
-from coordinator.torque_control.gains import floating_gains, holding_gains
+from coordinator.torque_control.gains import compensation_gains, holding_gains
 from coordinator.torque_control.gravity_compensation import (
-    Floater,
-    FloatRefused,
-    FloatSettings,
+    CompensationRefused,
+    CompensationSettings,
+    GravityCompensator,
     Phase,
     Reading,
     Targets,
 )
-from coordinator.torque_control.gravity_model import KnownWeight
-from coordinator.torque_control.preconditions import Felt, check_mounting, find_known
-from coordinator.torque_control.summary import FloatSummary, FloatTally
+from coordinator.torque_control.gravity_model import GravityModel
+from coordinator.torque_control.preconditions import Felt, check_mounting, find_baseline_robot
+from coordinator.torque_control.summary import CompensationSummary, CompensationTally
 from module_agent.model.chain import Array
 from module_agent.transport.transport import Transport
 from module_agent.wire.feedback_rows import STATE_NAMES, Rows
@@ -43,14 +43,14 @@ _LET_GO = ("idle", "expired", "stopped", "fault")
 _READ = ("position_rad", "velocity_rad_s", "effort_nm")
 
 
-class FloatPlan(NamedTuple):
+class CompensationPlan(NamedTuple):
     """What a float is told. rate_hz: of the set-points. for_s: None until it is asked to end.
 
     then_hold_s: how long it is held still before it is led back to where it stood; is_led_back: whether it
     is, or let go where it is. After a limit was met it is let go where it is.
     """
 
-    settings: FloatSettings = FloatSettings()
+    settings: CompensationSettings = CompensationSettings()
     rate_hz: float = 200.0
     for_s: float | None = None
     then_hold_s: float = 1.0
@@ -61,7 +61,7 @@ class Moment(NamedTuple):
     """What is to be seen of a float at one moment."""
 
     phase: Phase
-    floated_s: float
+    compensated_s: float
     missed: int
     reading: Reading
     effort_nm: Array
@@ -79,7 +79,7 @@ class Watcher(Protocol):
         ...
 
 
-class FloatSession:
+class CompensationSession:
     """One float of the robot `name`, whose modules nobody holds yet, by `sender`; on any transport and clock.
 
     `post` runs a function on the event loop from any thread.
@@ -89,19 +89,19 @@ class FloatSession:
         self,
         transport: Transport,
         name: str,
-        weight: KnownWeight,
-        plan: FloatPlan,
+        weight: GravityModel,
+        plan: CompensationPlan,
         clock: Clock,
         post: Post,
         watcher: Watcher,
         sender: str,
     ):
         self._recording = Recording()
-        self._radio = Radio(transport, name, clock, post, self._record)
-        self._link = RobotLink(self._radio, self._recording, clock, sender)
+        self._radio = Messenger(transport, name, clock, post, self._record)
+        self._link = ModuleGroup(self._radio, self._recording, clock, sender)
         self._weight, self._plan, self._clock, self._watcher = weight, plan, clock, watcher
         self._serials = weight.chain.serials
-        self._tally = FloatTally(self._serials)
+        self._tally = CompensationTally(self._serials)
         self._asked = ""
         # How often the end was asked for, and how often as the robot was taken hold of.
         self._asks = self._asks_heard = 0
@@ -121,7 +121,7 @@ class FloatSession:
         self._asked = self._asked or why
         self._asks += 1
 
-    async def run(self) -> FloatSummary:
+    async def run(self) -> CompensationSummary:
         """Float until the plan's time is over, the end is asked for, or a limit is met; say how it went.
 
         Raises:
@@ -141,16 +141,16 @@ class FloatSession:
             return None  # counted by the recording, by reason
         return message if isinstance(message, Message) else None
 
-    async def _run(self) -> FloatSummary:
-        await find_known(self._link, self._radio, self._weight, self._clock)
+    async def _run(self) -> CompensationSummary:
+        await find_baseline_robot(self._link, self._radio, self._weight, self._clock)
         told = [self._link.info(serial) for serial in self._serials]
         stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in told)
         settings = self._plan.settings._replace(stale_s=min(stale_s, self._plan.settings.stale_s))
-        floater = Floater(self._weight, tuple(info.limits for info in told), settings)
+        floater = GravityCompensator(self._weight, tuple(info.limits for info in told), settings)
         stood = self._reading(_FELT_ROWS)
         try:
             floater.check_start(stood)
-        except FloatRefused:
+        except CompensationRefused:
             # A base that stands otherwise changes the weight too, and says more.
             check_mounting(self._weight.chain, self._felt())
             raise
@@ -158,7 +158,7 @@ class FloatSession:
             return self._tally.summary(self._asked, is_fault=False)
         streaming: asyncio.Task[None] | None = None
         try:
-            await together(self._link.acquire(serial) for serial in self._serials)
+            await gather_all(self._link.acquire(serial) for serial in self._serials)
             streaming = asyncio.create_task(self._stream(floater))
             await self._float(floater, streaming)
             await self._return(floater, stood.q_rad, streaming)
@@ -173,18 +173,19 @@ class FloatSession:
 
     # ------------------------------------------------------------------ floating
 
-    async def _float(self, floater: Floater, streaming: "asyncio.Task[None]") -> None:
+    async def _float(self, floater: GravityCompensator, streaming: "asyncio.Task[None]") -> None:
         """Set the robot free once its motors bear it, and take hold of it in the end."""
         await self._until(lambda: not floater.is_in("loading") or bool(self._asked), streaming)
         if floater.is_in("loaded") and not self._asked:
             # Not before it is held: what falls feels no gravity.
             check_mounting(self._weight.chain, self._felt())
             damping = self._plan.settings.damping_nm_s_rad
-            await together(
-                self._link.set_gains(s, floating_gains(self._link.kind(s), damping)) for s in self._serials
+            await gather_all(
+                self._link.set_gains(s, compensation_gains(self._link.kind(s), damping))
+                for s in self._serials
             )
             self._is_under_torque = True
-            floater.let_go(self._now_s())
+            floater.release(self._now_s())
             await self._until(lambda: not floater.is_in("freeing") or bool(self._asked), streaming)
             if floater.is_in("floating"):
                 self._watcher.note("it floats: lead it by hand")
@@ -194,10 +195,12 @@ class FloatSession:
         self._watcher.note(f"it is held: {floater.why}")
         await self._until(lambda: floater.is_in("held"), streaming)
         if self._is_under_torque:
-            await together(self._link.set_gains(s, holding_gains(self._link.kind(s))) for s in self._serials)
+            await gather_all(
+                self._link.set_gains(s, holding_gains(self._link.kind(s))) for s in self._serials
+            )
 
-    def _is_over(self, floater: Floater) -> bool:
-        over = self._plan.for_s is not None and self._tally.floated_s >= self._plan.for_s
+    def _is_over(self, floater: GravityCompensator) -> bool:
+        over = self._plan.for_s is not None and self._tally.compensated_s >= self._plan.for_s
         return over or bool(self._asked) or not floater.is_in("floating")
 
     async def _until(self, condition: Callable[[], bool], streaming: "asyncio.Task[None]") -> None:
@@ -207,7 +210,7 @@ class FloatSession:
             self._link.check()
             await asyncio.sleep(POLL_S)
 
-    async def _stream(self, floater: Floater) -> None:
+    async def _stream(self, floater: GravityCompensator) -> None:
         """Send set-points at their rate, renew the leases, and keep no more of the past than it takes."""
         period_s = 1.0 / self._plan.rate_hz
         due_s = forgot_s = self._now_s()
@@ -228,14 +231,16 @@ class FloatSession:
                 due_s += late_s
             await asyncio.sleep(max(0.0, due_s - self._now_s()))
 
-    def _step(self, floater: Floater, now_s: float) -> None:
+    def _step(self, floater: GravityCompensator, now_s: float) -> None:
         reading = self._reading()
         targets = floater.step(now_s, reading)
         self._send(targets)
         if floater.phase == "floating":
             self._tally.add(now_s, reading.q_rad, reading.qd_rad_s, targets.effort_nm)
         tally = self._tally
-        self._watcher.moment(Moment(floater.phase, tally.floated_s, tally.missed, reading, targets.effort_nm))
+        self._watcher.moment(
+            Moment(floater.phase, tally.compensated_s, tally.missed, reading, targets.effort_nm)
+        )
 
     def _send(self, targets: Targets) -> None:
         for k, serial in enumerate(self._serials):
@@ -262,7 +267,9 @@ class FloatSession:
 
     # ------------------------------------------------------------------ the end
 
-    async def _return(self, floater: Floater, stood_rad: Array, streaming: "asyncio.Task[None]") -> None:
+    async def _return(
+        self, floater: GravityCompensator, stood_rad: Array, streaming: "asyncio.Task[None]"
+    ) -> None:
         """Hold the robot still, and lead it back to where it stood, where its motors were off before.
 
         A robot that met a limit met perhaps somebody, and what lies on its way back is not known: it stays.

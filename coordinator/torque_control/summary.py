@@ -19,7 +19,7 @@ class JointSummary(NamedTuple):
     effort_most_nm: float
 
 
-class FloatSummary(NamedTuple):
+class CompensationSummary(NamedTuple):
     """How a float went: why it ended, and whether by a limit. missed: of `sent`, so many more were due.
 
     joints is empty if the robot was not set free.
@@ -27,13 +27,13 @@ class FloatSummary(NamedTuple):
 
     why: str
     is_fault: bool
-    floated_s: float
+    compensated_s: float
     sent: int
     missed: int
     joints: tuple[JointSummary, ...]
 
 
-class FloatTally:
+class CompensationTally:
     """Adds up a float of n joints, moment by moment."""
 
     def __init__(self, serials: tuple[str, ...]):
@@ -45,7 +45,7 @@ class FloatTally:
         self.sent = self.missed = 0
 
     @property
-    def floated_s(self) -> float:
+    def compensated_s(self) -> float:
         """For how long it has floated so far."""
         return 0.0 if self._began is None else self._last[0] - self._began[0]
 
@@ -60,10 +60,10 @@ class FloatTally:
         self._squares = self._squares + effort_nm**2
         self._count += 1
 
-    def summary(self, why: str, is_fault: bool) -> FloatSummary:
+    def summary(self, why: str, is_fault: bool) -> CompensationSummary:
         """Return what it came to."""
         if self._began is None:
-            return FloatSummary(why, is_fault, 0.0, self.sent, self.missed, ())
+            return CompensationSummary(why, is_fault, 0.0, self.sent, self.missed, ())
         columns = (
             self._began[1],
             self._last[1],
@@ -76,4 +76,4 @@ class FloatTally:
             JointSummary(serial, *(float(column[k]) for column in columns))
             for k, serial in enumerate(self._serials)
         )
-        return FloatSummary(why, is_fault, self.floated_s, self.sent, self.missed, joints)
+        return CompensationSummary(why, is_fault, self.compensated_s, self.sent, self.missed, joints)

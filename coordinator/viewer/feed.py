@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from coordinator.identification.identified import HeldOutMotion
-from coordinator.identification.preview import RobotSoFar
+from coordinator.identification.preview import Preview
 from coordinator.kinematics.assembly import ChainFit
 from coordinator.kinematics.frames import axis_angles
 from coordinator.kinematics.null_space import Unresolved
@@ -23,7 +23,7 @@ from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.messages import Feedback, Message, Status
 
 
-class Beside(Protocol):
+class Overlay(Protocol):
     """Draws beside what is identified: the run hands out its viewer and what it shows, and takes nothing."""
 
     def met(self, viewer: Viewer, t_ns: int) -> None:
@@ -86,7 +86,9 @@ class ViewerFeed:
     knows besides.
     """
 
-    def __init__(self, viewer: Viewer, recording: Recording, pace: Pace = LIVE, beside: Beside | None = None):
+    def __init__(
+        self, viewer: Viewer, recording: Recording, pace: Pace = LIVE, beside: Overlay | None = None
+    ):
         self._viewer = viewer
         self._recording = recording
         self._beside = beside
@@ -233,7 +235,7 @@ class ViewerFeed:
                 shown = _Shown(LOCAL, observer, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
                 self._show(self.since_start(session_ns), shown)
 
-    def so_far(self, session_ns: int, found: RobotSoFar) -> None:
+    def so_far(self, session_ns: int, found: Preview) -> None:
         """Show the robot as far as it is known, and the estimates of links that nothing can come between."""
         drawn = side_by_side(found.fit.chain)
         self._draw(session_ns, found.fit._replace(chain=drawn))

@@ -110,7 +110,9 @@ class Recorder:
             progress.set_time(self._stream, t)
             progress.log_truth(self._stream, name, serial, value)
 
-    def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.Look) -> None:
+    def chain(
+        self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.SceneStyle
+    ) -> None:
         """Draw the robot from now on, in the posture it was last seen in; at q = 0 before the first pose."""
         self._know(chain.serials)
         scene = robot_scene.build_scene(chain, self._types, self._colours(chain.serials), sigma_m, look)

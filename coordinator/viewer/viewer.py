@@ -119,7 +119,7 @@ class Viewer:
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None = None) -> None:
         """Draw the robot as identified, with (n,) standard deviations of its joints' places [m]."""
-        self._chain(t_ns, chain, sigma_m, robot_scene.ESTIMATE_LOOK)
+        self._chain(t_ns, chain, sigma_m, robot_scene.ESTIMATE_STYLE)
 
     def true_chain(self, t_ns: int, chain: Chain, types: Mapping[str, str] | None = None) -> None:
         """Draw the robot as it is, in grey; only the simulator's tools know it.
@@ -128,7 +128,7 @@ class Viewer:
         """
         if types is not None:
             self._submit(partial(self._recorder.name_types, dict(types)), essential=True)
-        self._chain(t_ns, chain, None, robot_scene.TRUTH_LOOK)
+        self._chain(t_ns, chain, None, robot_scene.TRUTH_STYLE)
 
     def pose(self, t_ns: int, q_rad: ArrayLike) -> None:
         """Turn the robot to `q_rad` (n,), in the order of the chain; at most 30 times a second are shown."""
@@ -187,7 +187,7 @@ class Viewer:
             viewer_process.stop(self._opened.web_server)
 
     def _chain(
-        self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.Look
+        self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.SceneStyle
     ) -> None:
         sigma = None if sigma_m is None else tuple(float(s) for s in sigma_m)
         self._submit(partial(self._recorder.chain, t_ns, chain, sigma, look), essential=True)

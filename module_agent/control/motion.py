@@ -13,17 +13,17 @@ from module_agent.wire.refusal import Refusal, WireError
 
 SAMPLE = np.dtype("<f4")
 # What `EffortProfile` takes.
-MOST_SAMPLES = 800
-LEAST_PERIOD_NS = 1_000_000
+MAX_SAMPLES = 800
+MIN_PERIOD_NS = 1_000_000
 # A motion of a few hertz is then interpolated to better than 0.2 %: (2 pi f h)^2 / 8 at 2 Hz.
 USUAL_PERIOD_NS = 10_000_000
 
 
 def profile_period_ns(total_s: float) -> int:
     """Return how far apart the samples of a motion are: 10 ms, more for a motion over 8 s."""
-    fitting_ns = -(-round(total_s * 1e9) // (MOST_SAMPLES - 1))
+    fitting_ns = -(-round(total_s * 1e9) // (MAX_SAMPLES - 1))
     # Whole milliseconds, which are a module's ticks.
-    return max(USUAL_PERIOD_NS, -(-fitting_ns // LEAST_PERIOD_NS) * LEAST_PERIOD_NS)
+    return max(USUAL_PERIOD_NS, -(-fitting_ns // MIN_PERIOD_NS) * MIN_PERIOD_NS)
 
 
 def effort_profile(effort_nm: ArrayLike, period_ns: int) -> EffortProfile:
@@ -33,9 +33,9 @@ def effort_profile(effort_nm: ArrayLike, period_ns: int) -> EffortProfile:
         ValueError: not 2 to 800 finite numbers in a row, or a period outside 1 ms to 1 s.
     """
     values = np.asarray(effort_nm, dtype=float)
-    if values.ndim != 1 or not 2 <= values.size <= MOST_SAMPLES or not np.isfinite(values).all():
+    if values.ndim != 1 or not 2 <= values.size <= MAX_SAMPLES or not np.isfinite(values).all():
         raise ValueError(
-            f"efforts of shape {values.shape}; a profile is 2 to {MOST_SAMPLES} finite numbers in a row"
+            f"efforts of shape {values.shape}; a profile is 2 to {MAX_SAMPLES} finite numbers in a row"
         )
     return EffortProfile(period_ns=period_ns, samples=values.astype(SAMPLE).tobytes())
 

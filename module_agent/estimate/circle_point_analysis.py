@@ -22,9 +22,9 @@ from module_agent.wire.messages import CircleEstimate, Vector3
 
 Mask = NDArray[np.bool_]
 
-LEAST_SAMPLES = 3 * TAPS
-LEAST_RATE_RAD_S = 0.02  # 15 times the gyro's noise; slower motions say nothing about an axis
-LEAST_ACCELERATION_RAD_S2 = 0.1  # 100 mm give 0.01 m/s^2, below the noise of one sample
+MIN_SAMPLES = 3 * TAPS
+MIN_RATE_RAD_S = 0.02  # 15 times the gyro's noise; slower motions say nothing about an axis
+MIN_ACCELERATION_RAD_S2 = 0.1  # 100 mm give 0.01 m/s^2, below the noise of one sample
 QUIET_S = (
     0.1  # the window of 5.6 s leaves 2 % of the amplitude in its first 0.1 s, 0.4 mrad of angle at 0.2 rad
 )
@@ -97,17 +97,17 @@ def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
     """
     _enough(constant.t_s.size, "constant motion")
     speed = np.abs(constant.velocity_rad_s)
-    if speed.max() < LEAST_RATE_RAD_S:
+    if speed.max() < MIN_RATE_RAD_S:
         raise ValueError(
             f"the joint turned at {speed.max():.2g} rad/s at most in the constant motion, "
-            f"at least {LEAST_RATE_RAD_S} is needed for its axis"
+            f"at least {MIN_RATE_RAD_S} is needed for its axis"
         )
     steady = speed >= 0.5 * speed.max()
     sign = np.sign(constant.velocity_rad_s[steady])
     gyro = sign[:, None] * (constant.gyro_rad_s[steady] - rest.gyro_offset_rad_s)
     mean = gyro.mean(axis=0)
     rate = float(np.linalg.norm(mean))
-    if rate < 0.25 * LEAST_RATE_RAD_S:
+    if rate < 0.25 * MIN_RATE_RAD_S:
         raise ValueError(
             f"the gyro saw {rate:.2g} rad/s while the joint turned: this IMU does not move with it"
         )
@@ -186,10 +186,10 @@ def angular_acceleration(motion: AlignedMotion, taps: int = TAPS) -> Array:
     """
     alpha = gaussian_filter(np.gradient(motion.velocity_rad_s, motion.t_s), taps)
     rms = float(np.sqrt(np.mean(alpha**2)))
-    if rms < LEAST_ACCELERATION_RAD_S2:
+    if rms < MIN_ACCELERATION_RAD_S2:
         raise ValueError(
             f"the joint accelerated by {rms:.2g} rad/s^2 rms in the windowed sine motion, "
-            f"at least {LEAST_ACCELERATION_RAD_S2} is needed for its radial distance"
+            f"at least {MIN_ACCELERATION_RAD_S2} is needed for its radial distance"
         )
     return alpha
 
@@ -269,8 +269,8 @@ def _variance_of_mean(series: Array) -> float:
 
 
 def _enough(samples: int, what: str) -> None:
-    if samples < LEAST_SAMPLES:
-        raise ValueError(f"{samples} samples of the {what}: at least {LEAST_SAMPLES} are needed")
+    if samples < MIN_SAMPLES:
+        raise ValueError(f"{samples} samples of the {what}: at least {MIN_SAMPLES} are needed")
 
 
 def _frozen(values: Array) -> Array:

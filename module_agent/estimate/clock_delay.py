@@ -19,7 +19,7 @@ STEPS = 8
 # Below this the gyro does not follow the joint, and the best of many poor delays would mean nothing. Reaction
 # motion of a held joint follows it well and is kept: motion_detection tells it from being carried by its
 # size.
-LEAST_EXPLAINED = 0.25
+MIN_EXPLAINED = 0.25
 
 
 class ClockDelay(NamedTuple):
@@ -64,7 +64,7 @@ def clock_delay(
     delay, sigma = _refine(gyro, at, rate.spline, float(grid[np.argmax(scores)]))
     delay = min(max(delay, -search_s), search_s)
     explained = _explained(gyro, rate.spline(at - delay))
-    if explained < LEAST_EXPLAINED:
+    if explained < MIN_EXPLAINED:
         return ClockDelay(rough_offset_ns, 0.0, float("inf"), explained, found=False)
     return ClockDelay(rough_offset_ns + round(1e9 * delay), delay, sigma, explained, found=True)
 

@@ -47,7 +47,7 @@ BEARING, LATE, PIVOT, HEIGHT = 30, 31, slice(32, 34), 34
 DELAY = 35
 ALONG = 6  # gravity along the axis
 
-_LEAST_DISTANCE_M = 0.05  # where gravity's pull over the distance would grow beyond all bounds
+_MIN_DISTANCE_M = 0.05  # where gravity's pull over the distance would grow beyond all bounds
 # Readings are polynomials of what these are steps of, so differences are as good as derivatives.
 _STEPS = {COMPLIANCE: 1e-7, HINGE: 1e-2}
 _BASE_STEPS = {BEARING: 1e-4, PIVOT.start: 1e-2, PIVOT.start + 1: 1e-2, HEIGHT: 1e-2}
@@ -177,7 +177,7 @@ def _load(values: Array, shake: Array | None, p: Array) -> list[Array]:
     """
     rate, acceleration, jerk, snap, fifth, sixth, cosine, sine, squared = values.T
     (g1, g2, _), (r1, r2), c = p[GRAVITY], p[RADIAL], p[COMPLIANCE]
-    square = max(r1**2 + r2**2, _LEAST_DISTANCE_M**2)
+    square = max(r1**2 + r2**2, _MIN_DISTANCE_M**2)
     even, odd = (r1 * g2 - r2 * g1) / square, -(r1 * g1 + r2 * g2) / square
     pull, slope = even * cosine + odd * sine, odd * cosine - even * sine
     loads = [

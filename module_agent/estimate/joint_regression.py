@@ -33,7 +33,7 @@ from module_agent.estimate.joint_model import (
     felt_columns,
     predict,
 )
-from module_agent.estimate.observed_motion import SeenMotion
+from module_agent.estimate.observed_motion import ObservedMotion
 from module_agent.estimate.smoothing import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
 from module_agent.estimate.windows import Array
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
@@ -44,9 +44,9 @@ STRIDE = 7
 ITERATIONS = 12
 SETTLED = 0.03  # of every parameter's deviation, were it the only one
 BIAS_DRIFT_RAD_S = 1e-4  # of a gyro, within the minute between rest and motion
-LEAST_CARRIED = 0.25
+MIN_CARRIED = 0.25
 # With less of gravity across the axis than this, two IMUs do not agree on directions across it.
-LEAST_ACROSS_M_S2 = 1.0
+MIN_ACROSS_M_S2 = 1.0
 PINNED = 1e6  # the weight of a parameter that is to stay as it is
 
 
@@ -145,7 +145,7 @@ class _Equations(NamedTuple):
 
 
 def regress_joint(
-    motions: Sequence[SeenMotion], rest: RestReading | None, knowledge: ImuKnowledge = CALIBRATED
+    motions: Sequence[ObservedMotion], rest: RestReading | None, knowledge: ImuKnowledge = CALIBRATED
 ) -> JointRegression:
     """Fit the model of `joint_model` to all motions of one joint, and what the IMU read at rest.
 
@@ -158,7 +158,7 @@ def regress_joint(
 
 
 def distance_bound_m(
-    motions: Sequence[SeenMotion],
+    motions: Sequence[ObservedMotion],
     rest: RestReading | None,
     knowledge: ImuKnowledge,
     noise: tuple[float, float],
@@ -203,7 +203,7 @@ def _inverse(normal: Array) -> Array:
 
 
 def _problem(
-    motions: Sequence[SeenMotion], rest: RestReading | None, knowledge: ImuKnowledge
+    motions: Sequence[ObservedMotion], rest: RestReading | None, knowledge: ImuKnowledge
 ) -> tuple[_Problem, _State]:
     """Return the problem, and a first guess of its solution."""
     if not motions:
@@ -215,7 +215,7 @@ def _problem(
     untold_m = 0.0
     if len(bases) == len(motions) and any(base.shakes for base in bases):
         across, housing = guess.values[GRAVITY][:2], bases[-1].gravity
-        if min(np.hypot(*across), np.hypot(*housing)) < LEAST_ACROSS_M_S2:
+        if min(np.hypot(*across), np.hypot(*housing)) < MIN_ACROSS_M_S2:
             # The longest motion tells best; half of a push of unknown direction is along the radius.
             untold_m = max(bases, key=lambda base: base.end_s - base.start_s).push_m / np.sqrt(2.0)
             bases = [base.about_the_axis() for base in bases]
@@ -229,7 +229,7 @@ def _problem(
     return _Problem(tuple(rows), known, rest, float(untold_m)), guess
 
 
-def _rows(seen: SeenMotion) -> _Rows:
+def _rows(seen: ObservedMotion) -> _Rows:
     since_ns = seen.imu.t_ns - seen.offset_ns - seen.joint.origin_ns
     t_s = since_ns.astype(np.float64) * 1e-9
     # A little is kept for the delay to move in.
@@ -251,7 +251,7 @@ def _first_guess(rows: Sequence[_Rows], known: Beliefs) -> _State:
     one = np.ones_like(rate)
     gyro = np.linalg.lstsq(np.stack([rate, one], axis=1), readings[:, :3], rcond=None)[0]
     size = float(np.linalg.norm(gyro[0]))
-    if size < LEAST_CARRIED:
+    if size < MIN_CARRIED:
         raise ValueError(
             f"the gyro turned by {size:.2g} of what the joint did: this IMU does not move with it"
         )

@@ -10,7 +10,7 @@ from module_agent.estimate.smoothing import SMOOTH_S, SmoothImu, SmoothMotion, s
 from module_agent.estimate.windows import ImuWindow, JointWindow
 
 
-class SeenMotion(NamedTuple):
+class ObservedMotion(NamedTuple):
     """A joint's motion and what an IMU saw of it: t_imu = t_joint + `offset_ns` and a delay to be found.
 
     base: how what carries the joint shook meanwhile, None where nobody saw it.
@@ -37,7 +37,7 @@ class MotionWindows(NamedTuple):
     offset_ns: int
 
 
-def seen_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_S) -> list[SeenMotion]:
+def observed_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_S) -> list[ObservedMotion]:
     """Put the motions of one joint behind the low-pass.
 
     Raises:
@@ -49,7 +49,7 @@ def seen_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_S) -
     longest = max((window.carrier for window in windows), key=lambda imu: imu.t_ns.size)
     still = np.hstack([longest.gyro_rad_s, longest.accel_m_s2]).mean(axis=0)
     return [
-        SeenMotion(
+        ObservedMotion(
             smooth_imu(window.imu, smooth_s),
             SmoothMotion(window.joint, smooth_s),
             window.offset_ns,

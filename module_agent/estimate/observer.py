@@ -17,7 +17,7 @@ from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.joint_model import AS_DELIVERED, ImuKnowledge
 from module_agent.estimate.joint_regression import regress_joint, regression_estimate
 from module_agent.estimate.motion_detection import detect_motion
-from module_agent.estimate.observed_motion import MotionWindows, seen_motions
+from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, imu_window, joint_window
 from module_agent.firmware.feedback import History
 from module_agent.peers.motion_listener import JointMotion
@@ -128,7 +128,7 @@ class Observer:
 
     def _regress(self, circle: CircleEstimate, windows: list[MotionWindows], still: RestReading) -> _Local:
         try:
-            found = regress_joint(seen_motions(windows), still, self.knowledge)
+            found = regress_joint(observed_motions(windows), still, self.knowledge)
         except ValueError as error:
             return _Local(circle, None, f"no joint regression: {error}")
         delay_s = circle.delay_s + found.delays_s[-1]

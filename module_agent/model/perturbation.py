@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from module_agent.model.chain import Array, Chain
 
 
-def apply_increment(chain: Chain, delta: ArrayLike) -> Chain:
+def apply_perturbation(chain: Chain, delta: ArrayLike) -> Chain:
     """Return the chain with every module displaced by its twist in `delta` (6 n,), arrays read-only.
 
     Raises:
@@ -34,7 +34,7 @@ def apply_increment(chain: Chain, delta: ArrayLike) -> Chain:
     )
 
 
-def increments_between(before: Chain, after: Chain) -> Array:
+def perturbation_between(before: Chain, after: Chain) -> Array:
     """Return the twists (6 n,) that displace the housings of one chain to the other's."""
     moved = RigidTransform.from_matrix(after.imu_home) * RigidTransform.from_matrix(before.imu_home).inv()
     return np.asarray(moved.as_exp_coords()).reshape(-1)

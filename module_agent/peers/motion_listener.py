@@ -70,7 +70,7 @@ class _Track:
             self.offset_ns[own] = min(self.offset_ns.get(own, offset), offset)
 
 
-class Neighbours:
+class MotionListener:
     """Collects exploration motions of all joints; `own_ns` maps own serials to their clocks now.
 
     `restless` says whether `poll` may have anything to say: something was heard since, or rows are missing.

@@ -20,8 +20,8 @@ from module_agent.wire.row_log import RowLog
 
 GIVE_UP_NS = 30_000_000_000
 # Of all motions of all modules together: 20 bytes each.
-MOST_ROWS = 4_000_000
-MOST_MOTIONS = 256
+MAX_ROWS = 4_000_000
+MAX_MOTIONS = 256
 QUESTIONS_AT_ONCE = 8
 
 
@@ -101,7 +101,7 @@ class MotionCollection:
     def _forget(self) -> None:
         """Drop the oldest motions while there are more, or more rows, than are kept."""
         rows = sum(map(_rows, self._motions.values()))
-        while len(self._motions) > MOST_MOTIONS or (len(self._motions) > 1 and rows > MOST_ROWS):
+        while len(self._motions) > MAX_MOTIONS or (len(self._motions) > 1 and rows > MAX_ROWS):
             oldest = self._motions.pop(next(iter(self._motions)))
             rows -= _rows(oldest)
             for part in oldest.values():

@@ -76,22 +76,22 @@ def clocks_of(parts: Sequence[ClockPart]) -> list[ClockMap]:
 
 _HEAD = struct.Struct("<3IQd")
 # 64 bodies, and half as many further columns.
-MOST_COLUMNS = 960
-MOST_BYTES = _HEAD.size + 2 * MOST_COLUMNS + 8 * (MOST_COLUMNS * (MOST_COLUMNS + 1) // 2 + MOST_COLUMNS)
+MAX_COLUMNS = 960
+MAX_BYTES = _HEAD.size + 2 * MAX_COLUMNS + 8 * (MAX_COLUMNS * (MAX_COLUMNS + 1) // 2 + MAX_COLUMNS)
 
 
 def pack(information: JointInformation) -> bytes:
     """Return the bytes of what `information.gather_joint` or `merge_joint` has returned.
 
     Raises:
-        ValueError: more than `MOST_COLUMNS` columns, or rows that are not triangular.
+        ValueError: more than `MAX_COLUMNS` columns, or rows that are not triangular.
     """
     rows, columns = information.r.shape
     felt = np.flatnonzero(information.r.any(axis=0))
     kept = information.r[:, felt]
-    if columns > MOST_COLUMNS or rows > felt.size or np.tril(kept, -1).any():
+    if columns > MAX_COLUMNS or rows > felt.size or np.tril(kept, -1).any():
         raise ValueError(
-            f"{rows} rows of {columns} columns: triangular ones of at most {MOST_COLUMNS} columns are packed"
+            f"{rows} rows of {columns} columns: triangular ones of at most {MAX_COLUMNS} columns are packed"
         )
     upper = kept[np.triu_indices(rows, 0, felt.size)]
     head = _HEAD.pack(columns, rows, felt.size, information.samples, information.rest)
@@ -108,9 +108,9 @@ def unpack(block: bytes) -> JointInformation:
     if len(block) < _HEAD.size:
         raise ValueError(f"{len(block)} bytes of information, the head alone has {_HEAD.size}")
     columns, rows, felt_count, samples, rest = _HEAD.unpack_from(block)
-    if not rows <= felt_count <= columns <= MOST_COLUMNS:
+    if not rows <= felt_count <= columns <= MAX_COLUMNS:
         raise ValueError(
-            f"{rows} rows in {felt_count} of {columns} columns: at most {MOST_COLUMNS}, and rows in as many"
+            f"{rows} rows in {felt_count} of {columns} columns: at most {MAX_COLUMNS}, and rows in as many"
         )
     upper = felt_count * rows - rows * (rows - 1) // 2
     due = _HEAD.size + 2 * felt_count + 8 * (upper + rows)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol, TypeVar
 
 from module_agent.peers.row_collection import MotionCollection, OwnRows, Track
-from module_agent.wire.information_messages import MOST_PART_BYTES, CollectRequest, InformationRequest
+from module_agent.wire.information_messages import MAX_PART_BYTES, CollectRequest, InformationRequest
 from module_agent.wire.refusal import Refusal, WireError
 
 T = TypeVar("T")
@@ -77,7 +77,7 @@ class InformationService:
         total = len(result.block)
         if request.offset >= total:
             raise WireError(Refusal.RANGE, f"a part from byte {request.offset} on, there are {total}")
-        part = result.block[request.offset : request.offset + MOST_PART_BYTES]
+        part = result.block[request.offset : request.offset + MAX_PART_BYTES]
         numbers = tuple(sorted({motion.motion_id for motion in request.motions}))
         return Answer(digest, numbers, total, request.offset, part)
 

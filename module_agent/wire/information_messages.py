@@ -11,15 +11,15 @@ from pydantic_core import PydanticCustomError
 from module_agent.wire.codec import encode
 from module_agent.wire.messages import Counter, Message, Name, Part, Vector3
 
-MOST_MODULES = 64
-MOST_PART_BYTES = 65_536
+MAX_MODULES = 64
+MAX_PART_BYTES = 65_536
 # A module's part in `ChainPart.geometry`: axis, point and IMU's pose, row by row.
 GEOMETRY_BYTES = 8 * (3 + 3 + 16)
 
 # Of a module in one motion: 400 s at 250 Hz.
 LONGEST_ROWS = 100_000
 # Samples of all motions together, times modules squared, to which the time of computing goes: under a minute.
-MOST_WORK = 200_000_000
+MAX_WORK = 200_000_000
 # 85 years, of Unix time until 2055: sums of three such times, and a tenth for the drift, fit in 64 bits.
 FARTHEST_NS = 2_700_000_000_000_000_000
 FARTHEST_OFFSET_NS = 2.7e18
@@ -58,7 +58,7 @@ class CollectRequest(Message):
 
     sender: Name
     motion_id: Counter
-    rows: Annotated[tuple[RowRange, ...], Field(min_length=1, max_length=MOST_MODULES)]
+    rows: Annotated[tuple[RowRange, ...], Field(min_length=1, max_length=MAX_MODULES)]
 
     @model_validator(mode="after")
     def _check_serials(self) -> Self:
@@ -72,10 +72,10 @@ class CollectRequest(Message):
 class ChainPart(Part):
     """A `dynamics.chain.Chain` of n modules; `geometry` is one block of little-endian doubles, (n, 22)."""
 
-    serials: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST_MODULES)]
-    parent: tuple[Annotated[int, Field(ge=-1, lt=MOST_MODULES)], ...]
+    serials: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MAX_MODULES)]
+    parent: tuple[Annotated[int, Field(ge=-1, lt=MAX_MODULES)], ...]
     reversed: tuple[bool, ...]
-    geometry: Annotated[bytes, Field(max_length=MOST_MODULES * GEOMETRY_BYTES)]
+    geometry: Annotated[bytes, Field(max_length=MAX_MODULES * GEOMETRY_BYTES)]
     gravity_m_s2: Vector3
 
 
@@ -106,7 +106,7 @@ class InformationRequest(Message):
 
     sender: Name
     chain: ChainPart
-    clocks: Annotated[tuple[ClockPart, ...], Field(min_length=1, max_length=MOST_MODULES)]
+    clocks: Annotated[tuple[ClockPart, ...], Field(min_length=1, max_length=MAX_MODULES)]
     motions: Annotated[tuple[SpanPart, ...], Field(min_length=1, max_length=64)]
     step_ns: Annotated[int, Field(ge=1_000_000, le=1_000_000_000)]
     cutoff_hz: Annotated[float, Field(ge=0.01, le=500.0)]
@@ -115,9 +115,9 @@ class InformationRequest(Message):
     @model_validator(mode="after")
     def _check_work(self) -> Self:
         samples, modules = sum(motion.samples for motion in self.motions), len(self.chain.serials)
-        if samples * modules**2 > MOST_WORK:
+        if samples * modules**2 > MAX_WORK:
             raise out_of_range(
-                f"{samples} samples of {modules} modules: at most {MOST_WORK // modules**2} are computed with"
+                f"{samples} samples of {modules} modules: at most {MAX_WORK // modules**2} are computed with"
             )
         return self
 
@@ -137,4 +137,4 @@ class Information(Message):
     motion_ids: Annotated[tuple[Counter, ...], Field(max_length=64)]
     total_bytes: Annotated[int, Field(gt=0, le=4_194_304)]
     offset: Counter
-    part: Annotated[bytes, Field(max_length=MOST_PART_BYTES)]
+    part: Annotated[bytes, Field(max_length=MAX_PART_BYTES)]

@@ -42,7 +42,7 @@ SPRING_LOSS_S = 3e-3
 STOP_NM_RAD = 2000.0
 STOP_LOSS_S = 2e-3
 # A gear that loses nearly all still has to turn.
-_LEAST_EFFICIENCY = 0.05
+_MIN_EFFICIENCY = 0.05
 
 
 class Power(NamedTuple):
@@ -209,7 +209,7 @@ def _module_records(
     records: kernel.Records = np.zeros(len(types), kernel.MODULE)
     records["resistance_ohm"] = variation.resistance * [m.resistance_ohm for m in motors]
     records["per_amp_nm"] = variation.motor * gear * [m.back_emf_v_s_rad for m in motors]
-    records["loss"] = 1.0 - np.maximum(efficiency, _LEAST_EFFICIENCY)
+    records["loss"] = 1.0 - np.maximum(efficiency, _MIN_EFFICIENCY)
     records["coulomb_nm"] = friction * [m.coulomb_nm for m in motors]
     records["viscous_nm_s_rad"] = friction * [m.viscous_nm_s_rad for m in motors]
     records["rotor_kg_m2"] = gear**2 * [m.rotor_inertia_kg_m2 for m in motors]

@@ -92,7 +92,7 @@ def write_results(path: Path, results: Results) -> None:
 
 
 # A pipe has no width; a table cut short in it would be of no use.
-_LEAST_WIDTH = 150
+_MIN_WIDTH = 150
 
 
 def table(rows: Sequence[Row], title: str) -> Table:
@@ -116,7 +116,7 @@ def print_rows(rows: Sequence[Row], title: str) -> None:
     """Print the table on standard output; with FORCE_COLOR set the colours go through a pipe too."""
     console = Console(highlight=False)
     if not sys.stdout.isatty():
-        console.width = max(console.width, _LEAST_WIDTH)
+        console.width = max(console.width, _MIN_WIDTH)
     console.print(table(rows, title))
 
 

@@ -20,7 +20,7 @@ from sim.thesis.amplitude_sweep import Series, Trial, repeat_series, run_all, sw
 from sim.thesis.published import AMPLITUDES_RAD, LENGTHS_MM, TRIALS
 
 T = TypeVar("T", int, float)
-_MOST_AMPLITUDE_RAD = 0.5
+_MAX_AMPLITUDE_RAD = 0.5
 
 
 def amplitudes(
@@ -55,8 +55,8 @@ def amplitudes(
         amplitudes,
         "--amplitudes",
         float,
-        lambda value: 0.0 < value <= _MOST_AMPLITUDE_RAD,
-        f"more than 0 and at most {_MOST_AMPLITUDE_RAD} rad",
+        lambda value: 0.0 < value <= _MAX_AMPLITUDE_RAD,
+        f"more than 0 and at most {_MAX_AMPLITUDE_RAD} rad",
     )
     series = sweep_series(arms, sizes, rigs, seed, choice)
     if trials:

@@ -21,11 +21,11 @@ from sim.benchmark.cases.monitoring import (
     ARM,
     Alarms,
     Found,
+    MonitoringTrial,
     Subject,
-    WatchTrial,
     confusion,
     false_alarms,
-    watch_trial,
+    monitoring_trial,
 )
 from sim.benchmark.workers import run_trials
 from sim.commands.options import Seed, fail
@@ -67,7 +67,7 @@ def watching(
     else:
         after_s, stretches = AFTER_S, [_STRETCH_S] * max(1, round(3600.0 * hours / _STRETCH_S))
     found = _run(subject, trials, after_s, stretches, processes or os.cpu_count() or 1)
-    happened = [one for one in found if isinstance(one, WatchTrial)]
+    happened = [one for one in found if isinstance(one, MonitoringTrial)]
     quiet = [one for one in found if isinstance(one, Alarms)]
     alarms = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
     print_table(confusion_table(happened))
@@ -84,7 +84,7 @@ def watching(
             fail(f"cannot write {json_file}: {error.strerror or error}", EXIT_FAILED)
 
 
-def confusion_table(trials: Sequence[WatchTrial]) -> Table:
+def confusion_table(trials: Sequence[MonitoringTrial]) -> Table:
     """Return what happened, by what the watch took it for."""
     counted = confusion(trials)
     columns: tuple[Found, ...] = ("nothing", *KINDS)
@@ -96,7 +96,7 @@ def confusion_table(trials: Sequence[WatchTrial]) -> Table:
     return table
 
 
-def size_table(trials: Sequence[WatchTrial]) -> Table:
+def size_table(trials: Sequence[MonitoringTrial]) -> Table:
     """Return how soon things were said, and how large they were said to be."""
     table = Table(
         "happened",
@@ -120,7 +120,7 @@ def size_table(trials: Sequence[WatchTrial]) -> Table:
     return table
 
 
-def summary(trials: Sequence[WatchTrial]) -> dict[Kind, dict[str, Any]]:
+def summary(trials: Sequence[MonitoringTrial]) -> dict[Kind, dict[str, Any]]:
     """Return the figures of every kind; None where there is nothing to measure."""
     found: dict[Kind, dict[str, Any]] = {}
     for kind in _KINDS:
@@ -144,7 +144,7 @@ def summary(trials: Sequence[WatchTrial]) -> dict[Kind, dict[str, Any]]:
     return found
 
 
-def figures(trials: Sequence[WatchTrial], alarms: Alarms) -> dict[str, object]:
+def figures(trials: Sequence[MonitoringTrial], alarms: Alarms) -> dict[str, object]:
     """Return everything as it stands in JSON."""
     return {
         "confusion": confusion(trials),
@@ -168,14 +168,14 @@ def _subject(robot: str, noise: str, seed: int) -> Subject:
 
 def _run(
     subject: Subject, trials: int, after_s: float, stretches: Sequence[float], processes: int
-) -> list[WatchTrial | Alarms]:
+) -> list[MonitoringTrial | Alarms]:
     # Processes that share the cores already must not each start as many threads; they inherit this.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for number in SIGNALS:
         signal.signal(number, signal.default_int_handler)
     work = [
-        Trial(watch_trial, (kind, day, subject, after_s), _COST_SHARE * (after_s + 10.0))
+        Trial(monitoring_trial, (kind, day, subject, after_s), _COST_SHARE * (after_s + 10.0))
         for kind in _KINDS
         for day in range(trials)
     ]

@@ -157,7 +157,7 @@ def run(
                 network or found.network,
                 choice.of(found),
                 planned,
-                refined_looks=REFINED_LOOKS,
+                refined_previews=REFINED_LOOKS,
                 pushes=pushed,
             ),
             quiet,

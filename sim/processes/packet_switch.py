@@ -14,7 +14,7 @@ from module_agent.network_emulation.profile import NetworkProfile, Receiver
 _COORDINATOR = 0
 _IPV4 = 4
 _DESTINATION = slice(16, 20)
-_LEAST_HEADER_BYTES = 20
+_MIN_HEADER_BYTES = 20
 
 
 class LinkCounts(NamedTuple):
@@ -70,7 +70,7 @@ class PacketSwitch:
 
     def take(self, t_s: float, source: int, packet: bytes) -> None:
         """Take a packet from a host at a time from the start [s], never decreasing."""
-        if len(packet) < _LEAST_HEADER_BYTES or packet[0] >> 4 != _IPV4:
+        if len(packet) < _MIN_HEADER_BYTES or packet[0] >> 4 != _IPV4:
             return
         destination = self._host_of.get(packet[_DESTINATION])
         if destination is None or destination == source:

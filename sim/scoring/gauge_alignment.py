@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import imu_poses
-from module_agent.model.perturbation import adjoint, apply_increment, frozen
+from module_agent.model.perturbation import adjoint, apply_perturbation, frozen
 
 # What a wrong orientation counts against a wrong position: the displacement at a usual module's reach.
 REACH_M = 0.3
@@ -72,12 +72,12 @@ def align_gauge(estimated: Chain, reference: Chain, null_basis: ArrayLike, q_rad
 
     Args:
         estimated, reference: chains of the same modules in the same order.
-        null_basis: (6 n, k) directions of `increments.apply_increment`.
+        null_basis: (6 n, k) directions of `increments.apply_perturbation`.
         q_rad: (m, n) the configurations over which nearness is measured, by least squares of position and of
             orientation times `REACH_M`.
 
     Returns:
-        `apply_increment(estimated, null_basis @ z)` for the best z.
+        `apply_perturbation(estimated, null_basis @ z)` for the best z.
     """
     basis = np.asarray(null_basis, dtype=float)
     if not basis.shape[1]:
@@ -87,12 +87,12 @@ def align_gauge(estimated: Chain, reference: Chain, null_basis: ArrayLike, q_rad
     target = imu_poses(reference, q)[:, tips]
 
     def misfit(z: Array) -> Array:
-        return _misfit(imu_poses(apply_increment(estimated, basis @ z), q)[:, tips], target)
+        return _misfit(imu_poses(apply_perturbation(estimated, basis @ z), q)[:, tips], target)
 
     found = least_squares(
         misfit, _start(misfit, basis), jac="3-point", method="trf", xtol=1e-13, ftol=1e-13, gtol=1e-13
     )
-    return apply_increment(estimated, basis @ found.x)
+    return apply_perturbation(estimated, basis @ found.x)
 
 
 def tip_error(estimated: Chain, reference: Chain, q_rad: ArrayLike) -> TipError:

@@ -24,7 +24,7 @@ from sim.world.truth import Motion, read_motion, read_truth
 
 # A torque below what the sensor resolves is no scale to measure errors by: a bare output turns against next
 # to nothing.
-LEAST_TORQUE_NM = 0.02
+MIN_TORQUE_NM = 0.02
 
 
 class ScoreError(ValueError):
@@ -55,7 +55,7 @@ class Score(BaseModel):
 
     Tip errors are root mean squares over 1000 random poses of all leaf IMUs in the root frame. Torque errors
     are |e| / |tau| on the held-out motion, against the true torque and against the measured one; None for a
-    joint whose true torque is below `LEAST_TORQUE_NM` (rms), whose error in Nm is there all the same.
+    joint whose true torque is below `MIN_TORQUE_NM` (rms), whose error in Nm is there all the same.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -210,7 +210,7 @@ def _torque(run: Path, result: _ResultFile) -> _TorqueScore:
     predicted = held_out.tau_predicted_nm[:, known]
     serials = [result.serials[c] for c in known]
     size, error = _rms(true), _rms(predicted - true)
-    relative = [e / s if s >= LEAST_TORQUE_NM else None for e, s in zip(error, size, strict=True)]
+    relative = [e / s if s >= MIN_TORQUE_NM else None for e, s in zip(error, size, strict=True)]
     return _TorqueScore(
         _ratio(predicted, true),
         dict(zip(serials, relative, strict=True)),

@@ -10,7 +10,7 @@ import numpy as np
 
 from coordinator.kinematics.assembly import link_lengths
 from coordinator.kinematics.frames import axis_angles
-from coordinator.kinematics.gauge_fixing import free_motions, moved, nearest
+from coordinator.kinematics.gauge_fixing import gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.viewer.scene.blueprint import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.viewer import Viewer
@@ -20,7 +20,7 @@ from sim.scoring.gauge_alignment import move_root
 
 
 class TruthView:
-    """Draws one robot's truth in the viewer of a run; implements `coordinator.viewer.feed.Beside`."""
+    """Draws one robot's truth in the viewer of a run; implements `coordinator.viewer.feed.Overlay`."""
 
     def __init__(self, truth: Chain, types: Sequence[str]):
         self._truth = truth
@@ -59,7 +59,7 @@ def beside(truth: Chain, estimated: Chain, unresolved: Sequence[Unresolved]) -> 
     chain, _ = move_root(truth, np.zeros((6 * len(truth.serials), 0)), into)
     # Both stand upright by the same vertical: an error in that is no error of the robot's shape.
     chain = chain._replace(gravity=estimated.gravity)
-    free = free_motions(chain, unresolved)
+    free = gauge_freedoms(chain, unresolved)
     seen = _comparable(chain, estimated)
     target = estimated.imu_home[[estimated.serials.index(s) for s in seen]]
     return moved(chain, free, nearest(chain, free, [chain.serials.index(s) for s in seen], target))

@@ -14,7 +14,7 @@ from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.gaussian_filter import TAPS
 from module_agent.estimate.joint_model import CALIBRATED, ImuKnowledge
 from module_agent.estimate.joint_regression import JointRegression, regress_joint
-from module_agent.estimate.observed_motion import MotionWindows, seen_motions
+from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.observer import MARGIN_NS
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
 from module_agent.firmware.config import config_of
@@ -155,7 +155,7 @@ def regress(trial: TrialRows, knowledge: ImuKnowledge = CALIBRATED) -> JointRegr
     Raises:
         ValueError: too little motion, with what would be enough.
     """
-    return regress_joint(seen_motions(windows(trial)), rest_reading(imu_window(trial.rest)), knowledge)
+    return regress_joint(observed_motions(windows(trial)), rest_reading(imu_window(trial.rest)), knowledge)
 
 
 def windows(trial: TrialRows) -> list[MotionWindows]:

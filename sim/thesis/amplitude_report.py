@@ -117,7 +117,7 @@ def _replace(path: Path, text: str) -> None:
 
 _FILTERED, _UNFILTERED, _THESIS, _TRUTH, _SATURATED = "#1f5fa8", "#d07a1f", "#b0204a", "#404040", "#e9e4da"
 # The same relative range in every panel, so that they can be compared; what is beyond is drawn at its edge.
-_LEAST_RANGE, _MOST_RANGE = 0.10, 0.30
+_MIN_RANGE, _MAX_RANGE = 0.10, 0.30
 
 
 def plot(trials: Sequence[Trial], path: Path, title: str) -> None:
@@ -134,7 +134,7 @@ def plot(trials: Sequence[Trial], path: Path, title: str) -> None:
     figure = Figure(figsize=(width, 7.0), dpi=150)
     FigureCanvasAgg(figure)
     grid: Any = figure.subplots(2, len(lengths), squeeze=False)
-    half = float(np.clip(1.1 * _largest_error(sweep), _LEAST_RANGE, _MOST_RANGE))
+    half = float(np.clip(1.1 * _largest_error(sweep), _MIN_RANGE, _MAX_RANGE))
     for row, alignment in enumerate(ALIGNMENTS):
         for column, length in enumerate(lengths):
             own = [t for t in sweep if (t.alignment, t.length_mm) == (alignment, length)]

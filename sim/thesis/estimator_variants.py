@@ -26,7 +26,7 @@ from rich.table import Table
 from module_agent.estimate.circle_point_analysis import rest_reading
 from module_agent.estimate.gaussian_filter import gaussian_filter
 from module_agent.estimate.joint_regression import JointRegression, regress_joint
-from module_agent.estimate.observed_motion import MotionWindows, SeenMotion, seen_motions
+from module_agent.estimate.observed_motion import MotionWindows, ObservedMotion, observed_motions
 from module_agent.estimate.smoothing import SmoothMotion
 from module_agent.estimate.windows import Array, ImuWindow, JointWindow, imu_window
 from sim.imperfections.noise_profile import NoiseProfile
@@ -110,7 +110,7 @@ def _command(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
     motions = [
         seen._replace(instrument=SmoothMotion(_commanded(window.joint, motion.joint["position_command_rad"])))
         for seen, window, motion in zip(
-            seen_motions(windows(trial)), windows(trial), (trial.constant, trial.sine), strict=True
+            observed_motions(windows(trial)), windows(trial), (trial.constant, trial.sine), strict=True
         )
     ]
     return _regressed(trial, profile, motions)
@@ -125,7 +125,7 @@ VARIANTS: Mapping[str, Variant] = {
 }
 
 
-def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[SeenMotion]) -> tuple[float, float]:
+def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[ObservedMotion]) -> tuple[float, float]:
     rest = rest_reading(imu_window(trial.rest))
     return _told(regress_joint(motions, rest, imu_knowledge(profile)))
 
@@ -134,7 +134,7 @@ def _told(found: JointRegression) -> tuple[float, float]:
     return found.distance_m, found.sigma_distance_m
 
 
-def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None) -> SeenMotion:
+def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None) -> ObservedMotion:
     """Return the motion with an angle from the gyro; the encoder gives its slow part, or offset and slope."""
     since_ns = window.imu.t_ns - window.offset_ns
     inside = (since_ns >= window.joint.t_ns[0]) & (since_ns <= window.joint.t_ns[-1])
@@ -154,7 +154,7 @@ def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None)
         spread = crossover_s * (t_s.size - 1) / t_s[-1]
         turned = turned + gaussian_filter(rest_of, 2 * round(4.0 * spread) + 1, spread)
     joint = JointWindow(since_ns[inside], turned, along)
-    return seen_motions([window._replace(joint=joint)])[0]._replace(base=None)
+    return observed_motions([window._replace(joint=joint)])[0]._replace(base=None)
 
 
 def _commanded(joint: JointWindow, command_rad: Array) -> JointWindow:

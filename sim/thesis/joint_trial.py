@@ -19,7 +19,7 @@ from coordinator.excitation.plan import Plan
 from module_agent.estimate.circle_point_analysis import rest_reading
 from module_agent.estimate.joint_model import AS_DELIVERED, CALIBRATED, ImuKnowledge
 from module_agent.estimate.joint_regression import distance_bound_m
-from module_agent.estimate.observed_motion import seen_motions
+from module_agent.estimate.observed_motion import observed_motions
 from module_agent.estimate.windows import imu_window
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import load_robot
@@ -61,7 +61,7 @@ def bound_m(trial: TrialRows, profile: NoiseProfile) -> float:
         ValueError: too little motion, with what would be enough.
     """
     rest = rest_reading(imu_window(trial.rest))
-    motions = seen_motions(windows(trial), _LIGHTLY_S)
+    motions = observed_motions(windows(trial), _LIGHTLY_S)
     return distance_bound_m(motions, rest, imu_knowledge(profile), white_noise(profile))
 
 

@@ -21,7 +21,7 @@ from coordinator.torque_control.feed_forward import (
     on_module,
     standing,
 )
-from coordinator.torque_control.motor_compensation import with_drive
+from coordinator.torque_control.motor_compensation import with_motor_compensation
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array, Chain
@@ -49,14 +49,14 @@ SETTLE_S = 1.5
 _STILL_S = 0.5
 # A joint that still moves by so much in the last half second of its rest is unstable: 1 mm rms at the end of
 # the thesis' arm of 484 mm.
-MOST_RINGING_RAD = 2e-3
+MAX_RINGING_RAD = 2e-3
 # So is one whose bridge is at its limit for more than this share of the motion: no loop is closed then.
-MOST_SATURATED = 0.25
+MAX_SATURATED = 0.25
 _SATURATED_DUTY = 0.98
 # And so is one whose loops answer single counts of the encoder with all that the bridge has: its duty jumps
 # by half of its range or more from one tick to the next. Where that happens at all, it does in 34 to 57 % of
 # the ticks; in the others in 6 % at most.
-MOST_THROWN = 0.20
+MAX_THROWN = 0.20
 _THROWN_DUTY = 1.0
 
 
@@ -201,11 +201,11 @@ def _largest_share(when: NDArray[np.bool_]) -> float:
 
 def _unstable(ringing_rad: float, saturated: float, thrown: float) -> str:
     found = []
-    if ringing_rad > MOST_RINGING_RAD:
+    if ringing_rad > MAX_RINGING_RAD:
         found.append(f"rings by {1e3 * ringing_rad:.1f} mrad")
-    if saturated > MOST_SATURATED:
+    if saturated > MAX_SATURATED:
         found.append(f"saturates {100.0 * saturated:.0f} % of the time")
-    if thrown > MOST_THROWN:
+    if thrown > MAX_THROWN:
         found.append(f"is thrown to and fro in {100.0 * thrown:.0f} % of the ticks")
     return ", ".join(found)
 
@@ -229,7 +229,7 @@ def _driven(
     phases: list[SetPoints], kinds: list[ModuleType], gains: list[GainSet], winding_c: list[float]
 ) -> list[SetPoints]:
     """Return phases that follow on each other with what the motors take, as they get warm on the way."""
-    driven = with_drive(_joined(phases), kinds, gains, winding_c).effort_nm
+    driven = with_motor_compensation(_joined(phases), kinds, gains, winding_c).effort_nm
     ends = np.cumsum([len(phase.effort_nm) for phase in phases])[:-1]
     parts = np.split(driven, ends)
     return [phase._replace(effort_nm=part) for phase, part in zip(phases, parts, strict=True)]

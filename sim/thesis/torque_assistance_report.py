@@ -27,7 +27,7 @@ from sim.thesis.torque_assistance import MODES, ON_MODULE, Follow, Model, standi
 from sim.thesis.torque_assistance_cases import Case, Combination, robots_of, try_case
 
 # What the six joints of an arm are to gain under torque control.
-LEAST_GAIN = 3.0
+MIN_GAIN = 3.0
 
 
 class Bar(NamedTuple):
@@ -62,8 +62,8 @@ def bars(found: Sequence[Combination]) -> list[Bar]:
         judged.append(_bar(asked, own, lambda each: each.helps))
     for strategy in (4, 3):
         own = [each for each in six if each.case.gains.strategy == strategy]
-        asked = f"six joints, strategy {strategy}: mode 3 is {LEAST_GAIN:g} times lower than mode 2"
-        judged.append(_bar(asked, own, lambda each: each.gain >= LEAST_GAIN))
+        asked = f"six joints, strategy {strategy}: mode 3 is {MIN_GAIN:g} times lower than mode 2"
+        judged.append(_bar(asked, own, lambda each: each.gain >= MIN_GAIN))
     return [bar for bar in judged if bar.stable + len(bar.unstable)]
 
 

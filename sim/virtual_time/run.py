@@ -26,7 +26,7 @@ COORDINATOR = "coordinator"
 class VirtualConfig(NamedTuple):
     """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given.
 
-    `known` and `refined_looks` as in `RunConfig`: nobody watches a virtual run, so that none is the rule.
+    `known` and `refined_previews` as in `RunConfig`: nobody watches a virtual run, so that none is the rule.
     `pushes` act on the robot from outside.
     """
 
@@ -39,7 +39,7 @@ class VirtualConfig(NamedTuple):
     connect_viewer: str | None = None
     feedback_rate_hz: float = 250.0
     noise_seed: int | None = None
-    refined_looks: int = 0
+    refined_previews: int = 0
     known: Path | None = None
     pushes: tuple[Push, ...] = ()
 
@@ -76,7 +76,7 @@ def run_virtual(
                 expect=len(robot.world.modules),
                 connect_viewer=config.connect_viewer,
                 inline=True,
-                refined_looks=config.refined_looks,
+                refined_previews=config.refined_previews,
                 known=config.known,
             ),
             robot.endpoint(COORDINATOR),

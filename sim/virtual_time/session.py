@@ -11,8 +11,8 @@ from coordinator.excitation.robot_excitation import RobotModule, robot_excitatio
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.identify import identify_kinematics
 from coordinator.identification.topology_search import doubtful_motions
-from coordinator.live_robot.messenger import Radio
-from coordinator.live_robot.module_group import RobotLink
+from coordinator.live_robot.messenger import Messenger
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.runtime.event_loop import run_to_end
@@ -42,8 +42,8 @@ def record_session(
     robot = VirtualRobot(settings, loop)
     keeper = _Keeper(plan)
     endpoint = robot.endpoint(COORDINATOR)
-    radio = Radio(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
-    link = RobotLink(radio, keeper.recording, lambda: loop.now_ns, COORDINATOR)
+    radio = Messenger(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
+    link = ModuleGroup(radio, keeper.recording, lambda: loop.now_ns, COORDINATOR)
     session = Session(link, radio, keeper.recording, plan, lambda: loop.now_ns, keeper.journal, keeper)
     robot.start()
     try:
@@ -66,7 +66,7 @@ def record_session(
         loop.close()
 
 
-async def _to_end(session: Session, radio: Radio, robot: VirtualRobot) -> None:
+async def _to_end(session: Session, radio: Messenger, robot: VirtualRobot) -> None:
     radio.start()
     try:
         await session.run(len(robot.world.modules))

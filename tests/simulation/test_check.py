@@ -12,12 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from coordinator.baseline.check import check, check_plan
-from coordinator.baseline.known_robot import KnownRobot, KnownRobotError, load_known
+from coordinator.baseline.known_robot import BaselineError, BaselineRobot, load_baseline
 from coordinator.commands.check import CHECK, EXIT_CHANGED
 from coordinator.excitation.plan import Plan
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
-from sim.benchmark.cases.link_change import Wear, draw_wear, worn
+from sim.benchmark.cases.link_change import Wear, draw_link_change, worn
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
 from sim.virtual_time.run import VirtualConfig, run_virtual
@@ -29,15 +29,15 @@ SLIPPED_M = 4e-3
 class Days(NamedTuple):
     """The same robot: as it was known, another day, and worn yet another day."""
 
-    known: KnownRobot
-    sound: KnownRobot
-    worn: KnownRobot
+    known: BaselineRobot
+    sound: BaselineRobot
+    worn: BaselineRobot
     wear: Wear
 
 
-def _lived(robot: Robot, out: Path, day: int, plan: Plan) -> KnownRobot:
+def _lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:
     run_virtual(VirtualConfig(robot, out, seed=5, noise_seed=day, network="lan", plan=plan), Terminal(True))
-    return load_known(out)
+    return load_baseline(out)
 
 
 KNOWN_BY = {
@@ -78,7 +78,7 @@ def report_of_thesis(days: Days) -> bool:
 def test_a_check_runs_the_motions_that_the_robot_is_known_from(days: Days) -> None:
     """What a model leaves out of a motion cancels only then; the thesis' are cut short, and no more."""
 
-    def patterns(run: KnownRobot) -> list[object]:
+    def patterns(run: BaselineRobot) -> list[object]:
         moved = [e for e in run.recording.journal if e.what == "motion" and e.purpose == "windowed_sine"]
         return [(e.serial, e.motion.pattern) for e in moved if e.motion is not None]
 
@@ -118,8 +118,8 @@ def test_modules_that_are_not_the_known_ones_are_named(days: Days) -> None:
 
 
 def test_a_folder_without_a_recording_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(KnownRobotError, match=r"holds no session\.mcap"):
-        load_known(tmp_path)
+    with pytest.raises(BaselineError, match=r"holds no session\.mcap"):
+        load_baseline(tmp_path)
     done = CliRunner().invoke(app, ["check", str(tmp_path), "--out", str(tmp_path / "new")])
     assert done.exit_code == 2
 
@@ -133,7 +133,7 @@ def test_worn_robots_are_displaced_where_they_say_and_only_there(name: str) -> N
     robot = load_robot(name)
     sound = true_chain(robot)
     for seed in range(5):
-        wear = draw_wear(robot, seed, 2e-3)
+        wear = draw_link_change(robot, seed, 2e-3)
         assert np.linalg.norm(wear.displacement_m) == pytest.approx(2e-3)
         k = robot.serials.index(wear.child)
         moved = true_chain(worn(robot, wear)).imu_home[:, :3, 3] - sound.imu_home[:, :3, 3]

@@ -10,7 +10,7 @@ import pytest
 from coordinator.excitation.plan import Plan
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, UnfitLink
 from coordinator.recording.run_folder import load_recording
-from coordinator.session.session import NobodyThere
+from coordinator.session.session import NoModulesFound
 from module_agent.network_emulation.profile import NetworkProfile
 from sim.scoring.score import score
 
@@ -152,7 +152,7 @@ def test_a_module_that_is_missing_is_said_before_anything_moves(
 ) -> None:
     rig = rigs(ARM, "lan")
     rig.kill(TIP)
-    with pytest.raises(NobodyThere, match="2 module expected, found 1: X-00009"):
+    with pytest.raises(NoModulesFound, match="2 module expected, found 1: X-00009"):
         rig.session(tmp_path / "run", quick_plan)
 
 

@@ -12,23 +12,23 @@ import pytest
 from coordinator.live_robot.errors import RobotStopped
 from coordinator.live_robot.messenger import Refused
 from coordinator.torque_control.gravity_compensation import (
-    Floater,
-    FloatRefused,
-    FloatSettings,
+    CompensationRefused,
+    CompensationSettings,
+    GravityCompensator,
     StaleFeedback,
 )
-from coordinator.torque_control.gravity_model import KnownWeight
-from coordinator.torque_control.preconditions import NotTheKnownRobot
-from coordinator.torque_control.session import FloatPlan, FloatSession, Moment
+from coordinator.torque_control.gravity_model import GravityModel
+from coordinator.torque_control.preconditions import RobotMismatch
+from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
 from module_agent.model.chain import Array
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.transport.transport import TransportError
 from sim.benchmark.cases.gravity_compensation import (
     POSES,
-    FloatTrial,
+    CompensationTrial,
     Pose,
-    float_robot,
-    float_trial,
+    compensate_robot,
+    compensation_trial,
     posed,
     true_weight,
 )
@@ -40,14 +40,14 @@ from sim.world.external_force import Push
 ARM = "a2085_03"
 LIFT, ELBOW = "shoulder-lift", "elbow"
 BENT = Pose("bent", {LIFT: 0.7, ELBOW: -0.8})
-LONG = FloatPlan(for_s=5.0)
-SHORT = FloatPlan(for_s=1.0, then_hold_s=0.2)
+LONG = CompensationPlan(for_s=5.0)
+SHORT = CompensationPlan(for_s=1.0, then_hold_s=0.2)
 UNTIL_HELD = ["loading", "loaded", "freeing", "floating", "holding", "held"]
 IDEAL = NOISE_PROFILES["ideal"]
 LOSSLESS = switched(IDEAL, (), ("friction", "gear-loss"))
 
 
-def weight() -> KnownWeight:
+def weight() -> GravityModel:
     return true_weight(load_robot(ARM))
 
 
@@ -55,8 +55,8 @@ def weight() -> KnownWeight:
 
 
 @cache
-def tried() -> FloatTrial:
-    return float_trial(1, load_robot(ARM), weight(), "x5", drift_s=5.0, poses=(BENT,))
+def tried() -> CompensationTrial:
+    return compensation_trial(1, load_robot(ARM), weight(), "x5", drift_s=5.0, poses=(BENT,))
 
 
 def test_left_alone_an_arm_stays_where_it_is() -> None:
@@ -79,9 +79,9 @@ def test_without_friction_it_creeps_by_what_the_feed_forward_takes_the_gear_to_l
     # The modules' feed-forward counts on 65 % of the motor's torque; of a gear without loss it gets all, and
     # the effort loop leaves a tenth of that error. With the motors' friction the same arm stands still.
     start = posed(load_robot(ARM), BENT.start_rad)
-    plan = FloatPlan(for_s=2.5, then_hold_s=0.0, is_led_back=False)
+    plan = CompensationPlan(for_s=2.5, then_hold_s=0.0, is_led_back=False)
     creeping, standing = (
-        float_robot(start, weight(), plan, 1, noise).floating() for noise in (LOSSLESS, IDEAL)
+        compensate_robot(start, weight(), plan, 1, noise).floating() for noise in (LOSSLESS, IDEAL)
     )
     rate = np.abs(creeping.q_rad[-1] - creeping.q_rad[0]).max() / np.ptp(creeping.t_s)
     # Measured 2.9 degrees a second.
@@ -94,8 +94,8 @@ def test_a_damper_makes_the_arm_follow_a_hand_more_slowly() -> None:
     push = Push(serial=ELBOW, force_n=(0.0, 0.0, 2.0), from_s=3.0, for_s=0.3)
     gone = []
     for damping in (0.0, 1.2):
-        plan = FloatPlan(FloatSettings(damping), for_s=2.0, then_hold_s=0.0, is_led_back=False)
-        free = float_robot(start, weight(), plan, 1, IDEAL, pushes=(push,)).floating()
+        plan = CompensationPlan(CompensationSettings(damping), for_s=2.0, then_hold_s=0.0, is_led_back=False)
+        free = compensate_robot(start, weight(), plan, 1, IDEAL, pushes=(push,)).floating()
         gone.append(np.ptp(free.q_rad[free.t_s > 2.9], axis=0).max())
     # Without it the motors' own friction and back-EMF are what brakes.
     assert np.degrees(gone[0]) > 5.0
@@ -103,16 +103,16 @@ def test_a_damper_makes_the_arm_follow_a_hand_more_slowly() -> None:
 
 
 def test_it_floats_over_a_network_that_loses_and_delays() -> None:
-    poor = float_robot(posed(load_robot(ARM), BENT.start_rad), weight(), SHORT, 2, "x5", "wifi")
+    poor = compensate_robot(posed(load_robot(ARM), BENT.start_rad), weight(), SHORT, 2, "x5", "wifi")
     assert not poor.summary.is_fault
-    assert poor.summary.floated_s == pytest.approx(1.0, abs=0.05)
+    assert poor.summary.compensated_s == pytest.approx(1.0, abs=0.05)
     assert np.degrees(np.ptp(poor.floating().q_rad, axis=0).max()) < 1.5
 
 
 def test_in_the_end_it_is_led_back_to_where_it_stood() -> None:
     start = posed(load_robot(ARM), BENT.start_rad)
     push = Push(serial=ELBOW, force_n=(0.0, 0.0, 3.0), from_s=3.0, for_s=0.4)
-    done = float_robot(start, weight(), SHORT._replace(for_s=2.0), 1, "x5", pushes=(push,))
+    done = compensate_robot(start, weight(), SHORT._replace(for_s=2.0), 1, "x5", pushes=(push,))
     joints = {joint.serial: joint for joint in done.summary.joints}
     assert not done.summary.is_fault
     assert abs(joints[LIFT].ended_rad - joints[LIFT].began_rad) > 0.2
@@ -129,8 +129,8 @@ def test_in_the_end_it_is_led_back_to_where_it_stood() -> None:
 def test_a_push_that_is_too_fast_ends_it_and_the_arm_is_held_there() -> None:
     start = posed(load_robot(ARM), BENT.start_rad)
     shove = Push(serial=ELBOW, force_n=(0.0, 0.0, 25.0), from_s=3.0, for_s=0.4)
-    plan = FloatPlan(FloatSettings(max_speed_rad_s=0.6), for_s=5.0, then_hold_s=1.0)
-    done = float_robot(start, weight(), plan, 1, "x5", pushes=(shove,))
+    plan = CompensationPlan(CompensationSettings(max_speed_rad_s=0.6), for_s=5.0, then_hold_s=1.0)
+    done = compensate_robot(start, weight(), plan, 1, "x5", pushes=(shove,))
     assert done.summary.is_fault
     assert "rad/s, at most 0.60 rad/s are allowed" in done.summary.why
     held = done.q_rad[np.array([phase == "held" for phase in done.phases])]
@@ -152,8 +152,8 @@ def laden(mass_kg: float, pose: Pose) -> Robot:
 def test_an_arm_with_a_tool_that_is_not_known_is_refused_before_anything_moves(
     mass_kg: float, pose: Pose
 ) -> None:
-    with pytest.raises(FloatRefused, match=f"joint {LIFT} bears .* it carries something"):
-        float_robot(laden(mass_kg, pose), weight(), SHORT, 1, "x5-uncalibrated")
+    with pytest.raises(CompensationRefused, match=f"joint {LIFT} bears .* it carries something"):
+        compensate_robot(laden(mass_kg, pose), weight(), SHORT, 1, "x5-uncalibrated")
 
 
 @pytest.mark.parametrize("pose", POSES, ids=lambda pose: pose.name)
@@ -161,8 +161,8 @@ def test_a_tool_that_is_noticed_only_when_the_arm_has_been_taken_is_held_and_doe
     pose: Pose, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Hung on it between the first look and the first set-point.
-    monkeypatch.setattr(Floater, "check_start", lambda *_: None)
-    done = float_robot(laden(1.0, pose), weight(), SHORT, 1, "x5-uncalibrated")
+    monkeypatch.setattr(GravityCompensator, "check_start", lambda *_: None)
+    done = compensate_robot(laden(1.0, pose), weight(), SHORT, 1, "x5-uncalibrated")
     assert done.summary.is_fault
     assert "it carries something" in done.summary.why
     assert list(dict.fromkeys(done.phases)) == ["holding", "held"]
@@ -177,7 +177,7 @@ def test_a_tool_that_is_noticed_only_when_the_arm_has_been_taken_is_held_and_doe
 def test_sensors_as_delivered_keep_no_arm_from_floating(seed: int) -> None:
     robot = posed(load_robot(ARM), BENT.start_rad)
     plan = SHORT._replace(for_s=0.1, is_led_back=False)
-    done = float_robot(robot, weight(), plan, seed, "x5-uncalibrated")
+    done = compensate_robot(robot, weight(), plan, seed, "x5-uncalibrated")
     assert (done.summary.is_fault, done.summary.why) == (False, "its time is over")
 
 
@@ -185,15 +185,15 @@ def test_a_heavy_arm_that_sinks_while_its_motors_are_off_is_taken_and_set_free()
     # Its second joint bears 6.8 Nm, and sinks at 0.6 rad/s as it is taken.
     robot = load_robot("arm6")
     plan = SHORT._replace(for_s=0.1, is_led_back=False)
-    done = float_robot(robot, true_weight(robot), plan, 1, "x5-uncalibrated")
+    done = compensate_robot(robot, true_weight(robot), plan, 1, "x5-uncalibrated")
     assert (done.summary.is_fault, done.summary.why) == (False, "its time is over")
 
 
 def test_an_arm_that_something_comes_to_hang_on_while_it_is_being_loaded_is_not_set_free() -> None:
     robot = posed(load_robot(ARM), BENT.start_rad)
-    began_s = float_robot(robot, weight(), SHORT, 1, "x5").t_s[0]
+    began_s = compensate_robot(robot, weight(), SHORT, 1, "x5").t_s[0]
     hung = Push(serial=ELBOW, force_n=(0.0, 0.0, -3.0), from_s=began_s + 0.25, for_s=20.0)
-    done = float_robot(robot, weight(), SHORT, 1, "x5", pushes=(hung,))
+    done = compensate_robot(robot, weight(), SHORT, 1, "x5", pushes=(hung,))
     assert done.summary.is_fault
     assert "freeing" not in done.phases
     # Measured 9.6 degrees: the load over the stiffness of the factory's position control.
@@ -203,15 +203,15 @@ def test_an_arm_that_something_comes_to_hang_on_while_it_is_being_loaded_is_not_
 def test_a_base_that_stands_on_its_side_is_not_set_free() -> None:
     robot = load_robot(ARM)
     base = robot.base.model_copy(update={"mount": None, "rpy_deg": (0.0, 25.0, 0.0)})
-    with pytest.raises(NotTheKnownRobot, match="feels gravity 25 degrees"):
-        float_robot(robot.model_copy(update={"base": base}), weight(), SHORT, 1, "x5")
+    with pytest.raises(RobotMismatch, match="feels gravity 25 degrees"):
+        compensate_robot(robot.model_copy(update={"base": base}), weight(), SHORT, 1, "x5")
 
 
 def test_an_arm_that_is_too_heavy_where_it_stands_is_refused_before_anything_moves() -> None:
     robot = load_robot(ARM)
     heavy = weight()._replace(phi=40.0 * weight().phi)
-    with pytest.raises(FloatRefused, match=r"joint shoulder-lift would have to bear -?\d\d"):
-        float_robot(robot, heavy, SHORT, 1, "x5")
+    with pytest.raises(CompensationRefused, match=r"joint shoulder-lift would have to bear -?\d\d"):
+        compensate_robot(robot, heavy, SHORT, 1, "x5")
 
 
 # --------------------------------------------------------------------------- modules that fail
@@ -241,9 +241,9 @@ class Seen:
         return [p for k, p in enumerate(self.phases) if k == 0 or self.phases[k - 1] != p]
 
 
-def session(rig: Any, plan: FloatPlan = LONG) -> tuple[FloatSession, Seen]:
+def session(rig: Any, plan: CompensationPlan = LONG) -> tuple[CompensationSession, Seen]:
     seen, loop = Seen(), rig.loop
-    made = FloatSession(
+    made = CompensationSession(
         rig.endpoint("float"), ARM, weight(), plan, lambda: loop.now_ns, loop.call_soon, seen, "float"
     )
     return made, seen
@@ -320,11 +320,11 @@ def test_a_module_that_somebody_holds_is_not_taken_from_him(rigs: Callable[..., 
 
 def test_asked_to_end_it_is_held_led_back_and_let_go(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, NetworkProfile(name="some", delay_ms=3.0, jitter_ms=2.0))
-    floating, seen = session(rig, FloatPlan(then_hold_s=0.2))
+    floating, seen = session(rig, CompensationPlan(then_hold_s=0.2))
     rig.when(lambda: seen.phases.count("floating") > 100, floating.end)
     found = rig.run(floating.run())
     assert found.why == "asked to end"
-    assert found.floated_s == pytest.approx(0.5, abs=0.1)
+    assert found.compensated_s == pytest.approx(0.5, abs=0.1)
     assert {rig.state(serial) for serial in rig.serials} == {"idle"}
     assert seen.order == [*UNTIL_HELD, "returning", "held"]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.baseline.known_robot import KNOWN, KnownRobot, load_known
+from coordinator.baseline.known_robot import KNOWN, BaselineRobot, load_baseline
 from coordinator.excitation.plan import Plan
 from coordinator.main import app
 from coordinator.recording.run_folder import RESULT
@@ -24,8 +24,8 @@ ARM = "a2085_03"
 class Updated(NamedTuple):
     """A robot brought up to date: as it was known, as it is, and what was said."""
 
-    known: KnownRobot
-    found: KnownRobot
+    known: BaselineRobot
+    found: BaselineRobot
     notes: list[str]
 
 
@@ -37,7 +37,9 @@ def bring(tmp_path_factory: pytest.TempPathFactory) -> Bring:
     """Let a robot be known, and bring it up to date another day."""
     known: dict[tuple[str, ...], Path] = {}
     done: dict[tuple[tuple[str, ...], ...], Updated] = {}
-    short = Plan(dynamics=False, sine_centre_s=1.2, sine_sigma_s=0.5, settle_s=0.3, whole_duration_s=6.0)
+    short = Plan(
+        dynamics=False, sine_centre_s=1.2, sine_sigma_s=0.5, settle_s=0.3, simultaneous_duration_s=6.0
+    )
 
     def run(robot: Robot, out: Path, day: int, before: Path | None = None) -> list[str]:
         notes = Notes()
@@ -53,7 +55,7 @@ def bring(tmp_path_factory: pytest.TempPathFactory) -> Bring:
             known[before.serials] = folder / "known"
             run(before, folder / "known", 0)
         lines = run(after, folder / "new", 1, known[before.serials])
-        done[case] = Updated(load_known(known[before.serials]), load_known(folder / "new"), lines)
+        done[case] = Updated(load_baseline(known[before.serials]), load_baseline(folder / "new"), lines)
         return done[case]
 
     return make

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.baseline.known_robot import KnownRobot, load_known
+from coordinator.baseline.known_robot import BaselineRobot, load_baseline
 from coordinator.baseline.payload import PayloadError, payload_plan, search_payload
 from coordinator.commands.payload import PAYLOAD
 from coordinator.description.urdf_writer import link_homes
@@ -26,24 +26,24 @@ HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1
 PLAN = Plan(excitation="designed", excitation_motions=3, excitation_s=4.0, imu="calibrated")
 
 
-def lived(robot: Robot, out: Path, day: int, plan: Plan) -> KnownRobot:
+def lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:
     config = VirtualConfig(robot, out, seed=6, noise_seed=day, network="lan", noise="x5", plan=plan)
     run_virtual(config, Terminal(True))
-    return load_known(out)
+    return load_baseline(out)
 
 
 @pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> KnownRobot:
+def known(tmp_path_factory: pytest.TempPathFactory) -> BaselineRobot:
     return lived(load_robot(ARM), tmp_path_factory.mktemp("payload") / "known", 0, PLAN)
 
 
 @pytest.fixture(scope="module")
-def later(known: KnownRobot, tmp_path_factory: pytest.TempPathFactory) -> KnownRobot:
+def later(known: BaselineRobot, tmp_path_factory: pytest.TempPathFactory) -> BaselineRobot:
     robot = loaded(load_robot(ARM), known.chain.serials[-1], HELD)
     return lived(robot, tmp_path_factory.mktemp("payload") / "later", 1, payload_plan(known, Plan()))
 
 
-def test_mass_and_centre_are_found_from_one_motion(known: KnownRobot, later: KnownRobot) -> None:
+def test_mass_and_centre_are_found_from_one_motion(known: BaselineRobot, later: BaselineRobot) -> None:
     report = search_payload(known, later)
     assert report.found
     assert report.carrier == known.chain.serials[-1]
@@ -67,7 +67,7 @@ def from_axis(chain: Chain, place_m: Array) -> Array:
     return np.array([np.linalg.norm(off - axis * (axis @ off)), axis @ (place_m - imu)])
 
 
-def test_an_arm_that_was_handed_nothing_says_so(known: KnownRobot, tmp_path: Path) -> None:
+def test_an_arm_that_was_handed_nothing_says_so(known: BaselineRobot, tmp_path: Path) -> None:
     same = lived(load_robot(ARM), tmp_path / "same", 2, payload_plan(known, Plan()))
     report = search_payload(known, same)
     assert not report.found
@@ -75,7 +75,7 @@ def test_an_arm_that_was_handed_nothing_says_so(known: KnownRobot, tmp_path: Pat
     assert "nothing was added" in report.words[0]
 
 
-def test_what_was_taken_off_is_not_taken_for_something_added(known: KnownRobot, tmp_path: Path) -> None:
+def test_what_was_taken_off_is_not_taken_for_something_added(known: BaselineRobot, tmp_path: Path) -> None:
     """The robot is known with a load, and bare later: the same two runs the other way round."""
     full = loaded(load_robot(ARM), known.chain.serials[-1], HELD)
     carrying = lived(full, tmp_path / "carrying", 3, PLAN)
@@ -88,7 +88,7 @@ def test_what_was_taken_off_is_not_taken_for_something_added(known: KnownRobot, 
     assert "taken off" in report.words[0]
 
 
-def test_the_command_writes_what_it_says(known: KnownRobot, later: KnownRobot) -> None:
+def test_the_command_writes_what_it_says(known: BaselineRobot, later: BaselineRobot) -> None:
     done = CliRunner().invoke(app, ["payload", str(known.folder), "--measured", str(later.folder)])
     assert done.exit_code == 0, done.output
     assert "kg were added" in done.output
@@ -97,7 +97,9 @@ def test_the_command_writes_what_it_says(known: KnownRobot, later: KnownRobot) -
     assert not list(later.folder.glob("*.part"))
 
 
-def test_a_run_without_inertia_is_no_robot_to_compare_with(known: KnownRobot, later: KnownRobot) -> None:
+def test_a_run_without_inertia_is_no_robot_to_compare_with(
+    known: BaselineRobot, later: BaselineRobot
+) -> None:
     with pytest.raises(PayloadError, match="no motions for inertia"):
         search_payload(later, known)
     done = CliRunner().invoke(app, ["payload", str(later.folder), "--measured", str(known.folder)])

@@ -4,7 +4,14 @@ import pytest
 
 from coordinator.monitoring.monitor import Heard, Watcher
 from sim.benchmark.cases.monitored_robot import Happening, watched
-from sim.benchmark.cases.monitoring import Alarms, Subject, WatchTrial, confusion, known_subject, settings_of
+from sim.benchmark.cases.monitoring import (
+    Alarms,
+    MonitoringTrial,
+    Subject,
+    confusion,
+    known_subject,
+    settings_of,
+)
 
 ARM = Subject(robot="a2085_03", seed=3, brief=True)
 
@@ -43,6 +50,6 @@ def test_rates_have_the_interval_of_poisson() -> None:
 
 
 def test_a_table_counts_what_was_taken_for_what() -> None:
-    trial = WatchTrial("wear", "payload", False, None, None, 1.0, None, 0, 10.0, ())
+    trial = MonitoringTrial("wear", "payload", False, None, None, 1.0, None, 0, 10.0, ())
     table = confusion([trial, trial._replace(found="wear"), trial])
     assert table == {"wear": {"payload": 2, "wear": 1}}

@@ -14,7 +14,7 @@ from coordinator.identification.inertia.agent_information import AGREES_BELOW
 from coordinator.identification.result import DynamicsPart
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import SESSION, load_recording
-from coordinator.session.information_requests import TorqueQuestions
+from coordinator.session.information_requests import InformationRequests
 from module_agent.torque_information.service import InformationService
 from module_agent.wire.information_messages import CollectRequest
 from module_agent.wire.refusal import Refusal, WireError
@@ -138,13 +138,13 @@ def test_of_an_agent_that_is_gone_when_it_is_asked_the_coordinator_has_the_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robots: list[VirtualRobot] = []
-    ask = TorqueQuestions.ask
+    ask = InformationRequests.ask
 
-    async def killed(self: TorqueQuestions, *arguments: Any) -> None:
+    async def killed(self: InformationRequests, *arguments: Any) -> None:
         robots[0].kill("X-00010")
         await ask(self, *arguments)
 
-    monkeypatch.setattr(TorqueQuestions, "ask", killed)
+    monkeypatch.setattr(InformationRequests, "ask", killed)
     found = run(tmp_path / "run", between=robots.append)
     assert (found.gathered_by, found.by_agents) == ("both", ["X-00009"])
     assert found.held_out is not None

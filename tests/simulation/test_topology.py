@@ -12,7 +12,7 @@ from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.topology_search import TopologyFound, doubtful_motions, search_topology
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
-from coordinator.session.session import NobodyThere, Session
+from coordinator.session.session import NoModulesFound, Session
 from coordinator.topology.next_motion import NextMotion
 from module_agent.firmware.config import config_of
 from module_agent.wire.keys import Leaf, parse
@@ -208,7 +208,7 @@ def test_where_no_module_responds_the_session_says_so(arm: Any) -> None:
     arm.run(asyncio.sleep(0.2))
     for serial in arm.serials:
         arm.freeze(serial)
-    with pytest.raises(NobodyThere, match="none of the modules that announced themselves responds"):
+    with pytest.raises(NoModulesFound, match="none of the modules that announced themselves responds"):
         explore(arm)
 
 

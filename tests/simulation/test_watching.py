@@ -7,11 +7,11 @@ from coordinator.monitoring.monitor import Heard, Watcher
 from sim.benchmark.cases.monitored_robot import Happening, watched
 from sim.benchmark.cases.monitoring import (
     Happens,
+    MonitoringTrial,
     Subject,
-    WatchTrial,
     known_subject,
+    monitoring_trial,
     settings_of,
-    watch_trial,
 )
 from sim.world.external_force import Push
 
@@ -20,8 +20,8 @@ ARM = Subject(robot="a2085_03", seed=3, brief=True)
 SOON_S = 6.0
 
 
-def tried(happens: Happens, seed: int = 1) -> WatchTrial:
-    trial = watch_trial(happens, seed, ARM, SOON_S)
+def tried(happens: Happens, seed: int = 1) -> MonitoringTrial:
+    trial = monitoring_trial(happens, seed, ARM, SOON_S)
     assert trial.found == happens, trial.words
     assert trial.false_alarms == 0, trial.words
     return trial

@@ -18,7 +18,7 @@ from module_agent.model.information import JointInformation
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import settling_samples
 from module_agent.torque_information.serialisation import chain_of, chain_part, clock_part, clocks_of, unpack
-from module_agent.wire.information_messages import MOST_MODULES, InformationRequest, RowRange, SpanPart
+from module_agent.wire.information_messages import MAX_MODULES, InformationRequest, RowRange, SpanPart
 
 # Of a chain and of clocks that are worked out again, on another machine for example.
 SAME_CHAIN, SAME_CLOCK_NS = 1e-9, 2.0
@@ -29,7 +29,7 @@ _SPARE_NS = 100_000_000
 _MARGIN_S = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
 
 
-class Gathered(NamedTuple):
+class AgentInformation(NamedTuple):
     """The information of n joints, and whose it is.
 
     by_agents: of which serials it is the module's own. difference: the largest between what an agent and what
@@ -76,7 +76,7 @@ def question(
         ValueError: there is no dynamic motion, a hole in its rows, or more than a message carries.
     """
     steps = dynamic_steps(recording)
-    if not steps or len(chain.serials) > MOST_MODULES:
+    if not steps or len(chain.serials) > MAX_MODULES:
         raise ValueError(f"{len(steps)} dynamic motions of {len(chain.serials)} modules")
     return InformationRequest(
         serial="",
@@ -111,7 +111,7 @@ def gathered(
     chain: Chain,
     clocks: Mapping[str, ClockMap],
     own: Sequence[JointInformation],
-) -> Gathered:
+) -> AgentInformation:
     """Return the agents' information where they have answered, else the coordinator's `own`, joint by joint.
 
     Own rows may have further columns than the agents', which then have nothing to say of those: they are
@@ -119,7 +119,7 @@ def gathered(
     """
     digest, why = _asked(recording, chain, clocks)
     if digest is None:
-        return Gathered(tuple(own), (), None, why)
+        return AgentInformation(tuple(own), (), None, why)
     joints = list(own)
     by_agents: list[str] = []
     apart: list[float] = []
@@ -137,7 +137,7 @@ def gathered(
             joints[k] = theirs
             by_agents.append(serial)
     note = f"torques by the rows of the coordinator, not the agent: {'; '.join(reasons)}" if reasons else ""
-    return Gathered(tuple(joints), tuple(by_agents), max(apart, default=None), note)
+    return AgentInformation(tuple(joints), tuple(by_agents), max(apart, default=None), note)
 
 
 def difference(one: JointInformation, other: JointInformation) -> float:

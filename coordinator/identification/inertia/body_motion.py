@@ -29,7 +29,7 @@ from module_agent.model.forward_kinematics import BASE, carrier
 from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
 
-Eyes = Literal["encoders", "structure", "imus"]
+MotionSource = Literal["encoders", "structure", "imus"]
 
 # What gives is a load itself: the second round changes the turns by a percent.
 _ROUNDS = 2
@@ -66,7 +66,7 @@ def readings(one: Window, refined: Refinement, cutoff_hz: float) -> Readings:
     return Readings(*(signal[kept] for signal in (q, qd, differentiate(qd, RATE_HZ), rate, force)))
 
 
-def seen_tracks(
+def body_motion_tracks(
     chain: Chain,
     kinds: Sequence[ModuleType],
     refined: Refinement,

@@ -14,10 +14,19 @@ from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.body_regressor import track_regressor
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
-from coordinator.identification.inertia.agent_information import Gathered
-from coordinator.identification.inertia.body_motion import Eyes, Readings, readings, seen_tracks
-from coordinator.identification.inertia.projected_rows import GatheredRows
-from coordinator.parameter_fit.instrumental_variables import SeenFit, solve_seen, without_used
+from coordinator.identification.inertia.agent_information import AgentInformation
+from coordinator.identification.inertia.body_motion import (
+    MotionSource,
+    Readings,
+    body_motion_tracks,
+    readings,
+)
+from coordinator.identification.inertia.projected_rows import ProjectedRows
+from coordinator.parameter_fit.instrumental_variables import (
+    InstrumentalFit,
+    solve_instrumental_variables,
+    without_used,
+)
 from coordinator.parameter_fit.systematic_errors import chain_effects, scale_effects
 from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE, SCALE_SIGMA, scaled
 from coordinator.synchronisation.motion_windows import (
@@ -34,11 +43,11 @@ from module_agent.model.regressor import torque_regressor
 from module_agent.signals.filtering import JointMotion
 from module_agent.signals.torque_terms import TERMS, TorqueTerm, term_columns
 
-EYES: tuple[Eyes, ...] = get_args(Eyes)
+MOTION_SOURCES: tuple[MotionSource, ...] = get_args(MotionSource)
 # Of the torques' noise, in the mean over the joints: less is chance.
 BETTER_BY = 0.01
 
-_SEEN_BY: dict[Eyes, str] = {
+_SEEN_BY: dict[MotionSource, str] = {
     "encoders": "encoders",
     "structure": "encoders, base and springs of the links",
     "imus": "IMUs",
@@ -56,7 +65,7 @@ _SHOWN: dict[TorqueTerm, tuple[str, float]] = {
     "coulomb": ("Nm", 1.0),
 }
 
-Agents = Callable[[tuple[JointInformation, ...]], Gathered]
+Agents = Callable[[tuple[JointInformation, ...]], AgentInformation]
 
 
 class Robot(NamedTuple):
@@ -84,11 +93,11 @@ class Inertia(NamedTuple):
     the information from encoders is, None if no agent can have been asked.
     """
 
-    seen: SeenFit
-    eyes: Eyes
-    noise_nm: Mapping[Eyes, Array]
+    seen: InstrumentalFit
+    eyes: MotionSource
+    noise_nm: Mapping[MotionSource, Array]
     effects: tuple[Array, ...]
-    gathered: Gathered | None = None
+    gathered: AgentInformation | None = None
 
     def words(self) -> list[str]:
         """Return in lines to read what the motion was seen by, and what torque readings hold besides."""
@@ -124,27 +133,29 @@ def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None 
     """
     pieces = [_information(robot, one) for one in windows]
     prior = np.concatenate([parameters(one) for one in module_prior(robot.chain, robot.kinds)])
-    found: dict[Eyes, SeenFit] = {}
-    shared: Gathered | None = None
+    found: dict[MotionSource, InstrumentalFit] = {}
+    shared: AgentInformation | None = None
     gathered: tuple[JointInformation, ...] = ()
-    for eyes in EYES:
+    for eyes in MOTION_SOURCES:
         total = pieces[0][eyes]
         for piece in pieces[1:]:
             total = merge(total, piece[eyes])
         if eyes == "encoders":
             shared = agents(total) if agents is not None else None
             gathered = total = shared.joints if shared is not None else total
-        found[eyes] = solve_seen(total, prior, INDEPENDENT_FRACTION, SCALE_SIGMA[robot.torque])
+        found[eyes] = solve_instrumental_variables(
+            total, prior, INDEPENDENT_FRACTION, SCALE_SIGMA[robot.torque]
+        )
     noise = {eyes: fit.fit.torque_sigma_nm for eyes, fit in found.items()}
-    best: Eyes = "encoders"
-    for eyes in EYES[1:]:
+    best: MotionSource = "encoders"
+    for eyes in MOTION_SOURCES[1:]:
         if _level(noise[eyes]) < _level(noise[best]) - BETTER_BY:
             best = eyes
     seen, effects = _considered(robot, windows, gathered, found[best], best)
     return Inertia(seen, best, noise, effects, shared)
 
 
-def without_terms(one: Window, seen: SeenFit) -> JointMotion:
+def without_terms(one: Window, seen: InstrumentalFit) -> JointMotion:
     """Return the motion of a window as encoders see it, with the torque of the bodies alone."""
     motion = filtered_window(one)
     columns = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
@@ -153,15 +164,15 @@ def without_terms(one: Window, seen: SeenFit) -> JointMotion:
     return motion._replace(tau_nm=torque)
 
 
-def _information(robot: Robot, one: Window) -> dict[Eyes, tuple[JointInformation, ...]]:
+def _information(robot: Robot, one: Window) -> dict[MotionSource, tuple[JointInformation, ...]]:
     motion = filtered_window(one)
     rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     terms = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
-    found: dict[Eyes, tuple[JointInformation, ...]] = {
+    found: dict[MotionSource, tuple[JointInformation, ...]] = {
         "encoders": compress(np.concatenate([rigid, terms], axis=2), motion.tau_nm)
     }
     seen = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
-    for eyes in EYES[1:]:
+    for eyes in MOTION_SOURCES[1:]:
         apart = _regressor(robot, seen, eyes) - rigid
         found[eyes] = compress(np.concatenate([rigid, terms, apart], axis=2), motion.tau_nm)
     return found
@@ -171,23 +182,27 @@ def _considered(
     robot: Robot,
     windows: Sequence[Window],
     gathered: Sequence[JointInformation],
-    seen: SeenFit,
-    eyes: Eyes,
-) -> tuple[SeenFit, tuple[Array, ...]]:
+    seen: InstrumentalFit,
+    eyes: MotionSource,
+) -> tuple[InstrumentalFit, tuple[Array, ...]]:
     """Return the fit with the rows gathered from encoders, and what errors of chain and scale do to them.
 
     What was seen beyond encoders is taken off the torques: of the rows, its projection onto them.
     """
     size = seen.informed_phi.size
     offsets_nm = _offsets_nm(robot, seen)
-    beside = [GatheredRows(scaled(piece, one)) for piece, one in zip(gathered, seen.scale.value, strict=True)]
+    beside = [
+        ProjectedRows(scaled(piece, one)) for piece, one in zip(gathered, seen.scale.value, strict=True)
+    ]
     for one in windows:
         motion = filtered_window(one)
         rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
         rows = np.concatenate([rigid, term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)], axis=2)
         effects = chain_effects(robot.chain, robot.covariance, seen.informed_phi, motion)
-        left_out = np.broadcast_to(np.diag(offsets_nm), (len(motion.t_ns), *np.diag(offsets_nm).shape))
-        effects = np.concatenate([effects, left_out], axis=2)
+        excluded_modules = np.broadcast_to(
+            np.diag(offsets_nm), (len(motion.t_ns), *np.diag(offsets_nm).shape)
+        )
+        effects = np.concatenate([effects, excluded_modules], axis=2)
         departure = np.zeros_like(motion.tau_nm)
         if eyes != "encoders":
             apart = _regressor(robot, readings(one, robot.refined, DYNAMIC_CUTOFF_HZ), eyes) - rigid
@@ -204,7 +219,7 @@ def _considered(
     return seen._replace(information=bodies), tuple(map(np.hstack, zip(scale, chain, strict=True)))
 
 
-def _offsets_nm(robot: Robot, seen: SeenFit) -> Array:
+def _offsets_nm(robot: Robot, seen: InstrumentalFit) -> Array:
     """Return by how much (n,) the offsets may be off that are taken for none [Nm]."""
     offset = TERMS.index("offset")
     largest = np.array([kind.max_effort_nm for kind in robot.kinds])
@@ -215,8 +230,8 @@ def _offsets_nm(robot: Robot, seen: SeenFit) -> Array:
     return np.where(seen.terms.used[:, offset] | (likely == 0.0), 0.0, either)
 
 
-def _regressor(robot: Robot, seen: Readings, eyes: Eyes) -> Array:
-    tracks = seen_tracks(robot.chain, robot.kinds, robot.refined, robot.floor, seen, eyes == "imus")
+def _regressor(robot: Robot, seen: Readings, eyes: MotionSource) -> Array:
+    tracks = body_motion_tracks(robot.chain, robot.kinds, robot.refined, robot.floor, seen, eyes == "imus")
     return track_regressor(tracks)
 
 

@@ -13,7 +13,7 @@ from module_agent.model.information import JointInformation
 _ROUNDING = 1e-10
 
 
-class GatheredRows:
+class ProjectedRows:
     """The information of one joint in p columns; signals of its samples are added stretch by stretch."""
 
     def __init__(self, gathered: JointInformation) -> None:

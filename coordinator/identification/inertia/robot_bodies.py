@@ -23,7 +23,12 @@ from coordinator.parameter_fit.base_parameters import (
     joint_frames,
     whitened,
 )
-from coordinator.parameter_fit.identifiability import Verdict, verdicts, words_of_base, words_of_body
+from coordinator.parameter_fit.identifiability import (
+    Identifiability,
+    identifiabilities,
+    words_of_base,
+    words_of_body,
+)
 from coordinator.parameter_fit.least_squares import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG, InertialFit
 from coordinator.parameter_fit.physically_consistent import NotSolvedError, PhysicalFit, fit_physical
 from coordinator.parameter_fit.systematic_errors import whitened_effects
@@ -33,7 +38,7 @@ from module_agent.model.information import JointInformation
 from module_agent.model.regressor import PER_BODY
 
 # Torques without noise, as a simulation may have them, would weigh infinitely.
-_LEAST_SIGMA_NM = 1e-9
+_MIN_SIGMA_NM = 1e-9
 
 
 class RobotBodies(NamedTuple):
@@ -48,7 +53,7 @@ class RobotBodies(NamedTuple):
     serials: tuple[str, ...]
     frames: Array
     base: BaseParameters
-    verdicts: tuple[Verdict, ...]
+    identifiabilities: tuple[Identifiability, ...]
     fit: PhysicalFit | None
     bodies: tuple[Body, ...]
     note: str
@@ -58,7 +63,7 @@ class RobotBodies(NamedTuple):
         """Return what is known in lines to read: the sums, then body by body."""
         lines = [words_of_base(self.base)]
         for i, serial in enumerate(self.serials):
-            own = self.verdicts[PER_BODY * i : PER_BODY * (i + 1)]
+            own = self.identifiabilities[PER_BODY * i : PER_BODY * (i + 1)]
             lines.append(f"body {i + 1}, turned by {serial}: {words_of_body(own)}")
         return lines
 
@@ -85,7 +90,7 @@ def robot_bodies(
     """
     joints = len(chain.serials)
     frames = joint_frames(chain)
-    sigma = np.maximum(least_squares.torque_sigma_nm, _LEAST_SIGMA_NM)
+    sigma = np.maximum(least_squares.torque_sigma_nm, _MIN_SIGMA_NM)
     rows, target = whitened(information, sigma, independent_fraction)
     common = None if effects is None else whitened_effects(effects, sigma, independent_fraction)
     base = base_parameters(
@@ -109,11 +114,11 @@ def robot_bodies(
     except NotSolvedError as error:
         note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
     if fit is None:
-        judged = verdicts(base, inertial_units(joints))
+        judged = identifiabilities(base, inertial_units(joints))
         return RobotBodies(chain.serials, frames, base, judged, None, (), note)
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
     informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
-    judged = verdicts(base, inertial_units(joints), into @ fit.phi, informed_sigma)
+    judged = identifiabilities(base, inertial_units(joints), into @ fit.phi, informed_sigma)
     bodies = _in_links(fit.pseudo, link_homes(chain))
     return RobotBodies(chain.serials, frames, base, judged, fit, bodies, note)
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import BASE, carrier, descendants
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 
 class Box(NamedTuple):
@@ -166,7 +166,7 @@ def side_by_side(chain: Chain) -> Chain:
         if number > 0:
             shift[tree, 3:] = (end + GAP_M - places.min()) * along
         end = max(end, float((places + shift[root, 3:] @ along).max()))
-    return apply_increment(chain, shift.ravel())
+    return apply_perturbation(chain, shift.ravel())
 
 
 def _horizontal(chain: Chain) -> Array:

@@ -25,7 +25,7 @@ SPREAD = NINETY_FIVE_SIGMAS
 Drawn = rr.AsComponents
 
 
-class Look(NamedTuple):
+class SceneStyle(NamedTuple):
     """How a robot is drawn in one world: `link` for what joins modules; `plain` paints everything so.
 
     The truth is translucent and without labels, so that it does not hide the estimate that it should coincide
@@ -39,14 +39,14 @@ class Look(NamedTuple):
     labels: bool
 
 
-ESTIMATE_LOOK = Look(
+ESTIMATE_STYLE = SceneStyle(
     entity_paths.ESTIMATED_WORLD,
     entity_paths.ESTIMATE_COLOUR,
     None,
     rr.components.FillMode.Solid,
     labels=True,
 )
-TRUTH_LOOK = Look(
+TRUTH_STYLE = SceneStyle(
     entity_paths.TRUE_WORLD,
     entity_paths.TRUE_BODY_COLOUR,
     entity_paths.TRUE_BODY_COLOUR,
@@ -59,7 +59,7 @@ class Scene(NamedTuple):
     """Everything to log for a chain: (entity path, archetypes), in the root frame at q = 0."""
 
     chain: Chain
-    look: Look
+    look: SceneStyle
     drawn: tuple[tuple[str, tuple[Drawn, ...]], ...]
 
 
@@ -68,7 +68,7 @@ def build_scene(
     types: Mapping[str, str],
     colours: Mapping[str, entity_paths.Colour],
     sigma_m: Sequence[float] | None = None,
-    look: Look = ESTIMATE_LOOK,
+    look: SceneStyle = ESTIMATE_STYLE,
 ) -> Scene:
     """Draw a chain at q = 0.
 
@@ -149,7 +149,7 @@ def _body(
     placed: tuple[Module, ...],
     paint: Sequence[entity_paths.Colour],
     sigma_m: Sequence[float] | None,
-    look: Look,
+    look: SceneStyle,
     body: int,
 ) -> list[tuple[str, tuple[Drawn, ...]]]:
     path = entity_paths.body_path(look.world, None if body == BASE else chain.serials[body])
@@ -180,7 +180,7 @@ def _housings(
     placed: tuple[Module, ...],
     paint: Sequence[entity_paths.Colour],
     sigma_m: Sequence[float] | None,
-    look: Look,
+    look: SceneStyle,
     housed: Sequence[int],
 ) -> rr.Boxes3D:
     poses = [placed[k].housing for k in housed]
@@ -207,7 +207,7 @@ def _label(chain: Chain, k: int, sigma_m: Sequence[float] | None) -> str:
 
 
 def _outputs(
-    placed: tuple[Module, ...], paint: Sequence[entity_paths.Colour], look: Look, turning: Sequence[int]
+    placed: tuple[Module, ...], paint: Sequence[entity_paths.Colour], look: SceneStyle, turning: Sequence[int]
 ) -> rr.Cylinders3D:
     return rr.Cylinders3D(
         lengths=[OUTPUT_THICKNESS_M] * len(turning),
@@ -228,7 +228,7 @@ def _axis(module: Module, colour: entity_paths.Colour) -> rr.Arrows3D:
     )
 
 
-def _spread(module: Module, sigma_m: float, look: Look) -> rr.Ellipsoids3D:
+def _spread(module: Module, sigma_m: float, look: SceneStyle) -> rr.Ellipsoids3D:
     return rr.Ellipsoids3D(
         centers=[module.output],
         radii=[SPREAD * sigma_m],
@@ -237,7 +237,7 @@ def _spread(module: Module, sigma_m: float, look: Look) -> rr.Ellipsoids3D:
     )
 
 
-def _links(joined: Sequence[Link], look: Look) -> rr.Capsules3D:
+def _links(joined: Sequence[Link], look: SceneStyle) -> rr.Capsules3D:
     return rr.Capsules3D(
         lengths=[_length(link) for link in joined],
         radii=[LINK_RADIUS_M] * len(joined),

@@ -22,7 +22,7 @@ from coordinator.recording.recording import Recording
 from coordinator.runtime.exit_codes import explain
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from module_agent.network_emulation.profile_file import network as named_network
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
 from sim.benchmark.row import Row, count, for_few, largest, mean_abs, rms, scaled
@@ -165,7 +165,7 @@ def expected_tip(chain: Chain, covariance: Array, seed: int) -> TipErrors:
     spread = vectors * np.sqrt(np.maximum(values, 0.0))
     q = rng.uniform(-np.pi, np.pi, (BOUND_POSES, len(chain.serials)))
     drawn = rng.standard_normal((BOUND_DRAWS, len(covariance)))
-    found = [tip_error(apply_increment(chain, spread @ each), chain, q) for each in drawn]
+    found = [tip_error(apply_perturbation(chain, spread @ each), chain, q) for each in drawn]
     squares = np.mean(np.square(found), axis=0)
     return TipErrors(float(np.sqrt(squares[0])), float(np.degrees(np.sqrt(squares[1]))))
 

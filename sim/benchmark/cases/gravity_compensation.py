@@ -16,9 +16,9 @@ import numpy as np
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify
 from coordinator.runtime.event_loop import run_to_end
-from coordinator.torque_control.gravity_model import KnownWeight, weight_of
-from coordinator.torque_control.session import FloatPlan, FloatSession, Moment
-from coordinator.torque_control.summary import FloatSummary
+from coordinator.torque_control.gravity_model import GravityModel, weight_of
+from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
+from coordinator.torque_control.summary import CompensationSummary
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import body_displacements
 from module_agent.network_emulation.profile_file import network
@@ -60,7 +60,7 @@ POSES = (
 )
 
 
-class FloatTrial(NamedTuple):
+class CompensationTrial(NamedTuple):
     """What came of floating.
 
     drift_deg: how far any joint went by itself, in any pose, in `drift_s`. led_deg: how far a hand led one of
@@ -77,53 +77,53 @@ class FloatTrial(NamedTuple):
     held_n: float
 
 
-class Floated(NamedTuple):
+class CompensationRun(NamedTuple):
     """One float: what the session says of it, and what the joints truly did.
 
     phase: (m,) at every set-point, t_s (m,) world time, q_rad (m, n) the true positions then.
     """
 
-    summary: FloatSummary
+    summary: CompensationSummary
     phases: tuple[str, ...]
     t_s: Array
     q_rad: Array
 
-    def floating(self) -> "Floated":
+    def floating(self) -> "CompensationRun":
         """Return the part of it in which the robot was free."""
         free = np.array([phase == "floating" for phase in self.phases])
         phases = tuple(phase for phase in self.phases if phase == "floating")
-        return Floated(self.summary, phases, self.t_s[free], self.q_rad[free])
+        return CompensationRun(self.summary, phases, self.t_s[free], self.q_rad[free])
 
 
-def float_trial(
+def compensation_trial(
     seed: int,
     robot: Robot,
-    weight: KnownWeight,
+    weight: GravityModel,
     noise: str | NoiseProfile | None = None,
     drift_s: float = 10.0,
     poses: Sequence[Pose] = POSES,
-) -> FloatTrial:
+) -> CompensationTrial:
     """Let a robot float in some poses, lead it in the last but one by hand, and hold it against the hand.
 
     Raises:
-        what `FloatSession.run` raises.
+        what `CompensationSession.run` raises.
     """
-    free = FloatPlan(for_s=drift_s, then_hold_s=0.0, is_led_back=False)
+    free = CompensationPlan(for_s=drift_s, then_hold_s=0.0, is_led_back=False)
     drifts = []
     for pose in poses:
-        alone = float_robot(posed(robot, pose.start_rad), weight, free, seed, noise).floating()
+        alone = compensate_robot(posed(robot, pose.start_rad), weight, free, seed, noise).floating()
         drifts.append(_most_deg(alone.q_rad - alone.q_rad[0]))
     here = posed(robot, poses[min(1, len(poses) - 1)].start_rad)
     tip = here.serials[-1]
     lead = Push(serial=tip, force_n=(0.0, 0.0, _LEAD_N), from_s=FREE_S, for_s=_LEAD_S)
-    led = float_robot(here, weight, free, seed, noise, pushes=(lead,)).floating()
+    led = compensate_robot(here, weight, free, seed, noise, pushes=(lead,)).floating()
     left = led.q_rad[led.t_s > FREE_S + _LEAD_S + _REST_S]
     long = free._replace(for_s=FREE_S + GROWING_S)
-    guided = float_robot(here, weight, long, seed, noise, pushes=_growing(tip, FREE_MOST_N))
+    guided = compensate_robot(here, weight, long, seed, noise, pushes=_growing(tip, FREE_MOST_N))
     # Held from the moment at which it would float.
     still = free._replace(for_s=0.0, then_hold_s=FREE_S + GROWING_S)
-    held = float_robot(here, weight, still, seed, noise, pushes=_growing(tip, HELD_MOST_N))
-    return FloatTrial(
+    held = compensate_robot(here, weight, still, seed, noise, pushes=_growing(tip, HELD_MOST_N))
+    return CompensationTrial(
         drift_deg=max(drifts),
         drift_s=drift_s,
         led_deg=_most_deg(left[0] - led.q_rad[led.t_s <= FREE_S][-1]),
@@ -147,7 +147,7 @@ def _growing(serial: str, most_n: float) -> list[Push]:
     ]
 
 
-def _leading_force_n(chain: Chain, floated: "Floated", most_n: float) -> float:
+def _leading_force_n(chain: Chain, floated: "CompensationRun", most_n: float) -> float:
     """Return the force at which the tip has gone far enough; infinite if it never has."""
     tip = np.append(chain.point[-1], 1.0)
     place = (body_displacements(chain, floated.q_rad)[:, -1] @ tip)[:, :3]
@@ -162,13 +162,13 @@ def _most_deg(away_rad: Array) -> float:
     return float(np.degrees(np.abs(away_rad).max()))
 
 
-def true_weight(robot: Robot) -> KnownWeight:
+def true_weight(robot: Robot) -> GravityModel:
     """Return what a simulated robot weighs, as if it had been identified without error."""
     types = tuple(module.type for module in robot.modules)
-    return KnownWeight(robot.name, types, true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
+    return GravityModel(robot.name, types, true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
 
 
-def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> KnownWeight:
+def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> GravityModel:
     """Return what a robot weighs by a whole session on it, as a run would write it down.
 
     Raises:
@@ -187,25 +187,25 @@ def posed(robot: Robot, start_rad: Mapping[str, float]) -> Robot:
     return robot.model_copy(update={"modules": modules})
 
 
-def float_robot(
+def compensate_robot(
     robot: Robot,
-    weight: KnownWeight,
-    plan: FloatPlan,
+    weight: GravityModel,
+    plan: CompensationPlan,
     seed: int = 0,
     noise: str | NoiseProfile | None = None,
     network_name: str = "lan",
     pushes: Sequence[Push] = (),
-) -> Floated:
+) -> CompensationRun:
     """Let a robot float as the plan says, from where its file has it.
 
     Raises:
-        what `FloatSession.run` raises.
+        what `CompensationSession.run` raises.
     """
     loop = VirtualLoop()
     settings = VirtualSettings(robot, network(network_name), seed, noise, noise_seed=1, pushes=tuple(pushes))
     virtual = VirtualRobot(settings, loop)
     watcher = _Watcher(virtual)
-    session = FloatSession(
+    session = CompensationSession(
         virtual.endpoint(COORDINATOR),
         robot.name,
         weight,
@@ -218,13 +218,13 @@ def float_robot(
     virtual.start()
     try:
         summary = run_to_end(loop, loop.create_task(_to_end(session, virtual)))
-        return Floated(summary, tuple(watcher.phases), np.array(watcher.t_s), np.array(watcher.q_rad))
+        return CompensationRun(summary, tuple(watcher.phases), np.array(watcher.t_s), np.array(watcher.q_rad))
     finally:
         virtual.close()
         loop.close()
 
 
-async def _to_end(session: FloatSession, virtual: VirtualRobot) -> FloatSummary:
+async def _to_end(session: CompensationSession, virtual: VirtualRobot) -> CompensationSummary:
     try:
         return await session.run()
     finally:
@@ -259,7 +259,7 @@ DRIFT_DEG, LIGHT = 2.0, 0.25
 _COST_S, _QUICK_COST_S = 10.0, 5.0
 
 
-def float_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
+def compensation_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return the one case; `shortened`: of one pose, and for some seconds."""
     name = f"{ROBOT}, x5, floating, known without error"
     cost_s = _QUICK_COST_S if shortened else _COST_S
@@ -269,14 +269,14 @@ def float_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
     return [Case(name, work, partial(_summary, name))]
 
 
-def floated(seed: int, shortened: bool) -> FloatTrial:
+def floated(seed: int, shortened: bool) -> CompensationTrial:
     """Let an arm float that knows its weight without error: what is left is the modules' own."""
     robot = somewhere(load_robot(ROBOT), seed)
     drift_s, poses = (QUICK_DRIFT_S, POSES[1:2]) if shortened else (DRIFT_S, POSES)
-    return float_trial(seed, robot, true_weight(robot), "x5", drift_s, poses)
+    return compensation_trial(seed, robot, true_weight(robot), "x5", drift_s, poses)
 
 
-def _summary(case: str, trials: Sequence[FloatTrial]) -> Summary:
+def _summary(case: str, trials: Sequence[CompensationTrial]) -> Summary:
     alone = largest([trial.drift_deg for trial in trials])
     after = largest([trial.rest_deg for trial in trials])
     guiding = largest([trial.guiding_n for trial in trials])

@@ -20,7 +20,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_trans
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Identified
 from coordinator.identification.identify import base_floor, identify, recorded_type
-from coordinator.identification.inertia.body_motion import Eyes
+from coordinator.identification.inertia.body_motion import MotionSource
 from coordinator.identification.inertia.inertia import Robot as SeenRobot
 from coordinator.identification.inertia.inertia import find_inertia
 from coordinator.parameter_fit.base_parameters import joint_frames
@@ -79,7 +79,7 @@ class InertiaTrial(NamedTuple):
     bodies: float = float("nan")
     poses: int = 0
     not_definite: int = 0
-    eyes: Eyes = "encoders"
+    eyes: MotionSource = "encoders"
     gain: float = 1.0
     robot_time_s: float = 0.0
     identify_s: float = 0.0

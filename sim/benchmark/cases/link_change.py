@@ -15,7 +15,7 @@ import numpy as np
 
 from coordinator.baseline.check import check, check_plan
 from coordinator.baseline.check_report import CheckReport, LinkCheck
-from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify_kinematics
 from module_agent.model.chain import Array, Chain
@@ -35,7 +35,7 @@ DAYS = 20
 PARALLEL = 0.999
 
 
-class WearTrial(NamedTuple):
+class LinkChangeTrial(NamedTuple):
     """What one check made of a robot of which one link was displaced, or none.
 
     found: it said that something has changed. located: and that of all links it was this one alone.
@@ -70,7 +70,7 @@ class _Subject(NamedTuple):
     plan: Plan
 
 
-def wear_trial(
+def link_change_trial(
     seed: int,
     changed: bool,
     robot: str = "a2085_06",
@@ -78,7 +78,7 @@ def wear_trial(
     network: str = "lan",
     change_m: float = 2e-3,
     plan: Plan | None = None,
-) -> WearTrial:
+) -> LinkChangeTrial:
     """Check a robot that is known, with one link displaced or as it was.
 
     Args:
@@ -90,7 +90,7 @@ def wear_trial(
         plan: of the session that the robot is known from, which says how it is checked.
     """
     subject = _Subject(robot, noise, network, seed // DAYS, plan or Plan(dynamics=False))
-    wear = draw_wear(load_robot(robot), seed, change_m) if changed else None
+    wear = draw_link_change(load_robot(robot), seed, change_m) if changed else None
     known = _known(subject)
     later = _recorded(subject, 1 + seed % DAYS, check_plan(known, Plan()), wear)
     return _trial(check(known, later), wear)
@@ -114,7 +114,7 @@ def worn(robot: Robot, wear: Wear) -> Robot:
     return robot.model_copy(update={"modules": (*robot.modules[:k], longer, *robot.modules[k + 1 :])})
 
 
-def draw_wear(robot: Robot, seed: int, change_m: float) -> Wear:
+def draw_link_change(robot: Robot, seed: int, change_m: float) -> Wear:
     """Draw a link and a direction: any that some motion can show.
 
     A displacement along an axis shows in the motions of the joints further up; where all of these have
@@ -139,11 +139,11 @@ def _hidden(chain: Chain, child: int) -> Array | None:
 
 
 @lru_cache(maxsize=1)
-def _known(subject: _Subject) -> KnownRobot:
+def _known(subject: _Subject) -> BaselineRobot:
     return _recorded(subject, 0, subject.plan, None)
 
 
-def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> KnownRobot:
+def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> BaselineRobot:
     robot = somewhere(load_robot(subject.robot), subject.seed)
     settings = VirtualSettings(
         robot if wear is None else worn(robot, wear),
@@ -154,15 +154,15 @@ def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> Kno
         noise_seed=subject.seed * (DAYS + 1) + day,
     )
     recording = record_session(settings, plan)
-    return KnownRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
+    return BaselineRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
 
 
-def _trial(report: CheckReport, wear: Wear | None) -> WearTrial:
+def _trial(report: CheckReport, wear: Wear | None) -> LinkChangeTrial:
     named = [link for link in report.links if link.changed]
     child = wear.child if wear is not None else None
     located = [link.child for link in named] == [child]
     errors = _errors(named, wear) if located and wear is not None else (None, None)
-    return WearTrial(
+    return LinkChangeTrial(
         found=report.changed,
         located=located,
         size_error_m=errors[0],
@@ -197,11 +197,11 @@ _AT_ONCE_SHARE = 0.3
 class Checks(NamedTuple):
     """Checks of one robot, with a link changed and as it was."""
 
-    changed: tuple[WearTrial, ...]
-    unchanged: tuple[WearTrial, ...]
+    changed: tuple[LinkChangeTrial, ...]
+    unchanged: tuple[LinkChangeTrial, ...]
 
 
-def wear_cases(changed: int, unchanged: int, seed: int, shortened: bool = False) -> list[Case]:
+def link_change_cases(changed: int, unchanged: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return the one case; each of its trials is about one robot, recorded once for all its checks.
 
     `shortened`: the robot is known and checked by a motion of all joints at once, not joint by joint.
@@ -221,10 +221,10 @@ def wear_cases(changed: int, unchanged: int, seed: int, shortened: bool = False)
 
 
 def checks_of_one_robot(changed: Sequence[int], unchanged: Sequence[int], plan: Plan | None = None) -> Checks:
-    """Check a robot on several days, one after the other in one process; plan: see `wear_trial`."""
+    """Check a robot on several days, one after the other in one process; plan: see `link_change_trial`."""
     return Checks(
-        tuple(wear_trial(seed, True, ROBOT, change_m=CHANGE_M, plan=plan) for seed in changed),
-        tuple(wear_trial(seed, False, ROBOT, change_m=CHANGE_M, plan=plan) for seed in unchanged),
+        tuple(link_change_trial(seed, True, ROBOT, change_m=CHANGE_M, plan=plan) for seed in changed),
+        tuple(link_change_trial(seed, False, ROBOT, change_m=CHANGE_M, plan=plan) for seed in unchanged),
     )
 
 

@@ -12,9 +12,9 @@ from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.live_robot.errors import MotionInterrupted
-from coordinator.live_robot.messenger import Radio, together
-from coordinator.live_robot.module_group import RobotLink
-from coordinator.monitoring.live import LiveWatch
+from coordinator.live_robot.messenger import Messenger, gather_all
+from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.monitoring.live import LiveMonitor
 from coordinator.monitoring.monitor import Heard, Watcher
 from coordinator.recording.recording import Entry, Recording
 from coordinator.runtime.event_loop import run_to_end
@@ -64,19 +64,19 @@ def watched(
     `say` hears what the watcher says, and when [ns] of virtual time.
 
     Raises:
-        what `RobotLink` raises, if the robot is lost.
+        what `ModuleGroup` raises, if the robot is lost.
     """
     loop = VirtualLoop()
     robot = VirtualRobot(settings, loop)
     recording = Recording()
-    mover = Radio(
+    mover = Messenger(
         robot.endpoint(MOVER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, _kept(recording)
     )
-    watch = LiveWatch(watcher, lambda: loop.now_ns, WATCHER, lambda heard: say(heard, loop.now_ns))
-    ears = Radio(
+    watch = LiveMonitor(watcher, lambda: loop.now_ns, WATCHER, lambda heard: say(heard, loop.now_ns))
+    ears = Messenger(
         robot.endpoint(WATCHER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
     )
-    link = RobotLink(mover, recording, lambda: loop.now_ns, MOVER)
+    link = ModuleGroup(mover, recording, lambda: loop.now_ns, MOVER)
     for one in happenings:
         loop.schedule_ns(round(one.at_s * 1e9), lambda one=one: one.what(robot.world))  # type: ignore[misc]
     robot.start()
@@ -116,8 +116,8 @@ def _kept(recording: Recording) -> Callable[[Entry], Message | None]:
 
 
 async def _move(
-    link: RobotLink,
-    radio: Radio,
+    link: ModuleGroup,
+    radio: Messenger,
     motions: Sequence[RobotMotion],
     count: int,
     until_ns: int,
@@ -128,7 +128,7 @@ async def _move(
     await link.meet(sorted(radio.alive))
     await asyncio.sleep(0.3)
     keeper = asyncio.create_task(link.keep_alive())
-    await together(link.acquire(serial) for serial in link.serials)
+    await gather_all(link.acquire(serial) for serial in link.serials)
     turn = 0
     while loop.now_ns < until_ns:
         motion = motions[turn % len(motions)]
@@ -140,7 +140,7 @@ async def _move(
             await link.run(dict(motion.patterns))
         except MotionInterrupted:
             # A blow may make a module let go; whoever moves the robot takes it again.
-            await together(link.acquire(serial) for serial in link.serials)
+            await gather_all(link.acquire(serial) for serial in link.serials)
     await link.release_all()
     keeper.cancel()
     await asyncio.gather(keeper, return_exceptions=True)

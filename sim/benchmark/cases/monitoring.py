@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.stats import binom, chi2
 
-from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.identify import identify_kinematics
@@ -27,7 +27,7 @@ from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import ancestors
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.benchmark.case import Case, Summary, Trial
-from sim.benchmark.cases.link_change import Wear, draw_wear, worn
+from sim.benchmark.cases.link_change import Wear, draw_link_change, worn
 from sim.benchmark.cases.monitored_robot import Happening, ordinary_motions, watched
 from sim.benchmark.row import Row
 from sim.geometry.link_parts import FreePose
@@ -56,7 +56,7 @@ MASS_KG, FRICTION, SHIFT_M = (0.05, 0.3), (1.25, 1.75), (6e-3, 12e-3)
 FORCE_N, PUSH_S, LEVER_M = (6.0, 20.0), (0.05, 0.3), 0.1
 
 
-class WatchTrial(NamedTuple):
+class MonitoringTrial(NamedTuple):
     """What the watch made of one robot to which something happened, or nothing.
 
     found: the kind of the first lasting word on it, "nothing" if there was none. located: it named the right
@@ -122,7 +122,7 @@ class Subject(NamedTuple):
 ARM = Subject()
 
 
-class Watched(NamedTuple):
+class MonitoredRobot(NamedTuple):
     """The robot itself, what is known of it, and the motions that it does."""
 
     robot: Robot
@@ -139,7 +139,9 @@ class _Event(NamedTuple):
     happening: Happening | None
 
 
-def watch_trial(happens: Happens, seed: int, subject: Subject = ARM, after_s: float = AFTER_S) -> WatchTrial:
+def monitoring_trial(
+    happens: Happens, seed: int, subject: Subject = ARM, after_s: float = AFTER_S
+) -> MonitoringTrial:
     """Watch a known robot move while something happens to it.
 
     Args:
@@ -171,15 +173,15 @@ def false_alarms(seed: int, for_s: float, subject: Subject = ARM) -> Alarms:
 
 
 @lru_cache(maxsize=2)
-def known_subject(subject: Subject) -> Watched:
+def known_subject(subject: Subject) -> MonitoredRobot:
     """Return a robot, what a run tells of it, and other motions than those of that run."""
     robot = somewhere(load_robot(subject.robot), subject.seed)
     recording = record_session(settings_of(robot, subject, 0), subject.plan)
-    known = KnownRobot(Path("the known run"), recording, identify_kinematics(recording))
+    known = BaselineRobot(Path("the known run"), recording, identify_kinematics(recording))
     plan = KNOWN_PLAN.model_copy(update={"excitation_s": MOTION_S, "excitation_motions": MOTIONS})
     # Other motions than those that it is known from.
     motions = ordinary_motions(known.chain, recording, plan, 1000 + subject.seed)
-    return Watched(robot, build_reference(known), motions)
+    return MonitoredRobot(robot, build_reference(known), motions)
 
 
 def settings_of(robot: Robot, subject: Subject, day: int) -> VirtualSettings:
@@ -209,7 +211,7 @@ def _draw(happens: Happens, rng: np.random.Generator, robot: Robot, at_s: float)
             happening = Happening(at_s, lambda w: w.change_friction(serial, factor))
             return _Event(serial, 100.0 * (factor - 1.0), at_s, happening)
         case "wear":
-            wear = draw_wear(robot, int(rng.integers(2**31)), float(rng.uniform(*SHIFT_M)))
+            wear = draw_link_change(robot, int(rng.integers(2**31)), float(rng.uniform(*SHIFT_M)))
             return _Event(
                 wear.child,
                 1e3 * float(np.linalg.norm(wear.displacement_m)),
@@ -240,7 +242,7 @@ def _weight(rng: np.random.Generator, mass_kg: float) -> FreePose:
     return FreePose(mass_kg=mass_kg, com_xyz_m=(x, y, z), inertia=(own, own, own, 0.0, 0.0, 0.0))
 
 
-def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Finding]) -> WatchTrial:
+def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Finding]) -> MonitoringTrial:
     at_ns = round(1e9 * event.at_s)
     held = watcher.ledger.all
     # A change is known to within the windows of the watch.
@@ -254,7 +256,7 @@ def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Fin
     first = [f.said_ns for f in said if f.said_ns >= at_ns]
     named = [f.said_ns for f in said if f.said_ns >= at_ns and f.kind == happens]
     own = right[0] if right else None
-    return WatchTrial(
+    return MonitoringTrial(
         happened=happens,
         found=found,
         located=own is not None and _is_there(watcher.reference.chain, own, event.serial),
@@ -276,7 +278,7 @@ def _is_there(chain: Chain, finding: Finding, serial: str) -> bool:
     return named in ancestors(chain, where)
 
 
-def confusion(trials: Sequence[WatchTrial]) -> dict[Happens, dict[Found, int]]:
+def confusion(trials: Sequence[MonitoringTrial]) -> dict[Happens, dict[Found, int]]:
     """Return how often what happened was taken for what."""
     table: dict[Happens, dict[Found, int]] = {}
     for trial in trials:
@@ -289,7 +291,7 @@ def confusion(trials: Sequence[WatchTrial]) -> dict[Happens, dict[Found, int]]:
 MISSED_SHARE = 0.2
 # That chance alone leaves a bar: one case in so many.
 ONE_IN = 100.0
-STRETCH_S = 300.0
+SEGMENT_S = 300.0
 _QUICK_AFTER_S, _QUICK_STRETCH_S = 5.0, 8.0
 # Trials of unchanged robots are days of their own.
 _UNCHANGED_DAY = 500
@@ -299,17 +301,17 @@ _KNOWN_COST_S, _COST_PER_S = 8.0, 0.2
 class Watches(NamedTuple):
     """What became of trials, and of stretches without any change."""
 
-    trials: tuple[WatchTrial, ...]
+    trials: tuple[MonitoringTrial, ...]
     quiet: tuple[Alarms, ...]
 
 
-def watch_cases(trials: int, stretches: int, seed: int, shortened: bool = False) -> list[Case]:
+def monitoring_cases(trials: int, stretches: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return the one case: every kind so many times, and stretches of no change.
 
     `shortened`: trials and stretch are short, all in one process, which learns to know the robot once.
     """
     kinds = [one for one in HAPPENS if one != "nothing"]
-    after_s, stretch_s = (_QUICK_AFTER_S, _QUICK_STRETCH_S) if shortened else (AFTER_S, STRETCH_S)
+    after_s, stretch_s = (_QUICK_AFTER_S, _QUICK_STRETCH_S) if shortened else (AFTER_S, SEGMENT_S)
     name = f"{ARM.robot}, watched"
     drawn = [(kind, seed * 100 + number) for number in range(trials) for kind in kinds]
     quiet = [_UNCHANGED_DAY + number for number in range(stretches)]
@@ -335,7 +337,7 @@ def watches_of_one_robot(
     """Let a process learn to know a robot, and watch it for all of its trials."""
     subject = ARM._replace(brief=shortened)
     return Watches(
-        tuple(watch_trial(kind, seed, subject, after_s) for kind, seed in drawn),
+        tuple(monitoring_trial(kind, seed, subject, after_s) for kind, seed in drawn),
         tuple(false_alarms(day, stretch_s, subject) for day in quiet),
     )
 

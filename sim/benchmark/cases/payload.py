@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.baseline.known_robot import KnownRobot
+from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.baseline.payload import payload_plan, search_payload
 from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan
@@ -83,12 +83,12 @@ def payload_trial(
     )
 
 
-def _lived(robot: Robot, noise: str | NoiseProfile, seed: int, day: int, plan: Plan) -> KnownRobot:
+def _lived(robot: Robot, noise: str | NoiseProfile, seed: int, day: int, plan: Plan) -> BaselineRobot:
     """Return a robot after a session; the same seed has the same modules, another day other noise."""
     settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=1000 * seed + day)
     recording = record_session(settings, plan)
     kinematics: Kinematics = identify_kinematics(recording)
-    return KnownRobot(Path(f"day {day}"), recording, kinematics)
+    return BaselineRobot(Path(f"day {day}"), recording, kinematics)
 
 
 def _from_axis(chain: Chain, place_m: Array) -> Array:

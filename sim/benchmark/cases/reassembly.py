@@ -53,7 +53,7 @@ class Reassembly(NamedTuple):
     sigma_ratio: float
     sigma_ratios: tuple[float, ...]
     difference: float
-    strain: tuple[float, ...]
+    inconsistency_sigma: tuple[float, ...]
 
 
 class _Nobody:
@@ -100,7 +100,7 @@ def _told(merged: MergedInformation, difference: float) -> Reassembly:
         sigma_ratio=merged.gain,
         sigma_ratios=tuple(run.gain for run in merged.runs),
         difference=difference,
-        strain=tuple(run.strain for run in merged.runs),
+        inconsistency_sigma=tuple(run.inconsistency_sigma for run in merged.runs),
     )
 
 

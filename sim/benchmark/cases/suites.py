@@ -11,11 +11,11 @@ from typing import NamedTuple
 from coordinator.excitation.plan import Motions
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.cases.arm import SHORTENED, arm_cases, arm_plan
-from sim.benchmark.cases.gravity_compensation import float_cases
+from sim.benchmark.cases.gravity_compensation import compensation_cases
 from sim.benchmark.cases.inertia import inertia_cases
 from sim.benchmark.cases.joint import joint_cases
-from sim.benchmark.cases.link_change import wear_cases
-from sim.benchmark.cases.monitoring import watch_cases
+from sim.benchmark.cases.link_change import link_change_cases
+from sim.benchmark.cases.monitoring import monitoring_cases
 from sim.benchmark.cases.network import network_cases
 from sim.benchmark.cases.payload import payload_cases
 from sim.benchmark.cases.reassembly import reassembly_cases
@@ -60,7 +60,7 @@ def kinematic_cases(effort: KinematicEffort, seed: int, motions: Motions | None 
         *arm_cases(effort.arms, seed, effort.shortened, motions),
         *topology_cases(effort.robots, seed, effort.shortened),
         *network_cases(effort.networks, seed, plan),
-        *wear_cases(effort.changed, effort.unchanged, seed, effort.shortened),
+        *link_change_cases(effort.changed, effort.unchanged, seed, effort.shortened),
     ]
 
 
@@ -106,7 +106,7 @@ def dynamic_cases(effort: DynamicEffort, seed: int, tx40: Path | None = None) ->
         *reassembly_cases(effort.reassemblies, seed),
         *payload_cases(effort.payloads, seed, effort.shortened),
         *assistance_cases(seed, effort.shortened),
-        *float_cases(effort.floats, seed, effort.shortened),
-        *watch_cases(effort.watches, effort.stretches, seed, effort.shortened),
+        *compensation_cases(effort.floats, seed, effort.shortened),
+        *monitoring_cases(effort.watches, effort.stretches, seed, effort.shortened),
         *([] if tx40 is None else recorded_cases(tx40)),
     ]

@@ -9,7 +9,7 @@ from sim.imperfections.noise_profile import noise_profile
 from sim.thesis.torque_assistance import identified_model, standing_robot
 from sim.thesis.torque_assistance_cases import Case as Combined
 from sim.thesis.torque_assistance_cases import cases as combinations
-from sim.thesis.torque_assistance_report import LEAST_GAIN, AssistanceRow, assistance_rows
+from sim.thesis.torque_assistance_report import MIN_GAIN, AssistanceRow, assistance_rows
 
 NOISE = "x5"
 _IDENTIFY_COST_S, _CASE_COST_S = 12.0, 4.0
@@ -64,7 +64,7 @@ def _name(combined: Combined) -> str:
 def _limit(combined: Combined) -> float | None:
     """Return what the error by calculated torque must not exceed of that without."""
     if combined.alignment is None:
-        return 1.0 / LEAST_GAIN
+        return 1.0 / MIN_GAIN
     return 1.0 if combined.gains.setting is not None else None
 
 

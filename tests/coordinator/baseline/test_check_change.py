@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from coordinator.baseline.change_detection import FLOOR_M, FLOOR_RAD, TiedFits, find_changes
 from coordinator.batch_estimation.estimator import Refinement
 from module_agent.model.chain import Chain
-from module_agent.model.perturbation import adjoint, apply_increment, increments_between
+from module_agent.model.perturbation import adjoint, apply_perturbation, perturbation_between
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 
@@ -60,8 +60,8 @@ def draw() -> Draw:
             change = _moved(chain, chain.serials.index(child), twist)
         seen = np.eye(len(change)) - unknown @ unknown.T
         noise = [rng.multivariate_normal(np.zeros(len(change)), covariance, method="eigh") for _ in range(2)]
-        before = apply_increment(chain, noise[0])
-        after = apply_increment(chain, noise[1] + seen @ change)
+        before = apply_perturbation(chain, noise[0])
+        after = apply_perturbation(chain, noise[1] + seen @ change)
         return TiedFits(*(_fit(c, covariance, unknown) for c in (before, after)))
 
     return make
@@ -82,8 +82,8 @@ def _moved(chain: Chain, k: int, twist: np.ndarray) -> np.ndarray:
 def test_increments_between_two_chains_lead_from_the_one_to_the_other() -> None:
     chain = _true(ARM)
     delta = 0.02 * np.random.default_rng(1).standard_normal(36)
-    other = apply_increment(chain, delta)
-    assert np.allclose(increments_between(chain, other), delta, atol=1e-12)
+    other = apply_perturbation(chain, delta)
+    assert np.allclose(perturbation_between(chain, other), delta, atol=1e-12)
 
 
 @pytest.mark.parametrize(("robot", "child"), [(ARM, "A-2"), (ARM, "A-4"), (ARM, "A-6"), (TREE, "right-1")])
@@ -113,7 +113,7 @@ def test_of_two_links_that_changed_both_are_named_the_surer_one_first(draw: Draw
     fits = draw(ARM, rng, "A-5", np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0]))
     chain = fits.before.chain
     second = _moved(chain, 2, np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    both = fits._replace(after=fits.after._replace(chain=apply_increment(fits.after.chain, second)))
+    both = fits._replace(after=fits.after._replace(chain=apply_perturbation(fits.after.chain, second)))
     found = find_changes(both)
     assert [chain.serials[c.child] for c in found.changed] == ["A-3", "A-5"]
     assert found.changed[0].rotation_rad[0] == pytest.approx(0.02, abs=3e-3)
@@ -137,7 +137,7 @@ def test_the_gain_of_a_link_that_has_not_changed_is_distributed_as_chi_squared(d
         chain = fits.after.chain
         for k in range(1, 6):
             twist = rng.standard_normal(6) * np.repeat([FLOOR_RAD, FLOOR_M], 3)
-            chain = apply_increment(chain, _moved(_true(ARM), k, twist))
+            chain = apply_perturbation(chain, _moved(_true(ARM), k, twist))
         (change,) = [
             c
             for c in find_changes(fits._replace(after=fits.after._replace(chain=chain))).each
@@ -166,7 +166,7 @@ def test_it_is_the_generalised_least_squares_estimate(draw: Draw) -> None:
         )
     )
     weight = np.linalg.inv(2.0 * fits.before.noise_covariance[6:, 6:] + floor)
-    difference = increments_between(chain, fits.after.chain)[6:]
+    difference = perturbation_between(chain, fits.after.chain)[6:]
     expected = np.linalg.solve(columns.T @ weight @ columns, columns.T @ weight @ difference)
     (change,) = find_changes(fits).changed
     assert np.allclose(np.r_[change.rotation_rad, change.displacement_m], expected, atol=1e-9)

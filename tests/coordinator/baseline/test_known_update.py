@@ -12,7 +12,7 @@ from coordinator.batch_estimation.estimator import Refinement
 from coordinator.topology.topology import Topology
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import descendants
-from module_agent.model.perturbation import adjoint, apply_increment, increments_between
+from module_agent.model.perturbation import adjoint, apply_perturbation, perturbation_between
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
 
@@ -73,7 +73,7 @@ def _fit(chain: Chain, covariance: np.ndarray, hidden: np.ndarray | None = None)
 
 def _drawn(chain: Chain, covariance: np.ndarray, rng: np.random.Generator) -> Refinement:
     noise = rng.multivariate_normal(np.zeros(len(covariance)), covariance, method="eigh")
-    return _fit(apply_increment(chain, noise), covariance)
+    return _fit(apply_perturbation(chain, noise), covariance)
 
 
 def _relative(chain: Chain, top: str, serial: str) -> np.ndarray:
@@ -178,7 +178,7 @@ def test_errors_are_as_large_as_claimed(case: str) -> None:
     excess = []
     for _ in range(150):
         result = placed(_drawn(before, spreads[0], rng), _drawn(after, spreads[1], rng), other.parts)
-        error = increments_between(after, result.chain)[6:]
+        error = perturbation_between(after, result.chain)[6:]
         excess.append(error @ np.linalg.solve(result.covariance[6:, 6:], error) / len(error))
     assert result.null_basis.shape[1] == 0
     # Chi-squared of 24 to 30 degrees of freedom over itself: 150 of them average to 1 +- 0.024; the model is

@@ -12,7 +12,7 @@ from coordinator.batch_estimation.imu_intrinsics import BIASES_ONLY
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.sensor_data import BaseMotion, SensorData, outstanding
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 RATE_HZ, CUTOFF_HZ = 250.0, 12.0
 SAMPLES = 1400
@@ -118,14 +118,14 @@ def test_a_shaking_base_shows_the_heading_that_gravity_hides(robots: Any, headin
     # The first axis is vertical through the root frame's origin.
     twist = np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 0.0], 3)
     twist[:6] = 0.0
-    turned = apply_increment(upright, np.radians(heading_deg) * twist)
+    turned = apply_perturbation(upright, np.radians(heading_deg) * twist)
     hidden = twist / np.linalg.norm(twist)
     found = faced(turned, data, hidden[:, None])
     left = Rotation.from_matrix(found.imu_home[2, :3, :3] @ upright.imu_home[2, :3, :3].T)
     # What the joints' own motion leaves in the gyros after a wrong heading is random against the base's.
     assert left.magnitude() < np.radians(15)
-    settled = refine_chain(found, data, BIASES_ONLY)
-    left = Rotation.from_matrix(settled.chain.imu_home[2, :3, :3] @ upright.imu_home[2, :3, :3].T)
+    gauge_fixed = refine_chain(found, data, BIASES_ONLY)
+    left = Rotation.from_matrix(gauge_fixed.chain.imu_home[2, :3, :3] @ upright.imu_home[2, :3, :3].T)
     assert left.magnitude() < np.radians(0.1)
 
 

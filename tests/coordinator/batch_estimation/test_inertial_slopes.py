@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.batch_estimation.imu_jacobian import imu_slopes
+from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import body_motions, imu_readings
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 STEP = 1e-5
 
@@ -30,7 +30,7 @@ def _analytic(chain: Chain, motion: tuple[Array, Array, Array]) -> Array:
     found = np.zeros((6 * joints + 3, samples, joints, 6))
     bodies = body_motions(chain, *motion)
     for k in range(joints):
-        slopes = imu_slopes(chain, bodies, *motion[:2], k)
+        slopes = imu_jacobian(chain, bodies, *motion[:2], k)
         rows = np.concatenate([6 * module + np.arange(6) for module in slopes.modules])
         found[rows, :, k] = np.swapaxes(slopes.poses, 1, 2)
         found[-3:, :, k] = np.swapaxes(slopes.gravity, 1, 2)
@@ -43,7 +43,9 @@ def _differences(chain: Chain, motion: tuple[Array, Array, Array]) -> Array:
     for unit in STEP * np.eye(6 * len(chain.serials) + 3):
         ahead, behind = (
             _read(
-                apply_increment(chain, sign * unit[:-3])._replace(gravity=chain.gravity + sign * unit[-3:]),
+                apply_perturbation(chain, sign * unit[:-3])._replace(
+                    gravity=chain.gravity + sign * unit[-3:]
+                ),
                 motion,
             )
             for sign in (1.0, -1.0)
@@ -78,7 +80,7 @@ def test_an_imu_feels_the_joints_below_it_and_its_own_module_only(robots: Any) -
         while joint >= 0:
             felt.add(joint)
             joint = chain.parent[joint]
-        assert set(imu_slopes(chain, bodies, *motion[:2], k).modules) == felt
+        assert set(imu_jacobian(chain, bodies, *motion[:2], k).modules) == felt
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -87,8 +89,8 @@ def test_moving_the_whole_robot_as_one_changes_readings_as_turning_gravity_back_
 ) -> None:
     chain, _ = robots.random(seed, joints=5)
     found = _analytic(chain, _motion(5, seed))
-    together = found[:-3].reshape(5, 6, *found.shape[1:]).sum(axis=0)
+    gather_all = found[:-3].reshape(5, 6, *found.shape[1:]).sum(axis=0)
     # Shifted, everything reads as before; turned by theta it reads as if gravity had turned by -theta.
-    np.testing.assert_allclose(together[3:], 0.0, atol=1e-11)
+    np.testing.assert_allclose(gather_all[3:], 0.0, atol=1e-11)
     back = -np.cross(np.eye(3), chain.gravity)
-    np.testing.assert_allclose(together[:3], np.einsum("ij,j...->i...", back, found[-3:]), atol=1e-11)
+    np.testing.assert_allclose(gather_all[:3], np.einsum("ij,j...->i...", back, found[-3:]), atol=1e-11)

@@ -17,12 +17,12 @@ from coordinator.batch_estimation.link_compliance import (
     LINK_MASS_KG,
     LINK_MASS_KG_M,
     UNIT_RAD_NM,
-    flex_slopes,
+    compliance_jacobian,
     hinge_slopes,
     joined,
     link_ends,
     link_loads,
-    no_flex,
+    rigid,
 )
 from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.catalogue import ModuleType
@@ -135,7 +135,7 @@ def test_links_that_bend_come_out_as_long_as_they_are(robots: Any, seed: int) ->
     chain, types = _forward(robots, 20 + seed, 4)
     data, loads = _bent(chain, types, 4.0, seed)
     stiff = refine_chain(chain, data)
-    flex = flex_slopes(chain, data.joints, loads)
+    flex = compliance_jacobian(chain, data.joints, loads)
     found = refine_chain(chain, data, flex=flex)
     apart = [np.abs(one.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]).max() for one in (stiff, found)]
     assert apart[1] < 0.2 * apart[0]
@@ -150,7 +150,7 @@ def test_where_a_link_bends_is_a_share_of_its_length(robots: Any) -> None:
     """Readings of links that bend at their clamps differ from the model's by the hinges' slopes."""
     chain, types = _forward(robots, 21, 3)
     data, loads = _bent(chain, types, 4.0, 0)
-    flex = flex_slopes(chain, data.joints, loads)
+    flex = compliance_jacobian(chain, data.joints, loads)
     known = hinge_slopes(chain, data.joints, loads, flex, np.full(len(flex.links), 4.0))
     assert known.links[len(flex.links) :] == (1, 1, 1, 2, 2, 2)
     still = readings_on(chain, body_motions(chain, *data.joints))
@@ -188,8 +188,8 @@ def test_a_robot_without_links_has_nothing_that_bends(robots: Any) -> None:
     joints = _swing(1, 1.0)
     loads = link_loads(chain, types, body_motions(chain, *joints), joints[0], RATE_HZ)
     assert loads == [None]
-    found = flex_slopes(chain, joints, loads)
-    assert found.links == no_flex(1, len(joints[0])).links
+    found = compliance_jacobian(chain, joints, loads)
+    assert found.links == rigid(1, len(joints[0])).links
     assert found.slopes.shape == (0, 6, len(joints[0]), 1)
 
 

@@ -26,7 +26,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.null_space import name_null_space
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03
 
@@ -66,7 +66,7 @@ def _perturbed(chain: Chain, seed: int, angle: float, offset: float) -> Chain:
     delta[:, 3:] += np.cross(chain.imu_home[:, :3, 3], delta[:, :3])
     delta[0] = 0.0
     tilt = Rotation.from_rotvec(rng.normal(0, angle, 3))
-    return apply_increment(chain, delta.ravel())._replace(gravity=tilt.apply(chain.gravity))
+    return apply_perturbation(chain, delta.ravel())._replace(gravity=tilt.apply(chain.gravity))
 
 
 def _increment(found: Chain, truth: Chain) -> Array:
@@ -192,7 +192,7 @@ def test_scipy_finds_the_same_minimum(robots: Any) -> None:
     poses = orth(np.eye(12) - found.null_basis[6:] @ found.null_basis[6:].T)
 
     def misfit(x: Array) -> Array:
-        moved = apply_increment(truth, np.concatenate([np.zeros(6), poses @ x[: found.rank]]))
+        moved = apply_perturbation(truth, np.concatenate([np.zeros(6), poses @ x[: found.rank]]))
         tilt, biases = x[found.rank : found.rank + 3], x[found.rank + 3 :].reshape(2, 3, 3)
         read = imu_readings(moved._replace(gravity=truth.gravity + tilt), q, qd, qdd)
         return np.concatenate(

@@ -11,7 +11,7 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from coordinator.commands.compensate_view import (
-    FloatView,
+    CompensationView,
     moment_line,
     moment_table,
     summary_fields,
@@ -20,7 +20,7 @@ from coordinator.commands.compensate_view import (
 from coordinator.main import app
 from coordinator.torque_control.gravity_compensation import Reading
 from coordinator.torque_control.session import Moment
-from coordinator.torque_control.summary import FloatTally
+from coordinator.torque_control.summary import CompensationTally
 
 SERIALS = ("A", "B")
 
@@ -85,12 +85,12 @@ def test_a_moment_is_a_line_in_a_pipe_and_a_row_a_joint_in_a_terminal() -> None:
 
 def test_lines_of_json_come_twice_a_second_and_hold_si_units(capsys: pytest.CaptureFixture[str]) -> None:
     now = [0.0]
-    with FloatView(SERIALS, lambda: now[0], as_json=True, quiet=True) as view:
+    with CompensationView(SERIALS, lambda: now[0], as_json=True, quiet=True) as view:
         for k in range(201):
             now[0] = 100.0 + 0.005 * k
             view.moment(moment(0.005 * k))
         view.note("nobody hears it")
-        tally = FloatTally(SERIALS)
+        tally = CompensationTally(SERIALS)
         view.summary(tally.summary("its time is over", False))
     *lines, summary = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["floated_s"] for line in lines] == [0.0, 0.5, 1.0]
@@ -106,7 +106,7 @@ def test_lines_of_json_come_twice_a_second_and_hold_si_units(capsys: pytest.Capt
 
 
 def test_a_summary_tells_how_far_how_fast_and_under_what_load_every_joint_went() -> None:
-    tally = FloatTally(SERIALS)
+    tally = CompensationTally(SERIALS)
     way = np.linspace(0.0, 0.4, 101)
     for k, q in enumerate(way):
         # There and half the way back.
@@ -114,7 +114,7 @@ def test_a_summary_tells_how_far_how_fast_and_under_what_load_every_joint_went()
         tally.add(0.01 * k, np.array([here, 0.1]), np.array([-0.4, 0.0]), np.array([3.0 if k else -5.0, 2.0]))
     tally.sent, tally.missed = 101, 2
     found = tally.summary("asked to end", False)
-    assert (found.floated_s, found.sent, found.missed) == (pytest.approx(1.0), 101, 2)
+    assert (found.compensated_s, found.sent, found.missed) == (pytest.approx(1.0), 101, 2)
     first, second = found.joints
     assert (first.began_rad, first.ended_rad) == (0.0, pytest.approx(0.16))
     assert first.farthest_rad == pytest.approx(0.32)
@@ -130,5 +130,5 @@ def test_a_summary_tells_how_far_how_fast_and_under_what_load_every_joint_went()
 
 
 def test_a_float_that_never_began_has_no_joints_to_tell_of() -> None:
-    found = FloatTally(SERIALS).summary("it carries something", True)
-    assert (found.floated_s, found.joints, found.is_fault) == (0.0, (), True)
+    found = CompensationTally(SERIALS).summary("it carries something", True)
+    assert (found.compensated_s, found.joints, found.is_fault) == (0.0, (), True)

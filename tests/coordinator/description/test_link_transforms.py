@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from coordinator.description.link_transforms import LinkTransform, link_transforms, parameter_slope
 from module_agent.model.chain import Array
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import build_tree, true_chain
 
@@ -77,7 +77,7 @@ def test_the_covariance_is_that_of_many_robots_drawn_from_the_chains(robots: Any
     claimed = link_transforms(chain, types, root @ root.T, NOTHING)
     drawn = [
         np.array([link.values for link in link_transforms(moved, types, np.zeros((18, 18)), NOTHING)])
-        for moved in (apply_increment(chain, root @ rng.normal(size=18)) for _ in range(3000))
+        for moved in (apply_perturbation(chain, root @ rng.normal(size=18)) for _ in range(3000))
     ]
     for link, found in zip(claimed, np.swapaxes(np.array(drawn), 0, 1), strict=True):
         # 3000 draws tell a variance to 2.6 %; four of that over the 36 figures.

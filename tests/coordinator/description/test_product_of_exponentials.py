@@ -13,7 +13,7 @@ from coordinator.description.urdf_writer import write_urdf
 from coordinator.kinematics.frames import distal_homes, housing_homes, output_homes, proximal_homes
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import body_displacements
-from module_agent.model.perturbation import apply_increment, skew
+from module_agent.model.perturbation import apply_perturbation, skew
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import build_tree, true_chain
 
@@ -79,7 +79,7 @@ def test_the_covariances_are_those_of_many_robots_drawn_from_the_chains(robots: 
     model = screw_model(chain, types, spread)
     rng = np.random.default_rng(7)
     root = np.linalg.cholesky(spread + 1e-18 * np.eye(24))
-    drawn = [apply_increment(chain, root @ rng.normal(size=24)) for _ in range(4000)]
+    drawn = [apply_perturbation(chain, root @ rng.normal(size=24)) for _ in range(4000)]
     screws = np.array([screw_axes(one) for one in drawn])
     for k in range(1, 4):
         found = np.cov(screws[:, k].T)

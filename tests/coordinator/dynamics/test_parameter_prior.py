@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.dynamics.inertia_prior import LEAST_LINK_KG, LINK_KG_M, OUTPUT_SHARE, module_prior
+from coordinator.dynamics.inertia_prior import LINK_KG_M, MIN_LINK_KG, OUTPUT_SHARE, module_prior
 from coordinator.dynamics.pseudo_inertia import body, is_consistent, pseudo_inertia
 from sim.robot.random_robot import random_robot
 from sim.robot.robot_file import Robot, load_robot
@@ -45,7 +45,7 @@ def test_the_expected_mass_is_that_of_all_modules_but_for_what_stands_on_the_bas
                 enter = tree.output[i] if tree.reversed[i] else tree.housing[i]
                 leave = tree.housing[parent] if tree.reversed[parent] else tree.output[parent]
                 length = float(np.linalg.norm(enter[:3, 3] - leave[:3, 3]))
-                expected += max(LINK_KG_M * length, LEAST_LINK_KG)
+                expected += max(LINK_KG_M * length, MIN_LINK_KG)
         found = module_prior(chain, tree.types)[:, 3, 3].sum()
         assert found == pytest.approx(expected, rel=1e-9)
 

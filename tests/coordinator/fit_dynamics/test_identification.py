@@ -129,9 +129,9 @@ def test_every_term_that_is_there_earns_its_place_and_one_that_is_not_does_not(r
     for part in plain:
         # Every friction and offset is far above what 24 s of this noise hide.
         if part.term in ("viscous", "coulomb", "offset"):
-            assert part.earns_its_place, part
+            assert part.significant, part
     motors = {part.name: part for part in plain if part.term == "inertia"}
-    assert not motors["Ia1"].earns_its_place
+    assert not motors["Ia1"].significant
     assert "I1zz" in motors["Ia1"].lumped_with
 
 

@@ -101,9 +101,11 @@ def test_the_result_says_what_is_known_of_every_parameter(run: list[Entry]) -> N
     dynamics = identify(_recorded(run)).result.dynamics
     assert dynamics is not None
     assert len(dynamics.base_parameters) == dynamics.rank
-    assert len(dynamics.verdicts) == dynamics.parameters == 20
+    assert len(dynamics.identifiabilities) == dynamics.parameters == 20
     sums = dynamics.base_parameters
-    alone = [v for v in dynamics.verdicts if any(sums[place].words == v.parameter for place in v.sums)]
+    alone = [
+        v for v in dynamics.identifiabilities if any(sums[place].words == v.parameter for place in v.sums)
+    ]
     assert alone
     for verdict in alone:
         # Known by itself: the one sum that it is in is it.
@@ -112,7 +114,7 @@ def test_the_result_says_what_is_known_of_every_parameter(run: list[Entry]) -> N
         relative = sums[place].relative_sigma
         assert relative is not None
         assert verdict.verdict == ("identified" if relative <= 0.1 else "weak")
-    assert {v.serial for v in dynamics.verdicts} == {BASE, TIP}
+    assert {v.serial for v in dynamics.identifiabilities} == {BASE, TIP}
     assert len(dynamics.words) == 3
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.identification.preview import Looks, RobotSoFar, robot_so_far
+from coordinator.identification.preview import Preview, Previewer, preview
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
 
@@ -43,13 +43,13 @@ def until(recording: Recording, explored: Sequence[str]) -> Recording:
     return recording
 
 
-def sigma(found: RobotSoFar | None) -> float:
+def sigma(found: Preview | None) -> float:
     assert found is not None
     return float(found.fit.link_length_sigma_m[1])
 
 
 def test_one_joint_tells_the_link_beyond_it_within_what_it_claims(recording: Recording) -> None:
-    found = Looks(until(recording, [BASE])).look([BASE])
+    found = Previewer(until(recording, [BASE])).look([BASE])
     assert found is not None
     assert found.fit.chain.serials == (BASE, TIP)
     assert found.beside == (False, True)
@@ -60,7 +60,7 @@ def test_one_joint_tells_the_link_beyond_it_within_what_it_claims(recording: Rec
 
 def test_samples_move_the_robot_within_what_the_circles_leave_open(recording: Recording) -> None:
     explored = [BASE, TIP]
-    circles, samples = robot_so_far(recording, explored), Looks(recording).look(explored)
+    circles, samples = preview(recording, explored), Previewer(recording).look(explored)
     assert circles is not None
     assert samples is not None
     apart = samples.fit.link_length_m[1] - circles.fit.link_length_m[1]
@@ -69,23 +69,23 @@ def test_samples_move_the_robot_within_what_the_circles_leave_open(recording: Re
 
 
 def test_a_robot_of_more_modules_than_are_to_be_refined_is_as_assembled(recording: Recording) -> None:
-    found, assembled = Looks(recording, most_refined=1).look([BASE]), robot_so_far(recording, [BASE])
+    found, assembled = Previewer(recording, most_refined=1).look([BASE]), preview(recording, [BASE])
     assert found is not None
     assert assembled is not None
     np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
 
 
 def test_where_samples_are_missing_the_robot_is_as_assembled(recording: Recording) -> None:
-    assembled = robot_so_far(recording, [BASE])
+    assembled = preview(recording, [BASE])
     recording.modules[TIP].round_trips.clear()
-    found = Looks(recording).look([BASE])
+    found = Previewer(recording).look([BASE])
     assert found is not None
     assert assembled is not None
     np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
 
 
 def test_the_same_look_twice_is_the_same_to_the_last_bit(recording: Recording) -> None:
-    looks = Looks(recording)
+    looks = Previewer(recording)
     one, two = (looks.look([BASE, TIP]) for _ in range(2))
     assert one is not None
     assert two is not None
@@ -93,4 +93,4 @@ def test_the_same_look_twice_is_the_same_to_the_last_bit(recording: Recording) -
 
 
 def test_before_anything_has_moved_there_is_nothing_to_see(recording: Recording) -> None:
-    assert Looks(until(recording, [])).look([]) is None
+    assert Previewer(until(recording, [])).look([]) is None

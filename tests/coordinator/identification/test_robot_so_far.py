@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.identification.preview import beside, robot_so_far
+from coordinator.identification.preview import beside, preview
 from coordinator.kinematics.assembly import link_lengths
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import ancestors, carrier
@@ -79,7 +79,7 @@ def forward(robots: Any, seed: int, joints: int) -> tuple[Chain, Any]:
 def test_when_all_joints_have_moved_the_robot_is_the_whole_one(robots: Any, seed: int) -> None:
     chain, types = robots.random(seed, joints=2 + seed)
     recording: Any = Seen(robots, chain, types, chain.serials)
-    found = robot_so_far(recording, chain.serials)
+    found = preview(recording, chain.serials)
     assert found is not None
     so_far = found.fit.chain
     parents = {
@@ -102,7 +102,7 @@ def test_a_module_stands_on_the_nearest_joint_that_has_moved_and_moves_it(robots
     for count in range(1, 7):
         explored = [chain.serials[i] for i in order[:count]]
         recording: Any = Seen(robots, chain, types, explored)
-        found = robot_so_far(recording, explored)
+        found = preview(recording, explored)
         nearest = {}
         for k, serial in enumerate(chain.serials):
             above = [chain.serials[i] for i in ancestors(chain, carrier(chain, k))]
@@ -135,7 +135,7 @@ def test_bands_grow_narrower_the_more_joints_have_moved(robots: Any) -> None:
     sigmas = []
     for count in range(1, 6):
         recording: Any = Seen(robots, chain, types, chain.serials[:count])
-        found = robot_so_far(recording, chain.serials[:count])
+        found = preview(recording, chain.serials[:count])
         assert found is not None
         sigmas.append(float(found.fit.link_length_sigma_m[1]))
     assert all(later <= sooner * (1 + 1e-6) for sooner, later in pairwise(sigmas))
@@ -144,7 +144,7 @@ def test_bands_grow_narrower_the_more_joints_have_moved(robots: Any) -> None:
 def test_before_anything_has_moved_there_is_no_robot(robots: Any) -> None:
     chain, types = robots.random(1, joints=3)
     recording: Any = Seen(robots, chain, types, [])
-    assert robot_so_far(recording, []) is None
+    assert preview(recording, []) is None
 
 
 def test_a_module_that_has_not_told_its_type_is_named(robots: Any) -> None:
@@ -152,4 +152,4 @@ def test_a_module_that_has_not_told_its_type_is_named(robots: Any) -> None:
     recording: Any = Seen(robots, chain, types, chain.serials)
     recording.modules[chain.serials[1]].info = None
     with pytest.raises(ValueError, match=f"module {chain.serials[1]} has not told its type"):
-        robot_so_far(recording, chain.serials)
+        preview(recording, chain.serials)

@@ -17,7 +17,7 @@ from coordinator.kinematics.chain_observations import (
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import imu_poses
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 X5 = CATALOGUE["X5-4"]
 
@@ -33,11 +33,11 @@ def without_null_space(fit: ChainFit, truth: Chain) -> Chain:
     """Move the estimate along its null space, and nowhere else, as near to the truth as it goes."""
 
     def off(amounts: np.ndarray) -> np.ndarray:
-        return (apply_increment(fit.chain, fit.null_basis @ amounts).imu_home - truth.imu_home).ravel()
+        return (apply_perturbation(fit.chain, fit.null_basis @ amounts).imu_home - truth.imu_home).ravel()
 
     start = np.zeros(fit.null_basis.shape[1])
     best = least_squares(off, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x if start.size else start
-    return apply_increment(fit.chain, fit.null_basis @ best)
+    return apply_perturbation(fit.chain, fit.null_basis @ best)
 
 
 @pytest.mark.parametrize("seed", range(12))

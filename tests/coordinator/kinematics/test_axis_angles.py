@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from coordinator.kinematics.frames import axis_angles
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 
 def test_the_sigma_is_the_spread_of_many_robots_drawn_from_the_chains(robots: Any) -> None:
@@ -15,7 +15,7 @@ def test_the_sigma_is_the_spread_of_many_robots_drawn_from_the_chains(robots: An
     root[:6] = 0.0
     angle, sigma = axis_angles(chain, root @ root.T)
     drawn = [
-        axis_angles(apply_increment(chain, root @ rng.normal(size=24)), np.zeros((24, 24)))[0]
+        axis_angles(apply_perturbation(chain, root @ rng.normal(size=24)), np.zeros((24, 24)))[0]
         for _ in range(4000)
     ]
     assert np.isnan(angle[0])
@@ -28,7 +28,7 @@ def test_the_sigma_is_the_spread_of_many_robots_drawn_from_the_chains(robots: An
 def test_a_turn_about_the_parents_axis_changes_nothing_and_costs_nothing(robots: Any) -> None:
     chain, _ = robots.random(7, joints=2)
     twist = np.concatenate([np.zeros(6), chain.axis[0], np.cross(chain.point[0], chain.axis[0])])
-    turned, _ = axis_angles(apply_increment(chain, 0.8 * twist), np.zeros((12, 12)))
+    turned, _ = axis_angles(apply_perturbation(chain, 0.8 * twist), np.zeros((12, 12)))
     angle, sigma = axis_angles(chain, np.outer(twist, twist))
     np.testing.assert_allclose(turned[1], angle[1], atol=1e-12)
     np.testing.assert_allclose(sigma[1], 0.0, atol=1e-12)

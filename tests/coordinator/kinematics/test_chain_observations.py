@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coordinator.kinematics.chain_observations import jacobian, pack, predict, residuals
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -18,7 +18,7 @@ def test_the_jacobian_is_the_slope_of_the_residuals_of_any_tree(robots: Any, see
     seen = pack(chain.serials, robots.observe(chain, positions), rests)
     rng = np.random.default_rng(seed)
     width = 6 * len(chain.serials)
-    elsewhere = apply_increment(chain, rng.normal(0, 0.05, width))
+    elsewhere = apply_perturbation(chain, rng.normal(0, 0.05, width))
     slopes = jacobian(elsewhere, seen)
     step = 1e-6
     for column in range(width + 3):
@@ -27,7 +27,7 @@ def test_the_jacobian_is_the_slope_of_the_residuals_of_any_tree(robots: Any, see
             delta = np.zeros(width + 3)
             delta[column] = sign * step
             turn = Rotation.from_rotvec(delta[width:])
-            moved = apply_increment(elsewhere, delta[:width])
+            moved = apply_perturbation(elsewhere, delta[:width])
             ends.append(residuals(moved._replace(gravity=turn.apply(moved.gravity)), seen))
         numeric = (ends[0] - ends[1]) / (2 * step)
         # Second differences of weights up to 1/(0.3 mm): 3000 * 1e-12 / 1e-6, and rounding of the same size.

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.kinematics.gauge_fixing import carried, free_motions, moved, nearest, settled
+from coordinator.kinematics.gauge_fixing import carried, gauge_fixed, gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved, name_null_space
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import descendants
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 
 def hidden(chain: Chain) -> tuple[Unresolved, ...]:
@@ -32,7 +32,7 @@ def hidden(chain: Chain) -> tuple[Unresolved, ...]:
 @pytest.mark.parametrize("seed", range(6))
 def test_a_robot_that_has_drifted_by_what_cannot_be_known_comes_back(robots: Any, seed: int) -> None:
     chain, _ = robots.random(seed, joints=5)
-    free = free_motions(chain, hidden(chain))
+    free = gauge_freedoms(chain, hidden(chain))
     rng = np.random.default_rng(seed)
     # Up to half a turn, and half a metre.
     away = moved(
@@ -52,13 +52,13 @@ def test_without_anything_unknown_nothing_moves(robots: Any) -> None:
 
 def test_a_change_of_the_robot_is_the_same_change_after_it_was_brought_back(robots: Any) -> None:
     chain, _ = robots.random(4, joints=4, serial=True)
-    free = free_motions(chain, hidden(chain))
+    free = gauge_freedoms(chain, hidden(chain))
     amounts = np.array([0.3, -1.1])
     delta = np.random.default_rng(1).normal(size=24) * 1e-6
     delta[:6] = 0.0
     after = moved(chain, free, amounts)
-    changed = apply_increment(after, carried(chain, after, delta[:, None])[:, 0].copy())
-    expected = moved(apply_increment(chain, delta), free, amounts)
+    changed = apply_perturbation(after, carried(chain, after, delta[:, None])[:, 0].copy())
+    expected = moved(apply_perturbation(chain, delta), free, amounts)
     # Of first order: the axis that the branch was turned about is the root's, which does not change.
     np.testing.assert_allclose(changed.imu_home, expected.imu_home, atol=1e-10)
 
@@ -67,15 +67,15 @@ def test_motions_of_another_tree_than_the_chains_are_left_out(robots: Any) -> No
     chain, _ = robots.random(4, joints=4, serial=True)
     items = hidden(chain)
     turned = chain._replace(serials=chain.serials[::-1])
-    assert free_motions(turned, items) == ()
+    assert gauge_freedoms(turned, items) == ()
     combination = items[0]._replace(kind="combination", joint="")
-    assert free_motions(chain, [combination]) == ()
+    assert gauge_freedoms(chain, [combination]) == ()
 
 
 def test_a_fit_that_drifted_is_settled_with_all_that_is_known_of_it(robots: Any) -> None:
     chain, _ = robots.random(6, joints=5)
     items = hidden(chain)
-    free = free_motions(chain, items)
+    free = gauge_freedoms(chain, items)
     basis, _ = np.linalg.qr(np.concatenate([item.directions for item in items], axis=1))
     root = np.random.default_rng(2).normal(size=(30, 30)) * 1e-4
     root[:6] = 0.0
@@ -83,7 +83,7 @@ def test_a_fit_that_drifted_is_settled_with_all_that_is_known_of_it(robots: Any)
     away = moved(chain, free, np.full(len(free), 0.4))
     drifted_basis, _ = np.linalg.qr(carried(chain, away, basis))
     drifted = carried(chain, away, carried(chain, away, known @ known.T).T)
-    back = settled(away, drifted, drifted_basis, chain)
+    back = gauge_fixed(away, drifted, drifted_basis, chain)
     np.testing.assert_allclose(back.chain.imu_home, chain.imu_home, atol=1e-6)
     np.testing.assert_allclose(back.covariance, known @ known.T, atol=1e-12)
     # The same space, whatever vectors span it.

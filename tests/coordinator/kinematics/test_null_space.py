@@ -8,7 +8,7 @@ import pytest
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import pack, residuals
 from coordinator.kinematics.null_space import name_null_space
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -23,7 +23,7 @@ def test_moving_along_a_named_direction_by_any_amount_changes_no_observation(rob
     directions = [d for item in fit.unresolved for d in item.directions.T]
     assert len(directions) == fit.null_basis.shape[1]
     for direction in directions:
-        moved = apply_increment(fit.chain, 1.3 * direction)  # no small amount: 1.3 m, or 1.3 rad
+        moved = apply_perturbation(fit.chain, 1.3 * direction)  # no small amount: 1.3 m, or 1.3 rad
         # Residuals are in sigmas; rounding of 1e-12 m over 0.3 mm is far below.
         np.testing.assert_allclose(residuals(moved, seen), residuals(fit.chain, seen), atol=1e-5)
 

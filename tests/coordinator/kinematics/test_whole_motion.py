@@ -9,12 +9,12 @@ from coordinator.batch_estimation.estimator import SensorData, refine_chain
 from coordinator.batch_estimation.imu_prediction import imu_readings
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.simultaneous_motion import (
+    SimultaneousMotion,
+    SimultaneousResponse,
     StillReading,
-    WholeMotion,
-    WholeResponse,
     circles_of_all,
     seen_by_all,
-    whole_response,
+    simultaneous_response,
 )
 from coordinator.topology.topology import find_topology
 from module_agent.model.chain import Chain
@@ -36,7 +36,7 @@ def multi_sines(count: int, slow_rad: float = 0.2, fast_rad: float = 0.03) -> tu
     )
 
 
-def moved(chain: Chain, seed: int, noise: float = 1.0) -> tuple[WholeMotion, StillReading]:
+def moved(chain: Chain, seed: int, noise: float = 1.0) -> tuple[SimultaneousMotion, StillReading]:
     """What IMUs with white noise and gyro offsets read of a robot that moves all joints."""
     rng = np.random.default_rng(seed)
     count = len(chain.serials)
@@ -44,7 +44,7 @@ def moved(chain: Chain, seed: int, noise: float = 1.0) -> tuple[WholeMotion, Sti
     gyro, accel = imu_readings(chain, q, qd, qdd)
     rest = imu_readings(chain, np.zeros((1, count)), np.zeros((1, count)), np.zeros((1, count)))
     offset = rng.normal(0.0, 0.02, (count, 3))
-    data = WholeMotion(
+    data = SimultaneousMotion(
         q,
         qd,
         qdd,
@@ -54,8 +54,8 @@ def moved(chain: Chain, seed: int, noise: float = 1.0) -> tuple[WholeMotion, Sti
     return data, StillReading(rest.gyro_rad_s[0] + offset, rest.accel_m_s2[0])
 
 
-def answered(chain: Chain, seed: int) -> WholeResponse:
-    return whole_response(*moved(chain, seed), RATE_HZ, 15.0)
+def answered(chain: Chain, seed: int) -> SimultaneousResponse:
+    return simultaneous_response(*moved(chain, seed), RATE_HZ, 15.0)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -102,7 +102,7 @@ def test_the_refinement_ends_where_it_would_have_ended_from_the_true_robot(
 ) -> None:
     chain, types = robots.random(20 + seed, joints=6, serial=True)
     data, still = moved(chain, seed)
-    response = whole_response(data, still, RATE_HZ, 15.0)
+    response = simultaneous_response(data, still, RATE_HZ, 15.0)
     topology = find_topology(seen_by_all(chain.serials, response))
     rest = robots.rest(chain, np.zeros(6))
     first = assemble(topology, types, circles_of_all(chain.serials, response), [rest])
@@ -126,7 +126,7 @@ def test_without_noise_the_gyro_answers_a_single_joint_exactly(robots: SimpleNam
     qdd = np.concatenate([alone.qdd_rad_s2, np.zeros_like(alone.q_rad)], axis=1)
     gyro, accel = imu_readings(chain, q, qd, qdd)
     seen = alone._replace(gyro_rad_s=gyro[:, 1:], accel_m_s2=accel[:, 1:])
-    response = whole_response(seen, StillReading(np.zeros((1, 3)), accel[:1, 1]), RATE_HZ, 15.0)
+    response = simultaneous_response(seen, StillReading(np.zeros((1, 3)), accel[:1, 1]), RATE_HZ, 15.0)
     axis, radial = robots.circle(chain, 0, 1, np.zeros(2))
     np.testing.assert_allclose(response.axis[0, 0], axis, atol=1e-9)
     # Integrating the gyro by the trapezoid rule at 250 Hz turns gravity wrongly by some microradians.
@@ -136,14 +136,14 @@ def test_without_noise_the_gyro_answers_a_single_joint_exactly(robots: SimpleNam
 def test_joints_that_moved_alike_are_named() -> None:
     q, qd, qdd = multi_sines(3)
     qd[:, 2] = 2.0 * qd[:, 0]
-    data = WholeMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
+    data = SimultaneousMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
     with pytest.raises(ValueError, match="columns 0 and 2 moved alike"):
-        whole_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
+        simultaneous_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
 
 
 def test_a_joint_that_did_not_turn_is_named() -> None:
     q, qd, qdd = multi_sines(3)
     qd[:, 1] = 0.0
-    data = WholeMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
+    data = SimultaneousMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
     with pytest.raises(ValueError, match=r"column 1 turned at only 0 rad/s"):
-        whole_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
+        simultaneous_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.live_robot.messenger import NoAnswer, Radio, Refused
+from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused
 from coordinator.recording.recording import Entry, Recording
 from module_agent.transport.transport import Request, TransportError
 from module_agent.wire.codec import encode
@@ -28,7 +28,7 @@ class Bench:
         self.module: VirtualEndpoint = self.network.endpoint("module")
         self.entries: list[Entry] = []
         self.recording = Recording()
-        self.radio = Radio(
+        self.radio = Messenger(
             self.network.endpoint("coordinator"),
             wire.robot,
             lambda: self.loop.now_ns,
@@ -166,7 +166,7 @@ def test_a_burst_larger_than_one_turn_of_the_loop_is_heard_to_the_end_and_in_ord
 
 def test_what_a_loop_that_hangs_cannot_take_is_counted(bench: Bench) -> None:
     wire, posted = bench.wire, []
-    radio = Radio(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
+    radio = Messenger(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
     radio.start()
     payload = encode(wire.status())
     for _ in range(100_007):

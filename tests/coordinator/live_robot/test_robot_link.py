@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted
-from coordinator.live_robot.messenger import NoAnswer, Radio, Refused
-from coordinator.live_robot.module_group import RobotLink
+from coordinator.live_robot.messenger import Messenger, NoAnswer, Refused
+from coordinator.live_robot.module_group import ModuleGroup
 from module_agent.control.motion import effort_profile
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.wire.keys import Leaf
@@ -22,12 +22,12 @@ PATIENT_NS = 500_000_000
 SLOW = GoTo(target_rad=1.0, max_speed_rad_s=0.6)
 
 
-async def _met(link: RobotLink, *serials: str) -> None:
+async def _met(link: ModuleGroup, *serials: str) -> None:
     await asyncio.sleep(0.1)
     await link.meet(serials or (BASE, TIP))
 
 
-async def _armed(link: RobotLink, *serials: str) -> asyncio.Task[None]:
+async def _armed(link: ModuleGroup, *serials: str) -> asyncio.Task[None]:
     """Meet, take, and keep alive until the task is cancelled."""
     await _met(link, *serials)
     for serial in link.serials:
@@ -272,7 +272,7 @@ def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_a
     lost: list[Ack] = []
 
     async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
-        ack = await Radio.command(radio, serial, leaf, message, timeout_s)
+        ack = await Messenger.command(radio, serial, leaf, message, timeout_s)
         if leaf is Leaf.MOTION and not lost:
             lost.append(ack)
             # The answer is lost, and for longer than a command lives so are the keep-alives.
@@ -356,14 +356,14 @@ def test_motion_numbers_grow_from_one_coordinator_to_the_next(rigs: Callable[...
     rig.run(work())
 
 
-def _commands(monkeypatch: pytest.MonkeyPatch, radio: Radio) -> list[MotionCommand]:
+def _commands(monkeypatch: pytest.MonkeyPatch, radio: Messenger) -> list[MotionCommand]:
     """Return a list that fills with the motion commands that go out."""
     sent: list[MotionCommand] = []
 
     async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
         if isinstance(message, MotionCommand):
             sent.append(message)
-        return await Radio.command(radio, serial, leaf, message, timeout_s)
+        return await Messenger.command(radio, serial, leaf, message, timeout_s)
 
     monkeypatch.setattr(radio, "command", command)
     return sent
@@ -464,7 +464,7 @@ def test_a_motion_during_which_another_joint_let_go_is_spoilt(
     async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
         if serial == TIP and leaf is Leaf.LEASE and rig.state(BASE) == "moving":
             raise NoAnswer(serial, leaf, "Timeout")
-        return await Radio.command(radio, serial, leaf, message, timeout_s)
+        return await Messenger.command(radio, serial, leaf, message, timeout_s)
 
     monkeypatch.setattr(radio, "command", command)
 

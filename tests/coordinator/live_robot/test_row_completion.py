@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from coordinator.live_robot.backfill import HOLES_AT_ONCE, RowCompletion
-from coordinator.live_robot.messenger import Refused, together
+from coordinator.live_robot.messenger import Refused, gather_all
 from module_agent.wire.keys import Leaf
 from module_agent.wire.refusal import Refusal
 from module_agent.wire.row_log import RowLog
@@ -89,5 +89,5 @@ def test_what_is_done_together_is_done_to_its_end_though_some_of_it_fails() -> N
         done.append(number)
 
     with pytest.raises(ValueError, match="one"):
-        asyncio.run(together(work(number) for number in range(4)))
+        asyncio.run(gather_all(work(number) for number in range(4)))
     assert done == [0, 2, 3]

@@ -26,7 +26,7 @@ from coordinator.parameter_fit.systematic_errors import chain_effects, error_dir
 from coordinator.recording.run_folder import INFORMATION
 from module_agent.model.chain import Array, Chain
 from module_agent.model.information import compress, merge
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
 from module_agent.signals.filtering import JointMotion
 
@@ -92,7 +92,7 @@ def measured(
     tau = inverse_dynamics(chain, bodies, q, qd, qdd) / (1.0 + errors.scale[of])
     noise = np.asarray(errors.noise * NOISE_NM[of])
     shown = (1.0 + errors.taken) * (tau + noise * rng.normal(size=tau.shape))
-    believed = apply_increment(chain, errors.off)
+    believed = apply_perturbation(chain, errors.off)
     bodies = bodies_from_parts(believed, PARTS) @ phi
     columns = chain_effects(believed, errors.spread, bodies, JointMotion(np.arange(samples), q, qd, qdd, tau))
     pieces = compress(np.concatenate([torque_regressor(believed, q, qd, qdd), columns], axis=2), shown)
@@ -127,12 +127,12 @@ def test_runs_of_one_assembly_say_together_what_one_long_run_says() -> None:
     for run in runs[1:]:
         total = merge(total, run.joints)
     long = runs[0]._replace(joints=total, effects=tuple(np.zeros((len(j.z), 0)) for j in total))
-    together, alone = exact(runs).base, exact([long]).base
-    assert together.rank == alone.rank
-    np.testing.assert_array_equal(together.independent, alone.independent)
+    gather_all, alone = exact(runs).base, exact([long]).base
+    assert gather_all.rank == alone.rank
+    np.testing.assert_array_equal(gather_all.independent, alone.independent)
     # The bar for what is distributed.
-    np.testing.assert_allclose(together.value, alone.value, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(together.covariance, alone.covariance, rtol=1e-8, atol=1e-18)
+    np.testing.assert_allclose(gather_all.value, alone.value, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(gather_all.covariance, alone.covariance, rtol=1e-8, atol=1e-18)
 
 
 def test_three_runs_of_one_assembly_cut_the_deviations_by_the_root_of_three() -> None:
@@ -155,7 +155,9 @@ def test_the_order_of_the_runs_does_not_matter(order: list[int]) -> None:
     # Rounding, by the condition of the sums.
     np.testing.assert_allclose(one.base.value, other.base.value, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(one.base.sigma, other.base.sigma, rtol=1e-6)
-    assert one.runs[0].strain == pytest.approx(other.runs[order.index(0)].strain, rel=1e-6, abs=1e-6)
+    assert one.runs[0].inconsistency_sigma == pytest.approx(
+        other.runs[order.index(0)].inconsistency_sigma, rel=1e-6, abs=1e-6
+    )
 
 
 def test_other_orders_of_the_modules_show_other_sums_of_their_parts() -> None:
@@ -184,7 +186,7 @@ def test_what_is_claimed_of_the_merged_sums_is_true() -> None:
     # Of some 35 standard normal draws the largest is below 4 in 99.8 of 100.
     assert np.abs(off).max() < 4.0
     assert 0.6 < np.sqrt(np.mean(off**2)) < 1.4
-    assert max(run.strain for run in found.runs) < 1.3
+    assert max(run.inconsistency_sigma for run in found.runs) < 1.3
 
 
 def test_a_part_that_was_not_the_same_is_noticed() -> None:
@@ -193,8 +195,8 @@ def test_a_part_that_was_not_the_same_is_noticed() -> None:
     heavier[[part.name == "B turned" for part in PARTS].index(True) * 10] += 0.1
     chain = assembled(rng)
     same, other = ([measured(rng, chain), measured(rng, chain, phi=phi)] for phi in (PHI, heavier))
-    assert max(run.strain for run in exact(same).runs) < 1.3
-    assert max(run.strain for run in exact(other).runs) > 5.0
+    assert max(run.inconsistency_sigma for run in exact(same).runs) < 1.3
+    assert max(run.inconsistency_sigma for run in exact(other).runs) > 5.0
 
 
 ORDERS = ((0, 1, 2), (2, 1, 0), (1, 2, 0), (0, 2, 1))

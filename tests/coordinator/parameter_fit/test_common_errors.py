@@ -15,7 +15,7 @@ from coordinator.parameter_fit.systematic_errors import (
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
 from module_agent.signals.filtering import JointMotion
 from sim.geometry.pose import inverse, pose
@@ -51,7 +51,7 @@ def test_effects_are_the_change_of_the_torques_one_deviation_each(rng: Generator
     values, vectors = np.linalg.eigh(spread)
     draws = [
         inverse_dynamics(
-            apply_increment(CHAIN, vectors[:, -6:] @ (np.sqrt(values[-6:]) * rng.normal(size=6))),
+            apply_perturbation(CHAIN, vectors[:, -6:] @ (np.sqrt(values[-6:]) * rng.normal(size=6))),
             PHI,
             *moved[1:4],
         )
@@ -83,7 +83,7 @@ def test_parts_of_known_modules_move_with_the_chain_and_so_do_their_torques(rng:
     for k in range(6 * JOINTS):
         # 1 mrad or 1 mm.
         one = 1e-3 * np.eye(6 * JOINTS)[:, [k]]
-        elsewhere = apply_increment(CHAIN, one[:, 0])
+        elsewhere = apply_perturbation(CHAIN, one[:, 0])
         true = (
             inverse_dynamics(elsewhere, bodies_from_parts(elsewhere, parts) @ phi, *moved[1:4]) - moved.tau_nm
         )
@@ -114,7 +114,7 @@ def test_what_a_chain_does_hardly_depends_on_how_bodies_are_split_into_parts(rng
     regressor = torque_regressor(CHAIN, *moved[1:4])
     each = 1e-3 * np.eye(6 * JOINTS)
     held = np.stack(
-        [inverse_dynamics(apply_increment(CHAIN, one), PHI, *moved[1:4]) - moved.tau_nm for one in each],
+        [inverse_dynamics(apply_perturbation(CHAIN, one), PHI, *moved[1:4]) - moved.tau_nm for one in each],
         axis=2,
     )
     likely = likely_parts(CHAIN, build_tree(ROBOT).types, PHI)
@@ -127,7 +127,7 @@ def test_what_a_chain_does_hardly_depends_on_how_bodies_are_split_into_parts(rng
 def rows_of(chain_moved: Array, spread: Array, rng: Generator) -> tuple[list[JointInformation], list[Array]]:
     """Rows by a chain that is wrong, beside what its errors do."""
     moved = motion(np.random.default_rng(5))
-    wrong = apply_increment(CHAIN, chain_moved)
+    wrong = apply_perturbation(CHAIN, chain_moved)
     regressor = torque_regressor(wrong, *moved[1:4])
     effects = chain_effects(wrong, spread, PHI, moved)
     noisy = moved.tau_nm + SIGMA * rng.normal(size=moved.tau_nm.shape)

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.parameter_fit.instrumental_variables import EARNS_ABOVE, SeenFit, solve_seen
+from coordinator.parameter_fit.instrumental_variables import (
+    EARNS_ABOVE,
+    InstrumentalFit,
+    solve_instrumental_variables,
+)
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress, merge
 from module_agent.model.regressor import torque_regressor
@@ -57,11 +61,11 @@ def lagging(torque: Array, lag_s: float) -> Array:
     return found
 
 
-def solved(motion: JointMotion) -> SeenFit:
-    return solve_seen(rows(motion), np.zeros_like(PHI), FRACTION)
+def solved(motion: JointMotion) -> InstrumentalFit:
+    return solve_instrumental_variables(rows(motion), np.zeros_like(PHI), FRACTION)
 
 
-def of(fit: SeenFit, term: str) -> tuple[Array, Array]:
+def of(fit: InstrumentalFit, term: str) -> tuple[Array, Array]:
     k = [*TERMS].index(term)
     return fit.terms.value[:, k], fit.terms.sigma[:, k]
 
@@ -123,8 +127,10 @@ def test_a_term_that_is_not_used_is_off_by_no_more_than_is_said(rng: Generator) 
 
 def test_the_order_of_motions_does_not_matter(rng: Generator) -> None:
     pieces = [rows(filtered(*swings(rng, 6.0))) for _ in range(3)]
-    one = solve_seen(merge(merge(*pieces[:2]), pieces[2]), np.zeros_like(PHI), FRACTION)
-    other = solve_seen(merge(pieces[2], merge(*pieces[1::-1])), np.zeros_like(PHI), FRACTION)
+    one = solve_instrumental_variables(merge(merge(*pieces[:2]), pieces[2]), np.zeros_like(PHI), FRACTION)
+    other = solve_instrumental_variables(
+        merge(pieces[2], merge(*pieces[1::-1])), np.zeros_like(PHI), FRACTION
+    )
     np.testing.assert_allclose(one.fit.phi, other.fit.phi, rtol=1e-8, atol=1e-10)
 
 
@@ -135,7 +141,7 @@ def test_noise_in_what_was_seen_does_not_make_inertias_small(rng: Generator) -> 
     # Accelerations that are seen with as much noise as they have signal.
     noisy = motion.qdd_rad_s2 + motion.qdd_rad_s2.std(axis=0) * rng.normal(size=q[: len(rigid)].shape)
     seen = torque_regressor(CHAIN, motion.q_rad, motion.qd_rad_s, noisy)
-    found = solve_seen(rows(motion, seen - rigid), np.zeros_like(PHI), FRACTION)
+    found = solve_instrumental_variables(rows(motion, seen - rigid), np.zeros_like(PHI), FRACTION)
     plain = compress(seen, motion.tau_nm)
     shrunk = np.linalg.lstsq(
         np.vstack([p.r for p in plain]), np.concatenate([p.z for p in plain]), rcond=1e-6
@@ -152,7 +158,7 @@ def test_what_a_rigid_robot_does_not_show_is_not_taken_from_noise(
     motion = filtered(q, torque + SIGMA_NM * rng.normal(size=torque.shape))
     rigid = torque_regressor(CHAIN, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     departure = 0.02 * rng.normal(size=rigid.shape) * (np.abs(rigid).sum(axis=0) > 0.0)
-    found = solve_seen(rows(motion, departure), np.zeros_like(PHI), FRACTION)
+    found = solve_instrumental_variables(rows(motion, departure), np.zeros_like(PHI), FRACTION)
     assert found.fit.rank == solved(motion).fit.rank
 
 
@@ -161,4 +167,4 @@ def test_rows_of_other_columns_are_refused() -> None:
     motion = filtered(q, torque)
     plain = compress(torque_regressor(CHAIN, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2), motion.tau_nm)
     with pytest.raises(ValueError, match=r"\[30\] columns"):
-        solve_seen(plain, np.zeros_like(PHI), FRACTION)
+        solve_instrumental_variables(plain, np.zeros_like(PHI), FRACTION)

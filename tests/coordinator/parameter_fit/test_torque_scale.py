@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 
-from coordinator.parameter_fit.instrumental_variables import SeenFit, solve_seen
+from coordinator.parameter_fit.instrumental_variables import InstrumentalFit, solve_instrumental_variables
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, scaled
 from module_agent.model.chain import Array
 from module_agent.model.information import compress
@@ -18,13 +18,15 @@ CHAIN, PHI = true_chain(ROBOT), true_inertia(ROBOT).ravel()
 JOINTS, SIGMA_NM, PRIOR = 4, 0.01, 0.05
 
 
-def solved(rng: Generator, off: Array, prior: float = PRIOR) -> SeenFit:
+def solved(rng: Generator, off: Array, prior: float = PRIOR) -> InstrumentalFit:
     """Fit 2000 samples at random, read by sensors that show tau / (1 + off)."""
     signals = rng.uniform(-1.0, 1.0, (3, 2000, JOINTS)) * np.array([3.0, 2.0, 10.0])[:, None, None]
     rigid = torque_regressor(CHAIN, *signals)
     tau = rigid @ PHI / (1.0 + off) + SIGMA_NM * rng.normal(size=(2000, JOINTS))
     nothing = np.zeros((2000, JOINTS, len(TERMS)))
-    return solve_seen(compress(np.concatenate([rigid, nothing], axis=2), tau), np.zeros_like(PHI), 1.0, prior)
+    return solve_instrumental_variables(
+        compress(np.concatenate([rigid, nothing], axis=2), tau), np.zeros_like(PHI), 1.0, prior
+    )
 
 
 def test_sensors_that_disagree_are_put_right_relative_to_each_other(rng: Generator) -> None:

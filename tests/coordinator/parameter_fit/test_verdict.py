@@ -12,7 +12,12 @@ from coordinator.parameter_fit.base_parameters import (
     inertial_units,
     into_frames,
 )
-from coordinator.parameter_fit.identifiability import Verdict, verdicts, words_of_base, words_of_body
+from coordinator.parameter_fit.identifiability import (
+    Identifiability,
+    identifiabilities,
+    words_of_base,
+    words_of_body,
+)
 from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import torque_regressor
 
@@ -47,12 +52,12 @@ def base_of(rng: Generator, noise_nm: float = 0.01) -> BaseParameters:
     return base_parameters(rows, target, inertial_columns(2), sigma=noise_nm)
 
 
-def named(some: tuple[Verdict, ...]) -> dict[str, Verdict]:
+def named(some: tuple[Identifiability, ...]) -> dict[str, Identifiability]:
     return {verdict.name: verdict for verdict in some}
 
 
 def test_what_a_double_pendulum_shows_is_told_apart(rng: Generator) -> None:
-    found = named(verdicts(base_of(rng), inertial_units(2)))
+    found = named(identifiabilities(base_of(rng), inertial_units(2)))
     assert {name for name, one in found.items() if one.kind == "identified"} == {"m1 c1y", "m2 c2x", "I2zz"}
     # Nearly balanced: known to a fraction of a gram metre, which is still more than its size.
     weak = found["m2 c2y"]
@@ -67,7 +72,7 @@ def test_what_a_double_pendulum_shows_is_told_apart(rng: Generator) -> None:
 
 
 def test_an_identified_parameter_has_the_digits_that_its_noise_leaves(rng: Generator) -> None:
-    found = named(verdicts(base_of(rng), inertial_units(2)))["I2zz"]
+    found = named(identifiabilities(base_of(rng), inertial_units(2)))["I2zz"]
     assert found.value is not None
     assert found.sigma is not None
     assert abs(found.value - 0.02) < 5.0 * found.sigma
@@ -82,20 +87,20 @@ def test_what_only_the_prior_settles_is_weak_however_small_its_deviation(rng: Ge
     base = base_of(rng)
     sigma = np.full(20, 10.0)
     sigma[10] = 0.001
-    found = named(verdicts(base, inertial_units(2), TRUTH, sigma))
+    found = named(identifiabilities(base, inertial_units(2), TRUTH, sigma))
     assert found["m2"].kind == "weak"
     assert found["m2"].words.startswith(
         "weak: 0.5000 +- 0.0010 kg (0.2 %) by the prior, only in sums with m1"
     )
     assert found["m1 c1x"].kind == "not identifiable"
     # Without effect stays so, whatever the prior believes.
-    believed = named(verdicts(base, inertial_units(2), np.ones(20), np.full(20, 1e-6)))
+    believed = named(identifiabilities(base, inertial_units(2), np.ones(20), np.full(20, 1e-6)))
     assert believed["m1"].kind == "not identifiable"
     assert believed["I2zz"].value == pytest.approx(0.02, abs=1e-3)
 
 
 def test_more_noise_makes_weak_what_was_identified(rng: Generator) -> None:
-    quiet, loud = (named(verdicts(base_of(rng, noise), inertial_units(2))) for noise in (0.01, 5.0))
+    quiet, loud = (named(identifiabilities(base_of(rng, noise), inertial_units(2))) for noise in (0.01, 5.0))
     assert quiet["m1 c1y"].kind == "identified"
     assert loud["m1 c1y"].kind == "weak"
     for verdict in loud.values():
@@ -106,7 +111,7 @@ def test_more_noise_makes_weak_what_was_identified(rng: Generator) -> None:
 
 def test_a_body_is_summed_up_in_a_line(rng: Generator) -> None:
     base = base_of(rng)
-    found = verdicts(base, inertial_units(2))
+    found = identifiabilities(base, inertial_units(2))
     assert words_of_body(found[:10]) == (
         "identified: m1 c1y; only in sums: m1 c1x, I1zz; "
         "without effect: m1, m1 c1z, I1xx, I1xy, I1xz, I1yy, I1yz"
@@ -119,8 +124,8 @@ def test_what_does_not_fit_is_named(rng: Generator) -> None:
     base = base_of(rng)
     nothing: Array = np.zeros(3)
     with pytest.raises(ValueError, match="10 units for 20 parameters"):
-        verdicts(base, inertial_units(1))
+        identifiabilities(base, inertial_units(1))
     with pytest.raises(ValueError, match="need their standard deviations"):
-        verdicts(base, inertial_units(2), TRUTH)
+        identifiabilities(base, inertial_units(2), TRUTH)
     with pytest.raises(ValueError, match=r"\(3,\) values"):
-        verdicts(base, inertial_units(2), nothing, nothing)
+        identifiabilities(base, inertial_units(2), nothing, nothing)

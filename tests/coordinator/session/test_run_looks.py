@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.identification.preview import Looks
+from coordinator.identification.preview import Previewer
 from coordinator.session.run import Run, RunConfig
 from module_agent.transport.transport import Transport
 
@@ -21,12 +21,12 @@ class Slow:
     def __init__(self) -> None:
         self.asked: list[list[str]] = []
         self.begun = threading.Event()
-        self.let_go = threading.Event()
+        self.release = threading.Event()
 
     def look(self, explored: Collection[str]) -> Any:
         self.asked.append(list(explored))
         self.begun.set()
-        assert self.let_go.wait(10.0)
+        assert self.release.wait(10.0)
         return SimpleNamespace(explored=tuple(explored))
 
 
@@ -61,7 +61,7 @@ def test_while_one_look_is_worked_out_no_other_begins_and_the_run_goes_on(tmp_pa
         # The call for the next joint returns at once, though the first look is not done.
         seen(run, "A", "B")
         assert shown == []
-        slow.let_go.set()
+        slow.release.set()
         await run._looked()
         assert shown == [("A",)]
         seen(run, "A", "B", "C")
@@ -74,7 +74,7 @@ def test_while_one_look_is_worked_out_no_other_begins_and_the_run_goes_on(tmp_pa
 
 def test_in_virtual_time_a_look_is_done_before_the_call_returns(tmp_path: Path) -> None:
     slow, shown = Slow(), []
-    slow.let_go.set()
+    slow.release.set()
     seen(run_of(tmp_path, slow, shown, inline=True), "A")
     assert shown == [("A",)]
 
@@ -96,6 +96,6 @@ def test_a_look_that_fails_is_logged_and_nothing_is_shown(
 def test_without_any_estimate_a_look_shows_nothing(tmp_path: Path) -> None:
     shown: list[Any] = []
     run = run_of(tmp_path, None, shown, inline=True)
-    run._looks = Looks(run.recording)
+    run._looks = Previewer(run.recording)
     run.estimates("A")
     assert shown == []

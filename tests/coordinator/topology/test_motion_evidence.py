@@ -6,7 +6,7 @@ import pytest
 from coordinator.topology.motion_evidence import (
     FEWEST_SAMPLES,
     GIVE_LEFT,
-    LEAST_RATE_RAD_S,
+    MIN_RATE_RAD_S,
     RATIO_FLOOR,
     NotMoved,
     carried_log_odds,
@@ -114,7 +114,7 @@ def test_of_a_joint_of_which_nothing_is_known_all_may_have_been_given() -> None:
 
 
 def test_a_joint_that_is_stuck_has_not_moved_whatever_its_encoder_jitters() -> None:
-    rate = 0.5 * LEAST_RATE_RAD_S * np.random.default_rng(1).normal(size=(SAMPLES, 3))
+    rate = 0.5 * MIN_RATE_RAD_S * np.random.default_rng(1).normal(size=(SAMPLES, 3))
     with pytest.raises(NotMoved, match=r"rad/s rms; 0.02 is needed"):
         motion_evidence(0, rate, np.zeros((SAMPLES, 3, 3)), np.zeros((3, 3)))
 

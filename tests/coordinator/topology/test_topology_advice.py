@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coordinator.topology.next_motion import MOST_REPEATS, next_motions
+from coordinator.topology.next_motion import MAX_REPEATS, next_motions
 from coordinator.topology.topology import Doubt, MotionSeen, likely_topology, seen_again
 from module_agent.wire.messages import ConstantMotion
 
@@ -45,9 +45,9 @@ def test_a_joint_that_was_seen_through_noise_moves_farther() -> None:
 def test_the_last_try_is_in_another_pose_and_then_the_joint_is_given_up() -> None:
     seen = watch(BC=MotionSeen(True, 0.55, sigma=0.3))
     doubts = likely_topology(seen).doubts
-    (last,) = next_motions(doubts, seen, {"B": MOST_REPEATS - 1})
+    (last,) = next_motions(doubts, seen, {"B": MAX_REPEATS - 1})
     assert last.others_rad > 0.3
-    assert next_motions(doubts, seen, {"B": MOST_REPEATS}) == ()
+    assert next_motions(doubts, seen, {"B": MAX_REPEATS}) == ()
 
 
 def test_an_observation_that_was_missed_is_asked_for_as_it_was() -> None:

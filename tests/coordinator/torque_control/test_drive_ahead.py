@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from coordinator.torque_control.feed_forward import Reference, SetPoints
-from coordinator.torque_control.motor_compensation import motor_pwm, winding_c, with_drive
+from coordinator.torque_control.motor_compensation import motor_pwm, winding_c, with_motor_compensation
 from module_agent.control.controller import Command, Controller
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import CATALOGUE, ModuleType
@@ -101,7 +101,7 @@ def test_loops_that_are_without_error_put_out_the_pwm_that_the_motor_needs(strat
     t_s = np.arange(1000) * TICK_S
     tau, rate = 2.0 + np.sin(6.0 * t_s), 0.7 * np.cos(4.0 * t_s)
     gains = default_gains(X5_4, strategy)
-    given = with_drive(points(tau, rate), [X5_4], [gains])
+    given = with_motor_compensation(points(tau, rate), [X5_4], [gains])
     controller = Controller(X5_4, gains, TICK_S)
     q = given.reference.q_rad[:, 0]
     pwm = [
@@ -115,7 +115,7 @@ def test_loops_that_are_without_error_put_out_the_pwm_that_the_motor_needs(strat
 
 def test_at_rest_only_the_constant_efficiency_is_put_right() -> None:
     tau = np.full(200, 3.0)
-    given = with_drive(points(tau, np.zeros(200)), [X5_4], [default_gains(X5_4, 3)])
+    given = with_motor_compensation(points(tau, np.zeros(200)), [X5_4], [default_gains(X5_4, 3)])
     # Half way between driving and being driven.
     added = given.effort_nm[100, 0] - 3.0
     assert abs(added) < 0.1 * 3.0
@@ -127,5 +127,5 @@ def test_where_a_loop_integrates_or_none_takes_an_effort_nothing_is_added() -> N
     winding = factory.model_copy(update={"effort": factory.effort.model_copy(update={"ki": 0.8})})
     asked: list[GainSet] = [winding, default_gains(X5_4, 0), default_gains(X5_4, 1)]
     for gains in asked:
-        given = with_drive(points(tau, rate), [X5_4], [gains])
+        given = with_motor_compensation(points(tau, rate), [X5_4], [gains])
         np.testing.assert_array_equal(given.effort_nm[:, 0], tau)

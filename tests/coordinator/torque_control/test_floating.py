@@ -5,23 +5,23 @@ import pytest
 
 from coordinator.torque_control.gains import (
     HOLDING_TIMES,
-    floating_gains,
+    compensation_gains,
     holding_gains,
     most_damping_nm_s_rad,
 )
 from coordinator.torque_control.gravity_compensation import (
-    MOST_GIVEN_RAD,
-    MOST_SUNK_RAD,
+    MAX_GIVEN_RAD,
+    MAX_SUNK_RAD,
     UNKNOWN_OF_LARGEST,
     UNKNOWN_OF_WEIGHT,
-    Floater,
-    FloatRefused,
-    FloatSettings,
+    CompensationRefused,
+    CompensationSettings,
+    GravityCompensator,
     Reading,
     StaleFeedback,
     Targets,
 )
-from coordinator.torque_control.gravity_model import KnownWeight
+from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.session import first_of_newest
 from module_agent.firmware.config import catalogue_limits
 from module_agent.model.catalogue import CATALOGUE
@@ -33,10 +33,10 @@ from sim.robot.robot_file import load_robot
 X5_4 = CATALOGUE["X5-4"]
 G_M_S2, MASS_KG, REACH_M = 9.81, 0.8, 0.3
 LEVEL_NM = -MASS_KG * REACH_M * G_M_S2
-SETTINGS = FloatSettings(ramp_s=0.8, hold_s=0.4, stale_s=0.12)
+SETTINGS = CompensationSettings(ramp_s=0.8, hold_s=0.4, stale_s=0.12)
 
 
-def pendulum(mass_kg: float = MASS_KG) -> KnownWeight:
+def pendulum(mass_kg: float = MASS_KG) -> GravityModel:
     """A mass on the x axis that turns about y: turning about +y lowers it, so that its weight helps."""
     chain = Chain(
         serials=("J",),
@@ -49,7 +49,7 @@ def pendulum(mass_kg: float = MASS_KG) -> KnownWeight:
     )
     inertia = mass_kg * REACH_M**2
     phi = np.array([mass_kg, mass_kg * REACH_M, 0.0, 0.0, 0.0, 0.0, 0.0, inertia, 0.0, inertia])
-    return KnownWeight("pendulum", ("X5-4",), chain, phi)
+    return GravityModel("pendulum", ("X5-4",), chain, phi)
 
 
 def limits(low: float | None = None, high: float | None = None) -> Limits:
@@ -60,11 +60,11 @@ def reading(q: float = 0.0, rate: float = 0.0, effort: float = LEVEL_NM, age_s: 
     return Reading(*(np.array([value]) for value in (age_s, q, rate, effort)))
 
 
-def floater(of: Limits | None = None, settings: FloatSettings = SETTINGS) -> Floater:
-    return Floater(pendulum(), (of or limits(),), settings)
+def floater(of: Limits | None = None, settings: CompensationSettings = SETTINGS) -> GravityCompensator:
+    return GravityCompensator(pendulum(), (of or limits(),), settings)
 
 
-def loaded() -> Floater:
+def loaded() -> GravityCompensator:
     found = floater()
     for t_s in (10.0, 10.8):
         found.step(t_s, reading())
@@ -72,9 +72,9 @@ def loaded() -> Floater:
     return found
 
 
-def free() -> Floater:
+def free() -> GravityCompensator:
     found = loaded()
-    found.let_go(11.0)
+    found.release(11.0)
     found.step(11.8, reading())
     assert found.phase == "floating"
     return found
@@ -106,7 +106,7 @@ def test_what_a_sensor_reads_beside_the_weight_before_it_is_free_is_borne_with_t
     for t_s in np.arange(10.0, 10.81, 0.005):
         # 0.3 Nm of offset and some noise.
         it.step(float(t_s), reading(effort=LEVEL_NM + 0.3 + rng.normal(0.0, 0.05)))
-    it.let_go(11.0)
+    it.release(11.0)
     it.step(11.8, reading())
     # The mean of some fifty readings.
     led = it.step(12.0, reading(q=0.9, effort=0.0)).effort_nm[0]
@@ -123,7 +123,7 @@ def test_where_it_has_given_while_it_was_held_softly_it_is_not_snatched_back() -
 
 def test_the_position_loop_lets_go_little_by_little_and_pulls_to_where_it_held() -> None:
     it = loaded()
-    it.let_go(11.0)
+    it.release(11.0)
     # The joint has given by 0.06 rad; half way the pull is half of what it was, and in the end there is none.
     assert place(it.step(11.0, reading(q=0.06))) == pytest.approx(0.0)
     assert place(it.step(11.4, reading(q=0.06))) == pytest.approx(0.03)
@@ -143,13 +143,13 @@ def test_free_it_is_asked_for_its_weight_wherever_it_is_led() -> None:
 def test_velocity_forces_are_borne_if_asked_for(velocity_forces: bool) -> None:
     arm = true_weight(load_robot("a2085_03"))
     settings = SETTINGS._replace(velocity_forces=velocity_forces, max_speed_rad_s=5.0)
-    it = Floater(arm, (limits(),) * 3, settings)
+    it = GravityCompensator(arm, (limits(),) * 3, settings)
     q, rate = np.array([0.1, 0.4, -0.6]), np.array([1.0, 1.5, -1.0])
     at_rest = arm.effort_nm(q, np.zeros(3))
     still = Reading(np.full(3, 0.01), q, np.zeros(3), at_rest)
     for t_s in (10.0, 10.8):
         it.step(t_s, still)
-    it.let_go(11.0)
+    it.release(11.0)
     it.step(11.8, still)
     found = it.step(12.0, still._replace(qd_rad_s=rate)).effort_nm
     # Newton metres by the tens of milli, of a small arm at a good speed.
@@ -159,7 +159,7 @@ def test_velocity_forces_are_borne_if_asked_for(velocity_forces: bool) -> None:
 
 def test_only_what_has_the_gains_of_torque_control_is_set_free() -> None:
     it = floater()
-    it.let_go(10.0)
+    it.release(10.0)
     assert it.phase == "loading"
 
 
@@ -195,10 +195,10 @@ def test_the_first_reason_to_hold_is_the_one_that_is_told() -> None:
     ],
 )
 def test_a_joint_beyond_a_limit_is_held_where_it_is_and_named(now: Reading, words: str) -> None:
-    it = Floater(pendulum(), (limits(-2.0, 2.0),), SETTINGS)
+    it = GravityCompensator(pendulum(), (limits(-2.0, 2.0),), SETTINGS)
     for t_s in (10.0, 10.8):
         it.step(t_s, reading())
-    it.let_go(11.0)
+    it.release(11.0)
     it.step(11.8, reading())
     found = it.step(12.0, now)
     assert it.phase == "holding"
@@ -211,10 +211,10 @@ def test_a_pose_that_is_too_heavy_for_the_joint_is_held_at_what_it_can_bear() ->
     heavy = pendulum(mass_kg=3.0)
     # Straight down it weighs nothing, level 8.8 Nm, of 7 Nm.
     down = reading(q=np.pi / 2, effort=0.0)
-    it = Floater(heavy, (limits(),), SETTINGS)
+    it = GravityCompensator(heavy, (limits(),), SETTINGS)
     for t_s in (10.0, 10.8):
         it.step(t_s, down)
-    it.let_go(11.0)
+    it.release(11.0)
     it.step(11.8, down)
     assert it.phase == "floating"
     found = it.step(12.0, reading(q=0.2, effort=-7.0))
@@ -272,7 +272,7 @@ def test_an_unknown_load_that_shows_in_the_end_of_loading_is_borne_and_held_wher
 
 def test_taken_hold_of_while_it_is_being_set_free_the_pull_goes_on_as_it_is() -> None:
     it = loaded()
-    it.let_go(11.0)
+    it.release(11.0)
     before = it.step(11.4, reading(q=0.06))
     it.hold(11.4, "asked")
     after = it.step(11.405, reading(q=0.06))
@@ -285,8 +285,8 @@ def test_taken_hold_of_while_it_is_being_set_free_the_pull_goes_on_as_it_is() ->
 def test_a_joint_that_sinks_before_it_is_free_is_held(is_freeing: bool) -> None:
     it = loaded() if is_freeing else floater()
     if is_freeing:
-        it.let_go(11.0)
-    most = MOST_GIVEN_RAD if is_freeing else MOST_SUNK_RAD
+        it.release(11.0)
+    most = MAX_GIVEN_RAD if is_freeing else MAX_SUNK_RAD
     it.step(11.0, reading())
     it.step(11.2, reading(q=0.9 * most))
     assert not it.is_fault
@@ -299,7 +299,7 @@ def test_a_joint_that_sinks_before_it_is_free_is_held(is_freeing: bool) -> None:
 # --------------------------------------------------------------------------- led back
 
 
-def returning() -> Floater:
+def returning() -> GravityCompensator:
     """Led from 0 to 0.8 rad, held there, and on its way back from 30 s on."""
     it = free()
     it.hold(20.0, "asked")
@@ -325,7 +325,7 @@ def test_led_back_it_goes_to_where_it_stood_at_the_speed_that_is_promised() -> N
 
 
 def test_a_float_with_a_low_speed_limit_is_led_back_below_it() -> None:
-    it = Floater(pendulum(), (limits(),), SETTINGS._replace(max_speed_rad_s=0.4))
+    it = GravityCompensator(pendulum(), (limits(),), SETTINGS._replace(max_speed_rad_s=0.4))
     it.step(10.0, reading(q=0.5, effort=LEVEL_NM))
     it.hold(10.0, "asked")
     for t_s in (10.1, 10.5):
@@ -363,9 +363,11 @@ def test_what_stops_it_on_its_way_back_is_not_pushed_against() -> None:
 
 
 def test_a_robot_too_heavy_where_it_stands_or_at_its_end_is_refused_before_it_is_taken() -> None:
-    with pytest.raises(FloatRefused, match=r"joint J would have to bear -8.83 Nm here, it can bear 7.00 Nm"):
-        Floater(pendulum(mass_kg=3.0), (limits(),), SETTINGS).check_start(reading())
-    with pytest.raises(FloatRefused, match=r"joint J is at 0.95 rad, within 0.10 rad of the end"):
+    with pytest.raises(
+        CompensationRefused, match=r"joint J would have to bear -8.83 Nm here, it can bear 7.00 Nm"
+    ):
+        GravityCompensator(pendulum(mass_kg=3.0), (limits(),), SETTINGS).check_start(reading())
+    with pytest.raises(CompensationRefused, match=r"joint J is at 0.95 rad, within 0.10 rad of the end"):
         floater(limits(-1.0, 1.0)).check_start(reading(q=0.95))
     floater(limits(-1.0, 1.0)).check_start(reading(q=0.85, effort=LEVEL_NM * np.cos(0.85)))
 
@@ -389,7 +391,7 @@ def test_a_robot_that_bears_another_load_than_the_known_one_is_not_set_free(
     if is_free:
         floater().check_start(strange)
     else:
-        with pytest.raises(FloatRefused, match="beside what the robot that is known weighs there"):
+        with pytest.raises(CompensationRefused, match="beside what the robot that is known weighs there"):
             floater().check_start(strange)
 
 
@@ -404,11 +406,11 @@ def test_feedback_that_is_too_old_ends_it_in_any_phase_and_names_the_module() ->
 
 
 def test_under_the_gains_of_floating_nothing_but_the_damper_answers_a_velocity() -> None:
-    gains = floating_gains(X5_4, 0.7)
+    gains = compensation_gains(X5_4, 0.7)
     assert gains.strategy == 2
     assert (gains.velocity.kp, gains.velocity.ki, gains.velocity.kd) == (0.7, 0.0, 0.0)
     assert gains.velocity.feed_forward == 0.0
-    assert floating_gains(X5_4, 0.0).velocity.kp == 0.0
+    assert compensation_gains(X5_4, 0.0).velocity.kp == 0.0
     # The factory's 10 Nm/rad.
     assert holding_gains(X5_4).position.kp == 10.0 * HOLDING_TIMES
     assert holding_gains(X5_4).velocity.kp > 0.0
@@ -417,8 +419,8 @@ def test_under_the_gains_of_floating_nothing_but_the_damper_answers_a_velocity()
 @pytest.mark.parametrize("damping", [-0.1, float("nan"), float("inf"), 1e6, 1.3])
 def test_a_damping_that_no_module_can_give_makes_no_gains(damping: float) -> None:
     with pytest.raises(ValueError, match=r"module type X5-4 takes 0 to 1\.2 Nm s/rad"):
-        floating_gains(X5_4, damping)
-    assert floating_gains(X5_4, most_damping_nm_s_rad(X5_4)).velocity.kp == pytest.approx(1.2)
+        compensation_gains(X5_4, damping)
+    assert compensation_gains(X5_4, most_damping_nm_s_rad(X5_4)).velocity.kp == pytest.approx(1.2)
 
 
 # --------------------------------------------------------------------------- what is newest

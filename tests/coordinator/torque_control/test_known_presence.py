@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coordinator.torque_control.gravity_model import KnownWeight
-from coordinator.torque_control.preconditions import Felt, NotTheKnownRobot, check_mounting, find_known
+from coordinator.torque_control.gravity_model import GravityModel
+from coordinator.torque_control.preconditions import Felt, RobotMismatch, check_mounting, find_baseline_robot
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import imu_poses
 from sim.benchmark.cases.gravity_compensation import true_weight
@@ -41,7 +41,7 @@ def test_a_robot_that_stands_as_it_stood_is_known_by_where_its_imus_feel_gravity
 @pytest.mark.parametrize("change", [{"tilt_rad": 0.35}, {"tilt_rad": -np.pi}])
 def test_a_base_that_stands_otherwise_is_noticed_and_the_module_is_named(change: dict[str, float]) -> None:
     chain = true_chain(load_robot("arm6"))
-    with pytest.raises(NotTheKnownRobot, match=r"the IMU of module A-\d feels gravity \d+ degrees from"):
+    with pytest.raises(RobotMismatch, match=r"the IMU of module A-\d feels gravity \d+ degrees from"):
         check_mounting(chain, felt(chain, np.full(6, 0.2), **change))
 
 
@@ -51,21 +51,21 @@ def test_a_joint_that_has_lost_its_zero_is_noticed_where_its_imu_turns_with_it()
     at = felt(chain, q)
     wrong = at.q_rad.copy()
     wrong[1] += 0.5
-    with pytest.raises(NotTheKnownRobot, match="feels gravity 29 degrees"):
+    with pytest.raises(RobotMismatch, match="feels gravity 29 degrees"):
         check_mounting(chain, at._replace(q_rad=wrong))
 
 
 # --------------------------------------------------------------------------- on a network
 
 
-def known(**changes: object) -> KnownWeight:
+def known(**changes: object) -> GravityModel:
     return true_weight(load_robot(ARM))._replace(**changes)
 
 
 def test_the_known_robot_is_found_and_met(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     radio, recording, link = rig.link()
-    rig.run(find_known(link, radio, known(), lambda: rig.loop.now_ns))
+    rig.run(find_baseline_robot(link, radio, known(), lambda: rig.loop.now_ns))
     assert link.serials == ("X-00009", "X-00010")
     assert all(recording.modules[serial].arrivals for serial in link.serials)
 
@@ -83,5 +83,5 @@ def test_a_module_that_is_missing_of_another_type_or_no_part_of_it_is_named(
         (known(chain=less), "module X-00010 is no part of the robot that is known, X-00009"),
         (known(types=("X5-9", "X5-1")), "module X-00009 is an X5-"),
     ):
-        with pytest.raises(NotTheKnownRobot, match=words):
-            rig.run(find_known(link, radio, weight, lambda: rig.loop.now_ns))
+        with pytest.raises(RobotMismatch, match=words):
+            rig.run(find_baseline_robot(link, radio, weight, lambda: rig.loop.now_ns))

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.baseline.known_robot import KnownRobotError
+from coordinator.baseline.known_robot import BaselineError
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Identified
 from coordinator.identification.identify import identify
 from coordinator.identification.result import write_result
 from coordinator.recording.run_folder import RESULT
-from coordinator.torque_control.gravity_model import known_weight
+from coordinator.torque_control.gravity_model import gravity_model
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.network_emulation.profile import profile
 from sim.robot.robot_file import load_robot
@@ -39,7 +39,7 @@ def written(folder: Path, **changes: object) -> Path:
 
 
 def test_the_weight_read_back_is_that_of_the_real_bodies_that_were_found(tmp_path: Path) -> None:
-    weight, found = known_weight(written(tmp_path)), identified()
+    weight, found = gravity_model(written(tmp_path)), identified()
     assert weight.chain.serials == found.kinematics.fit.chain.serials
     assert weight.types == tuple(found.result.types[s] for s in weight.chain.serials)
     assert found.real_phi is not None
@@ -58,20 +58,20 @@ def test_the_weight_of_the_upright_arm_is_what_the_simulated_one_weighs(tmp_path
     q = np.array([[0.3, 0.0]])
     still = np.zeros((1, 2))
     true = inverse_dynamics(true_chain(robot), true_inertia(robot), q, still, still)[0]
-    found = known_weight(written(tmp_path)).effort_nm(q[0], still[0])
+    found = gravity_model(written(tmp_path)).effort_nm(q[0], still[0])
     assert abs(true[0]) > 0.5
     # The motions were short, and the torque sensor's scale is only as known as it is.
     np.testing.assert_allclose(found[0], true[0], rtol=0.1)
 
 
 def test_a_run_without_dynamics_does_not_tell_the_weight(tmp_path: Path) -> None:
-    with pytest.raises(KnownRobotError, match=r"result.json does not tell what the robot weighs: it was run"):
-        known_weight(written(tmp_path, dynamics=None))
+    with pytest.raises(BaselineError, match=r"result.json does not tell what the robot weighs: it was run"):
+        gravity_model(written(tmp_path, dynamics=None))
 
 
 def test_a_folder_without_a_result_or_with_another_file_in_its_place_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(KnownRobotError, match=r"holds no result.json: give the folder of a run that has"):
-        known_weight(tmp_path)
+    with pytest.raises(BaselineError, match=r"holds no result.json: give the folder of a run that has"):
+        gravity_model(tmp_path)
     (tmp_path / RESULT).write_text("{}")
-    with pytest.raises(KnownRobotError, match=r"result.json is no result of a run: robot: Field required"):
-        known_weight(tmp_path)
+    with pytest.raises(BaselineError, match=r"result.json is no result of a run: robot: Field required"):
+        gravity_model(tmp_path)

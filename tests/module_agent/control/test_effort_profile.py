@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from module_agent.control.motion import MOST_SAMPLES, effort_at, effort_profile, profile_period_ns
+from module_agent.control.motion import MAX_SAMPLES, effort_at, effort_profile, profile_period_ns
 from module_agent.firmware.config import FirmwareConfig, catalogue_limits
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Publication
 from module_agent.hardware.hardware import SensorSample
@@ -128,7 +128,7 @@ def test_efforts_that_are_no_numbers_are_refused_and_nothing_moves(
 def test_every_motion_that_a_module_takes_fits_a_profile(total_s: float) -> None:
     period_ns = profile_period_ns(total_s)
     count = int(np.ceil(total_s * 1e9 / period_ns)) + 1
-    assert count <= MOST_SAMPLES
+    assert count <= MAX_SAMPLES
     assert period_ns % MS == 0
     profile = effort_profile(np.zeros(max(count, 2)), period_ns)
     assert effort_at(profile, np.array([0.0, total_s])).tolist() == [0.0, 0.0]

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from module_agent.estimate.circle_point_analysis import circle_point_analysis, rest_reading
 from module_agent.estimate.joint_model import AS_DELIVERED, CALIBRATED
 from module_agent.estimate.joint_regression import JointRegression, regress_joint, regression_estimate
-from module_agent.estimate.observed_motion import SeenMotion
+from module_agent.estimate.observed_motion import ObservedMotion
 from module_agent.estimate.smoothing import SmoothMotion, smooth_imu
 from module_agent.estimate.windows import ImuWindow, JointWindow, align
 from module_agent.wire.messages import RegressionEstimate
@@ -24,8 +24,8 @@ def link(horizontal_link: Any) -> Any:
     return horizontal_link._replace(gravity=9.81 * gravity / np.linalg.norm(gravity))
 
 
-def seen(windows: tuple[ImuWindow, JointWindow], offset_ns: int = 0) -> SeenMotion:
-    return SeenMotion(smooth_imu(windows[0]), SmoothMotion(windows[1]), offset_ns)
+def seen(windows: tuple[ImuWindow, JointWindow], offset_ns: int = 0) -> ObservedMotion:
+    return ObservedMotion(smooth_imu(windows[0]), SmoothMotion(windows[1]), offset_ns)
 
 
 def regressed(hinge: Any, seed: int, knowledge: Any = CALIBRATED, slow: Any = None) -> JointRegression:

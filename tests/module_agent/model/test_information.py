@@ -17,7 +17,7 @@ from module_agent.model.information import (
     merge_joint,
 )
 from module_agent.model.regressor import torque_regressor
-from module_agent.torque_information.serialisation import MOST_BYTES, pack, unpack
+from module_agent.torque_information.serialisation import MAX_BYTES, pack, unpack
 from module_agent.wire.information_messages import Information
 
 # Some hundred additions of doubles, with room; the bar is 1e-10.
@@ -62,9 +62,9 @@ def test_a_joint_alone_gathers_what_all_together_gather_of_it(joints: int, seed:
     rng = default_rng(seed)
     chain = random_tree(rng, joints)
     q, qd, qdd, tau = motion(rng, 150, joints)
-    together = gather(chain, q, qd, qdd, tau)
+    gather_all = gather(chain, q, qd, qdd, tau)
     for joint in range(joints):
-        assert far(gather_joint(chain, joint, q, qd, qdd, tau[:, joint]), together[joint]) < EXACT
+        assert far(gather_joint(chain, joint, q, qd, qdd, tau[:, joint]), gather_all[joint]) < EXACT
 
 
 def test_a_joint_gathers_as_well_in_many_small_blocks(rng: Generator) -> None:
@@ -156,4 +156,4 @@ def test_rows_that_are_not_triangular_are_not_packed(rng: Generator) -> None:
 
 def test_the_largest_information_fits_its_message() -> None:
     most = next(m.le for m in Information.model_fields["total_bytes"].metadata if hasattr(m, "le"))
-    assert most >= MOST_BYTES
+    assert most >= MAX_BYTES

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from module_agent.firmware.feedback import History
 from module_agent.peers.motion_listener import ANSWER_TIMEOUT_NS, AskHistory
-from module_agent.peers.row_collection import GIVE_UP_NS, MOST_MOTIONS, MotionCollection, OwnRows
+from module_agent.peers.row_collection import GIVE_UP_NS, MAX_MOTIONS, MotionCollection, OwnRows
 from module_agent.wire.information_messages import LONGEST_ROWS, CollectRequest, RowRange
 from module_agent.wire.messages import Feedback
 from module_agent.wire.refusal import Refusal, WireError
@@ -175,14 +175,14 @@ def test_a_refusal_of_one_range_leaves_the_other_motions_of_the_module_open() ->
 def test_motions_are_not_more_than_are_kept_however_short_they_are() -> None:
     collection = MotionCollection()
     own = kept(J1=history(700), J2=history(700))
-    for number in range(MOST_MOTIONS + 1):
+    for number in range(MAX_MOTIONS + 1):
         collection.collect(request(number, 10, 11), own, 0)
     assert refused(collection, 0) is Refusal.GONE
     assert len(collection.tracks(1)[OWN].t_ns) == 1
 
 
 def test_the_oldest_motions_make_room(monkeypatch: Any) -> None:
-    monkeypatch.setattr("module_agent.peers.row_collection.MOST_ROWS", 3000)
+    monkeypatch.setattr("module_agent.peers.row_collection.MAX_ROWS", 3000)
     collection = MotionCollection()
     own = kept(J1=history(700), J2=history(700))
     for number in range(4):

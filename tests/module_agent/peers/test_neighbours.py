@@ -13,7 +13,7 @@ from module_agent.peers.motion_listener import (
     AskHistory,
     JointMotion,
     Listen,
-    Neighbours,
+    MotionListener,
     Wish,
 )
 from module_agent.wire.feedback_rows import ROW
@@ -76,7 +76,7 @@ def _feedback(first: int, count: int = BATCH, boot: int = 1, serial: str = "J") 
     return Feedback(serial=serial, boot=boot, seq=first, first_row=first, count=count, rows=rows.tobytes())
 
 
-class Checked(Neighbours):
+class Checked(MotionListener):
     """Neighbours that have nothing to say unless they are restless."""
 
     def poll(self, now_ns: int) -> tuple[list[Wish], list[JointMotion]]:

@@ -20,7 +20,7 @@ from module_agent.torque_information.module_information import coupled, own_info
 from module_agent.torque_information.serialisation import chain_of, chain_part, clock_part, clocks_of, unpack
 from module_agent.torque_information.service import InformationService
 from module_agent.wire.information_messages import (
-    MOST_PART_BYTES,
+    MAX_PART_BYTES,
     CollectRequest,
     InformationRequest,
     RowRange,
@@ -212,7 +212,7 @@ def test_the_answer_of_many_bodies_comes_in_parts_that_fit_a_message() -> None:
     while len(block) < total:
         answer = found.answer(robot.request(offset=len(block)))
         total = answer.total_bytes
-        assert 0 < len(answer.part) <= MOST_PART_BYTES
+        assert 0 < len(answer.part) <= MAX_PART_BYTES
         block += answer.part
         count += 1
     # 164 columns: 13530 doubles and what is about them.

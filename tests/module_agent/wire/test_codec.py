@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.control.motion import MOST_SAMPLES, effort_profile
+from module_agent.control.motion import MAX_SAMPLES, effort_profile
 from module_agent.wire import keys
 from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import ROW, unpack
 from module_agent.wire.information_messages import (
-    MOST_MODULES,
-    MOST_PART_BYTES,
+    MAX_MODULES,
+    MAX_PART_BYTES,
     ChainPart,
     ClockPart,
     CollectRequest,
@@ -244,18 +244,18 @@ def test_the_longest_effort_and_the_longest_pattern_fit_a_command() -> None:
         **COMMAND,
         motion_id=2**32 - 1,
         pattern=MultiSine(sines=sines, duration_s=12.0),
-        effort=effort_profile([1.0] * MOST_SAMPLES, 10_000_000),
+        effort=effort_profile([1.0] * MAX_SAMPLES, 10_000_000),
     )
     assert len(encode(command)) <= MAX_COMMAND_BYTES
 
 
 def test_what_is_asked_of_64_modules_and_the_longest_answer_fit_a_message() -> None:
-    names = tuple(f"{'X' * 60}-{number:03d}" for number in range(MOST_MODULES))
+    names = tuple(f"{'X' * 60}-{number:03d}" for number in range(MAX_MODULES))
     chain = ChainPart(
         serials=names,
-        parent=tuple(range(-1, MOST_MODULES - 1)),
-        reversed=(False,) * MOST_MODULES,
-        geometry=bytes(MOST_MODULES * 22 * 8),
+        parent=tuple(range(-1, MAX_MODULES - 1)),
+        reversed=(False,) * MAX_MODULES,
+        geometry=bytes(MAX_MODULES * 22 * 8),
         gravity_m_s2=(0.1, 0.2, 9.81),
     )
     clock = ClockPart(origin_ns=2**61, offset_ns=-1e18, drift=1e-4)
@@ -271,9 +271,9 @@ def test_what_is_asked_of_64_modules_and_the_longest_answer_fit_a_message() -> N
             **HEAD,
             digest=bytes(32),
             motion_ids=(2**62,) * 64,
-            total_bytes=MOST_PART_BYTES,
+            total_bytes=MAX_PART_BYTES,
             offset=0,
-            part=bytes(MOST_PART_BYTES),
+            part=bytes(MAX_PART_BYTES),
         ),
     ):
         assert decode(type(message), encode(message), MAX_MESSAGE_BYTES) == message

@@ -5,12 +5,12 @@ import json
 import pytest
 from rich.console import Console
 
-from sim.benchmark.cases.monitoring import Alarms, WatchTrial
+from sim.benchmark.cases.monitoring import Alarms, MonitoringTrial
 from sim.commands.monitoring import confusion_table, figures, size_table, summary
 
-HIT = WatchTrial("payload", "payload", True, 0.02, 2.5, 0.2, 0.003, 0, 20.0, ("0.203 kg",))
+HIT = MonitoringTrial("payload", "payload", True, 0.02, 2.5, 0.2, 0.003, 0, 20.0, ("0.203 kg",))
 MISSED = HIT._replace(found="nothing", located=False, latency_s=None, named_s=None, size_error=None)
-BLOW = WatchTrial("collision", "collision", True, 0.03, 0.03, 0.0, None, 0, 20.0, ())
+BLOW = MonitoringTrial("collision", "collision", True, 0.03, 0.03, 0.0, None, 0, 20.0, ())
 
 
 def printed(table: object) -> str:

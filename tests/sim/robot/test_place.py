@@ -4,14 +4,14 @@ import numpy as np
 
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from sim.robot.robot_file import load_robot
-from sim.robot.variants import LEAST_M_S2, MOST_M_S2, somewhere
+from sim.robot.variants import MAX_M_S2, MIN_M_S2, somewhere
 from sim.world.world import World
 
 
 def test_what_is_believed_of_gravity_is_how_it_is_drawn() -> None:
     robot = load_robot("thesis_245_horizontal")
     drawn = np.array([somewhere(robot, seed).base.gravity_m_s2 for seed in range(400)])
-    assert LEAST_M_S2 <= drawn.min() < drawn.max() <= MOST_M_S2
+    assert MIN_M_S2 <= drawn.min() < drawn.max() <= MAX_M_S2
     # A uniform distribution's: 400 draws tell the mean to a twentieth of its sigma, and sigma to 4 %.
     np.testing.assert_allclose(drawn.mean(), GRAVITY_M_S2, atol=0.2 * GRAVITY_SIGMA_M_S2)
     np.testing.assert_allclose(drawn.std(), GRAVITY_SIGMA_M_S2, rtol=0.1)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.chain import Chain
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.chain_score import LinkErrors, link_errors, link_length_m
@@ -18,7 +18,7 @@ NONE = LinkErrors(0.0, 0.0, 0.0)
 
 def moved(twist: np.ndarray) -> Chain:
     """The truth with its second module moved by a twist [turn, shift] in the root frame."""
-    return apply_increment(TRUTH, np.concatenate([np.zeros(6), twist]))
+    return apply_perturbation(TRUTH, np.concatenate([np.zeros(6), twist]))
 
 
 def turned_about_axis(angle_rad: float) -> np.ndarray:

@@ -6,7 +6,7 @@ from numpy.random import Generator, default_rng
 
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import descendants, imu_poses
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.gauge_alignment import align_gauge, leaves, move_root, reorder, reorder_basis, tip_error
@@ -49,7 +49,7 @@ def test_a_chain_that_is_off_in_the_listed_directions_alone_is_the_truth(
     twist = yaw_rad * np.concatenate([axis, np.cross(point, axis)]) + 0.2 * np.concatenate(
         [np.zeros(3), axis]
     )
-    off = apply_increment(chain, beyond(chain, 0, twist))
+    off = apply_perturbation(chain, beyond(chain, 0, twist))
     q = poses(default_rng(0), chain)
     assert tip_error(off, chain, q).position_m > 0.01 * abs(yaw_rad)
     error = tip_error(align_gauge(off, chain, yaw_and_height(chain), q), chain, q)
@@ -60,7 +60,7 @@ def test_a_chain_that_is_off_in_the_listed_directions_alone_is_the_truth(
 def test_an_error_in_any_other_direction_stays(chain: Chain) -> None:
     q = poses(default_rng(0), chain)
     sideways = np.cross(chain.axis[0], [1.0, 0.0, 0.0])
-    off = apply_increment(chain, beyond(chain, 0, 0.01 * np.concatenate([np.zeros(3), sideways])))
+    off = apply_perturbation(chain, beyond(chain, 0, 0.01 * np.concatenate([np.zeros(3), sideways])))
     before = tip_error(off, chain, q)
     after = tip_error(align_gauge(off, chain, yaw_and_height(chain), q), chain, q)
     assert after.position_m == pytest.approx(before.position_m, rel=0.05)
@@ -71,7 +71,7 @@ def test_a_shift_of_one_leaf_by_a_centimetre_is_a_centimetre(chain: Chain) -> No
     leaf = len(chain.serials) - 1
     delta = np.zeros((len(chain.serials), 6))
     delta[leaf, 3:] = [0.006, 0.0, 0.008]
-    moved = apply_increment(chain, delta.ravel())
+    moved = apply_perturbation(chain, delta.ravel())
     error = tip_error(moved, chain, poses(default_rng(1), chain))
     # One of two leaves, its own joint does not carry its IMU: sqrt(1 / 2) of 10 mm in every pose.
     assert error.position_m == pytest.approx(0.01 / np.sqrt(2.0), rel=1e-9)
@@ -86,9 +86,9 @@ def test_another_order_is_the_same_robot(chain: Chain) -> None:
     np.testing.assert_allclose(imu_poses(other, q[:, columns]), imu_poses(chain, q)[:, columns], atol=1e-14)
     basis = yaw_and_height(chain)
     z = np.array([0.3, -0.1])
-    moved = apply_increment(other, reorder_basis(chain, basis, order) @ z)
+    moved = apply_perturbation(other, reorder_basis(chain, basis, order) @ z)
     np.testing.assert_allclose(
-        moved.imu_home, apply_increment(chain, basis @ z).imu_home[columns], atol=1e-14
+        moved.imu_home, apply_perturbation(chain, basis @ z).imu_home[columns], atol=1e-14
     )
 
 
@@ -100,7 +100,7 @@ def test_another_root_frame_is_the_same_robot(chain: Chain) -> None:
     np.testing.assert_allclose(imu_poses(moved, q), pose @ imu_poses(chain, q), atol=1e-12)
     z = np.array([0.4, 0.1])
     np.testing.assert_allclose(
-        apply_increment(moved, moved_basis @ z).imu_home,
-        pose @ apply_increment(chain, basis @ z).imu_home,
+        apply_perturbation(moved, moved_basis @ z).imu_home,
+        pose @ apply_perturbation(chain, basis @ z).imu_home,
         atol=1e-12,
     )

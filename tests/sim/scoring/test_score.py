@@ -11,7 +11,7 @@ from rich.console import Console
 
 from coordinator.identification.result import chain_part
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.chain_score import tip_errors
@@ -148,7 +148,7 @@ def test_a_leaf_that_sits_two_millimetres_further_out_is_two_millimetres_too_lon
     outward = arm - (arm @ axis) * axis
     delta = np.zeros((len(SERIALS), 6))
     delta[leaf, 3:] = 0.002 * outward / np.linalg.norm(outward)
-    found = score(make_run(tmp_path, apply_increment(TRUTH, delta.ravel())))
+    found = score(make_run(tmp_path, apply_perturbation(TRUTH, delta.ravel())))
     errors = {link.child: link.link_length_error_mm for link in found.links}
     assert errors.pop("left-3") == pytest.approx(2.0)
     assert list(errors.values()) == pytest.approx([0.0] * 4, abs=1e-9)
@@ -161,7 +161,7 @@ def test_a_leaf_tilted_by_one_degree_sees_the_axis_one_degree_off(tmp_path: Path
     tilt *= np.radians(1.0) / np.linalg.norm(tilt)
     delta = np.zeros((len(SERIALS), 6))
     delta[leaf] = np.concatenate([tilt, np.cross(TRUTH.imu_home[leaf, :3, 3], tilt)])
-    found = score(make_run(tmp_path, apply_increment(TRUTH, delta.ravel())))
+    found = score(make_run(tmp_path, apply_perturbation(TRUTH, delta.ravel())))
     by_child = {link.child: link for link in found.links}
     assert by_child["right-2"].axis_error_deg == pytest.approx(1.0, rel=1e-9)
     assert by_child["right-2"].link_length_error_mm == pytest.approx(0.0, abs=1e-9)
@@ -174,7 +174,7 @@ def test_what_the_result_lists_as_unidentifiable_does_not_count_and_all_else_doe
     yaw = np.zeros((len(SERIALS), 6))
     yaw[1:] = np.concatenate([axis, np.cross(point, axis)])
     basis = yaw.reshape(-1, 1) / np.linalg.norm(yaw)
-    off = apply_increment(TRUTH, 1.2 * yaw.ravel())
+    off = apply_perturbation(TRUTH, 1.2 * yaw.ravel())
     excused = score(make_run(tmp_path, off, basis))
     assert excused.tip_position_rms_mm == pytest.approx(0.0, abs=1e-6)
     assert excused.tip_orientation_rms_deg == pytest.approx(0.0, abs=1e-6)

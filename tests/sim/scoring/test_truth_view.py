@@ -12,7 +12,7 @@ from coordinator.kinematics.null_space import Unresolved, name_null_space
 from coordinator.runtime.terminal import Terminal
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import BASE, ancestors, descendants
-from module_agent.model.perturbation import apply_increment
+from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.gauge_alignment import move_root, reorder
@@ -40,7 +40,7 @@ def free(chain: Chain) -> tuple[Unresolved, ...]:
 
 def moved(chain: Chain, unresolved: tuple[Unresolved, ...], by: float) -> Chain:
     for number, item in enumerate(unresolved):
-        chain = apply_increment(chain, item.directions[:, 0] * by * (1 + number))
+        chain = apply_perturbation(chain, item.directions[:, 0] * by * (1 + number))
     return chain
 
 
@@ -59,7 +59,7 @@ def test_an_error_that_can_be_known_stays_in_the_picture() -> None:
     truth = true_chain(load_robot("a2085_04"))
     wrong = np.zeros((4, 6))
     wrong[3, 3:] = 0.005 * (truth.imu_home[3, :3, 3] - truth.imu_home[2, :3, 3]) / 0.35
-    estimated = moved(apply_increment(truth, wrong.ravel()), free(truth), 0.4)
+    estimated = moved(apply_perturbation(truth, wrong.ravel()), free(truth), 0.4)
     drawn = beside(truth, estimated, free(truth))
     apart = np.linalg.norm(drawn.imu_home[3, :3, 3] - estimated.imu_home[3, :3, 3])
     # 5 mm, of which the unknown turn and height take up no more than they can.

@@ -5,7 +5,7 @@ import pytest
 
 from coordinator.excitation.plan import Plan
 from module_agent.estimate.joint_model import AS_DELIVERED, CALIBRATED
-from module_agent.estimate.observed_motion import seen_motions
+from module_agent.estimate.observed_motion import observed_motions
 from sim.imperfections.noise_profile import NOISE_PROFILES, switched
 from sim.robot.robot_file import load_robot
 from sim.test_bench.one_joint_rig import OneJointRig, TrialRows, regress, windows
@@ -38,7 +38,7 @@ def test_a_tall_base_that_rocks_is_seen_by_the_joints_own_module_and_taken_off()
     plan = trial_plan(thesis_length("vertical", 484), NOISE_PROFILES["x5"])
     with OneJointRig(robot, 3, "x5") as rig:
         trial = rig.trial(plan)
-    assert all(motion.base is not None and motion.base.shakes for motion in seen_motions(windows(trial)))
+    assert all(motion.base is not None and motion.base.shakes for motion in observed_motions(windows(trial)))
     found = regress(trial)
     assert found.base_shakes
     # It rocks by 3 % of the joint's angle: 5 to 10 mm where nobody takes it off (measured).
@@ -72,7 +72,9 @@ def without_carrier(trial: TrialRows) -> TrialRows:
 def test_noise_of_the_gears_is_not_taken_for_a_shaking_base() -> None:
     with OneJointRig(load_robot("thesis_245_horizontal"), 5, SOLID) as rig:
         trial = rig.trial(Plan(sine_amplitude_rad=0.2))
-    assert not any(motion.base is not None and motion.base.shakes for motion in seen_motions(windows(trial)))
+    assert not any(
+        motion.base is not None and motion.base.shakes for motion in observed_motions(windows(trial))
+    )
     assert not regress(trial).base_shakes
 
 

@@ -21,8 +21,8 @@ from sim.main import app
 from sim.test_bench.robot_bench import Track
 from sim.thesis.published import setting, thesis_gains, without_velocity
 from sim.thesis.torque_assistance import (
-    MOST_RINGING_RAD,
-    MOST_SATURATED,
+    MAX_RINGING_RAD,
+    MAX_SATURATED,
     ON_MODULE,
     Follow,
     Gains,
@@ -124,7 +124,7 @@ def test_a_joint_that_stays_away_from_its_goal_is_wrong_but_stable() -> None:
 
 
 def test_a_joint_that_goes_on_in_a_cycle_is_unstable() -> None:
-    cycle = 1.5 * np.sqrt(2.0) * MOST_RINGING_RAD * np.sin(2 * np.pi * 8.0 * ASKED.t_s[:, None])
+    cycle = 1.5 * np.sqrt(2.0) * MAX_RINGING_RAD * np.sin(2 * np.pi * 8.0 * ASKED.t_s[:, None])
     assert judge(ASKED, still(), still()._replace(q_rad=cycle)).unstable == "rings by 3.0 mrad"
     faded = cycle * (ASKED.t_s[:, None] < 0.9)
     assert judge(ASKED, still(), still()._replace(q_rad=faded)).unstable == ""
@@ -133,7 +133,7 @@ def test_a_joint_that_goes_on_in_a_cycle_is_unstable() -> None:
 def test_a_bridge_that_is_at_its_limit_most_of_the_time_is_unstable() -> None:
     duty = np.ones((1500, 1))
     assert judge(ASKED, still()._replace(duty=duty), still()).unstable == "saturates 100 % of the time"
-    rare = duty * (np.arange(1500) < 0.9 * MOST_SATURATED * 1500)[:, None]
+    rare = duty * (np.arange(1500) < 0.9 * MAX_SATURATED * 1500)[:, None]
     assert judge(ASKED, still()._replace(duty=rare), still()).unstable == ""
 
 

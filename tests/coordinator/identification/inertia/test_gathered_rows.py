@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.identification.inertia.projected_rows import GatheredRows
+from coordinator.identification.inertia.projected_rows import ProjectedRows
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress, merge_joint
 
@@ -38,7 +38,7 @@ def fit(rows: Array, target: Array) -> Array:
 def test_estimates_and_what_errors_do_to_them_are_those_of_all_samples(rng: Generator) -> None:
     parts = [stretch(rng, samples) for samples in (60, 45)]
     total = merge_joint(*(gathered(rows, torque) for rows, torque, *_ in parts))
-    beside = GatheredRows(total)
+    beside = ProjectedRows(total)
     for part in parts:
         beside.add(*part)
     found = beside.rows()
@@ -57,7 +57,7 @@ def test_estimates_and_what_errors_do_to_them_are_those_of_all_samples(rng: Gene
 def test_with_nothing_beside_them_rows_are_as_they_were(rng: Generator) -> None:
     rows, torque, _, effects = stretch(rng, 40)
     before = gathered(rows, torque)
-    beside = GatheredRows(before)
+    beside = ProjectedRows(before)
     beside.add(rows, torque, np.zeros(40), effects[:, :0])
     found = beside.rows()
     np.testing.assert_array_equal(found.r, before.r)

@@ -36,13 +36,13 @@ def test_base_parameters_are_within_their_deviations_of_the_built_robots(found: 
     pulls = (found.base.value - found.base.grouping @ truth) / found.base.sigma
     assert found.base.rank == 22
     assert np.abs(pulls).max() < 4.0
-    for verdict, true in zip(found.verdicts, truth, strict=True):
+    for verdict, true in zip(found.identifiabilities, truth, strict=True):
         # An identified parameter is the body's own, not a sum; that of the prior's help is near it.
         if verdict.kind == "identified":
             assert verdict.value is not None
             assert verdict.sigma is not None
             assert abs(verdict.value - true) < 4.0 * verdict.sigma
-    kinds = {verdict.kind for verdict in found.verdicts}
+    kinds = {verdict.kind for verdict in found.identifiabilities}
     assert kinds == {"identified", "weak", "not identifiable"}
 
 
@@ -90,6 +90,7 @@ def test_without_real_bodies_the_rest_is_said_all_the_same(monkeypatch: pytest.M
     assert one.base.rank == 22
     # Nothing is settled by a prior that was not used.
     assert all(
-        verdict.sums == () or verdict.value is not None or verdict.lumped_with for verdict in one.verdicts
+        verdict.sums == () or verdict.value is not None or verdict.lumped_with
+        for verdict in one.identifiabilities
     )
-    assert not any("by the prior" in verdict.words for verdict in one.verdicts)
+    assert not any("by the prior" in verdict.words for verdict in one.identifiabilities)

@@ -17,7 +17,7 @@ from sim.benchmark.cases.arm import (
     arm_plan,
 )
 from sim.benchmark.cases.joint import SETTINGS, joint_cases
-from sim.benchmark.cases.link_change import DAYS, Checks, WearTrial, wear_cases
+from sim.benchmark.cases.link_change import DAYS, Checks, LinkChangeTrial, link_change_cases
 from sim.benchmark.cases.network import NetworkTrial, network_cases
 from sim.benchmark.cases.suites import (
     ALL,
@@ -307,8 +307,8 @@ def test_over_a_bad_network_intervals_must_cover() -> None:
     assert len(shy.sigmas_off) == 26
 
 
-def check(**changed: Any) -> WearTrial:
-    done = WearTrial(
+def check(**changed: Any) -> LinkChangeTrial:
+    done = LinkChangeTrial(
         found=True,
         located=True,
         size_error_m=2e-4,
@@ -322,7 +322,7 @@ def check(**changed: Any) -> WearTrial:
 
 
 def test_a_change_must_be_found_located_and_sized_in_time() -> None:
-    (case,) = wear_cases(3, 0, 0)
+    (case,) = link_change_cases(3, 0, 0)
     lost = check(located=False, size_error_m=None, vector_error_m=None)
     checks = [Checks((check(), check(size_error_m=6e-4)), ()), Checks((lost,), ())]
     found = rows(case.summarise(checks))
@@ -332,7 +332,7 @@ def test_a_change_must_be_found_located_and_sized_in_time() -> None:
 
 
 def test_a_false_alarm_misses_its_bar() -> None:
-    (case,) = wear_cases(3, 3, 0)
+    (case,) = link_change_cases(3, 3, 0)
     quiet = check(found=False, located=False, size_error_m=None, child=None)
     alarm = "false alarms without a change, of 3"
     assert rows(case.summarise([Checks((), (quiet,) * 3)]))[alarm].holds
@@ -340,7 +340,7 @@ def test_a_false_alarm_misses_its_bar() -> None:
 
 
 def test_checks_of_one_robot_are_made_in_one_process() -> None:
-    (case,) = wear_cases(13, 100, 0)
+    (case,) = link_change_cases(13, 100, 0)
     assert [[len(seeds) for seeds in trial.arguments[:2]] for trial in case.trials] == [
         [3, DAYS],
         [3, DAYS],

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 
 from sim.benchmark.case import Case, Summary
-from sim.benchmark.cases.gravity_compensation import FloatTrial
+from sim.benchmark.cases.gravity_compensation import CompensationTrial
 from sim.benchmark.cases.inertia import InertiaTrial
-from sim.benchmark.cases.monitoring import Alarms, Watches, WatchTrial
+from sim.benchmark.cases.monitoring import Alarms, MonitoringTrial, Watches
 from sim.benchmark.cases.payload import PayloadTrial
 from sim.benchmark.cases.reassembly import Reassembly
 from sim.benchmark.cases.regressor import RegressorTrial
@@ -154,7 +154,7 @@ def test_calculated_torque_must_help_where_it_is_stable() -> None:
 
 def test_floating_that_is_as_stiff_as_holding_misses() -> None:
     name = "a2085_04, x5, floating, known without error"
-    light = FloatTrial(0.1, 10.0, 5.0, 0.1, 0.7, 8.0)
+    light = CompensationTrial(0.1, 10.0, 5.0, 0.1, 0.7, 8.0)
     assert missed(rows(name, light)) == []
     assert missed(rows(name, light._replace(drift_deg=3.0))) == ["drift left alone, most [deg]"]
     assert missed(rows(name, light._replace(guiding_n=4.0))) == [
@@ -162,8 +162,8 @@ def test_floating_that_is_as_stiff_as_holding_misses() -> None:
     ]
 
 
-def watched(**changed: Any) -> WatchTrial:
-    good = WatchTrial("payload", "payload", True, 0.5, 1.5, 0.2, 0.01, 0, 20.0, ())
+def watched(**changed: Any) -> MonitoringTrial:
+    good = MonitoringTrial("payload", "payload", True, 0.5, 1.5, 0.2, 0.01, 0, 20.0, ())
     return good._replace(**changed)
 
 

@@ -21,7 +21,7 @@ def test_merging_three_assemblies_raises_the_rank_and_cuts_the_deviations(tmp_pa
     assert min(found.sigma_ratios) < 0.75
     assert found.sigma_ratio < 0.9
     # Noise makes 1 at most, and what is claimed of the chains and the torque sensors is a guess to a half.
-    assert max(found.strain) < 3.0
+    assert max(found.inconsistency_sigma) < 3.0
     assert {run.name for run in tmp_path.iterdir()} == set(assemblies(arm))
     assert all((run / "information.npz").exists() for run in tmp_path.iterdir())
 
