@@ -1,0 +1,33 @@
+"""Errors of the domain: their text is for the user, their exit code for the program that called.
+
+A RobotError is raised for what may go wrong with a correct program: unsuitable data, an absent module, a file
+that cannot be used. Everything else (ValueError, TypeError, LinAlgError...) is a programming error and ends the
+program with a traceback. A RobotError is therefore never a ValueError: numerics raise ValueErrors, and catching
+one kind would catch the other.
+"""
+
+from typing import ClassVar
+
+EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
+
+
+class RobotError(Exception):
+    """The robot, its data or its network keep an operation from succeeding; the text says what to do."""
+
+    exit_code: ClassVar[int] = EXIT_FAILED
+
+
+class UsageError(RobotError):
+    """An option, a path or a file that the user gave cannot be used."""
+
+    exit_code = EXIT_USAGE
+
+
+class LostError(RobotError):
+    """A module or its connection was lost during the operation."""
+
+    exit_code = EXIT_LOST
+
+
+class DataError(RobotError):
+    """The measurements do not answer what is asked: they are too few, too weak, contradictory or damaged."""
