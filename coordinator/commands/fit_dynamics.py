@@ -7,17 +7,17 @@ from typing import Annotated
 
 import typer
 
+from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_data
+from coordinator.arm_fit.filtered_log import filtered_log, most_samples, usual_cutoff_hz
+from coordinator.arm_fit.fit import STEPS, Elsewhere, Identified, identified
+from coordinator.arm_fit.physically_consistent import USUAL_TRUST
+from coordinator.arm_fit.problem import ModelChoice, Problem, problem
+from coordinator.arm_fit.report import write_report
 from coordinator.commands.fit_dynamics_tables import notes, tables
 from coordinator.commands.options import fail
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfError, UrdfRobot, read_urdf
 from coordinator.description.urdf_update import friction_of, write_fitted_urdf
 from coordinator.dynamics.drive_model import TERMS, USUAL_TERMS, Term
-from coordinator.fit_dynamics.data_file import DataFileError, JointLog, in_two, read_data
-from coordinator.fit_dynamics.filtered_log import filtered_log, most_samples, usual_cutoff_hz
-from coordinator.fit_dynamics.fit import STEPS, Elsewhere, Identified, identified
-from coordinator.fit_dynamics.physically_consistent import USUAL_TRUST
-from coordinator.fit_dynamics.problem import ModelChoice, Problem, problem
-from coordinator.fit_dynamics.report import write_report
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import Terminal, print_table
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from rich.table import Table
 
-from coordinator.fit_dynamics.report import BaseParameterPart, ErrorPart, FitReport, Model, TermPart
+from coordinator.arm_fit.report import BaseParameterPart, ErrorPart, FitReport, Model, TermPart
 
 _MODEL_WORDS: dict[Model, str] = {
     "fitted": "least squares",

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from coordinator.arm_fit.data_file import read_data
+from coordinator.arm_fit.filtered_log import filtered_log, usual_cutoff_hz
+from coordinator.arm_fit.fit import identified
+from coordinator.arm_fit.problem import ModelChoice, problem
+from coordinator.arm_fit.report import FitReport
 from coordinator.description.urdf_reader import read_urdf
-from coordinator.fit_dynamics.data_file import read_data
-from coordinator.fit_dynamics.filtered_log import filtered_log, usual_cutoff_hz
-from coordinator.fit_dynamics.fit import identified
-from coordinator.fit_dynamics.problem import ModelChoice, problem
-from coordinator.fit_dynamics.report import FitReport
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, scaled
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from coordinator.fit_dynamics.report import FitReport
+from coordinator.arm_fit.report import FitReport
 from coordinator.main import app
 
 # A pendulum of two links that swing in a plane, hanging down from a wall.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.fit_dynamics.data_file import DataFileError, JointLog, in_two, read_data
+from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_data
 from module_agent.model.chain import Array
 
 JOINTS = ("shoulder", "elbow")

@@ -7,21 +7,21 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from coordinator.description.urdf_reader import read_urdf
-from coordinator.description.urdf_update import friction_of, write_fitted_urdf
-from coordinator.dynamics.drive_model import DriveColumn
-from coordinator.dynamics.pseudo_inertia import is_consistent, pseudo_inertia
-from coordinator.fit_dynamics.cross_validation import fit_part, fitted, held_out_errors, overall
-from coordinator.fit_dynamics.data_file import read_data
-from coordinator.fit_dynamics.filtered_log import filtered_log
-from coordinator.fit_dynamics.physically_consistent import (
+from coordinator.arm_fit.cross_validation import fit_part, fitted, held_out_errors, overall
+from coordinator.arm_fit.data_file import read_data
+from coordinator.arm_fit.filtered_log import filtered_log
+from coordinator.arm_fit.physically_consistent import (
     USUAL_TRUST,
     RealBodies,
     by_real_bodies,
     claimed_bodies,
     real_bodies,
 )
-from coordinator.fit_dynamics.problem import ModelChoice, Problem, problem
+from coordinator.arm_fit.problem import ModelChoice, Problem, problem
+from coordinator.description.urdf_reader import read_urdf
+from coordinator.description.urdf_update import friction_of, write_fitted_urdf
+from coordinator.dynamics.drive_model import DriveColumn
+from coordinator.dynamics.pseudo_inertia import is_consistent, pseudo_inertia
 
 SHARED = ModelChoice(coupled=((1, 2),))
 

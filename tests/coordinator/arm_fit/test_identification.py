@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
+from coordinator.arm_fit.cross_validation import fit_part, fitted, halves, held_out_errors
+from coordinator.arm_fit.data_file import JointLog, in_two, read_data
+from coordinator.arm_fit.filtered_log import filtered_log, usual_cutoff_hz
+from coordinator.arm_fit.fit import Elsewhere, identified, named
+from coordinator.arm_fit.problem import ModelChoice, Problem, problem
+from coordinator.arm_fit.report import ErrorPart, FitReport
 from coordinator.description.urdf_reader import read_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
-from coordinator.fit_dynamics.cross_validation import fit_part, fitted, halves, held_out_errors
-from coordinator.fit_dynamics.data_file import JointLog, in_two, read_data
-from coordinator.fit_dynamics.filtered_log import filtered_log, usual_cutoff_hz
-from coordinator.fit_dynamics.fit import Elsewhere, identified, named
-from coordinator.fit_dynamics.problem import ModelChoice, Problem, problem
-from coordinator.fit_dynamics.report import ErrorPart, FitReport
 
 TX40 = Path(__file__).resolve().parents[3] / ".." / "shared" / "data" / "tx40"
 # Of the robot in conftest.py.

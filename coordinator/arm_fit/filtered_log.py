@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import welch
 
-from coordinator.fit_dynamics.data_file import JointLog
+from coordinator.arm_fit.data_file import JointLog
 from module_agent.model.chain import Array
 from module_agent.signals.filtering import NS_PER_S, filtered_motion, settling_samples, zero_phase_low_pass
 

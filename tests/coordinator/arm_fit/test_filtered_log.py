@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from coordinator.fit_dynamics.data_file import JointLog
-from coordinator.fit_dynamics.filtered_log import filtered_log, most_samples, usual_cutoff_hz
+from coordinator.arm_fit.data_file import JointLog
+from coordinator.arm_fit.filtered_log import filtered_log, most_samples, usual_cutoff_hz
 
 RATE_HZ = 1000.0
 

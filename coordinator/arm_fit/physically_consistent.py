@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.arm_fit.cross_validation import Predictor, fit_part
+from coordinator.arm_fit.problem import Problem
 from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.dynamics.pseudo_inertia import (
     Body,
@@ -13,8 +15,6 @@ from coordinator.dynamics.pseudo_inertia import (
     parameter_transform,
     pseudo_inertia,
 )
-from coordinator.fit_dynamics.cross_validation import Predictor, fit_part
-from coordinator.fit_dynamics.problem import Problem
 from coordinator.parameter_fit.physically_consistent import physically_consistent
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from module_agent.model.chain import Array

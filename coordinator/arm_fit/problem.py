@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.arm_fit.filtered_log import FilteredLog
 from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.dynamics.drive_model import (
     NONLINEAR,
@@ -16,7 +17,6 @@ from coordinator.dynamics.drive_model import (
     drive_regressor,
     drive_signals,
 )
-from coordinator.fit_dynamics.filtered_log import FilteredLog
 from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY, torque_regressor

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from coordinator.fit_dynamics.cross_validation import (
+from coordinator.arm_fit.cross_validation import (
     HeldOutError,
     Predictor,
     claimed,
@@ -19,16 +19,16 @@ from coordinator.fit_dynamics.cross_validation import (
     length_curve,
     mean_torque,
 )
-from coordinator.fit_dynamics.data_file import JointLog
-from coordinator.fit_dynamics.physically_consistent import (
+from coordinator.arm_fit.data_file import JointLog
+from coordinator.arm_fit.physically_consistent import (
     USUAL_TRUST,
     RealBodies,
     by_real_bodies,
     claimed_bodies,
     real_bodies,
 )
-from coordinator.fit_dynamics.problem import Problem, joined
-from coordinator.fit_dynamics.report import (
+from coordinator.arm_fit.problem import Problem, joined
+from coordinator.arm_fit.report import (
     BaseParameterPart,
     BodyPart,
     DataPart,

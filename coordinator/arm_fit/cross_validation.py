@@ -12,9 +12,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.arm_fit.problem import Problem
 from coordinator.dynamics.drive_model import Term
 from coordinator.dynamics.torque_prediction import TorqueError, torque_error
-from coordinator.fit_dynamics.problem import Problem
 from coordinator.parameter_fit.robust_least_squares import WeightedFit, fit_weighted
 from module_agent.model.chain import Array
 

@@ -1,1 +1,0 @@
-"""Inertial parameters of any arm from its URDF and a log."""
