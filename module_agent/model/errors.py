@@ -1,9 +1,9 @@
 """Errors of the domain: their text is for the user, their exit code for the program that called.
 
-A RobotError is raised for what may go wrong with a correct program: unsuitable data, an absent module, a file
-that cannot be used. Everything else (ValueError, TypeError, LinAlgError...) is a programming error and ends the
-program with a traceback. A RobotError is therefore never a ValueError: numerics raise ValueErrors, and catching
-one kind would catch the other.
+A RobotError is raised for what may go wrong with a correct program: unsuitable data, an absent module, a
+file that cannot be used. Everything else (ValueError, TypeError, LinAlgError...) is a programming error and
+ends the program with a traceback. A RobotError is therefore never a ValueError: numerics raise ValueErrors,
+and catching one kind would catch the other.
 """
 
 from typing import ClassVar
