@@ -79,18 +79,21 @@ def run(
         typer.Option(help="How well the torque sensors' scales are known [uncalibrated, as delivered]."),
     ] = None,
     mode: Annotated[
-        Mode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
+        Mode | None, typer.Option(help="Move one joint after the other, or all joints at once [joint].")
     ] = None,
     motions: Annotated[
-        Motions | None, typer.Option(help="The thesis' motions, or designed for each joint [thesis].")
+        Motions | None,
+        typer.Option(help="Motions of one joint: standard, or optimised for each joint [standard]."),
     ] = None,
     excitation: Annotated[
         Excitation | None,
-        typer.Option(help="What tells the inertia: the thesis' motions, or all joints at once [thesis]."),
+        typer.Option(help="Motions for the inertial parameters [joint-by-joint]."),
     ] = None,
-    known: Annotated[
+    baseline: Annotated[
         Path | None,
-        typer.Option(help="Folder of a former run of this robot: only what is other is looked at closely."),
+        typer.Option(
+            help="Folder of an earlier run of this robot: only joints that differ are explored again."
+        ),
     ] = None,
     viewer: Annotated[
         str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
@@ -133,7 +136,7 @@ def run(
         spawn_viewer=shown.spawn,
         connect_viewer=shown.connect,
         serve_viewer=serve_port if shown.serve else None,
-        known=known,
+        baseline=baseline,
     )
     advice = f"to go on: {resuming(context)}" if advise else ""
     with Terminal(quiet) as terminal:
@@ -286,9 +289,9 @@ def screenshot(
 app.command("check")(check_robot)
 app.command("payload")(find_payload)
 app.command("merge")(merge)
-app.command("watch")(monitor_robot)
+app.command("monitor")(monitor_robot)
 app.command("fit-dynamics")(fit_dynamics)
-app.command("float")(compensate_robot)
+app.command("compensate")(compensate_robot)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from sim.commands.benchmark import app as benchmark
 from sim.commands.compare_log import compare_log
 from sim.commands.effects_page import OFF, default_size, page, sizes
 from sim.commands.estimators import estimators
-from sim.commands.monitoring import watching
+from sim.commands.monitoring import monitoring
 from sim.commands.options import RobotArgument, fail, load
 from sim.commands.run import launch, run, world
 from sim.commands.score import score_run
@@ -95,7 +95,7 @@ app.command("score")(score_run)
 app.command()(amplitudes)
 app.command()(estimators)
 app.command()(assistance)
-app.command()(watching)
+app.command()(monitoring)
 app.command()(compare_log)
 app.add_typer(benchmark, name="benchmark")
 

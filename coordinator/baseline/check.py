@@ -32,7 +32,7 @@ def check_plan(known: BaselineRobot, plan: Plan) -> Plan:
     if _designed(known):
         # The same are designed again, if they are given the same time for journeys and settling.
         same = {"settle_s": plan.settle_s, "travel_speed_rad_s": plan.travel_speed_rad_s}
-        short |= same | {"mode": "joint", "motions": "designed"}
+        short |= same | {"mode": "joint", "motions": "optimised"}
     elif isinstance(sine, WindowedSine):
         short |= {
             "mode": "joint",
@@ -41,7 +41,7 @@ def check_plan(known: BaselineRobot, plan: Plan) -> Plan:
             "sine_sigma_s": min(sine.sigma_s, LONGEST_SIGMA_S),
         }
     elif "whole" in last:
-        short["mode"] = "whole"
+        short["mode"] = "simultaneous"
     return plan.model_copy(update=short)
 
 

@@ -23,7 +23,7 @@ class PayloadError(ValueError):
 
 def payload_plan(known: BaselineRobot, plan: Plan) -> Plan:
     """Return a plan of one short motion of all joints at once, with all around it as short as it takes."""
-    return plan.model_copy(update=hurried(plan, known) | {"mode": "whole"})
+    return plan.model_copy(update=hurried(plan, known) | {"mode": "simultaneous"})
 
 
 def search_payload(known: BaselineRobot, later: BaselineRobot) -> PayloadReport:

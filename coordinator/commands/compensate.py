@@ -1,4 +1,4 @@
-"""`x5-coordinator float`: a known robot bears its own weight, and is led by hand."""
+"""`x5-coordinator compensate`: a known robot bears its own weight, and is led by hand."""
 
 import math
 from collections.abc import Callable

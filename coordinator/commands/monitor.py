@@ -1,4 +1,4 @@
-"""`x5-coordinator watch`: is a known robot, while somebody moves it, still what it was?"""
+"""`x5-coordinator monitor`: is a known robot, while somebody moves it, still what it was?"""
 
 import asyncio
 import contextlib

@@ -10,9 +10,9 @@ from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
-Mode = Literal["joint", "whole"]
-Motions = Literal["thesis", "designed"]
-Excitation = Literal["thesis", "designed"]
+Mode = Literal["joint", "simultaneous"]
+Motions = Literal["standard", "optimised"]
+Excitation = Literal["joint-by-joint", "d-optimal"]
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
 
 
@@ -25,11 +25,11 @@ class Plan(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    # One joint after the other, or all at once: sooner done, without the agents' own estimates.
+    # One joint after the other, or all at once: shorter, but without the agents' own estimates.
     mode: Mode = "joint"
-    # The thesis' motions of every joint as below; or those designed for it (`motion_design`), and then one of
-    # all joints at once.
-    motions: Motions = "thesis"
+    # `standard`: the motions below for every joint. `optimised`: motions chosen by a joint's load and module
+    # type (`excitation.single_joint`), and then one of all joints at once.
+    motions: Motions = "standard"
     # Of designed motions: how long exploring a joint may take, journeys included; by their number if not set,
     # so that all of the session takes 10 s a joint.
     joint_s: Seconds | None = None
@@ -55,10 +55,10 @@ class Plan(BaseModel):
     # Thesis table 6 and figure 44.
     dynamic_amplitude_rad: Annotated[float, Field(gt=0.0, le=3.0)] | None = None
     dynamic_repeats: Annotated[int, Field(ge=1, le=20)] = 4
-    # Joint by joint, as above, or so many motions of all joints at once, designed for what they tell of the
-    # inertia, each so long and no joint further than that from home: there must be room around the robot. A
-    # joint that went further could fold a link onto its neighbour, which nothing here would see.
-    excitation: Excitation = "thesis"
+    # `joint-by-joint`: the dynamic pattern above. `d-optimal`: `excitation_motions` motions of all joints at
+    # once, each `excitation_s` long, D-optimal for the inertial parameters, with no joint further than
+    # `excitation_reach_rad` from home: the space around the robot must be free.
+    excitation: Excitation = "joint-by-joint"
     excitation_motions: Annotated[int, Field(ge=2, le=50)] = 5
     excitation_s: Annotated[float, Field(ge=3.0, le=60.0)] = 6.0
     excitation_reach_rad: Annotated[float, Field(gt=0.0, le=1.2)] = 0.8

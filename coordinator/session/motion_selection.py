@@ -94,7 +94,7 @@ class MotionChoice:
     # ------------------------------------------------------------------ what is known
 
     def _designs(self) -> bool:
-        return self._plan.motions == "designed"
+        return self._plan.motions == "optimised"
 
     def _designed(
         self, serial: str, limits: JointLimits, slow: ConstantMotion | None = None

@@ -67,8 +67,8 @@ class RunConfig(NamedTuple):
 
     `refined_previews`: modules up to which the robot is refined, not only assembled, for every preview while
     it is being explored; None for any number, as in a thread beside the run it keeps nobody waiting.
-    `known`: the folder of a run that the robot is known from. Then all joints are moved at once for a glance,
-    and by themselves only those next to what is other.
+    `baseline`: the folder of an earlier run of this robot. Then all joints are moved at once, and one by one
+    only those next to what differs from that run.
     """
 
     robot: str
@@ -82,7 +82,7 @@ class RunConfig(NamedTuple):
     serve_viewer: int | None = None
     inline: bool = False
     refined_previews: int | None = None
-    known: Path | None = None
+    baseline: Path | None = None
 
 
 class Run:
@@ -108,13 +108,13 @@ class Run:
                 "the plan sets topology_only, which leaves out the fast motions; a run identifies the chain "
                 "too, and needs them: set it to false"
             )
-        before = load_baseline(config.known) if config.known is not None and not config.resume else None
+        before = load_baseline(config.baseline) if config.baseline is not None and not config.resume else None
         crashed = open_run_folder(config.out, config.resume, config.robot)
         if before is not None:
             keep_baseline(before, config.out)
         self._known = before.kinematics if before is not None else baseline_within(config.out)
         if self._known is not None:
-            config = config._replace(plan=config.plan.model_copy(update={"mode": "whole"}))
+            config = config._replace(plan=config.plan.model_copy(update={"mode": "simultaneous"}))
         self._config = config
         self._clock = clock
         self._screen = screen

@@ -108,7 +108,9 @@ class Session:
         self._report("checking the link")
         await check_link(self.link, self._clock, self._plan.link_s, self._reporter.note)
         serials = self.link.serials
-        explorations = 1 if self._plan.mode == "whole" else len(serials) + (self._plan.motions == "designed")
+        explorations = (
+            1 if self._plan.mode == "simultaneous" else len(serials) + (self._plan.motions == "optimised")
+        )
         self._total = 6 + explorations + (self._excitations(len(serials)) if self._plan.dynamics else 0)
         self._mend_after_restart()
         starts = {s: self._position(s) for s in serials}
@@ -116,14 +118,14 @@ class Session:
             await self._take()
             await self._if_it_moves("home", "all joints to their home position", self._home)
             await self._step("rest", "listening at rest", self._rest)
-            if self._plan.mode == "whole":
+            if self._plan.mode == "simultaneous":
                 await self._step("explore", "exploring all joints at once", self._explore_all)
                 await self._look_closer()
             else:
                 for serial in serials:
                     text = f"exploring joint {serial}"
                     await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
-                if self._plan.motions == "designed" and not self._plan.topology_only:
+                if self._plan.motions == "optimised" and not self._plan.topology_only:
                     await self._step("explore", "exploring all joints at once", self._explore_all)
             await self._settle_doubts()
             self._report("topology and chain")
@@ -274,7 +276,7 @@ class Session:
         await asyncio.sleep(self._plan.settle_s)
 
     async def _rest(self) -> None:
-        longest = WHOLE_REST_S if self._plan.mode == "whole" else self._plan.rest_s
+        longest = WHOLE_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
         pattern = Rest(duration_s=min(longest, self._plan.rest_s))
         records = await self.link.run(dict.fromkeys(self._left_out.movers(), pattern))
         for serial, record in records.items():
@@ -379,10 +381,10 @@ class Session:
 
     def _excitations(self, joints: int) -> int:
         """Return how many steps the plan takes to excite so many joints."""
-        return 1 + self._plan.excitation_motions if self._plan.excitation == "designed" else 2 * joints
+        return 1 + self._plan.excitation_motions if self._plan.excitation == "d-optimal" else 2 * joints
 
     def _together(self) -> bool:
-        if self._plan.excitation != "designed":
+        if self._plan.excitation != "d-optimal":
             return False
         if self._left_out.why:
             # Its links are where they are, and it is not to be told to move again.

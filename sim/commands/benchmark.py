@@ -99,7 +99,7 @@ def kinematics(
         ),
     ] = None,
     seed: Seed = 0,
-    motions: Annotated[Motions, typer.Option(help="How whole arms explore joint by joint.")] = "designed",
+    motions: Annotated[Motions, typer.Option(help="How whole arms explore joint by joint.")] = "optimised",
     only: Only = "",
     processes: Processes = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""`x5-sim watching`: what the watch makes of simulated robots to which something happens, or nothing."""
+"""`x5-sim monitoring`: what the watch makes of simulated robots to which something happens, or nothing."""
 
 import json
 import os
@@ -42,7 +42,7 @@ _COST_SHARE = 0.2
 _UNCHANGED_DAY = 500
 
 
-def watching(
+def monitoring(
     seed: Seed = 0,
     robot: Annotated[str, typer.Option(help="A robot of `x5-sim robots`, or a file.")] = ARM.robot,
     noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = ARM.noise,
@@ -191,7 +191,7 @@ def _run(
                 nonlocal done
                 done += 1
                 if terminal.console.is_terminal or done == len(work):
-                    terminal.step(done, len(work), "watching")
+                    terminal.step(done, len(work), "monitoring")
 
             results = [found.result for found in run_trials(work, processes, show)]
     except KeyboardInterrupt:

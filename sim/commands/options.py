@@ -46,17 +46,15 @@ Torque = Annotated[
     typer.Option(help="How well the torque sensors' scales are known beforehand [uncalibrated]."),
 ]
 Mode = Annotated[
-    PlanMode | None, typer.Option(help="One joint after the other, or the whole robot at once [joint].")
+    PlanMode | None, typer.Option(help="Move one joint after the other, or all joints at once [joint].")
 ]
 Motions = Annotated[
     PlanMotions | None,
-    typer.Option("--motions", help="The thesis' motions, or designed for each joint [thesis]."),
+    typer.Option("--motions", help="Motions of one joint: standard, or optimised for each joint [standard]."),
 ]
 Excitation = Annotated[
     PlanExcitation | None,
-    typer.Option(
-        "--excitation", help="What tells the inertia: the thesis' motions, or all joints at once [thesis]."
-    ),
+    typer.Option("--excitation", help="Motions for the inertial parameters [joint-by-joint]."),
 ]
 Endpoint = Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")]
 Processes = Annotated[

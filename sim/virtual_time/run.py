@@ -26,7 +26,7 @@ COORDINATOR = "coordinator"
 class VirtualConfig(NamedTuple):
     """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given.
 
-    `known` and `refined_previews` as in `RunConfig`: nobody watches a virtual run, so that none is the rule.
+    `baseline` and `refined_previews` as in `RunConfig`; by default there is no preview.
     `pushes` act on the robot from outside.
     """
 
@@ -40,7 +40,7 @@ class VirtualConfig(NamedTuple):
     feedback_rate_hz: float = 250.0
     noise_seed: int | None = None
     refined_previews: int = 0
-    known: Path | None = None
+    baseline: Path | None = None
     pushes: tuple[Push, ...] = ()
 
 
@@ -77,7 +77,7 @@ def run_virtual(
                 connect_viewer=config.connect_viewer,
                 inline=True,
                 refined_previews=config.refined_previews,
-                known=config.known,
+                baseline=config.baseline,
             ),
             robot.endpoint(COORDINATOR),
             lambda: loop.now_ns,

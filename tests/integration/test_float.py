@@ -22,7 +22,7 @@ def floating(launcher, known_folder, tmp_path):
         out = (tmp_path / "out.jsonl").open("wb")
         process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "coordinator.main", "float", str(folder or known_folder(ROBOT))),
+                *(sys.executable, "-m", "coordinator.main", "compensate", str(folder or known_folder(ROBOT))),
                 *("--listen", robot.config.endpoint, "--network", "lan", "--json", *options),
             ],
             stdin=subprocess.DEVNULL,

@@ -42,7 +42,7 @@ def _lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:
 
 KNOWN_BY = {
     "thesis": Plan(dynamics=False, sine_centre_s=1.6, sine_sigma_s=0.7),
-    "designed": Plan(dynamics=False, motions="designed"),
+    "designed": Plan(dynamics=False, motions="optimised"),
 }
 
 

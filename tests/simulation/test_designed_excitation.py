@@ -22,7 +22,7 @@ from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 
 ARM, MOTIONS = "a2085_03", 3
-PLAN = Plan(excitation="designed", excitation_motions=MOTIONS, excitation_s=4.0, imu="calibrated")
+PLAN = Plan(excitation="d-optimal", excitation_motions=MOTIONS, excitation_s=4.0, imu="calibrated")
 
 
 @pytest.fixture(scope="module")

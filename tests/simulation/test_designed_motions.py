@@ -16,7 +16,7 @@ def test_four_joints_are_explored_in_ten_seconds_each_within_what_they_can_do(
     rigs: Rigs, tmp_path: Path
 ) -> None:
     out = tmp_path / "run"
-    plan = Plan(motions="designed", dynamics=False, imu="calibrated", settle_s=0.3)
+    plan = Plan(motions="optimised", dynamics=False, imu="calibrated", settle_s=0.3)
     result = rigs("a2085_04", "lan", 1).session(out, plan)
     assert result.robot_time_s < 10.0 * len(result.serials)
     found = score(out)
@@ -38,7 +38,7 @@ def test_a_precision_that_is_asked_for_is_reached_by_repeats_or_it_is_said_how_f
 ) -> None:
     rig, out = rigs("thesis_171_vertical", "lan", 2), tmp_path / "run"
     plan = Plan(
-        motions="designed",
+        motions="optimised",
         dynamics=False,
         imu="calibrated",
         precision_mm=0.1,

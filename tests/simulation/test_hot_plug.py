@@ -43,7 +43,9 @@ def bring(tmp_path_factory: pytest.TempPathFactory) -> Bring:
 
     def run(robot: Robot, out: Path, day: int, before: Path | None = None) -> list[str]:
         notes = Notes()
-        run_virtual(VirtualConfig(robot, out, 3, noise_seed=day, noise="x5", plan=short, known=before), notes)
+        run_virtual(
+            VirtualConfig(robot, out, 3, noise_seed=day, noise="x5", plan=short, baseline=before), notes
+        )
         return notes.lines
 
     def make(before: Robot, after: Robot) -> Updated:
@@ -147,7 +149,7 @@ def test_a_folder_that_holds_no_run_is_no_known_robot(tmp_path: Path) -> None:
         str(tmp_path / "new"),
         "--listen",
         "tcp/127.0.0.1:0",
-        "--known",
+        "--baseline",
         str(tmp_path),
     ]
     done = CliRunner().invoke(app, arguments)

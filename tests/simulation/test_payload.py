@@ -23,7 +23,7 @@ from sim.virtual_time.run import VirtualConfig, run_virtual
 
 ARM = "a2085_03"
 HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
-PLAN = Plan(excitation="designed", excitation_motions=3, excitation_s=4.0, imu="calibrated")
+PLAN = Plan(excitation="d-optimal", excitation_motions=3, excitation_s=4.0, imu="calibrated")
 
 
 def lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:

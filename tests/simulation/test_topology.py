@@ -187,7 +187,7 @@ def narrow_elbow(arm: Any) -> None:
 def test_all_joints_are_excited_together_only_if_all_take_part(arm: Any, narrow: bool) -> None:
     if narrow:
         narrow_elbow(arm)
-    update = {"dynamics": True, "excitation": "designed", "dynamic_repeats": 1}
+    update = {"dynamics": True, "excitation": "d-optimal", "dynamic_repeats": 1}
     recording, watcher = explore(arm, PLAN.model_copy(update=update))
     assert ("asked for motions of all joints" in watcher.notes) != narrow
     excited = {e.serial for e in recording.journal if e.purpose == "dynamic"}

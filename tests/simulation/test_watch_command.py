@@ -39,7 +39,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def watch(*words: str) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["watch", *words])
+    done = CliRunner().invoke(app, ["monitor", *words])
     return done.exit_code, done.output
 
 

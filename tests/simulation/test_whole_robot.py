@@ -11,7 +11,7 @@ from coordinator.recording.run_folder import load_recording
 from sim.scoring.score import score
 
 Rigs = Callable[..., Any]
-WHOLE = Plan(mode="whole", dynamics=False, imu="calibrated")
+WHOLE = Plan(mode="simultaneous", dynamics=False, imu="calibrated")
 ARM, BASE, TIP = "thesis_171_vertical", "X-00009", "X-00010"
 
 

@@ -210,7 +210,7 @@ WHOLE_TIME_S = 20.0
 REFINEMENT_S = 5.0
 # The thesis' motions, and less of everything.
 SHORTENED = {
-    "motions": "thesis",
+    "motions": "standard",
     "discover_s": 0.3,
     "link_s": 0.3,
     "rest_s": 0.5,
@@ -237,7 +237,9 @@ def arm_cases(trials: int, seed: int, shortened: bool = False, motions: Motions 
         plan = arm_plan("joint", _imu(noise), motions)
         own = plan.model_copy(update=SHORTENED) if short else plan
         cases.append(_case(arm, noise, own, trials, seed, short))
-    whole = [_case(WHOLE_ARM, noise, arm_plan("whole", _imu(noise)), trials, seed) for noise in PROFILES]
+    whole = [
+        _case(WHOLE_ARM, noise, arm_plan("simultaneous", _imu(noise)), trials, seed) for noise in PROFILES
+    ]
     return cases + whole
 
 
@@ -334,7 +336,7 @@ def _link_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, 
 def _time_rows(case: str, mode: Mode, shortened: bool, trials: Sequence[ArmTrial]) -> tuple[Row, ...]:
     """Return how long the robot was at work; of shortened motions that meets no bar."""
     done = [trial for trial in trials if not trial.why]
-    if mode == "whole":
+    if mode == "simultaneous":
         spent = largest([trial.robot_time_s for trial in done])
         return (Row(case, "robot time in all, longest [s]", None, spent, None, WHOLE_TIME_S),)
     each = largest([trial.robot_time_s / trial.joints for trial in done])

@@ -241,10 +241,10 @@ LARGEST_PERCENT = 1.0
 TRUE_CHAIN_RATIO = 1.2
 BODIES_POINTS = 0.1
 PLAN = Plan(
-    excitation="designed", motions="designed", imu="calibrated", torque="calibrated", excitation_s=8.0
+    excitation="d-optimal", motions="optimised", imu="calibrated", torque="calibrated", excitation_s=8.0
 )
 QUICK_PLAN = PLAN.model_copy(
-    update=SHORTENED | {"mode": "whole", "excitation_motions": 3, "excitation_s": 4.0}
+    update=SHORTENED | {"mode": "simultaneous", "excitation_motions": 3, "excitation_s": 4.0}
 )
 POSES, QUICK_POSES = 10_000, 1_000
 _COST_S = {"a2085_04": 10.0, "a2085_06": 18.0}

@@ -190,7 +190,7 @@ SIZE_MM = 0.5
 CHECK_S = 60.0
 _KNOWN_COST_S, _CHECK_COST_S = 11.0, 11.0
 # A quarter of that where all joints are moved at once.
-AT_ONCE = Plan(mode="whole", dynamics=False)
+AT_ONCE = Plan(mode="simultaneous", dynamics=False)
 _AT_ONCE_SHARE = 0.3
 
 

@@ -45,7 +45,7 @@ Found = Literal["nothing", "collision", "payload", "friction", "wear", "unexplai
 DAYS = 1000
 # A run by which a robot gets known: all joints at once, and six motions for its inertia.
 KNOWN_PLAN = Plan(
-    mode="whole", excitation="designed", excitation_motions=6, excitation_s=5.0, imu="calibrated"
+    mode="simultaneous", excitation="d-optimal", excitation_motions=6, excitation_s=5.0, imu="calibrated"
 )
 BRIEF = {"excitation_motions": 4, "excitation_s": 4.0}
 MOTION_S, MOTIONS = 4.0, 6

@@ -27,7 +27,7 @@ from sim.virtual_time.run import VirtualConfig, run_virtual
 ROBOT = "a2085_03"
 # All joints explored at once, and the thesis' motions once: less robot time than any other way.
 QUICK = Plan(
-    mode="whole",
+    mode="simultaneous",
     discover_s=0.3,
     link_s=0.3,
     rest_s=1.0,

@@ -53,7 +53,7 @@ def moment(t_s: float = 1.0, q: tuple[float, float] = (0.5, -1.0)) -> Moment:
 def test_wrong_usage_is_answered_with_what_is_right(
     known_folder: Callable[..., Path], options: tuple[str, str], words: str
 ) -> None:
-    done = CliRunner().invoke(app, ["float", str(known_folder("a2085_03")), *options])
+    done = CliRunner().invoke(app, ["compensate", str(known_folder("a2085_03")), *options])
     assert done.exit_code == 2, done.output
     assert words in done.output
 
@@ -65,7 +65,7 @@ def test_a_folder_that_does_not_tell_the_weight_is_wrong_usage(
         (tmp_path / "nowhere", "holds no result.json: give the folder of a run that has finished"),
         (known_folder("a2085_03", dynamics=None), "it was run with --no-dynamics"),
     ):
-        done = CliRunner().invoke(app, ["float", str(folder)])
+        done = CliRunner().invoke(app, ["compensate", str(folder)])
         assert done.exit_code == 2, done.output
         assert words in done.output
 

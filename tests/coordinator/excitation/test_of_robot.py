@@ -13,7 +13,7 @@ from sim.robot.robot_tree import true_chain
 
 ROBOT = load_robot("a2085_04")
 CHAIN = true_chain(ROBOT)
-PLAN = Plan(excitation="designed", excitation_motions=2, excitation_s=4.0)
+PLAN = Plan(excitation="d-optimal", excitation_motions=2, excitation_s=4.0)
 
 
 def modules(**changed: float) -> list[RobotModule]:

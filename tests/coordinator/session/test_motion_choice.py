@@ -71,7 +71,7 @@ def test_the_plan_s_own_motions_are_the_thesis() -> None:
 
 
 def test_a_joint_that_carries_more_is_accelerated_less() -> None:
-    plan = Plan(motions="designed", imu="calibrated")
+    plan = Plan(motions="optimised", imu="calibrated")
     light, heavy = fast_of(0.05, plan), fast_of(3.0, plan)
 
     def peak(sine: WindowedSine) -> float:
@@ -88,13 +88,13 @@ def test_a_robot_of_any_size_has_the_time_for_designed_motions(joints: int) -> N
         SimpleNamespace(purpose="rest", serial=s, motion=record(Rest(duration_s=1.0), REST)) for s in serials
     ]
     recording: Any = told
-    plan = Plan(motions="designed")
+    plan = Plan(motions="optimised")
     chosen = MotionChoice(plan, recording, lambda: serials, lambda serial: CATALOGUE["X5-4"])
     assert chosen.slow("A") != plan.constant()
 
 
 def test_where_no_designed_motion_fits_into_the_time_the_thesis_has_to_do() -> None:
-    plan = Plan(motions="designed", joint_s=1.5)
+    plan = Plan(motions="optimised", joint_s=1.5)
     chosen = choice(plan, Told(0.1))
     assert chosen.slow("A") == plan.constant()
     assert chosen.fast("A", record(plan.constant(), SLOW)) == plan.sine(CATALOGUE["X5-4"])
@@ -102,7 +102,7 @@ def test_where_no_designed_motion_fits_into_the_time_the_thesis_has_to_do() -> N
 
 @pytest.mark.parametrize("wanted_mm", [5.0, 0.05])
 def test_motions_are_repeated_until_the_precision_is_reached_or_more_does_not_help(wanted_mm: float) -> None:
-    plan = Plan(motions="designed", imu="calibrated", precision_mm=wanted_mm)
+    plan = Plan(motions="optimised", imu="calibrated", precision_mm=wanted_mm)
     slow = choice(plan, Told(0.1)).slow("A")
     chosen = choice(plan, Told(0.1, slow))
     done = [record(slow, SLOW), record(chosen.fast("A", record(slow, SLOW)), FAST)]
@@ -120,8 +120,8 @@ def test_motions_are_repeated_until_the_precision_is_reached_or_more_does_not_he
 
 def test_all_joints_at_once_move_whatever_they_hold() -> None:
     # 2.5 Nm is all that this type has: what holds itself can be moved a little all the same.
-    strained = choice(Plan(mode="whole"), Told(0.1, rest_nm=2.4), "X5-1").whole()
+    strained = choice(Plan(mode="simultaneous"), Told(0.1, rest_nm=2.4), "X5-1").whole()
     assert set(strained) == set(SERIALS)
-    easy = choice(Plan(mode="whole"), Told(0.1), "X5-1").whole()
+    easy = choice(Plan(mode="simultaneous"), Told(0.1), "X5-1").whole()
     for serial in SERIALS:
         assert strained[serial].sines[1].amplitude_rad <= easy[serial].sines[1].amplitude_rad

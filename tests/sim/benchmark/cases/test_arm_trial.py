@@ -49,7 +49,7 @@ def test_a_session_in_memory_is_message_for_message_that_of_a_run_with_a_folder(
 def test_the_thesis_chain_is_that_of_the_agents_own_circles_and_of_nothing_else() -> None:
     robot = load_robot(ROBOT)
     settings = VirtualSettings(robot, network("lan"), SEED, "x5")
-    recording = record_session(settings, arm_plan("joint", "calibrated", "thesis"))
+    recording = record_session(settings, arm_plan("joint", "calibrated", "standard"))
     topology = identify_kinematics(recording).topology
     joint, observer = topology.serials
     circle = list(recording.estimates[joint, observer].values())[-1].circle

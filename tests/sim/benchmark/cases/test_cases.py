@@ -199,21 +199,21 @@ def test_shortened_motions_meet_no_bar_of_time_and_one_arm_moves_in_full_all_the
     assert [plan.imu for plan in plans] == ["calibrated", "uncalibrated"] * 3
     assert all(plan.sine_centre_s < plans[0].sine_centre_s for plan in plans[1:])
     # Whoever chooses the motions: those are the thesis', shortened.
-    quick = kinematic_cases(QUICK_KINEMATICS, seed=0, motions="designed")
+    quick = kinematic_cases(QUICK_KINEMATICS, seed=0, motions="optimised")
     motions = [c.trials[0].arguments[-1].motions for c in chosen(quick, "joint by joint")]
-    assert motions == ["designed"] + ["thesis"] * 5
+    assert motions == ["optimised"] + ["standard"] * 5
 
 
 def test_other_motions_are_those_of_whole_arms_joint_by_joint() -> None:
-    cases = kinematic_cases(full_kinematics(1), seed=0, motions="designed")
+    cases = kinematic_cases(full_kinematics(1), seed=0, motions="optimised")
     plans = {case.name: case.trials[0].arguments[-1] for case in cases}
-    assert all(plan.motions == "designed" for name, plan in plans.items() if "joint by joint" in name)
-    assert plans["a2085_04, x5, clocks apart, wifi"].motions == "designed"
+    assert all(plan.motions == "optimised" for name, plan in plans.items() if "joint by joint" in name)
+    assert plans["a2085_04, x5, clocks apart, wifi"].motions == "optimised"
 
 
 def test_all_joints_at_once_have_twenty_seconds_in_all() -> None:
     case = case_named(arm_cases(13, 0), f"{WHOLE_ARM}, x5, all")
-    trials = [arm(0.9, mode="whole", robot_time_s=19.0, thesis_tip=None)] * 13
+    trials = [arm(0.9, mode="simultaneous", robot_time_s=19.0, thesis_tip=None)] * 13
     found = rows(case.summarise(trials))
     assert found["robot time in all, longest [s]"].holds
     assert found["tip position, rms [mm]"].thesis is None
