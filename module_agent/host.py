@@ -25,15 +25,21 @@ from module_agent.transport.transport import (
     Transport,
     Undeclare,
 )
-from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
+from module_agent.wire.codec import decode, encode
 from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import Ack, Estimate, EstimateRequest, Feedback, HistoryRequest, Status
+from module_agent.wire.messages import (
+    Ack,
+    Estimate,
+    EstimateRequest,
+    Feedback,
+    HistoryRequest,
+    Message,
+    Status,
+)
 from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.topics import PUBLISHED_TO_MODULE, SERVED, TOPICS
 
-BESIDE = (Leaf.ESTIMATE, Leaf.COLLECT, Leaf.INFORMATION)  # answered here, not by the firmware
-SERVED = (Leaf.INFO, Leaf.STATUS, Leaf.HISTORY, Leaf.LEASE, Leaf.MOTION, Leaf.STOP, Leaf.GAINS, *BESIDE)
-HEARD = (Leaf.SETPOINT, Leaf.STOP)
 HISTORY_TIMEOUT_S = 0.4
 # A question whose answer is dropped on arrival would otherwise be remembered for ever.
 MAX_ASKED = 1024
@@ -110,39 +116,43 @@ class HostedModule:
             self._request_id += 1
             number = self._request_id
             self.requests[number] = event
-        if leaf in BESIDE and number is not None:
+        if TOPICS[leaf].answered_by == "host" and number is not None:
             answers.append(Answer(number, self._answer(leaf, event.payload)))
         else:
             incoming.append(Incoming(leaf, event.payload, number))
 
     def _answer(self, leaf: Leaf, payload: bytes) -> bytes:
         try:
-            if leaf is Leaf.ESTIMATE:
-                return encode(self._answer_estimate(payload))
-            if leaf is Leaf.COLLECT:
-                return encode(self._answer_collect(payload))
-            return encode(self._answer_information(payload))
+            return encode(self._answer_message(self.firmware.admission.read(leaf, payload)))
         except WireError as error:
             # What is not ready yet is asked for again; nobody has done anything wrong.
             if error.reason is not Refusal.BUSY:
                 self.firmware.admission.count(error.reason)
             return encode(self._ack(False, 0, error.reason.value, error.detail[:512]))
 
-    def _answer_estimate(self, payload: bytes) -> Estimate:
-        request = self.firmware.admission.read(EstimateRequest, payload, any_boot=True)
+    def _answer_message(self, request: Message) -> Message:
+        match request:
+            case EstimateRequest():
+                return self._answer_estimate(request)
+            case CollectRequest():
+                return self._answer_collect(request)
+            case InformationRequest():
+                return self._answer_information(request)
+            case _:
+                raise WireError(Refusal.MALFORMED, f"{type(request).__name__} is not answered by the host")
+
+    def _answer_estimate(self, request: EstimateRequest) -> Estimate:
         finding = self.observer.findings.get(request.joint)
         if finding is None:
             raise WireError(Refusal.GONE, f"{self.serial} has no estimate of joint {request.joint}")
         return self.estimate(finding)
 
-    def _answer_collect(self, payload: bytes) -> Ack:
-        request = self.firmware.admission.read(CollectRequest, payload, max_bytes=MAX_MESSAGE_BYTES)
+    def _answer_collect(self, request: CollectRequest) -> Ack:
         shared = self._shared
         self._information.collect(request, shared.own_rows, shared.clock_ns())
         return self._ack(True, request.seq)
 
-    def _answer_information(self, payload: bytes) -> Information:
-        request = self.firmware.admission.read(InformationRequest, payload, max_bytes=MAX_MESSAGE_BYTES)
+    def _answer_information(self, request: InformationRequest) -> Information:
         answer = self._information.answer(request)
         return Information(
             serial=self.serial, boot=self.firmware.config.boot, seq=self._next_seq(), **answer._asdict()
@@ -245,7 +255,7 @@ class AgentHost:
         for module in self.modules:
             for leaf in SERVED:
                 self._declared.append(transport.serve(module.key(leaf), module.sink(leaf)))
-            for leaf in HEARD:
+            for leaf in PUBLISHED_TO_MODULE:
                 self._declared.append(transport.subscribe(module.key(leaf), module.sink(leaf)))
         self._declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._heard.put))
         # Last, so that whoever sees the token finds everything else in place.
@@ -312,15 +322,19 @@ class AgentHost:
             return
         parts = parse(event.key)
         if parts.leaf is Leaf.STATUS:
-            status = _of(parts.serial, decode(Status, event.payload))
+            status = _of(
+                parts.serial, decode(Status, event.payload, TOPICS[Leaf.STATUS].max_bytes_from_module)
+            )
             self._neighbours.on_status(status, now_ns, clocks)
         else:
-            feedback = _of(parts.serial, decode(Feedback, event.payload, MAX_MESSAGE_BYTES))
+            feedback = _of(
+                parts.serial, decode(Feedback, event.payload, TOPICS[Leaf.FEEDBACK].max_bytes_from_module)
+            )
             self._neighbours.on_feedback(feedback, clocks)
 
     def _hear_history(self, asked: AskHistory, payload: bytes, clocks: dict[str, int]) -> None:
         try:
-            feedback = decode(Feedback, payload, MAX_MESSAGE_BYTES)
+            feedback = decode(Feedback, payload, TOPICS[Leaf.HISTORY].max_bytes_from_module)
         except WireError:
             # An answer too; anything else is malformed.
             refused = _of(asked.serial, decode(Ack, payload))

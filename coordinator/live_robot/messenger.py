@@ -14,6 +14,7 @@ from module_agent.transport.transport import CLOSED, Event, Liveness, Reply, Sam
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Message
+from module_agent.wire.topics import PUBLISHED_BY_MODULE
 
 Clock = Callable[[], int]
 """Returns session time in integer nanoseconds; it never goes back."""
@@ -68,7 +69,7 @@ class Messenger:
 
     def start(self) -> None:
         """Begin to listen."""
-        for leaf in (Leaf.FEEDBACK, Leaf.STATUS, Leaf.ESTIMATE):
+        for leaf in PUBLISHED_BY_MODULE:
             self._declared.append(self._transport.subscribe(every(self.robot, leaf), self._sink))
         self._declared.append(self._transport.watch_alive(every(self.robot, Leaf.ALIVE), self._sink))
 

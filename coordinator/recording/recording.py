@@ -10,57 +10,17 @@ from typing import Literal, NamedTuple
 
 from coordinator.recording.journal import JournalEvent, Purpose
 from module_agent.model.catalogue import ImuKind, TorqueKind
-from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
+from module_agent.wire.codec import decode
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
+from module_agent.wire.information_messages import Information, InformationRequest
 from module_agent.wire.keys import Leaf, parse
-from module_agent.wire.messages import (
-    Ack,
-    Ask,
-    Estimate,
-    EstimateRequest,
-    Feedback,
-    GainsCommand,
-    HistoryRequest,
-    Info,
-    LeaseRequest,
-    Message,
-    MotionCommand,
-    Setpoint,
-    Status,
-    Stop,
-)
+from module_agent.wire.messages import Ack, Estimate, Feedback, Info, Message, Status
 from module_agent.wire.refusal import Refusal, WireError
 from module_agent.wire.row_log import RowLog
+from module_agent.wire.topics import TOPICS, Exchange
 
-Kind = Literal["publication", "request", "reply", "journal"]
+Kind = Exchange | Literal["journal"]
 JOURNAL_TOPIC = "journal"
-
-PUBLISHED: dict[Leaf, type[Message]] = {
-    Leaf.FEEDBACK: Feedback,
-    Leaf.STATUS: Status,
-    Leaf.ESTIMATE: Estimate,
-    Leaf.SETPOINT: Setpoint,
-}
-ASKED: dict[Leaf, type[Message]] = {
-    Leaf.INFO: Ask,
-    Leaf.STATUS: Ask,
-    Leaf.HISTORY: HistoryRequest,
-    Leaf.ESTIMATE: EstimateRequest,
-    Leaf.LEASE: LeaseRequest,
-    Leaf.MOTION: MotionCommand,
-    Leaf.STOP: Stop,
-    Leaf.GAINS: GainsCommand,
-    Leaf.COLLECT: CollectRequest,
-    Leaf.INFORMATION: InformationRequest,
-}
-ANSWERED: dict[Leaf, type[Message]] = {
-    Leaf.INFO: Info,
-    Leaf.STATUS: Status,
-    Leaf.HISTORY: Feedback,
-    Leaf.ESTIMATE: Estimate,
-    Leaf.INFORMATION: Information,
-}
 
 
 class Entry(NamedTuple):
@@ -147,44 +107,26 @@ class Recording:
         head = f"{entry.kind} {entry.topic} {len(entry.payload)} ".encode()
         self._hash.update(head + struct.pack("<q", entry.t_ns) + entry.payload)
         try:
-            return self._index(entry)
+            return self._index(entry, entry.kind)
         except WireError as error:
             self.refused[error.reason.value] = self.refused.get(error.reason.value, 0) + 1
             raise
 
-    def _index(self, entry: Entry) -> Message:
+    def _index(self, entry: Entry, exchange: Exchange) -> Message:
         parts = parse(entry.topic)
-        message = self._decode(entry, parts.leaf)
+        message = _decode(exchange, parts.leaf, entry.payload)
         if message.serial != parts.serial:
             raise WireError(Refusal.WRONG_SERIAL, f"{message.serial} speaks on the key of {parts.serial}")
-        if entry.kind == "request":
+        if exchange == "request":
             self._sent[entry.topic, message.seq] = entry.t_ns
             if isinstance(message, InformationRequest):
                 self.questions.setdefault(message.digest(), message)
             return message
-        if isinstance(message, Setpoint):
+        if exchange == "publication" and TOPICS[parts.leaf].published_by == "coordinator":
             return message
         module = self.module(message.serial, message.boot)
         self._note(module, message, entry)
         return message
-
-    def _decode(self, entry: Entry, leaf: Leaf) -> Message:
-        if entry.kind == "publication":
-            table = PUBLISHED
-        elif entry.kind == "request":
-            table = ASKED
-        else:
-            table = ANSWERED
-            if leaf not in table:
-                return decode(Ack, entry.payload)
-        if leaf not in table:
-            raise WireError(Refusal.MALFORMED, f"nothing is {entry.kind} on {leaf.value}")
-        try:
-            return decode(table[leaf], entry.payload, MAX_MESSAGE_BYTES)
-        except WireError as error:
-            if entry.kind == "reply" and error.reason is Refusal.TYPES:
-                return decode(Ack, entry.payload)
-            raise
 
     def _note(self, module: ModuleRecord, message: Message, entry: Entry) -> None:
         match message:
@@ -249,3 +191,16 @@ class Recording:
     def rows(self, serial: str, first: int, end: int) -> Rows:
         """Return the rows of a range of the latest boot of a module that have arrived."""
         return self.modules[serial].rows.rows(first, end)
+
+
+def _decode(exchange: Exchange, leaf: Leaf, payload: bytes) -> Message:
+    topic = TOPICS[leaf]
+    message_type = topic.message(exchange)
+    if message_type is None:
+        raise WireError(Refusal.MALFORMED, f"no {exchange} is defined on {leaf.value}")
+    try:
+        return decode(message_type, payload, topic.max_bytes(exchange))
+    except WireError as error:
+        if exchange == "reply" and error.reason is Refusal.TYPES:
+            return decode(Ack, payload)  # a refusal
+        raise

@@ -15,9 +15,10 @@ from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
 
 from coordinator.recording.journal import JournalEvent
-from coordinator.recording.recording import ANSWERED, ASKED, PUBLISHED, Entry, Kind
-from module_agent.wire.keys import Leaf, parse
+from coordinator.recording.recording import Entry, Kind
+from module_agent.wire.keys import parse
 from module_agent.wire.messages import Ack, Message
+from module_agent.wire.topics import TOPICS
 
 CHUNK_BYTES = 16 * 1024
 FLUSH_NS = 200_000_000
@@ -32,9 +33,7 @@ class SessionFileError(ValueError):
 def _message_type(kind: Kind, topic: str) -> type[Message] | type[JournalEvent]:
     if kind == "journal":
         return JournalEvent
-    leaf: Leaf = parse(topic).leaf
-    table = {"publication": PUBLISHED, "request": ASKED, "reply": ANSWERED}[kind]
-    return table.get(leaf, Ack)
+    return TOPICS[parse(topic).leaf].message(kind) or Ack
 
 
 class SessionWriter:

@@ -5,14 +5,13 @@ and age. Age is the time since the newest module time that the sender had seen, 
 commands are refused without any clock in common.
 """
 
-from typing import TypeVar
-
 from module_agent.firmware.lease import Lease
-from module_agent.wire.codec import MAX_COMMAND_BYTES, decode
+from module_agent.wire.codec import decode
+from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import GainsCommand, LeaseRequest, Message, MotionCommand, Setpoint
 from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.topics import TOPICS
 
-M = TypeVar("M", bound=Message)
 Command = LeaseRequest | MotionCommand | Setpoint | GainsCommand
 
 
@@ -30,18 +29,19 @@ class Admission:
         """Count one refusal."""
         self.refusals[reason.value] = self.refusals.get(reason.value, 0) + 1
 
-    def read(
-        self, kind: type[M], payload: bytes, any_boot: bool = False, max_bytes: int = MAX_COMMAND_BYTES
-    ) -> M:
-        """Decode a message that is meant for this module in this boot.
+    def read(self, leaf: Leaf, payload: bytes) -> Message:
+        """Decode what arrived on a leaf and is meant for this module in this boot.
 
         Raises:
             WireError: with the reason.
         """
-        message = decode(kind, payload, max_bytes)
+        topic = TOPICS[leaf]
+        if topic.to_module is None:
+            raise WireError(Refusal.MALFORMED, f"{leaf.value} takes no message")
+        message = decode(topic.to_module, payload, topic.max_bytes_to_module)
         if message.serial != self._serial:
             raise WireError(Refusal.WRONG_SERIAL, f"for {message.serial}, this is {self._serial}")
-        if message.boot != self._boot and not (any_boot and message.boot == 0):
+        if message.boot != self._boot and not (topic.any_boot and message.boot == 0):
             raise WireError(
                 Refusal.WRONG_BOOT,
                 f"for boot {message.boot:016x} of {self._serial}, which has booted anew as {self._boot:016x}",

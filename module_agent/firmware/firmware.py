@@ -215,43 +215,31 @@ class Firmware:
             out.append(Answer(incoming.request, answer))
 
     def _dispatch(self, incoming: Incoming) -> bytes:
-        leaf, payload, read = incoming.leaf, incoming.payload, self.admission.read
-        match leaf:
-            case Leaf.INFO:
-                read(Ask, payload, any_boot=True)
+        message = self.admission.read(incoming.leaf, incoming.payload)
+        if isinstance(message, LeaseRequest | MotionCommand | Setpoint | GainsCommand):
+            self.admission.check_command(message, self.lease, self._now_ns)
+        match message:
+            case Ask() if incoming.leaf is Leaf.INFO:
                 return encode(self._info())
-            case Leaf.STATUS:
-                return encode(self._status(read(Ask, payload, any_boot=True).seq))
-            case Leaf.HISTORY:
-                return self._answer_history(read(HistoryRequest, payload))
-            case Leaf.STOP:
-                stop = read(Stop, payload, any_boot=True)
+            case Ask():
+                return encode(self._status(message.seq))
+            case HistoryRequest():
+                return self._answer_history(message)
+            case Stop():
                 self._finish_motion("stopped")
-                self._enter("stop", f"stopped by {stop.sender}: {stop.why}"[:512])
+                self._enter("stop", f"stopped by {message.sender}: {message.why}"[:512])
                 self._stopped_ns = self._now_ns
-                return encode(self._ack(True, stop.seq))
-            case Leaf.LEASE:
-                request = read(LeaseRequest, payload, any_boot=False)
-                self.admission.check_command(request, self.lease, self._now_ns)
-                self._act_lease(request)
-                return encode(self._ack(True, request.seq))
-            case Leaf.MOTION:
-                motion = read(MotionCommand, payload)
-                self.admission.check_command(motion, self.lease, self._now_ns)
-                self._start_motion(motion)
-                return encode(self._ack(True, motion.seq))
-            case Leaf.SETPOINT:
-                setpoint = read(Setpoint, payload)
-                self.admission.check_command(setpoint, self.lease, self._now_ns)
-                self._stream(setpoint)
-                return encode(self._ack(True, setpoint.seq))
-            case Leaf.GAINS:
-                gains = read(GainsCommand, payload)
-                self.admission.check_command(gains, self.lease, self._now_ns)
-                self._set_gains(gains)
-                return encode(self._ack(True, gains.seq))
+            case LeaseRequest():
+                self._act_lease(message)
+            case MotionCommand():
+                self._start_motion(message)
+            case Setpoint():
+                self._stream(message)
+            case GainsCommand():
+                self._set_gains(message)
             case _:
-                raise WireError(Refusal.MALFORMED, f"{leaf.value} takes no message")
+                raise WireError(Refusal.MALFORMED, f"{incoming.leaf.value} is not answered by the firmware")
+        return encode(self._ack(True, message.seq))
 
     def _act_lease(self, request: LeaseRequest) -> None:
         if request.action == "renew":

@@ -6,25 +6,22 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from module_agent.host import HEARD, SERVED
-from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES
+from module_agent.wire.codec import MAX_MESSAGE_BYTES
 from module_agent.wire.keys import ROOT, Leaf, key
+from module_agent.wire.topics import PUBLISHED_TO_MODULE, SERVED, TOPICS
 from sim.scoring.score import score
 from sim.world.truth import read_motion
 
 NAN, INFINITY = float("nan"), float("inf")
 
 
-# Questions about torques hold a chain, and rows of every module.
-LONG = {Leaf.COLLECT, Leaf.INFORMATION}
 REASONS = ("too_long", "malformed", "version", "types")
 
 
 def without_values(leaf: Leaf) -> dict[str, bytes]:
     """Return what is garbage on any key, by the reason for which it is refused on this one."""
-    most = MAX_MESSAGE_BYTES if leaf in LONG else MAX_COMMAND_BYTES
     return {
-        "too_long": b"\x90" * (most + 1),
+        "too_long": b"\x90" * (TOPICS[leaf].max_bytes_to_module + 1),
         "malformed": b"\x91" * 1000,
         "version": msgpack.packb({"v": 2, "serial": "X", "boot": 0, "seq": 1}),
         "types": msgpack.packb({"v": 1, "serial": 5, "boot": "x"}),
@@ -84,7 +81,7 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
             for leaf in Leaf:
                 throw(key(name, serial, leaf), without_values(leaf)[reason])
     # Each module reads the questions and publications of its own keys, and the status of every module.
-    each = len(SERVED) + len(HEARD) + len(serials)
+    each = len(SERVED) + len(PUBLISHED_TO_MODULE) + len(serials)
     gauge_fixed({s: Counter(dict.fromkeys(REASONS, each)) for s in serials}, none)
 
     so_far = {s: Counter(commander.status(s).refusals) for s in serials}
@@ -96,7 +93,7 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
     # Wildcards reach all of a module's keys at once; larger than any message, or than Zenoh itself takes.
     so_far = {s: Counter(commander.status(s).refusals) for s in serials}
     throw(f"{ROOT}/{name}/**", b"garbage")
-    gauge_fixed({s: Counter(malformed=len(SERVED) + len(HEARD)) for s in serials}, so_far)
+    gauge_fixed({s: Counter(malformed=len(SERVED) + len(PUBLISHED_TO_MODULE)) for s in serials}, so_far)
     for size in (MAX_MESSAGE_BYTES + 1, 2 << 20):
         throw(key(name, serials[0], Leaf.FEEDBACK), bytes(size))
         throw(key(name, serials[1], Leaf.SETPOINT), bytes(size))

@@ -116,7 +116,7 @@ def test_what_cannot_be_read_is_counted_by_reason(heard: Recording, wire: Simple
     for payload in (b"", b"\xc1", other_version):
         with pytest.raises(WireError):
             heard.add(Entry("publication", topic, 0, payload))
-    with pytest.raises(WireError, match="nothing is publication on info"):
+    with pytest.raises(WireError, match="no publication is defined on info"):
         heard.add(wire.publication(Leaf.INFO, wire.info()))
     assert heard.refused == {"malformed": 3, "version": 1}
 

@@ -54,6 +54,7 @@ from module_agent.wire.messages import (
     WindowedSine,
 )
 from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.topics import PUBLISHED_BY_MODULE, PUBLISHED_TO_MODULE, SERVED, TOPICS
 
 GOLDEN = Path(__file__).parent / "golden.json"
 HEAD: dict[str, Any] = {"serial": "J1", "boot": 0xFEDCBA9876543210, "seq": 7}
@@ -210,6 +211,24 @@ def test_the_bytes_are_the_committed_ones_and_plain_msgpack_reads_them(message: 
     assert encode(message) == golden
     plain = msgpack.unpackb(golden, use_list=False)
     assert plain == message.model_dump()
+
+
+def test_every_message_of_the_topics_has_an_example() -> None:
+    in_topics = {message for topic in TOPICS.values() for message in (topic.publication, topic.to_module)}
+    in_topics |= {topic.reply for topic in TOPICS.values()}
+    assert in_topics - {None} == {type(message) for message in EXAMPLES}
+
+
+def test_every_leaf_is_a_topic_and_one_side_answers_it() -> None:
+    assert set(TOPICS) == set(keys.Leaf)
+    assert set(SERVED) | set(PUBLISHED_BY_MODULE) | set(PUBLISHED_TO_MODULE) == set(TOPICS) - {
+        keys.Leaf.ALIVE
+    }
+    for topic in TOPICS.values():
+        for exchange in ("publication", "request", "reply"):
+            message = topic.message(exchange)
+            example = next((one for one in EXAMPLES if type(one) is message), None)
+            assert example is None or len(encode(example)) <= topic.max_bytes(exchange)
 
 
 def test_the_bytes_of_several_sines_at_once_are_the_committed_ones() -> None:
