@@ -2,7 +2,10 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+# What the programs need, and what developing needs besides.
 STAMP := $(VENV)/.installed
+DEV := $(VENV)/.installed-dev
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
@@ -11,20 +14,29 @@ export OPENBLAS_NUM_THREADS := 1
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh, one process per module, and is scored"
 	@echo "make kinematics  the thesis' estimator, ours and the physical limit, every row in about a minute"
-	@echo "make dynamics    inertia, payloads, torque that helps and watching, every row in about a minute"
+	@echo "make dynamics    inertia, payloads, torque control and monitoring, every row in about a minute"
 	@echo "make test    all tests"
-	@echo "make check   format, lint, types and import floors"
+	@echo "make check   format, lint, types, floors and doors"
 	@echo "make bench   benchmarks"
 	@echo "make clean   remove .venv and caches; runs/ stays"
 
-$(STAMP): pyproject.toml
+$(BIN)/python:
 	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; v == (3, 11) or sys.exit("Python 3.11 is needed, this is %d.%d: pybullet has no wheels beyond it. Try: make PYTHON=/path/to/python3.11" % v)'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@$(PYTHON) -m venv $(VENV)
+
+$(STAMP): pyproject.toml | $(BIN)/python
+	@echo "Installing the programs into $(VENV): one to two minutes, about 1.4 GB."
+	@$(PIP) -e '.[all]'
+	@touch $@
+
+$(DEV): pyproject.toml $(STAMP)
+	@echo "Installing what developing needs: about a minute, 1 GB more."
+	@$(PIP) -e '.[dev]'
 	@touch $@
 
 demo: $(STAMP)
 	@rm -rf runs/demo
+	@echo "Four modules identify their arm in real time: about two minutes."
 	$(BIN)/x5-sim run a2085_04 --network lan --out runs/demo
 	@echo "Look at it: $(BIN)/rerun runs/demo/session.rrd"
 
@@ -32,20 +44,20 @@ kinematics: $(STAMP)
 	@mkdir -p runs
 	$(BIN)/x5-sim benchmark kinematics --quick --json runs/kinematics.json
 
-dynamics: $(STAMP)
+dynamics: $(DEV)
 	@mkdir -p runs
 	$(BIN)/x5-sim benchmark dynamics --quick --json runs/dynamics.json $(if $(TX40),--tx40 $(TX40))
 
-test: $(STAMP)
+test: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
-check: $(STAMP)
+check: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(STAMP)
+bench: $(DEV)
 	$(BIN)/python -m pytest -m benchmark -s tests/benchmarks
 
 clean:
