@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.arm_fit.problem import Problem
-from coordinator.dynamics.drive_model import Term
 from coordinator.dynamics.torque_prediction import TorqueError, torque_error
 from coordinator.parameter_fit.robust_least_squares import WeightedFit, fit_weighted
 from module_agent.model.chain import Array
+from module_agent.signals.torque_terms import Term
 
 Index = NDArray[np.int64]
 Tried = Literal["second half", "first half", "both", "other recording"]

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from coordinator.arm_fit.cross_validation import (
     HeldOutError,
@@ -51,13 +50,11 @@ from coordinator.parameter_fit.base_parameters import (
 from coordinator.parameter_fit.identifiability import WEAK_ABOVE, identifiabilities, words_of_body
 from coordinator.parameter_fit.physically_consistent import NotSolvedError
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
+from coordinator.parameter_fit.significance import SIGNIFICANT_CHANCE, chance_of, f_statistic
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY
 
 _TOLD_BELOW = 1.0
-# A term of no use passes a test at this level once in a hundred.
-EARNS_BELOW = 0.01
-_LARGEST_F = 1e12
 _ROUNDING = 1e-9
 
 Step = Callable[[str], None]
@@ -288,9 +285,8 @@ def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int
     own = min(groups, key=lambda i: found.independent[i] != column)
     others = [found.columns.names[j] for j in found.lumped(own) if j != column]
     value, sigma = float(found.value[own]), float(found.sigma[own])
-    # Torques without any noise leave no scatter to test against.
-    f = min((value / max(sigma, np.finfo(float).tiny)) ** 2, _LARGEST_F)
-    chance = float(f_distribution.sf(f, 1, max(1.0, fit.independent_samples - fit.rank)))
+    f = float(f_statistic(value, sigma))
+    chance = chance_of(f, fit.independent_samples - fit.rank)
     return TermPart(
         name=drive.name,
         term=drive.term,
@@ -300,7 +296,7 @@ def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int
         sigma=sigma,
         f=f,
         chance=chance,
-        significant=chance < EARNS_BELOW and not others,
+        significant=chance < SIGNIFICANT_CHANCE and not others,
         lumped_with=", ".join(others),
     )
 

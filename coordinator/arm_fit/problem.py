@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from coordinator.arm_fit.filtered_log import FilteredLog
 from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.dynamics.drive_model import (
-    NONLINEAR,
     USUAL_TERMS,
     DriveColumn,
-    Term,
     drive_columns,
     drive_regressor,
     drive_signals,
@@ -20,6 +18,7 @@ from coordinator.dynamics.drive_model import (
 from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY, torque_regressor
+from module_agent.signals.torque_terms import TERM_KINDS, Term
 
 
 class ModelChoice(NamedTuple):
@@ -156,7 +155,7 @@ def _regressor(robot: UrdfRobot, drives: Sequence[DriveColumn], log: FilteredLog
 def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
     """Return the drives' signals (m, k) as they are behind the torque's low-pass."""
     found = drive_signals(drives, log.qd_rad_s, log.qdd_rad_s2, slow_rad_s).copy()
-    at = [k for k, drive in enumerate(drives) if drive.term in NONLINEAR]
+    at = [k for k, drive in enumerate(drives) if not TERM_KINDS[drive.term].linear]
     fine = drive_signals([drives[k] for k in at], log.fine_qd_rad_s, log.fine_qdd_rad_s2, slow_rad_s)
     if at:
         found[:, at] = log.low_passed(fine)

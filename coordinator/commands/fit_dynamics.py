@@ -17,9 +17,10 @@ from coordinator.commands.fit_dynamics_tables import notes, tables
 from coordinator.commands.options import fail
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfError, UrdfRobot, read_urdf
 from coordinator.description.urdf_update import friction_of, write_fitted_urdf
-from coordinator.dynamics.drive_model import TERMS, USUAL_TERMS, Term
+from coordinator.dynamics.drive_model import USUAL_TERMS
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import Terminal, print_table
+from module_agent.signals.torque_terms import DRIVE_TERMS, Term
 
 _UP = ",".join(f"{part:g}" for part in STANDARD_GRAVITY)
 _USUAL_TERMS = ",".join(USUAL_TERMS)
@@ -46,7 +47,7 @@ _FittedUrdf = Annotated[
     typer.Option(help="File to write the URDF to with the real bodies and friction that were found."),
 ]
 _Trust = Annotated[float, typer.Option(help="How much the URDF's own inertias count for the real bodies.")]
-_Terms = Annotated[str, typer.Option(help=f"Terms of the drives, of {', '.join(TERMS)}; or none.")]
+_Terms = Annotated[str, typer.Option(help=f"Terms of the drives, of {', '.join(DRIVE_TERMS)}; or none.")]
 _Coupled = Annotated[
     list[str] | None,
     typer.Option(help="Two joints that share a drive, by number or name: 5,6. Repeat for several."),
@@ -187,11 +188,11 @@ def _gravity(text: str) -> list[float]:
 
 def _terms(text: str) -> tuple[Term, ...]:
     words = [word.strip() for word in text.split(",")]
-    known = tuple(term for term in TERMS if term in words)
+    known = tuple(term for term in DRIVE_TERMS if term in words)
     if words == ["none"]:
         return ()
     if len(known) != len(words):
-        fail(f"terms {text!r}: known are {', '.join(TERMS)}, each once, or none", EXIT_USAGE)
+        fail(f"terms {text!r}: known are {', '.join(DRIVE_TERMS)}, each once, or none", EXIT_USAGE)
     return known
 
 

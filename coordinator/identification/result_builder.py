@@ -33,7 +33,7 @@ from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY
-from module_agent.signals.torque_terms import TERMS, UNITS
+from module_agent.signals.torque_terms import READING_TERMS, TERM_KINDS
 
 if TYPE_CHECKING:
     from coordinator.identification.identified import HeldOutMotion, Kinematics
@@ -285,14 +285,14 @@ def _torque_terms(serials: tuple[str, ...], seen: "InstrumentalFit") -> list[Tor
         TorqueTermPart(
             serial=serial,
             term=term,
-            unit=UNITS[term],
+            unit=TERM_KINDS[term].unit,
             used=bool(terms.used[i, k]),
             value=float(terms.value[i, k]),
             sigma=float(terms.sigma[i, k]),
             gain=float(terms.gain[i, k]),
         )
         for i, serial in enumerate(serials)
-        for k, term in enumerate(TERMS)
+        for k, term in enumerate(READING_TERMS)
     ] + [
         TorqueTermPart(
             serial=serial,

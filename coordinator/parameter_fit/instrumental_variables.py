@@ -27,14 +27,13 @@ from coordinator.parameter_fit.least_squares import (
     solve_information,
     solve_weighted,
 )
+from coordinator.parameter_fit.significance import SIGNIFICANT_F, f_statistic
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, known_scale, refine_scale, scaled
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
 from module_agent.model.regressor import PER_BODY
-from module_agent.signals.torque_terms import TERMS
+from module_agent.signals.torque_terms import READING_TERMS
 
-# In variances: a term that is none exceeds it once in two million. Readings err by more than noise.
-EARNS_ABOVE = 25.0
 # The torque of Y - Z is a few percent: every round leaves as much of the error.
 _ROUNDS, _SETTLED = 8, 1e-9
 # A column that keeps less of its length beside the bodies' is one of theirs.
@@ -43,7 +42,7 @@ _MIN_NM = 1e-9
 
 
 class TermsFit(NamedTuple):
-    """The parameters of `TERMS` of n joints, (n, 4) each; zero where a term does not earn its place.
+    """The parameters of `READING_TERMS` of n joints, (n, 4) each; zero where a term does not earn its place.
 
     sigma: one standard deviation. gain: by how many variances of the torque's noise a term makes the misfit
     of its joint smaller, whether it is used or not. spread: the standard deviation to which the joint by
@@ -91,8 +90,8 @@ def solve_instrumental_variables(
     """
     size = PER_BODY * len(information)
     widths = {piece.r.shape[1] for piece in information}
-    seen = widths == {2 * size + len(TERMS)}
-    if not seen and widths != {size + len(TERMS)}:
+    seen = widths == {2 * size + len(READING_TERMS)}
+    if not seen and widths != {size + len(READING_TERMS)}:
         raise ValueError(f"rows of {sorted(widths)} columns are no rows of {len(information)} joints")
     phi = np.asarray(prior_phi, dtype=float)
     scale = known_scale(len(information))
@@ -131,7 +130,7 @@ class _Earned(NamedTuple):
 
 def _without_departure(piece: JointInformation, size: int, phi: Array) -> JointInformation:
     """Return the rows in [Z | T], with the torque of Y - Z taken off."""
-    kept = size + len(TERMS)
+    kept = size + len(READING_TERMS)
     if piece.r.shape[1] == kept:
         return piece
     return piece._replace(r=piece.r[:, :kept], z=piece.z - piece.r[:, kept:] @ phi)
@@ -144,18 +143,18 @@ def _earned(piece: JointInformation, size: int, independent_fraction: float) -> 
     space = left[:, values > RANK_TOLERANCE * values[0]]
     terms = piece.r[:, size:]
     columns, target = (part - space @ (space.T @ part) for part in (terms, piece.z))
-    gain, spread = np.zeros(len(TERMS)), np.full(len(TERMS), np.inf)
+    gain, spread = np.zeros(len(READING_TERMS)), np.full(len(READING_TERMS), np.inf)
     used = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
-    freedom = max(piece.samples - space.shape[1] - len(TERMS), 1)
+    freedom = max(piece.samples - space.shape[1] - len(READING_TERMS), 1)
     while used.any():
         inverse = np.linalg.pinv(columns[:, used])
         value = inverse @ target
         misfit = target - columns[:, used] @ value
         variance = (float(misfit @ misfit) + piece.rest) / freedom / independent_fraction
         spread[used] = np.maximum(np.sqrt(np.sum(inverse**2, axis=1) * variance), _MIN_NM)
-        gain[used] = (value / spread[used]) ** 2
+        gain[used] = f_statistic(value, spread[used])
         weakest = np.flatnonzero(used)[np.argmin(gain[used])]
-        if gain[weakest] > EARNS_ABOVE:
+        if gain[weakest] > SIGNIFICANT_F:
             break
         used[weakest] = False
     return _Earned(gain, used, spread)
@@ -165,10 +164,10 @@ def without_used(piece: JointInformation, size: int, used: NDArray[np.bool_]) ->
     """Return rows in [Z | T | any others] without T: what they say whatever the terms in use are.
 
     Args:
-        size: of Z, 10 n. used: (4,) which of `TERMS` are; the others are left out.
+        size: of Z, 10 n. used: (4,) which of `READING_TERMS` are; the others are left out.
     """
-    kept = np.delete(piece.r, np.s_[size : size + len(TERMS)], axis=1)
-    terms = piece.r[:, size : size + len(TERMS)][:, used]
+    kept = np.delete(piece.r, np.s_[size : size + len(READING_TERMS)], axis=1)
+    terms = piece.r[:, size : size + len(READING_TERMS)][:, used]
     count = terms.shape[1]
     if not count:
         return piece._replace(r=kept)
@@ -184,7 +183,7 @@ def _terms(
 ) -> TermsFit:
     """Return the terms that the rows of every joint leave once the bodies are known."""
     size = len(fit.phi)
-    value, sigma = np.zeros((len(rigid), len(TERMS))), np.zeros((len(rigid), len(TERMS)))
+    value, sigma = np.zeros((len(rigid), len(READING_TERMS))), np.zeros((len(rigid), len(READING_TERMS)))
     for i, (piece, one) in enumerate(zip(rigid, earned, strict=True)):
         inverse = np.linalg.pinv(piece.r[:, size:][:, one.used])
         bodies = piece.r[:, :size]

@@ -1,42 +1,105 @@
-"""What a joint's torque reading holds beside the torque of the bodies that the joint carries.
+"""The registry of torque terms: what a joint's torque holds besides the torque of the bodies.
 
-A spring is read by its deflection y. What rubber or grease in it damps does not show there: it transmits
-k (y + T y'), and the reading k y is as late as T. With that, an offset, and the friction of the bearings
-beyond the spring, what the joint does to its bodies and what is read are related by
+Every term is a column, linear in one parameter per joint (Khalil and Dombre 2002, Modeling, identification
+and control of robots, section 9.6). A drive adds the torque of its rotor, friction and an offset:
 
-    reading = tau - T reading' + offset + Fv qd + Fc s(qd),
+    tau = bodies + Ia qdd + Fv qd + Fc s(qd) + Fr s(qd) sqrt|qd| + offset,    s(v) = tanh(v / slow).
 
-one parameter a term and joint (viscous and Coulomb friction: Khalil and Dombre 2002, Modeling, identification
-and control of robots, section 9.6; a spring with a damper beside it is a Kelvin-Voigt element).
+A spring is read by its deflection y, and what rubber or grease in it damps does not show there: it transmits
+k (y + T y'), so the reading k y lags by T (a spring with a damper in parallel is a Kelvin-Voigt element). The
+friction that it shows is that of the bearings beyond the spring:
+
+    reading = bodies - T reading' + offset + Fv qd + Fc s(qd).
 """
 
-from typing import Literal, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from module_agent.model.chain import Array
 from module_agent.signals.filtering import JointMotion, differentiate, zero_phase_low_pass
 
-TorqueTerm = Literal["lag", "offset", "viscous", "coulomb"]
-TERMS: tuple[TorqueTerm, ...] = get_args(TorqueTerm)
-UNITS: dict[TorqueTerm, str] = {"lag": "s", "offset": "Nm", "viscous": "Nm s/rad", "coulomb": "Nm"}
+Term = Literal["inertia", "viscous", "coulomb", "curved", "offset", "lag"]
 
-# Below this speed the sign of Coulomb friction fades: ten times what an encoder of 14 bits, low-passed, makes
-# of a joint at rest.
+
+class TermKind(NamedTuple):
+    """The symbol and the unit of a term's parameter, and whether its column is linear in the motion.
+
+    A low-pass does to a linear column what it does to the motion; a nonlinear one has to be filtered itself.
+    """
+
+    symbol: str
+    unit: str
+    linear: bool
+
+
+TERM_KINDS: dict[Term, TermKind] = {
+    "inertia": TermKind("Ia", "kg m^2", True),
+    "viscous": TermKind("Fv", "Nm s/rad", True),
+    "coulomb": TermKind("Fc", "Nm", False),
+    "curved": TermKind("Fr", "Nm (s/rad)^0.5", False),
+    "offset": TermKind("offset", "Nm", True),
+    "lag": TermKind("T", "s", True),
+}
+
+# What the torque of a drive may hold; a motor's current has no lag.
+DRIVE_TERMS: tuple[Term, ...] = ("inertia", "viscous", "coulomb", "curved", "offset")
+# What the reading of a spring may hold; the rotor is on its other side.
+READING_TERMS: tuple[Term, ...] = ("lag", "offset", "viscous", "coulomb")
+
+# Below this speed the sign of a reading's Coulomb friction fades: ten times what an encoder of 14 bits,
+# low-passed, makes of a joint at rest.
 SLOW_RAD_S = 0.01
 
 
-def term_columns(motion: JointMotion, rate_hz: float, cutoff_hz: float) -> Array:
-    """Return the columns of `TERMS`, (m, n, 4), read-only: reading = tau + columns @ parameters.
+def term_signal(term: Term, qd_rad_s: Array, qdd_rad_s2: Array, slow_rad_s: float) -> Array:
+    """Return the column of a term of the motion, of the shape of the speeds.
 
     Args:
-        motion: of one stretch of time without a gap, its signals low-passed at `cutoff_hz`.
-        rate_hz: of its samples.
-        cutoff_hz: the sign of a speed is no linear function of it, and is low-passed as all else was.
+        term: any but `lag`, whose column is the derivative of the reading.
+        qd_rad_s, qdd_rad_s2: of one shape.
+        slow_rad_s: speed below which the sign of friction fades. The sign itself would make full friction of
+            the noise of a joint at rest.
+
+    Raises:
+        ValueError: the term is `lag`.
     """
-    sign = zero_phase_low_pass(np.tanh(motion.qd_rad_s / SLOW_RAD_S), rate_hz, cutoff_hz)
-    found = np.stack(
-        [-differentiate(motion.tau_nm, rate_hz), np.ones_like(motion.tau_nm), motion.qd_rad_s, sign], axis=2
+    match term:
+        case "inertia":
+            return qdd_rad_s2
+        case "viscous":
+            return qd_rad_s
+        case "coulomb":
+            return np.tanh(qd_rad_s / slow_rad_s)
+        case "curved":
+            # Lubricated gears: friction that rises steeply first and then ever less.
+            return np.tanh(qd_rad_s / slow_rad_s) * np.sqrt(np.abs(qd_rad_s))
+        case "offset":
+            return np.ones_like(qd_rad_s)
+        case "lag":
+            raise ValueError("the column of a lag is the derivative of the reading, not of the motion")
+
+
+def term_columns(motion: JointMotion, rate_hz: float, cutoff_hz: float) -> Array:
+    """Return the columns of `READING_TERMS`, (m, n, 4), read-only: reading = tau + columns @ parameters.
+
+    Args:
+        motion: m consecutive samples of n joints, low-passed at `cutoff_hz`.
+        rate_hz: of its samples.
+        cutoff_hz: nonlinear columns are low-passed as the motion was.
+    """
+    columns = [
+        -differentiate(motion.tau_nm, rate_hz)
+        if term == "lag"
+        else term_signal(term, motion.qd_rad_s, motion.qdd_rad_s2, SLOW_RAD_S)
+        for term in READING_TERMS
+    ]
+    stacked = np.stack(
+        [
+            column if TERM_KINDS[term].linear else zero_phase_low_pass(column, rate_hz, cutoff_hz)
+            for term, column in zip(READING_TERMS, columns, strict=True)
+        ],
+        axis=2,
     )
-    found.flags.writeable = False
-    return found
+    stacked.flags.writeable = False
+    return stacked

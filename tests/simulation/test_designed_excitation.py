@@ -14,7 +14,7 @@ from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION
 from module_agent.model.chain import Chain
 from module_agent.model.regressor import torque_regressor
 from module_agent.network_emulation.profile_file import network
-from module_agent.signals.torque_terms import TERMS
+from module_agent.signals.torque_terms import READING_TERMS
 from sim.actuator.actuator import SPRING_LOSS_S
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import build_tree, true_chain, true_inertia
@@ -81,7 +81,7 @@ def test_imus_explain_the_torques_better_than_encoders(found: Identified) -> Non
 def test_readings_lag_by_the_damping_of_the_springs_and_hold_nothing_else(found: Identified) -> None:
     assert found.inertia is not None
     terms = found.inertia.seen.terms
-    lag = TERMS.index("lag")
+    lag = READING_TERMS.index("lag")
     # The last joint turns a bare output against next to nothing.
     np.testing.assert_array_equal(terms.used[:, lag], [True, True, False])
     error = terms.value[:2, lag] - SPRING_LOSS_S

@@ -41,7 +41,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.information import JointInformation, compress, merge
 from module_agent.model.regressor import torque_regressor
 from module_agent.signals.filtering import JointMotion
-from module_agent.signals.torque_terms import TERMS, TorqueTerm, term_columns
+from module_agent.signals.torque_terms import READING_TERMS, Term, term_columns
 
 MOTION_SOURCES: tuple[MotionSource, ...] = get_args(MotionSource)
 # Of the torques' noise, in the mean over the joints: less is chance.
@@ -52,13 +52,13 @@ _SEEN_BY: dict[MotionSource, str] = {
     "structure": "encoders, base and springs of the links",
     "imus": "IMUs",
 }
-_NAMES: dict[TorqueTerm, str] = {
+_NAMES: dict[Term, str] = {
     "lag": "a lag",
     "offset": "an offset",
     "viscous": "viscous friction",
     "coulomb": "Coulomb friction",
 }
-_SHOWN: dict[TorqueTerm, tuple[str, float]] = {
+_SHOWN: dict[Term, tuple[str, float]] = {
     "lag": ("ms", 1e3),
     "offset": ("mNm", 1e3),
     "viscous": ("Nm s/rad", 1.0),
@@ -106,7 +106,7 @@ class Inertia(NamedTuple):
         lines = [f"torques are explained to {noise} mNm, with motion as seen by {_SEEN_BY[self.eyes]}"]
         if self.eyes != "encoders":
             lines[0] += f"; encoders alone leave {self.gain:.2f} times as much"
-        for k, term in enumerate(TERMS):
+        for k, term in enumerate(READING_TERMS):
             used = terms.used[:, k]
             if used.any():
                 unit, size = _SHOWN[term]
@@ -221,7 +221,7 @@ def _considered(
 
 def _offsets_nm(robot: Robot, seen: InstrumentalFit) -> Array:
     """Return by how much (n,) the offsets may be off that are taken for none [Nm]."""
-    offset = TERMS.index("offset")
+    offset = READING_TERMS.index("offset")
     largest = np.array([kind.max_effort_nm for kind in robot.kinds])
     likely = OFFSET_SHARE[robot.torque] * largest
     told = seen.terms.spread[:, offset]

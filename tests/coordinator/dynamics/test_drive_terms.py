@@ -7,8 +7,9 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import ArrayLike
 
-from coordinator.dynamics.drive_model import TERMS, DriveColumn, drive_columns, drive_regressor, drive_signals
+from coordinator.dynamics.drive_model import DriveColumn, drive_columns, drive_regressor, drive_signals
 from module_agent.model.chain import Array
+from module_agent.signals.torque_terms import DRIVE_TERMS
 
 
 def matrix(columns: Sequence[DriveColumn], qd: Array, qdd: Array, slow: ArrayLike) -> Array:
@@ -48,7 +49,7 @@ def test_every_term_may_be_left_out_and_names_say_which_joints_share_a_drive() -
     names = [column.name for column in drive_columns(2, ["viscous", "offset"], [(0, 1)])]
     assert names == ["Fv1", "offset1", "Fv2", "offset2", "Fv1+2"]
     assert drive_columns(3, []) == ()
-    assert len(drive_columns(3, TERMS)) == 3 * len(TERMS)
+    assert len(drive_columns(3, DRIVE_TERMS)) == 3 * len(DRIVE_TERMS)
 
 
 @pytest.mark.parametrize(

@@ -5,15 +5,15 @@ import pytest
 from numpy.random import Generator, default_rng
 
 from coordinator.parameter_fit.instrumental_variables import (
-    EARNS_ABOVE,
     InstrumentalFit,
     solve_instrumental_variables,
 )
+from coordinator.parameter_fit.significance import SIGNIFICANT_F
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress, merge
 from module_agent.model.regressor import torque_regressor
 from module_agent.signals.filtering import JointMotion, filtered_motion
-from module_agent.signals.torque_terms import TERMS, term_columns
+from module_agent.signals.torque_terms import READING_TERMS, term_columns
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 
@@ -66,7 +66,7 @@ def solved(motion: JointMotion) -> InstrumentalFit:
 
 
 def of(fit: InstrumentalFit, term: str) -> tuple[Array, Array]:
-    k = [*TERMS].index(term)
+    k = [*READING_TERMS].index(term)
     return fit.terms.value[:, k], fit.terms.sigma[:, k]
 
 
@@ -91,7 +91,7 @@ def test_offset_and_friction_are_found_where_they_are_and_nowhere_else(rng: Gene
     reading[:, 1] += 0.15
     reading[:, 2] += 0.2 * np.tanh(rate[:, 2] / 0.01)
     found = solved(filtered(q, reading))
-    expected = np.zeros((JOINTS, len(TERMS)), dtype=bool)
+    expected = np.zeros((JOINTS, len(READING_TERMS)), dtype=bool)
     expected[0, 2] = expected[1, 1] = expected[2, 3] = True
     np.testing.assert_array_equal(found.terms.used, expected)
     for joint, term, true in ((0, "viscous", 0.3), (1, "offset", 0.15), (2, "coulomb", 0.2)):
@@ -105,7 +105,7 @@ def test_noise_alone_earns_no_term_a_place(seed: int) -> None:
     q, torque = swings(rng)
     found = solved(filtered(q, torque + SIGMA_NM * rng.normal(size=torque.shape)))
     assert not found.terms.used.any()
-    assert found.terms.gain.max() < EARNS_ABOVE
+    assert found.terms.gain.max() < SIGNIFICANT_F
 
 
 def test_a_term_that_is_not_used_is_off_by_no_more_than_is_said(rng: Generator) -> None:
@@ -115,7 +115,7 @@ def test_a_term_that_is_not_used_is_off_by_no_more_than_is_said(rng: Generator) 
         # Small enough to stay unnoticed.
         offset = 2e-3 * rng.normal(size=JOINTS)
         found = solved(filtered(q, torque + offset + SIGMA_NM * rng.normal(size=torque.shape)))
-        k = TERMS.index("offset")
+        k = READING_TERMS.index("offset")
         unused = ~found.terms.used[:, k]
         size = np.sqrt(found.terms.gain[unused, k]) * found.terms.spread[unused, k]
         # What was estimated of it before it was left out is it, to within its spread.

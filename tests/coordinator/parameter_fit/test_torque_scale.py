@@ -9,7 +9,7 @@ from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, scaled
 from module_agent.model.chain import Array
 from module_agent.model.information import compress
 from module_agent.model.regressor import torque_regressor
-from module_agent.signals.torque_terms import TERMS
+from module_agent.signals.torque_terms import READING_TERMS
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 
@@ -23,7 +23,7 @@ def solved(rng: Generator, off: Array, prior: float = PRIOR) -> InstrumentalFit:
     signals = rng.uniform(-1.0, 1.0, (3, 2000, JOINTS)) * np.array([3.0, 2.0, 10.0])[:, None, None]
     rigid = torque_regressor(CHAIN, *signals)
     tau = rigid @ PHI / (1.0 + off) + SIGMA_NM * rng.normal(size=(2000, JOINTS))
-    nothing = np.zeros((2000, JOINTS, len(TERMS)))
+    nothing = np.zeros((2000, JOINTS, len(READING_TERMS)))
     return solve_instrumental_variables(
         compress(np.concatenate([rigid, nothing], axis=2), tau), np.zeros_like(PHI), 1.0, prior
     )
