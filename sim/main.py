@@ -21,7 +21,6 @@ from sim.commands.run import launch, run, world
 from sim.commands.score import score_run
 from sim.imperfections.effects import EFFECTS
 from sim.imperfections.noise_profile import NOISE_PROFILES
-from sim.robot.drawing import draw
 from sim.robot.robot_file import load_robot, shipped_robots
 
 app = typer.Typer(
@@ -56,6 +55,9 @@ def show(
     out: Annotated[Path | None, typer.Option(help="PNG or SVG to write [ROBOT.png].")] = None,
 ) -> None:
     """Draw a robot at its zero position."""
+    # Loaded here, since nothing else needs matplotlib.
+    from sim.robot.drawing import draw
+
     found = load(robot)
     path = out if out is not None else Path(f"{found.name}.png")
     try:

@@ -1,30 +1,23 @@
-"""What a benchmark found, as JSON: whole or not at all.
+"""The results of a benchmark as a JSON file and as a picture.
 
-A benchmark's rows as a table to read; what a colour says, a word says too.
-
-A benchmark's rows as a picture: the thesis' figure, ours and the bound on one line, and the bar.
+The picture has a panel for every figure, with the thesis' value, ours, the bound and the bar in one line for
+each case. matplotlib is imported where it draws, since everything else here works without it.
 """
 
 import json
 import os
 import platform
-import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from math import ceil, floor, isfinite, log10
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import NullFormatter, StrMethodFormatter
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sim.benchmark.case import CaseResult
-from sim.benchmark.row import Limit, Row
+from sim.benchmark.row import Row
+
+if TYPE_CHECKING:
+    from matplotlib.lines import Line2D
 
 SCHEMA = 1
 _MEASURED_WITH = ("x5-self-model", "numpy", "scipy", "numba", "pybullet")
@@ -91,49 +84,6 @@ def write_results(path: Path, results: Results) -> None:
     os.replace(temporary, path)
 
 
-# A pipe has no width; a table cut short in it would be of no use.
-_MIN_WIDTH = 150
-
-
-def table(rows: Sequence[Row], title: str) -> Table:
-    """Return the rows, every case with its name once."""
-    shown = Table(title=title, title_justify="left")
-    for name in ("case", "figure", "thesis", "ours", "bound", "bar", ""):
-        shown.add_column(name, justify="left" if name in ("case", "figure", "") else "right")
-    before = ""
-    for row in rows:
-        if before and row.case != before:
-            shown.add_section()
-        cells = (_number(row.thesis), _number(row.ours), _number(row.bound), _bar(row.limit))
-        # Units stand in brackets, which are markup to rich.
-        name = escape(row.case) if row.case != before else ""
-        shown.add_row(name, escape(row.figure), *cells, _verdict(row.holds))
-        before = row.case
-    return shown
-
-
-def print_rows(rows: Sequence[Row], title: str) -> None:
-    """Print the table on standard output; with FORCE_COLOR set the colours go through a pipe too."""
-    console = Console(highlight=False)
-    if not sys.stdout.isatty():
-        console.width = max(console.width, _MIN_WIDTH)
-    console.print(table(rows, title))
-
-
-def _verdict(holds: bool | None) -> str:
-    return "" if holds is None else "[green]holds[/]" if holds else "[bold red]MISSED[/]"
-
-
-def _bar(limit: Limit) -> str:
-    if limit is None:
-        return ""
-    return f"{limit[0]:.4g} to {limit[1]:.4g}" if isinstance(limit, tuple) else f"<= {limit:.4g}"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}" if abs(value) < 100.0 else f"{value:.0f}"
-
-
 _OURS, _MISSED, _THESIS, _BOUND, _BAR = "#1f5fa8", "#c0261c", "#d07a1f", "#606060", "#2f7d32"
 _ROW_INCH, _PANEL_INCH, _WIDTH_INCH = 0.19, 0.85, 15.0
 _MARKS = (
@@ -165,13 +115,14 @@ def plot(rows: Sequence[Row], path: Path) -> None:
     Raises:
         ValueError: no row has a bar, or a suffix that matplotlib cannot write.
     """
+    from matplotlib.figure import Figure
+
     panels = _panels(rows)
     if not panels:
         raise ValueError("no row has a bar: nothing to draw")
     columns = _columns(panels)
     height = max(sum(panel.height_inch for panel in column) for column in columns) + 0.7
     figure = Figure(figsize=(_WIDTH_INCH, height), dpi=110)
-    FigureCanvasAgg(figure)
     for number, column in enumerate(columns):
         top = height - 0.75
         for panel in column:
@@ -228,6 +179,8 @@ def _draw(axes: Any, panel: _Panel) -> None:
 
 def _decades(axes: Any) -> None:
     """Make the scale logarithmic, over whole decades, so that there are always numbers at it."""
+    from matplotlib.ticker import NullFormatter, StrMethodFormatter
+
     axes.set_xscale("log")
     low, high = axes.dataLim.intervalx
     axes.set_xlim(10.0 ** floor(log10(0.9 * low)), 10.0 ** ceil(log10(1.1 * high)))
@@ -242,7 +195,9 @@ def _draw_bar(axes: Any, row: Row, place: int) -> None:
         )
 
 
-def _legend() -> list[Line2D]:
+def _legend() -> list["Line2D"]:
+    from matplotlib.lines import Line2D
+
     handles = [
         Line2D([], [], marker=marker, linestyle="none", color=colour, markersize=size, label=name)
         for name, colour, marker, size in _MARKS

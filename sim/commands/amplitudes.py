@@ -1,26 +1,33 @@
 """`x5-sim amplitudes`: the thesis' amplitude experiment on simulated modules."""
 
-import os
-import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar
 
 import typer
+from rich.table import Table
 
-from coordinator.runtime.event_loop import SIGNALS
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
-from coordinator.runtime.terminal import Terminal, print_table
+from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
+from coordinator.runtime.terminal import print_table
+from sim.benchmark.case import Trial
+from sim.commands.experiment import (
+    ProfileName,
+    WorkerCount,
+    chosen_profile,
+    experiment,
+    profile_settings,
+    trial_results,
+)
 from sim.commands.options import Seed, With, Without, fail
-from sim.imperfections.noise_profile import NOISE_PROFILES
 from sim.robot.noise_choice import NoiseChoice
-from sim.test_bench.module_bench import ExperimentFailed
-from sim.thesis.amplitude_report import plot, repeats, table, write_results
-from sim.thesis.amplitude_sweep import Series, Trial, repeat_series, run_all, sweep_series
+from sim.thesis.amplitude_report import Repeats, plot, repeats, write_results
+from sim.thesis.amplitude_sweep import AmplitudeTrial, Series, repeat_series, run_series, sweep_series
 from sim.thesis.published import AMPLITUDES_RAD, LENGTHS_MM, TRIALS
 
 T = TypeVar("T", int, float)
 _MAX_AMPLITUDE_RAD = 0.5
+# About what a trial takes on one core.
+_TRIAL_COST_S = 0.6
 
 
 def amplitudes(
@@ -28,7 +35,7 @@ def amplitudes(
         "runs/amplitudes"
     ),
     seed: Seed = 0,
-    noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = "x5",
+    noise: ProfileName = "x5",
     with_effects: With = None,
     without_effects: Without = None,
     lengths: Annotated[str, typer.Option(help="Lengths of the arms [mm], separated by commas.")] = ",".join(
@@ -44,11 +51,10 @@ def amplitudes(
     filtered: Annotated[
         bool, typer.Option("--filter/--no-filter", help="Show the table with the thesis' filter or without.")
     ] = True,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
-    ] = None,
+    processes: WorkerCount = None,
 ) -> None:
     """Estimate link lengths over amplitudes as the thesis did (chapter 6.2), on simulated modules."""
+    chosen_profile(noise, with_effects, without_effects)
     choice = NoiseChoice(noise, tuple(with_effects or ()), tuple(without_effects or ()))
     arms = _numbers(lengths, "--lengths", int, lambda value: value in LENGTHS_MM, _one_of(LENGTHS_MM))
     sizes = _numbers(
@@ -61,48 +67,27 @@ def amplitudes(
     series = sweep_series(arms, sizes, rigs, seed, choice)
     if trials:
         series += repeat_series(arms, trials, seed, choice)
-    _check_noise(series[0])
-    found = _run(series, processes or os.cpu_count() or 1)
-    settings = {"seed": seed, "noise": noise, "rigs": rigs}
-    switched = {"with": list(choice.on), "without": list(choice.off)}
+    measured = _run(series, processes)
+    settings = {"seed": seed, "rigs": rigs} | profile_settings(noise, with_effects, without_effects)
     try:
-        write_results(out, settings | switched, found)
-        plot(found, out / "amplitudes.png", _title(series[0]))
+        write_results(out, settings, measured)
+        plot(measured, out / "amplitudes.png", _title(series[0]))
     except OSError as error:
         fail(f"cannot write to {out}: {error.strerror or error}", EXIT_FAILED)
     if trials:
-        print_table(table(repeats(found, filtered), filtered))
+        print_table(table(repeats(measured, filtered), filtered))
     typer.echo(str(out / "amplitudes.png"))
 
 
-def _run(series: list[Series], processes: int) -> list[Trial]:
-    done = 0
+def _run(series: list[Series], processes: int | None) -> list[AmplitudeTrial]:
+    work = [Trial(run_series, (each,), _TRIAL_COST_S * len(each.amplitudes_rad)) for each in series]
 
-    def show(finished: Series) -> None:
-        nonlocal done
-        done += 1
-        name = f"{finished.length_mm} mm {finished.alignment}: {len(finished.amplitudes_rad)} trials"
-        terminal.step(done, len(series), name)
+    def label(index: int) -> str:
+        own = series[index]
+        return f"{own.length_mm} mm {own.alignment}: {len(own.amplitudes_rad)} trials"
 
-    # Processes that share the cores already must not each start as many threads; they inherit this.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)
-    try:
-        with Terminal() as terminal:
-            return run_all(series, processes, show)
-    except KeyboardInterrupt:
-        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
-    except ExperimentFailed as error:
-        fail(error, EXIT_FAILED)
-
-
-def _check_noise(series: Series) -> None:
-    try:
-        series.noise.of(series.robot)
-    except (KeyError, ValueError) as error:
-        fail(error.args[0], EXIT_USAGE)
+    with experiment() as terminal:
+        return [trial for trials in trial_results(terminal, work, processes, label) for trial in trials]
 
 
 def _title(series: Series) -> str:
@@ -130,3 +115,26 @@ def _numbers(
             fail(f"{option} {text}: {word} must be {right}", EXIT_USAGE)
         found.append(value)
     return list(dict.fromkeys(found))
+
+
+def table(found: Sequence[Repeats], filtered: bool = True) -> Table:
+    """Return tables 4 and 5 of the thesis with the simulated figures beside, to print."""
+    how = "" if filtered else ", without the filter"
+    shown = Table(title=f"Repeated trials at the thesis' amplitudes{how}")
+    columns = ("arm", "A [rad]", "trials", "mean [mm]", "error [mm]", "error [%]", "scatter [mm]")
+    for name in (*columns, "thesis' mean [mm]", "its error [%]"):
+        shown.add_column(name, justify="left" if name == "arm" else "right")
+    for row in found:
+        thesis = row.thesis
+        shown.add_row(
+            f"{thesis.length_mm} mm {thesis.alignment}",
+            f"{thesis.amplitude_rad:.2f}",
+            str(row.trials),
+            f"{row.mean_mm:.1f}",
+            f"{row.error_mm:+.1f}",
+            f"{100 * row.error_mm / row.true_mm:+.1f}",
+            f"{row.scatter_mm:.1f}",
+            f"{thesis.mean_mm:.1f}",
+            f"{100 * (thesis.mean_mm / thesis.length_mm - 1):+.1f}",
+        )
+    return shown

@@ -1,30 +1,31 @@
 """`x5-sim assistance`: the thesis' torque assistance on simulated arms, by what they identify themselves."""
 
-import os
-import signal
 from collections.abc import Sequence
+from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+from rich.table import Table
 
-from coordinator.runtime.event_loop import SIGNALS
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
-from coordinator.runtime.terminal import Terminal, print_table
-from sim.benchmark.case import Failed, Trial
-from sim.benchmark.workers import run_trials
-from sim.commands.options import Seed, With, Without, fail
-from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
-from sim.robot.noise_choice import NoiseChoice
-from sim.thesis.torque_assistance import MODES, Model, identified_model, standing_robot
-from sim.thesis.torque_assistance_cases import Case, Combination, cases, robots_of, try_case
-from sim.thesis.torque_assistance_report import (
-    assistance_table,
-    bar_lines,
-    bars,
-    plot_assistance,
-    write_assistance,
+from coordinator.runtime.exit_codes import EXIT_FAILED
+from coordinator.runtime.terminal import print_table
+from sim.benchmark.case import Trial
+from sim.commands.experiment import (
+    JsonFile,
+    ProfileName,
+    WorkerCount,
+    check_writable,
+    chosen_profile,
+    experiment,
+    profile_settings,
+    trial_results,
 )
+from sim.commands.options import Seed, With, Without, fail
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.thesis.torque_assistance import MODES, Follow, Model, identified_model, standing_robot
+from sim.thesis.torque_assistance_cases import Case, Combination, cases, robots_of, try_case
+from sim.thesis.torque_assistance_report import Bar, bars, plot_assistance, robot_and_pose, write_assistance
 
 _IDENTIFY_S = 15.0
 _CASE_S = 1.2 * len(MODES)
@@ -32,44 +33,32 @@ _CASE_S = 1.2 * len(MODES)
 
 def assistance(
     seed: Seed = 0,
-    noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = "x5",
+    noise: ProfileName = "x5",
     with_effects: With = None,
     without_effects: Without = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="Only the thesis' figures, and one arm of six joints.")
     ] = False,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
-    ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the table as JSON too.")] = None,
+    processes: WorkerCount = None,
+    json_file: JsonFile = None,
     picture: Annotated[
         Path | None, typer.Option("--picture", help="Draw figures 52 to 61 (PNG, SVG or PDF).")
     ] = None,
 ) -> None:
-    """Follow motions by position, by velocity too, and by calculated torque too, as the thesis did (6.3)."""
-    choice = NoiseChoice(noise, tuple(with_effects or ()), tuple(without_effects or ()))
-    profile = _profile(choice)
-    for file in (json_file, picture):
-        if file is not None and not file.parent.is_dir():
-            fail(f"{file}: there is no folder {file.parent}", EXIT_USAGE)
-    found = _run(cases(quick), profile, seed, processes or os.cpu_count() or 1)
-    print_table(assistance_table(found))
-    for line in bar_lines(bars(found)):
+    """Track by position, with velocity too, and with calculated torque too, as the thesis did (6.3)."""
+    profile = chosen_profile(noise, with_effects, without_effects)
+    check_writable(json_file, picture)
+    combinations = _run(cases(quick), profile, seed, processes)
+    print_table(assistance_table(combinations))
+    for line in bar_lines(bars(combinations)):
         typer.echo(line)
-    settings: dict[str, object] = {
-        "seed": seed,
-        "noise": noise,
-        "with": list(choice.on),
-        "without": list(choice.off),
-        "quick": quick,
-    }
+    settings = {"seed": seed} | profile_settings(noise, with_effects, without_effects) | {"quick": quick}
     try:
         if json_file is not None:
-            write_assistance(json_file, settings, found)
+            write_assistance(json_file, settings, combinations)
         if picture is not None:
-            plot_assistance(
-                found, picture, f"Torque assistance: profile {profile.name}, seed {seed}; * unstable"
-            )
+            title = f"Torque assistance: profile {profile.name}, seed {seed}; * unstable"
+            plot_assistance(combinations, picture, title)
     except (OSError, ValueError) as error:
         fail(f"cannot write: {error}", EXIT_FAILED)
 
@@ -79,45 +68,62 @@ def identify_robot(name: str, profile: NoiseProfile, seed: int) -> Model:
     return identified_model(standing_robot(name, seed), profile, seed)
 
 
-def _profile(choice: NoiseChoice) -> NoiseProfile:
-    try:
-        return switched(noise_profile(str(choice.profile)), choice.on, choice.off)
-    except (KeyError, ValueError) as error:
-        fail(error.args[0], EXIT_USAGE)
-
-
-def _run(chosen: Sequence[Case], profile: NoiseProfile, seed: int, processes: int) -> list[Combination]:
-    """Identify every robot once, then try all cases with what came of it."""
-    # Processes that share the cores already must not each start as many threads; they inherit this.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)
+def _run(
+    chosen: Sequence[Case], profile: NoiseProfile, seed: int, processes: int | None
+) -> list[Combination]:
+    """Identify every robot once, then try all cases with the identified models."""
     robots = robots_of(list(chosen))
     total = len(robots) + len(chosen)
-    try:
-        with Terminal() as terminal:
-            work = [Trial(identify_robot, (name, profile, seed), _IDENTIFY_S) for name in robots]
-            models = dict(
-                zip(robots, _results(terminal, work, processes, 0, total, "identifying"), strict=True)
-            )
-            work = [Trial(try_case, (case, models[case.robot], profile, seed), _CASE_S) for case in chosen]
-            return _results(terminal, work, processes, len(robots), total, "following")
-    except KeyboardInterrupt:
-        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
+    with experiment() as terminal:
+        work = [Trial(identify_robot, (name, profile, seed), _IDENTIFY_S) for name in robots]
+        identified = trial_results(terminal, work, processes, lambda _: "identifying", total=total)
+        models = dict(zip(robots, identified, strict=True))
+        work = [Trial(try_case, (case, models[case.robot], profile, seed), _CASE_S) for case in chosen]
+        return trial_results(terminal, work, processes, lambda _: "following", len(robots), total)
 
 
-def _results(
-    terminal: Terminal, work: Sequence[Trial], processes: int, before: int, total: int, doing: str
-) -> list[Any]:
-    done = before
+def assistance_table(found: Sequence[Combination]) -> Table:
+    """Return the combinations as a table, a section for each robot; * marks what is unstable."""
+    titles = (
+        "robot",
+        "gains",
+        "read",
+        "motion",
+        "set-points",
+        "asked",
+        "mode 1",
+        "mode 2",
+        "mode 3",
+        "2 / 3",
+    )
+    shown = Table(*titles, title="Rms tracking error by input mode in mrad, * unstable")
+    for each, following in zip(found, [*found[1:], None], strict=True):
+        case = each.case
+        shown.add_row(
+            robot_and_pose(each),
+            case.gains.name,
+            case.gains.reading or "",
+            case.motion,
+            case.delivery.name,
+            f"{1e3 * each.follows[0].motion_rms_rad:.1f}",
+            *(_error(one) for one in each.follows),
+            f"{each.gain:.1f}" if isfinite(each.gain) else "",
+            end_section=following is None or following.case.robot != case.robot,
+        )
+    return shown
 
-    def show(index: int, result: Any) -> None:
-        nonlocal done
-        done += 1
-        terminal.step(done, total, doing)
 
-    results = [found.result for found in run_trials(work, processes, show)]
-    for failure in (found for found in results if isinstance(found, Failed)):
-        fail(failure.text, EXIT_FAILED)
-    return results
+def bar_lines(judged: Sequence[Bar]) -> list[str]:
+    """Return the bars in words, and what is unstable below them."""
+    lines = []
+    for bar in judged:
+        verdict = "holds" if bar.holds else "does not hold"
+        lines.append(f"{bar.asked}: {verdict}, in {bar.kept} of {bar.stable} stable combinations")
+        lines += [f"  not so: {words}" for words in bar.missed]
+        lines += [f"  unstable: {words}" for words in bar.unstable]
+    return lines
+
+
+def _error(one: Follow) -> str:
+    words = f"{1e3 * one.rms_error_rad:.2f}" if isfinite(one.rms_error_rad) else "-"
+    return f"{words} *" if one.unstable else words

@@ -1,17 +1,18 @@
 """`x5-sim benchmark`: figures of the whole system on simulated robots, against the bars set for it."""
 
-import os
-import signal
+import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from coordinator.excitation.plan import Motions
-from coordinator.runtime.event_loop import SIGNALS
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
-from coordinator.runtime.terminal import Terminal
+from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.cases.staubli_tx40 import MOTION, URDF
 from sim.benchmark.cases.suites import (
@@ -26,8 +27,10 @@ from sim.benchmark.cases.suites import (
     kinematic_cases,
     over_all,
 )
-from sim.benchmark.report import Results, gathered, plot, print_rows, write_results
+from sim.benchmark.report import Results, gathered, plot, write_results
+from sim.benchmark.row import Limit, Row
 from sim.benchmark.workers import run_cases
+from sim.commands.experiment import JsonFile, WorkerCount, check_writable, experiment, worker_count
 from sim.commands.options import Seed, fail
 
 EXIT_MISSED = 4
@@ -40,11 +43,7 @@ app = typer.Typer(
 )
 
 
-JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file to write.")]
-Only = Annotated[str, typer.Option(help="Cases whose name holds this; * and ? stand for anything.")]
-Processes = Annotated[
-    int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
-]
+Only = Annotated[str, typer.Option(help="Cases whose name contains this; * and ? are wildcards.")]
 
 
 @app.command()
@@ -63,7 +62,7 @@ def dynamics(
         typer.Option(help="Folder with a Staubli TX40's recording too: tx40.urdf and motion.npz."),
     ] = None,
     only: Only = "",
-    processes: Processes = None,
+    processes: WorkerCount = None,
 ) -> None:
     """Measure regressor, inertia, payloads, shared work, assistance and watching, against the truth.
 
@@ -101,7 +100,7 @@ def kinematics(
     seed: Seed = 0,
     motions: Annotated[Motions, typer.Option(help="How whole arms explore joint by joint.")] = "optimised",
     only: Only = "",
-    processes: Processes = None,
+    processes: WorkerCount = None,
 ) -> None:
     """Compare the thesis' estimator, ours and the physical limit on the same recordings of simulated robots.
 
@@ -127,14 +126,12 @@ def _benchmark(
     plot_file: Path | None,
 ) -> None:
     """Run the cases that are wanted, report, and end with the exit code that they earn."""
-    for file in (json_file, plot_file):
-        if file is not None and not file.parent.is_dir():
-            fail(f"{file}: there is no folder {file.parent}", EXIT_USAGE)
+    check_writable(json_file, plot_file)
     wanted = chosen(cases, only)
     if not wanted:
         fail(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases), EXIT_USAGE)
     started_s = time.monotonic()
-    found = _run(wanted, processes or os.cpu_count() or 1)
+    found = _run(wanted, worker_count(processes))
     results = gathered(name, settings, found, over_all(found), time.monotonic() - started_s)
     _report(results, json_file, plot_file)
     if results.missed:
@@ -152,16 +149,8 @@ def _run(cases: list[Case], processes: int) -> list[CaseResult]:
         if terminal.console.is_terminal or not left:
             terminal.step(done, total, case.name)
 
-    # Processes that share the cores already must not each start as many threads; they inherit this.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)
-    try:
-        with Terminal() as terminal:
-            return run_cases(cases, processes, show)
-    except KeyboardInterrupt:
-        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
+    with experiment() as terminal:
+        return run_cases(cases, processes, show)
 
 
 def _report(results: Results, json_file: Path | None, plot_file: Path | None) -> None:
@@ -180,3 +169,46 @@ def _report(results: Results, json_file: Path | None, plot_file: Path | None) ->
         fail(f"cannot write {error.filename}: {error.strerror}", EXIT_FAILED)
     except ValueError as error:
         fail(f"cannot draw {plot_file}: {error}", EXIT_FAILED)
+
+
+# A pipe has no width; a table cut short in it would be of no use.
+_MIN_WIDTH = 150
+
+
+def table(rows: Sequence[Row], title: str) -> Table:
+    """Return the rows, every case with its name once."""
+    shown = Table(title=title, title_justify="left")
+    for name in ("case", "figure", "thesis", "ours", "bound", "bar", ""):
+        shown.add_column(name, justify="left" if name in ("case", "figure", "") else "right")
+    before = ""
+    for row in rows:
+        if before and row.case != before:
+            shown.add_section()
+        cells = (_number(row.thesis), _number(row.ours), _number(row.bound), _bar(row.limit))
+        # Units stand in brackets, which are markup to rich.
+        name = escape(row.case) if row.case != before else ""
+        shown.add_row(name, escape(row.figure), *cells, _verdict(row.holds))
+        before = row.case
+    return shown
+
+
+def print_rows(rows: Sequence[Row], title: str) -> None:
+    """Print the table on standard output; with FORCE_COLOR set the colours go through a pipe too."""
+    console = Console(highlight=False)
+    if not sys.stdout.isatty():
+        console.width = max(console.width, _MIN_WIDTH)
+    console.print(table(rows, title))
+
+
+def _verdict(holds: bool | None) -> str:
+    return "" if holds is None else "[green]holds[/]" if holds else "[bold red]MISSED[/]"
+
+
+def _bar(limit: Limit) -> str:
+    if limit is None:
+        return ""
+    return f"{limit[0]:.4g} to {limit[1]:.4g}" if isinstance(limit, tuple) else f"<= {limit:.4g}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if abs(value) < 100.0 else f"{value:.0f}"

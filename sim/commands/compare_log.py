@@ -13,7 +13,6 @@ from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_ty
 from sim.commands.options import Seed, With, Without, fail
 from sim.imperfections.noise_profile import NOISE_PROFILES, noise_profile, switched
 from sim.real_module.comparison import CommandRefused, SignalRow, compare, simulate
-from sim.real_module.plot import plot
 from sim.real_module.real_log import LogFileError, read_log
 
 
@@ -47,6 +46,9 @@ def compare_log(
         simulated = simulate(recorded, kind, profile, seed)
     except CommandRefused as error:
         fail(f"{log}: {error}", EXIT_FAILED)
+    # Loaded here, since nothing else needs matplotlib.
+    from sim.real_module.plot import plot
+
     rows = compare(recorded, simulated)
     picture = out if out is not None else Path(f"{log.stem}.png")
     text = json.dumps({"log": log.name, "type": kind, "noise": noise, "signals": _records(rows)}, indent=2)

@@ -1,28 +1,27 @@
 """`x5-sim estimators`: the thesis' estimator and variants of the joint regression on the same recordings."""
 
-import os
-import signal
-from pathlib import Path
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import Annotated
 
 import typer
+from rich.table import Table
 
-from coordinator.runtime.event_loop import SIGNALS
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
-from coordinator.runtime.terminal import Terminal, print_table
-from sim.benchmark.case import Failed, Trial
-from sim.benchmark.workers import run_trials
-from sim.commands.options import Seed, With, Without, fail
-from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
-from sim.robot.noise_choice import NoiseChoice
-from sim.thesis.estimator_variants import (
-    Arm,
-    EstimatorRow,
-    compare,
-    estimator_rows,
-    estimator_table,
-    write_estimators,
+from coordinator.runtime.exit_codes import EXIT_FAILED
+from coordinator.runtime.terminal import print_table
+from sim.benchmark.case import Trial
+from sim.commands.experiment import (
+    JsonFile,
+    ProfileName,
+    WorkerCount,
+    check_writable,
+    chosen_profile,
+    experiment,
+    profile_settings,
+    trial_results,
 )
+from sim.commands.options import Seed, With, Without, fail
+from sim.imperfections.noise_profile import NoiseProfile
+from sim.thesis.estimator_variants import Arm, EstimatorRow, compare, estimator_rows, write_estimators
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM, TRIALS
 
 ARMS = tuple(Arm(alignment, length_mm) for alignment in ALIGNMENTS for length_mm in LENGTHS_MM)
@@ -31,31 +30,21 @@ _COST_S = 2.0
 
 def estimators(
     seed: Seed = 0,
-    noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = "x5",
+    noise: ProfileName = "x5",
     with_effects: With = None,
     without_effects: Without = None,
     trials: Annotated[
-        int, typer.Option(min=1, help="Rigs of other modules an arm, one trial on each.")
+        int, typer.Option(min=1, help="Trials for each arm, each with other modules.")
     ] = TRIALS,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
-    ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the table as JSON too.")] = None,
+    processes: WorkerCount = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Compare estimators of one joint's radial distance on the thesis' eight arms, and their bound."""
-    choice = NoiseChoice(noise, tuple(with_effects or ()), tuple(without_effects or ()))
-    profile = _profile(choice)
-    if json_file is not None and not json_file.parent.is_dir():
-        fail(f"{json_file}: there is no folder {json_file.parent}", EXIT_USAGE)
-    rows = _run(profile, trials, seed, processes or os.cpu_count() or 1)
+    profile = chosen_profile(noise, with_effects, without_effects)
+    check_writable(json_file)
+    rows = _run(profile, trials, seed, processes)
     print_table(estimator_table(rows))
-    settings: dict[str, object] = {
-        "seed": seed,
-        "noise": noise,
-        "with": list(choice.on),
-        "without": list(choice.off),
-        "trials": trials,
-    }
+    settings = {"seed": seed} | profile_settings(noise, with_effects, without_effects) | {"trials": trials}
     if json_file is not None:
         try:
             write_estimators(json_file, settings, rows)
@@ -63,41 +52,54 @@ def estimators(
             fail(f"cannot write {json_file}: {error.strerror or error}", EXIT_FAILED)
 
 
-def _profile(choice: NoiseChoice) -> NoiseProfile:
-    try:
-        return switched(noise_profile(str(choice.profile)), choice.on, choice.off)
-    except (KeyError, ValueError) as error:
-        fail(error.args[0], EXIT_USAGE)
-
-
-def _run(profile: NoiseProfile, trials: int, seed: int, processes: int) -> list[EstimatorRow]:
+def _run(profile: NoiseProfile, trials: int, seed: int, processes: int | None) -> list[EstimatorRow]:
     work = [
         Trial(compare, (arm.length_mm, arm.alignment, profile, seed * 1000 + number), _COST_S)
         for arm in ARMS
         for number in range(trials)
     ]
-    done = 0
 
-    def show(index: int, result: Any) -> None:
-        nonlocal done
-        done += 1
+    def label(index: int) -> str:
         arm = ARMS[index // trials]
-        terminal.step(done, len(work), f"{arm.length_mm} mm {arm.alignment}")
+        return f"{arm.length_mm} mm {arm.alignment}"
 
-    # Processes that share the cores already must not each start as many threads; they inherit this.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)
-    try:
-        with Terminal() as terminal:
-            results = [found.result for found in run_trials(work, processes, show)]
-    except KeyboardInterrupt:
-        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
-    for failure in (found for found in results if isinstance(found, Failed)):
-        fail(failure.text, EXIT_FAILED)
+    with experiment() as terminal:
+        results = trial_results(terminal, work, processes, label)
     return [
         row
         for place, arm in enumerate(ARMS)
         for row in estimator_rows(arm, results[place * trials : (place + 1) * trials])
     ]
+
+
+def estimator_table(rows: Sequence[EstimatorRow]) -> Table:
+    """Return the rows as a table, a section for each arm."""
+    titles = (
+        "arm",
+        "estimator",
+        "trials",
+        "mean |e|",
+        "bias",
+        "rms",
+        "sigma",
+        "bound",
+        "rms / bound",
+        "in 95 %",
+    )
+    shown = Table(*titles, title="Errors of the radial distance [mm]")
+    for row, following in zip(rows, [*rows[1:], None], strict=True):
+        last = following is None or (following.alignment, following.length_mm) != (
+            row.alignment,
+            row.length_mm,
+        )
+        shown.add_row(
+            f"{row.length_mm} mm {row.alignment}",
+            row.estimator,
+            str(row.trials),
+            *(f"{value:.3f}" for value in (row.mean_error_mm, row.bias_mm, row.rms_mm, row.sigma_mm)),
+            f"{row.bound_mm:.3f}",
+            f"{row.ratio:.2f}",
+            f"{100.0 * row.covered:.0f} %",
+            end_section=last,
+        )
+    return shown

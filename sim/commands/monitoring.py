@@ -1,10 +1,7 @@
 """`x5-sim monitoring`: what the watch makes of simulated robots to which something happens, or nothing."""
 
 import json
-import os
-import signal
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,10 +9,9 @@ import typer
 from rich.table import Table
 
 from coordinator.monitoring.findings import KINDS, UNITS, Kind
-from coordinator.runtime.event_loop import SIGNALS
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
-from coordinator.runtime.terminal import Terminal, print_table
-from sim.benchmark.case import Failed, Trial
+from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
+from coordinator.runtime.terminal import print_table
+from sim.benchmark.case import Trial
 from sim.benchmark.cases.monitoring import (
     AFTER_S,
     ARM,
@@ -27,9 +23,16 @@ from sim.benchmark.cases.monitoring import (
     false_alarms,
     monitoring_trial,
 )
-from sim.benchmark.workers import run_trials
+from sim.commands.experiment import (
+    JsonFile,
+    ProfileName,
+    WorkerCount,
+    check_writable,
+    experiment,
+    trial_results,
+)
 from sim.commands.options import Seed, fail
-from sim.imperfections.noise_profile import NOISE_PROFILES, noise_profile
+from sim.imperfections.noise_profile import noise_profile
 from sim.robot.robot_file import RobotFileError, load_robot
 
 _KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
@@ -45,7 +48,7 @@ _UNCHANGED_DAY = 500
 def monitoring(
     seed: Seed = 0,
     robot: Annotated[str, typer.Option(help="A robot of `x5-sim robots`, or a file.")] = ARM.robot,
-    noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = ARM.noise,
+    noise: ProfileName = ARM.noise,
     trials: Annotated[int, typer.Option(min=1, max=400, help="Trials of each kind.")] = 10,
     hours: Annotated[
         float, typer.Option(min=0.01, max=30.0, help="How long unchanged robots are watched.")
@@ -53,20 +56,17 @@ def monitoring(
     quick: Annotated[
         bool, typer.Option("--quick", help="One short trial of each kind, and some seconds of no change.")
     ] = False,
-    processes: Annotated[
-        int | None, typer.Option(min=1, help="Processes that share the work [one for each core].")
-    ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON too.")] = None,
+    processes: WorkerCount = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Let something happen to a known robot while it moves, or nothing, and count what the watch says."""
     subject = _subject(robot, noise, seed)._replace(brief=quick)
-    if json_file is not None and not json_file.parent.is_dir():
-        fail(f"{json_file}: there is no folder {json_file.parent}", EXIT_USAGE)
+    check_writable(json_file)
     if quick:
         trials, after_s, stretches = 1, _QUICK_AFTER_S, [_QUICK_STRETCH_S]
     else:
         after_s, stretches = AFTER_S, [_STRETCH_S] * max(1, round(3600.0 * hours / _STRETCH_S))
-    found = _run(subject, trials, after_s, stretches, processes or os.cpu_count() or 1)
+    found = _run(subject, trials, after_s, stretches, processes)
     happened = [one for one in found if isinstance(one, MonitoringTrial)]
     quiet = [one for one in found if isinstance(one, Alarms)]
     alarms = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
@@ -167,13 +167,8 @@ def _subject(robot: str, noise: str, seed: int) -> Subject:
 
 
 def _run(
-    subject: Subject, trials: int, after_s: float, stretches: Sequence[float], processes: int
+    subject: Subject, trials: int, after_s: float, stretches: Sequence[float], processes: int | None
 ) -> list[MonitoringTrial | Alarms]:
-    # Processes that share the cores already must not each start as many threads; they inherit this.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for number in SIGNALS:
-        signal.signal(number, signal.default_int_handler)
     work = [
         Trial(monitoring_trial, (kind, day, subject, after_s), _COST_SHARE * (after_s + 10.0))
         for kind in _KINDS
@@ -183,22 +178,8 @@ def _run(
         Trial(false_alarms, (_UNCHANGED_DAY + k, for_s, subject), _COST_SHARE * for_s)
         for k, for_s in enumerate(stretches)
     ]
-    done = 0
-    try:
-        with Terminal() as terminal:
-
-            def show(index: int, result: Any) -> None:
-                nonlocal done
-                done += 1
-                if terminal.console.is_terminal or done == len(work):
-                    terminal.step(done, len(work), "monitoring")
-
-            results = [found.result for found in run_trials(work, processes, show)]
-    except KeyboardInterrupt:
-        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
-    for failure in (found for found in results if isinstance(found, Failed)):
-        fail(failure.text, EXIT_FAILED)
-    return results
+    with experiment() as terminal:
+        return trial_results(terminal, work, processes, lambda _: "monitoring")
 
 
 def _median(values: Sequence[float | None]) -> float | None:

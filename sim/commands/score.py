@@ -4,11 +4,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.table import Table
 
 from coordinator.runtime.exit_codes import EXIT_FAILED
 from coordinator.runtime.terminal import print_table
 from sim.commands.options import fail
-from sim.scoring.score import ScoreError, score, table, write_score
+from sim.scoring.score import Score, ScoreError, score, write_score
 
 
 def score_run(
@@ -30,3 +31,40 @@ def print_score(folder: Path, as_json: bool = False) -> None:
         typer.echo((folder / "score.json").read_text())
     else:
         print_table(table(found))
+
+
+def table(found: Score) -> Table:
+    """Return the score as a table to print."""
+    excused = "\n".join(f"Not identifiable: {words}" for words in found.unidentifiable)
+    shown = Table(title="Result against truth", caption=excused or None, caption_justify="left")
+    for name in ("", "truth", "error", "claimed sigma", "axis error"):
+        shown.add_column(name, justify="left" if not name else "right")
+    shown.add_row("topology", "", "correct" if found.topology_correct else "WRONG", "", "")
+    for line in found.topology_differences:
+        shown.add_row(f"  {line}", "", "", "", "")
+    for link in found.links:
+        shown.add_row(
+            f"link {link.parent} - {link.child}",
+            f"{link.link_length_true_mm:.2f} mm",
+            _shown(link.link_length_error_mm, "+.2f", " mm"),
+            _shown(link.link_length_sigma_mm, ".2f", " mm"),
+            _shown(link.axis_error_deg, ".3f", " deg"),
+        )
+    shown.add_section()
+    shown.add_row("tip position, rms", "", _shown(found.tip_position_rms_mm, ".2f", " mm"), "", "")
+    shown.add_row("tip orientation, rms", "", _shown(found.tip_orientation_rms_deg, ".3f", " deg"), "", "")
+    shown.add_row("held-out torque against the true", "", _shown(found.torque_relative_error, ".2%"), "", "")
+    for serial, error in (found.torque_relative_error_per_joint or {}).items():
+        absolute = (found.torque_rms_error_nm_per_joint or {}).get(serial)
+        words = _shown(absolute, ".3f", " Nm") if error is None else _shown(error, ".2%")
+        shown.add_row(f"  of {serial}", "", words, "", "")
+    measured = _shown(found.torque_relative_error_measured, ".2%")
+    shown.add_row("held-out torque against the measured", "", measured, "", "")
+    shown.add_section()
+    shown.add_row("robot time", _shown(found.robot_time_s, ".1f", " s"), "", "", "")
+    shown.add_row("wall time", _shown(found.wall_time_s, ".1f", " s"), "", "", "")
+    return shown
+
+
+def _shown(value: float | None, form: str, unit: str = "") -> str:
+    return "-" if value is None else f"{value:{form}}{unit}"

@@ -1,23 +1,23 @@
-"""`python -m sim.link_emulator`: a network in user space between network namespaces.
+"""`python -m sim.processes.link_emulator`: a network in user space between network namespaces.
 
 Every host is a namespace with a TUN interface; what it sends is read here and written to the host that it is
 for, at the time and if the profile has it so. So TCP itself meets delay, loss and reordering, and no queueing
 discipline of the kernel is needed.
 """
 
+import argparse
 import json
 import os
 import select
 import signal
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from ipaddress import IPv4Address, IPv4Interface
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, NamedTuple
-
-import typer
+from typing import NamedTuple
 
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.processes.network_namespace import open_tun
@@ -82,15 +82,16 @@ def counts_by_address(
     return {f"{addresses[a]} > {addresses[b]}": each._asdict() for (a, b), each in counts.items()}
 
 
-def main(
-    hosts: Annotated[
-        list[str], typer.Argument(help="NAMESPACE=ADDRESS/PREFIX of every host, the coordinator's first.")
-    ],
-    network: Annotated[str, typer.Option(help="Network profile, or a TOML file.")],
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the network.")] = 0,
-    counts: Annotated[Path | None, typer.Option(help="JSON file for what became of the packets.")] = None,
-) -> None:
-    """Connect network namespaces by links that delay and lose, until a signal comes."""
+def main() -> int:
+    """Connect network namespaces by links that delay and lose packets, until a signal arrives."""
+    parser = argparse.ArgumentParser(prog="python -m sim.processes.link_emulator", description=main.__doc__)
+    parser.add_argument(
+        "hosts", nargs="+", metavar="NAMESPACE=ADDRESS/PREFIX", help="Hosts, the coordinator's first."
+    )
+    parser.add_argument("--network", required=True, help="Network profile, or a TOML file.")
+    parser.add_argument("--seed", type=int, default=0, help="Seed of the network.")
+    parser.add_argument("--counts", type=Path, help="JSON file for the counts of packets.")
+    asked = parser.parse_args()
     ended: list[int] = []
 
     def end(number: int, _frame: FrameType | None) -> None:
@@ -99,23 +100,24 @@ def main(
     signal.signal(signal.SIGINT, end)
     signal.signal(signal.SIGTERM, end)
     try:
-        found = [host(text) for text in hosts]
-        addresses = [each.interface.ip for each in found]
-        switch = PacketSwitch(addresses, network_named(network), seed)
-        tuns = [open_tun(*each) for each in found]
+        hosts = [host(text) for text in asked.hosts]
+        addresses = [each.interface.ip for each in hosts]
+        switch = PacketSwitch(addresses, network_named(asked.network), asked.seed)
+        tuns = [open_tun(*each) for each in hosts]
     except (ValueError, OSError) as error:
-        typer.echo(f"link emulator: {error}", err=True)
-        raise typer.Exit(EXIT_USAGE) from error
-    typer.echo(UP, err=True)
+        print(f"link emulator: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    print(UP, file=sys.stderr, flush=True)
     try:
         forward(tuns, switch, lambda: bool(ended))
     except OSError as error:
-        typer.echo(f"link emulator: a host is gone: {error}", err=True)
-        raise typer.Exit(EXIT_LOST) from error
+        print(f"link emulator: the interface of a host is gone: {error}", file=sys.stderr)
+        return EXIT_LOST
     finally:
-        if counts is not None:
-            counts.write_text(json.dumps(counts_by_address(switch.counts, addresses), indent=2) + "\n")
+        if asked.counts is not None:
+            asked.counts.write_text(json.dumps(counts_by_address(switch.counts, addresses), indent=2) + "\n")
+    return 0
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    sys.exit(main())

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from rich.table import Table
 
 from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, UnresolvedPart
 from module_agent.model.chain import Array, Chain
@@ -141,39 +140,6 @@ def write_score(path: Path, found: Score) -> None:
     os.replace(temporary, path)
 
 
-def table(found: Score) -> Table:
-    """Return the score as a table to print."""
-    excused = "\n".join(f"Not identifiable: {words}" for words in found.unidentifiable)
-    shown = Table(title="Result against truth", caption=excused or None, caption_justify="left")
-    for name in ("", "truth", "error", "claimed sigma", "axis error"):
-        shown.add_column(name, justify="left" if not name else "right")
-    shown.add_row("topology", "", "correct" if found.topology_correct else "WRONG", "", "")
-    for line in found.topology_differences:
-        shown.add_row(f"  {line}", "", "", "", "")
-    for link in found.links:
-        shown.add_row(
-            f"link {link.parent} - {link.child}",
-            f"{link.link_length_true_mm:.2f} mm",
-            _shown(link.link_length_error_mm, "+.2f", " mm"),
-            _shown(link.link_length_sigma_mm, ".2f", " mm"),
-            _shown(link.axis_error_deg, ".3f", " deg"),
-        )
-    shown.add_section()
-    shown.add_row("tip position, rms", "", _shown(found.tip_position_rms_mm, ".2f", " mm"), "", "")
-    shown.add_row("tip orientation, rms", "", _shown(found.tip_orientation_rms_deg, ".3f", " deg"), "", "")
-    shown.add_row("held-out torque against the true", "", _shown(found.torque_relative_error, ".2%"), "", "")
-    for serial, error in (found.torque_relative_error_per_joint or {}).items():
-        absolute = (found.torque_rms_error_nm_per_joint or {}).get(serial)
-        words = _shown(absolute, ".3f", " Nm") if error is None else _shown(error, ".2%")
-        shown.add_row(f"  of {serial}", "", words, "", "")
-    measured = _shown(found.torque_relative_error_measured, ".2%")
-    shown.add_row("held-out torque against the measured", "", measured, "", "")
-    shown.add_section()
-    shown.add_row("robot time", _shown(found.robot_time_s, ".1f", " s"), "", "", "")
-    shown.add_row("wall time", _shown(found.wall_time_s, ".1f", " s"), "", "", "")
-    return shown
-
-
 def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[LinkScore]:
     sigma = {(link.parent, link.child): link.link_length_sigma_mm for link in claimed}
     found = []
@@ -236,10 +202,6 @@ def _ratio(predicted: Array, true: Array) -> float | None:
 
 def _rms(columns: Array) -> list[float]:
     return [float(value) for value in np.sqrt((columns**2).mean(axis=0))]
-
-
-def _shown(value: float | None, form: str, unit: str = "") -> str:
-    return "-" if value is None else f"{value:{form}}{unit}"
 
 
 # ---------------------------------------------------------------------- files

@@ -1,6 +1,6 @@
-"""The amplitude experiment's results as files, and beside the thesis' own figures.
+"""Results of the amplitude experiment: summaries next to the thesis' figures, files, and a picture.
 
-The amplitude experiment as a picture: amplitude against estimated length, as figures 23-26 and 29-32.
+The picture draws the estimated length over the amplitude, as the thesis' figures 23-26 and 29-32 do.
 """
 
 import csv
@@ -11,12 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from rich.table import Table
 
-from sim.thesis.amplitude_sweep import Trial
+from sim.thesis.amplitude_sweep import AmplitudeTrial
 from sim.thesis.published import ALIGNMENTS, Alignment, ThesisLength, thesis_length
 
 
@@ -35,12 +31,12 @@ class Repeats(NamedTuple):
         return self.mean_mm - self.true_mm
 
 
-def repeats(trials: Sequence[Trial], filtered: bool = True) -> list[Repeats]:
+def repeats(trials: Sequence[AmplitudeTrial], filtered: bool = True) -> list[Repeats]:
     """Summarise the repeated trials, arm by arm, in the order in which they come.
 
     An arm on which no trial gave an estimate is left out.
     """
-    arms: dict[tuple[Alignment, int], list[Trial]] = {}
+    arms: dict[tuple[Alignment, int], list[AmplitudeTrial]] = {}
     for trial in trials:
         if trial.purpose == "repeats":
             arms.setdefault((trial.alignment, trial.length_mm), []).append(trial)
@@ -55,30 +51,7 @@ def repeats(trials: Sequence[Trial], filtered: bool = True) -> list[Repeats]:
     return found
 
 
-def table(found: Sequence[Repeats], filtered: bool = True) -> Table:
-    """Return tables 4 and 5 of the thesis with the simulated figures beside, to print."""
-    how = "" if filtered else ", without the filter"
-    shown = Table(title=f"Repeated trials at the thesis' amplitudes{how}")
-    columns = ("arm", "A [rad]", "trials", "mean [mm]", "error [mm]", "error [%]", "scatter [mm]")
-    for name in (*columns, "thesis' mean [mm]", "its error [%]"):
-        shown.add_column(name, justify="left" if name == "arm" else "right")
-    for row in found:
-        thesis = row.thesis
-        shown.add_row(
-            f"{thesis.length_mm} mm {thesis.alignment}",
-            f"{thesis.amplitude_rad:.2f}",
-            str(row.trials),
-            f"{row.mean_mm:.1f}",
-            f"{row.error_mm:+.1f}",
-            f"{100 * row.error_mm / row.true_mm:+.1f}",
-            f"{row.scatter_mm:.1f}",
-            f"{thesis.mean_mm:.1f}",
-            f"{100 * (thesis.mean_mm / thesis.length_mm - 1):+.1f}",
-        )
-    return shown
-
-
-def write_results(folder: Path, settings: dict[str, object], trials: Sequence[Trial]) -> None:
+def write_results(folder: Path, settings: dict[str, object], trials: Sequence[AmplitudeTrial]) -> None:
     """Write `amplitudes.json` (settings, all trials, both summaries) and `amplitudes.csv` (all trials).
 
     Each file is the complete old or the complete new one.
@@ -94,7 +67,7 @@ def write_results(folder: Path, settings: dict[str, object], trials: Sequence[Tr
     temporary = folder / "amplitudes.csv.part"
     with temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(Trial._fields)
+        writer.writerow(AmplitudeTrial._fields)
         writer.writerows(trials)
     os.replace(temporary, folder / "amplitudes.csv")
 
@@ -120,19 +93,21 @@ _FILTERED, _UNFILTERED, _THESIS, _TRUTH, _SATURATED = "#1f5fa8", "#d07a1f", "#b0
 _MIN_RANGE, _MAX_RANGE = 0.10, 0.30
 
 
-def plot(trials: Sequence[Trial], path: Path, title: str) -> None:
+def plot(trials: Sequence[AmplitudeTrial], path: Path, title: str) -> None:
     """Draw the sweep and save it (PNG, SVG or PDF by suffix): one row per alignment, one column per length.
 
     Raises:
         ValueError: no trial of a sweep, or a suffix that matplotlib cannot write.
     """
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
     sweep = [trial for trial in trials if trial.purpose == "sweep"]
     if not sweep:
         raise ValueError("no trial of a sweep over amplitudes: nothing to draw")
     lengths = list(dict.fromkeys(trial.length_mm for trial in sweep))
     width = max(3.1 * len(lengths) + 0.9, 6.0)
     figure = Figure(figsize=(width, 7.0), dpi=150)
-    FigureCanvasAgg(figure)
     grid: Any = figure.subplots(2, len(lengths), squeeze=False)
     half = float(np.clip(1.1 * _largest_error(sweep), _MIN_RANGE, _MAX_RANGE))
     for row, alignment in enumerate(ALIGNMENTS):
@@ -163,13 +138,13 @@ def plot(trials: Sequence[Trial], path: Path, title: str) -> None:
     figure.savefig(path)
 
 
-def _largest_error(sweep: Sequence[Trial]) -> float:
+def _largest_error(sweep: Sequence[AmplitudeTrial]) -> float:
     """Return the size of the largest relative error, with the filter or without."""
     errors = [abs(e) for t in sweep for filtered in (True, False) if (e := t.error(filtered)) is not None]
     return max(errors, default=0.0)
 
 
-def _panel(axes: Any, own: Sequence[Trial], half: float) -> None:
+def _panel(axes: Any, own: Sequence[AmplitudeTrial], half: float) -> None:
     """Draw one arm: the mean over rigs as a line, every rig as a point, and where the velocity saturates."""
     axes.grid(True, linewidth=0.4, color="#d5d5d5")
     axes.set_axisbelow(True)
@@ -189,7 +164,7 @@ def _panel(axes: Any, own: Sequence[Trial], half: float) -> None:
         each.tick_params(labelsize=8)
 
 
-def _shade(axes: Any, own: Sequence[Trial]) -> None:
+def _shade(axes: Any, own: Sequence[AmplitudeTrial]) -> None:
     amplitudes = sorted({t.amplitude_rad for t in own})
     saturated = [t.amplitude_rad for t in own if t.saturated]
     if saturated:
@@ -201,7 +176,13 @@ def _shade(axes: Any, own: Sequence[Trial]) -> None:
 
 
 def _series(
-    axes: Any, own: Sequence[Trial], filtered: bool, colour: str, marker: str, label: str, half: float
+    axes: Any,
+    own: Sequence[AmplitudeTrial],
+    filtered: bool,
+    colour: str,
+    marker: str,
+    label: str,
+    half: float,
 ) -> None:
     true = own[0].true_mm
     low, high = true * (1 - half), true * (1 + half)

@@ -1,14 +1,10 @@
-"""The thesis' amplitude experiment: trials on a rig one after the other, and many rigs at once.
+"""The thesis' amplitude experiment: series of trials on one rig.
 
 A series is one rig, put up once, on which trials of given amplitudes are run in turn, as the thesis ran them:
 the same modules, with the same errors, that get warmer. Rigs differ in their seed.
 """
 
-import multiprocessing
-import signal
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from multiprocessing.synchronize import Event
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -45,7 +41,7 @@ class Series(NamedTuple):
         return load_robot(f"thesis_{self.length_mm}_{self.alignment}")
 
 
-class Trial(NamedTuple):
+class AmplitudeTrial(NamedTuple):
     """One trial: the estimated distance from the joint's axis to the second IMU, and how the joint moved.
 
     estimated_mm, sigma_mm: by the thesis' analysis; unfiltered_mm: the same data without its filter. None
@@ -75,10 +71,6 @@ class Trial(NamedTuple):
         """Return the relative error of the estimate, with the thesis' filter or without."""
         found = self.estimated_mm if filtered else self.unfiltered_mm
         return None if found is None else found / self.true_mm - 1.0
-
-
-class Interrupted(RuntimeError):
-    """The experiment was stopped before its end."""
 
 
 def sweep_series(
@@ -126,12 +118,11 @@ def _seed(seed: int, *key: int) -> int:
 # ---------------------------------------------------------------------- one rig
 
 
-def run_series(series: Series, stopping: Callable[[], bool] = lambda: False) -> list[Trial]:
-    """Put up the rig and run its trials; `stopping` is asked before each.
+def run_series(series: Series) -> list[AmplitudeTrial]:
+    """Put up the rig and run its trials.
 
     Raises:
         ExperimentFailed: a module refused a motion or broke it off.
-        Interrupted: `stopping` said so.
         KeyError, ValueError: no such noise profile or effect, no such robot.
     """
     robot = series.robot
@@ -140,8 +131,6 @@ def run_series(series: Series, stopping: Callable[[], bool] = lambda: False) -> 
     with OneJointRig(robot, series.seed, series.noise.of(robot)) as rig:
         clamp = rig.modules[JOINT].firmware.config.kind.velocity_clamp_rad_s
         for number, amplitude in enumerate(series.amplitudes_rad):
-            if stopping():
-                raise Interrupted(f"stopped before the end of {series.length_mm} mm {series.alignment}")
             rows = rig.trial(Plan(sine_amplitude_rad=amplitude))
             found.append(_trial(series, number, amplitude, true_mm, rows, clamp))
     return found
@@ -149,12 +138,12 @@ def run_series(series: Series, stopping: Callable[[], bool] = lambda: False) -> 
 
 def _trial(
     series: Series, number: int, amplitude: float, true_mm: float, rows: TrialRows, clamp_rad_s: float
-) -> Trial:
+) -> AmplitudeTrial:
     filtered, note = _fit(rows, TAPS)
     unfiltered, _ = _fit(rows, taps=1)
     joint = rows.sine.joint
     commanded = float(np.nanmax(np.abs(joint["velocity_command_rad_s"])))
-    return Trial(
+    return AmplitudeTrial(
         purpose=series.purpose,
         alignment=series.alignment,
         length_mm=series.length_mm,
@@ -185,45 +174,3 @@ def _stroke(joint: Rows) -> float:
     """Return the size of a motion over that of the commanded one; the sag under a load counts for neither."""
     moving = joint[np.isfinite(joint["position_command_rad"])]
     return float(np.std(moving["position_rad"]) / np.std(moving["position_command_rad"]))
-
-
-# ---------------------------------------------------------------------- many rigs
-
-_stop: Event | None = None
-
-
-def _start_worker(stop: Event) -> None:
-    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
-    global _stop
-    _stop = stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _run_in_worker(series: Series) -> list[Trial]:
-    return run_series(series, lambda: _stop is not None and _stop.is_set())
-
-
-def run_all(
-    series: Sequence[Series], processes: int, on_done: Callable[[Series], None] = lambda _: None
-) -> list[Trial]:
-    """Run series in several processes; return their trials in the order of the series.
-
-    The result does not depend on the number of processes. Whatever ends this early - Ctrl-C, or the failure
-    of one series - ends the others after the trial that they are at.
-
-    Raises:
-        ExperimentFailed, KeyError, ValueError: as `run_series`.
-    """
-    context = multiprocessing.get_context("spawn")
-    stop = context.Event()
-    with ProcessPoolExecutor(processes, context, _start_worker, (stop,)) as pool:
-        work: dict[Future[list[Trial]], Series] = {pool.submit(_run_in_worker, each): each for each in series}
-        try:
-            for done in as_completed(work):
-                done.result()
-                on_done(work[done])
-        except BaseException:
-            stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
-            raise
-        return [trial for future in work for trial in future.result()]

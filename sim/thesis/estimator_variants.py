@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from rich.table import Table
 
 from module_agent.estimate.circle_point_analysis import rest_reading
 from module_agent.estimate.gaussian_filter import gaussian_filter
@@ -223,39 +222,6 @@ def estimator_rows(arm: Arm, comparisons: Sequence[Comparison]) -> list[Estimato
             )
         )
     return rows
-
-
-def estimator_table(rows: Sequence[EstimatorRow]) -> Table:
-    """Return the rows as a table, a section for each arm."""
-    titles = (
-        "arm",
-        "estimator",
-        "trials",
-        "mean |e|",
-        "bias",
-        "rms",
-        "sigma",
-        "bound",
-        "rms / bound",
-        "in 95 %",
-    )
-    shown = Table(*titles, title="Errors of the radial distance [mm]")
-    for row, following in zip(rows, [*rows[1:], None], strict=True):
-        last = following is None or (following.alignment, following.length_mm) != (
-            row.alignment,
-            row.length_mm,
-        )
-        shown.add_row(
-            f"{row.length_mm} mm {row.alignment}",
-            row.estimator,
-            str(row.trials),
-            *(f"{value:.3f}" for value in (row.mean_error_mm, row.bias_mm, row.rms_mm, row.sigma_mm)),
-            f"{row.bound_mm:.3f}",
-            f"{row.ratio:.2f}",
-            f"{100.0 * row.covered:.0f} %",
-            end_section=last,
-        )
-    return shown
 
 
 def write_estimators(path: Path, settings: dict[str, object], rows: Sequence[EstimatorRow]) -> None:

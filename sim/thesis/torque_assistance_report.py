@@ -1,30 +1,24 @@
-"""What torque assistance came to: a table of rms tracking errors, the bars, and both as JSON.
+"""Results of torque assistance: the bars, a JSON file, and a picture.
 
-Torque assistance as plain figures: of every combination the rms errors of all modes, and who is unstable.
-
-Each combination is one piece of work; robots are identified beforehand, or known without error.
-
-How the thesis' arm follows in the three input modes, as a picture: its figures 52 to 61.
+The picture shows how the thesis' arm follows in the three input modes, as its figures 52 to 61 do.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from rich.table import Table
 
 from sim.geometry.pose import read_only
-from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
-from sim.thesis.torque_assistance import MODES, ON_MODULE, Follow, Model, standing_robot
-from sim.thesis.torque_assistance_cases import Case, Combination, robots_of, try_case
+from sim.thesis.torque_assistance import MODES, ON_MODULE, Model, standing_robot
+from sim.thesis.torque_assistance_cases import Combination
+
+if TYPE_CHECKING:
+    from matplotlib.lines import Line2D
 
 # What the six joints of an arm are to gain under torque control.
 MIN_GAIN = 3.0
@@ -76,48 +70,6 @@ def _bar(asked: str, found: Sequence[Combination], keeps: Callable[[Combination]
     return Bar(asked, len(stable), len(stable) - len(missed), missed, unstable)
 
 
-def assistance_table(found: Sequence[Combination]) -> Table:
-    """Return the combinations as a table, a section for each robot; * marks what is unstable."""
-    titles = (
-        "robot",
-        "gains",
-        "read",
-        "motion",
-        "set-points",
-        "asked",
-        "mode 1",
-        "mode 2",
-        "mode 3",
-        "2 / 3",
-    )
-    shown = Table(*titles, title="Rms tracking error by input mode in mrad, * unstable")
-    for each, following in zip(found, [*found[1:], None], strict=True):
-        case = each.case
-        shown.add_row(
-            _robot(each),
-            case.gains.name,
-            case.gains.reading or "",
-            case.motion,
-            case.delivery.name,
-            f"{1e3 * each.follows[0].motion_rms_rad:.1f}",
-            *(_error(one) for one in each.follows),
-            f"{each.gain:.1f}" if isfinite(each.gain) else "",
-            end_section=following is None or following.case.robot != case.robot,
-        )
-    return shown
-
-
-def bar_lines(judged: Sequence[Bar]) -> list[str]:
-    """Return the bars in words, and what is unstable below them."""
-    lines = []
-    for bar in judged:
-        verdict = "holds" if bar.holds else "does not hold"
-        lines.append(f"{bar.asked}: {verdict}, in {bar.kept} of {bar.stable} stable combinations")
-        lines += [f"  not so: {words}" for words in bar.missed]
-        lines += [f"  unstable: {words}" for words in bar.unstable]
-    return lines
-
-
 def write_assistance(path: Path, settings: dict[str, object], found: Sequence[Combination]) -> None:
     """Write settings, combinations and bars as JSON; an error that is infinite, as null.
 
@@ -162,12 +114,8 @@ def _number(value: float) -> float | None:
     return value if isfinite(value) else None
 
 
-def _error(one: Follow) -> str:
-    words = f"{1e3 * one.rms_error_rad:.2f}" if isfinite(one.rms_error_rad) else "-"
-    return f"{words} *" if one.unstable else words
-
-
-def _robot(each: Combination) -> str:
+def robot_and_pose(each: Combination) -> str:
+    """Return the alignment of the thesis' arm, or robot and pose of another one."""
     return each.case.alignment or f"{each.case.robot} {each.case.pose}"
 
 
@@ -176,75 +124,13 @@ def combination_words(each: Combination) -> str:
     case = each.case
     read = f" {case.gains.reading}" if case.gains.reading else ""
     delivered = "" if case.delivery == ON_MODULE else f", {case.delivery.name}"
-    return f"{_robot(each)}, {case.gains.name}{read}, {case.motion}{delivered}"
-
-
-class AssistanceRow(NamedTuple):
-    """What came of one combination, by input modes 1, 2 and 3.
-
-    name: the combination in words. is_thesis: the thesis' arm, as against an arm of several joints; setting:
-    the thesis' PID setting, None of the factory's gains. unstable: why a mode counts as such, empty if not.
-    """
-
-    name: str
-    robot: str
-    is_thesis: bool
-    strategy: int
-    setting: str | None
-    rms_error_rad: tuple[float, float, float]
-    unstable: tuple[str, str, str]
-
-    @property
-    def is_stable(self) -> bool:
-        """Whether input mode 3 is."""
-        return not self.unstable[2]
-
-    @property
-    def helps(self) -> bool:
-        """Whether input mode 3 has the lowest error."""
-        return self.rms_error_rad[2] < min(self.rms_error_rad[:2])
-
-    @property
-    def gain(self) -> float:
-        """By how much mode 3 is better than mode 2."""
-        return self.rms_error_rad[1] / self.rms_error_rad[2]
+    return f"{robot_and_pose(each)}, {case.gains.name}{read}, {case.motion}{delivered}"
 
 
 def true_model(name: str, seed: int) -> Model:
-    """Return what a shipped robot is, where the seed puts it, as if it had been identified without error."""
+    """Return the true model of a shipped robot where the seed puts it, in place of an identified one."""
     robot = standing_robot(name, seed)
     return Model(true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
-
-
-def assistance_row(case: Case, model: Model, noise: NoiseProfile, seed: int) -> AssistanceRow:
-    """Try one combination in all input modes."""
-    return row_of(try_case(case, model, noise, seed))
-
-
-def assistance_rows(
-    chosen: Sequence[Case], noise: NoiseProfile, seed: int, models: Mapping[str, Model] | None = None
-) -> list[AssistanceRow]:
-    """Try some combinations (see `torque_assistance_cases.cases`), one after the other.
-
-    Robots that `models` does not have by name are known without error.
-    """
-    known = {name: true_model(name, seed) for name in robots_of(list(chosen)) if name not in (models or {})}
-    known.update(models or {})
-    return [assistance_row(case, known[case.robot], noise, seed) for case in chosen]
-
-
-def row_of(found: Combination) -> AssistanceRow:
-    """Return the plain figures of a combination."""
-    first, second, third = found.follows
-    return AssistanceRow(
-        name=combination_words(found),
-        robot=found.case.robot,
-        is_thesis=found.case.alignment is not None,
-        strategy=found.case.gains.strategy,
-        setting=found.case.gains.setting,
-        rms_error_rad=(first.rms_error_rad, second.rms_error_rad, third.rms_error_rad),
-        unstable=(first.unstable, second.unstable, third.unstable),
-    )
 
 
 _ASKED = "#202020"
@@ -268,11 +154,12 @@ def plot_assistance(found: Sequence[Combination], path: Path, title: str) -> Non
     Raises:
         ValueError: none of the combinations is one of the thesis', or matplotlib cannot write the suffix.
     """
+    from matplotlib.figure import Figure
+
     panels = [_first(found, alignment, each.name) for alignment in ALIGNMENTS[::-1] for each in SETTINGS]
     if not any(panels):
         raise ValueError("no combination of the thesis' arm and settings: nothing to draw")
     figure = Figure(figsize=(13.5, 12.0), dpi=120)
-    FigureCanvasAgg(figure)
     grid: Any = figure.subplots(len(panels) // _COLUMNS, _COLUMNS, squeeze=False)
     for axes, one in zip(grid.flat, panels, strict=True):
         if one is None:
@@ -289,7 +176,9 @@ def plot_assistance(found: Sequence[Combination], path: Path, title: str) -> Non
     figure.savefig(path)
 
 
-def _legend() -> list[Line2D]:
+def _legend() -> list["Line2D"]:
+    from matplotlib.lines import Line2D
+
     modes = [
         Line2D([], [], color=colour, label=label) for colour, label in zip(_COLOURS, _LABELS, strict=True)
     ]

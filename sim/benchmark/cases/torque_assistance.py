@@ -8,8 +8,9 @@ from sim.benchmark.row import Row, count
 from sim.imperfections.noise_profile import noise_profile
 from sim.thesis.torque_assistance import identified_model, standing_robot
 from sim.thesis.torque_assistance_cases import Case as Combined
+from sim.thesis.torque_assistance_cases import Combination, try_case
 from sim.thesis.torque_assistance_cases import cases as combinations
-from sim.thesis.torque_assistance_report import MIN_GAIN, AssistanceRow, assistance_rows
+from sim.thesis.torque_assistance_report import MIN_GAIN, true_model
 
 NOISE = "x5"
 _IDENTIFY_COST_S, _CASE_COST_S = 12.0, 4.0
@@ -45,13 +46,13 @@ def assistance_cases(seed: int, shortened: bool = False) -> list[Case]:
 
 def assistance_of_robot(
     robot: str, chosen: Sequence[Combined], seed: int, shortened: bool
-) -> list[AssistanceRow]:
-    """Let a robot find out its inertia, then try combinations with what came of it."""
+) -> list[Combination]:
+    """Identify a robot, or take it as known without error if `shortened`, and try combinations on it."""
     noise = noise_profile(NOISE)
-    if shortened:
-        return assistance_rows(chosen, noise, seed)
-    model = identified_model(standing_robot(robot, seed), noise, seed)
-    return assistance_rows(chosen, noise, seed, {robot: model})
+    model = (
+        true_model(robot, seed) if shortened else identified_model(standing_robot(robot, seed), noise, seed)
+    )
+    return [try_case(case, model, noise, seed) for case in chosen]
 
 
 def _name(combined: Combined) -> str:
@@ -68,7 +69,7 @@ def _limit(combined: Combined) -> float | None:
     return 1.0 if combined.gains.setting is not None else None
 
 
-def _summary(case: str, limit: float | None, trials: Sequence[list[AssistanceRow]]) -> Summary:
+def _summary(case: str, limit: float | None, trials: Sequence[list[Combination]]) -> Summary:
     rows = [row for trial in trials for row in trial]
     stable = [row for row in rows if row.is_stable]
     most = max((1.0 / row.gain for row in stable), default=None)

@@ -8,9 +8,10 @@ import pytest
 from rich.console import Console
 
 from sim.benchmark.case import Case, Failed, Summary, Trial, concluded, trial_seed
-from sim.benchmark.report import SCHEMA, Cost, Results, gathered, plot, print_rows, table, write_results
+from sim.benchmark.report import SCHEMA, Cost, Results, gathered, plot, write_results
 from sim.benchmark.row import Row
 from sim.benchmark.workers import run_cases
+from sim.commands.benchmark import print_rows, table
 
 ROWS = (
     Row("long arm", "length [mm]", 4.35, 0.12, 0.08, 0.5),

@@ -12,11 +12,12 @@ from rich.console import Console
 from coordinator.identification.result import chain_part
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import apply_perturbation
+from sim.commands.score import table
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.chain_score import tip_errors
 from sim.scoring.gauge_alignment import reorder
-from sim.scoring.score import Score, ScoreError, score, table, write_score
+from sim.scoring.score import Score, ScoreError, score, write_score
 from sim.world.truth import write_truth
 
 ROBOT = load_robot("tree_y")

@@ -12,9 +12,10 @@ import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
+from sim.commands.amplitudes import table
 from sim.main import app
-from sim.thesis.amplitude_report import plot, repeats, table, write_results
-from sim.thesis.amplitude_sweep import Purpose, Trial
+from sim.thesis.amplitude_report import plot, repeats, write_results
+from sim.thesis.amplitude_sweep import AmplitudeTrial, Purpose
 from sim.thesis.published import Alignment, thesis_length
 
 
@@ -24,9 +25,9 @@ def trial(
     purpose: Purpose = "repeats",
     alignment: Alignment = "vertical",
     amplitude_rad: float = 0.04,
-) -> Trial:
+) -> AmplitudeTrial:
     unfiltered = None if estimated_mm is None else estimated_mm - 10.0
-    return Trial(
+    return AmplitudeTrial(
         purpose, alignment, 171, 0, number, amplitude_rad, 171.0, estimated_mm, 1.0, unfiltered, 0.5, 0.5,
         amplitude_rad > 0.12, 1.0, "" if estimated_mm else "too little",
     )  # fmt: skip
@@ -51,7 +52,7 @@ def test_files_hold_every_trial_and_both_summaries(tmp_path: Path) -> None:
     write_results(tmp_path / "new", {"seed": 3}, trials)
     document = json.loads((tmp_path / "new" / "amplitudes.json").read_text())
     assert document["seed"] == 3
-    assert [Trial(**row) for row in document["trials"]] == trials
+    assert [AmplitudeTrial(**row) for row in document["trials"]] == trials
     assert document["repeats"][0]["error_mm"] == 1.0
     assert document["repeats"][0]["thesis_mean_mm"] == 188.0
     assert document["repeats_unfiltered"][0]["error_mm"] == -9.0

@@ -7,16 +7,16 @@ from coordinator.excitation.plan import Plan
 from module_agent.estimate.observer import Observer
 from module_agent.peers.motion_listener import JointMotion
 from module_agent.wire.messages import WindowedSine
+from sim.benchmark.case import Trial
+from sim.benchmark.workers import run_trials
 from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import load_robot
 from sim.test_bench.module_bench import ExperimentFailed
 from sim.test_bench.one_joint_rig import IMU, JOINT, MotionRows, OneJointRig, analyse
 from sim.thesis.amplitude_sweep import (
-    Interrupted,
+    AmplitudeTrial,
     Series,
-    Trial,
     repeat_series,
-    run_all,
     run_series,
     sweep_series,
 )
@@ -31,18 +31,18 @@ SERIES = sweep_series(LENGTHS_MM, (FOLLOWED_RAD, SATURATED_RAD), rigs=1, seed=SE
 
 
 @pytest.fixture(scope="module")
-def trials() -> dict[tuple[Alignment, float], list[Trial]]:
+def trials() -> dict[tuple[Alignment, float], list[AmplitudeTrial]]:
     """One rig for every length and alignment, two trials on each."""
-    found: dict[tuple[Alignment, float], list[Trial]] = {}
+    found: dict[tuple[Alignment, float], list[AmplitudeTrial]] = {}
     for trial in (trial for each in SERIES for trial in run_series(each)):
         found.setdefault((trial.alignment, trial.amplitude_rad), []).append(trial)
     return found
 
 
-Trials = dict[tuple[Alignment, float], list[Trial]]
+Trials = dict[tuple[Alignment, float], list[AmplitudeTrial]]
 
 
-def errors(trials: list[Trial], filtered: bool = True) -> np.ndarray:
+def errors(trials: list[AmplitudeTrial], filtered: bool = True) -> np.ndarray:
     return np.array([trial.error(filtered) for trial in trials], dtype=float)
 
 
@@ -161,24 +161,11 @@ def test_the_sweep_is_the_thesis_with_a_seed_for_every_rig() -> None:
 
 def test_processes_find_what_one_finds_alone(trials: Trials) -> None:
     series = [each for each in SERIES if each.length_mm == 171]
-    done: list[Series] = []
-    assert run_all(series, 2, done.append) == [
+    found = run_trials([Trial(run_series, (each,)) for each in series], 2)
+    assert [trial for done in found for trial in done.result] == [
         trial
         for alignment in ALIGNMENTS
         for amplitude in (FOLLOWED_RAD, SATURATED_RAD)
         for trial in trials[alignment, amplitude]
         if trial.length_mm == 171
     ]
-    assert sorted(done) == sorted(series)
-
-
-def test_a_failing_series_ends_the_experiment_with_its_own_words() -> None:
-    bad = Series("sweep", "horizontal", 171, 0, SEED, (FOLLOWED_RAD,), NoiseChoice("loud"))
-    long = sweep_series((171,), (FOLLOWED_RAD,) * 50, rigs=1, seed=SEED)
-    with pytest.raises(KeyError, match="unknown noise profile 'loud'"):
-        run_all([bad, *long], 2)
-
-
-def test_a_stopped_series_says_where() -> None:
-    with pytest.raises(Interrupted, match="stopped before the end of 171 mm horizontal"):
-        run_series(Series("sweep", "horizontal", 171, 0, SEED, (FOLLOWED_RAD,)), stopping=lambda: True)

@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from coordinator.excitation.plan import Plan
 from module_agent.estimate.windows import JointWindow
+from sim.commands.estimators import estimator_table
 from sim.imperfections.noise_profile import NOISE_PROFILES, switched
 from sim.main import app
 from sim.robot.robot_file import load_robot
@@ -21,7 +22,6 @@ from sim.thesis.estimator_variants import (
     Found,
     _commanded,
     estimator_rows,
-    estimator_table,
     judge_all,
 )
 

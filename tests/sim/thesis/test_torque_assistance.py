@@ -16,6 +16,7 @@ from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import CATALOGUE
 from sim.benchmark.case import Trial
 from sim.benchmark.workers import Done
+from sim.commands.assistance import assistance_table
 from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile
 from sim.main import app
 from sim.test_bench.robot_bench import Track
@@ -42,7 +43,7 @@ from sim.thesis.torque_assistance_cases import (
     thesis_robot,
     try_case,
 )
-from sim.thesis.torque_assistance_report import assistance_table, bars, row_of, true_model, write_assistance
+from sim.thesis.torque_assistance_report import bars, true_model, write_assistance
 
 X5 = NOISE_PROFILES["x5"]
 SEED = 0
@@ -71,6 +72,8 @@ def test_under_torque_control_only_calculated_torque_comes_close_as_in_figure_55
     assert min(first.rms_error_rad, second.rms_error_rad) > 0.06
     # Measured 2.1 mrad: friction and winding of the single module are not quite the catalogue's.
     assert third.rms_error_rad < 0.004
+    assert tried(CASE_4).is_stable
+    assert tried(CASE_4).helps
     assert tried(CASE_4).gain > 20.0
 
 
@@ -223,16 +226,6 @@ def test_what_was_broken_off_is_written_without_a_number(tmp_path: Path) -> None
     assert row["modes"]["1"]["rms_error_rad"] == 0.3
 
 
-def test_a_row_holds_the_plain_figures_of_a_combination() -> None:
-    row = row_of(tried(CASE_4))
-    assert row.rms_error_rad == tuple(one.rms_error_rad for one in tried(CASE_4).follows)
-    assert (row.name, row.setting, row.strategy) == ("vertical, #4 per tick, windowed sine", "#4", 4)
-    assert row.is_thesis
-    assert row.is_stable
-    assert row.helps
-    assert row.gain == tried(CASE_4).gain
-
-
 def test_what_a_robot_identifies_of_itself_helps_nearly_as_much_as_the_truth() -> None:
     true = follow(stage_of(CASE_4, SEED), CASE_4.gains, 3, ON_MODULE, true_model(VERTICAL, SEED), X5, SEED)
     # Both are left with the friction of the single module; the model's error is under a percent of 2.3 Nm.
@@ -262,7 +255,7 @@ def test_the_command_identifies_follows_prints_and_draws(
 
     program = "sim.commands.assistance"
     monkeypatch.setattr(f"{program}.cases", lambda quick: [CASE_4])
-    monkeypatch.setattr(f"{program}.run_trials", through_a_pipe)
+    monkeypatch.setattr("sim.commands.experiment.run_trials", through_a_pipe)
     monkeypatch.setattr(f"{program}.identify_robot", identified)
     file, picture = tmp_path / "a.json", tmp_path / "a.png"
     done = CliRunner().invoke(app, ["assistance", "--json", str(file), "--picture", str(picture)])

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from sim.benchmark.case import Case, Summary
@@ -13,7 +14,9 @@ from sim.benchmark.cases.reassembly import Reassembly
 from sim.benchmark.cases.regressor import RegressorTrial
 from sim.benchmark.cases.suites import DYNAMIC_TRIALS, QUICK_DYNAMICS, dynamic_cases, full_dynamics
 from sim.benchmark.row import Row
-from sim.thesis.torque_assistance_report import AssistanceRow
+from sim.thesis.torque_assistance import ON_MODULE, Follow, Gains
+from sim.thesis.torque_assistance_cases import Case as Combined
+from sim.thesis.torque_assistance_cases import Combination
 
 CASES = {case.name: case for case in dynamic_cases(full_dynamics(), seed=0)}
 
@@ -133,8 +136,13 @@ def test_assemblies_that_tell_nothing_new_together_miss() -> None:
     ]
 
 
-def assisted(rms: tuple[float, float, float], unstable: str = "") -> AssistanceRow:
-    return AssistanceRow("", "arm6", False, 4, None, rms, ("", "", unstable))
+def assisted(rms: tuple[float, float, float], unstable: str = "") -> Combination:
+    nothing = np.empty((0, 1))
+    first, second, third = (
+        Follow(error, 1.0, 0.0, 0.0, 0.0, words, nothing, nothing)
+        for error, words in zip(rms, ("", "", unstable), strict=True)
+    )
+    return Combination(Combined("arm6", "", "all joints", Gains(4), ON_MODULE), (first, second, third))
 
 
 def test_calculated_torque_must_help_where_it_is_stable() -> None:
