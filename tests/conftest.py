@@ -10,7 +10,7 @@ import pytest
 from numpy.random import Generator
 
 from coordinator.excitation.plan import Plan
-from coordinator.identification.result import Result, chain_part, write_result
+from coordinator.identification.result import ChainPart, Result, write_result
 from coordinator.recording.run_folder import RESULT
 from tests import random_chains
 
@@ -79,7 +79,7 @@ def known_folder(tmp_path: Path) -> Callable[..., Path]:
             "serials": known.serials,
             "types": {module.serial: module.type for module in known.modules},
             "topology_confidence": 1.0,
-            "chain": chain_part(true_chain(known)),
+            "chain": ChainPart.of(true_chain(known)),
             "rank": 1,
             "condition": 1.0,
             "reduced_chi2": 1.0,

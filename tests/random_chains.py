@@ -10,7 +10,7 @@ from coordinator.kinematics.initial_guess import own_line
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import CATALOGUE, GRAVITY_M_S2, ModuleType
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import ancestors, carrier, imu_poses
+from module_agent.model.forward_kinematics import imu_poses
 
 # Where the fit expects it: without noise nothing draws it elsewhere.
 G = GRAVITY_M_S2
@@ -79,7 +79,7 @@ def observe(chain: Chain, positions: np.ndarray) -> list[PairObservation]:
     """Every circle that exists, joint i at `positions[i]` (n,)."""
     found = []
     for k, observer in enumerate(chain.serials):
-        for i in ancestors(chain, carrier(chain, k)):
+        for i in chain.ancestors(chain.carrier(k)):
             q = positions[i]
             found.append(PairObservation(chain.serials[i], observer, *circle(chain, i, k, q), 0.0, 0.0, q))
     return found

@@ -29,7 +29,6 @@ from coordinator.identification.robot_refinement import CUTOFF_HZ, KEEP_EVERY, M
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, sensor_data, window
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import descendants
 from module_agent.model.perturbation import adjoint, frozen, perturbation_between
 from module_agent.signals.filtering import settling_samples
 
@@ -203,7 +202,7 @@ def _problem(fits: TiedFits) -> _Problem:
 def _slope(chain: Chain, child: int) -> Array:
     """Return the increments (6 (n - 1), 6) of all but the root by one link's change in its IMU's frame."""
     found = np.zeros((6 * len(chain.serials), 6))
-    for module in descendants(chain, child):
+    for module in chain.descendants(child):
         found[6 * module : 6 * module + 6] = adjoint(chain.imu_home[child])
     return found[6:]
 

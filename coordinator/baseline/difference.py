@@ -7,7 +7,7 @@ that hang together by kept links are a part of the robot that is as it was known
 from typing import NamedTuple
 
 from coordinator.topology.topology import Topology
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE
 
 
 class Difference(NamedTuple):

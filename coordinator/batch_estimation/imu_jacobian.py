@@ -13,7 +13,6 @@ import numpy as np
 
 from coordinator.batch_estimation.imu_prediction import BodyMotion, acceleration_at, turned
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import ancestors, carrier
 from module_agent.model.perturbation import cross
 
 
@@ -48,8 +47,8 @@ def imu_jacobian(
         q_rad, qd_rad_s: (m, n) joint positions and velocities.
         module: whose IMU.
     """
-    body = carrier(chain, module)
-    joints = ancestors(chain, body)
+    body = chain.carrier(module)
+    joints = chain.ancestors(body)
     seen = _at_home(chain.imu_home[module], q_rad.shape[0])
     moved = {body: _displaced(bodies[body], seen)}
     for joint in reversed(joints):

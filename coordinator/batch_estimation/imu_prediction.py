@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.batch_estimation.sensor_data import BaseMotion
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, carrier
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import cross, skew
 
 
@@ -62,7 +61,7 @@ def readings_on(chain: Chain, bodies: list[BodyMotion], turns: LinkTurns | None 
     samples = bodies[BASE].omega.shape[1]
     gyro, accel = np.empty((samples, joints, 3)), np.empty((samples, joints, 3))
     for k in range(joints):
-        motion = bodies[carrier(chain, k)]
+        motion = bodies[chain.carrier(k)]
         if turns and not chain.reversed[k]:
             motion = given(motion, turns.get(k, ()))
         turn, place = chain.imu_home[k, :3, :3], chain.imu_home[k, :3, 3, None]

@@ -25,8 +25,7 @@ from coordinator.batch_estimation.imu_prediction import (
 )
 from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate
 

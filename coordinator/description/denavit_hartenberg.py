@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import ancestors
 from module_agent.model.perturbation import frozen
 
 PARALLEL_BELOW_RAD = 1e-7
@@ -42,8 +41,7 @@ class DhPath(NamedTuple):
 
 def dh_paths(chain: Chain, parallel_below_rad: float = PARALLEL_BELOW_RAD) -> tuple[DhPath, ...]:
     """Return one table per leaf, in the order of the chain."""
-    leaves = [k for k in range(len(chain.serials)) if k not in chain.parent]
-    return tuple(dh_path(chain, leaf, parallel_below_rad) for leaf in leaves)
+    return tuple(dh_path(chain, leaf, parallel_below_rad) for leaf in chain.leaves)
 
 
 def dh_path(chain: Chain, leaf: int, parallel_below_rad: float = PARALLEL_BELOW_RAD) -> DhPath:
@@ -52,7 +50,7 @@ def dh_path(chain: Chain, leaf: int, parallel_below_rad: float = PARALLEL_BELOW_
     Frame 0 has its origin at the first joint's point and its x along the root frame's x, as near as it goes.
     Of parallel axes the common normal through the last origin is taken, so that d = 0.
     """
-    path = ancestors(chain, leaf)
+    path = chain.ancestors(leaf)
     first = path[0]
     frame = _frame(chain.axis[first], _beside(chain.axis[first]), chain.point[first])
     base, rows = frozen(frame), []

@@ -22,8 +22,7 @@ from coordinator.description.urdf_writer import link_homes, upright_pose
 from coordinator.dynamics.pseudo_inertia import body, is_consistent, nearest_consistent, pseudo_inertia
 from coordinator.kinematics.frames import distal_homes, housing_homes
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.regressor import PER_BODY, check_phi
 
 VERSION = "1.6.0"
@@ -96,11 +95,11 @@ def hrdf_element(
 def joint_order(chain: Chain) -> tuple[int, ...]:
     """Return the joints in the order in which the format counts its degrees of freedom: branch by branch."""
     order: list[int] = []
-    stack = [k for k in reversed(range(len(chain.parent))) if chain.parent[k] == BASE]
+    stack = list(reversed(chain.roots))
     while stack:
         joint = stack.pop()
         order.append(joint)
-        stack += [k for k in reversed(range(len(chain.parent))) if chain.parent[k] == joint]
+        stack += reversed(chain.children(joint))
     return tuple(order)
 
 
@@ -128,7 +127,7 @@ def _follow(parent: Element, robot: _Robot, carrier: int, frame: Array) -> None:
     Without recursion over a chain: one of a hundred joints is as deep as it is long.
     """
     while True:
-        children = [k for k, p in enumerate(robot.chain.parent) if p == carrier]
+        children = robot.chain.children(carrier)
         if len(children) != 1:
             break
         _rigid(parent, robot, carrier, frame, robot.entry[children[0]])

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from coordinator.kinematics.frames import distal_homes, proximal_homes
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import adjoint, frozen, skew
 
 Face = Literal["output", "housing"]

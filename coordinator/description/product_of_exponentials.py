@@ -16,7 +16,6 @@ from scipy.spatial.transform import RigidTransform
 from coordinator.kinematics.frames import distal_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import ancestors
 from module_agent.model.perturbation import frozen, skew
 
 
@@ -68,12 +67,11 @@ def screw_model(chain: Chain, types: Sequence[ModuleType], covariance: ArrayLike
     # Displaced by the twist d, a screw changes by ad(d) S = -ad(S) d.
     slope = -_ad(screws)
     homes = distal_homes(chain, types)
-    leaves = [k for k in range(count) if k not in chain.parent]
     return ScrewModel(
         serials=chain.serials,
         screws=screws,
         covariance=frozen(slope @ own @ np.swapaxes(slope, 1, 2)),
-        tips=tuple(_tip(chain, leaf, homes[leaf], own[leaf]) for leaf in leaves),
+        tips=tuple(_tip(chain, leaf, homes[leaf], own[leaf]) for leaf in chain.leaves),
     )
 
 
@@ -103,7 +101,7 @@ def _tip(chain: Chain, leaf: int, home: Array, covariance: Array) -> Tip:
     return Tip(
         serial=chain.serials[leaf],
         frame="housing" if chain.reversed[leaf] else "output",
-        joints=tuple(chain.serials[i] for i in ancestors(chain, leaf)),
+        joints=tuple(chain.serials[i] for i in chain.ancestors(leaf)),
         home=frozen(home),
         covariance=frozen(covariance),
     )

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from coordinator.dynamics.pseudo_inertia import parameters, pseudo_inertia
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 
 STANDARD_GRAVITY = (0.0, 0.0, 9.81)
 _MOVING, _FIXED = ("revolute", "continuous"), "fixed"

@@ -22,8 +22,7 @@ from coordinator.dynamics.pseudo_inertia import (
     smallest_eigenvalue,
 )
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, carrier
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.regressor import PER_BODY, check_phi
 
 
@@ -91,7 +90,7 @@ def robot_element(
             kind = module_types[i]
             SubElement(joint, "limit", effort=_text(kind.max_effort_nm), velocity=_text(kind.max_speed_rad_s))
     for k, serial in enumerate(chain.serials):
-        on = carrier(chain, k)
+        on = chain.carrier(k)
         SubElement(robot, "link", name=f"imu_{serial}")
         pose = _relative(homes, on, chain.imu_home[k])
         _joint(robot, f"imu_mount_{serial}", "fixed", _link_name(chain, on), f"imu_{serial}", pose)

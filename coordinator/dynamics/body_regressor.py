@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.batch_estimation.imu_prediction import BodyMotion, LinkTurn, LinkTurns, given, turned
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import cross
 from module_agent.model.regressor import PER_BODY
 
@@ -55,7 +54,7 @@ def body_tracks(
             for joint, screw in near[parent].items():
                 screws[joint] = _carried(chain, i, q_rad[:, i], _beyond(screw, turns.get(i, ())))
         near.append(screws)
-        link = turns.get(_first_child(chain, i), ())
+        link = turns.get(next(iter(chain.children(i)), BASE), ())
         found.append(
             BodyTrack(given(bodies[i], link), {joint: _beyond(s, link) for joint, s in screws.items()})
         )
@@ -71,10 +70,6 @@ def track_regressor(tracks: Sequence[BodyTrack]) -> Array:
         for joint, screw in track.screws.items():
             found[:, joint, PER_BODY * i : PER_BODY * (i + 1)] = _row(track.motion, screw).T
     return found
-
-
-def _first_child(chain: Chain, body: int) -> int:
-    return next((k for k, parent in enumerate(chain.parent) if parent == body), BASE)
 
 
 def _beyond(screw: Screw, link: Sequence[LinkTurn]) -> Screw:

@@ -11,8 +11,7 @@ import numpy as np
 
 from coordinator.kinematics.frames import distal_homes, housing_homes, output_homes, proximal_homes
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 
 # What turns with a module's output: a flange and the last wheel of the gear. Not published; a flange of
 # aluminium of 36 mm by 6 mm has 16 g, the wheel and its bearing about as much.

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, body_displacements, places_on_axes
+from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.forward_kinematics import body_displacements, places_on_axes
 
 # An X5's housing is 31 mm deep and 110 mm long, its tubes are of 32 mm; two of them, and the cables.
 CLEARANCE_M = 0.10

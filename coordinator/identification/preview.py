@@ -27,8 +27,7 @@ from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinne
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import MotionSeen, Topology, likely_topology
 from module_agent.model.catalogue import ModuleType, module_type
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.signals.filtering import settling_samples
 from module_agent.wire.messages import Estimate
 
@@ -86,8 +85,7 @@ def beside(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
     """
     open_ = [s not in explored for s in chain.serials]
     return tuple(
-        parent != BASE
-        and not any(open_[other] for other, p in enumerate(chain.parent) if p == parent and other != k)
+        parent != BASE and not any(open_[other] for other in chain.children(parent) if other != k)
         for k, parent in enumerate(chain.parent)
     )
 

@@ -28,6 +28,19 @@ class ChainPart(Part):
     imu_home: list[list[list[float]]]
     gravity: list[float]
 
+    @classmethod
+    def of(cls, chain: Chain) -> "ChainPart":
+        """Return a chain as lists."""
+        return cls(**chain.to_dict())
+
+    def chain(self) -> Chain:
+        """Return the chain with arrays.
+
+        Raises:
+            ChainError: shapes that do not fit each other.
+        """
+        return Chain.from_dict(self.model_dump())
+
 
 class LinkPart(Part):
     """The thesis' link length: perpendicular distance from the parent's axis to the child's IMU at q = 0."""
@@ -289,19 +302,6 @@ class Result(Part):
     wall_time_s: float | None
     trace_hash: str
     schema_version: int = Field(default=SCHEMA, alias="schema")
-
-
-def chain_part(chain: Chain) -> ChainPart:
-    """Return a chain as lists."""
-    return ChainPart(
-        serials=list(chain.serials),
-        parent=list(chain.parent),
-        reversed=list(chain.reversed),
-        axis=chain.axis.tolist(),
-        point=chain.point.tolist(),
-        imu_home=chain.imu_home.tolist(),
-        gravity=chain.gravity.tolist(),
-    )
 
 
 def write_result(path: Path, result: Result) -> None:

@@ -11,6 +11,7 @@ from coordinator.identification.result import (
     BaseParameterPart,
     BodiesPart,
     BodyPart,
+    ChainPart,
     DhPart,
     DhRowPart,
     DynamicsPart,
@@ -27,7 +28,6 @@ from coordinator.identification.result import (
     TransformPart,
     UnknownPart,
     UnresolvedPart,
-    chain_part,
 )
 from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ModuleType, module_type
@@ -66,7 +66,7 @@ def build_result(
         types=named,
         topology_confidence=topology.confidence,
         topology=_mountings(topology),
-        chain=chain_part(fit.chain),
+        chain=ChainPart.of(fit.chain),
         rank=fit.rank,
         condition=fit.condition,
         reduced_chi2=fit.reduced_chi2,

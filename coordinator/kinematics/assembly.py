@@ -26,7 +26,6 @@ from coordinator.kinematics.null_space import Unresolved, name_null_space
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
 from module_agent.model.perturbation import apply_perturbation, frozen, skew
 
 # A direction counts as resolved if its one sigma is below this (rad or m). A parallel pair of axes is never
@@ -225,9 +224,8 @@ def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
     Where the length is zero it has no slope; the sigma is then that of the place across the axis.
     """
     length, sigma = np.full((2, len(chain.serials)), np.nan)
-    for k, parent in enumerate(chain.parent):
-        if parent == BASE:
-            continue
+    for k in chain.linked:
+        parent = chain.parent[k]
         axis, place = chain.axis[parent], chain.imu_home[k, :3, 3]
         off = place - chain.point[parent]
         radial = off - axis * (axis @ off)

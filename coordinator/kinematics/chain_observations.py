@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import body_displacements, carrier
+from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.perturbation import adjoint, skew
 from module_agent.wire.messages import Estimate
 
@@ -154,7 +154,7 @@ class _Geometry:
         self.chain, self.seen = chain, seen
         count = len(chain.serials)
         self.parent = np.array(chain.parent)
-        self.carrier = np.array([carrier(chain, k) for k in range(count)])
+        self.carrier = np.array([chain.carrier(k) for k in range(count)])
         # The base in the last place is body -1 and never moves.
         self.body = np.tile(np.eye(4), (len(seen.positions), count + 1, 1, 1))
         self.body[:, :-1] = body_displacements(chain, seen.positions)

@@ -12,7 +12,6 @@ import numpy as np
 
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
 from module_agent.model.perturbation import frozen
 
 # Of the sine: below this two axes are parallel, and any tilt makes the angle grow.
@@ -26,9 +25,8 @@ def axis_angles(chain: Chain, covariance: Array) -> tuple[Array, Array]:
     module is turned about its parent's axis, or placed along it, does not matter.
     """
     angle, sigma = np.full((2, len(chain.serials)), np.nan)
-    for k, parent in enumerate(chain.parent):
-        if parent == BASE:
-            continue
+    for k in chain.linked:
+        parent = chain.parent[k]
         cross = np.cross(chain.axis[parent], chain.axis[k])
         sine = float(np.linalg.norm(cross))
         angle[k] = np.arctan2(sine, chain.axis[parent] @ chain.axis[k])

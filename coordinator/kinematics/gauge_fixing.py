@@ -11,8 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from coordinator.kinematics.null_space import Kind, Unresolved, name_null_space
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, ancestors, descendants
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import adjoint, apply_perturbation, frozen
 
 # What a wrong orientation counts against a wrong place: the displacement at a usual module's reach.
@@ -65,7 +64,7 @@ def gauge_freedoms(chain: Chain, unresolved: Sequence[Unresolved]) -> tuple[Gaug
     found: list[GaugeFreedom] = []
     for item in unresolved:
         first = chain.serials.index(item.modules[0])
-        path = ancestors(chain, first)
+        path = chain.ancestors(first)
         if item.kind in ("offset_along_axis", "rotation_about_axis"):
             joint = chain.serials.index(item.joint)
             if joint in path[:-1]:
@@ -94,7 +93,7 @@ def moved(chain: Chain, free: Sequence[GaugeFreedom], amounts: Array) -> Chain:
     for one in free:
         twists = _twists(chain, one)
         increment = np.zeros((len(chain.serials), 6))
-        increment[list(descendants(chain, one.branch))] = amounts[used : used + len(twists)] @ twists
+        increment[list(chain.descendants(one.branch))] = amounts[used : used + len(twists)] @ twists
         chain = apply_perturbation(chain, increment.ravel())
         used += len(twists)
     return chain

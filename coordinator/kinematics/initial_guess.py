@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from coordinator.kinematics.chain_observations import ChainObservations
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, body_displacements, screw_motion
+from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.forward_kinematics import body_displacements, screw_motion
 from module_agent.model.perturbation import frozen
 
 # How far a mounting may be from neutral, in rad and m. It only fills in what no observation says better than

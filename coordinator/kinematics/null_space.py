@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, ancestors, descendants
 from module_agent.model.perturbation import frozen
 
 Kind = Literal[
@@ -60,19 +59,18 @@ def _hidden(item: Unresolved, null_basis: Array) -> bool:
 
 def _candidates(chain: Chain) -> Iterator[Unresolved]:
     # Branch by branch: two children of one joint do not see each other, so each can hide on its own.
-    for child, joint in enumerate(chain.parent):
-        if joint != BASE:
-            yield _offset(chain, joint, child)
-            yield _rotation(chain, joint, child)
-    roots = [k for k, parent in enumerate(chain.parent) if parent == BASE]
-    for root in roots[1:]:
+    for child in chain.linked:
+        joint = chain.parent[child]
+        yield _offset(chain, joint, child)
+        yield _rotation(chain, joint, child)
+    for root in chain.roots[1:]:
         yield _position(chain, root)
         yield _heading(chain, root)
 
 
 def _offset(chain: Chain, joint: int, child: int) -> Unresolved:
-    name, further = chain.serials[joint], ancestors(chain, joint)[:-1]
-    beyond = descendants(chain, child)
+    name, further = chain.serials[joint], chain.ancestors(joint)[:-1]
+    beyond = chain.descendants(child)
     text = f"offset of {_branch(chain, child)} along {name}'s axis"
     if not further:
         text += ": not observable from inertial sensors on a fixed base"
@@ -84,8 +82,8 @@ def _offset(chain: Chain, joint: int, child: int) -> Unresolved:
 
 
 def _rotation(chain: Chain, joint: int, child: int) -> Unresolved:
-    name, further = chain.serials[joint], ancestors(chain, joint)[:-1]
-    beyond = descendants(chain, child)
+    name, further = chain.serials[joint], chain.ancestors(joint)[:-1]
+    beyond = chain.descendants(child)
     text = f"rotation of {_branch(chain, child)} about {name}'s axis at {name}'s zero"
     text += (
         f": the axis is parallel to gravity and to every joint further up ({_names(chain, further)})"
@@ -102,14 +100,14 @@ def _rotation(chain: Chain, joint: int, child: int) -> Unresolved:
 
 
 def _position(chain: Chain, root: int) -> Unresolved:
-    tree, name = descendants(chain, root), chain.serials[root]
+    tree, name = chain.descendants(root), chain.serials[root]
     twists = np.concatenate([np.zeros((3, 3)), np.eye(3)])
     text = f"position of {name}'s tree relative to {chain.serials[0]}: nothing moves both"
     return _item(chain, "position", None, tree, text, "nothing: both stand on the base; measure it", twists)
 
 
 def _heading(chain: Chain, root: int) -> Unresolved:
-    tree, name = descendants(chain, root), chain.serials[root]
+    tree, name = chain.descendants(root), chain.serials[root]
     up = chain.gravity / np.linalg.norm(chain.gravity)
     twist = np.r_[up, np.cross(chain.imu_home[root, :3, 3], up)]
     text = f"heading of {name}'s tree relative to {chain.serials[0]}: gravity does not tell it"
@@ -161,7 +159,7 @@ def _combination(chain: Chain, direction: Array) -> Unresolved:
 
 def _branch(chain: Chain, child: int) -> str:
     name = chain.serials[child]
-    return name if len(descendants(chain, child)) == 1 else f"{name} and everything beyond it"
+    return name if len(chain.descendants(child)) == 1 else f"{name} and everything beyond it"
 
 
 def _names(chain: Chain, modules: tuple[int, ...]) -> str:

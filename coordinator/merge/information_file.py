@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from module_agent.model.chain import Array, Chain
+from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.information import JointInformation
 
 VERSION = 2
@@ -46,14 +46,10 @@ class InformationFileError(ValueError):
 
 def write_information(path: Path, run: RunInformation) -> None:
     """Write the information of a run, whole or not at all."""
-    chain = run.chain
     arrays: dict[str, Any] = {
         "version": VERSION,
         "session": run.session,
-        "serials": np.array(chain.serials),
-        "parent": np.array(chain.parent, dtype=np.int64),
-        "reversed": np.array(chain.reversed, dtype=bool),
-        **{name: getattr(chain, name) for name in ("axis", "point", "imu_home", "gravity")},
+        **{name: np.array(values) for name, values in run.chain.to_dict().items()},
         "sigma_nm": run.sigma_nm,
         "independent_fraction": run.independent_fraction,
         "phi_parts": run.phi_parts,
@@ -88,7 +84,7 @@ def read_information(path: Path) -> RunInformation:
         raise InformationFileError(
             f"{path}: {error.strerror or error}; a run with dynamics writes it, and so does replaying one"
         ) from error
-    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (KeyError, ValueError, ChainError, zipfile.BadZipFile) as error:
         if isinstance(error, InformationFileError):
             raise
         raise InformationFileError(f"{path} is not the information of a run: {error}") from error
@@ -98,15 +94,6 @@ def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
     for array in arrays.values():
         array.flags.writeable = False
     joints = len(arrays["serials"])
-    chain = Chain(
-        serials=tuple(str(serial) for serial in arrays["serials"]),
-        parent=tuple(int(parent) for parent in arrays["parent"]),
-        reversed=tuple(bool(turned) for turned in arrays["reversed"]),
-        axis=_checked(arrays["axis"], (joints, 3)),
-        point=_checked(arrays["point"], (joints, 3)),
-        imu_home=_checked(arrays["imu_home"], (joints, 4, 4)),
-        gravity=_checked(arrays["gravity"], (3,)),
-    )
     rest, samples = _checked(arrays["rest_nm2"], (joints,)), arrays["samples"]
     found = tuple(
         JointInformation(
@@ -121,7 +108,7 @@ def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
     return RunInformation(
         name=name,
         session=str(arrays["session"]),
-        chain=chain,
+        chain=Chain.from_dict(arrays),
         joints=found,
         sigma_nm=_checked(arrays["sigma_nm"], (joints,)),
         independent_fraction=float(arrays["independent_fraction"]),

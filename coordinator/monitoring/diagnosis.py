@@ -20,7 +20,6 @@ from coordinator.monitoring.residual_tests import (
     drive_window,
     imu_evidence,
     information_of,
-    linked,
     torque_evidence,
 )
 from coordinator.monitoring.segments import DataSegment
@@ -166,7 +165,7 @@ def _drives(reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece
 def _link(
     reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece], laden: bool
 ) -> LinkShift | None:
-    children = linked(reference.chain)
+    children = reference.chain.linked
     if not children:
         return None
     later = without_own(joined([piece.imu for piece in pieces]), reference.imu_model.own_sigma)

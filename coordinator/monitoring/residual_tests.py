@@ -41,7 +41,6 @@ from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.base_parameters import whitened
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import ancestors
 from module_agent.model.information import JointInformation, gather
 from module_agent.model.regressor import PER_BODY, inverse_dynamics
 
@@ -180,18 +179,12 @@ def link_changes(chain: Chain) -> tuple[Array, ...]:
     count = len(chain.serials)
     total = _PER_TWIST * count + 3 + len(_LASTING) * count
     found = []
-    for child in linked(chain):
+    for child in chain.linked:
         change = np.zeros((total, _PER_TWIST))
-        for module in range(count):
-            if child in ancestors(chain, module):
-                change[_PER_TWIST * module : _PER_TWIST * (module + 1)] = LARGE * np.eye(_PER_TWIST)
+        for module in chain.descendants(child):
+            change[_PER_TWIST * module : _PER_TWIST * (module + 1)] = LARGE * np.eye(_PER_TWIST)
         found.append(change)
     return tuple(found)
-
-
-def linked(chain: Chain) -> tuple[int, ...]:
-    """Return the modules whose link to another module is tested."""
-    return tuple(k for k, parent in enumerate(chain.parent) if parent >= 0)
 
 
 def displacement(chain: Chain, child: int, size: Array) -> tuple[Array, Array]:

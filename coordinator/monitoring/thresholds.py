@@ -6,7 +6,6 @@ import numpy as np
 
 from coordinator.monitoring.likelihood_ratio import gain_above
 from coordinator.monitoring.reference import Reference
-from coordinator.monitoring.residual_tests import linked
 from coordinator.monitoring.segments import SEGMENT_S
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY
@@ -42,7 +41,7 @@ def thresholds(reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR) -
     looks = len(SPANS) * 3600.0 / SEGMENT_S
     return Thresholds(
         gain_above(PER_BODY, looks * count, each),
-        gain_above(_LINK_FREEDOM, looks * max(len(linked(reference.chain)), 1), each),
+        gain_above(_LINK_FREEDOM, looks * max(len(reference.chain.linked), 1), each),
         gain_above(_DRIVE_FREEDOM, looks * count, each),
         np.maximum(reference.contact.level_nm(each), MIN_CONTACT * effort),
     )

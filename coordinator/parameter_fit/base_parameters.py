@@ -285,7 +285,7 @@ def joint_frames(chain: Chain) -> Array:
     frames = np.tile(np.eye(4), (len(chain.serials), 1, 1))
     for i, frame in enumerate(frames):
         axis, point = chain.axis[i], chain.point[i]
-        child = next((k for k, parent in enumerate(chain.parent) if parent == i), None)
+        child = next(iter(chain.children(i)), None)
         found = None if child is None else _towards(axis, point, chain.axis[child], chain.point[child])
         if found is None:
             found = _beside(axis, point, chain.imu_home[i, :3, 3]) or (_any_normal(axis), point)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from coordinator.batch_estimation.imu_prediction import turned
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, carrier
 from module_agent.model.perturbation import cross, frozen
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
@@ -234,11 +233,7 @@ def _variance(residual: Array) -> float:
 
 def _turns(chain: Chain, imu: int, q: Array, qd: Array, qdd: Array) -> tuple[Array, list[int], Array] | None:
     """Return the rate (m, 3) of an IMU by the joints, who they are, and their slopes (j, m, 3)."""
-    path: list[int] = []
-    joint = carrier(chain, imu)
-    while joint != BASE:
-        path.insert(0, joint)
-        joint = chain.parent[joint]
+    path = list(chain.ancestors(chain.carrier(imu)))
     if not path:
         return None
     samples = len(q)

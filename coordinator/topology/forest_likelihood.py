@@ -12,8 +12,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
-from module_agent.model.chain import Array
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array
 
 # (n,) the index of every module's parent, BASE on the base; parents need not come first.
 Parents = tuple[int, ...]

@@ -15,8 +15,7 @@ import numpy as np
 
 from coordinator.topology.forest_likelihood import Parents, ancestors, edge_log_odds, likeliest_forest, rivals
 from coordinator.topology.motion_evidence import carried_log_odds
-from module_agent.model.chain import Array
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array
 
 # What is less likely than this (log-odds) to be right is worth another motion: 1 in 100 may be wrong.
 DOUBTFUL_BELOW = float(np.log(99.0))

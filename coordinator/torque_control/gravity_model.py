@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from coordinator.baseline.known_robot import BaselineError
 from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.pseudo_inertia import parameter_transform
-from coordinator.identification.result import BodiesPart, BodyPart, ChainPart, Result
+from coordinator.identification.result import BodiesPart, BodyPart, Result
 from coordinator.recording.run_folder import RESULT
 from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import inverse_dynamics
@@ -69,20 +69,10 @@ def weight_of(result: Result) -> GravityModel:
     dynamics = result.dynamics
     if dynamics is None:
         raise ValueError("a result without dynamics does not tell what the robot weighs")
-    chain = _chain(result.chain)
+    chain = result.chain.chain()
     phi = np.array(dynamics.phi) if dynamics.bodies is None else _phi(chain, dynamics.bodies)
     phi.flags.writeable = False
     return GravityModel(result.robot, tuple(result.types[s] for s in chain.serials), chain, phi)
-
-
-def _chain(part: ChainPart) -> Chain:
-    arrays = (part.axis, part.point, part.imu_home, part.gravity)
-    axis, point, imu_home, gravity = (np.array(values, dtype=float) for values in arrays)
-    for array in (axis, point, imu_home, gravity):
-        array.flags.writeable = False
-    return Chain(
-        tuple(part.serials), tuple(part.parent), tuple(part.reversed), axis, point, imu_home, gravity
-    )
 
 
 def _phi(chain: Chain, part: BodiesPart) -> Array:

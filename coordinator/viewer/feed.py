@@ -17,8 +17,7 @@ from coordinator.synchronisation.round_trips import map_clock
 from coordinator.viewer.scene.blueprint import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.scene.robot_geometry import side_by_side
 from coordinator.viewer.viewer import Viewer
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.messages import Feedback, Message, Status
 

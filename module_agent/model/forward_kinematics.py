@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from module_agent.model.chain import Array, Chain
-
-BASE = -1
+from module_agent.model.chain import BASE, Array, Chain
 
 
 def body_displacements(chain: Chain, q_rad: ArrayLike) -> Array:
@@ -45,7 +43,7 @@ def imu_poses(chain: Chain, q_rad: ArrayLike) -> Array:
     displacement = body_displacements(chain, q_rad)
     poses = np.empty_like(displacement)
     for k in range(len(chain.serials)):
-        body = carrier(chain, k)
+        body = chain.carrier(k)
         home = chain.imu_home[k]
         poses[:, k] = home if body == BASE else displacement[:, body] @ home
     poses.flags.writeable = False
@@ -61,32 +59,6 @@ def screw_motion(axis: ArrayLike, point: ArrayLike, angle_rad: ArrayLike) -> Arr
     motion[:, :3, 3] = np.asarray(point) - turn @ np.asarray(point, dtype=float)
     motion[:, 3, 3] = 1.0
     return motion
-
-
-def carrier(chain: Chain, module: int) -> int:
-    """Return the body that carries the housing and IMU of `module`: its own if reversed, else its parent's.
-
-    A body has the index of the joint that moves it; -1 is the base.
-    """
-    return module if chain.reversed[module] else chain.parent[module]
-
-
-def descendants(chain: Chain, joint: int) -> tuple[int, ...]:
-    """Return the bodies that move with `joint`, itself first, in the order of the chain."""
-    moving = [joint]
-    for i in range(joint + 1, len(chain.parent)):
-        if chain.parent[i] in moving:
-            moving.append(i)
-    return tuple(moving)
-
-
-def ancestors(chain: Chain, body: int) -> tuple[int, ...]:
-    """Return the joints that move `body`, from the root joint to the body's own; empty for the base."""
-    path: list[int] = []
-    while body != BASE:
-        path.append(body)
-        body = chain.parent[body]
-    return tuple(reversed(path))
 
 
 def places_on_axes(chain: Chain) -> Array:

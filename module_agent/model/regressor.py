@@ -107,9 +107,7 @@ def _carriers(chain: Chain) -> tuple[Index, Index]:
     """Return the joints that carry every body (n, n), the root's first, and how many they are (n,)."""
     joints = len(chain.serials)
     carriers, depth = np.zeros((joints, joints), dtype=np.int64), np.zeros(joints, dtype=np.int64)
-    for body, parent in enumerate(chain.parent):
-        if parent >= 0:
-            carriers[body], depth[body] = carriers[parent], depth[parent]
-        carriers[body, depth[body]] = body
-        depth[body] += 1
+    for body in range(joints):
+        above = chain.ancestors(body)
+        carriers[body, : len(above)], depth[body] = above, len(above)
     return carriers, depth

@@ -21,16 +21,7 @@ from module_agent.wire.information_messages import InformationRequest, SpanPart
 
 def coupled(chain: Chain, joint: int) -> tuple[int, ...]:
     """Return the joints that a joint's torque depends on: itself, those that carry it, those it carries."""
-    found = [joint]
-    parent = chain.parent[joint]
-    while parent >= 0:
-        found.append(parent)
-        parent = chain.parent[parent]
-    carried = {joint}
-    for child in range(joint + 1, len(chain.parent)):
-        if chain.parent[child] in carried:
-            carried.add(child)
-    return tuple(sorted({*found, *carried}))
+    return (*chain.ancestors(joint)[:-1], *chain.descendants(joint))
 
 
 def own_information(

@@ -24,13 +24,13 @@ def chain_part(chain: Chain) -> ChainPart:
     Raises:
         ValueError: more modules than a message carries.
     """
-    joints = len(chain.serials)
+    joints, fields = len(chain.serials), chain.to_dict()
     columns = [chain.axis, chain.point, chain.imu_home.reshape(joints, 16)]
     x, y, z = (float(value) for value in chain.gravity)
     return ChainPart(
         serials=chain.serials,
-        parent=tuple(int(parent) for parent in chain.parent),
-        reversed=tuple(bool(turned) for turned in chain.reversed),
+        parent=tuple(fields["parent"]),
+        reversed=tuple(fields["reversed"]),
         geometry=np.hstack(columns).astype("<f8").tobytes(),
         gravity_m_s2=(x, y, z),
     )
@@ -44,22 +44,18 @@ def chain_of(part: ChainPart) -> Chain:
             value that is not finite.
     """
     joints = len(part.serials)
-    if len(part.parent) != joints or len(part.reversed) != joints or len(set(part.serials)) != joints:
-        raise ValueError(f"{joints} serials, {len(part.parent)} parents, {len(part.reversed)} mountings")
     if len(part.geometry) != joints * GEOMETRY_BYTES:
         raise ValueError(
             f"{len(part.geometry)} bytes of geometry, {joints} modules need {joints * GEOMETRY_BYTES}"
         )
-    if any(parent >= child for child, parent in enumerate(part.parent)):
-        raise ValueError(f"parents {part.parent}: a parent comes before its children")
-    values = np.frombuffer(part.geometry, "<f8").astype(np.float64).reshape(joints, 22)
-    if not np.isfinite(values).all():
-        raise ValueError("the chain's geometry holds a value that is not finite")
-    gravity = np.array(part.gravity_m_s2)
-    axis, point, home = values[:, :3].copy(), values[:, 3:6].copy(), values[:, 6:].reshape(joints, 4, 4)
-    for array in (axis, point, home, gravity):
-        array.flags.writeable = False
-    return Chain(part.serials, part.parent, part.reversed, axis, point, home, gravity)
+    values = np.frombuffer(part.geometry, "<f8").reshape(joints, 22)
+    geometry = {
+        "axis": values[:, :3],
+        "point": values[:, 3:6],
+        "imu_home": values[:, 6:].reshape(joints, 4, 4),
+        "gravity": part.gravity_m_s2,
+    }
+    return Chain.from_dict(part.model_dump(include={"serials", "parent", "reversed"}) | geometry)
 
 
 def clock_part(clock: ClockMap) -> ClockPart:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol, TypeVar
 
+from module_agent.model.errors import RobotError
 from module_agent.peers.row_collection import MotionCollection, OwnRows, Track
 from module_agent.wire.information_messages import MAX_PART_BYTES, CollectRequest, InformationRequest
 from module_agent.wire.refusal import Refusal, WireError
@@ -101,7 +102,7 @@ def _compute(serial: str, request: InformationRequest, tracks: Mapping[int, Mapp
         return _Result(pack(own_information(serial, request, tracks)), "")
     except KeyError as error:
         return _Result(b"", f"no rows of {error.args[0]} were kept for a motion")
-    except ValueError as error:
+    except (ValueError, RobotError) as error:
         # A finding too, to be told to whoever asks.
         return _Result(b"", str(error))
     except Exception as error:

@@ -27,11 +27,6 @@ class TipError(NamedTuple):
     orientation_rad: float
 
 
-def leaves(chain: Chain) -> tuple[int, ...]:
-    """Return the modules that are no module's parent."""
-    return tuple(i for i in range(len(chain.serials)) if i not in chain.parent)
-
-
 def reorder(chain: Chain, serials: tuple[str, ...]) -> Chain:
     """Return the chain with its modules in another order, in which parents still come before children."""
     order = [chain.serials.index(serial) for serial in serials]
@@ -82,7 +77,7 @@ def align_gauge(estimated: Chain, reference: Chain, null_basis: ArrayLike, q_rad
     basis = np.asarray(null_basis, dtype=float)
     if not basis.shape[1]:
         return estimated
-    tips = list(leaves(reference))
+    tips = list(reference.leaves)
     q = np.asarray(q_rad, dtype=float)
     target = imu_poses(reference, q)[:, tips]
 
@@ -97,7 +92,7 @@ def align_gauge(estimated: Chain, reference: Chain, null_basis: ArrayLike, q_rad
 
 def tip_error(estimated: Chain, reference: Chain, q_rad: ArrayLike) -> TipError:
     """Compare the leaf IMUs' poses in the root frame over configurations (m, n)."""
-    tips = list(leaves(reference))
+    tips = list(reference.leaves)
     found, target = imu_poses(estimated, q_rad)[:, tips], imu_poses(reference, q_rad)[:, tips]
     offset = found[..., :3, 3] - target[..., :3, 3]
     chord = np.linalg.norm(found[..., :3, :3] - target[..., :3, :3], axis=(-2, -1))

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, UnresolvedPart
-from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import frozen
+from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.world.truth import Motion, read_motion, read_truth
@@ -111,7 +110,10 @@ def score(run: Path) -> Score:
         ScoreError: a file is missing, broken or does not fit the others; the message says which and how.
     """
     result = _read_result(run / "result.json")
-    estimated = _chain(result.chain, run / "result.json")
+    try:
+        estimated = result.chain.chain()
+    except ChainError as error:
+        raise ScoreError(f"{run / 'result.json'}: chain.{error}") from error
     truth = _read_truth(run / "truth.json")
     differences = topology_differences(estimated, truth)
     basis = _null_basis(result, run / "result.json")
@@ -234,33 +236,6 @@ def _read_result(path: Path) -> _ResultFile:
     return found
 
 
-def _chain(part: ChainPart, path: Path) -> Chain:
-    n = len(part.serials)
-    shapes = {
-        "parent": (n,),
-        "reversed": (n,),
-        "axis": (n, 3),
-        "point": (n, 3),
-        "imu_home": (n, 4, 4),
-        "gravity": (3,),
-    }
-    for name, shape in shapes.items():
-        try:
-            found = np.shape(getattr(part, name))
-        except ValueError as error:
-            raise ScoreError(f"{path}: chain.{name} has rows of different lengths") from error
-        if found != shape:
-            raise ScoreError(f"{path}: chain.{name} has shape {found}, {n} modules need {shape}")
-    if any(not -1 <= parent < i for i, parent in enumerate(part.parent)):
-        raise ScoreError(f"{path}: chain.parent {part.parent} does not put every parent before its children")
-    return Chain(
-        tuple(part.serials),
-        tuple(part.parent),
-        tuple(part.reversed),
-        *(frozen(value) for value in (part.axis, part.point, part.imu_home, part.gravity)),
-    )
-
-
 def _null_basis(result: _ResultFile, path: Path) -> Array:
     rows = 6 * len(result.serials)
     if not result.null_basis:
@@ -277,7 +252,7 @@ def _read_truth(path: Path) -> Chain:
         raise ScoreError(f"{path} lacks {error}") from error
     except ScoreError:
         raise
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, ChainError) as error:
         raise ScoreError(f"{path} is broken: {error}") from error
 
 

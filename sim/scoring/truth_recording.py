@@ -19,7 +19,7 @@ from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from coordinator.viewer.viewer_process import MergeFailed, merge_into
-from module_agent.model.chain import Chain
+from module_agent.model.chain import ChainError
 from sim.geometry.pose import Array
 from sim.scoring.truth_view import TruthView
 from sim.world.truth import Motion, read_motion, read_truth
@@ -49,12 +49,12 @@ def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None
         drawn = Viewer(truth.robot, run.name, targets, waits=True, lays_out=False)
         start_ns, end_ns = int(shown.t_ns[0]), int(shown.t_ns[-1])
         view.values(drawn, (0, end_ns))
-        chain = _chain(result)
+        chain = result.chain.chain()
         view.chain(drawn, start_ns, chain, name_null_space(chain, np.array(result.null_basis)))
         drawn.poses(shown.t_ns, shown.q_rad, shown.serials)
         drawn.close()
         merge_into(run / VIEW, run / ADDITION)
-    except (OSError, ValueError, KeyError, MergeFailed) as failure:
+    except (OSError, ValueError, KeyError, ChainError, MergeFailed) as failure:
         say(f"the true robot is not in {run / VIEW}: {failure}")
     finally:
         (run / ADDITION).unlink(missing_ok=True)
@@ -62,19 +62,6 @@ def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None
 
 def _result(run: Path) -> Result:
     return Result.model_validate_json((run / RESULT).read_bytes())
-
-
-def _chain(result: Result) -> Chain:
-    part = result.chain
-    return Chain(
-        serials=tuple(part.serials),
-        parent=tuple(part.parent),
-        reversed=tuple(part.reversed),
-        axis=np.array(part.axis),
-        point=np.array(part.point),
-        imu_home=np.array(part.imu_home),
-        gravity=np.array(part.gravity),
-    )
 
 
 def _motion(recording: Recording, motion: Motion) -> _Shown:

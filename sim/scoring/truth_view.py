@@ -14,8 +14,7 @@ from coordinator.kinematics.gauge_fixing import gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.viewer.scene.blueprint import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.viewer import Viewer
-from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Chain
 from sim.scoring.gauge_alignment import move_root
 
 
@@ -67,8 +66,6 @@ def beside(truth: Chain, estimated: Chain, unresolved: Sequence[Unresolved]) -> 
 
 def _comparable(truth: Chain, estimated: Chain) -> list[str]:
     """Return the modules that stand in both as parts of the same tree, or of one that is free in both."""
-    top: list[int] = []
-    for k, parent in enumerate(estimated.parent):
-        top.append(k if parent == BASE else top[parent])
+    top = [estimated.ancestors(k)[0] for k in range(len(estimated.serials))]
     apart = [truth.parent[truth.serials.index(estimated.serials[r])] == BASE for r in top]
     return [s for s, r, free in zip(estimated.serials, top, apart, strict=True) if r == 0 or free]

@@ -75,14 +75,11 @@ def write_truth(path: Path, robot: Robot, world: World | None = None) -> None:
     """Write `truth_of` as JSON, atomically."""
     truth = truth_of(robot, world)
     errors = truth.sensor_errors
-    chain = {
-        k: v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in truth.chain._asdict().items()
-    }
     document = {
         "version": VERSION,
         "robot": truth.robot,
         "module_types": list(truth.module_types),
-        "chain": chain,
+        "chain": truth.chain.to_dict(),
         "inertia": truth.inertia.tolist(),
         "clocks": None if truth.clocks is None else [clock._asdict() for clock in truth.clocks],
         "imu_bias": None if truth.imu_bias is None else truth.imu_bias.tolist(),
@@ -105,25 +102,13 @@ def read_truth(path: Path) -> Truth:
     return Truth(
         robot=document["robot"],
         module_types=tuple(document["module_types"]),
-        chain=_chain(document["chain"]),
+        chain=Chain.from_dict(document["chain"]),
         inertia=read_only(np.array(document["inertia"])),
         clocks=None if clocks is None else tuple(ModuleClock(**clock) for clock in clocks),
         imu_bias=None if bias is None else read_only(np.array(bias)),
         sensor_errors=None
         if errors is None
         else SensorErrors(**{k: read_only(np.array(v)) for k, v in errors.items()}),
-    )
-
-
-def _chain(fields: dict[str, Any]) -> Chain:
-    return Chain(
-        serials=tuple(fields["serials"]),
-        parent=tuple(fields["parent"]),
-        reversed=tuple(fields["reversed"]),
-        axis=read_only(np.array(fields["axis"])),
-        point=read_only(np.array(fields["point"])),
-        imu_home=read_only(np.array(fields["imu_home"])),
-        gravity=read_only(np.array(fields["gravity"])),
     )
 
 

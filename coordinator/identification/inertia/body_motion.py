@@ -25,7 +25,6 @@ from coordinator.dynamics.body_regressor import BodyTrack, body_tracks
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, carrier
 from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
 
@@ -114,7 +113,7 @@ def _turns(
     base: BaseMotion | None,
 ) -> LinkTurns:
     """Return how links turn; without any if the refinement has not looked for what gives."""
-    links = [i for i, parent in enumerate(chain.parent) if parent != BASE]
+    links = list(chain.linked)
     turns: LinkTurns = {}
     if len(refined.compliance) != 5 * len(links):
         return turns
@@ -128,7 +127,7 @@ def _turns(
 
 def _rider(chain: Chain, body: int) -> int | None:
     """Return the module whose IMU rides on a body, None if none does."""
-    return next((k for k in range(len(chain.serials)) if carrier(chain, k) == body), None)
+    return next((k for k in range(len(chain.serials)) if chain.carrier(k) == body), None)
 
 
 def _corrected(
@@ -140,7 +139,7 @@ def _corrected(
     rider: int,
 ) -> BodyTrack:
     """Return a track with what an IMU on the body reads beyond it; means are the IMU's, not the body's."""
-    expected = bodies[carrier(chain, rider)]
+    expected = bodies[chain.carrier(rider)]
     if not chain.reversed[rider]:
         expected = given(expected, turns.get(rider, ()))
     turn, place = chain.imu_home[rider, :3, :3], chain.imu_home[rider, :3, 3, None]

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.catalogue import module_type
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, carrier, descendants
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import apply_perturbation
 
 
@@ -78,7 +77,7 @@ def _module(chain: Chain, k: int, types: Mapping[str, str]) -> Module:
     nominal = housing[:3, :3] @ made.output_xyz + housing[:3, 3]
     axis, point = chain.axis[k], chain.point[k]
     return Module(
-        housing_body=carrier(chain, k),
+        housing_body=chain.carrier(k),
         output_body=chain.parent[k] if chain.reversed[k] else k,
         housing=housing,
         box=_BOXES.get(made.name, _X5_BOX),
@@ -155,13 +154,12 @@ def side_by_side(chain: Chain) -> Chain:
 
     Nothing that sensors on a fixed base tell depends on where a second tree stands.
     """
-    roots = [k for k, parent in enumerate(chain.parent) if parent == BASE]
-    if len(roots) == 1:
+    if len(chain.roots) == 1:
         return chain
     along = _horizontal(chain)
     shift, end = np.zeros((len(chain.serials), 6)), 0.0
-    for number, root in enumerate(roots):
-        tree = list(descendants(chain, root))
+    for number, root in enumerate(chain.roots):
+        tree = list(chain.descendants(root))
         places = np.concatenate([chain.imu_home[tree, :3, 3], chain.point[tree]]) @ along
         if number > 0:
             shift[tree, 3:] = (end + GAP_M - places.min()) * along

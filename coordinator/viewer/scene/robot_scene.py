@@ -11,8 +11,8 @@ from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS
 from coordinator.viewer.scene.robot_geometry import Link, Module, from_z, links, modules, upright
 from coordinator.viewer.scene.time_series import IntArray, time_column
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, body_displacements
+from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.forward_kinematics import body_displacements
 
 LINK_RADIUS_M = 0.009
 OUTPUT_RADIUS_M = 0.024

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import rerun as rr
 
 from coordinator.viewer.scene import entity_paths
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE
 
 BASE_NODE = "base"
 BASE_COLOUR: entity_paths.Colour = (200, 200, 210, 255)

@@ -18,8 +18,7 @@ from coordinator.baseline.check_report import CheckReport, LinkCheck
 from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify_kinematics
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE, ancestors
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, count, largest, scaled
@@ -134,7 +133,7 @@ def draw_link_change(robot: Robot, seed: int, change_m: float) -> Wear:
 def _hidden(chain: Chain, child: int) -> Array | None:
     """Return the direction along which no joint shows that a module is displaced, in the root frame."""
     parent = chain.parent[child]
-    axes = chain.axis[list(ancestors(chain, parent))] if parent != BASE else np.zeros((0, 3))
+    axes = chain.axis[list(chain.ancestors(parent))] if parent != BASE else np.zeros((0, 3))
     return axes[-1] if len(axes) and np.all(np.abs(axes @ axes[-1]) > PARALLEL) else None
 
 

@@ -24,7 +24,6 @@ from coordinator.monitoring.monitor import Heard, Watcher
 from coordinator.monitoring.reference import Reference, build_reference
 from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import ancestors
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.cases.link_change import Wear, draw_link_change, worn
@@ -275,7 +274,7 @@ def _is_there(chain: Chain, finding: Finding, serial: str) -> bool:
     if finding.kind != "collision":
         return finding.serial == serial
     named, where = (chain.serials.index(s) for s in (finding.serial, serial))
-    return named in ancestors(chain, where)
+    return named in chain.ancestors(where)
 
 
 def confusion(trials: Sequence[MonitoringTrial]) -> dict[Happens, dict[Found, int]]:

@@ -16,8 +16,7 @@ from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
-from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import BASE
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
 from sim.benchmark.cases.inertia import PLAN, QUICK_PLAN

@@ -11,7 +11,6 @@ from coordinator.baseline.update import placed
 from coordinator.batch_estimation.estimator import Refinement
 from coordinator.topology.topology import Topology
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import descendants
 from module_agent.model.perturbation import adjoint, apply_perturbation, perturbation_between
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
@@ -59,7 +58,7 @@ def _spread(chain: Chain, sigma: Mapping[str, tuple[float, float]]) -> np.ndarra
     for k, serial in enumerate(chain.serials):
         if k:
             columns = np.zeros((6 * len(chain.serials), 6))
-            for j in descendants(chain, k):
+            for j in chain.descendants(k):
                 columns[6 * j : 6 * j + 6] = adjoint(chain.imu_home[k])
             found += columns @ np.diag(np.repeat(sigma.get(serial, FINE), 3) ** 2) @ columns.T
     return found

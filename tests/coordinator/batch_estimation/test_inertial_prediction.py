@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.batch_estimation.imu_prediction import imu_readings
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import carrier, imu_poses
+from module_agent.model.forward_kinematics import imu_poses
 
 
 class Reference:
@@ -27,7 +27,7 @@ class Reference:
             )
         self.frames: list[int] = []
         for k, home in enumerate(chain.imu_home):
-            body = carrier(chain, k)
+            body = chain.carrier(k)
             origin = np.zeros(3) if body < 0 else chain.point[body]
             place = pin.SE3(home[:3, :3], home[:3, 3] - origin)
             joint_id = 0 if body < 0 else joints[body]

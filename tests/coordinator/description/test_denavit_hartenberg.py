@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.description.denavit_hartenberg import DhPath, dh_path, dh_paths, dh_poses, dh_transform
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import ancestors, body_displacements
+from module_agent.model.forward_kinematics import body_displacements
 
 
 def displaced(chain: Chain, path: DhPath, q: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ def test_the_tables_of_a_random_tree_move_every_leaf_as_its_screws_do(robots: An
     leaves = [k for k in range(2 + seed) if k not in chain.parent]
     assert len(paths) == len(leaves)
     for leaf, path in zip(leaves, paths, strict=True):
-        assert [row.serial for row in path.rows] == [chain.serials[i] for i in ancestors(chain, leaf)]
+        assert [row.serial for row in path.rows] == [chain.serials[i] for i in chain.ancestors(leaf)]
         assert all(row.a_m >= 0 for row in path.rows)
         np.testing.assert_allclose(
             displaced(chain, path, q), body_displacements(chain, q)[:, leaf], atol=1e-9

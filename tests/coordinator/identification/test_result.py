@@ -10,10 +10,10 @@ from pydantic import ValidationError
 
 from coordinator.identification.result import (
     SCHEMA,
+    ChainPart,
     ExponentialsPart,
     LinkPart,
     Result,
-    chain_part,
     write_result,
 )
 from module_agent.model.chain import Chain
@@ -38,7 +38,7 @@ def _result(robot: str = "robot") -> Result:
         serials=["A", "B"],
         types={"A": "X5-1", "B": "X5-4"},
         topology_confidence=0.4,
-        chain=chain_part(_chain()),
+        chain=ChainPart.of(_chain()),
         rank=4,
         condition=10.0,
         reduced_chi2=1.0,

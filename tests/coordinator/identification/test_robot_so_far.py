@@ -11,7 +11,6 @@ import pytest
 from coordinator.identification.preview import beside, preview
 from coordinator.kinematics.assembly import link_lengths
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import ancestors, carrier
 from module_agent.wire.feedback_rows import ROW
 
 RESTED, MOVED = 100, 200
@@ -42,7 +41,7 @@ class Seen:
     def _estimate(self, robots: Any, joint: str, observer: str) -> Any:
         chain = self._chain
         i, k = chain.serials.index(joint), chain.serials.index(observer)
-        moved = i in ancestors(chain, carrier(chain, k))
+        moved = i in chain.ancestors(chain.carrier(k))
         circle = None
         if moved:
             axis, radial = robots.circle(chain, i, k, np.zeros(len(chain.serials)))
@@ -105,7 +104,7 @@ def test_a_module_stands_on_the_nearest_joint_that_has_moved_and_moves_it(robots
         found = preview(recording, explored)
         nearest = {}
         for k, serial in enumerate(chain.serials):
-            above = [chain.serials[i] for i in ancestors(chain, carrier(chain, k))]
+            above = [chain.serials[i] for i in chain.ancestors(chain.carrier(k))]
             moved = [s for s in above if s in explored]
             nearest[serial] = moved[-1] if moved else None
         tied = set(nearest.values()) - {None} | {s for s, p in nearest.items() if p is not None}

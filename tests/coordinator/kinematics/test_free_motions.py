@@ -8,7 +8,6 @@ import pytest
 from coordinator.kinematics.gauge_fixing import carried, gauge_fixed, gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved, name_null_space
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import descendants
 from module_agent.model.perturbation import apply_perturbation
 
 
@@ -21,7 +20,7 @@ def hidden(chain: Chain) -> tuple[Unresolved, ...]:
             np.r_[chain.axis[0], np.cross(chain.point[0], chain.axis[0])],
         ):
             column = np.zeros((len(chain.serials), 6))
-            column[list(descendants(chain, child))] = twist
+            column[list(chain.descendants(child))] = twist
             columns.append(column.ravel())
     basis, _ = np.linalg.qr(np.array(columns).T)
     found = name_null_space(chain, basis)

@@ -18,7 +18,6 @@ from coordinator.kinematics.simultaneous_motion import (
 )
 from coordinator.topology.topology import find_topology
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import ancestors, carrier
 
 RATE_HZ = 250.0
 DURATION_S = 12.0
@@ -83,7 +82,7 @@ def test_circles_are_near_the_true_ones_and_within_what_is_claimed_of_them(
     response = answered(chain, seed)
     found = circles_of_all(chain.serials, response)
     index = {serial: k for k, serial in enumerate(chain.serials)}
-    carried = [(i, k) for k in range(6) for i in ancestors(chain, carrier(chain, k)) if i != k]
+    carried = [(i, k) for k in range(6) for i in chain.ancestors(chain.carrier(k)) if i != k]
     assert sorted((index[p.joint], index[p.observer]) for p in found) == sorted(carried)
     axis_off, radius_off = [], []
     for pair in found:

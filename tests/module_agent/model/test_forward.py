@@ -7,10 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import (
-    ancestors,
     body_displacements,
-    carrier,
-    descendants,
     imu_poses,
 )
 
@@ -81,8 +78,8 @@ def test_a_joint_moves_its_descendants_and_nobody_else() -> None:
         q = np.zeros((1, 8))
         q[0, joint] = 0.7
         shift = np.abs(body_displacements(chain, q)[0] - np.eye(4)).max(axis=(1, 2))
-        assert tuple(np.flatnonzero(shift > 1e-9)) == descendants(chain, joint)
-        assert all(joint in ancestors(chain, body) for body in descendants(chain, joint))
+        assert tuple(np.flatnonzero(shift > 1e-9)) == chain.descendants(joint)
+        assert all(joint in chain.ancestors(body) for body in chain.descendants(joint))
 
 
 def test_points_on_the_axis_stay_where_they_are() -> None:
@@ -94,7 +91,7 @@ def test_points_on_the_axis_stay_where_they_are() -> None:
 def test_the_imu_rides_on_its_own_body_only_when_reversed() -> None:
     chain = random_chain(2, joints=5)
     for k in range(5):
-        assert carrier(chain, k) == (k if chain.reversed[k] else chain.parent[k])
+        assert chain.carrier(k) == (k if chain.reversed[k] else chain.parent[k])
 
 
 def test_results_cannot_be_written_to() -> None:

@@ -9,7 +9,7 @@ from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import body_displacements, descendants
+from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.regressor import PER_BODY, inverse_dynamics, torque_regressor
 
 # Pinocchio's order of a body's dynamic parameters: m, mc, Ixx, Ixy, Iyy, Ixz, Iyz, Izz.
@@ -133,7 +133,7 @@ def test_a_joint_feels_only_the_bodies_it_carries(joints: int, seed: int) -> Non
     chain = random_chain(rng, joints)
     y = torque_regressor(chain, *random_motion(rng, 3, joints))
     for i in range(joints):
-        carried = descendants(chain, i)
+        carried = chain.descendants(i)
         for j in range(joints):
             block = y[:, i, PER_BODY * j : PER_BODY * (j + 1)]
             assert bool(np.any(block)) == (j in carried)

@@ -5,11 +5,11 @@ import pytest
 from numpy.random import Generator, default_rng
 
 from module_agent.model.chain import Array, Chain
-from module_agent.model.forward_kinematics import descendants, imu_poses
+from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
-from sim.scoring.gauge_alignment import align_gauge, leaves, move_root, reorder, reorder_basis, tip_error
+from sim.scoring.gauge_alignment import align_gauge, move_root, reorder, reorder_basis, tip_error
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def poses(rng: Generator, chain: Chain) -> Array:
 def beyond(chain: Chain, joint: int, twist: Array) -> Array:
     """Increment that moves every module mounted beyond a joint by one twist."""
     found = np.zeros((len(chain.serials), 6))
-    found[list(descendants(chain, joint)[1:])] = twist
+    found[list(chain.descendants(joint)[1:])] = twist
     return found.ravel()
 
 
@@ -38,7 +38,7 @@ def yaw_and_height(chain: Chain) -> Array:
 
 
 def test_the_leaves_are_the_modules_that_carry_nothing(chain: Chain) -> None:
-    assert [chain.serials[i] for i in leaves(chain)] == ["left-3", "right-2"]
+    assert [chain.serials[i] for i in chain.leaves] == ["left-3", "right-2"]
 
 
 @pytest.mark.parametrize("yaw_rad", [0.01, 1.0, -2.5, 3.1, np.pi])

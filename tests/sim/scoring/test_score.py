@@ -9,7 +9,6 @@ import pytest
 from numpy.random import default_rng
 from rich.console import Console
 
-from coordinator.identification.result import chain_part
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import apply_perturbation
 from sim.commands.score import table
@@ -89,7 +88,7 @@ def make_run(
     document = {
         "schema": 1,
         "serials": list(chain.serials),
-        "chain": chain_part(chain).model_dump(),
+        "chain": chain.to_dict(),
         "unresolved": [
             {"kind": "rotation_about_axis", "joint": "root", "modules": [], "words": "yaw beyond root"}
         ],
@@ -277,10 +276,10 @@ def test_what_is_wrong_within_a_file_is_named(tmp_path: Path) -> None:
         ({"null_basis": [[1.0]]}, "null_basis must have 36 rows"),
         ({"serials": ["root"]}, r"serials and chain\.serials differ"),
         (
-            {"chain": chain_part(TRUTH).model_dump() | {"axis": [[0.0, 0.0, 1.0]]}},
+            {"chain": TRUTH.to_dict() | {"axis": [[0.0, 0.0, 1.0]]}},
             r"chain\.axis has shape \(1, 3\)",
         ),
-        ({"chain": chain_part(TRUTH).model_dump() | {"parent": [1, 0, 1, 2, 0, 4]}}, "every parent before"),
+        ({"chain": TRUTH.to_dict() | {"parent": [1, 0, 1, 2, 0, 4]}}, "every parent before"),
     ]
     for changed, words in cases:
         with pytest.raises(ScoreError, match=words):

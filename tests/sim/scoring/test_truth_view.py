@@ -10,8 +10,7 @@ from rerun.chunk import RrdReader
 from coordinator.excitation.plan import Plan
 from coordinator.kinematics.null_space import Unresolved, name_null_space
 from coordinator.runtime.terminal import Terminal
-from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import BASE, ancestors, descendants
+from module_agent.model.chain import BASE, Chain
 from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
@@ -30,7 +29,7 @@ def free(chain: Chain) -> tuple[Unresolved, ...]:
             np.r_[chain.axis[0], np.cross(chain.point[0], chain.axis[0])],
         ):
             column = np.zeros((len(chain.serials), 6))
-            column[list(descendants(chain, child))] = twist
+            column[list(chain.descendants(child))] = twist
             columns.append(column.ravel())
     basis, _ = np.linalg.qr(np.array(columns).T)
     found = name_null_space(chain, basis)
@@ -73,7 +72,7 @@ def test_a_part_of_the_robot_in_its_own_frame_has_the_whole_truth_beside_it() ->
     housing = truth.imu_home[root].copy()
     housing[:3, 3] -= housing[:3, :3] @ [0.025, 0.0, 0.003]
     there, _ = move_root(truth, np.zeros((24, 0)), np.linalg.inv(housing))
-    kept = [root, *[k for k in range(4) if root in ancestors(truth, k)[:-1]]]
+    kept = [root, *[k for k in range(4) if root in truth.ancestors(k)[:-1]]]
     part = Chain(
         serials=tuple(there.serials[k] for k in kept),
         parent=(BASE, 0),
