@@ -29,6 +29,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import apply_perturbation, frozen
+from module_agent.signals.autocorrelation import samples_per_independent
 
 ITERATIONS = 20
 CONVERGED = 1e-7
@@ -39,7 +40,7 @@ FARTHEST = 0.3
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 FINEST = 1e-6
 # Samples, 50 a second.
-LONGEST_LAG = 100
+MAX_LAG = 100
 
 Index = NDArray[np.int64]
 
@@ -171,27 +172,9 @@ def _spread(data: SensorData, residual: Array) -> Array:
 
 
 def _believed(data: SensorData, residual: Array) -> Array:
-    """Return the spread of every motion, (motions, n), widened for what repeats in it."""
+    """Return the spread of every motion, (motions, n), widened for the correlation of its samples."""
     parts = [residual[samples] for samples in data.motions]
-    return np.stack([_rms(part) * np.sqrt(repeats(part)) for part in parts])
-
-
-def repeats(residual: Array) -> Array:
-    """Return how many samples of residuals (m, n, 3) say the same, for every IMU (n,), at least 1.
-
-    That is 1 + 2 sum |rho(lag)|, the variance of a sum of correlated samples over that of independent ones
-    (Bayley and Hammersley, 1946), with the correlations' magnitude, as what follows the motion is met again
-    at every turn of it; over the lags whose correlation is more than chance makes it, up to 2 s.
-    """
-    samples = residual.shape[0]
-    lags = min(samples // 4, LONGEST_LAG)
-    centred = residual - residual.mean(axis=0)
-    spectrum = np.fft.rfft(centred, 2 * samples, axis=0)
-    covariance = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: lags + 1].sum(axis=2)
-    correlation = np.abs(covariance[1:] / np.maximum(covariance[0], FINEST**2))
-    # Three axes share a lag; of as many correlations of nothing the largest is below four sigmas.
-    correlation[correlation < 4.0 / np.sqrt(3.0 * samples)] = 0.0
-    return np.asarray(1.0 + 2.0 * correlation.sum(axis=0))
+    return np.stack([_rms(part) * np.sqrt(samples_per_independent(part, MAX_LAG, FINEST)) for part in parts])
 
 
 def _normal_equations(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import DYNAMIC_CUTOFF_HZ, RATE_HZ, STEP_NS
 from module_agent.model.chain import Array
+from module_agent.signals.autocorrelation import autocovariance
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
 
@@ -286,9 +287,7 @@ def noise_level(residuals: Sequence[Array]) -> tuple[Array, Array]:
     sigma = np.sqrt(np.mean(whole**2, axis=0))
     longest = len(whole) // 4
     counted = np.ones(whole.shape[1])
-    size = 1 << int(np.ceil(np.log2(2 * len(whole))))
-    spectrum = np.abs(np.fft.rfft(whole, size, axis=0)) ** 2
-    shared = np.fft.irfft(spectrum, size, axis=0)[:longest]
+    shared = autocovariance(whole)[:longest]
     shared = shared / np.maximum(shared[0], 1e-300)
     for c in range(whole.shape[1]):
         negative = np.flatnonzero(shared[:, c] <= 0.0)

@@ -19,6 +19,7 @@ from scipy.linalg import qr
 
 from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from module_agent.model.chain import Array
+from module_agent.signals.autocorrelation import autocovariance
 
 # 95 % as efficient as least squares on normal noise (Huber and Ronchetti 2009, Robust statistics, table 4.1).
 HUBER_LIMIT = 1.345
@@ -171,11 +172,8 @@ def correlation_times(residual: ArrayLike) -> Array:
 
 
 def _correlation_time(residual: Array) -> float:
-    there = np.isfinite(residual).astype(float)
-    size = 2 * residual.size
-    # By the lag: sum of products of samples that are both there, over their number.
-    signal, mask = (np.fft.rfft(a, size) for a in (np.nan_to_num(residual), there))
-    products, pairs = (np.fft.irfft(np.abs(a) ** 2, size)[: residual.size] for a in (signal, mask))
+    # By the lag: sum of products of samples that were both used, over their number.
+    products, pairs = autocovariance(np.nan_to_num(residual)), autocovariance(np.isfinite(residual))
     if not products[0] > 0.0:
         return 1.0
     rho = np.divide(products, pairs, out=np.zeros_like(products), where=pairs > 0.5)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from coordinator.batch_estimation.imu_prediction import turned
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import cross, frozen
+from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
 
@@ -37,6 +38,8 @@ MAX_OFF = 0.3
 STILL_RAD_S, FINEST_RAD_S = 0.02, 3e-4
 # A base clock runs as it does by definition.
 EXACT = 1e-12
+# One second of residuals (every fifth sample at 250 Hz).
+_MAX_LAG = 50
 
 
 class Moved(Protocol):
@@ -220,15 +223,7 @@ def _shares(nuisance: Array, variance: float, signals: Array) -> Array:
 def _variance(residual: Array) -> float:
     """Return the variance per axis of residuals (m, 3), as large as if its samples were independent."""
     size = float(np.mean(residual**2)) + FINEST_RAD_S**2 / 12.0
-    lags = min(len(residual) // 4, 50)
-    centred = residual - residual.mean(axis=0)
-    spectrum = np.fft.rfft(centred, 2 * len(residual), axis=0)
-    covariance = np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: lags + 1].sum(axis=1)
-    if covariance[0] <= 0.0:
-        return size
-    correlation = np.abs(covariance[1:] / covariance[0])
-    correlation[correlation < 4.0 / np.sqrt(3.0 * len(residual))] = 0.0
-    return size * float(1.0 + 2.0 * correlation.sum())
+    return size * float(samples_per_independent(residual, _MAX_LAG))
 
 
 def _turns(chain: Chain, imu: int, q: Array, qd: Array, qdd: Array) -> tuple[Array, list[int], Array] | None:

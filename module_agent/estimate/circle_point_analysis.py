@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
 from module_agent.estimate.windows import AlignedMotion, Array, ImuWindow
+from module_agent.signals.autocorrelation import autocovariance
 from module_agent.wire.messages import CircleEstimate, Vector3
 
 Mask = NDArray[np.bool_]
@@ -258,8 +259,7 @@ def _autocorrelation(series: Array) -> Array:
     power = float(series @ series)
     if power <= 0.0:
         return np.zeros_like(series)
-    spectrum = np.fft.rfft(series, 2 * series.size)
-    return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2)[: series.size] / power)
+    return autocovariance(series) / power
 
 
 def _variance_of_mean(series: Array) -> float:

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from coordinator.batch_estimation import estimator
-from coordinator.batch_estimation.estimator import refine_chain, repeats
+from coordinator.batch_estimation.estimator import refine_chain
 from coordinator.batch_estimation.imu_intrinsics import (
     BIASES_ONLY,
     DELAY,
@@ -284,21 +284,6 @@ def test_the_slopes_by_an_imus_own_errors_are_those_of_differences() -> None:
         np.testing.assert_allclose(found[k], (ahead - behind).T, atol=1e-14)
 
 
-def test_residuals_that_repeat_with_the_motion_count_as_fewer_samples() -> None:
-    rng = np.random.default_rng(0)
-    white = rng.normal(size=(600, 2, 3))
-    # Independent samples: none of a hundred correlations is above four sigmas.
-    np.testing.assert_array_equal(repeats(white), 1.0)
-    # A first-order process of correlation r says 1/N of it (1 + r) / (1 - r) times: nine for 0.8.
-    slow = np.zeros((6000, 1, 3))
-    for k in range(1, 6000):
-        slow[k] = 0.8 * slow[k - 1] + rng.normal(size=(1, 3))
-    assert repeats(slow)[0] == pytest.approx(9.0, rel=0.15)
-    # What swings with the motion is met again at every turn.
-    swing = np.sin(0.25 * np.arange(600))[:, None, None] * np.ones((1, 1, 3))
-    assert repeats(swing + 0.3 * white[:, :1])[0] > 50.0
-
-
 def test_what_the_model_leaves_out_widens_the_intervals(robots: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     truth, _ = robots.random(4, joints=3, serial=True)
     data = _sensed(truth, 1, noise=1.0)
@@ -306,7 +291,7 @@ def test_what_the_model_leaves_out_widens_the_intervals(robots: Any, monkeypatch
     swing = 0.03 * data.qdd_rad_s2[:, :1, None] * np.array([1.0, 0.0, 0.0])
     shaken = data._replace(accel_m_s2=data.accel_m_s2 + swing)
     told = refine_chain(truth, shaken)
-    monkeypatch.setattr(estimator, "repeats", lambda residual: np.ones(residual.shape[1]))
+    monkeypatch.setattr(estimator, "samples_per_independent", lambda residual, *_: np.ones(residual.shape[1]))
     untold = refine_chain(truth, shaken)
     np.testing.assert_array_equal(told.chain.imu_home, untold.chain.imu_home)
     wider = np.diag(told.covariance)[6:] / np.diag(untold.covariance)[6:]
