@@ -26,7 +26,6 @@ from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.regressor import PER_BODY, check_phi
 
 VERSION = "1.6.0"
-ACTUATORS = ("X5-1", "X5-4", "X5-9")
 # Two frames, or a joint's axis and its module's, are the same below this (m, and rad at a metre).
 SAME_BELOW = 1e-11
 _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -114,11 +113,10 @@ def _prepared(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None) 
 
 def _actuator(chain: Chain, k: int, kind: ModuleType, output: Array) -> str | None:
     """Return the format's type for a module, None if it has none that turns as this one does."""
-    name = kind.name.removesuffix("-old")
     off = output[:3, 3] - chain.point[k]
     beside = off - chain.axis[k] * (chain.axis[k] @ off)
     apart = max(float(np.abs(output[:3, 2] - chain.axis[k]).max()), float(np.abs(beside).max()))
-    return name if name in ACTUATORS and not chain.reversed[k] and apart < SAME_BELOW else None
+    return kind.hrdf_actuator if kind.hrdf_actuator and not chain.reversed[k] and apart < SAME_BELOW else None
 
 
 def _follow(parent: Element, robot: _Robot, carrier: int, frame: Array) -> None:

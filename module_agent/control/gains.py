@@ -3,17 +3,6 @@
 from module_agent.model.catalogue import ModuleType
 from module_agent.wire.messages import GainSet, PidGains
 
-# kp of (position, velocity, effort) by strategy, from the manufacturer's default gain files.
-_KP: dict[str, dict[int, tuple[float, float, float]]] = {
-    "X5-1": {2: (5.0, 0.1, 0.25), 3: (0.5, 0.05, 0.25), 4: (15.0, 0.05, 0.25)},
-    "X5-4": {2: (10.0, 0.2, 0.25), 3: (1.0, 0.05, 0.25), 4: (10.0, 0.05, 0.25)},
-    "X5-9": {2: (15.0, 0.5, 0.25), 3: (1.5, 0.05, 0.25), 4: (15.0, 0.05, 0.25)},
-}
-# The older generation has the same gear trains, and the snake module that of the X5-4 and no published file.
-for _name in ("X5-1", "X5-4", "X5-9"):
-    _KP[f"{_name}-old"] = _KP[_name]
-_KP["SEA-snake"] = _KP["X5-4"]
-
 
 def default_gains(kind: ModuleType, strategy: int) -> GainSet:
     """Return the factory gains of a module type for control strategy 0-4.
@@ -21,11 +10,11 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
     Position outputs Nm under strategies 2 and 4, velocity under strategy 2; those outputs are limited to the
     type's effort, all others to full PWM.
     """
-    kp = _KP[kind.name].get(strategy, _KP[kind.name][3])
+    kp = {2: kind.gains.strategy_2, 4: kind.gains.strategy_4}.get(strategy, kind.gains.strategy_3)
     effort = kind.max_effort_nm
     position_limit = effort if strategy in (2, 4) else 1.0
     velocity_limit = effort if strategy == 2 else 1.0
-    effort_target = 4.0 if kind.name in ("X5-1", "X5-1-old") else 1.6 * effort
+    effort_target = 1.6 * effort
     return GainSet(
         strategy=strategy,
         position=PidGains(kp=kp[0], min_output=-position_limit, max_output=position_limit),

@@ -12,24 +12,12 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import proj3d  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # type: ignore[import-untyped]
 
-from module_agent.model.catalogue import ModuleType, ModuleTypeName
+from module_agent.model.catalogue import CATALOGUE, ModuleType
 from sim.geometry.pose import Array, pose
 from sim.robot.robot_file import Robot
 from sim.robot.robot_tree import RobotTree, build_tree
 
-COLOURS: dict[ModuleTypeName, str] = {
-    "X5-1": "#4c9ed9",
-    "X5-4": "#3aa66a",
-    "X5-9": "#e0883a",
-    "X5-1-old": "#2f6288",
-    "X5-4-old": "#246a43",
-    "X5-9-old": "#8f5724",
-    "SEA-snake": "#9a6fc0",
-}
 _AXIS, _IMU, _LINK, _GRAVITY = "#c0264b", "#101010", "#6b6b6b", "#2050b0"
-# The housings' envelopes in their own frames: least and greatest corner [m].
-_X5_BOX = ((-0.0731, -0.0365, 0.0), (0.0365, 0.0365, 0.031))
-_SNAKE_BOX = ((-0.032, -0.0255, 0.0), (0.032, 0.0255, 0.032))
 _FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 _ELEVATION_DEG, _AZIMUTH_DEG = 22.0, -58.0
 
@@ -60,7 +48,7 @@ def draw(robot: Robot, path: Path | None = None) -> Figure:
 
 
 def _box(kind: ModuleType, housing: Array) -> Array:
-    low, high = _SNAKE_BOX if kind.name == "SEA-snake" else _X5_BOX
+    low, high = kind.housing_min_xyz, kind.housing_max_xyz
     corners = np.array(
         [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
     )
@@ -74,7 +62,7 @@ def _bodies(axes: Any, tree: RobotTree) -> Array:
         box = _box(kind, housing)
         faces = Poly3DCollection(
             [box[list(face)] for face in _FACES],
-            facecolor=COLOURS[kind.name],
+            facecolor=kind.colour,
             edgecolor="#303030",
             linewidth=0.6,
             alpha=0.35,
@@ -163,8 +151,8 @@ def _spread(wanted: Array, gap: float) -> Array:
 
 
 def _legend(figure: Figure, robot: Robot) -> None:
-    types = [name for name in COLOURS if any(m.type == name for m in robot.modules)]
-    handles = [Line2D([], [], color=COLOURS[t], linewidth=7, alpha=0.5, label=t) for t in types]
+    types = [kind for kind in CATALOGUE.values() if any(m.type == kind.name for m in robot.modules)]
+    handles = [Line2D([], [], color=t.colour, linewidth=7, alpha=0.5, label=t.name) for t in types]
     handles += [
         Line2D([], [], color=_AXIS, linewidth=1.8, marker=">", markersize=5, label="axis, turns to +q"),
         Line2D([], [], color=_IMU, linewidth=0, marker="o", markersize=4.5, label="IMU"),

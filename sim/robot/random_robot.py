@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from module_agent.model.catalogue import CATALOGUE, ModuleTypeName, module_type
+from module_agent.model.catalogue import CATALOGUE, module_type
 from sim.geometry.link_parts import BRACKETS
 from sim.geometry.pose import Array, inverse
 from sim.geometry.rigid_body import about_origin, joined, moved
@@ -25,7 +25,7 @@ GRAVITY_SHARE = 0.5
 ACCELERATION_RAD_S2 = 16.0
 # Its two right-angle ends alone take this much.
 SHORTEST_TUBE_M = 0.06
-_LADDER: tuple[ModuleTypeName, ...] = ("X5-1", "X5-4", "X5-9")
+_LADDER = ("X5-1", "X5-4", "X5-9")
 _TRIES = 40
 _SHRINK = 0.85
 
@@ -83,7 +83,7 @@ def _way_down(parent: Sequence[int], k: int) -> list[int]:
     return way
 
 
-def carries(kind: ModuleTypeName, load: JointLoad) -> bool:
+def carries(kind: str, load: JointLoad) -> bool:
     """Return whether a module of that type holds a load, and moves it as exploring does."""
     most = CATALOGUE[kind].max_effort_nm
     moving = load.weight_nm + ACCELERATION_RAD_S2 * load.inertia_kg_m2

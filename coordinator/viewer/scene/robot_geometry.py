@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from module_agent.model.catalogue import module_type
+from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import apply_perturbation
 
@@ -22,11 +22,6 @@ class Box(NamedTuple):
 
     size: tuple[float, float, float]
     centre: tuple[float, float, float]
-
-
-# The X5's output is not in the middle of its 110 mm: it is half a width (36.5 mm) from one end.
-_X5_BOX = Box((0.110, 0.073, 0.031), (-0.0185, 0.0, 0.0155))
-_BOXES = {"SEA-snake": Box((0.051, 0.051, 0.064), (0.0, 0.0, 0.032))}
 
 
 class Module(NamedTuple):
@@ -68,6 +63,12 @@ def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
     return tuple(_module(chain, k, types) for k in range(len(chain.serials)))
 
 
+def _box(made: ModuleType) -> Box:
+    corners = np.array([made.housing_min_xyz, made.housing_max_xyz])
+    size, centre = corners[1] - corners[0], corners.mean(axis=0)
+    return Box((size[0], size[1], size[2]), (centre[0], centre[1], centre[2]))
+
+
 def _module(chain: Chain, k: int, types: Mapping[str, str]) -> Module:
     serial = chain.serials[k]
     if serial not in types:
@@ -80,7 +81,7 @@ def _module(chain: Chain, k: int, types: Mapping[str, str]) -> Module:
         housing_body=chain.carrier(k),
         output_body=chain.parent[k] if chain.reversed[k] else k,
         housing=housing,
-        box=_BOXES.get(made.name, _X5_BOX),
+        box=_box(made),
         output=point + axis * float(axis @ (nominal - point)),
         axis=axis,
     )

@@ -9,7 +9,7 @@ import pytest
 from coordinator.excitation.plan import Plan
 from coordinator.session.motion_selection import MotionChoice
 from module_agent.control.waveform import duration_s, waveform
-from module_agent.model.catalogue import CATALOGUE, ModuleTypeName
+from module_agent.model.catalogue import CATALOGUE
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.messages import ConstantMotion, MotionRecord, Pattern, Rest, WindowedSine
 
@@ -51,7 +51,7 @@ class Told:
         return found
 
 
-def choice(plan: Plan, told: Told, kind: ModuleTypeName = "X5-4") -> MotionChoice:
+def choice(plan: Plan, told: Told, kind: str = "X5-4") -> MotionChoice:
     recording: Any = told
     return MotionChoice(plan, recording, lambda: SERIALS, lambda serial: CATALOGUE[kind])
 

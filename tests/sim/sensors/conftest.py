@@ -3,7 +3,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from module_agent.model.catalogue import ModuleTypeName, module_type
+from module_agent.model.catalogue import module_type
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.sensors.sensors import Instant, Sensors
 
@@ -19,7 +19,7 @@ class Bench:
         self,
         profile: NoiseProfile,
         serials: Sequence[str] = ("a", "b"),
-        kind: ModuleTypeName = "X5-9",
+        kind: str = "X5-9",
         seed: int = 1,
         imu_ticks: int = 4,
         tick_ns: int = 1_000_000,
