@@ -1,1 +1,63 @@
-"""What runs once: discovery, sequencing, chain model, regressor, estimates, viewer, files."""
+"""What runs once: discovery, sequencing, chain model, regressor, estimates, viewer, files.
+
+The library face: `from coordinator import load_run, identify, ...`. Each name is imported when it is first
+used, so that a program pays only for what it needs.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coordinator.arm_fit.data_file import read_log
+    from coordinator.batch_estimation.imu_prediction import imu_readings
+    from coordinator.description.urdf_reader import read_urdf
+    from coordinator.identification.identify import identify
+    from coordinator.library import (
+        denavit_hartenberg,
+        export_hrdf,
+        export_urdf,
+        forward_kinematics,
+        load_recording,
+        load_run,
+    )
+    from module_agent.model.regressor import inverse_dynamics, torque_regressor
+
+_HOMES = {
+    "denavit_hartenberg": "coordinator.library",
+    "export_hrdf": "coordinator.library",
+    "export_urdf": "coordinator.library",
+    "forward_kinematics": "coordinator.library",
+    "identify": "coordinator.identification.identify",
+    "imu_readings": "coordinator.batch_estimation.imu_prediction",
+    "inverse_dynamics": "module_agent.model.regressor",
+    "load_recording": "coordinator.library",
+    "load_run": "coordinator.library",
+    "read_log": "coordinator.arm_fit.data_file",
+    "read_urdf": "coordinator.description.urdf_reader",
+    "torque_regressor": "module_agent.model.regressor",
+}
+
+__all__ = [
+    "denavit_hartenberg",
+    "export_hrdf",
+    "export_urdf",
+    "forward_kinematics",
+    "identify",
+    "imu_readings",
+    "inverse_dynamics",
+    "load_recording",
+    "load_run",
+    "read_log",
+    "read_urdf",
+    "torque_regressor",
+]
+
+
+def __getattr__(name: str) -> object:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -86,7 +86,7 @@ def _frozen(signal: Array) -> Array:
     return copy
 
 
-def read_data(path: Path, joints: Sequence[str]) -> JointLog:
+def read_log(path: Path, joints: Sequence[str]) -> JointLog:
     """Return the recording in a file, its columns in the order of `joints`.
 
     Raises:

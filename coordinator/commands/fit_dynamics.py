@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_data
+from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_log
 from coordinator.arm_fit.filtered_log import filtered_log, most_samples, usual_cutoff_hz
 from coordinator.arm_fit.fit import STEPS, Elsewhere, Identified, identified
 from coordinator.arm_fit.physically_consistent import USUAL_TRUST
@@ -141,7 +141,7 @@ def _write_urdf(path: Path, given: Path, posed: Problem, found: Identified) -> N
 def _read(urdf: Path, data: Path, gravity: str) -> tuple[UrdfRobot, JointLog]:
     try:
         robot = read_urdf(urdf, _gravity(gravity))
-        return robot, read_data(data, robot.chain.serials)
+        return robot, read_log(data, robot.chain.serials)
     except (UrdfError, DataFileError) as error:
         fail(error, EXIT_USAGE)
     except OSError as error:
@@ -165,7 +165,7 @@ def _posed(
 def _elsewhere(posed: Problem, data: Path) -> Problem:
     """Pose another recording as the first one was, with its cut-off and its top speeds."""
     try:
-        log = read_data(data, posed.robot.chain.serials)
+        log = read_log(data, posed.robot.chain.serials)
         some = filtered_log(log, posed.log.cutoff_hz, most_samples(len(posed.robot.bodies)))
         return problem(posed.robot, some, posed.choice, top_rad_s=posed.log.top_rad_s)
     except OSError as error:

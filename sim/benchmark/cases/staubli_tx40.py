@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from coordinator.arm_fit.data_file import read_data
+from coordinator.arm_fit.data_file import read_log
 from coordinator.arm_fit.filtered_log import filtered_log, usual_cutoff_hz
 from coordinator.arm_fit.fit import identified
 from coordinator.arm_fit.problem import ModelChoice, problem
@@ -29,7 +29,7 @@ def recorded_cases(folder: Path) -> list[Case]:
 def fitted(folder: Path) -> FitReport:
     """Fit one half and try the other, both ways."""
     robot = read_urdf(folder / URDF)
-    log = read_data(folder / MOTION, robot.chain.serials)
+    log = read_log(folder / MOTION, robot.chain.serials)
     posed = problem(robot, filtered_log(log, usual_cutoff_hz(log)), ModelChoice(coupled=_COUPLED))
     return identified(folder / URDF, folder / MOTION, log, posed, lambda _: None).report
 

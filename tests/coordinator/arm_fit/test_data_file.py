@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_data
+from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_log
 from module_agent.model.chain import Array
 
 JOINTS = ("shoulder", "elbow")
@@ -36,7 +36,7 @@ def test_a_csv_and_an_npz_of_the_same_motion_are_read_alike(tmp_path: Path, rng:
     found = signals(rng)
     (tmp_path / "a.csv").write_text(csv_text(found, 500.0, velocity=True))
     np.savez(tmp_path / "a.npz", sample_rate_hz=500.0, **found)
-    one, other = (read_data(tmp_path / name, JOINTS) for name in ("a.csv", "a.npz"))
+    one, other = (read_log(tmp_path / name, JOINTS) for name in ("a.csv", "a.npz"))
     assert one.qd_rad_s is not None
     assert other.qd_rad_s is not None
     for ours, theirs in zip(one[1:4], other[1:4], strict=True):
@@ -51,14 +51,14 @@ def test_named_columns_of_an_npz_are_put_into_the_robots_order(tmp_path: Path, r
     found = signals(rng)
     t_s = np.arange(40) / 100.0
     np.savez(tmp_path / "a.npz", t_s=t_s, joint_names=np.array(JOINTS[::-1]), **found)
-    log = read_data(tmp_path / "a.npz", JOINTS)
+    log = read_log(tmp_path / "a.npz", JOINTS)
     np.testing.assert_array_equal(log.tau_nm, found["torque"][:, ::-1])
     assert log.rate_hz == pytest.approx(100.0)
 
 
 def test_velocities_are_not_needed(tmp_path: Path, rng: Generator) -> None:
     (tmp_path / "a.csv").write_text(csv_text(signals(rng), 100.0))
-    assert read_data(tmp_path / "a.csv", JOINTS).qd_rad_s is None
+    assert read_log(tmp_path / "a.csv", JOINTS).qd_rad_s is None
 
 
 def test_a_motion_on_jittering_times_is_that_on_even_ones(tmp_path: Path, rng: Generator) -> None:
@@ -67,7 +67,7 @@ def test_a_motion_on_jittering_times_is_that_on_even_ones(tmp_path: Path, rng: G
     wave = np.sin(2.0 * np.pi * 1.5 * times)
     motion = np.stack([wave, 2.0 * wave], axis=1)
     np.savez(tmp_path / "a.npz", t_s=times, position_rad=motion, torque=motion)
-    log = read_data(tmp_path / "a.npz", JOINTS)
+    log = read_log(tmp_path / "a.npz", JOINTS)
     assert log.resampled
     expected = np.sin(2.0 * np.pi * 1.5 * (times[0] + np.arange(400) / log.rate_hz))
     # A cubic spline at 130 samples a period: 1e-6 inside, worse at the ends, where it is one-sided.
@@ -113,7 +113,7 @@ def test_a_csv_that_cannot_be_used_is_answered_with_the_place(
     assert old in text
     path.write_text(text.replace(old, new, 1))
     with pytest.raises(DataFileError, match=words) as raised:
-        read_data(path, JOINTS)
+        read_log(path, JOINTS)
     assert str(raised.value).startswith(str(path))
 
 
@@ -145,7 +145,7 @@ def test_an_npz_that_cannot_be_used_is_answered_with_the_array(
 ) -> None:
     np.savez(tmp_path / "a.npz", **npz_with(rng, **changed))
     with pytest.raises(DataFileError, match=words):
-        read_data(tmp_path / "a.npz", JOINTS)
+        read_log(tmp_path / "a.npz", JOINTS)
 
 
 def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
@@ -158,4 +158,4 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
         ("a.csv", "not a CSV file"),
     ):
         with pytest.raises(DataFileError, match=words):
-            read_data(tmp_path / name, JOINTS)
+            read_log(tmp_path / name, JOINTS)

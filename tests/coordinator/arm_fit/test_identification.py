@@ -8,7 +8,7 @@ import pytest
 from numpy.random import default_rng
 
 from coordinator.arm_fit.cross_validation import fit_part, fitted, halves, held_out_errors
-from coordinator.arm_fit.data_file import JointLog, in_two, read_data
+from coordinator.arm_fit.data_file import JointLog, in_two, read_log
 from coordinator.arm_fit.filtered_log import filtered_log, usual_cutoff_hz
 from coordinator.arm_fit.fit import Elsewhere, identified, named
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
@@ -40,7 +40,7 @@ SHARED = ModelChoice(coupled=((1, 2),))
 
 def posed(urdf: Path, data: Path, choice: ModelChoice) -> tuple[JointLog, Problem]:
     robot = read_urdf(urdf)
-    log = read_data(data, robot.chain.serials)
+    log = read_log(data, robot.chain.serials)
     return log, problem(robot, filtered_log(log, usual_cutoff_hz(log)), choice)
 
 
@@ -198,7 +198,7 @@ def test_a_fit_to_more_predicts_better(three: FitReport) -> None:
 def test_another_recording_is_predicted_by_what_the_first_one_told(recording: Any, another: Any) -> None:
     log, first = posed(recording.urdf, recording.npz, SHARED)
     robot = read_urdf(another.urdf)
-    more = filtered_log(read_data(another.npz, robot.chain.serials), first.log.cutoff_hz)
+    more = filtered_log(read_log(another.npz, robot.chain.serials), first.log.cutoff_hz)
     second = problem(robot, more, SHARED, top_rad_s=first.log.top_rad_s)
     found = identified(
         recording.urdf, recording.npz, log, first, lambda _: None, elsewhere=Elsewhere(another.npz, second)

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from coordinator.arm_fit.cross_validation import fit_part, fitted, held_out_errors, overall
-from coordinator.arm_fit.data_file import read_data
+from coordinator.arm_fit.data_file import read_log
 from coordinator.arm_fit.filtered_log import filtered_log
 from coordinator.arm_fit.physically_consistent import (
     USUAL_TRUST,
@@ -45,7 +45,7 @@ def wrong(recording: Any, tmp_path: Path) -> Path:
 
 def found_in(urdf: Path, npz: Path) -> tuple[Problem, RealBodies]:
     robot = read_urdf(urdf)
-    posed = problem(robot, filtered_log(read_data(npz, robot.chain.serials), 8.0), SHARED)
+    posed = problem(robot, filtered_log(read_log(npz, robot.chain.serials), 8.0), SHARED)
     fit = fit_part(posed, slice(0, len(posed.log.tau_nm)))
     return posed, real_bodies(posed, fit, claimed_bodies(robot), USUAL_TRUST)
 

@@ -1,0 +1,270 @@
+"""The library: runs, recordings and robots in a few lines of Python.
+
+A run that was recorded is read back with `load_run`; a recording is evaluated again with `identify`; what was
+identified predicts poses with covariance (`forward_kinematics`), torques (`inverse_dynamics`) and what IMUs
+measure (`imu_readings`), and leaves as URDF, HRDF or Denavit-Hartenberg rows. Arrays are plain numpy in SI
+units. `from coordinator import ...` imports a name when it is used.
+
+A pose with covariance: the chain's 6 n unknowns are one twist per module, [rotation, translation] in the root
+frame (`apply_perturbation`). To first order the twist of a module's pose is J delta, with J by central
+differences, and its covariance is J C J^T.
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import RigidTransform
+
+from coordinator.baseline.known_robot import BaselineError
+from coordinator.description.denavit_hartenberg import DhPath, dh_paths
+from coordinator.description.hrdf_writer import write_hrdf
+from coordinator.description.urdf_writer import write_urdf
+from coordinator.identification.identified import Identified
+from coordinator.identification.result import Result
+from coordinator.recording.recording import Recording
+from coordinator.recording.run_folder import HELD_OUT, RESULT, SESSION
+from coordinator.recording.run_folder import load_recording as read_recording
+from coordinator.synchronisation.round_trips import map_clocks
+from coordinator.torque_control.gravity_model import weight_of
+from module_agent.model.catalogue import module_type
+from module_agent.model.chain import Array, Chain
+from module_agent.model.forward_kinematics import imu_poses
+from module_agent.model.perturbation import apply_perturbation
+from module_agent.signals.clock_map import ClockMap
+
+_STEP = 1e-6
+_NS = 1e-9
+
+
+class Signals(NamedTuple):
+    """What one module reported, in the order of time; m samples.
+
+    t_s, imu_t_s: (m,) time since the recording began, the module's clock mapped to the session's; encoder and
+    torque are sampled at t_s, the IMU at imu_t_s. Commands are NaN where a loop is off. gyro_rad_s and
+    accel_m_s2 (specific force) are (m, 3) in the IMU's frame, all others (m,).
+    """
+
+    t_s: Array
+    imu_t_s: Array
+    position_rad: Array
+    velocity_rad_s: Array
+    effort_nm: Array
+    position_command_rad: Array
+    velocity_command_rad_s: Array
+    effort_command_nm: Array
+    pwm: Array
+    deflection_rad: Array
+    motor_velocity_rad_s: Array
+    motor_current_a: Array
+    winding_temperature_c: Array
+    voltage_v: Array
+    gyro_rad_s: Array
+    accel_m_s2: Array
+
+
+class HeldOutTorques(NamedTuple):
+    """Torques of the motions that nothing was fitted to: t_s (m,) since the recording began, else (m, n)."""
+
+    serials: tuple[str, ...]
+    t_s: Array
+    position_rad: Array
+    measured_nm: Array
+    predicted_nm: Array
+
+
+class SavedRun:
+    """A run on disk: `result` as identified, `recording` as received, `signals` per module."""
+
+    def __init__(self, folder: Path, result: Result):
+        self.folder = folder
+        self.result = result
+        self.chain: Chain = result.chain.chain()
+        self.covariance: Array = np.asarray(result.chain_covariance, dtype=float)
+
+    def __repr__(self) -> str:
+        """Name folder, robot and modules."""
+        return f"SavedRun({str(self.folder)!r}: {self.result.robot}, modules {', '.join(self.serials)})"
+
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """Serials of the modules in the order of the chain's joints."""
+        return self.chain.serials
+
+    @cached_property
+    def phi(self) -> Array | None:
+        """The (10 n,) inertial parameters of physically consistent bodies, None for a run without dynamics.
+
+        Per body [m, m c (3), I about the root frame's origin (xx, xy, xz, yy, yz, zz)], root frame at q = 0.
+        """
+        return None if self.result.dynamics is None else weight_of(self.result).phi
+
+    @cached_property
+    def recording(self) -> Recording:
+        """Every message of the session, read from `session.mcap` at the first use."""
+        return load_recording(self.folder)
+
+    @cached_property
+    def _clocks(self) -> dict[str, ClockMap]:
+        return map_clocks({s: self.recording.modules[s].trips for s in self.serials})
+
+    @property
+    def _start_ns(self) -> int:
+        return min(event.t_ns for event in self.recording.journal)
+
+    def signals(self, serial: str) -> Signals:
+        """Return all samples of a module on the session's time base.
+
+        Raises:
+            KeyError: the run has no such module; the message lists those it has.
+        """
+        if serial not in self.serials:
+            raise KeyError(f"{self.folder} has no module {serial!r}, but {', '.join(self.serials)}")
+        log, clock = self.recording.modules[serial].rows, self._clocks[serial]
+        rows = log.rows(log.first_row, log.end_row)
+        times = {
+            name: _NS * (clock.to_session(rows[source]) - self._start_ns).astype(float)
+            for name, source in (("t_s", "t_ns"), ("imu_t_s", "imu_t_ns"))
+        }
+        values = {name: rows[name].astype(float) for name in Signals._fields if name not in times}
+        return Signals(**times, **values)
+
+    @cached_property
+    def held_out(self) -> HeldOutTorques | None:
+        """Torques of the held-out motions, measured and predicted; None for a run without dynamics."""
+        path = self.folder / HELD_OUT
+        if not path.is_file():
+            return None
+        with np.load(path) as data:
+            t_s = _NS * (data["session_ns"] - self._start_ns).astype(float)
+            arrays = (data["q_rad"], data["tau_measured_nm"], data["tau_predicted_nm"])
+            return HeldOutTorques(tuple(map(str, data["serials"])), t_s, *arrays)
+
+
+def load_run(folder: Path | str) -> SavedRun:
+    """Read a finished run back.
+
+    Args:
+        folder: the run's folder, which holds `result.json`.
+
+    Raises:
+        BaselineError: the folder holds no result, or one that cannot be read.
+    """
+    path = Path(folder) / RESULT
+    if not path.is_file():
+        raise BaselineError(f"{folder} holds no {RESULT}: give the folder of a run that has finished")
+    return SavedRun(Path(folder), Result.model_validate_json(path.read_bytes()))
+
+
+def load_recording(path: Path | str) -> Recording:
+    """Read every message of a session.
+
+    Args:
+        path: `session.mcap`, or the folder that holds it.
+
+    Raises:
+        SessionFileError: there is no such file, or it is no recording.
+    """
+    path = Path(path)
+    return read_recording(path / SESSION if path.is_dir() else path)
+
+
+# ---------------------------------------------------------------------- kinematics
+
+
+class Poses(NamedTuple):
+    """Poses of the modules' IMU frames in the root frame, at m positions of n joints.
+
+    pose: (m, n, 4, 4). covariance: (m, n, 6, 6) of the twist [rotation (rad), translation (m)] by which each
+    pose errs, about the root frame's axes at the pose's own origin; None without the chain's covariance.
+    """
+
+    serials: tuple[str, ...]
+    pose: Array
+    covariance: Array | None
+
+    @property
+    def position_sigma_m(self) -> Array | None:
+        """The (m, n) standard deviations of position: root of the summed variances of three axes."""
+        if self.covariance is None:
+            return None
+        return np.asarray(np.sqrt(np.trace(self.covariance[..., 3:, 3:], axis1=-2, axis2=-1)))
+
+
+def forward_kinematics(
+    robot: SavedRun | Chain, q_rad: ArrayLike, covariance: ArrayLike | None = None
+) -> Poses:
+    """Return where every module's IMU is, with the uncertainty of the identified chain.
+
+    Args:
+        robot: a run, with its covariance; or a chain.
+        q_rad: (m, n) joint positions, or (n,) for one.
+        covariance: (6 n, 6 n) of the chain's perturbations; the run's own if a run is given. Directions that
+            cannot be identified have zero variance in it and are named in `result.unresolved`.
+
+    Raises:
+        ValueError: shapes do not fit the chain.
+    """
+    chain = robot.chain if isinstance(robot, SavedRun) else robot
+    if covariance is None and isinstance(robot, SavedRun):
+        covariance = robot.covariance
+    q = np.atleast_2d(np.asarray(q_rad, dtype=float))
+    pose = imu_poses(chain, q)
+    if covariance is None:
+        return Poses(chain.serials, pose, None)
+    size = 6 * len(chain.serials)
+    spread = np.asarray(covariance, dtype=float)
+    if spread.shape != (size, size):
+        raise ValueError(
+            f"the covariance of {len(chain.serials)} modules is ({size}, {size}), got {spread.shape}"
+        )
+    slope = np.stack([_pose_slope(chain, q, direction) for direction in np.eye(size)], axis=-1)
+    return Poses(chain.serials, pose, slope @ spread @ np.swapaxes(slope, -1, -2))
+
+
+def _pose_slope(chain: Chain, q: Array, direction: Array) -> Array:
+    """Return the (m, n, 6) change of every pose, [rotation, translation], per unit of a perturbation."""
+    ahead, behind = (imu_poses(apply_perturbation(chain, s * _STEP * direction), q) for s in (1.0, -1.0))
+    shape = ahead.shape[:2]
+    turn = np.array(ahead[..., :3, :3] @ np.swapaxes(behind[..., :3, :3], -1, -2)).reshape(-1, 3, 3)
+    poses = np.tile(np.eye(4), (len(turn), 1, 1))
+    poses[:, :3, :3] = turn
+    rotation = RigidTransform.from_matrix(poses).rotation.as_rotvec().reshape(*shape, 3)
+    return np.concatenate([rotation, ahead[..., :3, 3] - behind[..., :3, 3]], axis=-1) / (2.0 * _STEP)
+
+
+def denavit_hartenberg(robot: SavedRun | Chain) -> tuple[DhPath, ...]:
+    """Return the Denavit-Hartenberg rows of every path from the base to a leaf (see `DhPath`; m and rad)."""
+    return dh_paths(robot.chain if isinstance(robot, SavedRun) else robot)
+
+
+# ---------------------------------------------------------------------- files
+
+
+def export_urdf(robot: SavedRun | Identified, path: Path | str) -> None:
+    """Write the robot as URDF, whole or not at all; inertias are physically consistent bodies.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    chain, phi, types, name = _described(robot)
+    write_urdf(Path(path), chain, phi, name, [module_type(types[s]) for s in chain.serials])
+
+
+def export_hrdf(robot: SavedRun | Identified, path: Path | str) -> None:
+    """Write the robot as HRDF, the manufacturer's format, whole or not at all.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    chain, phi, types, name = _described(robot)
+    write_hrdf(Path(path), chain, [module_type(types[s]) for s in chain.serials], phi, name)
+
+
+def _described(robot: SavedRun | Identified) -> tuple[Chain, Array | None, Mapping[str, str], str]:
+    if isinstance(robot, SavedRun):
+        return robot.chain, robot.phi, robot.result.types, robot.result.robot
+    return robot.kinematics.fit.chain, robot.real_phi, robot.result.types, robot.result.robot
