@@ -209,7 +209,9 @@ def _slope(chain: Chain, child: int) -> Array:
 
 def _visible(fits: TiedFits) -> Array:
     """Return orthonormal increments (6 (n - 1), r), as columns, that both sessions know."""
-    unknown = np.concatenate([fits.before.null_basis[6:], fits.after.null_basis[6:]], axis=1)
+    unknown = np.concatenate(
+        [fits.before.estimate.null_basis[6:], fits.after.estimate.null_basis[6:]], axis=1
+    )
     full, sizes, _ = np.linalg.svd(np.column_stack([unknown, np.zeros(len(unknown))]))
     return np.asarray(full[:, np.count_nonzero(sizes > 1e-6) :])
 

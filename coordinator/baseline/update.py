@@ -9,15 +9,13 @@ makes the lengths within a part no surer.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from coordinator.baseline.difference import difference
-from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement
+from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE
 from coordinator.identification.identified import Kinematics
-from coordinator.kinematics.assembly import ChainFit, link_lengths
-from coordinator.kinematics.null_space import name_null_space
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import adjoint, apply_perturbation, frozen, perturbation_between
 
@@ -25,17 +23,7 @@ from module_agent.model.perturbation import adjoint, apply_perturbation, frozen,
 UNTOLD = 1.0
 
 
-class Placed(NamedTuple):
-    """A chain of known parts and new links, arrays read-only; all as in `refinement.Refinement`."""
-
-    chain: Chain
-    covariance: Array
-    null_basis: Array
-    rank: int
-    condition: float
-
-
-def placed(known: Refinement, found: Refinement, parts: Sequence[Sequence[str]]) -> Placed:
+def placed(known: ChainEstimate, found: ChainEstimate, parts: Sequence[Sequence[str]]) -> ChainEstimate:
     """Put the known parts where a session finds them.
 
     Args:
@@ -91,7 +79,7 @@ def _frame(known: Chain, found: Chain, top: str) -> Array:
     return np.asarray(here @ np.linalg.inv(there))
 
 
-def _within(known: Refinement, chain: Chain, parts: Sequence[Sequence[str]]) -> tuple[Array, Array]:
+def _within(known: ChainEstimate, chain: Chain, parts: Sequence[Sequence[str]]) -> tuple[Array, Array]:
     """Return the covariance of the known robot's errors (k, k), and how they displace the modules (6 n, k).
 
     A part's topmost module is where the session finds it: only what is against it counts.
@@ -125,7 +113,7 @@ def _rigidly(chain: Chain, parts: Sequence[Sequence[str]]) -> Array:
     return found
 
 
-def _information(found: Refinement) -> Array:
+def _information(found: ChainEstimate) -> Array:
     """Return the information (6 n, 6 n) of the session, none along what it does not know."""
     values, vectors = np.linalg.eigh(found.covariance)
     # What is unknown has no variance at all, but for rounding.
@@ -133,7 +121,7 @@ def _information(found: Refinement) -> Array:
     return np.asarray((vectors[:, known] / values[known]) @ vectors[:, known].T)
 
 
-def _report(chain: Chain, covariance: Array, untold: Array) -> Placed:
+def _report(chain: Chain, covariance: Array, untold: Array) -> ChainEstimate:
     """Split what is known from what is not: `untold`, and where the covariance is wide."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     wide = values > UNKNOWN_ABOVE**2
@@ -144,7 +132,7 @@ def _report(chain: Chain, covariance: Array, untold: Array) -> Placed:
     kept = seen @ covariance @ seen
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(0.5 * (kept + kept.T)), 0.0))
     used = spread[spread > 1e-9]
-    return Placed(
+    return ChainEstimate(
         chain=chain,
         covariance=frozen(0.5 * (kept + kept.T)),
         null_basis=frozen(basis),
@@ -160,17 +148,6 @@ def _index(chain: Chain) -> dict[str, int]:
 def updated(known: Kinematics, found: Kinematics) -> Kinematics:
     """Return a session's kinematics with the known robot's geometry wherever nothing is other."""
     other = difference(known.topology, found.topology)
-    result = placed(known.refinement, found.refinement, other.parts)
-    refinement = found.refinement._replace(**result._asdict())
+    estimate = placed(known.fit, found.fit, other.parts)
     notes = (*(line for line in other.words()), *found.notes)
-    return found._replace(refinement=refinement, fit=_fit(found.fit, result), notes=notes)
-
-
-def _fit(found: ChainFit, result: Placed) -> ChainFit:
-    length, sigma = link_lengths(result.chain, result.covariance)
-    return found._replace(
-        **result._asdict(),
-        unresolved=name_null_space(result.chain, result.null_basis),
-        link_length_m=length,
-        link_length_sigma_m=sigma,
-    )
+    return found._replace(refinement=found.refinement._replace(estimate=estimate), notes=notes)

@@ -26,6 +26,7 @@ from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian, rigid
 from coordinator.batch_estimation.sensor_data import SensorData
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import apply_perturbation, frozen
@@ -46,28 +47,29 @@ Index = NDArray[np.int64]
 
 
 class Refinement(NamedTuple):
-    """A refined chain; increments are as in `increments`, of all n modules (the first one's are zero).
+    """A refined chain of n modules and what was estimated along with it; arrays read-only.
 
-    covariance: (6 n, 6 n), zero along what is unknown. noise_covariance: the same if the sensors' noise were
-    all, without what the model leaves out, which two sessions with the same motions share. null_basis:
-    (6 n, k) orthonormal directions that the data does not know. residual_gyro_rad_s, residual_accel_m_s2:
-    (n,) rms per axis. intrinsics: the IMUs' own errors; where nothing tells them, they are those expected.
-    compliance: of the links, order and units of `ComplianceJacobian`. late_s: how late all IMUs are alike,
-    beside their own delays in `intrinsics`.
+    noise_covariance: (6 n, 6 n) as `estimate.covariance`, by the sensors' noise alone: without the model's
+        systematic errors, which two sessions with the same motions share.
+    residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis.
+    intrinsics: the IMUs' own errors; the prior's mean where no observation resolves them.
+    compliance: of the links, in the order and units of `ComplianceJacobian`.
+    late_s: delay common to all IMUs, in addition to their own delays in `intrinsics`.
     """
 
-    chain: Chain
-    covariance: Array
+    estimate: ChainEstimate
     noise_covariance: Array
-    null_basis: Array
-    rank: int
-    condition: float
     residual_gyro_rad_s: Array
     residual_accel_m_s2: Array
     intrinsics: ImuIntrinsics
     compliance: Array
     iterations: int
     late_s: float = 0.0
+
+    @property
+    def chain(self) -> Chain:
+        """The refined chain."""
+        return self.estimate.chain
 
 
 class _State(NamedTuple):
@@ -309,12 +311,14 @@ def _report(
     unknown[6:] = spectrum.vectors[:, ~known]
     sigmas = spectrum.sigmas[known]
     return Refinement(
-        chain=state.chain,
-        covariance=frozen(covariance),
+        estimate=ChainEstimate(
+            chain=state.chain,
+            covariance=frozen(covariance),
+            null_basis=frozen(unknown),
+            rank=int(np.count_nonzero(known)),
+            condition=float(sigmas.max() / sigmas.min()) if sigmas.size else float("inf"),
+        ),
         noise_covariance=frozen(noise),
-        null_basis=frozen(unknown),
-        rank=int(np.count_nonzero(known)),
-        condition=float(sigmas.max() / sigmas.min()) if sigmas.size else float("inf"),
         residual_gyro_rad_s=frozen(sigma_gyro),
         residual_accel_m_s2=frozen(sigma_accel),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),

@@ -10,6 +10,7 @@ from coordinator.identification.inertia.inertia import Inertia
 from coordinator.identification.inertia.robot_bodies import RobotBodies
 from coordinator.identification.result import Result
 from coordinator.kinematics.assembly import ChainFit
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.topology.topology import Topology
 from module_agent.model.chain import Array
 from module_agent.signals.clock_map import ClockMap
@@ -20,14 +21,18 @@ class IdentificationError(ValueError):
 
 
 class Kinematics(NamedTuple):
-    """Topology and chain: `first` as assembled from the circles, `fit` after the batch refinement."""
+    """Topology and chain: `first` as assembled from the circles, `refinement` by the batch estimator."""
 
     topology: Topology
     first: ChainFit
-    fit: ChainFit
     refinement: Refinement
     clocks: dict[str, ClockMap]
     notes: tuple[str, ...]
+
+    @property
+    def fit(self) -> ChainEstimate:
+        """The refined chain and what is known of it."""
+        return self.refinement.estimate
 
     def words(self) -> list[str]:
         """Return the tree and the links in lines to read."""

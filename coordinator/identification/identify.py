@@ -6,6 +6,7 @@ over all exploration motions, then the inertial parameters, checked on motions t
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,10 +23,9 @@ from coordinator.identification.result_builder import build_result
 from coordinator.identification.robot_refinement import CUTOFF_HZ, refine_robot
 from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
-from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble, link_lengths
+from coordinator.kinematics.assembly import AssemblyError, assemble
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
-from coordinator.kinematics.null_space import name_null_space
 from coordinator.kinematics.simultaneous_motion import circles_of_all
 from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules
 from coordinator.recording.recording import Recording
@@ -126,7 +126,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     )
     notes += found.notes
     notes += _strange_imus(topology.serials, refined, prior)
-    return Kinematics(topology, first, _refined_fit(first, refined), refined, clocks, notes)
+    return Kinematics(topology, first, refined, clocks, notes)
 
 
 def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:
@@ -142,29 +142,10 @@ def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) 
 
 def _settled(refined: Refinement, reference: Chain) -> Refinement:
     """Return a refinement whose unobservable directions are fixed at `reference` (`gauge_fixed`)."""
-    known, by_noise = (
-        gauge_fixed(refined.chain, covariance, refined.null_basis, reference)
-        for covariance in (refined.covariance, refined.noise_covariance)
-    )
+    by_noise = replace(refined.estimate, covariance=refined.noise_covariance)
     return refined._replace(
-        chain=known.chain,
-        covariance=known.covariance,
-        noise_covariance=by_noise.covariance,
-        null_basis=known.null_basis,
-    )
-
-
-def _refined_fit(first: ChainFit, refined: Refinement) -> ChainFit:
-    length, sigma = link_lengths(refined.chain, refined.covariance)
-    return first._replace(
-        chain=refined.chain,
-        covariance=refined.covariance,
-        rank=refined.rank,
-        condition=refined.condition,
-        unresolved=name_null_space(refined.chain, refined.null_basis),
-        null_basis=refined.null_basis,
-        link_length_m=length,
-        link_length_sigma_m=sigma,
+        estimate=gauge_fixed(refined.estimate, reference),
+        noise_covariance=gauge_fixed(by_noise, reference).covariance,
     )
 
 

@@ -18,9 +18,9 @@ from coordinator.batch_estimation.estimator import Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS, ImuPrior
 from coordinator.batch_estimation.link_compliance import compliance_jacobian, joined, loads_of
 from coordinator.batch_estimation.sensor_data import SensorData
-from coordinator.kinematics.assembly import ChainFit, assemble, link_lengths
+from coordinator.kinematics.assembly import assemble
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
-from coordinator.kinematics.null_space import name_null_space
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, window
@@ -42,7 +42,7 @@ class Preview(NamedTuple):
     explored can lie between a module and its parent, so that what joins them is one link.
     """
 
-    fit: ChainFit
+    fit: ChainEstimate
     explored: tuple[str, ...]
     beside: tuple[bool, ...]
 
@@ -74,7 +74,7 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
         and (pair := _pair(recording, joint, observer, topology, rest.q_rad)) is not None
     ]
     types = [module_type(_type(recording, s)) for s in topology.serials]
-    fit = assemble(topology, types, pairs, [rest], MIN_GAIN)
+    fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
     return Preview(fit, tuple(moved), beside(fit.chain, moved))
 
 
@@ -282,20 +282,7 @@ def _refined(
     rigid = refine_chain(found.fit.chain, data, prior)
     loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / KEPT_EVERY), FITTED_EVERY)
     refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(rigid.chain, data.joints, loads))
-    length, sigma = link_lengths(refined.chain, refined.covariance)
-    if _is_lost(found, refined):
-        return found
-    fit = found.fit._replace(
-        chain=refined.chain,
-        covariance=refined.covariance,
-        rank=refined.rank,
-        condition=refined.condition,
-        unresolved=name_null_space(refined.chain, refined.null_basis),
-        null_basis=refined.null_basis,
-        link_length_m=length,
-        link_length_sigma_m=sigma,
-    )
-    return found._replace(fit=fit)
+    return found if _is_lost(found, refined) else found._replace(fit=refined.estimate)
 
 
 def _is_lost(found: Preview, refined: Refinement) -> bool:

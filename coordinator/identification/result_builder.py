@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from coordinator.identification.inertia.agent_information import AgentInformation
     from coordinator.identification.inertia.inertia import Inertia
     from coordinator.identification.inertia.robot_bodies import RobotBodies
-    from coordinator.kinematics.assembly import ChainFit
+    from coordinator.kinematics.chain_estimate import ChainEstimate
     from coordinator.kinematics.null_space import Unresolved
     from coordinator.parameter_fit.instrumental_variables import InstrumentalFit
     from coordinator.topology.topology import Topology
@@ -69,7 +69,7 @@ def build_result(
         chain=ChainPart.of(fit.chain),
         rank=fit.rank,
         condition=fit.condition,
-        reduced_chi2=fit.reduced_chi2,
+        reduced_chi2=kinematics.first.reduced_chi2,
         unresolved=[_unresolved(fit, types, u) for u in fit.unresolved],
         null_basis=fit.null_basis.tolist(),
         chain_covariance=fit.covariance.tolist(),
@@ -136,7 +136,7 @@ def _links(kinematics: "Kinematics") -> list[LinkPart]:
     ]
 
 
-def _unresolved(fit: "ChainFit", types: list[ModuleType], item: "Unresolved") -> UnresolvedPart:
+def _unresolved(fit: "ChainEstimate", types: list[ModuleType], item: "Unresolved") -> UnresolvedPart:
     links = [
         UnknownPart(parent=link.parent, child=link.child, parameters=_unknown(link))
         for link in link_transforms(fit.chain, types, np.zeros_like(fit.covariance), _columns(item))
@@ -170,7 +170,7 @@ def _columns(item: "Unresolved") -> Array:
     return np.asarray(item.directions / np.linalg.norm(item.directions, axis=0))
 
 
-def _transforms(fit: "ChainFit", types: list[ModuleType]) -> list[TransformPart]:
+def _transforms(fit: "ChainEstimate", types: list[ModuleType]) -> list[TransformPart]:
     # The motions that have been named, not the null vectors of the fit: those are mixed, and off by its
     # noise.
     nothing = np.zeros((len(fit.covariance), 0))
@@ -193,7 +193,7 @@ def _transform(link: LinkTransform) -> TransformPart:
     )
 
 
-def _exponentials(fit: "ChainFit", types: list[ModuleType]) -> ExponentialsPart:
+def _exponentials(fit: "ChainEstimate", types: list[ModuleType]) -> ExponentialsPart:
     model = screw_model(fit.chain, types, fit.covariance)
     return ExponentialsPart(
         screws=[

@@ -122,7 +122,7 @@ def _giving(
     nobody_else = len(rigid.chain.serials) == 1
     if data.base_motion is None or not data.base_motion.any() or nobody_else:
         return at_rest, still
-    shaken = refine_chain(faced(rigid.chain, data, rigid.null_basis), data, prior, flex)
+    shaken = refine_chain(faced(rigid.chain, data, rigid.estimate.null_basis), data, prior, flex)
     return (shaken, parts) if _misfit(shaken) < _misfit(at_rest) else (at_rest, still)
 
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import (
     ChainObservations,
     PairObservation,
@@ -22,7 +23,6 @@ from coordinator.kinematics.chain_observations import (
     residuals,
 )
 from coordinator.kinematics.initial_guess import initial_chain
-from coordinator.kinematics.null_space import Unresolved, name_null_space
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
@@ -37,37 +37,27 @@ STILL = 1e-13
 
 
 class ChainFit(NamedTuple):
-    """An assembled chain and what is known of it; arrays read-only.
+    """An assembled chain and how well it fits; arrays read-only.
 
-    covariance: (6 n, 6 n) of the perturbations of `apply_perturbation` over what is resolved; zero for
-    the
-        first root, which is the root frame, and along unresolved directions.
-    rank: of the weighted Jacobian over `unknowns` = 6 (n - 1) + 2 parameters, the last two gravity's
-    direction.
-    singular_values: (unknowns,) of it, largest first: each is 1 / sigma of a direction.
-    condition: the largest over the smallest resolved.
-    null_basis: (6 n, k) orthonormal increments that no observation tells.
-    link_length_m: (n,) perpendicular distance from the parent's axis to the module's IMU at q = 0; NaN for
-    roots.
-    reduced_chi2: weighted squares over degrees of freedom; about 1 if the sigmas are right. NaN without
-    freedom.
-    misfit_sigma: how far each pair observation is off, in the order given (rms of its four residuals); NaN
-    for
-        what a module saw of its own joint, which is not used.
+    estimate: its rank is that of the weighted Jacobian over `unknowns` = 6 (n - 1) + 2 parameters, the last
+        two for the direction of gravity.
+    singular_values: (unknowns,) of the Jacobian, largest first: each is 1 / sigma of a direction.
+    reduced_chi2: weighted squared residuals over degrees of freedom; about 1 if the sigmas are right, NaN
+        without a degree of freedom.
+    misfit_sigma: rms of the four weighted residuals of each pair observation, in the order given; NaN for
+        observations of a module's own joint, which are not used.
     """
 
-    chain: Chain
-    covariance: Array
-    rank: int
+    estimate: ChainEstimate
     unknowns: int
     singular_values: Array
-    condition: float
-    unresolved: tuple[Unresolved, ...]
-    null_basis: Array
-    link_length_m: Array
-    link_length_sigma_m: Array
     reduced_chi2: float
     misfit_sigma: Array
+
+    @property
+    def chain(self) -> Chain:
+        """The estimated chain."""
+        return self.estimate.chain
 
 
 class AssemblyError(ValueError):
@@ -185,18 +175,11 @@ def _describe(chain: Chain, seen: ChainObservations, pairs: Sequence[PairObserva
     covariance[6:, 6:] = resolved.T @ resolved
     null_basis = _null_basis(parts.vt[parts.rank :, :poses])
     freedom = seen.rows - parts.rank
-    length, sigma = link_lengths(chain, covariance)
+    condition = float(parts.s[0] / parts.s[parts.rank - 1]) if parts.rank else float("nan")
     return ChainFit(
-        chain=chain,
-        covariance=frozen(covariance),
-        rank=parts.rank,
+        estimate=ChainEstimate(chain, frozen(covariance), null_basis, parts.rank, condition),
         unknowns=parts.s.size,
         singular_values=frozen(parts.s),
-        condition=float(parts.s[0] / parts.s[parts.rank - 1]) if parts.rank else float("nan"),
-        unresolved=name_null_space(chain, null_basis),
-        null_basis=null_basis,
-        link_length_m=length,
-        link_length_sigma_m=sigma,
         reduced_chi2=float(rest @ rest) / freedom if freedom > 0 else float("nan"),
         misfit_sigma=_misfit(rest, pairs),
     )
@@ -215,27 +198,3 @@ def _misfit(rest: Array, pairs: Sequence[PairObservation]) -> Array:
     found = np.full(len(pairs), np.nan)
     found[used] = np.sqrt(np.mean(np.concatenate([axis, place], axis=1) ** 2, axis=1))
     return frozen(found)
-
-
-def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
-    """Return the lengths (n,) from each parent's axis to the module's IMU at q = 0 and their sigmas; NaN for
-    roots.
-
-    Where the length is zero it has no slope; the sigma is then that of the place across the axis.
-    """
-    length, sigma = np.full((2, len(chain.serials)), np.nan)
-    for k in chain.linked:
-        parent = chain.parent[k]
-        axis, place = chain.axis[parent], chain.imu_home[k, :3, 3]
-        off = place - chain.point[parent]
-        radial = off - axis * (axis @ off)
-        length[k] = float(np.linalg.norm(radial))
-        # Only the motion of the IMU against the axis counts: that of the line, as a body, is taken off.
-        slope = np.zeros((3, covariance.shape[0]))
-        slope[:, 6 * k : 6 * k + 6] = np.concatenate([-skew(place), np.eye(3)], axis=1)
-        slope[:, 6 * parent : 6 * parent + 6] -= np.concatenate([-skew(place), np.eye(3)], axis=1)
-        across = np.eye(3) - np.outer(axis, axis)
-        outward = radial[None, :] / length[k] if length[k] > 1e-6 else across
-        spread = outward @ slope @ covariance @ slope.T @ outward.T
-        sigma[k] = float(np.sqrt(np.trace(spread)))
-    return frozen(length), frozen(sigma)

@@ -5,12 +5,14 @@ round. So the motions that have a name are done one after the other, each where 
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from coordinator.kinematics.null_space import Kind, Unresolved, name_null_space
+from coordinator.kinematics.chain_estimate import ChainEstimate
+from coordinator.kinematics.null_space import Kind, Unresolved
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import adjoint, apply_perturbation, frozen
 
@@ -28,31 +30,24 @@ class GaugeFreedom(NamedTuple):
     branch: int
 
 
-class GaugeFixed(NamedTuple):
-    """A chain with the covariance of its increments (6 n, 6 n) and those that it does not know (6 n, k)."""
+def gauge_fixed(estimate: ChainEstimate, reference: Chain) -> ChainEstimate:
+    """Return an estimate moved along its null space as near as possible to `reference`.
 
-    chain: Chain
-    covariance: Array
-    null_basis: Array
-
-
-def gauge_fixed(chain: Chain, covariance: Array, null_basis: Array, reference: Chain) -> GaugeFixed:
-    """Return a fitted chain with what it does not know as near as can be to where `reference` has it.
-
-    A fit of many steps drifts along what it does not know, and nothing calls it back.
+    A fit of many steps drifts along unresolved directions, and no residual draws it back.
     """
-    free = gauge_freedoms(chain, name_null_space(chain, null_basis))
+    chain = estimate.chain
+    free = gauge_freedoms(chain, estimate.unresolved)
     if not free:
-        return GaugeFixed(chain, covariance, null_basis)
-    everybody = range(len(chain.serials))
-    found = moved(chain, free, nearest(chain, free, everybody, reference.imu_home))
-    hidden = carried(chain, found, null_basis)
+        return estimate
+    fixed = moved(chain, free, nearest(chain, free, range(len(chain.serials)), reference.imu_home))
+    hidden = carried(chain, fixed, estimate.null_basis)
     basis, _ = np.linalg.qr(hidden)
     basis[~hidden.any(axis=1)] = 0.0  # exactly, as the root is exactly known
     # What is known is what is across the unknown, also in the new place.
     across = np.eye(len(basis)) - basis @ basis.T
-    half = across @ carried(chain, found, covariance)
-    return GaugeFixed(found, frozen(across @ carried(chain, found, half.T)), frozen(basis))
+    half = across @ carried(chain, fixed, estimate.covariance)
+    covariance = frozen(across @ carried(chain, fixed, half.T))
+    return replace(estimate, chain=fixed, covariance=covariance, null_basis=frozen(basis))
 
 
 def gauge_freedoms(chain: Chain, unresolved: Sequence[Unresolved]) -> tuple[GaugeFreedom, ...]:

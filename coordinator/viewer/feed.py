@@ -9,7 +9,7 @@ import numpy as np
 
 from coordinator.identification.identified import HeldOutMotion
 from coordinator.identification.preview import Preview
-from coordinator.kinematics.assembly import ChainFit
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.frames import axis_angles
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.recording.recording import Entry, ModuleRecord, Recording
@@ -236,18 +236,17 @@ class ViewerFeed:
 
     def so_far(self, session_ns: int, found: Preview) -> None:
         """Show the robot as far as it is known, and the estimates of links that nothing can come between."""
-        drawn = side_by_side(found.fit.chain)
-        self._draw(session_ns, found.fit._replace(chain=drawn))
+        self._draw(session_ns, found.fit)
         self._show_links(session_ns, found.fit, found.beside)
 
-    def chain(self, session_ns: int, fit: ChainFit) -> None:
+    def chain(self, session_ns: int, fit: ChainEstimate) -> None:
         """Show the identified robot; it then turns as the robot turns."""
-        self._draw(session_ns, fit._replace(chain=side_by_side(fit.chain)))
+        self._draw(session_ns, fit)
         self._show_links(session_ns, fit, tuple(parent != BASE for parent in fit.chain.parent))
 
-    def _draw(self, session_ns: int, fit: ChainFit) -> None:
+    def _draw(self, session_ns: int, fit: ChainEstimate) -> None:
         self._show_poses()  # of the chain before
-        chain, now_ns = fit.chain, self.since_start(session_ns)
+        chain, now_ns = side_by_side(fit.chain), self.since_start(session_ns)
         if self._beside is not None:
             self._beside.chain(self._viewer, now_ns, chain, fit.unresolved)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
@@ -255,7 +254,7 @@ class ViewerFeed:
         self._viewer.chain(now_ns, chain, sigma)
         self._drawn = True
 
-    def _show_links(self, session_ns: int, fit: ChainFit, shown: tuple[bool, ...]) -> None:
+    def _show_links(self, session_ns: int, fit: ChainEstimate, shown: tuple[bool, ...]) -> None:
         now_ns = self.since_start(session_ns)
         angle, spread = (np.degrees(value) for value in axis_angles(fit.chain, fit.covariance))
         for k, serial in enumerate(fit.chain.serials):

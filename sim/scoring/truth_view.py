@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.kinematics.assembly import link_lengths
+from coordinator.kinematics.chain_estimate import link_lengths
 from coordinator.kinematics.frames import axis_angles
 from coordinator.kinematics.gauge_fixing import gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.kinematics.assembly import AssemblyError, ChainFit, assemble
+from coordinator.kinematics.assembly import AssemblyError, assemble
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
@@ -19,7 +20,7 @@ from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import Estimate
 
 
-def thesis_chain(recording: Recording, topology: Topology) -> ChainFit | None:
+def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | None:
     """Return the chain by circle point analysis; None without a joint moved by itself, or without a chain.
 
     The topology is given: the thesis' own motions tell it as well as any.
@@ -33,7 +34,7 @@ def thesis_chain(recording: Recording, topology: Topology) -> ChainFit | None:
     if not pairs:
         return None
     try:
-        return assemble(topology, types, pairs, [rest])
+        return assemble(topology, types, pairs, [rest]).estimate
     except AssemblyError:
         # What the circles of an arm that gives say may contradict itself: the thesis' way has no answer then.
         return None

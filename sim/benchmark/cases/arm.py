@@ -17,7 +17,7 @@ import numpy as np
 from coordinator.excitation.plan import Mode, Motions, Plan
 from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
-from coordinator.kinematics.assembly import link_lengths
+from coordinator.kinematics.chain_estimate import link_lengths
 from coordinator.recording.recording import Recording
 from coordinator.runtime.exit_codes import explain
 from module_agent.model.catalogue import ImuKind

@@ -1,6 +1,7 @@
 """Which link changed: from two chains with known covariances, drawn as two sessions' noise would."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.stats import chi2
 
 from coordinator.baseline.change_detection import FLOOR_M, FLOOR_RAD, TiedFits, find_changes
 from coordinator.batch_estimation.estimator import Refinement
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.model.chain import Chain
 from module_agent.model.perturbation import adjoint, apply_perturbation, perturbation_between
 from sim.robot.robot_file import load_robot
@@ -37,8 +39,15 @@ def _spread(chain: Chain, hidden: np.ndarray) -> np.ndarray:
 
 def _fit(chain: Chain, covariance: np.ndarray, hidden: np.ndarray) -> Refinement:
     values: dict[str, object] = dict.fromkeys(Refinement._fields)
-    values |= {"chain": chain, "noise_covariance": covariance, "null_basis": hidden}
+    values |= {
+        "estimate": ChainEstimate(chain, covariance, hidden, 0, 1.0),
+        "noise_covariance": covariance,
+    }
     return Refinement(**values)  # type: ignore[arg-type]
+
+
+def _ending_at(fits: TiedFits, chain: Chain) -> TiedFits:
+    return fits._replace(after=fits.after._replace(estimate=replace(fits.after.estimate, chain=chain)))
 
 
 @pytest.fixture
@@ -113,7 +122,7 @@ def test_of_two_links_that_changed_both_are_named_the_surer_one_first(draw: Draw
     fits = draw(ARM, rng, "A-5", np.array([0.0, 0.0, 0.0, 0.0, 3e-3, 0.0]))
     chain = fits.before.chain
     second = _moved(chain, 2, np.array([0.02, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    both = fits._replace(after=fits.after._replace(chain=apply_perturbation(fits.after.chain, second)))
+    both = _ending_at(fits, apply_perturbation(fits.after.chain, second))
     found = find_changes(both)
     assert [chain.serials[c.child] for c in found.changed] == ["A-3", "A-5"]
     assert found.changed[0].rotation_rad[0] == pytest.approx(0.02, abs=3e-3)
@@ -138,11 +147,7 @@ def test_the_gain_of_a_link_that_has_not_changed_is_distributed_as_chi_squared(d
         for k in range(1, 6):
             twist = rng.standard_normal(6) * np.repeat([FLOOR_RAD, FLOOR_M], 3)
             chain = apply_perturbation(chain, _moved(_true(ARM), k, twist))
-        (change,) = [
-            c
-            for c in find_changes(fits._replace(after=fits.after._replace(chain=chain))).each
-            if c.child == 3
-        ]
+        (change,) = [c for c in find_changes(_ending_at(fits, chain)).each if c.child == 3]
         white = np.linalg.solve(
             np.linalg.cholesky(change.covariance), np.r_[change.rotation_rad, change.displacement_m]
         )

@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.baseline.difference import difference, joints_to_explore
 from coordinator.baseline.update import placed
-from coordinator.batch_estimation.estimator import Refinement
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.topology.topology import Topology
 from module_agent.model.chain import Chain
 from module_agent.model.perturbation import adjoint, apply_perturbation, perturbation_between
@@ -64,13 +64,12 @@ def _spread(chain: Chain, sigma: Mapping[str, tuple[float, float]]) -> np.ndarra
     return found
 
 
-def _fit(chain: Chain, covariance: np.ndarray, hidden: np.ndarray | None = None) -> Refinement:
-    values: dict[str, object] = dict.fromkeys(Refinement._fields)
-    unknown = np.zeros((len(covariance), 0)) if hidden is None else hidden
-    return Refinement(**(values | {"chain": chain, "covariance": covariance, "null_basis": unknown}))  # type: ignore[arg-type]
+def _fit(chain: Chain, covariance: np.ndarray, hidden: np.ndarray | None = None) -> ChainEstimate:
+    null_basis = np.zeros((len(covariance), 0)) if hidden is None else hidden
+    return ChainEstimate(chain, covariance, null_basis, 0, 1.0)
 
 
-def _drawn(chain: Chain, covariance: np.ndarray, rng: np.random.Generator) -> Refinement:
+def _drawn(chain: Chain, covariance: np.ndarray, rng: np.random.Generator) -> ChainEstimate:
     noise = rng.multivariate_normal(np.zeros(len(covariance)), covariance, method="eigh")
     return _fit(apply_perturbation(chain, noise), covariance)
 

@@ -93,7 +93,7 @@ def test_links_keep_their_lengths_on_a_base_that_moves(shaken: tuple[Chain, Sens
     chain, data = shaken
     known, blind = (refine_chain(chain, one) for one in (data, data._replace(base_motion=None)))
     squares, freedom = 0.0, 0
-    values, vectors = np.linalg.eigh(known.covariance)
+    values, vectors = np.linalg.eigh(known.estimate.covariance)
     for value, vector in zip(values, vectors.T, strict=True):
         if value > values.max() * 1e-12:
             squares += float(vector @ _apart(known.chain, chain).ravel()) ** 2 / value

@@ -101,9 +101,9 @@ def test_parameters_are_exact_but_for_the_null_space(robots: Any, seed: int) -> 
     # What hides is a finite twist; small starts keep its second order, 0.5 * (7e-4)^2, below the bound.
     found = refine_chain(_perturbed(truth, seed, 2e-4, 2e-4), _sensed(truth))
     error = _increment(found.chain, truth)
-    known = error - found.null_basis @ (found.null_basis.T @ error)
+    known = error - found.estimate.null_basis @ (found.estimate.null_basis.T @ error)
     assert np.abs(known).max() < 1e-6
-    assert found.rank + found.null_basis.shape[1] == 6 * (len(truth.serials) - 1)
+    assert found.estimate.rank + found.estimate.null_basis.shape[1] == 6 * (len(truth.serials) - 1)
 
 
 def test_biases_do_not_bend_the_robot(robots: Any) -> None:
@@ -123,12 +123,12 @@ def test_the_covariance_is_honest_over_many_noisy_runs(robots: Any) -> None:
     squares, freedom = 0.0, 0
     for seed in range(25):
         found = refine_chain(truth, _sensed(truth, seed, noise=1.0, bias=1.0))
-        values, vectors = np.linalg.eigh(found.covariance)
+        values, vectors = np.linalg.eigh(found.estimate.covariance)
         kept = values > values.max() * 1e-12
         along = vectors[:, kept].T @ _increment(found.chain, truth)
         squares += float(np.sum(along**2 / values[kept]))
         freedom += int(np.count_nonzero(kept))
-    assert freedom == 25 * found.rank
+    assert freedom == 25 * found.estimate.rank
     # Chi-square with some 275 degrees of freedom: one sigma is 0.085; four sigma for what the seeds share.
     assert 0.66 < squares / freedom < 1.34
 
@@ -151,13 +151,15 @@ def test_a_vertical_first_axis_hides_offset_and_heading_and_a_tilted_one_the_off
 ) -> None:
     truth = _upright(robots, 11, joints, tilt_rad)
     found = refine_chain(truth, _sensed(truth, 0, noise=1.0))
-    named = name_null_space(found.chain, found.null_basis)
+    named = name_null_space(found.chain, found.estimate.null_basis)
     assert [u.kind for u in named] == kinds
     assert {u.joint for u in named} == {truth.serials[0]}
-    assert found.null_basis.shape[1] == len(kinds)
-    np.testing.assert_allclose(found.null_basis.T @ found.null_basis, np.eye(len(kinds)), atol=1e-9)
+    assert found.estimate.null_basis.shape[1] == len(kinds)
+    np.testing.assert_allclose(
+        found.estimate.null_basis.T @ found.estimate.null_basis, np.eye(len(kinds)), atol=1e-9
+    )
     # The covariance claims nothing along what is unknown.
-    np.testing.assert_allclose(found.covariance @ found.null_basis, 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.estimate.covariance @ found.estimate.null_basis, 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -189,11 +191,14 @@ def test_scipy_finds_the_same_minimum(robots: Any) -> None:
     q, qd, qdd = data.q_rad, data.qd_rad_s, data.qdd_rad_s2
     w_gyro, w_accel = 1 / found.residual_gyro_rad_s[:, None], 1 / found.residual_accel_m_s2[:, None]
     # Scipy's solver stalls along directions that change nothing: it moves in the others only.
-    poses = orth(np.eye(12) - found.null_basis[6:] @ found.null_basis[6:].T)
+    poses = orth(np.eye(12) - found.estimate.null_basis[6:] @ found.estimate.null_basis[6:].T)
 
     def misfit(x: Array) -> Array:
-        moved = apply_perturbation(truth, np.concatenate([np.zeros(6), poses @ x[: found.rank]]))
-        tilt, biases = x[found.rank : found.rank + 3], x[found.rank + 3 :].reshape(2, 3, 3)
+        moved = apply_perturbation(truth, np.concatenate([np.zeros(6), poses @ x[: found.estimate.rank]]))
+        tilt, biases = (
+            x[found.estimate.rank : found.estimate.rank + 3],
+            x[found.estimate.rank + 3 :].reshape(2, 3, 3),
+        )
         read = imu_readings(moved._replace(gravity=truth.gravity + tilt), q, qd, qdd)
         return np.concatenate(
             [
@@ -206,11 +211,11 @@ def test_scipy_finds_the_same_minimum(robots: Any) -> None:
         )
 
     theirs = least_squares(
-        misfit, np.zeros(found.rank + 21), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
+        misfit, np.zeros(found.estimate.rank + 21), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14
     )
-    their = np.concatenate([np.zeros(6), poses @ theirs.x[: found.rank]])
+    their = np.concatenate([np.zeros(6), poses @ theirs.x[: found.estimate.rank]])
     apart = _increment(found.chain, truth) - their
-    sigma = np.sqrt(np.einsum("ij,jk,ik->i", poses.T, found.covariance[6:, 6:], poses.T))
+    sigma = np.sqrt(np.einsum("ij,jk,ik->i", poses.T, found.estimate.covariance[6:, 6:], poses.T))
     # The same point on the scale of what the noise leaves open: a hundredth of a standard deviation.
     assert np.abs((poses.T @ apart[6:]) / sigma).max() < 0.01
 
@@ -241,7 +246,7 @@ def test_the_intervals_hold_with_imus_as_delivered(robots: Any) -> None:
     for seed in range(25):
         data, _ = _uncalibrated(_sensed(truth), seed)
         found = refine_chain(truth, _with_noise(data, 100 + seed), UNCALIBRATED)
-        values, vectors = np.linalg.eigh(found.covariance)
+        values, vectors = np.linalg.eigh(found.estimate.covariance)
         kept = values > values.max() * 1e-12
         along = vectors[:, kept].T @ _increment(found.chain, truth)
         squares += float(np.sum(along**2 / values[kept]))
@@ -294,7 +299,7 @@ def test_what_the_model_leaves_out_widens_the_intervals(robots: Any, monkeypatch
     monkeypatch.setattr(estimator, "samples_per_independent", lambda residual, *_: np.ones(residual.shape[1]))
     untold = refine_chain(truth, shaken)
     np.testing.assert_array_equal(told.chain.imu_home, untold.chain.imu_home)
-    wider = np.diag(told.covariance)[6:] / np.diag(untold.covariance)[6:]
+    wider = np.diag(told.estimate.covariance)[6:] / np.diag(untold.estimate.covariance)[6:]
     # Gyros alone know some parameters; those that the accelerometers tell are believed a good deal less.
     assert wider.min() > 0.999
     assert wider.max() > 2.0
@@ -328,8 +333,8 @@ def test_too_few_samples_are_refused(robots: Any) -> None:
 def test_results_cannot_be_written_to(robots: Any) -> None:
     truth, _ = robots.random(0, joints=2)
     found = refine_chain(truth, _sensed(truth, 0, noise=1.0))
-    for name in ("covariance", "null_basis", "residual_gyro_rad_s"):
-        assert not getattr(found, name).flags.writeable
+    for array in (found.estimate.covariance, found.estimate.null_basis, found.residual_gyro_rad_s):
+        assert not array.flags.writeable
     assert not found.intrinsics.errors.flags.writeable
     for array in (found.chain.axis, found.chain.point, found.chain.imu_home, found.chain.gravity):
         assert not array.flags.writeable

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coordinator.identification.preview import beside, preview
-from coordinator.kinematics.assembly import link_lengths
+from coordinator.kinematics.chain_estimate import link_lengths
 from module_agent.model.chain import Chain
 from module_agent.wire.feedback_rows import ROW
 

@@ -33,11 +33,13 @@ def without_null_space(fit: ChainFit, truth: Chain) -> Chain:
     """Move the estimate along its null space, and nowhere else, as near to the truth as it goes."""
 
     def off(amounts: np.ndarray) -> np.ndarray:
-        return (apply_perturbation(fit.chain, fit.null_basis @ amounts).imu_home - truth.imu_home).ravel()
+        return (
+            apply_perturbation(fit.chain, fit.estimate.null_basis @ amounts).imu_home - truth.imu_home
+        ).ravel()
 
-    start = np.zeros(fit.null_basis.shape[1])
+    start = np.zeros(fit.estimate.null_basis.shape[1])
     best = least_squares(off, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x if start.size else start
-    return apply_perturbation(fit.chain, fit.null_basis @ best)
+    return apply_perturbation(fit.chain, fit.estimate.null_basis @ best)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -53,7 +55,7 @@ def test_exact_observations_of_any_tree_give_the_exact_chain_up_to_the_named_nul
     np.testing.assert_allclose(fit.chain.gravity, chain.gravity, atol=1e-5)
     q = np.random.default_rng(seed).uniform(-2, 2, (4, len(types)))
     np.testing.assert_allclose(imu_poses(found, q), imu_poses(chain, q), atol=1e-5)
-    assert fit.rank + fit.null_basis.shape[1] == fit.unknowns
+    assert fit.estimate.rank + fit.estimate.null_basis.shape[1] == fit.unknowns
     assert fit.reduced_chi2 < 1e-10
 
 
@@ -63,14 +65,14 @@ def test_only_the_offset_along_the_first_axis_is_open_in_a_general_serial_robot(
 ) -> None:
     chain, types = robots.random(50 + seed, joints=5, serial=True)
     fit = fit_exact(robots, chain, types, seed)
-    assert [(u.kind, u.joint) for u in fit.unresolved] == [("offset_along_axis", "M00")]
-    assert "nothing" in fit.unresolved[0].resolved_by
+    assert [(u.kind, u.joint) for u in fit.estimate.unresolved] == [("offset_along_axis", "M00")]
+    assert "nothing" in fit.estimate.unresolved[0].resolved_by
 
 
 def test_two_trees_on_one_base_cannot_know_where_the_other_stands(robots: Any) -> None:
     chain, types = robots.random(7, joints=6, roots=2)
     fit = fit_exact(robots, chain, types, 7)
-    kinds = [(u.kind, u.joint) for u in fit.unresolved]
+    kinds = [(u.kind, u.joint) for u in fit.estimate.unresolved]
     assert ("position", "") in kinds
     assert ("rotation_about_gravity", "") in kinds
     assert all(kind != "combination" for kind, _ in kinds)
@@ -79,7 +81,7 @@ def test_two_trees_on_one_base_cannot_know_where_the_other_stands(robots: Any) -
         if parent >= 0:
             off = chain.imu_home[k, :3, 3] - chain.point[parent]
             length = np.linalg.norm(np.cross(off, chain.axis[parent]))
-            assert fit.link_length_m[k] == pytest.approx(length, abs=1e-6)
+            assert fit.estimate.link_length_m[k] == pytest.approx(length, abs=1e-6)
 
 
 def test_every_branch_of_a_tree_has_an_offset_of_its_own_that_nothing_tells(robots: Any) -> None:
@@ -89,7 +91,7 @@ def test_every_branch_of_a_tree_has_an_offset_of_its_own_that_nothing_tells(robo
     homes[1:, :3, :3] = Rotation.random(2, rng=np.random.default_rng(1)).as_matrix()
     chain = robots.build([-1, 0, 0], [False] * 3, homes, [X5] * 3, np.array([1.0, 0.0, 0.3]))
     fit = fit_exact(robots, chain, [X5] * 3, 1)
-    assert [(u.kind, u.joint, u.modules) for u in fit.unresolved] == [
+    assert [(u.kind, u.joint, u.modules) for u in fit.estimate.unresolved] == [
         ("offset_along_axis", "M00", ("M01",)),
         ("offset_along_axis", "M00", ("M02",)),
     ]
@@ -142,26 +144,26 @@ def test_with_noise_the_errors_are_those_that_the_covariance_states(robots: Any)
     chi2, lengths, distances = [], [], []
     truth = assemble(
         robots.topology(chain), types, robots.observe(chain, positions), [robots.rest(chain, positions[0])]
-    ).link_length_m
+    ).estimate.link_length_m
     for seed in range(20):
         fit = assemble(robots.topology(chain), types, *noisy(robots, chain, seed, positions))
         chi2.append(fit.reduced_chi2)
-        lengths.append((fit.link_length_m - truth)[1:] / fit.link_length_sigma_m[1:])
+        lengths.append((fit.estimate.link_length_m - truth)[1:] / fit.estimate.link_length_sigma_m[1:])
         aligned = without_null_space(fit, chain)
         distances.append(mahalanobis(aligned, chain, fit))
-    freedom = 4 * 10 + 2 * 5 - fit.rank
+    freedom = 4 * 10 + 2 * 5 - fit.estimate.rank
     # 20 draws of `freedom` squares each: sigma of the mean is sqrt(2 / (20 freedom)), four times that.
     assert np.mean(chi2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / (20 * freedom)))
     assert np.sqrt(np.mean(np.square(lengths))) == pytest.approx(1.0, abs=4 / np.sqrt(2 * 80))
     assert np.abs(lengths).max() < 4.5
     # Squares over the resolved directions of the poses: rank less the two of gravity.
-    assert np.mean(distances) / (fit.rank - 2) == pytest.approx(1.0, abs=0.3)
+    assert np.mean(distances) / (fit.estimate.rank - 2) == pytest.approx(1.0, abs=0.3)
 
 
 def mahalanobis(found: Chain, truth: Chain, fit: ChainFit) -> float:
     """Squared distance of two chains by the fit's covariance, null space left out."""
     error = RigidTransform.from_matrix(truth.imu_home @ np.linalg.inv(found.imu_home)).as_exp_coords().ravel()
-    return float(error @ np.linalg.pinv(fit.covariance, rcond=1e-9, hermitian=True) @ error)
+    return float(error @ np.linalg.pinv(fit.estimate.covariance, rcond=1e-9, hermitian=True) @ error)
 
 
 def test_a_worse_observation_is_named_by_its_misfit(robots: Any) -> None:
@@ -187,13 +189,13 @@ def two_modules(robots: Any, up: np.ndarray, yaw: float) -> Chain:
 def test_on_a_vertical_axis_the_yaw_of_the_next_module_is_unknown_and_said_so(robots: Any) -> None:
     chain = two_modules(robots, np.array([0.0, 0.0, 1.0]), yaw=0.9)
     fit = fit_exact(robots, chain, [X5, X5], 0)
-    assert [(u.kind, u.joint, u.modules) for u in fit.unresolved] == [
+    assert [(u.kind, u.joint, u.modules) for u in fit.estimate.unresolved] == [
         ("offset_along_axis", "M00", ("M01",)),
         ("rotation_about_axis", "M00", ("M01",)),
     ]
-    assert "base yaw" in fit.unresolved[1].text
-    assert "fixed base" in fit.unresolved[0].text
-    assert fit.link_length_m[1] == pytest.approx(0.3 - 0.0, abs=0.05)
+    assert "base yaw" in fit.estimate.unresolved[1].text
+    assert "fixed base" in fit.estimate.unresolved[0].text
+    assert fit.estimate.link_length_m[1] == pytest.approx(0.3 - 0.0, abs=0.05)
     np.testing.assert_allclose(without_null_space(fit, chain).imu_home, chain.imu_home, atol=1e-6)
     # Left at neutral, in the plane of the root's output face, but for what the first guess was off (0.1 mm).
     assert fit.chain.imu_home[1, 2, 3] == pytest.approx(X5.output_xyz[2], abs=1e-4)
@@ -202,7 +204,7 @@ def test_on_a_vertical_axis_the_yaw_of_the_next_module_is_unknown_and_said_so(ro
 def test_on_a_horizontal_axis_gravity_tells_the_yaw_but_not_the_offset(robots: Any) -> None:
     chain = two_modules(robots, np.array([1.0, 0.2, 0.0]), yaw=-0.7)
     fit = fit_exact(robots, chain, [X5, X5], 0)
-    assert [(u.kind, u.joint) for u in fit.unresolved] == [("offset_along_axis", "M00")]
+    assert [(u.kind, u.joint) for u in fit.estimate.unresolved] == [("offset_along_axis", "M00")]
     np.testing.assert_allclose(fit.chain.imu_home[1, :3, :3], chain.imu_home[1, :3, :3], atol=1e-6)
 
 
@@ -211,8 +213,8 @@ def test_a_single_module_is_a_chain_with_nothing_unknown_but_gravity(robots: Any
     fit = assemble(robots.topology(chain), [X5], [], [robots.rest(chain, np.array([0.8]))])
     np.testing.assert_allclose(fit.chain.gravity, chain.gravity, atol=1e-9)
     np.testing.assert_allclose(fit.chain.axis, [[0, 0, -1]])
-    assert fit.unresolved == ()
-    assert np.isnan(fit.link_length_m[0])
+    assert fit.estimate.unresolved == ()
+    assert np.isnan(fit.estimate.link_length_m[0])
 
 
 def test_parallel_axes_leave_the_offset_along_them_open_however_many_they_are(robots: Any) -> None:
@@ -222,11 +224,11 @@ def test_parallel_axes_leave_the_offset_along_them_open_however_many_they_are(ro
     homes[1, :3, 3], homes[2, :3, 3] = [0.3, 0.0, 0.05], [0.5, 0.1, 0.11]
     chain = robots.build([-1, 0, 1], [False] * 3, homes, [X5] * 3, np.array([0.0, 1.0, 0.0]))
     fit = fit_exact(robots, chain, [X5] * 3, 4)
-    assert [(u.kind, u.joint) for u in fit.unresolved] == [
+    assert [(u.kind, u.joint) for u in fit.estimate.unresolved] == [
         ("offset_along_axis", "M00"),
         ("offset_along_axis", "M01"),
     ]
-    assert "parallel" in fit.unresolved[1].text
+    assert "parallel" in fit.estimate.unresolved[1].text
     np.testing.assert_allclose(without_null_space(fit, chain).imu_home, chain.imu_home, atol=1e-6)
 
 
@@ -238,7 +240,7 @@ def test_noise_does_not_resolve_what_parallel_axes_leave_open(robots: Any) -> No
     positions = robots.positions(chain, 5)
     for seed in range(5):
         fit = assemble(robots.topology(chain), [X5] * 3, *noisy(robots, chain, seed, positions))
-        kinds = [(u.kind, u.joint) for u in fit.unresolved]
+        kinds = [(u.kind, u.joint) for u in fit.estimate.unresolved]
         assert ("offset_along_axis", "M00") in kinds
         assert ("offset_along_axis", "M01") in kinds
         assert ("rotation_about_axis", "M00") in kinds

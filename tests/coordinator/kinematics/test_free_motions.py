@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.gauge_fixing import carried, gauge_fixed, gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved, name_null_space
 from module_agent.model.chain import Chain
@@ -82,7 +83,7 @@ def test_a_fit_that_drifted_is_settled_with_all_that_is_known_of_it(robots: Any)
     away = moved(chain, free, np.full(len(free), 0.4))
     drifted_basis, _ = np.linalg.qr(carried(chain, away, basis))
     drifted = carried(chain, away, carried(chain, away, known @ known.T).T)
-    back = gauge_fixed(away, drifted, drifted_basis, chain)
+    back = gauge_fixed(ChainEstimate(away, drifted, drifted_basis, 25, 1.0), chain)
     np.testing.assert_allclose(back.chain.imu_home, chain.imu_home, atol=1e-6)
     np.testing.assert_allclose(back.covariance, known @ known.T, atol=1e-12)
     # The same space, whatever vectors span it.

@@ -20,8 +20,8 @@ def test_moving_along_a_named_direction_by_any_amount_changes_no_observation(rob
     pairs, rests = robots.observe(chain, positions), [robots.rest(chain, positions[0])]
     fit = assemble(robots.topology(chain), types, pairs, rests)
     seen = pack(chain.serials, pairs, rests)
-    directions = [d for item in fit.unresolved for d in item.directions.T]
-    assert len(directions) == fit.null_basis.shape[1]
+    directions = [d for item in fit.estimate.unresolved for d in item.directions.T]
+    assert len(directions) == fit.estimate.null_basis.shape[1]
     for direction in directions:
         moved = apply_perturbation(fit.chain, 1.3 * direction)  # no small amount: 1.3 m, or 1.3 rad
         # Residuals are in sigmas; rounding of 1e-12 m over 0.3 mm is far below.
@@ -33,10 +33,10 @@ def test_named_directions_span_the_null_space(robots: Any) -> None:
     positions = robots.positions(chain, 2)
     pairs, rests = robots.observe(chain, positions), [robots.rest(chain, positions[0])]
     fit = assemble(robots.topology(chain), types, pairs, rests)
-    named = np.concatenate([u.directions for u in fit.unresolved], axis=1)
-    outside = named - fit.null_basis @ (fit.null_basis.T @ named)
+    named = np.concatenate([u.directions for u in fit.estimate.unresolved], axis=1)
+    outside = named - fit.estimate.null_basis @ (fit.estimate.null_basis.T @ named)
     np.testing.assert_allclose(outside, 0.0, atol=1e-6)
-    assert np.linalg.matrix_rank(named) == fit.null_basis.shape[1]
+    assert np.linalg.matrix_rank(named) == fit.estimate.null_basis.shape[1]
 
 
 def test_a_direction_that_has_no_name_is_reported_as_a_combination(robots: Any) -> None:

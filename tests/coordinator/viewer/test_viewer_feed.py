@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.kinematics.assembly import ChainFit
+from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.recording.recording import Entry, Recording
 from coordinator.viewer.feed import FILE, LIVE, Pace, ViewerFeed
 from module_agent.model.chain import Chain
@@ -76,23 +76,10 @@ def rig(wire: SimpleNamespace, request: pytest.FixtureRequest) -> Rig:
     return Rig(wire, request.param)
 
 
-def _fit(chain: Chain) -> ChainFit:
+def _fit(chain: Chain) -> ChainEstimate:
     count = len(chain.serials)
     nothing = np.zeros((6 * count,) * 2)
-    return ChainFit(
-        chain=chain,
-        covariance=nothing,
-        rank=0,
-        unknowns=0,
-        singular_values=np.zeros(0),
-        condition=1.0,
-        unresolved=(),
-        null_basis=nothing[:, :0],
-        link_length_m=np.full(count, 0.3),
-        link_length_sigma_m=np.full(count, 0.001),
-        reduced_chi2=1.0,
-        misfit_sigma=np.zeros(0),
-    )
+    return ChainEstimate(chain, nothing, nothing[:, :0], 0, 1.0)
 
 
 def _rows(*numbers: int) -> list[tuple[int, float]]:

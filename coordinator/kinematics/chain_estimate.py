@@ -1,0 +1,70 @@
+"""A chain with what is known of it: covariance and null space of its perturbations, link lengths."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from coordinator.kinematics.null_space import Unresolved, name_null_space
+from module_agent.model.chain import Array, Chain
+from module_agent.model.perturbation import frozen, skew
+
+
+@dataclass(frozen=True, eq=False)
+class ChainEstimate:
+    """An estimated chain of n modules, arrays read-only; perturbations as in `apply_perturbation`.
+
+    covariance: (6 n, 6 n) of the perturbation; zero for the first module, whose housing is the root frame,
+        and along directions that no observation resolves.
+    null_basis: (6 n, k) orthonormal perturbations that no observation resolves.
+    rank: number of resolved directions. condition: the largest over the smallest of their sigmas.
+    """
+
+    chain: Chain
+    covariance: Array
+    null_basis: Array
+    rank: int
+    condition: float
+
+    @cached_property
+    def unresolved(self) -> tuple[Unresolved, ...]:
+        """The null space by name."""
+        return name_null_space(self.chain, self.null_basis)
+
+    @property
+    def link_length_m(self) -> Array:
+        """(n,) perpendicular distance from the parent's axis to the module's IMU at q = 0; NaN for roots."""
+        return self._link_lengths[0]
+
+    @property
+    def link_length_sigma_m(self) -> Array:
+        """(n,) one standard deviation of `link_length_m`."""
+        return self._link_lengths[1]
+
+    @cached_property
+    def _link_lengths(self) -> tuple[Array, Array]:
+        return link_lengths(self.chain, self.covariance)
+
+
+def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
+    """Return the lengths (n,) from each parent's axis to the module's IMU at q = 0 and their sigmas; NaN for
+    roots.
+
+    Where the length is zero it has no slope; the sigma is then that of the place across the axis.
+    """
+    length, sigma = np.full((2, len(chain.serials)), np.nan)
+    for k in chain.linked:
+        parent = chain.parent[k]
+        axis, place = chain.axis[parent], chain.imu_home[k, :3, 3]
+        off = place - chain.point[parent]
+        radial = off - axis * (axis @ off)
+        length[k] = float(np.linalg.norm(radial))
+        # Only the motion of the IMU against the axis counts: that of the line, as a body, is taken off.
+        slope = np.zeros((3, covariance.shape[0]))
+        slope[:, 6 * k : 6 * k + 6] = np.concatenate([-skew(place), np.eye(3)], axis=1)
+        slope[:, 6 * parent : 6 * parent + 6] -= np.concatenate([-skew(place), np.eye(3)], axis=1)
+        across = np.eye(3) - np.outer(axis, axis)
+        outward = radial[None, :] / length[k] if length[k] > 1e-6 else across
+        spread = outward @ slope @ covariance @ slope.T @ outward.T
+        sigma[k] = float(np.sqrt(np.trace(spread)))
+    return frozen(length), frozen(sigma)
