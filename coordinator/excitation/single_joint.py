@@ -14,7 +14,7 @@ import numpy as np
 from coordinator.batch_estimation.imu_intrinsics import ImuPrior
 from coordinator.excitation.fisher_information import CircleSetting, JointPath, SensorNoise, circle_covariance
 from coordinator.excitation.joint_limits import JointLimits, motion_peaks
-from module_agent.control.waveform import SHORTEST_GOTO_S, duration_s, waveform
+from module_agent.control.waveform import duration_s, minimum_jerk_duration_s, waveform
 from module_agent.model.catalogue import GRAVITY_M_S2
 from module_agent.wire.messages import ConstantMotion, Pattern, WindowedSine
 
@@ -162,7 +162,7 @@ def _sweep(task: JointTask, sweep_rad: float) -> ConstantMotion | None:
 def _other_s(task: JointTask, constant: ConstantMotion) -> float:
     """Return how long going to the slow motion's start, it, going home and settling twice take."""
     travel_rad = 0.5 * constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
-    journey_s = max(1.875 * travel_rad / task.travel_speed_rad_s, SHORTEST_GOTO_S)
+    journey_s = minimum_jerk_duration_s(travel_rad, task.travel_speed_rad_s)
     return duration_s(constant, 0.0) + 2.0 * (journey_s + task.settle_s)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.control.motion import effort_profile, profile_period_ns
-from module_agent.control.waveform import duration_s, waveform
+from module_agent.control.waveform import MINIMUM_JERK_PEAK, duration_s, waveform
 from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import differentiate
@@ -87,8 +87,8 @@ def paths_together(
     total_s = duration_s(last, origins_rad[longest])
     found: dict[str, Pattern] = {}
     for serial, way in ways.items():
-        # The peak of a minimum-jerk path is 15/8 of its mean speed.
-        own = GoTo(target_rad=targets_rad[serial], max_speed_rad_s=max(1.875 * way / total_s, _SLOWEST_RAD_S))
+        speed = max(MINIMUM_JERK_PEAK * way / total_s, _SLOWEST_RAD_S)
+        own = GoTo(target_rad=targets_rad[serial], max_speed_rad_s=speed)
         found[serial] = own if way >= _THERE_RAD else Rest(duration_s=total_s)
     return found
 

@@ -2,11 +2,8 @@
 
 import numpy as np
 
+from module_agent.control.waveform import minimum_jerk, minimum_jerk_duration_s
 from module_agent.model.chain import Array
-
-# The peak of a minimum-jerk path is 15/8 of its mean speed (Flash and Hogan, 1985).
-_PEAK = 1.875
-_SHORTEST_S = 0.2
 
 
 class Way:
@@ -16,14 +13,12 @@ class Way:
         self.end_rad = end_rad.copy()
         self._start_rad = start_rad.copy()
         farthest_rad = float(np.abs(end_rad - start_rad).max())
-        self.total_s = max(_PEAK * farthest_rad / top_speed_rad_s, _SHORTEST_S)
+        self.total_s = minimum_jerk_duration_s(farthest_rad, top_speed_rad_s)
 
     def at(self, t_s: float) -> tuple[Array, Array]:
         """Return positions [rad] and velocities [rad/s], (n,) each, at a time from its beginning."""
         gone = self.end_rad - self._start_rad
         if t_s >= self.total_s:
             return self.end_rad.copy(), np.zeros_like(gone)
-        s = max(t_s, 0.0) / self.total_s
-        share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-        rate = 30.0 * (s * (1.0 - s)) ** 2 / self.total_s
+        share, rate = minimum_jerk(1.0, self.total_s, t_s)
         return self._start_rad + share * gone, rate * gone

@@ -1,14 +1,14 @@
 """Motion patterns as position and velocity over time, relative to where the motion begins.
 
 All functions are vectorised over the time samples. Sources: thesis eq. 13 (constant motion), eq. 14 (windowed
-sine), table 6 and figure 44 (dynamic pattern); the minimum-jerk path is that of Flash and Hogan, 1985; sums
+sine), table 6 and figure 44 (dynamic pattern); sums
 of sines as excitation: Swevers et al., Optimal robot excitation and identification, 1997.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from module_agent.wire.messages import (
     ConstantMotion,
@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 # acceleration.
 TAPER_SHARE = 0.15
 SHORTEST_GOTO_S = 0.2
+# Peak speed over mean speed of a minimum-jerk path: 15/8.
+MINIMUM_JERK_PEAK = 1.875
 
 
 class Waveform(NamedTuple):
@@ -42,9 +44,7 @@ def duration_s(pattern: Pattern, origin_rad: float) -> float:
         case Rest():
             return pattern.duration_s
         case GoTo():
-            # The peak speed of a minimum-jerk path is 15/8 of its mean speed.
-            travel = abs(pattern.target_rad - origin_rad)
-            return max(1.875 * travel / pattern.max_speed_rad_s, SHORTEST_GOTO_S)
+            return minimum_jerk_duration_s(abs(pattern.target_rad - origin_rad), pattern.max_speed_rad_s)
         case ConstantMotion():
             return pattern.duration_s + 2.0 * pattern.ramp_s
         case WindowedSine():
@@ -61,7 +61,7 @@ def waveform(pattern: Pattern, origin_rad: float, t_s: Array) -> Waveform:
         case Rest():
             return Waveform(np.zeros_like(t_s), np.zeros_like(t_s))
         case GoTo():
-            return _minimum_jerk(pattern.target_rad - origin_rad, duration_s(pattern, origin_rad), t_s)
+            return minimum_jerk(pattern.target_rad - origin_rad, duration_s(pattern, origin_rad), t_s)
         case ConstantMotion():
             return _constant(pattern, t_s)
         case WindowedSine():
@@ -72,8 +72,17 @@ def waveform(pattern: Pattern, origin_rad: float, t_s: Array) -> Waveform:
             return _multi_sine(pattern, t_s)
 
 
-def _minimum_jerk(travel_rad: float, total_s: float, t_s: Array) -> Waveform:
-    s = np.clip(t_s / total_s, 0.0, 1.0)
+def minimum_jerk_duration_s(travel_rad: float, max_speed_rad_s: float) -> float:
+    """Return how long a minimum-jerk path of |travel_rad| takes whose peak speed is `max_speed_rad_s`."""
+    return max(MINIMUM_JERK_PEAK * travel_rad / max_speed_rad_s, SHORTEST_GOTO_S)
+
+
+def minimum_jerk(travel_rad: float, total_s: float, t_s: ArrayLike) -> Waveform:
+    """Return x(s) = travel (10 s^3 - 15 s^4 + 6 s^5), s = t / total, and its rate (Flash and Hogan, 1985).
+
+    Before 0 and after `total_s` the path stands still at its ends.
+    """
+    s = np.clip(np.asarray(t_s) / total_s, 0.0, 1.0)
     return Waveform(
         travel_rad * s**3 * (10.0 - 15.0 * s + 6.0 * s**2),
         travel_rad / total_s * 30.0 * s**2 * (1.0 - s) ** 2,
