@@ -5,6 +5,7 @@ from coordinator.baseline.check_report import CheckReport, Session, compared, ot
 from coordinator.baseline.known_robot import BaselineRobot, hurried
 from coordinator.excitation.plan import Plan
 from coordinator.topology.topology import Topology
+from module_agent.model.errors import DataError
 from module_agent.wire.messages import WindowedSine
 
 BASE_NAME = "base"
@@ -12,7 +13,7 @@ BASE_NAME = "base"
 LONGEST_CENTRE_S, LONGEST_SIGMA_S = 2.3, 0.85
 
 
-class CheckError(ValueError):
+class CheckError(DataError):
     """The two runs cannot be compared; the message says which of them lacks what."""
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from rich.table import Table
 from scipy.stats import norm
 
 from coordinator.baseline.change_detection import Findings, LinkChange
@@ -193,28 +192,6 @@ def _changed(link: LinkCheck) -> str:
 
 def _odds(probability: float) -> str:
     return f"1 of {1.0 / probability:.0e}" if probability > 1e-15 else "less than 1 of 1e+15"
-
-
-def table(report: CheckReport) -> Table:
-    """Return the links as a table to print."""
-    shown = Table(title=f"{report.robot} against {report.known}")
-    for name in ("parent", "child"):
-        shown.add_column(name)
-    for name in ("displaced [mm]", "+-", "turned [deg]", "+-", "false alarm"):
-        shown.add_column(name, justify="right")
-    shown.add_column("")
-    for link in report.links:
-        shown.add_row(
-            link.parent,
-            link.child,
-            f"{link.length_mm:.2f}",
-            f"{link.length_sigma_mm:.2f}",
-            f"{np.linalg.norm(link.rotation_deg):.3f}",
-            f"{max(link.rotation_sigma_deg):.3f}",
-            f"{link.false_alarm_probability:.1g}",
-            "changed" if link.changed else "",
-        )
-    return shown
 
 
 def write_check(path: Path, report: CheckReport) -> None:

@@ -13,13 +13,14 @@ from coordinator.recording.run_folder import SESSION, load_recording
 from coordinator.recording.session_file import SessionFileError
 from module_agent.model.catalogue import ImuKind, UnknownModuleType
 from module_agent.model.chain import Chain
+from module_agent.model.errors import UsageError
 
 # In the folder of a run that brought a known robot up to date: the recording of the run that the robot was
 # known from, so that the folder tells the robot by itself.
 KNOWN = "known"
 
 
-class BaselineError(ValueError):
+class BaselineError(UsageError):
     """The folder holds no run that a robot is known from; the message says what is missing, and where."""
 
 

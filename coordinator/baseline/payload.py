@@ -9,6 +9,7 @@ from coordinator.parameter_fit.physically_consistent import NotSolvedError
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, dynamic_motion
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.model.forward_kinematics import places_on_axes
 from module_agent.model.information import JointInformation, gather
 from module_agent.signals.filtering import JointMotion
@@ -17,7 +18,7 @@ from module_agent.signals.filtering import JointMotion
 _MOVING: tuple[Purpose, ...] = ("dynamic", "whole")
 
 
-class PayloadError(ValueError):
+class PayloadError(DataError):
     """The two runs cannot be compared; the message says which of them lacks what."""
 
 

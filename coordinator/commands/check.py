@@ -1,69 +1,63 @@
-"""`x5-coordinator check`: is a known robot still what it was?"""
+"""`x5-coordinator check`: compare a robot with an earlier run of it."""
 
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
+from rich.table import Table
 
-from coordinator.baseline.check import CheckError, check, check_plan
-from coordinator.baseline.check_report import CheckReport, table, write_check
-from coordinator.baseline.known_robot import BaselineRobot
-from coordinator.commands.options import Connect, Expect, Listen, Network, Robot, fail, planned
-from coordinator.commands.short_run import baseline_or_fail, run_again
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
+from coordinator.baseline.check import check, check_plan
+from coordinator.baseline.check_report import CheckReport, write_check
+from coordinator.baseline.known_robot import load_baseline
+from coordinator.commands.attended_run import run_short
+from coordinator.commands.options import (
+    AsJson,
+    BaselineFolder,
+    ConnectOptions,
+    Expect,
+    Measured,
+    PlanFile,
+    Speed,
+    planned,
+)
+from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal
-from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from module_agent.model.errors import EXIT_FINDING, UsageError
 
 CHECK = "check.json"
-# Not a failure of the program, and not the robot's silence either.
-EXIT_CHANGED = 4
 
 
+@with_options
 def check_robot(
-    known: Annotated[Path, typer.Argument(help="Folder of the run that the robot is known from.")],
+    baseline: BaselineFolder,
+    at: ConnectOptions,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the check, made new: a run, and check.json.")
+        Path | None, typer.Option(help="New folder for the check: a short run, and check.json.")
     ] = None,
-    measured: Annotated[
-        Path | None, typer.Option(help="Compare with a run that is there already, without a robot.")
-    ] = None,
-    robot: Robot | None = None,
-    listen: Listen = DEFAULT_ENDPOINT,
-    connect: Connect = None,
-    network: Network = "none",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0,
+    measured: Measured = None,
     expect: Expect = None,
-    plan: Annotated[
-        Path | None, typer.Option(help="TOML file with settings of the motions, which a check shortens.")
-    ] = None,
-    speed: Annotated[float, typer.Option(help="Speed of a simulated world.")] = 1.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print check.json instead of a table.")] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    plan: PlanFile = None,
+    speed: Speed = 1.0,
+    as_json: AsJson = False,
 ) -> None:
-    """Measure a known robot again, in short, and say which of its links changed.
+    """Measure a robot again in a short run, and say which of its links changed since an earlier run.
 
     Exit codes: 0 nothing changed, 4 a link or the modules changed, others as of `run`.
     """
     if (out is None) == (measured is None):
-        fail("give either --out, to measure the robot, or --measured, a run to compare with", EXIT_USAGE)
-    before = baseline_or_fail(known)
+        raise UsageError("give either --out, to measure the robot, or --measured, a run to compare with")
+    before = load_baseline(baseline)
     folder = measured
     if out is not None:
-        folder, short = out, check_plan(before, planned(plan))
-        run_again(robot or before.name, out, short, listen, connect, network, seed, expect, speed, quiet)
+        folder = out
+        run_short(before, at, out, check_plan(before, planned(plan)), expect, speed)
     assert folder is not None
-    report = _compared(before, baseline_or_fail(folder))
+    report = check(before, load_baseline(folder))
     write_check(folder / CHECK, report)
     _print(report, as_json)
     if report.changed:
-        raise typer.Exit(EXIT_CHANGED)
-
-
-def _compared(before: BaselineRobot, after: BaselineRobot) -> CheckReport:
-    try:
-        return check(before, after)
-    except CheckError as error:
-        fail(error, EXIT_FAILED)
+        raise typer.Exit(EXIT_FINDING)
 
 
 def _print(report: CheckReport, as_json: bool) -> None:
@@ -71,6 +65,27 @@ def _print(report: CheckReport, as_json: bool) -> None:
         typer.echo(report.model_dump_json(indent=1, by_alias=True))
         return
     if report.links:
-        Terminal().console.print(table(report))
+        Terminal().console.print(_table(report))
     for line in report.words:
         typer.echo(line)
+
+
+def _table(report: CheckReport) -> Table:
+    table = Table(title=f"{report.robot} against {report.known}")
+    for name in ("parent", "child"):
+        table.add_column(name)
+    for name in ("displaced [mm]", "+-", "turned [deg]", "+-", "false alarm"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for link in report.links:
+        table.add_row(
+            link.parent,
+            link.child,
+            f"{link.length_mm:.2f}",
+            f"{link.length_sigma_mm:.2f}",
+            f"{np.linalg.norm(link.rotation_deg):.3f}",
+            f"{max(link.rotation_sigma_deg):.3f}",
+            f"{link.false_alarm_probability:.1g}",
+            "changed" if link.changed else "",
+        )
+    return table

@@ -14,12 +14,13 @@ from coordinator.arm_fit.physically_consistent import USUAL_TRUST
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.report import write_report
 from coordinator.commands.fit_dynamics_tables import notes, tables
-from coordinator.commands.options import fail
+from coordinator.commands.options import Quiet
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfError, UrdfRobot, read_urdf
 from coordinator.description.urdf_update import friction_of, write_fitted_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.terminal import Terminal, print_table
+from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE
 from module_agent.signals.torque_terms import DRIVE_TERMS, Term
 
 _UP = ",".join(f"{part:g}" for part in STANDARD_GRAVITY)
@@ -86,7 +87,7 @@ def fit_dynamics(
     gravity: _Gravity = _UP,
     mask: _Mask = _USUAL.mask_part,
     slow: _Slow = _USUAL.slow_part,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Identify inertia, friction and motors from a recording, and test what comes out on what was held out.
 

@@ -1,38 +1,38 @@
-"""`x5-coordinator merge`: what do several runs with the same modules say together?"""
+"""`x5-coordinator merge`: combine what several runs with the same modules measured."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coordinator.commands.options import fail
+from coordinator.commands.options import AsJson
 from coordinator.merge.information_file import InformationFileError, read_information
 from coordinator.merge.merge_runs import merge_runs
 from coordinator.merge.report import MERGED, merge_report, table, write_report
 from coordinator.recording.run_folder import INFORMATION
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
+from module_agent.model.errors import DataError, UsageError
 
-# Above this something was not the same in all runs, or a chain is worse than it says.
+# Above this the robot was not the same in all runs, or the covariance of a chain is too small.
 INCONSISTENT_ABOVE = 5.0
 
 
 def merge(
     runs: Annotated[list[Path], typer.Argument(help="Folders of two or more runs, with dynamics.")],
     out: Annotated[Path, typer.Option(help="Folder for merged.json.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Print merged.json instead of a table.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Say what the torques of several runs tell together of the parts of the robot's modules.
+    """Combine the torque measurements of several runs into inertial parameters of the modules' parts.
 
-    The modules may be put together otherwise in every run, in another order, on another base or on other
-    modules, as long as every link stays with the module that it leads to.
+    The robot may be assembled differently in every run: in another order, on another base, with further
+    modules. Each link must stay with the module that it leads to.
     """
     if len(runs) < 2:
-        fail("give two runs or more: one by itself says what its result.json says", EXIT_USAGE)
+        raise UsageError("give two or more runs: the parameters of a single one are in its result.json")
     try:
         report = merge_report(merge_runs([read_information(run / INFORMATION) for run in runs]))
     except (InformationFileError, ValueError) as error:
-        fail(error, EXIT_FAILED)
+        raise DataError(str(error)) from error
     out.mkdir(parents=True, exist_ok=True)
     write_report(out / MERGED, report)
     if as_json:
@@ -42,6 +42,7 @@ def merge(
     for run in report.runs:
         if run.inconsistency_sigma > INCONSISTENT_ABOVE:
             typer.echo(
-                f"{run.run} is {run.inconsistency_sigma:.0f} sigma off: a part or a link differs from the "
-                "other runs, or the covariance of its chain is too small"
+                f"{run.run} disagrees with the other runs by {run.inconsistency_sigma:.0f} sigma (at "
+                f"most {INCONSISTENT_ABOVE:.0f} expected): a part or a link differs, or the covariance of "
+                "its chain is too small"
             )

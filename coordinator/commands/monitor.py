@@ -1,4 +1,4 @@
-"""`x5-coordinator monitor`: is a known robot, while somebody moves it, still what it was?"""
+"""`x5-coordinator monitor`: compare a moving robot with its baseline, live or from a recording."""
 
 import asyncio
 import contextlib
@@ -8,103 +8,86 @@ from typing import Annotated
 
 import typer
 
-from coordinator.commands.attended_run import Place, join, sender_name
-from coordinator.commands.check import EXIT_CHANGED
+from coordinator.baseline.known_robot import load_baseline
+from coordinator.commands.attended_run import checked_speed
 from coordinator.commands.monitor_view import MonitorScreen
-from coordinator.commands.options import Connect, Listen, Network, Robot, fail
-from coordinator.commands.short_run import baseline_or_fail
+from coordinator.commands.options import (
+    ConnectOptions,
+    DynamicsFolder,
+    Place,
+    Speed,
+    open_connection,
+    sender_name,
+)
 from coordinator.live_robot.messenger import Messenger
 from coordinator.monitoring.live import KEPT_ROWS, LOOK_S, LiveMonitor
 from coordinator.monitoring.monitor import Watcher
-from coordinator.monitoring.reference import NoReference, Reference, build_reference
+from coordinator.monitoring.reference import build_reference
 from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import SessionFileError, read_session
-from coordinator.runtime.event_loop import SIGNALS, ScaledLoop, check_speed
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
+from coordinator.runtime.command_line import with_options
+from coordinator.runtime.event_loop import SIGNALS, ScaledLoop
 from coordinator.runtime.terminal import Terminal
 from coordinator.synchronisation.round_trips import map_clocks
-from module_agent.network_emulation.profile_file import network as network_named
-from module_agent.transport.endpoint import DEFAULT_ENDPOINT
-from module_agent.transport.transport import TransportError
-from module_agent.wire.keys import check_chunk
+from module_agent.model.errors import EXIT_FINDING, DataError, RobotError, UsageError
 from module_agent.wire.refusal import WireError
 
-# Whoever has not heard all modules by then hears nobody.
-_FIRST_HEARD_S = 15.0
+# Modules that have sent nothing by then are taken to be absent.
+_FIRST_FEEDBACK_S = 15.0
 
 
+@with_options
 def monitor_robot(
-    known: Annotated[
-        Path, typer.Argument(help="Folder of the run that the robot is known from, inertia and all.")
-    ],
+    baseline: DynamicsFolder,
+    at: ConnectOptions,
     recording: Annotated[
-        Path | None, typer.Option(help="Watch a session.mcap that is there already, without a robot.")
+        Path | None, typer.Option(help="Monitor a recorded session.mcap; needs no robot.")
     ] = None,
-    robot: Robot | None = None,
-    listen: Listen = DEFAULT_ENDPOINT,
-    connect: Connect = None,
-    network: Network = "none",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0,
     for_s: Annotated[
         float | None, typer.Option("--for", min=1.0, help="End after so many seconds [at Ctrl-C].")
     ] = None,
     alarms_per_hour: Annotated[
-        float, typer.Option(min=1e-6, max=1e3, help="False alarms that are taken into account.")
+        float, typer.Option(min=1e-6, max=1e3, help="Accepted rate of false alarms [1/h].")
     ] = ALARMS_PER_HOUR,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="Write what is found, a line of JSON each.")
+        Path | None, typer.Option("--json", help="File to write findings to, one JSON object a line.")
     ] = None,
-    speed: Annotated[float, typer.Option(help="Speed of a simulated world.")] = 1.0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing.")] = False,
+    speed: Speed = 1.0,
 ) -> None:
-    """Watch a known robot move: say when something hits it, when it carries something, and what wears.
+    """Monitor a robot that another program moves: report collisions, payloads, friction and wear.
 
-    Moves nothing and takes no lease. Exit codes: 0 nothing was found, 4 something was, others as of `run`.
+    Sends no commands and takes no lease. Exit codes: 0 no findings, 4 findings, others as of `run`.
     """
     if json_file is not None and not json_file.parent.is_dir():
-        fail(f"{json_file}: there is no folder {json_file.parent}", EXIT_USAGE)
+        raise UsageError(f"{json_file}: there is no folder {json_file.parent}")
     if recording is not None and not recording.is_file():
-        fail(f"{recording}: there is no such file; give the session.mcap of a run", EXIT_USAGE)
-    reference = _reference(known)
+        raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
+    reference = build_reference(load_baseline(baseline))
     watcher = Watcher(reference, alarms_per_hour)
     try:
-        screen = MonitorScreen(watcher, json_file, quiet)
+        screen = MonitorScreen(watcher, json_file, at.quiet)
     except OSError as error:
-        fail(f"{json_file}: {error.strerror or error}", EXIT_USAGE)
+        raise UsageError(f"{json_file}: {error.strerror or error}") from error
     with screen:
         if recording is not None:
-            _watch_file(watcher, screen, recording)
+            _monitor_file(watcher, screen, recording)
         else:
-            name = robot or reference.name
-            try:
-                check_chunk("robot", name)
-                check_speed(speed)
-                place = Place(listen, tuple(connect or ()), network_named(network), seed)
-            except ValueError as error:
-                fail(error, EXIT_USAGE)
-            _watch_live(watcher, screen, name, place, for_s, speed)
+            _monitor_live(watcher, screen, at.place(reference.name), for_s, checked_speed(speed))
         screen.sum_up()
     if watcher.ledger.all:
-        raise typer.Exit(EXIT_CHANGED)
+        raise typer.Exit(EXIT_FINDING)
 
 
-def _reference(folder: Path) -> Reference:
-    try:
-        return build_reference(baseline_or_fail(folder))
-    except NoReference as error:
-        fail(error, EXIT_USAGE)
-
-
-def _watch_file(watcher: Watcher, screen: MonitorScreen, path: Path) -> None:
-    """Watch what a session recorded, as if it happened now."""
+def _monitor_file(watcher: Watcher, screen: MonitorScreen, path: Path) -> None:
+    """Monitor a recorded session as if it were live."""
     serials = watcher.reference.chain.serials
     try:
         whole = load_recording(path)
         missing = [s for s in serials if s not in whole.modules or not whole.modules[s].round_trips]
         if missing:
-            fail(f"{path}: it holds no feedback, or no answers, of {', '.join(missing)}", EXIT_FAILED)
+            raise DataError(f"{path} has no feedback or no round trips of {', '.join(missing)}")
         clocks = map_clocks({s: whole.modules[s].round_trips for s in serials})
         looked_ns, recording = 0, Recording()
         for entry in read_session(path):
@@ -121,34 +104,33 @@ def _watch_file(watcher: Watcher, screen: MonitorScreen, path: Path) -> None:
                     module.rows.forget_before(module.rows.end_row - KEPT_ROWS)
         screen.say(watcher.advance(recording, clocks))
     except SessionFileError as error:
-        fail(error, EXIT_FAILED)
+        raise DataError(str(error)) from error
 
 
-def _watch_live(
-    watcher: Watcher, screen: MonitorScreen, robot: str, place: Place, for_s: float | None, speed: float
+def _monitor_live(
+    watcher: Watcher, screen: MonitorScreen, place: Place, for_s: float | None, speed: float
 ) -> None:
-    """Watch until the time is up or a signal comes, which ends a watch in order."""
+    """Monitor until the time is up, or a signal comes."""
+    transport = open_connection(place, Terminal()).transport
     loop = ScaledLoop(speed)
-    try:
-        transport = join(place, Terminal()).transport
-    except (OSError, TransportError) as error:
-        loop.close()
-        fail(error, EXIT_USAGE)
     try:
         screen.start_ns = loop.clock_ns()
         live = LiveMonitor(watcher, loop.clock_ns, sender_name(), screen.say)
-        radio = Messenger(transport, robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
+        radio = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
         task = loop.create_task(_attend(live, radio, watcher, for_s, loop.clock_ns))
         for number in SIGNALS:
             loop.add_signal_handler(number, task.cancel)
-        # Asked to end: what was found is summed up.
+        # A signal cancels the task; the summary of the findings follows.
         with contextlib.suppress(asyncio.CancelledError):
             loop.run_until_complete(task)
     finally:
         loop.close()
     if not watcher.looked_s:
         serials = ", ".join(watcher.reference.chain.serials)
-        fail(f"not all modules of robot {robot!r} were heard: {serials} are needed", EXIT_FAILED)
+        raise RobotError(
+            f"not all modules of robot {place.robot!r} sent feedback within {_FIRST_FEEDBACK_S:.0f} s; "
+            f"needed: {serials}"
+        )
 
 
 async def _attend(
@@ -157,7 +139,7 @@ async def _attend(
     start_ns = clock()
     radio.start()
     try:
-        await live.watch(radio, start_ns + round(_FIRST_HEARD_S * 1e9), lambda: watcher.looked_s > 0.0)
+        await live.watch(radio, start_ns + round(_FIRST_FEEDBACK_S * 1e9), lambda: watcher.looked_s > 0.0)
         if watcher.looked_s > 0.0:
             await live.watch(radio, None if for_s is None else clock() + round(for_s * 1e9))
     finally:

@@ -1,39 +1,190 @@
-"""Options that several commands of `x5-coordinator` share, and how wrong ones are answered."""
+"""Options that several commands share, each declared once, and the connection that they describe."""
 
+import dataclasses
+import os
+import secrets
+import socket
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated, NamedTuple
 
 import typer
 from pydantic import ValidationError
 
-from coordinator.excitation.plan import Plan, PlanFileError, load_plan
-from coordinator.runtime.exit_codes import EXIT_USAGE
-from module_agent.network_emulation.profile import PROFILES
+from coordinator.excitation.plan import Excitation, Mode, Motions, Plan, PlanFileError, load_plan
+from coordinator.runtime.terminal import Terminal
+from module_agent.model.catalogue import ImuKind, TorqueKind
+from module_agent.model.errors import UsageError
+from module_agent.network_emulation.impaired_transport import inject
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile
+from module_agent.network_emulation.profile_file import network as network_named
+from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from module_agent.transport.transport import EndpointInUse, Transport, TransportError
+from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
+from module_agent.wire.keys import check_chunk
 
-Robot = Annotated[str, typer.Option(help="Name of the robot, part of every key.")]
-Listen = Annotated[str, typer.Option(help="Zenoh endpoint to listen on, the hub of the agents.")]
-Connect = Annotated[
-    list[str] | None,
-    typer.Option(help="Zenoh router to connect to, instead of listening; repeat for several."),
+JOIN_TIMEOUT_S = 5.0
+
+BaselineFolder = Annotated[Path, typer.Argument(help="Folder of an earlier run of this robot, its baseline.")]
+DynamicsFolder = Annotated[
+    Path, typer.Argument(help="Folder of an earlier run of this robot with dynamics, its baseline.")
 ]
-Network = Annotated[str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}, or a TOML file.")]
-Expect = Annotated[int | None, typer.Option(min=1, help="Wait for this many modules, no more and no fewer.")]
+Measured = Annotated[Path | None, typer.Option(help="Compare with this finished run; needs no robot.")]
+PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
+Expect = Annotated[
+    int | None, typer.Option(min=1, help="Wait until this many modules answer; fewer are a failure.")
+]
+Speed = Annotated[float, typer.Option(help="Speed of a simulated world, relative to real time.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
 
 
-def fail(text: object, code: int) -> NoReturn:
-    """End the command with a sentence on standard error and an exit code."""
-    typer.echo(f"x5-coordinator: {text}", err=True)
-    raise typer.Exit(code)
+class Place(NamedTuple):
+    """A robot on a network: the endpoint to listen on, or routers to connect to, and the injected network."""
+
+    robot: str
+    listen: str
+    connect: tuple[str, ...]
+    network: NetworkProfile = PROFILES["none"]
+    seed: int = 0
+
+
+class Connection(NamedTuple):
+    """The robot's network, and whether this program is its hub."""
+
+    transport: Transport
+    is_hub: bool
+
+
+@dataclass(frozen=True)
+class ConnectOptions:
+    """Where a robot is found on the network, and through which injected network."""
+
+    robot: Annotated[
+        str | None, typer.Option(help="Name of the robot, part of every key [the baseline's, else robot].")
+    ] = None
+    listen: Annotated[str, typer.Option(help="Zenoh endpoint to listen on, the hub of the agents.")] = (
+        DEFAULT_ENDPOINT
+    )
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Zenoh router to connect to instead of listening; repeat for several."),
+    ] = None
+    network: Annotated[
+        str, typer.Option(help=f"Injected network: {', '.join(PROFILES)}, or a TOML file.")
+    ] = "none"
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the injected network.")] = 0
+    quiet: Quiet = False
+
+    def place(self, robot: str = "robot") -> Place:
+        """Return where to connect to; `robot` is the name unless one is given.
+
+        Raises:
+            UsageError: the name or the network cannot be.
+        """
+        name = self.robot or robot
+        try:
+            check_chunk("robot", name)
+            return Place(name, self.listen, tuple(self.connect or ()), network_named(self.network), self.seed)
+        except ValueError as error:
+            raise UsageError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """How a robot is identified: a plan's file, and settings that take precedence over it."""
+
+    plan: PlanFile = None
+    dynamics: Annotated[
+        bool | None, typer.Option("--dynamics/--no-dynamics", help="Identify inertial parameters too [yes].")
+    ] = None
+    amplitude: Annotated[
+        float | None, typer.Option(help="Amplitude of the windowed sine [rad]; by module type if not given.")
+    ] = None
+    home: Annotated[float | None, typer.Option(help="Home position of all joints [rad] [0].")] = None
+    imu: Annotated[ImuKind | None, typer.Option(help="Prior of the IMUs' intrinsics [uncalibrated].")] = None
+    torque: Annotated[
+        TorqueKind | None, typer.Option(help="Prior of the torque sensors' scales [uncalibrated].")
+    ] = None
+    mode: Annotated[
+        Mode | None, typer.Option(help="Explore one joint after the other, or all simultaneously [joint].")
+    ] = None
+    motions: Annotated[
+        Motions | None,
+        typer.Option(help="Exploring motions: the same for every joint, or optimised for each [standard]."),
+    ] = None
+    excitation: Annotated[
+        Excitation | None, typer.Option(help="Motions for the inertial parameters [joint-by-joint].")
+    ] = None
+
+    def chosen(self) -> Plan:
+        """Return the plan with these settings; see `planned`."""
+        return planned(
+            self.plan,
+            dynamics=self.dynamics,
+            sine_amplitude_rad=self.amplitude,
+            home_rad=self.home,
+            imu=self.imu,
+            torque=self.torque,
+            mode=self.mode,
+            motions=self.motions,
+            excitation=self.excitation,
+        )
+
+    def arguments(self) -> tuple[str, ...]:
+        """Return these options as a command line has them."""
+        words: list[str] = []
+        for name, value in dataclasses.asdict(self).items():
+            if isinstance(value, bool):
+                words.append(f"--{name}" if value else f"--no-{name}")
+            elif value is not None:
+                words += [f"--{name}", str(value)]
+        return tuple(words)
 
 
 def planned(path: Path | None, **given: object) -> Plan:
-    """Return the plan of a file, or the default one, with the settings that are given (not None)."""
+    """Return the plan of a file, or the default one, with the settings that are given (not None).
+
+    Raises:
+        UsageError: the file is no plan, or a setting is out of range.
+    """
     try:
         base = load_plan(path) if path is not None else Plan()
         # Validated again: an option can be out of range as well.
         return Plan.model_validate({**base.model_dump(), **{k: v for k, v in given.items() if v is not None}})
     except PlanFileError as error:
-        fail(error, EXIT_USAGE)
+        raise UsageError(str(error)) from error
     except ValidationError as error:
         first = error.errors()[0]
-        fail(f"{first['loc'][0]} = {first['input']}: {first['msg']}", EXIT_USAGE)
+        raise UsageError(f"{first['loc'][0]} = {first['input']}: {first['msg']}") from error
+
+
+def open_connection(place: Place, terminal: Terminal) -> Connection:
+    """Join a robot's network: at its routers, as its hub, or as a client of the hub that it has already.
+
+    Raises:
+        UsageError: it cannot be joined.
+    """
+    is_hub = False
+    try:
+        if place.connect:
+            opened = open_zenoh(_client(place.connect))
+        else:
+            try:
+                opened, is_hub = open_zenoh(ZenohConfig.hub(place.listen)), True
+            except EndpointInUse:
+                # By another coordinator, or a router.
+                opened = open_zenoh(_client((place.listen,)))
+                terminal.note(f"{place.listen} is in use: joined the hub there")
+    except (OSError, TransportError) as error:
+        raise UsageError(str(error)) from error
+    return Connection(inject(opened, place.network, place.seed, "coordinator"), is_hub)
+
+
+def _client(connect: tuple[str, ...]) -> ZenohConfig:
+    return ZenohConfig(mode="client", connect=connect, connect_timeout_s=JOIN_TIMEOUT_S)
+
+
+def sender_name() -> str:
+    """Return the unique name under which this program holds leases."""
+    return f"coordinator-{os.getpid()}@{socket.gethostname()}-{secrets.token_hex(2)}"[:64]

@@ -40,6 +40,7 @@ from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ, dynamic_motion
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import UsageError
 from module_agent.model.information import JointInformation, gather, merge
 
 # How long a window of the watch is, in stretches.
@@ -53,7 +54,7 @@ MARGIN = 3.0
 _FIRST_S = 1.0
 
 
-class NoReference(ValueError):
+class NoReference(UsageError):
     """The run does not hold what the watch needs; the message says what is missing."""
 
 

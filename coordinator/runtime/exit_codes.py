@@ -10,6 +10,7 @@ from coordinator.recording.run_folder import RunFolderError
 from coordinator.recording.session_file import SessionFileError
 from coordinator.session.session import NoModulesFound
 from module_agent.model.catalogue import UnknownModuleType
+from module_agent.model.errors import RobotError
 from module_agent.transport.transport import TransportError
 
 EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_INTERRUPTED = 1, 2, 3, 130
@@ -39,6 +40,8 @@ def explain(error: BaseException) -> Failure | None:
     """Return what to say of an error that belongs to the life of a robot; None for a fault of the program."""
     if isinstance(error, asyncio.CancelledError | KeyboardInterrupt):
         return Failure("interrupted", EXIT_INTERRUPTED)
+    if isinstance(error, RobotError):
+        return Failure(str(error), error.exit_code)
     if isinstance(error, ModuleLost):
         return Failure(str(error), EXIT_LOST)
     if isinstance(error, RunFolderError):

@@ -26,6 +26,7 @@ import numpy as np
 from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.minimum_jerk import Way
 from module_agent.model.chain import Array
+from module_agent.model.errors import LostError, RobotError
 from module_agent.wire.messages import Limits
 
 Phase = Literal["loading", "loaded", "freeing", "floating", "holding", "held", "returning"]
@@ -48,11 +49,11 @@ MAX_LAG_RAD = 0.08
 BACK_RAD_S, BACK_SHARE = 0.5, 0.5
 
 
-class CompensationRefused(RuntimeError):
+class CompensationRefused(RobotError):
     """The robot is not set free; the message names the joint, what is wrong and what would be right."""
 
 
-class StaleFeedback(RuntimeError):
+class StaleFeedback(LostError):
     """A module has not been heard of for too long to say what its joints bear."""
 
     def __init__(self, serial: str, age_s: float, most_s: float):

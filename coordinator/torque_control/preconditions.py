@@ -9,6 +9,7 @@ from coordinator.live_robot.messenger import Clock, Messenger
 from coordinator.live_robot.module_group import POLL_S, ModuleGroup
 from coordinator.torque_control.gravity_model import GravityModel
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import RobotError
 from module_agent.model.forward_kinematics import imu_poses
 
 # For the first module, and from one to the next.
@@ -23,7 +24,7 @@ FEEDBACK_S = 2.0
 MAX_TILT_RAD = float(np.radians(12.0))
 
 
-class RobotMismatch(RuntimeError):
+class RobotMismatch(RobotError):
     """The robot is another one than the known, or stands otherwise; the message names the module."""
 
 

@@ -12,10 +12,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from coordinator.commands.run import resuming
 from coordinator.live_robot.discovery import Search, listed, stop_robot
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.live_robot.messenger import NoAnswer
-from coordinator.main import app, resuming
+from coordinator.main import app
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry
 from coordinator.recording.run_folder import SESSION, RunFolderError, check_free, open_run_folder
@@ -94,7 +95,7 @@ def test_a_robot_that_nobody_announces_leaves_a_folder_that_may_be_used_again(tm
     assert done.returncode == 1, done.stderr
     assert "expected, found 0: none; the robot was not moving; recorded up to here" in done.stderr
     assert "Traceback" not in done.stderr
-    resume = done.stderr.partition("to go on: ")[2].strip()
+    resume = done.stderr.partition("to resume: ")[2].strip()
     assert resume.startswith("x5-coordinator run ")
     assert f"--out '{out}'" in resume
     for words in ("--robot lonely", given[6], "--no-dynamics", str(plan), "--speed 8", "--resume"):

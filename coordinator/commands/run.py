@@ -1,0 +1,115 @@
+"""`x5-coordinator run`: a robot identifies itself."""
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from coordinator.commands.attended_run import checked_speed, run_attended
+from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed, sender_name
+from coordinator.identification.result import DynamicsPart, Result
+from coordinator.runtime.command_line import with_options
+from coordinator.runtime.terminal import Terminal
+from coordinator.session.run import RunConfig
+from coordinator.viewer.targets import viewer_choice
+from module_agent.model.errors import UsageError
+
+
+@with_options
+def run(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option(help="Folder of the run; it must be new.")],
+    at: ConnectOptions,
+    settings: PlanOptions,
+    expect: Expect = None,
+    baseline: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of an earlier run of this robot: only joints that differ are explored again."
+        ),
+    ] = None,
+    viewer: Annotated[
+        str, typer.Option(help="Live viewer: none, spawn, serve, or a rerun+http:// address.")
+    ] = "none",
+    serve_port: Annotated[
+        int, typer.Option(min=1, max=65534, help="Port of the viewer served to a browser.")
+    ] = 9090,
+    resume: Annotated[bool, typer.Option(help="Continue the crashed run in --out.")] = False,
+    speed: Speed = 1.0,
+    advise: Annotated[
+        bool, typer.Option("--advise/--no-advise", hidden=True, help="Say how to resume a run that ended.")
+    ] = True,
+) -> None:
+    """Discover a robot, move its joints, and identify topology, kinematic chain and inertia.
+
+    Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 130 interrupted.
+    """
+    place, speed = at.place(), checked_speed(speed)
+    try:
+        shown = viewer_choice(viewer)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    config = RunConfig(
+        robot=place.robot,
+        out=out,
+        sender=sender_name(),
+        plan=settings.chosen(),
+        expect=expect,
+        resume=resume,
+        spawn_viewer=shown.spawn,
+        connect_viewer=shown.connect,
+        serve_viewer=serve_port if shown.serve else None,
+        baseline=baseline,
+    )
+    advice = f"to resume: {resuming(context)}" if advise else ""
+    with Terminal(at.quiet) as terminal:
+        result = run_attended(config, place, speed, terminal, advice)
+    print_result(result, terminal)
+    terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
+
+
+def resuming(context: typer.Context) -> str:
+    """Return the command that resumes a run: the options that were given, with `--resume`."""
+    words = ["x5-coordinator", "run"]
+    for option in context.command.params:
+        name = option.name or ""
+        source = context.get_parameter_source(name)
+        if source is None or source.name != "COMMANDLINE" or name == "resume":
+            continue
+        value = context.params[name]
+        if isinstance(value, bool):
+            words.append((option.opts if value else option.secondary_opts)[0])
+        else:
+            for one in value if isinstance(value, list | tuple) else [value]:
+                words += [option.opts[0], str(one)]
+    return shlex.join([*words, "--resume"])
+
+
+def print_result(result: Result, terminal: Terminal) -> None:
+    """Print the links, what is not identifiable, and how well the inertial parameters predict."""
+    table = Table("parent", "child", "link length [mm]", "+-", title=f"{result.robot}: links")
+    for link in result.links:
+        table.add_row(
+            link.parent, link.child, f"{link.link_length_mm:.1f}", f"{link.link_length_sigma_mm:.1f}"
+        )
+    terminal.console.print(table)
+    for item in result.unresolved:
+        terminal.note(f"not identifiable: {item.words}")
+    if result.dynamics is not None:
+        _print_inertia(result.dynamics, terminal)
+    terminal.note(f"trace hash {result.trace_hash}")
+
+
+def _print_inertia(dynamics: DynamicsPart, terminal: Terminal) -> None:
+    for line in dynamics.words:
+        terminal.note(line)
+    if dynamics.held_out is None:
+        return
+    real = dynamics.bodies.held_out_relative_error if dynamics.bodies is not None else None
+    terminal.note(
+        f"inertia: {dynamics.rank} of {dynamics.parameters} parameters; error of predicted torque on "
+        f"held-out motions: {100 * dynamics.held_out.relative_error:.1f} %"
+        + ("" if real is None else f", by the bodies in the URDF: {100 * real:.1f} %")
+    )

@@ -1,0 +1,23 @@
+"""`x5-coordinator screenshot`: a picture of a recording as the viewer shows it."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coordinator.runtime.command_line import fail
+from coordinator.viewer.screenshot import ScreenshotFailed
+from coordinator.viewer.screenshot import screenshot as picture
+from module_agent.model.errors import EXIT_FAILED
+
+
+def screenshot(
+    recording: Annotated[Path, typer.Argument(help="A session.rrd.")],
+    out: Annotated[Path, typer.Option(help="PNG file to write.")],
+    tab: Annotated[str | None, typer.Option(help="Tab to show.")] = None,
+) -> None:
+    """Render a recording as the viewer shows it, without a screen."""
+    try:
+        picture(recording, out, tab)
+    except (ScreenshotFailed, ValueError, OSError) as error:
+        fail(error, EXIT_FAILED)
