@@ -222,8 +222,8 @@ def _next(problem: _Problem, taken: Sequence[int]) -> LinkChange:
     candidates = []
     for child in problem.slopes:
         if child not in taken:
-            gather_all = _explained(problem, [child, *taken])
-            candidates.append(gather_all.links[0]._replace(gain=gather_all.gain - before))
+            joint_fit = _explained(problem, [child, *taken])
+            candidates.append(joint_fit.links[0]._replace(gain=joint_fit.gain - before))
     return min(candidates, key=lambda c: (c.chance, -c.gain))
 
 

@@ -88,8 +88,8 @@ def merge_runs(
     columns = part_columns(parts)
     scales = _scale_sigmas(runs)
     rows = [_rows(run, parts, scales) for run in runs]
-    gather_all = _without_scales(rows, len(scales))
-    whole, spectrum = _base(*gather_all, columns, tolerance), _spectrum(*gather_all, columns)
+    merged = _without_scales(rows, len(scales))
+    whole, spectrum = _base(*merged, columns, tolerance), _spectrum(*merged, columns)
     shares = []
     for run, one in zip(runs, rows, strict=True):
         own = _without_scales([one], len(scales))

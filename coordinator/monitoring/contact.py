@@ -84,11 +84,11 @@ def fast_part(signal: Array, rate_hz: float) -> Array:
 
 def contact_model(fast_nm: Array, rate_hz: float = 250.0) -> ContactModel:
     """Learn what is normal from the fast part (m, n) of a run in which nobody touched the robot."""
-    gauge_fixed = fast_nm[round(LASTING_S * rate_hz) :]
-    sigma = gauge_fixed.std(axis=0)
-    upward = (gauge_fixed[:-1] < 0.0) & (gauge_fixed[1:] >= 0.0)
-    crossings = upward.sum(axis=0) * rate_hz / max(len(gauge_fixed), 1)
-    return ContactModel(sigma, np.abs(gauge_fixed).max(axis=0), np.maximum(crossings, 0.1))
+    settled = fast_nm[round(LASTING_S * rate_hz) :]
+    sigma = settled.std(axis=0)
+    upward = (settled[:-1] < 0.0) & (settled[1:] >= 0.0)
+    crossings = upward.sum(axis=0) * rate_hz / max(len(settled), 1)
+    return ContactModel(sigma, np.abs(settled).max(axis=0), np.maximum(crossings, 0.1))
 
 
 class ContactDetector:

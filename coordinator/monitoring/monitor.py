@@ -203,8 +203,8 @@ class Watcher:
         if verdict.kind != "wear" and any(f.kind == "wear" for f in self.ledger.held.values()):
             return []
         held = self.ledger.held.get(("load", 0))
-        gauge_fixed = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == verdict.kind
-        if gauge_fixed and verdict.kind == "payload" and self._agreed_for % SETTLED_AFTER:
+        settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == verdict.kind
+        if settled and verdict.kind == "payload" and self._agreed_for % SETTLED_AFTER:
             # It takes a while to weigh it, and it will not be another.
             self.ledger.see(("load", 0), now_ns)
             return []

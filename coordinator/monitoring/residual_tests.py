@@ -141,9 +141,9 @@ def lasting_residual(model: ImuModel, stretches: Sequence[DataSegment]) -> list[
     # One delay for all six axes of an IMU, weighed by what each scatters.
     weight = 1.0 / np.maximum(whole.var(axis=0), 1e-12)
     delay = (weight * late * whole).sum(axis=(0, 2)) / np.maximum((weight * late**2).sum(axis=(0, 2)), 1e-12)
-    gauge_fixed = whole - delay[:, None] * late
+    settled = whole - delay[:, None] * late
     ends = np.cumsum([len(one) for one in left])[:-1]
-    return [part.reshape(len(part), -1) for part in np.split(gauge_fixed, ends)]
+    return [part.reshape(len(part), -1) for part in np.split(settled, ends)]
 
 
 def imu_evidence(model: ImuModel, stretch: DataSegment) -> Evidence:

@@ -145,8 +145,8 @@ class Session:
             await asyncio.sleep(0.05)
             if frozenset(self._radio.alive) != known:
                 known, quiet_since = frozenset(self._radio.alive), self._clock()
-            gauge_fixed = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
-            if known and gauge_fixed and (expect is None or len(known) >= expect):
+            settled = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
+            if known and settled and (expect is None or len(known) >= expect):
                 break
         if not known or (expect is not None and len(known) != expect):
             names = ", ".join(sorted(known)) or "none"

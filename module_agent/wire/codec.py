@@ -32,12 +32,12 @@ def encode(message: Message) -> bytes:
     return packed
 
 
-def _is_nested_deeper(value: dict[str, Any] | tuple[Any, ...], thresholds: int) -> bool:
-    """Return whether there are more than `thresholds` of containers in each other, `value` the first."""
-    if not thresholds:
+def _is_nested_deeper(value: dict[str, Any] | tuple[Any, ...], levels: int) -> bool:
+    """Return whether there are more than `levels` of containers in each other, `value` the first."""
+    if not levels:
         return True
     for part in value.values() if isinstance(value, dict) else value:
-        if isinstance(part, _CONTAINERS) and _is_nested_deeper(part, thresholds - 1):
+        if isinstance(part, _CONTAINERS) and _is_nested_deeper(part, levels - 1):
             return True
     return False
 

@@ -140,12 +140,12 @@ def simulate(
 
 def compare(log: RealLog, simulated: Simulated) -> list[SignalRow]:
     """Return, signal by signal, the rms of recorded minus simulated over the rms of the recorded."""
-    gauge_fixed = log.t_s >= log.t_s[0] + SETTLED_S
+    settled = log.t_s >= log.t_s[0] + SETTLED_S
     rows = []
     for signal in SIGNALS:
         recorded: Array = getattr(log, signal)
         difference: Array = recorded - getattr(simulated, signal)
-        late = _ratio(difference[gauge_fixed], recorded[gauge_fixed])
+        late = _ratio(difference[settled], recorded[settled])
         whole = _ratio(difference, recorded)
         rows.append(SignalRow(signal, _rms(recorded), _rms(difference), whole, late))
     return rows

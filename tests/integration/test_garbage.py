@@ -65,7 +65,7 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
         commander.raw(at, payload, 0.5)
         hold()
 
-    def gauge_fixed(expected: dict[str, Counter[str]], before: dict[str, Counter[str]]) -> None:
+    def settled(expected: dict[str, Counter[str]], before: dict[str, Counter[str]]) -> None:
         def counted() -> bool:
             hold()
             return grown(commander, serials, before) == expected
@@ -82,18 +82,18 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
                 throw(key(name, serial, leaf), without_values(leaf)[reason])
     # Each module reads the questions and publications of its own keys, and the status of every module.
     each = len(SERVED) + len(PUBLISHED_TO_MODULE) + len(serials)
-    gauge_fixed({s: Counter(dict.fromkeys(REASONS, each)) for s in serials}, none)
+    settled({s: Counter(dict.fromkeys(REASONS, each)) for s in serials}, none)
 
     so_far = {s: Counter(commander.status(s).refusals) for s in serials}
     for serial in serials:
         for leaf, fields in not_finite().items():
             throw(key(name, serial, leaf), msgpack.packb({"v": 1, **commander.head(serial), **fields}))
-    gauge_fixed({s: Counter(not_finite=len(not_finite())) for s in serials}, so_far)
+    settled({s: Counter(not_finite=len(not_finite())) for s in serials}, so_far)
 
     # Wildcards reach all of a module's keys at once; larger than any message, or than Zenoh itself takes.
     so_far = {s: Counter(commander.status(s).refusals) for s in serials}
     throw(f"{ROOT}/{name}/**", b"garbage")
-    gauge_fixed({s: Counter(malformed=len(SERVED) + len(PUBLISHED_TO_MODULE)) for s in serials}, so_far)
+    settled({s: Counter(malformed=len(SERVED) + len(PUBLISHED_TO_MODULE)) for s in serials}, so_far)
     for size in (MAX_MESSAGE_BYTES + 1, 2 << 20):
         throw(key(name, serials[0], Leaf.FEEDBACK), bytes(size))
         throw(key(name, serials[1], Leaf.SETPOINT), bytes(size))

@@ -199,10 +199,8 @@ def _considered(
         rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
         rows = np.concatenate([rigid, term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)], axis=2)
         effects = chain_effects(robot.chain, robot.covariance, seen.informed_phi, motion)
-        excluded_modules = np.broadcast_to(
-            np.diag(offsets_nm), (len(motion.t_ns), *np.diag(offsets_nm).shape)
-        )
-        effects = np.concatenate([effects, excluded_modules], axis=2)
+        omitted = np.broadcast_to(np.diag(offsets_nm), (len(motion.t_ns), *np.diag(offsets_nm).shape))
+        effects = np.concatenate([effects, omitted], axis=2)
         departure = np.zeros_like(motion.tau_nm)
         if eyes != "encoders":
             apart = _regressor(robot, readings(one, robot.refined, DYNAMIC_CUTOFF_HZ), eyes) - rigid

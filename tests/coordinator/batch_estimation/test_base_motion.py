@@ -124,8 +124,8 @@ def test_a_shaking_base_shows_the_heading_that_gravity_hides(robots: Any, headin
     left = Rotation.from_matrix(found.imu_home[2, :3, :3] @ upright.imu_home[2, :3, :3].T)
     # What the joints' own motion leaves in the gyros after a wrong heading is random against the base's.
     assert left.magnitude() < np.radians(15)
-    gauge_fixed = refine_chain(found, data, BIASES_ONLY)
-    left = Rotation.from_matrix(gauge_fixed.chain.imu_home[2, :3, :3] @ upright.imu_home[2, :3, :3].T)
+    settled = refine_chain(found, data, BIASES_ONLY)
+    left = Rotation.from_matrix(settled.chain.imu_home[2, :3, :3] @ upright.imu_home[2, :3, :3].T)
     assert left.magnitude() < np.radians(0.1)
 
 

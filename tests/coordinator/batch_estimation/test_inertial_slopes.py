@@ -89,8 +89,8 @@ def test_moving_the_whole_robot_as_one_changes_readings_as_turning_gravity_back_
 ) -> None:
     chain, _ = robots.random(seed, joints=5)
     found = _analytic(chain, _motion(5, seed))
-    gather_all = found[:-3].reshape(5, 6, *found.shape[1:]).sum(axis=0)
+    merged = found[:-3].reshape(5, 6, *found.shape[1:]).sum(axis=0)
     # Shifted, everything reads as before; turned by theta it reads as if gravity had turned by -theta.
-    np.testing.assert_allclose(gather_all[3:], 0.0, atol=1e-11)
+    np.testing.assert_allclose(merged[3:], 0.0, atol=1e-11)
     back = -np.cross(np.eye(3), chain.gravity)
-    np.testing.assert_allclose(gather_all[:3], np.einsum("ij,j...->i...", back, found[-3:]), atol=1e-11)
+    np.testing.assert_allclose(merged[:3], np.einsum("ij,j...->i...", back, found[-3:]), atol=1e-11)

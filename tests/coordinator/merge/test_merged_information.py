@@ -127,12 +127,12 @@ def test_runs_of_one_assembly_say_together_what_one_long_run_says() -> None:
     for run in runs[1:]:
         total = merge(total, run.joints)
     long = runs[0]._replace(joints=total, effects=tuple(np.zeros((len(j.z), 0)) for j in total))
-    gather_all, alone = exact(runs).base, exact([long]).base
-    assert gather_all.rank == alone.rank
-    np.testing.assert_array_equal(gather_all.independent, alone.independent)
+    merged, alone = exact(runs).base, exact([long]).base
+    assert merged.rank == alone.rank
+    np.testing.assert_array_equal(merged.independent, alone.independent)
     # The bar for what is distributed.
-    np.testing.assert_allclose(gather_all.value, alone.value, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(gather_all.covariance, alone.covariance, rtol=1e-8, atol=1e-18)
+    np.testing.assert_allclose(merged.value, alone.value, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(merged.covariance, alone.covariance, rtol=1e-8, atol=1e-18)
 
 
 def test_three_runs_of_one_assembly_cut_the_deviations_by_the_root_of_three() -> None:

@@ -62,9 +62,9 @@ def test_a_joint_alone_gathers_what_all_together_gather_of_it(joints: int, seed:
     rng = default_rng(seed)
     chain = random_tree(rng, joints)
     q, qd, qdd, tau = motion(rng, 150, joints)
-    gather_all = gather(chain, q, qd, qdd, tau)
+    merged = gather(chain, q, qd, qdd, tau)
     for joint in range(joints):
-        assert far(gather_joint(chain, joint, q, qd, qdd, tau[:, joint]), gather_all[joint]) < EXACT
+        assert far(gather_joint(chain, joint, q, qd, qdd, tau[:, joint]), merged[joint]) < EXACT
 
 
 def test_a_joint_gathers_as_well_in_many_small_blocks(rng: Generator) -> None:

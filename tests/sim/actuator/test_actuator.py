@@ -250,8 +250,8 @@ def test_the_three_temperatures_follow_the_continuous_heat_equation() -> None:
 def test_a_constant_current_heats_the_winding_by_power_times_all_resistances_in_the_end() -> None:
     windings = Windings(1, DT)
     power = 9.5 * 0.5**2
-    gauge_fixed = np.linalg.solve(np.eye(3) - heat_flow(DT), [DT * power / CAPACITIES_J_K[0], 0.0, 0.0])
-    assert gauge_fixed[0] == pytest.approx(power * sum(RESISTANCES_K_W), rel=1e-6)
+    settled = np.linalg.solve(np.eye(3) - heat_flow(DT), [DT * power / CAPACITIES_J_K[0], 0.0, 0.0])
+    assert settled[0] == pytest.approx(power * sum(RESISTANCES_K_W), rel=1e-6)
     for _ in range(100):
         windings.step(np.array([power]))
     # Early on, nothing has left the winding yet: P t / C.

@@ -110,7 +110,7 @@ def test_the_inertial_parameters_are_in_the_order_of_equation_25() -> None:
     np.testing.assert_allclose(parameters(body), expected, atol=1e-12)
 
 
-def _largest_load(name: str, gather_all: bool) -> float:
+def _largest_load(name: str, simultaneously: bool) -> float:
     """Static torque over the largest effort, worst over joints and poses within half a radian of home."""
     robot = load_robot(name)
     limit = np.array([t.max_effort_nm for t in build_tree(robot).types])
@@ -119,7 +119,7 @@ def _largest_load(name: str, gather_all: bool) -> float:
     still = np.zeros(n)
     rng = np.random.default_rng(3)
     poses = [d * row for row in np.eye(n) for d in np.linspace(-0.5, 0.5, 9)]
-    if gather_all:
+    if simultaneously:
         poses += [rng.uniform(-0.5, 0.5, n) for _ in range(100)] + [
             rng.choice([-0.5, 0.5], n) for _ in range(200)
         ]
@@ -130,14 +130,14 @@ def _largest_load(name: str, gather_all: bool) -> float:
 def test_a_robot_can_hold_itself_at_sixty_percent_of_its_effort_with_every_joint_moved_alone(
     name: str,
 ) -> None:
-    assert _largest_load(name, gather_all=False) < 0.6
+    assert _largest_load(name, simultaneously=False) < 0.6
 
 
 @pytest.mark.parametrize("name", [n for n in shipped_robots() if n != "snake16"])
 def test_a_robot_can_hold_itself_at_sixty_percent_with_all_joints_moved(name: str) -> None:
-    assert _largest_load(name, gather_all=True) < 0.6
+    assert _largest_load(name, simultaneously=True) < 0.6
 
 
 def test_the_snake_can_hold_itself_with_all_joints_moved() -> None:
     # No sixteen modules of the catalogue in a row stay below 60 % at every such pose.
-    assert _largest_load("snake16", gather_all=True) < 1.0
+    assert _largest_load("snake16", simultaneously=True) < 1.0
