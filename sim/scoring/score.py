@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, UnresolvedPart
+from coordinator.identification.identified import Identified
+from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
@@ -103,8 +104,11 @@ class _TorqueScore(NamedTuple):
     measured: float | None
 
 
+_NO_TORQUE = _TorqueScore(None, None, None, None)
+
+
 def score(run: Path) -> Score:
-    """Compare the result in the folder `run` with the truth beside it.
+    """Compare the result in the folder `run` with the truth next to it.
 
     Raises:
         ScoreError: a file is missing, broken or does not fit the others; the message says which and how.
@@ -115,10 +119,33 @@ def score(run: Path) -> Score:
     except ChainError as error:
         raise ScoreError(f"{run / 'result.json'}: chain.{error}") from error
     truth = _read_truth(run / "truth.json")
-    differences = topology_differences(estimated, truth)
     basis = _null_basis(result, run / "result.json")
-    tip = (None, None) if differences else tip_errors(estimated, truth, basis)
-    torque = _torque(run, result)
+    torque = _NO_TORQUE
+    if result.dynamics is not None and result.dynamics.get("held_out") is not None:
+        held_out = _read_held_out(run / "held_out.npz", len(result.serials))
+        motion = _read_motion(run / "truth.npz")
+        torque = _torque(tuple(result.serials), held_out, motion, str(run / "truth.npz"))
+    return _compared(result, estimated, basis, truth, torque)
+
+
+def score_identified(identified: Identified, truth: Chain, motion: Motion) -> Score:
+    """Compare what was identified with the true chain and the true motion, without files.
+
+    Raises:
+        ScoreError: the true motion does not cover the held-out motion.
+    """
+    fit, held_out, torque = identified.kinematics.fit, identified.held_out, _NO_TORQUE
+    if held_out is not None:
+        torques = _HeldOut(held_out.module_ns, held_out.tau_measured_nm, held_out.tau_predicted_nm)
+        torque = _torque(held_out.serials, torques, motion, "the true motion")
+    return _compared(identified.result, fit.chain, fit.null_basis, truth, torque)
+
+
+def _compared(
+    result: "_ResultFile | Result", estimated: Chain, null_basis: Array, truth: Chain, torque: _TorqueScore
+) -> Score:
+    differences = topology_differences(estimated, truth)
+    tip = (None, None) if differences else tip_errors(estimated, truth, null_basis)
     return Score(
         topology_correct=not differences,
         topology_differences=differences,
@@ -164,36 +191,33 @@ def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[Link
     return found
 
 
-def _torque(run: Path, result: _ResultFile) -> _TorqueScore:
-    if result.dynamics is None or result.dynamics.get("held_out") is None:
-        return _TorqueScore(None, None, None, None)
-    held_out = _read_held_out(run / "held_out.npz", len(result.serials))
-    motion = _read_motion(run / "truth.npz")
-    known = [column for column, serial in enumerate(result.serials) if serial in motion.serials]
+def _torque(serials: tuple[str, ...], held_out: _HeldOut, motion: Motion, source: str) -> _TorqueScore:
+    known = [column for column, serial in enumerate(serials) if serial in motion.serials]
+    measured = _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm)
     if not known:
-        return _TorqueScore(None, None, None, _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm))
-    true = np.column_stack(
-        [_true_torque(motion, result.serials[c], held_out.t_ns[:, c], run / "truth.npz") for c in known]
-    )
+        return _NO_TORQUE._replace(measured=measured)
+    true = np.column_stack([_true_torque(motion, serials[c], held_out.t_ns[:, c], source) for c in known])
     predicted = held_out.tau_predicted_nm[:, known]
-    serials = [result.serials[c] for c in known]
+    own = [serials[c] for c in known]
     size, error = _rms(true), _rms(predicted - true)
     relative = [e / s if s >= MIN_TORQUE_NM else None for e, s in zip(error, size, strict=True)]
     return _TorqueScore(
-        _ratio(predicted, true),
-        dict(zip(serials, relative, strict=True)),
-        dict(zip(serials, error, strict=True)),
-        _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm),
+        overall=_ratio(predicted, true),
+        per_joint=dict(zip(own, relative, strict=True)),
+        rms_error_nm=dict(zip(own, error, strict=True)),
+        measured=measured,
     )
 
 
-def _true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], path: Path) -> Array:
+def _true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], source: str) -> Array:
     """Interpolate a module's true torque at times of its own clock."""
     column = motion.serials.index(serial)
     try:
         found = resample([motion.clock_ns[:, column]], [motion.spring_torque_nm[:, column]], t_ns)
     except ValueError as error:
-        raise ScoreError(f"{path} does not cover the held-out motion of module {serial}: {error}") from error
+        raise ScoreError(
+            f"{source} does not cover the held-out motion of module {serial}: {error}"
+        ) from error
     return found[:, 0]
 
 

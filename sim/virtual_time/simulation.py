@@ -11,6 +11,7 @@ from coordinator.recording.run_folder import SESSION, check_free, load_recording
 from module_agent.network_emulation.profile_file import network as network_profile
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import Robot, load_robot
+from sim.scoring.score import Score, score_identified
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.run import VirtualConfig, run_virtual
 from sim.virtual_time.session import record_session
@@ -44,6 +45,10 @@ class Simulation:
             IdentificationError: the recording does not suffice, or contradicts itself.
         """
         return identify(self.recording)
+
+    def score(self) -> Score:
+        """Compare result and truth: link lengths [mm], axes [deg], tips, torques."""
+        return score_identified(self.identified, self.truth.chain, self.motion)
 
 
 def simulate(

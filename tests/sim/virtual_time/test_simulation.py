@@ -23,6 +23,8 @@ def test_a_simulated_robot_is_identified_in_ten_lines() -> None:
     assert error is not None
     assert abs(error.length_m) < 1e-3
     assert run.identified.inertia is None
+    (link,) = run.score().links
+    assert link.link_length_error_mm == pytest.approx(1e3 * error.length_m)
     assert run.folder is None
     # The true motion is apart from what was measured of it, and covers the session.
     assert run.motion.q_rad.shape == (len(run.motion.t_ns), 2)
@@ -32,7 +34,9 @@ def test_a_simulated_robot_is_identified_in_ten_lines() -> None:
 def test_a_simulation_that_is_written_is_a_run_like_any_other(tmp_path: Path) -> None:
     run = simulate(ROBOT, noise="ideal", dynamics=False, out=tmp_path / "run")
     assert run.folder == tmp_path / "run"
-    assert score(run.folder).topology_correct
+    written = score(run.folder)
+    assert written.topology_correct
+    assert run.score().links == written.links
     assert run.identified.result.links[0].link_length_mm == pytest.approx(171.0, abs=0.5)
 
 
