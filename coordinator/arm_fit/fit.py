@@ -28,15 +28,14 @@ from coordinator.arm_fit.physically_consistent import (
 )
 from coordinator.arm_fit.problem import Problem, joined
 from coordinator.arm_fit.report import (
-    BaseParameterPart,
-    BodyPart,
+    ArmParameterPart,
     DataPart,
     ErrorPart,
     FitPart,
     FitReport,
-    Identifiability,
     JointNoisePart,
     LengthPart,
+    LinkBodyPart,
     Model,
     TermGainPart,
     TermPart,
@@ -47,14 +46,14 @@ from coordinator.parameter_fit.base_parameters import (
     inertial_units,
     into_frames,
 )
-from coordinator.parameter_fit.identifiability import WEAK_ABOVE, identifiabilities, words_of_body
+from coordinator.parameter_fit.identifiability import body_summary, identifiabilities, precision
 from coordinator.parameter_fit.physically_consistent import NotSolvedError
+from coordinator.parameter_fit.report_parts import base_parameter_parts, body_part, finite
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from coordinator.parameter_fit.significance import SIGNIFICANT_CHANCE, chance_of, f_statistic
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY
 
-_TOLD_BELOW = 1.0
 _ROUNDING = 1e-9
 
 Step = Callable[[str], None]
@@ -172,8 +171,8 @@ def _error_part(model: Model, found: HeldOutError) -> ErrorPart:
         tried_on=found.tried_on,
         torque="raw" if found.raw else "filtered",
         samples="masked" if found.masked else "all",
-        overall=_finite(found.error.overall),
-        per_joint=[_finite(float(e)) for e in found.error.per_joint],
+        overall=finite(found.error.overall),
+        per_joint=[finite(float(e)) for e in found.error.per_joint],
     )
 
 
@@ -220,61 +219,48 @@ def _fit_part(problem: Problem, fit: WeightedFit, real: RealBodies | None, note:
     )
 
 
-def _bodies(problem: Problem, found: BaseParameters, real: RealBodies | None) -> list[BodyPart]:
+def _bodies(problem: Problem, base: BaseParameters, real: RealBodies | None) -> list[LinkBodyPart]:
     robot = problem.robot
     units = (*inertial_units(len(robot.bodies)), *(drive.unit for drive in problem.drives))
-    judged = identifiabilities(found, units)
-    parts = []
-    for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True)):
-        own = None if real is None else real.bodies[i]
-        part = BodyPart(
+    results = identifiabilities(base, units)
+    return [
+        LinkBodyPart(
             link=link,
             joint=joint,
-            words=words_of_body(judged[PER_BODY * i : PER_BODY * (i + 1)]),
-            mass_kg=None if own is None else own.mass_kg,
-            com_m=None if own is None else own.com_m.tolist(),
-            inertia_kg_m2=None if own is None else own.inertia_kg_m2.tolist(),
+            summary=body_summary(results[PER_BODY * i : PER_BODY * (i + 1)]),
+            body=None if real is None else body_part(real.bodies[i]),
             urdf_mass_kg=None if robot.phi is None else float(robot.phi[PER_BODY * i]),
         )
-        parts.append(part)
-    return parts
-
-
-def _base_parts(problem: Problem, found: BaseParameters) -> list[BaseParameterPart]:
-    claims = _claims(problem, found)
-
-    def alone(i: int) -> bool:
-        return min(found.lumped(i)) >= problem.inertial
-
-    return [
-        BaseParameterPart(
-            words=found.words(i),
-            value=float(found.value[i]),
-            sigma=float(found.sigma[i]),
-            relative_sigma=_finite(float(found.relative_sigma[i])),
-            urdf=None if claims is None or alone(i) else float(claims[i]),
-            verdict=_verdict(float(found.relative_sigma[i])),
-        )
-        for i in range(found.rank)
+        for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True))
     ]
 
 
-def _claims(problem: Problem, found: BaseParameters) -> Array | None:
-    """Return what the URDF claims for every base parameter."""
+def _base_parts(problem: Problem, base: BaseParameters) -> list[ArmParameterPart]:
+    claims = _claims(problem, base)
+
+    def of_drives_alone(i: int) -> bool:
+        return min(base.lumped(i)) >= problem.inertial
+
+    return [
+        ArmParameterPart(
+            **dict(part),
+            urdf=None if claims is None or of_drives_alone(i) else float(claims[i]),
+            identifiability=precision(float(base.relative_sigma[i])),
+        )
+        for i, part in enumerate(base_parameter_parts(base))
+    ]
+
+
+def _claims(problem: Problem, base: BaseParameters) -> Array | None:
+    """Return the base parameters by the URDF (r,), None if it has no inertias."""
     if problem.robot.phi is None:
         return None
     bodies = slice(0, problem.inertial)
-    in_root = into_frames(found.grouping[:, bodies], np.linalg.inv(problem.robot.homes))
+    in_root = into_frames(base.grouping[:, bodies], np.linalg.inv(problem.robot.homes))
     claims: Array = in_root @ problem.robot.phi
     # Groupings have rounding where they are zero.
-    size = np.abs(found.grouping[:, bodies]) @ np.abs(problem.columns.scale[bodies])
+    size = np.abs(base.grouping[:, bodies]) @ np.abs(problem.columns.scale[bodies])
     return np.where(np.abs(claims) > _ROUNDING * size, claims, 0.0)
-
-
-def _verdict(relative_sigma: float) -> Identifiability:
-    if relative_sigma <= WEAK_ABOVE:
-        return "identified"
-    return "weak" if relative_sigma < _TOLD_BELOW else "not told from zero"
 
 
 def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int) -> TermPart:
@@ -299,7 +285,3 @@ def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int
         significant=chance < SIGNIFICANT_CHANCE and not others,
         lumped_with=", ".join(others),
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

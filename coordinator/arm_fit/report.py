@@ -1,26 +1,20 @@
-"""What a recording says of a robot's dynamics, in a versioned schema; written whole or not at all."""
+"""The report of fit-dynamics in a versioned schema; written whole or not at all."""
 
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from coordinator.parameter_fit.identifiability import Precision
+from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part
 
-SCHEMA = 1
+SCHEMA = 2
 
 Model = Literal["fitted", "bodies", "urdf", "drives_only", "mean"]
-Identifiability = Literal["identified", "weak", "not told from zero"]
-
-
-class Part(BaseModel):
-    """A piece of the report."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class DataPart(Part):
-    """The recording and what was made of it.
+    """The recording, and how it was filtered.
 
     noise: |raw - filtered| / |raw| of the torque, which no model of this bandwidth can predict. mask_rad_s:
     per joint the speed below which a sample is masked, and not fitted to.
@@ -70,11 +64,11 @@ class TermGainPart(Part):
 
 
 class TermPart(Part):
-    """A parameter of a drive, and whether it earns its place.
+    """A parameter of a drive, and whether it is significant.
 
-    f: (value / sigma)^2, the F-test of the model without it, by residuals of which only `independent_samples`
-    count. chance: of an F as large if the parameter were zero. lumped_with: the bodies' parameters that
-    cannot be told from it; then the test is of all of them together.
+    f: (value / sigma)^2, the F-test of the model without it; only `independent_samples` of the residuals
+    count. chance: the probability of an F as large if the parameter were zero. lumped_with: the bodies'
+    parameters that are only determined in combination with it; then the test is of all of them together.
     """
 
     name: str
@@ -89,45 +83,38 @@ class TermPart(Part):
     lumped_with: str
 
 
-class BaseParameterPart(Part):
-    """A combination of parameters that the torques show, in words.
+class ArmParameterPart(BaseParameterPart):
+    """A base parameter, compared with the URDF.
 
     Bodies are numbered as the joints are, their frames are those of the URDF's links behind the joints, and
-    their inertias are about the frames' origins. urdf: what the URDF claims for it, the drives' part left
-    out; null of a drive alone. verdict: identified with a standard deviation of up to a tenth of the value,
-    weak up to the value.
+    their inertias are about the frames' origins. urdf: the value by the URDF, without the drives; null if
+    only drives are in it. identifiability: `identified` with a standard deviation of up to a tenth of the
+    value, `weak` up to the value.
     """
 
-    words: str
-    value: float
-    sigma: float
-    relative_sigma: float | None
     urdf: float | None
-    verdict: Identifiability
+    identifiability: Precision
 
 
-class BodyPart(Part):
-    """A body, the link right behind a joint and all that is fixed to it, in the link's frame.
+class LinkBodyPart(Part):
+    """A body: the link right behind a joint and all links that are fixed to it, in the link's frame.
 
-    words: which of its parameters are identified, weak, known only in sums with others, or without effect.
-    mass_kg, com_m, inertia_kg_m2: the real body that explains the torques; where these say nothing, it is as
-    the URDF claims. The inertia is about the centre of mass. null if no real bodies were fitted.
-    urdf_mass_kg: what the URDF claims.
+    summary: which of its parameters are identified, weak, known only in combinations, or without effect.
+    body: the physically consistent body that explains the torques, as in the URDF where these do not
+    determine it; null if none were fitted. urdf_mass_kg: the mass by the URDF.
     """
 
     link: str
     joint: str
-    words: str
-    mass_kg: float | None
-    com_m: list[float] | None
-    inertia_kg_m2: list[list[float]] | None
+    summary: str
+    body: BodyPart | None
     urdf_mass_kg: float | None
 
 
 class JointNoisePart(Part):
-    """The residual of a joint: rms by its degrees of freedom, samples that count as one, samples fitted to.
+    """The residual of a joint: its noise, samples that count as one, samples that were fitted.
 
-    downweighted: the fraction of them that a robust fit held for outliers.
+    downweighted: the fraction of them that a robust fit takes for outliers.
     """
 
     joint: str
@@ -152,15 +139,19 @@ class FitPart(Part):
     terms: list[str]
     coupled: list[list[str]]
     independent_samples: float
-    base_parameters: list[BaseParameterPart]
-    bodies: list[BodyPart]
+    base_parameters: list[ArmParameterPart]
+    bodies: list[LinkBodyPart]
     bodies_note: str
     drives: list[TermPart]
     residuals: list[JointNoisePart]
 
 
 class FitReport(Part):
-    """Everything that `x5-coordinator fit-dynamics` finds; errors are fractions, SI units."""
+    """Everything that `x5-coordinator fit-dynamics` reports; errors are fractions, SI units.
+
+    Schema 2 names `summary`, `identifiability` and `body` (in schema 1 `words`, `verdict`, and the body's
+    fields by themselves).
+    """
 
     schema_version: int = SCHEMA
     urdf: str
@@ -177,7 +168,7 @@ class FitReport(Part):
         return [e for e in self.held_out if e.model == model and e.torque == torque]
 
     def models(self) -> Sequence[Model]:
-        """Return the models that were tried, the fitted one first."""
+        """Return the models that were tested, the fitted one first."""
         return list(dict.fromkeys(e.model for e in self.held_out))
 
 

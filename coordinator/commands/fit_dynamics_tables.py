@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from rich.table import Table
 
-from coordinator.arm_fit.report import BaseParameterPart, ErrorPart, FitReport, Model, TermPart
+from coordinator.arm_fit.report import ArmParameterPart, ErrorPart, FitReport, Model, TermPart
 
 _MODEL_WORDS: dict[Model, str] = {
     "fitted": "least squares",
@@ -17,7 +17,7 @@ _KINDS = (("filtered", "all"), ("filtered", "masked"), ("raw", "all"), ("raw", "
 
 
 def tables(report: FitReport) -> Iterator[Table]:
-    """Yield the tables, the most wanted first."""
+    """Yield the tables, the most important first."""
     yield _held_out(report)
     yield _joints(report)
     yield _lengths(report)
@@ -29,7 +29,7 @@ def tables(report: FitReport) -> Iterator[Table]:
 
 
 def notes(report: FitReport) -> Iterator[str]:
-    """Yield what one should know of the figures, in sentences."""
+    """Yield sentences about the recording, the filter and the fit."""
     data, fit = report.recording, report.fit
     evened = ", whose times were uneven" if data.resampled else ""
     yield (
@@ -68,14 +68,14 @@ def _joints(report: FitReport) -> Table:
     table = _table(
         "The same joint by joint, both halves; the baselines filtered, all samples",
         ("joint",),
-        [*kinds, *(_MODEL_WORDS[model] for model in baselines), "noise", "alike"],
+        [*kinds, *(_MODEL_WORDS[model] for model in baselines), "noise", "correlated"],
     )
     for i, residual in enumerate(report.fit.residuals):
         fitted = [_both(report, "fitted", *kind).per_joint[i] for kind in _KINDS]
         others = [_both(report, model, "filtered", "all").per_joint[i] for model in baselines]
         cells = [_percent(error) for error in [*fitted, *others]]
         table.add_row(residual.joint, *cells, f"{residual.sigma_nm:.3g} Nm", f"{residual.correlation:.1f}")
-    table.caption = "alike: so many samples of the residual count as one"
+    table.caption = "correlated: so many samples of the residual count as one"
     return table
 
 
@@ -93,14 +93,14 @@ def _gains(report: FitReport) -> Table:
     for gain in report.gains:
         worse = whole[0] is not None and gain.all > whole[0]
         table.add_row(
-            gain.without, _percent(gain.all), _percent(gain.masked), "needed" if worse else "not worth having"
+            gain.without, _percent(gain.all), _percent(gain.masked), "needed" if worse else "not needed"
         )
     return table
 
 
 def _drives(report: FitReport) -> Table:
     table = _table(
-        "Drives: F-test of each parameter, alike residuals counted once",
+        "Drives: F-test of each parameter, with the number of independent residuals",
         ("parameter", "joint"),
         ("value", "+-", "unit", "F", "chance", ""),
     )
@@ -120,30 +120,30 @@ def _drives(report: FitReport) -> Table:
 
 def _base(report: FitReport) -> Table:
     table = _table(
-        "What the torques show: sums of parameters, bodies in the frames of the URDF's links",
-        ("sum",),
+        "Base parameters that the torques determine, bodies in the frames of the URDF's links",
+        ("base parameter",),
         ("value", "+-", "+- [%]", "URDF", ""),
     )
     drives = [part.name for part in report.fit.drives]
     for part in report.fit.base_parameters:
-        if part.words in drives:
+        if part.summary in drives:
             continue
         table.add_row(
-            part.words,
+            part.summary,
             f"{part.value:.4g}",
             f"{part.sigma:.2g}",
             _percent(part.relative_sigma),
             _claim(part),
-            part.verdict,
+            part.identifiability,
         )
     return table
 
 
 def _bodies(report: FitReport) -> Table:
     table = _table("Body by body", ("body", "turned by", "its parameters"), ("mass [kg]", "URDF"))
-    for i, body in enumerate(report.fit.bodies, start=1):
-        masses = (_mass(body.mass_kg), _mass(body.urdf_mass_kg))
-        table.add_row(f"{i}: {body.link}", body.joint, body.words, *masses)
+    for i, part in enumerate(report.fit.bodies, start=1):
+        masses = (_mass(part.body.mass_kg if part.body else None), _mass(part.urdf_mass_kg))
+        table.add_row(f"{i}: {part.link}", part.joint, part.summary, *masses)
     return table
 
 
@@ -162,10 +162,10 @@ def _error(report: FitReport, model: Model, tried_on: str, torque: str, samples:
 def _place(part: TermPart) -> str:
     if part.lumped_with:
         return "within the inertias"
-    return "earns its place" if part.significant else "could go"
+    return "significant" if part.significant else "not significant"
 
 
-def _claim(part: BaseParameterPart) -> str:
+def _claim(part: ArmParameterPart) -> str:
     return "-" if part.urdf is None else f"{part.urdf:.4g}"
 
 

@@ -4,11 +4,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.table import Table
 
 from coordinator.commands.options import AsJson
 from coordinator.merge.information_file import InformationFileError, read_information
 from coordinator.merge.merge_runs import merge_runs
-from coordinator.merge.report import MERGED, merge_report, table, write_report
+from coordinator.merge.report import MERGED, MergeReport, merge_report, write_report
 from coordinator.recording.run_folder import INFORMATION
 from coordinator.runtime.terminal import print_table
 from module_agent.model.errors import DataError, UsageError
@@ -38,7 +39,7 @@ def merge(
     if as_json:
         typer.echo(report.model_dump_json(indent=1))
         return
-    print_table(table(report))
+    print_table(_table(report))
     for run in report.runs:
         if run.inconsistency_sigma > INCONSISTENT_ABOVE:
             typer.echo(
@@ -46,3 +47,30 @@ def merge(
                 f"most {INCONSISTENT_ABOVE:.0f} expected): a part or a link differs, or the covariance of "
                 "its chain is too small"
             )
+
+
+def _table(report: MergeReport) -> Table:
+    """Return one row per run."""
+    title = f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts"
+    table = Table(
+        "run",
+        "modules",
+        "rank",
+        "below 10 %",
+        "below 10 %, merged",
+        "sigma merged / alone",
+        "inconsistency [sigma]",
+        title=title,
+    )
+    for run in report.runs:
+        table.add_row(
+            run.run,
+            ", ".join(run.serials),
+            str(run.rank),
+            str(run.identified_alone),
+            str(run.identified_merged),
+            f"{run.gain:.2f}",
+            f"{run.inconsistency_sigma:.1f}",
+        )
+    table.add_row("merged", "", str(report.rank), "", "", f"{report.gain:.2f}", "")
+    return table

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from coordinator.parameter_fit.report_parts import BodyPart
 from module_agent.model.chain import Chain
 
 SCHEMA = 1
@@ -167,16 +168,13 @@ class HeldOutPart(Part):
     samples: int
 
 
-class BodyPart(Part):
-    """A real body: all that the module `serial` turns, as it is in `robot.urdf`.
+class ModuleBodyPart(BodyPart):
+    """A physically consistent body: all that the joint of the module `serial` moves, as in `robot.urdf`.
 
-    In the frame of the link `body_<serial>`: centre of mass and the inertia about it (3, 3).
+    It is in the frame of the link `body_<serial>`.
     """
 
     serial: str
-    mass_kg: float
-    com_m: list[float]
-    inertia_kg_m2: list[list[float]]
 
 
 class BodiesPart(Part):
@@ -186,7 +184,7 @@ class BodiesPart(Part):
     parameters, be they a body's or not. prior_weight is how much the modules' make counts.
     """
 
-    bodies: list[BodyPart]
+    bodies: list[ModuleBodyPart]
     relative_error: float
     least_squares_error: float
     prior_weight: float

@@ -10,7 +10,6 @@ from coordinator.description.product_of_exponentials import screw_model
 from coordinator.identification.result import (
     BaseParameterPart,
     BodiesPart,
-    BodyPart,
     ChainPart,
     DhPart,
     DhRowPart,
@@ -19,6 +18,7 @@ from coordinator.identification.result import (
     HeldOutPart,
     IdentifiabilityPart,
     LinkPart,
+    ModuleBodyPart,
     MountingPart,
     PairPart,
     Result,
@@ -29,6 +29,7 @@ from coordinator.identification.result import (
     UnknownPart,
     UnresolvedPart,
 )
+from coordinator.parameter_fit.report_parts import body_part
 from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array
@@ -260,7 +261,7 @@ def _dynamics(
         bodies=_bodies(bodies) if bodies is not None else None,
         base_parameters=_base_parameters(bodies) if bodies is not None else [],
         identifiabilities=_verdicts(bodies) if bodies is not None else [],
-        words=bodies.words() if bodies is not None else [],
+        words=bodies.summary() if bodies is not None else [],
         frames=bodies.frames.tolist() if bodies is not None else [],
         seen_by=found.eyes,
         gathered_by=_gathered_by(found.gathered, len(serials)),
@@ -311,12 +312,7 @@ def _bodies(found: "RobotBodies") -> BodiesPart | None:
         return None
     return BodiesPart(
         bodies=[
-            BodyPart(
-                serial=serial,
-                mass_kg=one.mass_kg,
-                com_m=one.com_m.tolist(),
-                inertia_kg_m2=one.inertia_kg_m2.tolist(),
-            )
+            ModuleBodyPart(**dict(body_part(one)), serial=serial)
             for serial, one in zip(found.serials, found.bodies, strict=True)
         ],
         relative_error=found.fit.error,
@@ -331,7 +327,7 @@ def _base_parameters(found: "RobotBodies") -> list[BaseParameterPart]:
     columns = zip(base.value.tolist(), base.sigma.tolist(), base.relative_sigma.tolist(), strict=True)
     return [
         BaseParameterPart(
-            words=base.words(i),
+            words=base.summary(i),
             value=value,
             sigma=sigma,
             relative_sigma=ratio if np.isfinite(ratio) else None,
@@ -348,7 +344,7 @@ def _verdicts(found: "RobotBodies") -> list[IdentifiabilityPart]:
             verdict=one.kind,
             value=one.value,
             sigma=one.sigma,
-            sums=list(one.sums),
+            sums=list(one.base_parameters),
         )
         for k, one in enumerate(found.identifiabilities)
     ]

@@ -1,40 +1,24 @@
-"""What runs say together of the parts of their modules: `merged.json`, and a table."""
+"""`merged.json`: the base parameters of module parts that several runs determine together."""
 
 import os
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
-from rich.table import Table
 
 from coordinator.merge.merge_runs import MergedInformation, RunShare
+from coordinator.parameter_fit.identifiability import WEAK_ABOVE
+from coordinator.parameter_fit.report_parts import BaseParameterPart, Part, base_parameter_parts
 
-SCHEMA = 1
+SCHEMA = 2
 MERGED = "merged.json"
-# As of a run's own parameters.
-IDENTIFIED_BELOW = 0.1
 
 
-class Piece(BaseModel):
-    """A piece of the report."""
+class RunPart(Part):
+    """One run by itself, and the same base parameters by all runs together.
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class SumPart(Piece):
-    """One base parameter of the parts: its sum in words, value, and standard deviation relative to it."""
-
-    words: str
-    value: float
-    relative_sigma: float | None
-
-
-class RunPart(Piece):
-    """One run: what it tells by itself, and what all tell of the same sums.
-
-    identified: how many of its sums have a relative standard deviation below a tenth, by itself and by all.
-    gain: median of sigma by all over sigma alone. strain: how far all are off from it, in its own standard
-    deviations, root mean square.
+    identified: how many of its base parameters have a relative standard deviation below a tenth, by itself
+    and merged. gain: median of sigma merged over sigma alone. inconsistency_sigma: the difference of the
+    merged values from its own, in its own standard deviations, root mean square.
     """
 
     run: str
@@ -46,8 +30,11 @@ class RunPart(Piece):
     inconsistency_sigma: float
 
 
-class MergeReport(Piece):
-    """All runs together. gain: as of a run, over all of them."""
+class MergeReport(Part):
+    """All runs together. gain: as of a run, over all of them.
+
+    Schema 2 names `base_parameters` with their `sigma`, and `summary` (in schema 1 `sums` and `words`).
+    """
 
     schema_version: int = SCHEMA
     parts: list[str]
@@ -55,32 +42,24 @@ class MergeReport(Piece):
     rank: int
     gain: float
     runs: list[RunPart]
-    sums: list[SumPart]
+    base_parameters: list[BaseParameterPart]
 
 
-def merge_report(found: MergedInformation) -> MergeReport:
+def merge_report(merged: MergedInformation) -> MergeReport:
     """Return the report of merged runs."""
-    base = found.base
-    relative = base.relative_sigma
+    base = merged.base
     return MergeReport(
-        parts=[part.name for part in found.parts],
+        parts=[part.name for part in merged.parts],
         parameters=len(base.columns.names),
         rank=base.rank,
-        gain=found.gain,
-        runs=[_run(run) for run in found.runs],
-        sums=[
-            SumPart(
-                words=base.words(i),
-                value=float(base.value[i]),
-                relative_sigma=float(relative[i]) if np.isfinite(relative[i]) else None,
-            )
-            for i in range(base.rank)
-        ],
+        gain=merged.gain,
+        runs=[_run(run) for run in merged.runs],
+        base_parameters=base_parameter_parts(base),
     )
 
 
 def _run(run: RunShare) -> RunPart:
-    size = np.abs(run.base.value) * IDENTIFIED_BELOW
+    size = np.abs(run.base.value) * WEAK_ABOVE
     return RunPart(
         run=run.name,
         serials=list(run.serials),
@@ -90,26 +69,6 @@ def _run(run: RunShare) -> RunPart:
         gain=run.gain,
         inconsistency_sigma=run.inconsistency_sigma,
     )
-
-
-def table(report: MergeReport) -> Table:
-    """Return the runs in rows."""
-    title = f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts"
-    found = Table(
-        "run", "modules", "rank", "below 10 %", "so by all", "sigma by all / alone", "strain", title=title
-    )
-    for run in report.runs:
-        found.add_row(
-            run.run,
-            ", ".join(run.serials),
-            str(run.rank),
-            str(run.identified_alone),
-            str(run.identified_merged),
-            f"{run.gain:.2f}",
-            f"{run.inconsistency_sigma:.1f}",
-        )
-    found.add_row("together", "", str(report.rank), "", "", f"{report.gain:.2f}", "")
-    return found
 
 
 def write_report(path: Path, report: MergeReport) -> None:

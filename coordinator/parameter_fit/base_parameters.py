@@ -103,7 +103,7 @@ class BaseParameters(NamedTuple):
         others = np.flatnonzero(np.abs(of_scale) > NEGLIGIBLE)
         return (int(self.independent[i]), *(int(j) for j in others if j != self.independent[i]))
 
-    def words(self, i: int) -> str:
+    def summary(self, i: int) -> str:
         """Return base parameter `i` as a sum of named parameters, "m2 c2x + 0.225 (m3 + m4)"."""
         groups: dict[tuple[bool, str], list[str]] = {}
         for j in self.lumped(i):

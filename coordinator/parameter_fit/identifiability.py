@@ -1,8 +1,8 @@
-"""What may be said of every single parameter: identified, weak, or not identifiable, and why.
+"""The identifiability of every single parameter: identified, weak, or not identifiable, and why.
 
-A parameter is known by itself if a base parameter holds it alone. One that only shows in sums is not
-identifiable from torques, but what is known beforehand may settle the sum; then it is weak, whatever its
-standard deviation, because it is no better than the prior's way of sharing out.
+A parameter is identified by itself if a base parameter consists of it alone. One that only appears in
+combination with others is not identifiable from torques, but a prior may settle it. Then it is weak, whatever
+its standard deviation, because the prior decides how the combination is shared out.
 """
 
 from collections.abc import Sequence
@@ -14,29 +14,31 @@ from numpy.typing import ArrayLike
 from coordinator.parameter_fit.base_parameters import BaseParameters
 
 Kind = Literal["identified", "weak", "not identifiable"]
+# Of an estimate: no prior is involved, and a value within its own sigma is no evidence of the parameter.
+Precision = Literal["identified", "weak", "not distinguishable from zero"]
 
 # Relative standard deviation: the limit that identification of robots is used to (Khalil and Dombre 2002,
 # section 12.4).
 WEAK_ABOVE = 0.1
-# Of the parameters that a sum shares: as many are named as one reads.
+# So many of the parameters in a combination are named in a summary.
 _NAMED = 6
 
 
 class Identifiability(NamedTuple):
-    """What is known of one parameter.
+    """The identifiability of one parameter.
 
-    value, sigma: from torques alone if it is known alone, with the prior's help if that settles it, else
-    None. sums: the base parameters that it is in. lumped_with: the other parameters in those. words: kind,
-    value and reason, to read.
+    value, sigma: from torques alone if it is a base parameter by itself, from torques and prior if these
+    settle it, else None. base_parameters: the places of the base parameters that it is in. lumped_with: the
+    other parameters in those. summary: kind, value and reason in a sentence.
     """
 
     name: str
     kind: Kind
     value: float | None
     sigma: float | None
-    sums: tuple[int, ...]
+    base_parameters: tuple[int, ...]
     lumped_with: tuple[str, ...]
-    words: str
+    summary: str
 
 
 def identifiabilities(
@@ -45,10 +47,10 @@ def identifiabilities(
     informed: ArrayLike | None = None,
     informed_sigma: ArrayLike | None = None,
 ) -> tuple[Identifiability, ...]:
-    """Return a verdict for every one of p columns.
+    """Return the identifiability of every one of p parameters.
 
     Args:
-        base: what torques alone tell.
+        base: the base parameters of the torques alone.
         units: (p,) of the parameters.
         informed, informed_sigma: (p,) parameters and their standard deviations with a prior
             (`physical_fit`), in the same frames; None where there is no prior.
@@ -68,40 +70,52 @@ def identifiabilities(
     if values.shape != (count,) or sigmas.shape != (count,):
         raise ValueError(f"{values.shape} values and {sigmas.shape} deviations for {count} parameters")
     members = [base.lumped(i) for i in range(base.rank)]
-    sums: list[list[int]] = [[] for _ in range(count)]
+    places: list[list[int]] = [[] for _ in range(count)]
     for i, some in enumerate(members):
         for j in some:
-            sums[j].append(i)
-    found = []
+            places[j].append(i)
+    results = []
     for j, (name, unit) in enumerate(zip(base.columns.names, units, strict=True)):
-        if len(sums[j]) == 1 and len(members[sums[j][0]]) == 1:
-            i = sums[j][0]
-            found.append(_known_alone(name, unit, i, float(base.value[i]), float(base.sigma[i])))
+        if len(places[j]) == 1 and len(members[places[j][0]]) == 1:
+            i = places[j][0]
+            results.append(_known_alone(name, unit, i, float(base.value[i]), float(base.sigma[i])))
             continue
-        others = sorted({k for i in sums[j] for k in members[i]} - {j})
+        others = sorted({k for i in places[j] for k in members[i]} - {j})
         names = tuple(base.columns.names[k] for k in others)
-        found.append(_in_sums(name, unit, tuple(sums[j]), names, float(values[j]), float(sigmas[j])))
-    return tuple(found)
+        results.append(
+            _in_combination(
+                name, unit, tuple(places[j]), names, value=float(values[j]), sigma=float(sigmas[j])
+            )
+        )
+    return tuple(results)
 
 
-def words_of_body(some: Sequence[Identifiability]) -> str:
-    """Return the verdicts of one body in a line: which are identified, weak, only in sums, without effect."""
+def precision(relative_sigma: float) -> Precision:
+    """Return how well an estimate is known by its standard deviation over its absolute value."""
+    if relative_sigma <= WEAK_ABOVE:
+        return "identified"
+    return "weak" if relative_sigma < 1.0 else "not distinguishable from zero"
+
+
+def body_summary(parameters: Sequence[Identifiability]) -> str:
+    """Return the parameters of one body in a line, grouped by how well they are known."""
     groups: dict[str, list[str]] = {}
-    for verdict in some:
-        group: str = verdict.kind
+    for one in parameters:
+        group: str = one.kind
         if group == "not identifiable":
-            group = "only in sums" if verdict.sums else "without effect"
-        groups.setdefault(group, []).append(verdict.name)
-    order = ("identified", "weak", "only in sums", "without effect")
+            group = "only in combinations" if one.base_parameters else "without effect"
+        groups.setdefault(group, []).append(one.name)
+    order = ("identified", "weak", "only in combinations", "without effect")
     return "; ".join(f"{group}: {', '.join(groups[group])}" for group in order if group in groups)
 
 
-def words_of_base(base: BaseParameters) -> str:
+def base_summary(base: BaseParameters) -> str:
     """Return in a line how many base parameters there are, and how well they are known."""
     strong = int(np.sum(base.relative_sigma <= WEAK_ABOVE))
     size = len(base.columns.names)
     return (
-        f"{base.rank} sums of {size} parameters are known, {strong} of them within {100 * WEAK_ABOVE:.0f} %"
+        f"{base.rank} base parameters of {size} parameters, {strong} of them known within "
+        f"{100 * WEAK_ABOVE:.0f} %"
     )
 
 
@@ -111,19 +125,19 @@ def _known_alone(name: str, unit: str, place: int, value: float, sigma: float) -
     return Identifiability(name, kind, value, sigma, (place,), (), f"{kind}: {_figures(value, sigma, unit)}")
 
 
-def _in_sums(
-    name: str, unit: str, sums: tuple[int, ...], others: tuple[str, ...], value: float, sigma: float
+def _in_combination(
+    name: str, unit: str, places: tuple[int, ...], others: tuple[str, ...], *, value: float, sigma: float
 ) -> Identifiability:
-    if not sums:
-        words = "not identifiable: without effect on torques"
-        return Identifiability(name, "not identifiable", None, None, (), (), words)
+    if not places:
+        summary = "not identifiable: without effect on torques"
+        return Identifiability(name, "not identifiable", None, None, (), (), summary)
     more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-    where = f"in sums with {', '.join(others[:_NAMED])}{more}"
+    where = f"in combination with {', '.join(others[:_NAMED])}{more}"
     if sigma <= WEAK_ABOVE * abs(value):
-        words = f"weak: {_figures(value, sigma, unit)} by the prior, only {where}"
-        return Identifiability(name, "weak", value, sigma, sums, others, words)
+        summary = f"weak: {_figures(value, sigma, unit)} by the prior, only {where}"
+        return Identifiability(name, "weak", value, sigma, places, others, summary)
     return Identifiability(
-        name, "not identifiable", None, None, sums, others, f"not identifiable: only {where}"
+        name, "not identifiable", None, None, places, others, f"not identifiable: only {where}"
     )
 
 

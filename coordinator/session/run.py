@@ -294,7 +294,7 @@ class Run:
             self._screen.note("estimating")
             found = await self._compute(lambda: identify(self.recording, self._revised, kinematics))
             self._write(found)
-            for line in found.inertia.words() if found.inertia is not None else ():
+            for line in found.inertia.summary() if found.inertia is not None else ():
                 self._screen.note(line)
             if self._crashed is not None:
                 self._crashed.unlink()

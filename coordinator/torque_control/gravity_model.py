@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from coordinator.baseline.known_robot import BaselineError
 from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.pseudo_inertia import parameter_transform
-from coordinator.identification.result import BodiesPart, BodyPart, Result
+from coordinator.identification.result import BodiesPart, ModuleBodyPart, Result
 from coordinator.recording.run_folder import RESULT
 from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import inverse_dynamics
@@ -82,7 +82,7 @@ def _phi(chain: Chain, part: BodiesPart) -> Array:
     return np.concatenate([parameter_transform(home) @ _about_origin(by_serial[s]) for s, home in pairs])
 
 
-def _about_origin(one: BodyPart) -> Array:
+def _about_origin(one: ModuleBodyPart) -> Array:
     """Return a body's ten parameters in its link's frame: the inertia about the origin (parallel axes)."""
     centre, inertia = np.array(one.com_m), np.array(one.inertia_kg_m2)
     inertia = inertia + one.mass_kg * (centre @ centre * np.eye(3) - np.outer(centre, centre))

@@ -99,7 +99,7 @@ class Inertia(NamedTuple):
     effects: tuple[Array, ...]
     gathered: AgentInformation | None = None
 
-    def words(self) -> list[str]:
+    def summary(self) -> list[str]:
         """Return in lines to read what the motion was seen by, and what torque readings hold besides."""
         fit, terms = self.seen.fit, self.seen.terms
         noise = ", ".join(f"{1e3 * value:.1f}" for value in fit.torque_sigma_nm)

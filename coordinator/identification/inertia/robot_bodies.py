@@ -25,9 +25,9 @@ from coordinator.parameter_fit.base_parameters import (
 )
 from coordinator.parameter_fit.identifiability import (
     Identifiability,
+    base_summary,
+    body_summary,
     identifiabilities,
-    words_of_base,
-    words_of_body,
 )
 from coordinator.parameter_fit.least_squares import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG, InertialFit
 from coordinator.parameter_fit.physically_consistent import NotSolvedError, PhysicalFit, fit_physical
@@ -59,12 +59,12 @@ class RobotBodies(NamedTuple):
     note: str
     held_out_error: float | None = None
 
-    def words(self) -> list[str]:
+    def summary(self) -> list[str]:
         """Return what is known in lines to read: the sums, then body by body."""
-        lines = [words_of_base(self.base)]
+        lines = [base_summary(self.base)]
         for i, serial in enumerate(self.serials):
             own = self.identifiabilities[PER_BODY * i : PER_BODY * (i + 1)]
-            lines.append(f"body {i + 1}, turned by {serial}: {words_of_body(own)}")
+            lines.append(f"body {i + 1}, turned by {serial}: {body_summary(own)}")
         return lines
 
 

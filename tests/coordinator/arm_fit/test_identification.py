@@ -86,9 +86,9 @@ def test_the_sums_that_the_torques_show_are_those_of_the_true_bodies(three: FitR
     assert len(bodies) == 15
     for part in bodies:
         # The first motor's inertia turns with the first body: they only show together.
-        truth = part.urdf + (0.15 if part.words.startswith("Ia1 + I1zz") else 0.0)
+        truth = part.urdf + (0.15 if part.summary.startswith("Ia1 + I1zz") else 0.0)
         assert abs(part.value - truth) < 4.0 * part.sigma, part
-    assert sum(part.words.startswith("Ia1 + I1zz") for part in bodies) == 1
+    assert sum(part.summary.startswith("Ia1 + I1zz") for part in bodies) == 1
 
 
 def test_every_body_is_spoken_of_in_words(three: FitReport) -> None:
@@ -98,8 +98,8 @@ def test_every_body_is_spoken_of_in_words(three: FitReport) -> None:
         ("hand", "wrist"),
     ]
     # All that an upright first joint shows of its body is one moment, and that only with its motor.
-    first, _, last = (body.words for body in three.fit.bodies)
-    assert first.startswith("only in sums: I1zz; without effect: m1, ")
+    first, _, last = (body.summary for body in three.fit.bodies)
+    assert first.startswith("only in combinations: I1zz; without effect: m1, ")
     assert "identified: " in last
     assert "m3 c3x" in last
 
@@ -157,13 +157,15 @@ def test_instruments_find_the_inertia_that_a_noisy_encoder_hides(recording: Any)
     turned = []
     for some in (plain, tooled):
         found = named(some, fit_part(some, slice(0, len(some.log.tau_nm))))
-        i = next(i for i in range(found.rank) if found.words(i).startswith("Ia1 + I1zz"))
+        i = next(i for i in range(found.rank) if found.summary(i).startswith("Ia1 + I1zz"))
         turned.append((float(found.value[i]), float(found.sigma[i])))
     # What stands upright turns with 0.15 of the motor, 0.025 of its own and the forearm and hand: the same
     # fit at 10 Hz.
     _, slow = posed(recording.urdf, recording.npz, SHARED)
     known = named(slow, fit_part(slow, slice(0, len(slow.log.tau_nm))))
-    truth = next(float(known.value[i]) for i in range(known.rank) if known.words(i).startswith("Ia1 + I1zz"))
+    truth = next(
+        float(known.value[i]) for i in range(known.rank) if known.summary(i).startswith("Ia1 + I1zz")
+    )
     assert turned[0][0] < 0.85 * truth
     assert turned[1][0] == pytest.approx(truth, abs=4.0 * turned[1][1])
     assert turned[1][0] == pytest.approx(truth, rel=0.05)
@@ -250,7 +252,7 @@ def test_the_staubli_tx40_is_predicted_within_the_best_known_errors() -> None:
     assert found.fit.rank == 61
     # The maker's inertias are no part of the fit; sums that come out near the claimed ones say that axes,
     # frames and signs are right.
-    sums = {part.words: part for part in found.fit.base_parameters}
+    sums = {part.summary: part for part in found.fit.base_parameters}
     reach = sums["m2 c2x + 0.225 (m3 + m4 + m5 + m6)"]
     assert reach.urdf == pytest.approx(2.397, abs=1e-3)
     assert reach.value == pytest.approx(reach.urdf, rel=0.15)

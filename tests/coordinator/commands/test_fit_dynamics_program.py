@@ -71,13 +71,13 @@ def test_a_double_pendulum_is_known_from_its_torques(tmp_path: Path) -> None:
         "filtered, masked",
         "raw, all",
         "constant mean",
-        "earns its place",
+        "significant",
     ):
         assert words in done.output
     found = FitReport.model_validate_json((tmp_path / "fit.json").read_text())
-    assert found.schema_version == 1
+    assert found.schema_version == 2
     # Swinging in a plane: gravity's moment of each link and the inertia of each about its joint.
-    sums = {part.words: part for part in found.fit.base_parameters}
+    sums = {part.summary: part for part in found.fit.base_parameters}
     hanging = sums["m2 c2z"]
     assert hanging.value == pytest.approx(-0.1, abs=4.0 * hanging.sigma)
     drives = {part.name: part.value for part in found.fit.drives}
@@ -110,7 +110,7 @@ def test_instruments_are_used_when_asked_for(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     found = FitReport.model_validate_json((tmp_path / "fit.json").read_text())
     assert found.fit.instruments
-    hanging = next(part for part in found.fit.base_parameters if part.words == "m2 c2z")
+    hanging = next(part for part in found.fit.base_parameters if part.summary == "m2 c2z")
     assert hanging.value == pytest.approx(-0.1, abs=4.0 * hanging.sigma)
 
 

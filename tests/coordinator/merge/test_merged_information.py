@@ -338,9 +338,9 @@ def test_the_command_merges_folders_and_says_by_how_much(tmp_path: Path) -> None
     assert said == json.loads((tmp_path / "both" / "merged.json").read_text())
     assert [run["run"] for run in said["runs"]] == ["one", "two"]
     assert said["rank"] > max(run["rank"] for run in said["runs"])
-    assert len(said["sums"]) == said["rank"]
+    assert len(said["base_parameters"]) == said["rank"]
     told = CliRunner().invoke(app, ["merge", *folders, "--out", str(tmp_path / "both")])
-    assert "together" in told.output
+    assert "merged" in told.output
     twice = CliRunner().invoke(app, ["merge", folders[0], *folders, "--out", str(tmp_path / "twice")])
     assert twice.exit_code == 1
     assert "one and one are of the same recording" in " ".join(twice.output.split())

@@ -105,7 +105,7 @@ def test_a_double_pendulum_has_the_base_parameters_of_the_textbook(rng: Generato
     # Two axes along -y, 0.35 m apart along x, gravity along -z. In the links' frames z is the axis.
     chain = chain_of((-1, 0), np.array([[0.0, -1.0, 0.0]] * 2), np.array([[0.0, 0.0, 0.0], [0.35, 0.0, 0.0]]))
     found = found_of(chain, bodies(rng, 2), rng)
-    assert [found.words(i) for i in range(found.rank)] == [
+    assert [found.summary(i) for i in range(found.rank)] == [
         "m1 c1x + 0.35 m2",
         "m1 c1y",
         "I1zz + 0.122 m2",
@@ -124,7 +124,7 @@ def test_across_a_right_angle_the_difference_of_two_moments_is_what_shows(rng: G
     # difference, because their sum turns with the table and is its inertia.
     chain = chain_of((-1, 0), np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]]), np.zeros((2, 3)))
     found = found_of(chain, bodies(rng, 2), rng)
-    words = [found.words(i) for i in range(found.rank)]
+    words = [found.summary(i) for i in range(found.rank)]
     assert words[0] == "I1zz + I2yy"
     assert "I2xx - I2yy" in words
     assert found.rank == 8
@@ -134,7 +134,7 @@ def test_masses_beyond_a_joint_are_named_in_one_bracket(rng: Generator) -> None:
     axis = np.array([[0.0, 1.0, 0.0]] * 3)
     chain = chain_of((-1, 0, 1), axis, np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.2, 0.0, 0.1]]))
     found = found_of(chain, bodies(rng, 3), rng)
-    assert "m1 c1x + 0.2 (m2 + m3)" in [found.words(i) for i in range(found.rank)]
+    assert "m1 c1x + 0.2 (m2 + m3)" in [found.summary(i) for i in range(found.rank)]
 
 
 def test_standard_deviations_are_the_scatter_of_repeated_fits(rng: Generator) -> None:
@@ -197,7 +197,7 @@ def test_friction_beside_inertia_stays_a_parameter_of_its_own(rng: Generator) ->
     rows = np.hstack([y, viscous])
     found = base_parameters(rows, rows @ truth, columns)
     assert found.rank == base_parameters(y, y @ truth[:20], inertial_columns(2)).rank + 2
-    named = dict(zip((found.words(i) for i in range(found.rank)), found.value, strict=True))
+    named = dict(zip((found.summary(i) for i in range(found.rank)), found.value, strict=True))
     assert named["viscous 1"] == pytest.approx(0.3)
     assert named["viscous 2"] == pytest.approx(0.7)
 

@@ -14,9 +14,9 @@ from coordinator.parameter_fit.base_parameters import (
 )
 from coordinator.parameter_fit.identifiability import (
     Identifiability,
+    base_summary,
+    body_summary,
     identifiabilities,
-    words_of_base,
-    words_of_body,
 )
 from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import torque_regressor
@@ -66,8 +66,8 @@ def test_what_a_double_pendulum_shows_is_told_apart(rng: Generator) -> None:
     assert weak.value == pytest.approx(1e-5, abs=5.0 * weak.sigma)
     assert found["m2"].kind == "not identifiable"
     assert found["m2"].lumped_with == ("m1 c1x", "I1zz")
-    assert found["m2"].words == "not identifiable: only in sums with m1 c1x, I1zz"
-    assert found["m1"].words == "not identifiable: without effect on torques"
+    assert found["m2"].summary == "not identifiable: only in combination with m1 c1x, I1zz"
+    assert found["m1"].summary == "not identifiable: without effect on torques"
     assert found["m2"].value is None
 
 
@@ -76,7 +76,7 @@ def test_an_identified_parameter_has_the_digits_that_its_noise_leaves(rng: Gener
     assert found.value is not None
     assert found.sigma is not None
     assert abs(found.value - 0.02) < 5.0 * found.sigma
-    value, _, sigma, *unit = found.words.removeprefix("identified: ").split()
+    value, _, sigma, *unit = found.summary.removeprefix("identified: ").split()
     # Two digits of the deviation, as many places of the value.
     assert float(sigma) == pytest.approx(found.sigma, rel=0.05)
     assert len(value.split(".")[1]) == len(sigma.split(".")[1])
@@ -89,8 +89,8 @@ def test_what_only_the_prior_settles_is_weak_however_small_its_deviation(rng: Ge
     sigma[10] = 0.001
     found = named(identifiabilities(base, inertial_units(2), TRUTH, sigma))
     assert found["m2"].kind == "weak"
-    assert found["m2"].words.startswith(
-        "weak: 0.5000 +- 0.0010 kg (0.2 %) by the prior, only in sums with m1"
+    assert found["m2"].summary.startswith(
+        "weak: 0.5000 +- 0.0010 kg (0.2 %) by the prior, only in combination with m1"
     )
     assert found["m1 c1x"].kind == "not identifiable"
     # Without effect stays so, whatever the prior believes.
@@ -105,19 +105,21 @@ def test_more_noise_makes_weak_what_was_identified(rng: Generator) -> None:
     assert loud["m1 c1y"].kind == "weak"
     for verdict in loud.values():
         if verdict.value is not None and verdict.sigma is not None:
-            assert verdict.words.endswith("may be zero") == (verdict.sigma >= abs(verdict.value))
-    assert any(verdict.words.endswith("may be zero") for verdict in loud.values())
+            assert verdict.summary.endswith("may be zero") == (verdict.sigma >= abs(verdict.value))
+    assert any(verdict.summary.endswith("may be zero") for verdict in loud.values())
 
 
 def test_a_body_is_summed_up_in_a_line(rng: Generator) -> None:
     base = base_of(rng)
     found = identifiabilities(base, inertial_units(2))
-    assert words_of_body(found[:10]) == (
-        "identified: m1 c1y; only in sums: m1 c1x, I1zz; "
+    assert body_summary(found[:10]) == (
+        "identified: m1 c1y; only in combinations: m1 c1x, I1zz; "
         "without effect: m1, m1 c1z, I1xx, I1xy, I1xz, I1yy, I1yz"
     )
-    assert words_of_body(found[10:]).startswith("identified: m2 c2x, I2zz; weak: m2 c2y; only in sums: m2;")
-    assert words_of_base(base) == "6 sums of 20 parameters are known, 5 of them within 10 %"
+    assert body_summary(found[10:]).startswith(
+        "identified: m2 c2x, I2zz; weak: m2 c2y; only in combinations: m2;"
+    )
+    assert base_summary(base) == "6 base parameters of 20 parameters, 5 of them known within 10 %"
 
 
 def test_what_does_not_fit_is_named(rng: Generator) -> None:

@@ -69,8 +69,8 @@ def test_the_bodies_are_near_those_that_were_built(found: RobotBodies) -> None:
 
 
 def test_a_line_says_how_many_sums_are_known_and_one_a_body_which(found: RobotBodies) -> None:
-    lines = found.words()
-    assert lines[0].startswith("22 sums of 40 parameters are known, ")
+    lines = found.summary()
+    assert lines[0].startswith("22 base parameters of 40 parameters, ")
     assert [line.split(":")[0] for line in lines[1:]] == [
         f"body {i + 1}, turned by {serial}" for i, serial in enumerate(ROBOT.serials)
     ]
@@ -90,7 +90,7 @@ def test_without_real_bodies_the_rest_is_said_all_the_same(monkeypatch: pytest.M
     assert one.base.rank == 22
     # Nothing is settled by a prior that was not used.
     assert all(
-        verdict.sums == () or verdict.value is not None or verdict.lumped_with
+        verdict.base_parameters == () or verdict.value is not None or verdict.lumped_with
         for verdict in one.identifiabilities
     )
-    assert not any("by the prior" in verdict.words for verdict in one.identifiabilities)
+    assert not any("by the prior" in verdict.summary for verdict in one.identifiabilities)

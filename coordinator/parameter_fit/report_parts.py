@@ -1,0 +1,59 @@
+"""Parts that `result.json`, `merged.json` and the report of fit-dynamics share."""
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from coordinator.dynamics.pseudo_inertia import Body
+from coordinator.parameter_fit.base_parameters import BaseParameters
+
+
+class Part(BaseModel):
+    """A part of a document: immutable, and without fields that the schema does not name."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class BaseParameterPart(Part):
+    """A combination of parameters that torques determine, SI units.
+
+    summary: the combination, "m2 c2x + 0.225 (m3 + m4)". relative_sigma: sigma / |value|, null for a value of
+    zero.
+    """
+
+    summary: str
+    value: float
+    sigma: float
+    relative_sigma: float | None
+
+
+class BodyPart(Part):
+    """A rigid body: mass, centre of mass, and the inertia about it (3, 3), in SI units."""
+
+    mass_kg: float
+    com_m: list[float]
+    inertia_kg_m2: list[list[float]]
+
+
+def base_parameter_parts(base: BaseParameters) -> list[BaseParameterPart]:
+    """Return all base parameters as parts, in their order."""
+    return [
+        BaseParameterPart(
+            summary=base.summary(i),
+            value=float(base.value[i]),
+            sigma=float(base.sigma[i]),
+            relative_sigma=finite(float(base.relative_sigma[i])),
+        )
+        for i in range(base.rank)
+    ]
+
+
+def body_part(body: Body) -> BodyPart:
+    """Return a body as a part."""
+    return BodyPart(
+        mass_kg=body.mass_kg, com_m=body.com_m.tolist(), inertia_kg_m2=body.inertia_kg_m2.tolist()
+    )
+
+
+def finite(value: float) -> float | None:
+    """Return a number, or None for what JSON does not have: NaN and infinity."""
+    return value if np.isfinite(value) else None
