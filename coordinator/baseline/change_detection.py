@@ -24,11 +24,12 @@ from scipy.stats import chi2
 
 from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain
-from coordinator.batch_estimation.imu_intrinsics import UNCALIBRATED, ImuIntrinsics
+from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics
 from coordinator.identification.robot_refinement import CUTOFF_HZ, KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, sensor_data, window
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import UNCALIBRATED
 from module_agent.model.perturbation import adjoint, frozen, perturbation_between
 from module_agent.signals.filtering import settling_samples
 

@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.batch_estimation.imu_intrinsics import (
-    BIASES_ONLY,
     ImuIntrinsics,
-    ImuPrior,
     mixing,
     perfect,
     read,
@@ -29,6 +27,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import BIASES_ONLY, ImuPrior
 from module_agent.model.perturbation import apply_perturbation, frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 

@@ -6,53 +6,18 @@ Gravity and the joints' own rates are the references that tell them, as far as t
 they do not reach stays as uncertain as it was before.
 """
 
-from math import radians
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from module_agent.model.catalogue import ImuKind
 from module_agent.model.chain import Array
+from module_agent.model.imu_prior import ImuPrior
 
 # One IMU's errors as one vector: E of the gyro and of the accelerometer row by row, their biases, the delay,
 # and the gyro's sensitivity to specific force row by row.
 SIZE = 34
 _GYRO, _ACCEL, DELAY, _FORCE = slice(0, 9), slice(9, 18), 24, slice(25, 34)
-
-
-class ImuPrior(NamedTuple):
-    """How well an IMU is known beforehand, one standard deviation each; zero means exactly."""
-
-    scale: float
-    misalignment_rad: float
-    gyro_bias_rad_s: float
-    accel_bias_m_s2: float
-    delay_s: float
-    g_sensitivity_s_m: float = 0.0
-
-    @property
-    def sigmas(self) -> Array:
-        """The standard deviations of an IMU's errors, (34,)."""
-        matrix = np.full((3, 3), self.misalignment_rad)
-        np.fill_diagonal(matrix, self.scale)
-        biases = np.repeat([self.gyro_bias_rad_s, self.accel_bias_m_s2], 3)
-        return np.concatenate(
-            [matrix.ravel(), matrix.ravel(), biases, [self.delay_s], np.full(9, self.g_sensitivity_s_m)]
-        )
-
-
-# What the data sheets of this class of IMU allow. The bias keeps apart what the motions cannot: an
-# accelerometer's bias and gravity where the IMU never turns.
-BIASES_ONLY = ImuPrior(0.0, 0.0, 0.05, 0.2, 0.0)
-# 0.1 deg/s per g, which calibrations of scale and axes leave as it is.
-G_SENSITIVITY_S_M = 1.8e-4
-# As delivered: scale good to 1 %, axes to 1 deg; a low-pass before the sampling makes readings late.
-UNCALIBRATED = ImuPrior(0.01, radians(1.0), 0.05, 0.2, 3e-3, G_SENSITIVITY_S_M)
-# Calibrated on a rate table and by gravity: what is left of scale and axes is below what motions tell.
-CALIBRATED = ImuPrior(1e-4, 1e-4, 0.05, 0.2, 3e-3, G_SENSITIVITY_S_M)
-
-IMU_PRIORS: dict[ImuKind, ImuPrior] = {"calibrated": CALIBRATED, "uncalibrated": UNCALIBRATED}
 
 
 class ImuIntrinsics(NamedTuple):

@@ -26,13 +26,11 @@ from coordinator.batch_estimation.imu_prediction import (
 from coordinator.batch_estimation.sensor_data import SensorData
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.imu_prior import HINGE_SHARE, HINGE_SHARE_SIGMA
 from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate
 
-# Where the hinge is, as a share of the length: 0 for a clamp that gives, 0.15 for a clamped beam (Howell,
-# section 5), up to a third where the end's slope counts more than its place.
-HINGE_SHARE, HINGE_SHARE_SIGMA = 0.15, 0.1
-# And how far it may be beside the line from face to face: tubes are centimetres beside the modules' axes.
+# How far the hinge may be beside the line from face to face: tubes are centimetres beside the modules' axes.
 HINGE_ASIDE_SIGMA_M = 0.02
 HINGE_SIGMAS = (HINGE_SHARE_SIGMA, HINGE_ASIDE_SIGMA_M, HINGE_ASIDE_SIGMA_M)
 

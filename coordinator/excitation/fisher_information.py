@@ -15,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.batch_estimation.imu_intrinsics import ImuPrior, slopes
+from coordinator.batch_estimation.imu_intrinsics import slopes
 from coordinator.batch_estimation.imu_prediction import turned
 from module_agent.model.catalogue import GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array
+from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.perturbation import cross, skew
 
 # Radius (2), axis (2), gravity (3): what is unknown beside the IMU's own errors.

@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.batch_estimation.imu_intrinsics import ImuPrior
 from coordinator.excitation.fisher_information import CircleSetting, JointPath, SensorNoise, circle_covariance
 from coordinator.excitation.joint_limits import JointLimits, motion_peaks
 from module_agent.control.waveform import duration_s, minimum_jerk_duration_s, waveform
 from module_agent.model.catalogue import GRAVITY_M_S2
+from module_agent.model.imu_prior import ImuPrior
 from module_agent.wire.messages import ConstantMotion, Pattern, WindowedSine
 
 # Before anything has moved, a link is taken to be as long as a kit's tube.

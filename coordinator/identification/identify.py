@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from coordinator.batch_estimation.estimator import Refinement
-from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS, ImuPrior, beyond
+from coordinator.batch_estimation.imu_intrinsics import beyond
 from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.torque_prediction import check_held_out
 from coordinator.identification.identified import HeldOutMotion, IdentificationError, Identified, Kinematics
@@ -43,6 +43,7 @@ from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import Topology, TopologyError
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import JointMotion, settling_samples
 from module_agent.wire.messages import Estimate

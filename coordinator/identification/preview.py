@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
-from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS, ImuPrior
 from coordinator.batch_estimation.link_compliance import compliance_jacobian, joined, loads_of
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.assembly import assemble
@@ -28,6 +27,7 @@ from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import MotionSeen, Topology, likely_topology
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.filtering import settling_samples
 from module_agent.wire.messages import Estimate
 

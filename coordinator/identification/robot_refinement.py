@@ -9,7 +9,7 @@ import numpy as np
 
 from coordinator.batch_estimation.base_heading import faced
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
-from coordinator.batch_estimation.imu_intrinsics import DELAY, ImuPrior
+from coordinator.batch_estimation.imu_intrinsics import DELAY
 from coordinator.batch_estimation.link_compliance import (
     ComplianceJacobian,
     LinkLoad,
@@ -24,6 +24,7 @@ from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, encoder_steps, filtered, thinned
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.perturbation import frozen
 
 # Six times the 2 Hz of the windowed sine, and above the resonance of a base that is worth the name.

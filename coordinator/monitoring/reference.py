@@ -12,7 +12,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from coordinator.baseline.known_robot import BaselineRobot
-from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS
 from coordinator.identification.identify import recorded_type
 from coordinator.monitoring.contact import ContactModel, contact_model, fast_part
 from coordinator.monitoring.likelihood_ratio import ChangeTest, Evidence, find_change, joined, without_own
@@ -41,6 +40,7 @@ from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RAT
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import UsageError
+from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.model.information import JointInformation, gather, merge
 
 # How long a window of the watch is, in stretches.

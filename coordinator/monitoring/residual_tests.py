@@ -28,7 +28,6 @@ from coordinator.batch_estimation.imu_intrinsics import (
     DELAY,
     SIZE,
     ImuIntrinsics,
-    ImuPrior,
     mixing,
     read,
     slopes,
@@ -41,6 +40,7 @@ from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.base_parameters import whitened
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.information import JointInformation, gather
 from module_agent.model.regressor import PER_BODY, inverse_dynamics
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from coordinator.batch_estimation.imu_intrinsics import IMU_PRIORS
 from coordinator.excitation.joint_limits import (
     JointLimits,
     joint_limits,
@@ -24,6 +23,7 @@ from coordinator.excitation.single_joint import (
 )
 from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ModuleType
+from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import ConstantMotion, MotionRecord, MultiSine, Pattern, WindowedSine
 

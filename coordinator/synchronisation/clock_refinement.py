@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from coordinator.batch_estimation.imu_prediction import turned
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import DELAY_RMS_S, DELAY_SPREAD_S, GYRO_BIAS_SIGMA_RAD_S
 from module_agent.model.perturbation import cross, frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.signals.clock_map import ClockMap
@@ -25,13 +26,11 @@ RATE_HZ = 250.0
 CUTOFF_HZ = 15.0
 # Half the time constant of that low-pass: about as many samples as are independent.
 KEEP_EVERY = 5
-# A low-pass before the sampling makes readings late: 2.4 ms at 92 Hz, none without; alike in all of a kind.
-DELAY_SIGMA_S, DELAY_SPREAD_S = 3e-3, 1e-4
 # What shifts a single lag without any clock: a gyro that feels acceleration (0.1 deg/s/g on 0.3 m), a link
 # that gives. Lags of other motions and IMUs are shifted otherwise.
 LAG_FLOOR_S = 8e-5
-# How far gyros are off beforehand: bias; and scale, axes and the chain's own axes together. Then their noise.
-BIAS_RAD_S, AXES, FIRST_RAD_S = 0.1, 0.05, 1e-3
+# Scale and axes of the gyros and the chain's own axes together; then the gyros' noise.
+AXES, FIRST_RAD_S = 0.05, 1e-3
 # A gyro that reads otherwise than the joints that carry it, by this share, tells nothing of clocks.
 MAX_OFF = 0.3
 # An angular rate that no sensor resolves, and the rounding of 16 bit readings [rad/s].
@@ -133,7 +132,7 @@ def _before(clocks: Sequence[ClockMap]) -> Array:
     """Return what is known before: sigmas of [offset errors, drift errors, common delay, its spread]."""
     offsets = [max(1e-9 * clock.sigma_ns, EXACT) for clock in clocks]
     drifts = [max(clock.drift_sigma, EXACT) for clock in clocks]
-    return np.array([*offsets, *drifts, DELAY_SIGMA_S, *[DELAY_SPREAD_S] * len(clocks)])
+    return np.array([*offsets, *drifts, DELAY_RMS_S, *[DELAY_SPREAD_S] * len(clocks)])
 
 
 def _base(clocks: Sequence[ClockMap]) -> int:
@@ -184,7 +183,7 @@ def _lag(chain: Chain, imu: int, joints: tuple[Array, ...], gyro: Array) -> _Nor
     columns = np.zeros((count + 1, *rate.shape))
     columns[path] = slopes
     columns[count] = -slopes.sum(axis=0)
-    nuisance = np.column_stack([np.full(len(rate), BIAS_RAD_S), AXES * rate])
+    nuisance = np.column_stack([np.full(len(rate), GYRO_BIAS_SIGMA_RAD_S), AXES * rate])
     variance = FIRST_RAD_S**2
     for _ in range(2):
         clean = _without(nuisance, variance, np.concatenate([columns, [gyro - rate]]))

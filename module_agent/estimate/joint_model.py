@@ -18,14 +18,13 @@ the joint's axis by the share h of the distance d gives the tangential term a + 
 
 The readings are late by a delay of their own in each motion: the clocks', and that of the IMU's low-pass. k
 is the axis as the gyro reads it, G what the gyro feels of specific force, E (3 x 3, its columns across j) the
-accelerometer's scale and misalignment, all near their perfect values as far as the `ImuKnowledge` says.
+accelerometer's scale and misalignment, all near their perfect values as far as the `ImuPrior` says.
 Gravity's known strength calibrates E in the plane in which the joint turns it; where it does not, the
 covariance of r keeps the uncertainty of before.
 
 What is known of an IMU, a link and a housing before any motion: the beliefs of the joint regression.
 """
 
-from math import radians
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +33,7 @@ from module_agent.estimate.base_shake import ACCELERATION, CURVE, FORCE, RATE, S
 from module_agent.estimate.smoothing import COSINE, SINE, SQUARED, SmoothMotion
 from module_agent.estimate.windows import Array
 from module_agent.model.catalogue import GRAVITY_M_S2
+from module_agent.model.imu_prior import DELAY_S, DELAY_SIGMA_S, HINGE_SHARE, HINGE_SHARE_SIGMA, ImuPrior
 
 # Where the parameters are in their vector; directions are (e1, e2, j), across and along the axis. The delays
 # of the motions come last.
@@ -242,28 +242,10 @@ def _linear(values: Array, shake: Array | None, p: Array) -> Array:
 
 # A link bends so that it rings at 12 Hz or above: c = 1 / (2 pi f)^2.
 _COMPLIANCE_SIGMA_S2 = 2e-4
-# A bent link's hinge as a share of the distance: at the axis where its clamp gives, at 0.15 by beam theory.
-_HINGE_SHARE, _HINGE_SHARE_SIGMA = 0.0, 0.05
-_GYRO_BIAS_RAD_S = 0.1
-_GYRO_FEELS_S_M = 2e-4  # rad/s per m/s^2: 0.1 deg/s/g in data sheets
+# Of the clocks' rough mapping and of the IMU's low-pass together.
 _DELAY_S = 0.02
-# IMUs of one make are late by the same low-pass; the corner may be set to between 40 and 200 Hz.
-_LATE_S, _LATE_SIGMA_S = 2.4e-3, 1.5e-3
 # Housings are some 60 mm wide, and a link leads the child's IMU off along the axis by about as much.
 _PIVOT_SIGMA_M, _HEIGHT_M, _HEIGHT_SIGMA_M = 0.03, 0.05, 0.1
-
-
-class ImuKnowledge(NamedTuple):
-    """How well an IMU is known beforehand, one standard deviation each."""
-
-    scale: float
-    misalignment_rad: float
-    accel_bias_m_s2: float
-
-
-# Calibrated on a rate table and by gravity, and what data sheets of this class of IMU allow.
-CALIBRATED = ImuKnowledge(1e-4, 1e-4, 0.2)
-AS_DELIVERED = ImuKnowledge(0.01, radians(1.0), 0.2)
 
 
 class Beliefs(NamedTuple):
@@ -273,7 +255,7 @@ class Beliefs(NamedTuple):
     weight: Array
 
 
-def beliefs(knowledge: ImuKnowledge, motions: int) -> Beliefs:
+def beliefs(knowledge: ImuPrior, motions: int) -> Beliefs:
     """Return the beliefs about the parameters of `joint_model` with that many delays."""
     sigma = np.full(DELAY + motions, np.inf)
     scale, turn = knowledge.scale, knowledge.misalignment_rad
@@ -281,13 +263,13 @@ def beliefs(knowledge: ImuKnowledge, motions: int) -> Beliefs:
     sigma[ACCEL_BIAS] = np.hypot(knowledge.accel_bias_m_s2, GRAVITY_M_S2 * max(scale, turn))
     sigma[KAPPA] = turn, turn, scale
     sigma[ACCEL_MATRIX] = scale, turn, turn, scale, turn, turn
-    sigma[FELT] = _GYRO_FEELS_S_M
-    sigma[COMPLIANCE], sigma[HINGE] = _COMPLIANCE_SIGMA_S2, _HINGE_SHARE_SIGMA
-    sigma[GYRO_BIAS] = _GYRO_BIAS_RAD_S
-    sigma[LATE], sigma[PIVOT], sigma[HEIGHT] = _LATE_SIGMA_S, _PIVOT_SIGMA_M, _HEIGHT_SIGMA_M
+    sigma[FELT] = knowledge.g_sensitivity_s_m
+    sigma[COMPLIANCE], sigma[HINGE] = _COMPLIANCE_SIGMA_S2, HINGE_SHARE_SIGMA
+    sigma[GYRO_BIAS] = knowledge.gyro_bias_rad_s
+    sigma[LATE], sigma[PIVOT], sigma[HEIGHT] = DELAY_SIGMA_S, _PIVOT_SIGMA_M, _HEIGHT_SIGMA_M
     # Any direction will do where no shake asks for it.
     sigma[BEARING] = np.pi
     sigma[DELAY:] = _DELAY_S
     mean = np.zeros_like(sigma)
-    mean[HINGE], mean[LATE], mean[HEIGHT] = _HINGE_SHARE, _LATE_S, _HEIGHT_M
+    mean[HINGE], mean[LATE], mean[HEIGHT] = HINGE_SHARE, DELAY_S, _HEIGHT_M
     return Beliefs(mean, 1.0 / sigma**2)

@@ -2,7 +2,7 @@
 
 The model is that of `joint_model`. What cannot be told from one another in a sine of one frequency - the
 tangential acceleration and gravity's sine, the gyro's scale and a bending link - slow motion tells apart;
-what no motion of this joint tells keeps the uncertainty that it had before (`ImuKnowledge`), and with it the
+what no motion of this joint tells keeps the uncertainty that it had before (`ImuPrior`), and with it the
 covariance of the result.
 """
 
@@ -17,7 +17,6 @@ from module_agent.estimate.joint_model import (
     ACCEL_BIAS,
     ALONG,
     BEARING,
-    CALIBRATED,
     COMPLIANCE,
     DELAY,
     FELT,
@@ -27,7 +26,6 @@ from module_agent.estimate.joint_model import (
     RADIAL,
     TURN,
     Beliefs,
-    ImuKnowledge,
     Motion,
     beliefs,
     felt_columns,
@@ -37,13 +35,13 @@ from module_agent.estimate.observed_motion import ObservedMotion
 from module_agent.estimate.smoothing import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
 from module_agent.estimate.windows import Array
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
+from module_agent.model.imu_prior import CALIBRATED, GYRO_BIAS_DRIFT_RAD_S, ImuPrior
 from module_agent.wire.messages import RegressionEstimate, Vector3
 
 # The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.
 STRIDE = 7
 ITERATIONS = 12
 SETTLED = 0.03  # of every parameter's deviation, were it the only one
-BIAS_DRIFT_RAD_S = 1e-4  # of a gyro, within the minute between rest and motion
 MIN_CARRIED = 0.25
 # With less of gravity across the axis than this, two IMUs do not agree on directions across it.
 MIN_ACROSS_M_S2 = 1.0
@@ -145,7 +143,7 @@ class _Equations(NamedTuple):
 
 
 def regress_joint(
-    motions: Sequence[ObservedMotion], rest: RestReading | None, knowledge: ImuKnowledge = CALIBRATED
+    motions: Sequence[ObservedMotion], rest: RestReading | None, knowledge: ImuPrior = CALIBRATED
 ) -> JointRegression:
     """Fit the model of `joint_model` to all motions of one joint, and what the IMU read at rest.
 
@@ -160,7 +158,7 @@ def regress_joint(
 def distance_bound_m(
     motions: Sequence[ObservedMotion],
     rest: RestReading | None,
-    knowledge: ImuKnowledge,
+    knowledge: ImuPrior,
     noise: tuple[float, float],
 ) -> float:
     """Return the Cramer-Rao bound of the radial distance for white noise of gyro and accelerometer [SI].
@@ -203,7 +201,7 @@ def _inverse(normal: Array) -> Array:
 
 
 def _problem(
-    motions: Sequence[ObservedMotion], rest: RestReading | None, knowledge: ImuKnowledge
+    motions: Sequence[ObservedMotion], rest: RestReading | None, knowledge: ImuPrior
 ) -> tuple[_Problem, _State]:
     """Return the problem, and a first guess of its solution."""
     if not motions:
@@ -341,7 +339,7 @@ def _add_rest(normal: Array, gradient: Array, rest: RestReading, state: _State) 
     predicted = slopes @ state.values
     slopes[:, TURN] = np.cross(np.eye(3)[:2], predicted).T
     error = state.frame.T @ rest.gyro_offset_rad_s - predicted
-    variance = rest.gyro_scatter_rad_s**2 / rest.samples + BIAS_DRIFT_RAD_S**2
+    variance = rest.gyro_scatter_rad_s**2 / rest.samples + GYRO_BIAS_DRIFT_RAD_S**2
     normal += slopes.T @ slopes / variance
     gradient += slopes.T @ error / variance
 

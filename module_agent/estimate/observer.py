@@ -14,12 +14,12 @@ from module_agent.estimate.circle_point_analysis import (
     rest_reading,
 )
 from module_agent.estimate.clock_delay import clock_delay
-from module_agent.estimate.joint_model import AS_DELIVERED, ImuKnowledge
 from module_agent.estimate.joint_regression import regress_joint, regression_estimate
 from module_agent.estimate.motion_detection import detect_motion
 from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, imu_window, joint_window
 from module_agent.firmware.feedback import History
+from module_agent.model.imu_prior import UNCALIBRATED, ImuPrior
 from module_agent.peers.motion_listener import JointMotion
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import CircleEstimate, MotionRecord, RegressionEstimate, Vector3
@@ -65,7 +65,7 @@ class Observer:
     `knowledge` is how well the module's own IMU is known.
     """
 
-    def __init__(self, serial: str, boot: int, knowledge: ImuKnowledge = AS_DELIVERED):
+    def __init__(self, serial: str, boot: int, knowledge: ImuPrior = UNCALIBRATED):
         self.serial = serial
         self.boot = boot
         self.knowledge = knowledge

@@ -12,13 +12,13 @@ from coordinator.excitation.plan import Plan
 from module_agent.estimate.circle_point_analysis import CircleFit, circle_point_analysis, rest_reading
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.gaussian_filter import TAPS
-from module_agent.estimate.joint_model import CALIBRATED, ImuKnowledge
 from module_agent.estimate.joint_regression import JointRegression, regress_joint
 from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.observer import MARGIN_NS
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
 from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware
+from module_agent.model.imu_prior import CALIBRATED, ImuPrior
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 from sim.imperfections.noise_profile import NoiseProfile
@@ -149,7 +149,7 @@ def analyse(trial: TrialRows, taps: int = TAPS) -> CircleFit:
     )
 
 
-def regress(trial: TrialRows, knowledge: ImuKnowledge = CALIBRATED) -> JointRegression:
+def regress(trial: TrialRows, knowledge: ImuPrior = CALIBRATED) -> JointRegression:
     """Run the agents' joint regression on a trial.
 
     Raises:

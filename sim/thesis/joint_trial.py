@@ -17,10 +17,10 @@ import numpy as np
 
 from coordinator.excitation.plan import Plan
 from module_agent.estimate.circle_point_analysis import rest_reading
-from module_agent.estimate.joint_model import AS_DELIVERED, CALIBRATED, ImuKnowledge
 from module_agent.estimate.joint_regression import distance_bound_m
 from module_agent.estimate.observed_motion import observed_motions
 from module_agent.estimate.windows import imu_window
+from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED, ImuPrior
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
@@ -34,10 +34,10 @@ from sim.thesis.published import Alignment, ThesisLength, thesis_length
 _LIGHTLY_S = 0.010
 
 
-def imu_knowledge(profile: NoiseProfile) -> ImuKnowledge:
+def imu_knowledge(profile: NoiseProfile) -> ImuPrior:
     """Return what is known beforehand of an IMU under this profile: whether it is calibrated."""
     errs = profile.accel_scale or profile.gyro_scale or profile.imu_misalignment_rad
-    return AS_DELIVERED if errs else CALIBRATED
+    return UNCALIBRATED if errs else CALIBRATED
 
 
 def white_noise(profile: NoiseProfile, rate_hz: float = WHITE_RATE_HZ) -> tuple[float, float]:

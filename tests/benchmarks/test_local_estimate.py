@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from coordinator.excitation.plan import Plan
-from module_agent.estimate.joint_model import AS_DELIVERED
+from module_agent.model.imu_prior import UNCALIBRATED
 from sim.robot.robot_file import load_robot
 from sim.test_bench.one_joint_rig import OneJointRig, TrialRows, analyse, regress
 
@@ -39,11 +39,11 @@ def _trial(noise: str) -> TrialRows:
 @pytest.mark.parametrize(("noise", "base"), [("ideal", "solid"), ("x5", "rocking")])
 def test_estimates_of_one_joint(noise: str, base: str) -> None:
     trial = _trial(noise)
-    regression = regress(trial, AS_DELIVERED)
+    regression = regress(trial, UNCALIBRATED)
     assert regression.base_shakes == (base == "rocking")
     estimators: tuple[tuple[str, Callable[[], object]], ...] = (
         ("thesis' circle", lambda: analyse(trial)),
-        ("joint regression", lambda: regress(trial, AS_DELIVERED)),
+        ("joint regression", lambda: regress(trial, UNCALIBRATED)),
     )
     for name, work in estimators:
         figures = f"{1e3 * _best_s(work, 7):.1f} ms, {_peak_bytes(work) / 1024:.0f} KiB at its peak"

@@ -8,10 +8,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from coordinator.batch_estimation.base_heading import faced
 from coordinator.batch_estimation.estimator import refine_chain
-from coordinator.batch_estimation.imu_intrinsics import BIASES_ONLY
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.sensor_data import BaseMotion, SensorData, outstanding
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import BIASES_ONLY
 from module_agent.model.perturbation import apply_perturbation
 
 RATE_HZ, CUTOFF_HZ = 250.0, 12.0

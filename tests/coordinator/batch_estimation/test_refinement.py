@@ -12,10 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from coordinator.batch_estimation import estimator
 from coordinator.batch_estimation.estimator import refine_chain
 from coordinator.batch_estimation.imu_intrinsics import (
-    BIASES_ONLY,
     DELAY,
     SIZE,
-    UNCALIBRATED,
     ImuIntrinsics,
     beyond,
     read,
@@ -26,6 +24,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.null_space import name_null_space
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import BIASES_ONLY, UNCALIBRATED
 from module_agent.model.perturbation import apply_perturbation
 
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from coordinator.batch_estimation.imu_intrinsics import BIASES_ONLY, CALIBRATED, UNCALIBRATED, ImuPrior
 from coordinator.batch_estimation.imu_prediction import imu_readings
 from coordinator.excitation.fisher_information import (
     CircleSetting,
@@ -15,9 +14,10 @@ from coordinator.excitation.fisher_information import (
     radial_directions,
 )
 from module_agent.model.chain import Chain
+from module_agent.model.imu_prior import BIASES_ONLY, CALIBRATED, UNCALIBRATED, ImuPrior
 
 RATE_HZ = 250.0
-NOTHING_UNKNOWN = ImuPrior(0.0, 0.0, 1e-9, 1e-9, 0.0)
+NOTHING_UNKNOWN = ImuPrior(0.0, 0.0, 1e-9, 1e-9, 0.0, 0.0)
 
 
 def sine(amplitude: float, frequency_hz: float, duration_s: float = 5.6) -> JointPath:

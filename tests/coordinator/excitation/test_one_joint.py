@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.batch_estimation.imu_intrinsics import CALIBRATED, UNCALIBRATED
 from coordinator.excitation.joint_limits import JointLimits, joint_limits, motion_peaks
 from coordinator.excitation.single_joint import JointTask, design_joint, predicted_sigma_m
 from module_agent.control.motion import Motion, check_motion
 from module_agent.control.waveform import duration_s, waveform
 from module_agent.firmware.config import catalogue_limits
 from module_agent.model.catalogue import CATALOGUE, ModuleType
+from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from module_agent.wire.messages import WindowedSine
 
 TYPES = list(CATALOGUE.values())

@@ -7,11 +7,11 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from module_agent.estimate.circle_point_analysis import circle_point_analysis, rest_reading
-from module_agent.estimate.joint_model import AS_DELIVERED, CALIBRATED
 from module_agent.estimate.joint_regression import JointRegression, regress_joint, regression_estimate
 from module_agent.estimate.observed_motion import ObservedMotion
 from module_agent.estimate.smoothing import SmoothMotion, smooth_imu
 from module_agent.estimate.windows import ImuWindow, JointWindow, align
+from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from module_agent.wire.messages import RegressionEstimate
 
 LENGTH_M = 0.245
@@ -120,7 +120,7 @@ def test_late_readings_of_the_imu_are_told_per_motion(link: Any) -> None:
 
 def test_an_unknown_scale_stays_in_the_interval_where_gravity_does_not_change(link: Any) -> None:
     upright = link._replace(gravity=9.81 * link.axis)
-    known, delivered = regressed(upright, 1), regressed(upright, 1, AS_DELIVERED)
+    known, delivered = regressed(upright, 1), regressed(upright, 1, UNCALIBRATED)
     assert known.sigma_distance_m < 6e-4
     # 1 % of 245 mm.
     assert delivered.sigma_distance_m == pytest.approx(2.45e-3, rel=0.3)
@@ -134,7 +134,7 @@ def test_gravity_calibrates_the_scale_where_the_joint_turns_the_imu_in_it(link: 
     motions = [seen(scaled(hanging.constant(s, 4 + i), 1.01)) for i, s in enumerate((1.0, -1.0))]
     motions.append(seen(scaled(hanging.sine(0.1, 4), 1.01)))
     trusting = regress_joint(motions, rest, CALIBRATED)
-    found = regress_joint(motions, rest, AS_DELIVERED)
+    found = regress_joint(motions, rest, UNCALIBRATED)
     # Taken for calibrated the link comes out as much too long as the scale is wrong; the strength of gravity
     # itself is believed to 0.15 %.
     assert trusting.distance_m > LENGTH_M + 1.2e-3

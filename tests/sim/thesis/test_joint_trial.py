@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from coordinator.excitation.plan import Plan
-from module_agent.estimate.joint_model import AS_DELIVERED, CALIBRATED
 from module_agent.estimate.observed_motion import observed_motions
+from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from sim.imperfections.noise_profile import NOISE_PROFILES, switched
 from sim.robot.robot_file import load_robot
 from sim.test_bench.one_joint_rig import OneJointRig, TrialRows, regress, windows
@@ -83,7 +83,7 @@ def test_an_arm_with_an_imu_as_delivered_swings_about_where_gravity_can_calibrat
     assert trial_plan(thesis_length("vertical", 350), delivered).home_rad == pytest.approx(-np.pi / 2)
     assert trial_plan(thesis_length("horizontal", 350), delivered).home_rad == 0.0
     assert trial_plan(thesis_length("vertical", 350), SOLID).home_rad == 0.0
-    assert (imu_knowledge(delivered), imu_knowledge(SOLID)) == (AS_DELIVERED, CALIBRATED)
+    assert (imu_knowledge(delivered), imu_knowledge(SOLID)) == (UNCALIBRATED, CALIBRATED)
     found = joint_trial(350, "vertical", delivered, seed=2)
     # One such trial of the thesis' may be right by chance: its errors and the scale's may cancel.
     assert abs(found.ours_error_m) < 4.0 * found.ours_sigma_m
