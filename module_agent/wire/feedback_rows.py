@@ -3,13 +3,16 @@
 import math
 import struct
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple, SupportsBytes
 
 import numpy as np
 from numpy.typing import NDArray
 
+from module_agent.wire.codec import decode
+from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Feedback
 from module_agent.wire.refusal import Refusal, WireError
+from module_agent.wire.topics import TOPICS
 
 ROW = np.dtype(
     [
@@ -52,7 +55,7 @@ _MEASURED_PACKING = struct.Struct("<21x d 2f 40x 6f")
 def pack_row(ring: bytearray, slot: int, values: Sequence[float]) -> None:
     """Write one record into its slot: the values in the order of `ROW`, vectors element by element.
 
-    A value too large for its field is kept as infinite, which whoever reads the row refuses.
+    A value too large for its field is kept as infinite, which makes readers refuse the row.
     """
     offset = slot * ROW.itemsize
     try:
@@ -80,3 +83,51 @@ def unpack(feedback: Feedback) -> Rows:
         field = next(name for name in _MEASURED if not np.isfinite(rows[name]).all())
         raise WireError(Refusal.NOT_FINITE, f"{field} of serial {feedback.serial} is not finite")
     return rows
+
+
+class FeedbackRows(NamedTuple):
+    """The rows of one feedback message.
+
+    boot: random number of the module's present boot; row numbers and times restart with it.
+    first_row: number of `rows[0]` since that boot; the rows are consecutive.
+    rows: (count,) structured array of `ROW`, read-only.
+    """
+
+    serial: str
+    boot: int
+    first_row: int
+    rows: Rows
+
+
+def decode_feedback(payload: SupportsBytes) -> FeedbackRows:
+    """Return the rows of a message on `x5/{robot}/{serial}/feedback`, or of a reply on `.../history`.
+
+    `rows` has one record for each sample, with the fields
+
+    - `t_ns`, `imu_t_ns`: module clock [ns] at the tick, and when the IMU was read,
+    - `motion_id`: the motion that ran, 0 for none; `state`: index into `STATE_NAMES`,
+    - `position_rad`, `velocity_rad_s`, `effort_nm`: the joint as measured, effort by the spring,
+    - `position_command_rad`, `velocity_command_rad_s`, `effort_command_nm`: NaN where unset,
+    - `pwm`: -1 to 1; `deflection_rad`: of the spring; `motor_velocity_rad_s`, `motor_current_a`,
+    - `winding_temperature_c`, `voltage_v`,
+    - `gyro_rad_s`, `accel_m_s2`: (3,) each, in the IMU's frame; at rest the specific force is 9.8 upwards.
+
+    Example, with plain zenoh::
+
+        import zenoh
+        from module_agent import decode_feedback
+
+        def show(sample):
+            feedback = decode_feedback(sample.payload)
+            print(feedback.serial, feedback.rows["t_ns"][-1], feedback.rows["position_rad"][-1])
+
+        with zenoh.open(zenoh.Config()) as session:
+            subscriber = session.declare_subscriber("x5/arm6/*/feedback", show)
+            input("Press Enter to end.")
+
+    Raises:
+        WireError: the bytes are not a feedback message of this schema version, or a measured value is not
+            finite.
+    """
+    feedback = decode(Feedback, bytes(payload), TOPICS[Leaf.FEEDBACK].max_bytes_from_module)
+    return FeedbackRows(feedback.serial, feedback.boot, feedback.first_row, unpack(feedback))

@@ -1,6 +1,8 @@
 """A row that is packed value by value is the record that numpy makes of the same values."""
 
 import math
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -8,6 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from module_agent import decode_feedback
+from module_agent.wire.codec import encode
 from module_agent.wire.feedback_rows import ROW, pack_row, unpack
 from module_agent.wire.messages import Feedback
 from module_agent.wire.refusal import Refusal, WireError
@@ -71,3 +75,20 @@ def test_a_block_of_another_length_than_announced_is_malformed() -> None:
     with pytest.raises(WireError, match="201 bytes of rows, 2 rows of 101 bytes") as refused:
         unpack(odd)
     assert refused.value.reason is Refusal.MALFORMED
+
+
+def test_a_published_message_is_decoded_to_plain_numpy() -> None:
+    rows = np.zeros(4, dtype=ROW)
+    rows["t_ns"], rows["gyro_rad_s"] = np.arange(4), [0.1, 0.2, 0.3]
+    decoded = decode_feedback(encode(message(rows).model_copy(update={"first_row": 70})))
+    assert (decoded.serial, decoded.boot, decoded.first_row) == ("A", 1, 70)
+    assert type(decoded.rows) is np.ndarray
+    assert np.array_equal(decoded.rows, rows)
+    with pytest.raises(WireError):
+        decode_feedback(b"noise")
+
+
+def test_importing_the_package_imports_no_numpy() -> None:
+    check = "import sys, module_agent; print('numpy' in sys.modules, 'pydantic' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
