@@ -7,10 +7,11 @@ virtual time inside the simulator; only hardware, transport and worker differ.
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from module_agent.control.controller import Command
 from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
-from module_agent.hardware.hardware import Hardware, SensorSample
+from module_agent.hardware.hardware import Modules, ModuleSample
 from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
 from module_agent.torque_information.service import InformationService, Worker
@@ -62,12 +63,12 @@ class InlineWorker:
 class HostedModule:
     """One module of this process: its firmware, its observer, and what waits for them."""
 
-    def __init__(self, robot: str, config: FirmwareConfig, shared: "Shared"):
+    def __init__(self, robot: str, config: FirmwareConfig, modules: Modules, index: int, shared: "Shared"):
         self.robot = robot
         self._shared = shared
         self._information = InformationService(config.serial, shared.collection, shared.worker)
         self.serial = config.serial
-        self.firmware = Firmware(config)
+        self.firmware = Firmware(config, modules, index)
         self.observer = Observer(config.serial, config.boot)
         self.inbox = Inbox()
         # Apart from all else, so that no flood can keep a stop out.
@@ -76,6 +77,7 @@ class HostedModule:
         self.requests: dict[int, Request] = {}
         self._request_id = 0
         self._arrived: list[Event] = []
+        self._answers: list[Outgoing] = []
         self._seq = 0
         self._keys = {leaf: key(robot, config.serial, leaf) for leaf in Leaf}
         self._leaves = {text: leaf for leaf, text in self._keys.items()}
@@ -94,20 +96,25 @@ class HostedModule:
             self._arrived = self.stops.drain() + self.inbox.drain()
             self.firmware.dropped_events = self.inbox.dropped
 
-    def step(self, sample: SensorSample) -> tuple[float, list[Outgoing]]:
-        """Run one tick on what was collected before the sample was taken."""
-        self.now_ns = sample.t_ns
+    def step(self, sample: ModuleSample) -> Command:
+        """Begin a tick on what was collected before the sample was taken; return the module's command."""
+        self.now_ns = sample.sensors.t_ns
         if not self._arrived:
-            return self.firmware.step(sample.t_ns, sample, ())
+            return self.firmware.step(sample, ())
         incoming: list[Incoming] = []
-        answers: list[Outgoing] = []
         for event in self._arrived:
-            self._sort(event, incoming, answers)
+            self._sort(event, incoming)
         self._arrived = []
-        pwm, out = self.firmware.step(sample.t_ns, sample, incoming)
-        return pwm, answers + out
+        return self.firmware.step(sample, incoming)
 
-    def _sort(self, event: Event, incoming: list[Incoming], answers: list[Outgoing]) -> None:
+    def publish(self, pwm: float) -> list[Outgoing]:
+        """End a tick with the module's PWM; return what to send."""
+        out = self.firmware.publish(pwm)
+        if self._answers:
+            out, self._answers = self._answers + out, []
+        return out
+
+    def _sort(self, event: Event, incoming: list[Incoming]) -> None:
         if not isinstance(event, Request | Sample):
             return
         leaf = self._leaves[event.key]
@@ -117,7 +124,7 @@ class HostedModule:
             number = self._request_id
             self.requests[number] = event
         if TOPICS[leaf].answered_by == "host" and number is not None:
-            answers.append(Answer(number, self._answer(leaf, event.payload)))
+            self._answers.append(Answer(number, self._answer(leaf, event.payload)))
         else:
             incoming.append(Incoming(leaf, event.payload, number))
 
@@ -222,19 +229,20 @@ class AgentHost:
     def __init__(
         self,
         robot: str,
-        hardware: Hardware,
+        modules: Modules,
         transport: Transport,
         configs: Sequence[FirmwareConfig],
         worker: Worker,
     ):
         self._shared = Shared(worker)
         self.modules = self._shared.modules
-        self.modules += [HostedModule(robot, config, self._shared) for config in configs]
+        self.modules += [
+            HostedModule(robot, config, modules, index, self._shared) for index, config in enumerate(configs)
+        ]
         self._robot = robot
-        self._hardware = hardware
+        self._hardware = modules
         self._transport = transport
         self._worker = worker
-        self._pwm = [0.0] * len(self.modules)
         self._neighbours = MotionListener()
         self._heard = Inbox(capacity=4096)
         self._found: list[tuple[HostedModule, Finding]] = []
@@ -244,11 +252,6 @@ class AgentHost:
         self._tag = 0
         self._seq = 0
         self._declare()
-
-    @property
-    def pwm(self) -> Sequence[float]:
-        """The PWM of every module as of the last cycle, that the next exchange hands over."""
-        return self._pwm
 
     def _declare(self) -> None:
         transport = self._transport
@@ -263,19 +266,23 @@ class AgentHost:
             self._declared.append(transport.declare_alive(module.key(Leaf.ALIVE)))
 
     def cycle(self) -> None:
-        """Run one tick of all modules: exchange with the hardware, step, send.
+        """Run one tick of all modules: receive samples, send commands, publish.
 
         Raises:
             HardwareLost: no further tick will come.
         """
-        # Before the exchange: a process that freezes in it finds the sample of long ago when it thaws, and by
+        # Before the sample: a process that freezes in it finds the sample of long ago when it thaws, and by
         # that sample's time all that was sent to it meanwhile would be fresh.
         for module in self.modules:
             module.collect()
-        samples = self._hardware.exchange(self._pwm)
+        samples = self._hardware.receive()
         if self._heard.waiting:
             self._hear()
-        self._pwm = list(map(self._step, self.modules, samples))
+        modules = self.modules
+        commands = [module.step(sample) for module, sample in zip(modules, samples, strict=True)]
+        for module, pwm in zip(modules, self._hardware.send(commands), strict=True):
+            for outgoing in module.publish(pwm):
+                self._send(module, outgoing)
         if self._neighbours.restless:
             self._attend_to_motions()
         if self._shared.collection.restless:
@@ -284,12 +291,6 @@ class AgentHost:
         self._worker.check()
         if self._found:
             self._publish_findings()
-
-    def _step(self, module: HostedModule, sample: SensorSample) -> float:
-        pwm, out = module.step(sample)
-        for outgoing in out:
-            self._send(module, outgoing)
-        return pwm
 
     def _send(self, module: HostedModule, outgoing: Outgoing) -> None:
         if isinstance(outgoing, Answer):
@@ -398,7 +399,7 @@ class AgentHost:
         )
 
     def close(self) -> None:
-        """Leave the network and let go of the hardware, whose motors then get zero PWM."""
+        """Leave the network and release the modules, whose motors then are off."""
         for declared in [*self._listening.values(), *reversed(self._declared)]:
             declared.undeclare()
         self._listening.clear()

@@ -13,7 +13,8 @@ import typer
 
 from module_agent.firmware.config import FirmwareConfig, config_of
 from module_agent.hardware.bus_client import BusClient
-from module_agent.hardware.hardware import HardwareLost, HardwareModule
+from module_agent.hardware.hardware import HardwareLost, ModuleInformation
+from module_agent.hardware.loop_inside import LoopInside
 from module_agent.host import AgentHost
 from module_agent.network_emulation.impaired_transport import inject
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
@@ -48,7 +49,7 @@ def _stop(number: int, _frame: FrameType | None) -> None:
 
 
 def _config(
-    module: HardwareModule, rate_hz: float, lifetime_ms: float, expiry: ExpiryAction, strategy: int
+    module: ModuleInformation, rate_hz: float, lifetime_ms: float, expiry: ExpiryAction, strategy: int
 ) -> FirmwareConfig:
     return config_of(
         module,
@@ -120,11 +121,11 @@ def main(
             # made once, and they are not looked at again.
             gc.collect()
             gc.freeze()
-            # The world waits for whoever is on its bus, so the bus comes last.
-            hardware = BusClient(bus, serial)
-            opened.callback(hardware.close)
-            configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in hardware.modules]
-            host = AgentHost(robot, hardware, transport, configs, worker := ThreadWorker())
+            # The world waits for every agent on its bus, so the bus comes last.
+            modules = LoopInside(BusClient(bus, serial))
+            opened.callback(modules.close)
+            configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in modules.information]
+            host = AgentHost(robot, modules, transport, configs, worker := ThreadWorker())
         except (ValueError, KeyError, OSError, TransportError) as error:
             # A KeyError shows its message in quotes.
             text = error.args[0] if isinstance(error, KeyError) else error

@@ -14,7 +14,9 @@ from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.session.run import Run, RunConfig
 from module_agent.firmware.config import config_of
-from module_agent.hardware.hardware import HardwareModule, SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.loop_inside import LoopInside
+from module_agent.hardware.wires import WiredModule
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile, profile
@@ -52,7 +54,7 @@ class _Wires:
         self._index = index
 
     @property
-    def modules(self) -> Sequence[HardwareModule]:
+    def modules(self) -> Sequence[WiredModule]:
         return [self._rig.world.modules[self._index]]
 
     def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
@@ -137,6 +139,7 @@ class Rig:
         self._firmware = firmware
         self._boots = 100 + 1000 * seed
         self.hosts: dict[str, AgentHost] = {}
+        self._loops: dict[str, LoopInside] = {}
         for serial in self.serials:
             self.boot(serial)
         self._ticking = True
@@ -145,12 +148,13 @@ class Rig:
     def boot(self, serial: str, **settings: Any) -> None:
         """Start the agent of a module, under a boot id of its own; `settings` of its firmware come first."""
         index = self.serials.index(serial)
-        module = self.world.modules[index]
+        loop_inside = self._loops[serial] = LoopInside(_Wires(self, index))
+        (module,) = loop_inside.information
         self._boots += 1
         config = config_of(module, self._boots, **self._firmware)._replace(**settings)
         self.hosts[serial] = AgentHost(
             self.robot.name,
-            _Wires(self, index),
+            loop_inside,
             self.endpoint(f"agent-{serial}"),
             [config],
             InlineWorker(),
@@ -184,7 +188,7 @@ class Rig:
         for serial, host in list(self.hosts.items()):
             host.cycle()
             # On the bus this PWM goes into the next exchange, and so into the very next step of the world.
-            self.pwm[self.serials.index(serial)] = host.pwm[0]
+            (self.pwm[self.serials.index(serial)],) = self._loops[serial].pwm
         self.truth.record()
         for watcher in self.watchers:
             watcher()

@@ -6,7 +6,7 @@
     3            pwm = clip(P + V + T(effort command))
     4            pwm = clip(V + T(effort command + P))
 
-P outputs Nm under 2 and 4 and PWM under 3; V outputs Nm only under 2. An unset command disables its loop.
+P outputs Nm under 2 and 4 and PWM under 3; V outputs Nm only under 2. A target of NaN disables its loop.
 Feed-forward turns a target into the PWM that holds it in steady state: v N 30 / (pi Kv 48) for a velocity,
 verified on a real log, and tau R / (48 Kt N efficiency) for an effort.
 """
@@ -23,14 +23,20 @@ NOMINAL_VOLTAGE_V = 48.0
 
 
 class Command(NamedTuple):
-    """What the loops shall follow at one tick; None disables a loop."""
+    """The targets of one module's loops: NaN switches a loop off, three times NaN is motor off.
 
-    position_rad: float | None
-    velocity_rad_s: float | None
-    effort_nm: float | None
+    brake: damp the motor instead of following targets. A module that cannot follows the velocity 0 that comes
+    with it.
+    """
+
+    position_rad: float
+    velocity_rad_s: float
+    effort_nm: float
+    brake: bool = False
 
 
-UNSET = Command(None, None, None)
+MOTOR_OFF = Command(math.nan, math.nan, math.nan)
+BRAKE = Command(math.nan, 0.0, math.nan, brake=True)
 
 
 Law = Callable[[Command, float, float, float], float]
@@ -74,37 +80,45 @@ def _off(position: Pid, velocity: Pid, effort: Pid) -> Law:
 
 
 def _direct_pwm(position: Pid, velocity: Pid, effort: Pid) -> Law:
-    return lambda command, position_rad, velocity_rad_s, effort_nm: _clip(_sum(command.effort_nm))
+    return lambda command, position_rad, velocity_rad_s, effort_nm: (
+        0.0 if command.effort_nm != command.effort_nm else _clip(command.effort_nm)
+    )
+
+
+# In the following a loop that is off contributes 0; a NaN is the only number that is not equal to itself.
 
 
 def _all_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
     def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
-        p_target, v_target, feed_nm = command
-        p = position.follow(p_target, position_rad)
-        v = velocity.follow(v_target, velocity_rad_s)
-        unset = p is None and v is None and feed_nm is None
-        return _clip(_sum(effort.follow(None if unset else _sum(p, v, feed_nm), effort_nm)))
+        p_target, v_target, target, _ = command
+        off = p_target != p_target and v_target != v_target and target != target
+        through = position.follow(p_target, position_rad) + velocity.follow(v_target, velocity_rad_s)
+        if target == target:
+            through += target
+        return _clip(effort.follow(math.nan if off else through, effort_nm))
 
     return law
 
 
 def _side_by_side(position: Pid, velocity: Pid, effort: Pid) -> Law:
     def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
-        p_target, v_target, e_target = command
+        p_target, v_target, target, _ = command
         p = position.follow(p_target, position_rad)
         v = velocity.follow(v_target, velocity_rad_s)
-        return _clip(_sum(p, v, effort.follow(e_target, effort_nm)))
+        return _clip(p + v + effort.follow(target, effort_nm))
 
     return law
 
 
 def _position_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
     def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
-        p_target, v_target, feed_nm = command
-        p = position.follow(p_target, position_rad)
+        p_target, v_target, target, _ = command
+        off = p_target != p_target and target != target
+        through = position.follow(p_target, position_rad)
         v = velocity.follow(v_target, velocity_rad_s)
-        unset = p is None and feed_nm is None
-        return _clip(_sum(v, effort.follow(None if unset else _sum(p, feed_nm), effort_nm)))
+        if target == target:
+            through += target
+        return _clip(v + effort.follow(math.nan if off else through, effort_nm))
 
     return law
 
@@ -116,14 +130,6 @@ _LAWS: dict[int, Callable[[Pid, Pid, Pid], Law]] = {
     3: _side_by_side,
     4: _position_through_effort,
 }
-
-
-def _sum(*terms: float | None) -> float:
-    total = 0.0
-    for term in terms:
-        if term is not None:
-            total += term
-    return total
 
 
 def _clip(pwm: float) -> float:

@@ -1,7 +1,7 @@
-"""The factory gains of every module type under every control strategy."""
+"""The factory gains and the limits of every module type."""
 
 from module_agent.model.catalogue import ModuleType
-from module_agent.wire.messages import GainSet, PidGains
+from module_agent.wire.messages import GainSet, Limits, PidGains
 
 
 def default_gains(kind: ModuleType, strategy: int) -> GainSet:
@@ -36,4 +36,15 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
             output_lowpass=0.9,
             d_on_error=False,
         ),
+    )
+
+
+def catalogue_limits(kind: ModuleType) -> Limits:
+    """Return the limits of a module type."""
+    low, high = kind.range_rad if kind.range_rad is not None else (None, None)
+    return Limits(
+        max_speed_rad_s=kind.max_speed_rad_s,
+        max_effort_nm=kind.max_effort_nm,
+        min_position_rad=low,
+        max_position_rad=high,
     )

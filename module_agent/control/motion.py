@@ -1,7 +1,9 @@
-"""The efforts that a motion is fed forward: as bytes on the wire, and at the ticks of a module.
+"""A motion pattern running on a module: its command at any module time, and which motions are refused.
 
-A motion pattern running on a module: its command at any module time.
+A motion may bring a profile of efforts that the effort loop is fed forward, as bytes on the wire.
 """
+
+import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -65,15 +67,29 @@ LONGEST_S = 60.0
 ABSURD_SPEED = 10.0
 
 
+# How finely a motion is sampled. Its command holds from one sample to the next, in the module's time and
+# however far apart the ticks are.
+STEP_NS = 1_000_000
+
+
 class Motion:
-    """A pattern sampled once at its start (0.3 ms for 6 s), so that a tick only looks it up."""
+    """A pattern sampled every millisecond at its start (0.3 ms for 6 s), so that a tick only looks it up.
+
+    Args:
+        pattern: the motion.
+        origin_rad: the commanded position at which it begins.
+        start_ns: the module time at which it begins.
+        effort: the efforts that it is fed forward; without them the effort loop is off.
+
+    Raises:
+        WireError: TYPES or NOT_FINITE, the efforts are no finite numbers.
+    """
 
     __slots__ = (
         "_effort",
         "_end_ns",
         "_position",
         "_start_ns",
-        "_tick_ns",
         "_velocity",
         "last_effort_nm",
         "last_position_rad",
@@ -84,21 +100,19 @@ class Motion:
         pattern: Pattern,
         origin_rad: float,
         start_ns: int,
-        tick_ns: int,
         effort: EffortProfile | None = None,
     ):
         total_s = duration_s(pattern, origin_rad)
-        ticks = max(1, round(total_s * 1e9 / tick_ns))
-        t_s = np.minimum(np.arange(ticks + 1) * (tick_ns / 1e9), total_s)
+        steps = max(1, round(total_s * 1e9 / STEP_NS))
+        t_s = np.minimum(np.arange(steps + 1) * (STEP_NS / 1e9), total_s)
         samples = waveform(pattern, origin_rad, t_s)
         self._position: list[float] = (origin_rad + samples.offset_rad).tolist()
         self._velocity: list[float] = samples.velocity_rad_s.tolist()
         self._effort: list[float] | None = None if effort is None else effort_at(effort, t_s).tolist()
         self._start_ns = start_ns
-        self._end_ns = start_ns + ticks * tick_ns
-        self._tick_ns = tick_ns
+        self._end_ns = start_ns + steps * STEP_NS
         self.last_position_rad = self._position[-1]
-        self.last_effort_nm = None if self._effort is None else self._effort[-1]
+        self.last_effort_nm = math.nan if self._effort is None else self._effort[-1]
 
     @property
     def top_speed_rad_s(self) -> float:
@@ -114,8 +128,8 @@ class Motion:
         """Return the command at this time, None when the motion is over."""
         if now_ns >= self._end_ns:
             return None
-        index = (now_ns - self._start_ns) // self._tick_ns
-        effort_nm = None if self._effort is None else self._effort[index]
+        index = (now_ns - self._start_ns) // STEP_NS
+        effort_nm = math.nan if self._effort is None else self._effort[index]
         return Command(self._position[index], self._velocity[index], effort_nm)
 
 

@@ -44,20 +44,20 @@ class Pid:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past, as a loop does whose command is unset."""
+        """Forget the past, as a loop does whose target is NaN."""
         self._target: float | None = None
         self._error: float | None = None
         self._measured: float | None = None
         self._integral = 0.0
         self._output: float | None = None
 
-    def follow(self, target: float | None, measured: float) -> float | None:
-        """Return this tick's output; None, and the past is forgotten, while the target is unset."""
-        if target is not None:
+    def follow(self, target: float, measured: float) -> float:
+        """Return this tick's output; 0, and the past is forgotten, while the target is NaN."""
+        if target == target:
             return self.update(target, measured)
         if self._output is not None:
             self.reset()
-        return None
+        return 0.0
 
     def update(self, target: float, measured: float) -> float:
         """Return this tick's output; the first one after a reset has no derivative and no filter past."""

@@ -1,8 +1,8 @@
-"""What a module is told once, before its first tick."""
+"""The settings of one module's firmware, made before its first tick."""
 
 from typing import Any, NamedTuple
 
-from module_agent.hardware.hardware import HardwareModule
+from module_agent.hardware.hardware import ModuleInformation
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.wire.messages import ExpiryAction, GainSet, Info, Limits
 
@@ -27,33 +27,21 @@ class FirmwareConfig(NamedTuple):
 
     @property
     def history_rows(self) -> int:
-        """How many feedback rows are kept."""
+        """The number of feedback rows in the history."""
         return int(self.history_s * self.feedback_rate_hz)
 
 
-def catalogue_limits(kind: ModuleType) -> Limits:
-    """Return the limits of a module type."""
-    low, high = kind.range_rad if kind.range_rad is not None else (None, None)
-    return Limits(
-        max_speed_rad_s=kind.max_speed_rad_s,
-        max_effort_nm=kind.max_effort_nm,
-        min_position_rad=low,
-        max_position_rad=high,
-    )
-
-
-def config_of(module: HardwareModule, boot: int, **settings: Any) -> FirmwareConfig:
-    """Return the settings of a module as its hardware and the catalogue describe it; others as given.
+def config_of(module: ModuleInformation, boot: int, **settings: Any) -> FirmwareConfig:
+    """Return the settings of a module as it describes itself; others as given.
 
     Raises:
         UnknownModuleType: the catalogue has no such type.
     """
-    kind = module_type(module.module_type)
     return FirmwareConfig(
         serial=module.serial,
-        kind=kind,
+        kind=module_type(module.module_type),
         boot=boot,
-        limits=catalogue_limits(kind),
+        limits=module.limits,
         tick_ns=module.tick_ns,
         imu_period_ns=module.imu_period_ns,
         **settings,
@@ -82,7 +70,7 @@ def check_config(config: FirmwareConfig) -> FirmwareConfig:
 
 
 def describe(config: FirmwareConfig, gains: GainSet, seq: int, t_ns: int) -> Info:
-    """Return what a module with these settings says of itself, with the gains in force, at a module time."""
+    """Return the information message of a module with these settings and gains, at a module time."""
     return Info(
         serial=config.serial,
         boot=config.boot,

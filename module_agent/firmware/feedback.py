@@ -82,7 +82,6 @@ class History:
 
 
 _STATE_INDEX = {name: index for index, name in enumerate(STATE_NAMES)}
-_NAN = float("nan")
 
 
 class Batch(NamedTuple):
@@ -130,7 +129,6 @@ class FeedbackStream:
         """Add the row of a tick; return the batch that is complete with it."""
         voltage_v = sample.voltage_v
         duty = pwm * NOMINAL_VOLTAGE_V / voltage_v if voltage_v else 0.0
-        position, velocity, effort = command
         history = self.history
         # From the deflection on, a sample's fields are in the order of a row's.
         history.append(
@@ -142,9 +140,7 @@ class FeedbackStream:
                 sample.position_rad,
                 sample.velocity_rad_s,
                 sample.effort_nm,
-                _NAN if position is None else position,
-                _NAN if velocity is None else velocity,
-                _NAN if effort is None else effort,
+                *command[:3],
                 min(max(duty, -1.0), 1.0),
                 *sample[5:],
             )

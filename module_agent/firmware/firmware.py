@@ -1,22 +1,26 @@
-"""The firmware of one module: `step` is called once a tick, with the time, a sample and what has arrived.
+"""The firmware of one module: `step` and then `publish` are called once a tick.
 
-It is pure: no clock, no socket, no file, no randomness. Each step expires what is stale, reads the inbox,
-runs the control law, and publishes feedback rows and status.
+`step` takes a sample of the module and what has arrived from the network, and returns a command for the
+module; `publish` takes the PWM that the module makes of it, and returns what to send. There is no clock, no
+socket, no file and no randomness in here: the module is behind `Modules`, and its samples bring the time.
+
+The firmware decides by the lease, by how fresh commands are and by its motions. What a module does by itself
+(loops, limits of position and temperature, a watchdog against a dead agent) is behind `Modules`.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from module_agent.control.controller import UNSET, Command, Controller
+from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
 from module_agent.control.gains import default_gains
 from module_agent.control.motion import Motion, check_duration, check_motion, check_setpoint
 from module_agent.firmware.admission import Admission
 from module_agent.firmware.config import FirmwareConfig, check_config, describe
 from module_agent.firmware.feedback import MAX_ROWS_PER_ANSWER, Batch, FeedbackStream
 from module_agent.firmware.lease import Lease
-from module_agent.firmware.motor_guard import WINDING_LIMIT_C, WINDING_REARM_C, MotorGuard
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import Modules, ModuleSample, SensorSample
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
@@ -24,6 +28,7 @@ from module_agent.wire.messages import (
     Ask,
     Feedback,
     GainsCommand,
+    GainSet,
     HistoryRequest,
     Info,
     LeaseRequest,
@@ -37,6 +42,9 @@ from module_agent.wire.messages import (
 from module_agent.wire.refusal import Refusal, WireError
 
 STATUS_PERIOD_NS = 400_000_000
+# A fault at the temperature at which a module has no PWM left, and armed again only when it has cooled.
+WINDING_LIMIT_C = 154.0
+WINDING_REARM_C = 140.0
 
 
 class Incoming(NamedTuple):
@@ -65,88 +73,105 @@ Outgoing = Publication | Answer
 
 
 class Firmware:
-    """One module. Times are the module's own nanoseconds, taken from its samples."""
+    """One module. Times are the module's own nanoseconds, taken from its samples.
 
-    def __init__(self, config: FirmwareConfig):
+    Args:
+        config: the settings.
+        modules: the modules of this process; gains and lifetime are set on construction.
+        index: which of them this is the firmware of.
+
+    Raises:
+        ValueError: a setting out of its range.
+    """
+
+    def __init__(self, config: FirmwareConfig, modules: Modules, index: int = 0):
         self.config = check_config(config)
+        self._modules, self._index = modules, index
         self.lease = Lease()
         self._rows = FeedbackStream(config)
         self.history = self._rows.history
         self.admission = Admission(config.serial, config.boot, config.lifetime_ns)
         self.state: State = "idle"
         self.dropped_events = 0
-        self._controller = self._own_controller()
-        self._guard = MotorGuard(config)
-        self._drives = self._drive_of_state()
+        self._commands = self._command_of_state()
         self._motion: Motion | None = None
         self._record: MotionRecord | None = None
         self.last_rest: MotionRecord | None = None
-        self._command: Command = UNSET
-        self._setpoint: Command = UNSET
+        self._command: Command = MOTOR_OFF
+        self._setpoint: Command = MOTOR_OFF
         self._fresh_ns = 0
         self._stopped_ns = 0
         self._expiries = 0
         self._seq = 0
         self._now_ns = 0
-        self._sample: SensorSample | None = None
+        self._sample: ModuleSample | None = None
+        self._out: list[Outgoing] = []
         self._status_due_ns = 0
         self._note = ""
+        modules.set_lifetime(index, config.lifetime_ns)
+        self._apply_gains(default_gains(config.kind, config.strategy))
 
     # ------------------------------------------------------------------ the tick
 
-    def step(
-        self, now_ns: int, sample: SensorSample, inbox: Sequence[Incoming]
-    ) -> tuple[float, list[Outgoing]]:
-        """Run one tick; return the PWM for the motor (at 48 V) and what to publish and answer."""
-        self._now_ns = now_ns
+    def step(self, sample: ModuleSample, inbox: Sequence[Incoming]) -> Command:
+        """Begin a tick: expire what is stale, read the inbox; return the command for the module."""
         self._sample = sample
-        out: list[Outgoing] = []
+        sensors = sample.sensors
+        now_ns = self._now_ns = sensors.t_ns
         if self.state in COMMANDED and now_ns - self._fresh_ns > self.config.lifetime_ns:
             self._expire()
         if self.lease.lapsed(now_ns):
             self._end_lease()
         for incoming in inbox:
-            self._receive(incoming, out)
-        if sample.winding_temperature_c >= WINDING_LIMIT_C and self.state != "fault":
+            self._receive(incoming)
+        if sensors.winding_temperature_c >= WINDING_LIMIT_C and self.state != "fault":
             self._finish_motion("fault")
-            self._enter("fault", f"winding at {sample.winding_temperature_c:.0f} C")
-        pwm = self._drives[self.state](sample)
-        if self._rows.due(now_ns, sample.imu_t_ns):
-            self._append_row(sample, pwm, out)
-        if now_ns >= self._status_due_ns:
-            self._status_due_ns = now_ns + STATUS_PERIOD_NS
+            self._enter("fault", f"winding at {sensors.winding_temperature_c:.0f} C")
+        if sample.m_stop and self.state not in ("stopped", "fault"):
+            self._stop("M-stop pressed")
+        return self._commands[self.state]()
+
+    def publish(self, pwm: float) -> list[Outgoing]:
+        """End a tick with the PWM (at 48 V) that the module makes of its command; return what to send."""
+        assert self._sample is not None
+        sensors, out, self._out = self._sample.sensors, self._out, []
+        if self._rows.due(self._now_ns, sensors.imu_t_ns):
+            self._append_row(sensors, pwm, out)
+        if self._now_ns >= self._status_due_ns:
+            self._status_due_ns = self._now_ns + STATUS_PERIOD_NS
             out.append(Publication(Leaf.STATUS, encode(self._status(re=0))))
-        return pwm, out
+        return out
 
-    # ------------------------------------------------------------------ what drives the motor
+    # ------------------------------------------------------------------ what the module shall do
 
-    def _drive_of_state(self) -> dict[State, Callable[[SensorSample], float]]:
-        on_expiry = {"motor_off": self._rest, "hold": self._follow, "damping": self._guard.damping}
+    def _command_of_state(self) -> dict[State, Callable[[], Command]]:
+        # While braking, feedback rows go on showing the last targets.
+        on_expiry = {"motor_off": self._rest, "hold": self._follow, "damping": self._brake}
         return {
             "idle": self._rest,
             "armed": self._follow,
             "moving": self._follow_motion,
             "streaming": self._follow_setpoint,
             "expired": on_expiry[self.config.expiry_action],
-            "stopped": self._guard.damping,
+            "stopped": self._brake,
             "fault": self._rest,
         }
 
-    def _rest(self, sample: SensorSample) -> float:
-        self._command = UNSET
-        return 0.0
+    def _rest(self) -> Command:
+        self._command = MOTOR_OFF
+        return MOTOR_OFF
 
-    def _follow(self, sample: SensorSample) -> float:
-        pwm = self._controller.update(
-            self._command, sample.position_rad, sample.velocity_rad_s, sample.effort_nm
-        )
-        return self._guard.limit(pwm, sample)
+    def _follow(self) -> Command:
+        return self._command
 
-    def _follow_setpoint(self, sample: SensorSample) -> float:
+    def _brake(self) -> Command:
+        return BRAKE
+
+    def _follow_setpoint(self) -> Command:
         self._command = self._setpoint
-        return self._follow(sample)
+        return self._setpoint
 
-    def _follow_motion(self, sample: SensorSample) -> float:
+    def _follow_motion(self) -> Command:
         assert self._motion is not None
         command = self._motion.command(self._now_ns)
         if command is None:
@@ -154,7 +179,7 @@ class Firmware:
             self._enter("motion_done")
         else:
             self._command = command
-        return self._follow(sample)
+        return self._command
 
     # ------------------------------------------------------------------ states
 
@@ -162,31 +187,36 @@ class Firmware:
         target = TRANSITIONS.get((self.state, trigger))
         if target is None:
             raise WireError(Refusal.NOT_ARMED, f"{trigger} is not possible while {self.state}: acquire first")
-        if target != self.state and target not in COMMANDED:
-            self._controller.reset()
         self.state = target
         self._status_due_ns = 0
         self._note = note
 
-    def _own_controller(self) -> Controller:
-        gains = default_gains(self.config.kind, self.config.strategy)
-        return Controller(self.config.kind, gains, self.config.tick_ns / 1e9)
+    def _apply_gains(self, gains: GainSet) -> None:
+        self._gains = gains
+        self._modules.set_gains(self._index, gains)
 
     def _end_lease(self) -> None:
-        """Let go of the holder, and of the gains that it has set: the next one shall not inherit them."""
+        """End the lease and with it the gains of its holder: the next one shall not inherit them."""
         self.lease.release()
-        self._controller = self._own_controller()
+        self._apply_gains(default_gains(self.config.kind, self.config.strategy))
         self._status_due_ns = 0
+
+    def _stop(self, note: str) -> None:
+        self._finish_motion("stopped")
+        self._enter("stop", note)
+        self._stopped_ns = self._now_ns
 
     def _expire(self) -> None:
         self._expiries += 1
         self._finish_motion("expired")
         self._hold()
+        # Loops that hold begin anew: what they have summed up belongs to the motion.
+        self._apply_gains(self._gains)
         self._enter("expire", f"no fresh command for {self.config.lifetime_ns / 1e6:.0f} ms")
 
     def _hold(self) -> None:
         assert self._sample is not None
-        self._command = Command(self._sample.position_rad, 0.0, None)
+        self._command = Command(self._sample.sensors.position_rad, 0.0, math.nan)
 
     def _finish_motion(self, outcome: str) -> None:
         if self._motion is None or self._record is None:
@@ -199,20 +229,20 @@ class Firmware:
         if outcome == "done":
             self._command = Command(self._motion.last_position_rad, 0.0, self._motion.last_effort_nm)
         else:
-            self._command = Command(self._command.position_rad, 0.0, None)
+            self._command = Command(self._command.position_rad, 0.0, math.nan)
         self._motion = None
         self._status_due_ns = 0
 
     # ------------------------------------------------------------------ inbox
 
-    def _receive(self, incoming: Incoming, out: list[Outgoing]) -> None:
+    def _receive(self, incoming: Incoming) -> None:
         try:
             answer = self._dispatch(incoming)
         except WireError as error:
             self.admission.count(error.reason)
             answer = encode(self._ack(False, 0, error.reason.value, error.detail))
         if incoming.request is not None:
-            out.append(Answer(incoming.request, answer))
+            self._out.append(Answer(incoming.request, answer))
 
     def _dispatch(self, incoming: Incoming) -> bytes:
         message = self.admission.read(incoming.leaf, incoming.payload)
@@ -226,9 +256,7 @@ class Firmware:
             case HistoryRequest():
                 return self._answer_history(message)
             case Stop():
-                self._finish_motion("stopped")
-                self._enter("stop", f"stopped by {message.sender}: {message.why}"[:512])
-                self._stopped_ns = self._now_ns
+                self._stop(f"stopped by {message.sender}: {message.why}"[:512])
             case LeaseRequest():
                 self._act_lease(message)
             case MotionCommand():
@@ -252,12 +280,13 @@ class Firmware:
             self._enter("release")
             return
         assert self._sample is not None
-        if self.state == "fault" and self._sample.winding_temperature_c > WINDING_REARM_C:
+        winding_c = self._sample.sensors.winding_temperature_c
+        if self.state == "fault" and winding_c > WINDING_REARM_C:
             raise WireError(
-                Refusal.NOT_ARMED,
-                f"winding at {self._sample.winding_temperature_c:.0f} C, "
-                f"re-arms below {WINDING_REARM_C:.0f} C",
+                Refusal.NOT_ARMED, f"winding at {winding_c:.0f} C, re-arms below {WINDING_REARM_C:.0f} C"
             )
+        if self._sample.m_stop:
+            raise WireError(Refusal.NOT_ARMED, "the M-stop is pressed: release it, then acquire again")
         if self.state == "stopped" and request.echo_ns <= self._stopped_ns:
             raise WireError(Refusal.STALE, "sent before the stop: its sender cannot have known of it")
         if not self.lease.acquire(request, self._now_ns):
@@ -287,9 +316,9 @@ class Firmware:
             raise WireError(Refusal.BUSY, f"motion {record.motion_id if record else '?'} is running")
         assert self._sample is not None
         held = self._command.position_rad
-        origin = held if held is not None else self._sample.position_rad
+        origin = self._sample.sensors.position_rad if math.isnan(held) else held
         check_duration(command.pattern, origin)
-        motion = Motion(command.pattern, origin, self._now_ns, self.config.tick_ns, command.effort)
+        motion = Motion(command.pattern, origin, self._now_ns, command.effort)
         check_motion(motion, self.config.limits)
         self._enter("motion")
         self._motion = motion
@@ -310,13 +339,15 @@ class Firmware:
         check_setpoint(setpoint, self.config.limits)
         if self.state != "streaming":
             self._enter("setpoint")
-        self._setpoint = Command(setpoint.position_rad, setpoint.velocity_rad_s, setpoint.effort_nm)
+        self._setpoint = Command(
+            _or_nan(setpoint.position_rad), _or_nan(setpoint.velocity_rad_s), _or_nan(setpoint.effort_nm)
+        )
         self._refresh(setpoint.echo_ns)
 
     def _set_gains(self, command: GainsCommand) -> None:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "gains are taken when no motion is running")
-        self._controller = Controller(self.config.kind, command.gains, self.config.tick_ns / 1e9)
+        self._apply_gains(command.gains)
         self._refresh(command.echo_ns)
 
     def _answer_history(self, request: HistoryRequest) -> bytes:
@@ -381,4 +412,8 @@ class Firmware:
         )
 
     def _info(self) -> Info:
-        return describe(self.config, self._controller.gains, self._next_seq(), self._now_ns)
+        return describe(self.config, self._gains, self._next_seq(), self._now_ns)
+
+
+def _or_nan(target: float | None) -> float:
+    return math.nan if target is None else target

@@ -1,1 +1,1 @@
-"""The contract to the module, and the client of the physics bus."""
+"""The contract to the modules, the loops inside simulated ones, and the client of the physics bus."""

@@ -1,4 +1,4 @@
-"""The agent's end of the physics bus: the `Hardware` of an agent that runs beside a simulated world."""
+"""The agent's end of the physics bus: the wires to modules that are simulated in another process."""
 
 import socket
 import time
@@ -12,7 +12,8 @@ from module_agent.hardware.bus_frames import (
     pack_hello,
     unpack_welcome,
 )
-from module_agent.hardware.hardware import HardwareLost, HardwareModule, SensorSample
+from module_agent.hardware.hardware import HardwareLost, SensorSample
+from module_agent.hardware.wires import WiredModule
 
 _RETRY_S = 0.02
 
@@ -22,7 +23,7 @@ class BusRefused(HardwareLost):
 
 
 class BusClient:
-    """`Hardware` over a Unix socket, in lock-step with the world.
+    """`Wires` over a Unix socket, in lock-step with the world.
 
     Args:
         path: the world's socket.
@@ -44,7 +45,7 @@ class BusClient:
             raise
 
     @property
-    def modules(self) -> Sequence[HardwareModule]:
+    def modules(self) -> Sequence[WiredModule]:
         """The modules served, in the order asked for."""
         return self._modules
 
@@ -71,7 +72,7 @@ class BusClient:
         return samples
 
     def close(self) -> None:
-        """Let go of the modules; whoever waits in `exchange` gets `HardwareLost`. May be called twice."""
+        """Release the modules; a thread that waits in `exchange` gets `HardwareLost`. May be called twice."""
         try:
             # Closing alone would not wake a thread inside recv.
             self._socket.shutdown(socket.SHUT_RDWR)
@@ -103,7 +104,7 @@ def _connect(path: str, timeout_s: float) -> socket.socket:
 
 def _greet(
     connection: socket.socket, path: str, serials: Sequence[str], timeout_s: float
-) -> tuple[int, tuple[HardwareModule, ...]]:
+) -> tuple[int, tuple[WiredModule, ...]]:
     connection.settimeout(timeout_s)
     try:
         connection.send(pack_hello(serials))

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from module_agent.hardware.hardware import HardwareModule, SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.wires import WiredModule
 
 BUS_VERSION = 1
 MAX_HANDSHAKE_BYTES = 64 * 1024
@@ -85,7 +86,7 @@ class Welcome(NamedTuple):
     """The world's answer to a hello: the tick number to answer first, and the modules in the order asked."""
 
     tick: int
-    modules: tuple[HardwareModule, ...]
+    modules: tuple[WiredModule, ...]
 
 
 def pack_hello(serials: Sequence[str]) -> bytes:
@@ -128,7 +129,7 @@ def unpack_welcome(frame: bytes) -> Welcome | str:
     if isinstance(error, str):
         return error
     try:
-        modules = tuple(HardwareModule(str(s), str(t), int(a), int(b)) for s, t, a, b in value["modules"])
+        modules = tuple(WiredModule(str(s), str(t), int(a), int(b)) for s, t, a, b in value["modules"])
         return Welcome(int(value["tick"]), modules)
     except (KeyError, TypeError, ValueError) as broken:
         raise FrameError(f"not a welcome: {broken!r}") from broken

@@ -1,15 +1,23 @@
-"""The contract between the firmware and whatever turns the motor and reads the sensors.
+"""The contract between the firmware and the modules whose motors it commands and whose sensors it reads.
 
-One `Hardware` serves one agent process, which may host several modules. The physics bus client and the
-in-process world of the simulator implement it; a driver for real modules will.
+The line runs where every kind of module has one: the firmware hands over targets (`Command`), and the module
+closes its loops inside. Real modules do so behind an Ethernet port, at a rate that a network could not keep;
+a simulated one does so in `loop_inside`. On this side of the line is what hangs on the lease, on how fresh
+commands are and on motions: who may command, the command lifetime of the firmware and its expiry action,
+states, motions. On the other side is what a module does by itself, whatever it is told: loops and gains,
+limits of position and temperature, the brake, and a watchdog that turns the motor off when no commands come.
 """
 
 from collections.abc import Sequence
+from enum import IntFlag
 from typing import NamedTuple, Protocol
+
+from module_agent.control.controller import Command
+from module_agent.wire.messages import GainSet, Limits
 
 
 class SensorSample(NamedTuple):
-    """One tick of one module, in the module's own clock and frames.
+    """The sensor readings of one tick of one module, in the module's own clock and frames.
 
     The accelerometer reads specific force (+g on the axis that points up at rest). Gyro and accelerometer
     are in the IMU frame. Effort is the torque that the output exerts on what it is mounted to, read from
@@ -35,11 +43,43 @@ class SensorSample(NamedTuple):
     accel_z_m_s2: float
 
 
-class HardwareModule(NamedTuple):
-    """What the hardware says of one module before its first tick. Periods in the module's own clock."""
+class LimitState(IntFlag):
+    """The limits that act on a module; no flag is set while it follows its commands as they are."""
+
+    NONE = 0
+    POSITION = 1
+    VELOCITY = 2
+    EFFORT = 4
+    TEMPERATURE = 8  # the PWM is kept below the winding's ceiling
+    OVER_TEMPERATURE = 16  # the output is off
+
+
+class ModuleSample(NamedTuple):
+    """One feedback of one module: its sensors, and what its drive does.
+
+    pwm is the PWM in [-1, 1] at 48 V that was in force when the sensors were read, `limits` what acted on it.
+    sequence counts the module's samples: a gap is a loss. m_stop: the emergency stop holds the motor off.
+    """
+
+    sensors: SensorSample
+    pwm: float
+    sequence: int
+    limits: LimitState
+    m_stop: bool
+
+
+class ModuleInformation(NamedTuple):
+    """What a module says of itself; periods in its own clock, gains as they are in force.
+
+    serial is unique and never changes; its user gives it a name, and the same family to all of one robot.
+    """
 
     serial: str
+    name: str
+    family: str
     module_type: str
+    gains: GainSet
+    limits: Limits
     tick_ns: int
     imu_period_ns: int
 
@@ -48,25 +88,75 @@ class HardwareLost(ConnectionError):
     """The hardware is gone (closed bus, dead world); the agent must end its processes cleanly."""
 
 
-class Hardware(Protocol):
-    """The wires inside the modules of one agent process."""
+class Modules(Protocol):
+    """The modules of one agent process. A tick is one `receive` and then one `send`.
+
+    `LoopInside` implements it for simulated modules; `tests/module_agent/hardware` has what every
+    implementation must fulfil. What a driver of HEBI's modules does for each method is said there.
+    """
 
     @property
-    def modules(self) -> Sequence[HardwareModule]:
-        """The modules served, in the order of `exchange`."""
+    def information(self) -> Sequence[ModuleInformation]:
+        """The modules, in the order in which all else counts them.
+
+        HEBI: a lookup of the serials and `request_info`. Its tick is the period of feedback that the driver
+        has set, its clock `hardware_transmit_time`.
+        """
         ...
 
-    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
-        """Hand over one PWM per module, wait for the next tick, return one sample per module.
+    def receive(self) -> Sequence[ModuleSample]:
+        """Wait for the next tick and return one sample per module.
 
-        A PWM is in [-1, 1] and normalised to 48 V, as the gains are: the motor sees the duty
-        `clip(pwm * 48 / voltage_v, -1, 1)` of the bus voltage.
+        Modules that are sent no command between two of these go on under their last one for their lifetime.
+
+        HEBI: `get_next_feedback`. Specific force is what an accelerometer reads: the driver checks that
+        `accel_includes_gravity` is set.
 
         Raises:
             HardwareLost: no further tick will come.
         """
         ...
 
+    def send(self, commands: Sequence[Command]) -> Sequence[float]:
+        """Hand over one command per module; return the PWM of each, as the module's feedback would show it.
+
+        A target of NaN switches its loop off, three of them the motor; `Command.brake` damps it.
+
+        HEBI: `send_command`, where a target is left out for NaN. No answer comes at once: the PWM is that of
+        the last feedback.
+
+        Raises:
+            ValueError: not one command per module, or there was no sample yet.
+        """
+        ...
+
+    def set_gains(self, index: int, gains: GainSet) -> None:
+        """Replace the gains and the control strategy of a module; its loops forget their past.
+
+        HEBI: a command with gains; they are not saved, so that a power cycle brings back the owner's.
+        """
+        ...
+
+    def set_lifetime(self, index: int, lifetime_ns: int) -> None:
+        """Set how long a module follows a command when no other comes: then its motor is off.
+
+        It guards against an agent that has died; whose commander has died, the firmware sees itself, and runs
+        its expiry action.
+
+        HEBI: `command_lifetime`. While it runs a module refuses other senders.
+
+        Raises:
+            ValueError: a lifetime that is not positive.
+        """
+        ...
+
+    def identify(self, index: int, on: bool) -> None:
+        """Show on a module which one it is, or show it no longer. HEBI: the colour of its LED."""
+        ...
+
     def close(self) -> None:
-        """Let go of the hardware; its motors then get zero PWM. May be called twice."""
+        """Release the modules; their motors then are off. May be called twice.
+
+        HEBI: a last command without targets.
+        """
         ...

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.control.controller import NOMINAL_VOLTAGE_V
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Answer, Firmware, Incoming
 from module_agent.hardware.hardware import SensorSample
-from module_agent.model.catalogue import module_type
+from module_agent.hardware.loop_inside import LoopInside
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ack, LeaseRequest, Message, Setpoint
@@ -25,7 +25,7 @@ from sim.geometry.pose import Array, read_only
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.real_module.real_log import RealLog
 from sim.robot.robot_file import Robot, parse_robot
-from sim.world.world import TICK_S, World
+from sim.world.world import TICK_S, World, WorldWires
 
 _STEP_S = 0.01
 
@@ -123,7 +123,7 @@ def simulate(
     robot = bench_robot(type_name, start_position(log, command_age_s))
     world = World(robot, seed, noise, voltage_v=float(log.voltage_v.mean()))
     world.warm(start_warmth(log)[:, None])
-    bench = _Bench(world, type_name)
+    bench = _Bench(world)
     # One tick for the lease, then the first command.
     first_s = TICK_S + command_age_s - log.t_s[0]
     due = np.rint((log.t_s + first_s - command_age_s) / TICK_S).astype(np.int64)
@@ -154,27 +154,25 @@ def compare(log: RealLog, simulated: Simulated) -> list[SignalRow]:
 class _Bench:
     """One module in a world of its own, and who commands it."""
 
-    def __init__(self, world: World, type_name: str):
-        kind = module_type(type_name)
-        self._world = world
-        self._firmware = Firmware(FirmwareConfig(SERIAL, kind, BOOT, catalogue_limits(kind)))
-        self._pwm = 0.0
+    def __init__(self, world: World):
+        self._hardware = LoopInside(WorldWires(world))
+        self._firmware = Firmware(config_of(self._hardware.information[0], BOOT), self._hardware)
         self._seen_ns = 0
         self._seq = 0
         self._inbox: list[Incoming] = []
 
     def tick(self) -> tuple[float, ...]:
         """Advance by one tick; return its row of `Simulated`."""
-        (sample,) = self._world.step([self._pwm])
-        self._seen_ns = sample.t_ns
+        (sample,) = self._hardware.receive()
+        self._seen_ns = sample.sensors.t_ns
         if not self._firmware.lease.token:
             self._send(Leaf.LEASE, self._request("acquire"))
         inbox, self._inbox = self._inbox, []
-        self._pwm, out = self._firmware.step(sample.t_ns, sample, inbox)
-        for answer in out:
+        (pwm,) = self._hardware.send([self._firmware.step(sample, inbox)])
+        for answer in self._firmware.publish(pwm):
             if isinstance(answer, Answer):
                 _check(decode(Ack, answer.payload), answer.request)
-        return _row(sample, self._pwm)
+        return _row(sample.sensors, pwm)
 
     def command(self, log: RealLog, number: int) -> None:
         """Send row `number` of the log as a setpoint, and keep the lease."""

@@ -6,8 +6,9 @@ All that is sent goes through the firmware's inbox, encoded, as it would come fr
 from collections.abc import Sequence
 from typing import Any, Literal
 
+from module_agent.control.controller import Command
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, Publication
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import ModuleSample
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.keys import Leaf
@@ -49,22 +50,23 @@ class ModuleBench:
         self._seq = 0
         self._renewed_ns: int | None = None
 
-    def step(self, sample: SensorSample, arrived: Sequence[Incoming] = ()) -> float:
-        """Run one tick of the firmware and return its PWM; `arrived` has come from elsewhere.
-
-        `published_rows` says afterwards whether feedback went out in this tick.
-
-        Raises:
-            ExperimentFailed: the module refused what it was told since the last tick.
-        """
-        self.now_ns, self.winding_c = sample.t_ns, sample.winding_temperature_c
+    def step(self, sample: ModuleSample, arrived: Sequence[Incoming] = ()) -> Command:
+        """Begin one tick of the firmware and return its command; `arrived` has come from elsewhere."""
+        self.now_ns, self.winding_c = sample.sensors.t_ns, sample.sensors.winding_temperature_c
         self._keep_alive()
         waiting, self._waiting = self._waiting, []
-        pwm, out = self.firmware.step(sample.t_ns, sample, [*waiting, *arrived])
+        return self.firmware.step(sample, [*waiting, *arrived])
+
+    def publish(self, pwm: float) -> None:
+        """End the tick with the module's PWM. `published_rows` says afterwards whether feedback went out.
+
+        Raises:
+            ExperimentFailed: the module refused a command that was sent since the last tick.
+        """
+        out = self.firmware.publish(pwm)
         self.published_rows = any(isinstance(one, Publication) and one.leaf is Leaf.FEEDBACK for one in out)
         for outgoing in out:
             self._hear(outgoing)
-        return pwm
 
     def start(self, pattern: Pattern, effort: EffortProfile | None = None) -> None:
         """Start a motion in the next tick, with the efforts that it is fed forward if there are any."""

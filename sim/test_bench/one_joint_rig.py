@@ -18,13 +18,14 @@ from module_agent.estimate.observer import MARGIN_NS
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
 from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware
+from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.imu_prior import CALIBRATED, ImuPrior
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
 from sim.test_bench.module_bench import ModuleBench
-from sim.world.world import TICK_NS, World
+from sim.world.world import TICK_NS, World, WorldWires
 
 JOINT, IMU = 0, 1
 
@@ -59,11 +60,11 @@ class OneJointRig:
             raise ValueError(f"robot {robot.name} is no arm of two modules, one upon the other")
         self.robot = robot
         self.world = World(robot, seed, noise)
+        self._hardware = LoopInside(WorldWires(self.world))
         self.modules = tuple(
-            ModuleBench(Firmware(config_of(module, boot)))
-            for boot, module in enumerate(self.world.modules, start=1)
+            ModuleBench(Firmware(config_of(module, index + 1), self._hardware, index))
+            for index, module in enumerate(self._hardware.information)
         )
-        self._pwm = [0.0, 0.0]
         # In their first tick both modules are taken under command, and hold still.
         self.tick()
 
@@ -77,8 +78,10 @@ class OneJointRig:
 
     def tick(self) -> None:
         """Advance world and firmware by one tick; the PWM acts in the next, as on the bus."""
-        samples = self.world.step(self._pwm)
-        self._pwm = [module.step(sample) for module, sample in zip(self.modules, samples, strict=True)]
+        samples = self._hardware.receive()
+        commands = [module.step(sample) for module, sample in zip(self.modules, samples, strict=True)]
+        for module, pwm in zip(self.modules, self._hardware.send(commands), strict=True):
+            module.publish(pwm)
 
     def wait(self, duration_s: float) -> None:
         """Let time pass."""

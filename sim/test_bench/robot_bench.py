@@ -16,6 +16,7 @@ import numpy as np
 from coordinator.torque_control.feed_forward import SetPoints
 from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware, Incoming
+from module_agent.hardware.loop_inside import LoopInside
 from module_agent.network_emulation.channel import Channel
 from module_agent.network_emulation.profile import NetworkProfile, PathProfile
 from module_agent.wire.messages import EffortProfile, GainSet, Pattern
@@ -23,7 +24,7 @@ from sim.geometry.pose import Array, read_only
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
 from sim.test_bench.module_bench import ModuleBench
-from sim.world.world import TICK_NS, World
+from sim.world.world import TICK_NS, World, WorldWires
 
 T = TypeVar("T")
 
@@ -95,12 +96,12 @@ class BenchRobot:
         self, robot: Robot, seed: int, noise: str | NoiseProfile | None = None, noise_seed: int | None = None
     ):
         self.world = World(robot, seed, noise, noise_seed=noise_seed)
+        self._hardware = LoopInside(WorldWires(self.world))
         self.modules = tuple(
-            ModuleBench(Firmware(config_of(module, boot)))
-            for boot, module in enumerate(self.world.modules, start=1)
+            ModuleBench(Firmware(config_of(module, index + 1), self._hardware, index))
+            for index, module in enumerate(self._hardware.information)
         )
         self.by_serial = {module.serial: module for module in self.modules}
-        self._pwm = [0.0] * len(self.modules)
         self._taken: list[tuple[Array, Array, Array]] = []
         # In their first tick all modules are taken under command, and hold still.
         self.tick()
@@ -119,12 +120,14 @@ class BenchRobot:
 
     def tick(self, arrived: Mapping[str, Sequence[Incoming]] | None = None) -> None:
         """Advance world and firmware by one tick; the PWM acts in the next, as on the bus."""
-        samples = self.world.step(self._pwm)
+        samples = self._hardware.receive()
         mail = arrived or {}
-        self._pwm = [
+        commands = [
             module.step(sample, mail.get(module.serial, ()))
             for module, sample in zip(self.modules, samples, strict=True)
         ]
+        for module, pwm in zip(self.modules, self._hardware.send(commands), strict=True):
+            module.publish(pwm)
         plant = self.world.plant
         self._taken.append((plant.q_rad, plant.spring_torque_nm, plant.duty))
 

@@ -6,7 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.firmware.config import config_of
-from module_agent.hardware.hardware import HardwareModule, SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.loop_inside import LoopInside
+from module_agent.hardware.wires import WiredModule
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile
@@ -44,7 +46,7 @@ class _Wires:
         self._index = index
 
     @property
-    def modules(self) -> Sequence[HardwareModule]:
+    def modules(self) -> Sequence[WiredModule]:
         return (self._robot.world.modules[self._index],)
 
     def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
@@ -79,11 +81,14 @@ class VirtualRobot:
         self._network_seeds = seeds[0]
         boots = np.random.default_rng(seeds[1]).integers(1, 2**63, size=len(self.world.modules))
         self.hosts: dict[str, AgentHost] = {}
-        for index, (module, boot) in enumerate(zip(self.world.modules, boots, strict=True)):
-            self.hosts[module.serial] = AgentHost(
+        self._loops: dict[str, LoopInside] = {}
+        for index, (serial, boot) in enumerate(zip(settings.robot.serials, boots, strict=True)):
+            loop_inside = self._loops[serial] = LoopInside(_Wires(self, index))
+            (module,) = loop_inside.information
+            self.hosts[serial] = AgentHost(
                 settings.robot.name,
-                _Wires(self, index),
-                self.endpoint(module.serial),
+                loop_inside,
+                self.endpoint(serial),
                 [config_of(module, int(boot), feedback_rate_hz=settings.feedback_rate_hz)],
                 InlineWorker(),
             )
@@ -113,7 +118,7 @@ class VirtualRobot:
         self.truth.record()
         for serial, host in self.hosts.items():
             host.cycle()
-            self.pwm[self._index[serial]] = host.pwm[0]
+            (self.pwm[self._index[serial]],) = self._loops[serial].pwm
         self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)
 
     def kill(self, serial: str) -> None:

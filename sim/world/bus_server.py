@@ -25,7 +25,8 @@ from module_agent.hardware.bus_frames import (
     pack_welcome,
     unpack_hello,
 )
-from module_agent.hardware.hardware import HardwareModule, SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.wires import WiredModule
 
 _BACKLOG = 128
 _MAX_LAG_S = 0.020
@@ -35,7 +36,7 @@ class World(Protocol):
     """What the bus serves: a world that is stepped with one PWM per module."""
 
     @property
-    def modules(self) -> Sequence[HardwareModule]:
+    def modules(self) -> Sequence[WiredModule]:
         """The modules, in the order of `step`."""
         ...
 

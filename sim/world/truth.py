@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from module_agent.hardware.hardware import HardwareModule, SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.wires import WiredModule
 from module_agent.model.chain import Chain
 from sim.geometry.pose import Array, read_only
 from sim.imperfections.module_errors import SensorErrors
@@ -188,7 +189,7 @@ class LoggedWorld:
         self.log = TruthLog(world)
 
     @property
-    def modules(self) -> Sequence[HardwareModule]:
+    def modules(self) -> Sequence[WiredModule]:
         """The modules, in the order of `step`."""
         return self._world.modules
 

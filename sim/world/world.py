@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.hardware.hardware import HardwareLost, HardwareModule, SensorSample
+from module_agent.hardware.hardware import HardwareLost, SensorSample
+from module_agent.hardware.wires import WiredModule
 from sim.actuator.actuator import BUS_VOLTAGE_V, Actuators
 from sim.actuator.thermal import Windings
 from sim.geometry.pose import Array, read_only
@@ -104,7 +105,7 @@ class World:
         q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.motor_rad
         self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.torque_nm, structure)
         self.modules = tuple(
-            HardwareModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
+            WiredModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
         )
 
     @property
@@ -266,15 +267,15 @@ class World:
         )
 
 
-class InProcessHardware:
-    """The `Hardware` of an agent that lives in the world's own process; the world stays the caller's."""
+class WorldWires:
+    """The wires to the modules of a world in the same process; closing them does not close the world."""
 
     def __init__(self, world: World):
         self._world = world
         self._open = True
 
     @property
-    def modules(self) -> Sequence[HardwareModule]:
+    def modules(self) -> Sequence[WiredModule]:
         """All modules of the world."""
         return self._world.modules
 
@@ -285,11 +286,11 @@ class InProcessHardware:
             HardwareLost: this or the world is closed.
         """
         if not self._open:
-            raise HardwareLost("this hardware has been closed")
+            raise HardwareLost("these wires have been closed")
         return self._world.step(pwm)
 
     def close(self) -> None:
-        """Let go of the world."""
+        """Let no further tick pass; may be called twice."""
         self._open = False
 
 

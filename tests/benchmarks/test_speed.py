@@ -10,8 +10,8 @@ import pytest
 from coordinator.batch_estimation.imu_prediction import imu_readings
 from coordinator.excitation.plan import Plan
 from coordinator.runtime.terminal import Terminal
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
-from module_agent.firmware.firmware import Firmware
+from module_agent.control.gains import catalogue_limits
+from module_agent.firmware.config import FirmwareConfig
 from module_agent.hardware.hardware import SensorSample
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
@@ -22,6 +22,7 @@ from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.virtual_time.run import VirtualConfig, run_virtual
 from sim.world.world import World
+from tests.module_agent.wired_firmware import WiredFirmware
 
 pytestmark = pytest.mark.benchmark
 
@@ -60,16 +61,18 @@ def test_virtual_time_over_real_time(tmp_path: Path, name: str, noise: str, dyna
 
 def test_firmware_step() -> None:
     kind = CATALOGUE["X5-9"]
-    firmware = Firmware(FirmwareConfig("A", kind, 1, catalogue_limits(kind)))
+    wired = WiredFirmware(FirmwareConfig("A", kind, 1, catalogue_limits(kind)))
     now = 0
 
     def tick() -> None:
         nonlocal now
         now += 1_000_000
         sample = SensorSample(now, now // 4_000_000 * 4_000_000, *([0.0] * 6), 40.0, 24.0, *([0.0] * 6))
-        firmware.step(now, sample, ())
+        wired.tick(sample)
 
-    _report("firmware step, one module, idle, 250 rows/s", f"{1e6 * _seconds(tick, 5000):.1f} us")
+    _report(
+        "firmware tick with its loops, one module, idle, 250 rows/s", f"{1e6 * _seconds(tick, 5000):.1f} us"
+    )
 
 
 @pytest.mark.parametrize("name", ["thesis_171_horizontal", "a2085_04", "snake16"])

@@ -8,8 +8,8 @@ import pytest
 
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry
-from module_agent.control.gains import default_gains
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
+from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.firmware.config import FirmwareConfig
 from module_agent.model.catalogue import module_type
 from module_agent.wire.codec import encode
 from module_agent.wire.feedback_rows import ROW

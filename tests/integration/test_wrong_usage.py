@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from module_agent.hardware.hardware import HardwareModule
+from module_agent.hardware.wires import WiredModule
 from sim.world.bus_server import BusServer
 
 ROBOT = "thesis_171_horizontal"
@@ -69,7 +69,7 @@ def test_there_is_nothing_to_resume_in_an_empty_folder(programs, tmp_path, endpo
 class OneModule:
     """A world that nobody is let into."""
 
-    modules = (HardwareModule("A-1", "X5-1", 1_000_000, 4_000_000),)
+    modules = (WiredModule("A-1", "X5-1", 1_000_000, 4_000_000),)
 
     def step(self, pwm):
         return [None]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from module_agent.firmware.motor_guard import DAMPING_LIMIT_PWM
+from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
 from module_agent.wire.codec import decode
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, WindowedSine

@@ -5,8 +5,8 @@ import pytest
 
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import END_RAD, RobotModule, excitation_task, robot_excitation
+from module_agent.control.gains import catalogue_limits
 from module_agent.control.waveform import waveform
-from module_agent.firmware.config import catalogue_limits
 from module_agent.model.catalogue import module_type
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from coordinator.excitation.joint_limits import JointLimits, joint_limits, motion_peaks
 from coordinator.excitation.single_joint import JointTask, design_joint, predicted_sigma_m
+from module_agent.control.gains import catalogue_limits
 from module_agent.control.motion import Motion, check_motion
 from module_agent.control.waveform import duration_s, waveform
-from module_agent.firmware.config import catalogue_limits
 from module_agent.model.catalogue import CATALOGUE, ModuleType
 from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from module_agent.wire.messages import WindowedSine
@@ -60,7 +60,7 @@ def test_no_type_is_asked_for_more_than_it_can_do_and_the_time_is_kept(
         assert limits.low_rad <= origin + samples.offset_rad.min() + 1e-9
         assert origin + samples.offset_rad.max() <= limits.high_rad + 1e-9
         assert samples.velocity_rad_s[[0, -1]] == pytest.approx([0.0, 0.0], abs=1e-12)
-        check_motion(Motion(pattern, origin, 0, 1_000_000), catalogue_limits(kind))
+        check_motion(Motion(pattern, origin, 0), catalogue_limits(kind))
 
 
 def test_no_other_frequency_or_sweep_within_the_limits_leaves_less_error() -> None:

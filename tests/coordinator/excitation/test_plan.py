@@ -5,10 +5,9 @@ import pytest
 from pydantic import ValidationError
 
 from coordinator.excitation.plan import Plan
-from module_agent.control.gains import default_gains
+from module_agent.control.gains import catalogue_limits, default_gains
 from module_agent.control.motion import Motion, check_motion
 from module_agent.control.waveform import duration_s
-from module_agent.firmware.config import catalogue_limits
 from module_agent.model.catalogue import CATALOGUE, ModuleType
 
 TYPES = list(CATALOGUE.values())
@@ -19,14 +18,14 @@ TICK_NS = 1_000_000
 def test_every_motion_is_within_what_the_firmware_accepts(kind: ModuleType) -> None:
     plan = Plan()
     for pattern in (plan.constant(), plan.sine(kind), plan.dynamic(kind), plan.held_out(kind)):
-        check_motion(Motion(pattern, 0.0, 0, TICK_NS), catalogue_limits(kind))
+        check_motion(Motion(pattern, 0.0, 0), catalogue_limits(kind))
 
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.name)
 def test_peak_speeds_leave_the_motor_a_quarter_of_its_own(kind: ModuleType) -> None:
     plan = Plan()
     for pattern in (plan.sine(kind), plan.dynamic(kind), plan.held_out(kind)):
-        motion = Motion(pattern, 0.0, 0, TICK_NS)
+        motion = Motion(pattern, 0.0, 0)
         ticks = np.arange(0, int(duration_s(pattern, 0.0) * 1e9), TICK_NS)
         commands = [motion.command(int(t)) for t in ticks]
         speeds = [abs(c.velocity_rad_s or 0.0) for c in commands if c is not None]

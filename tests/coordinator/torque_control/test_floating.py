@@ -23,7 +23,7 @@ from coordinator.torque_control.gravity_compensation import (
 )
 from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.session import first_of_newest
-from module_agent.firmware.config import catalogue_limits
+from module_agent.control.gains import catalogue_limits
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.chain import Chain
 from module_agent.wire.messages import Limits

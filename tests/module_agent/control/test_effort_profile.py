@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from module_agent.control.gains import catalogue_limits
 from module_agent.control.motion import MAX_SAMPLES, effort_at, effort_profile, profile_period_ns
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
-from module_agent.firmware.firmware import Answer, Firmware, Incoming, Publication
+from module_agent.firmware.config import FirmwareConfig
+from module_agent.firmware.firmware import Answer, Incoming, Publication
 from module_agent.hardware.hardware import SensorSample
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
@@ -23,6 +24,7 @@ from module_agent.wire.messages import (
     Rest,
 )
 from module_agent.wire.refusal import Refusal
+from tests.module_agent.wired_firmware import WiredFirmware
 
 MS = 1_000_000
 KIND = CATALOGUE["X5-9"]
@@ -33,9 +35,9 @@ class HeldModule:
     """A module under command, and what it says; its joint stands still."""
 
     def __init__(self) -> None:
-        self.firmware = Firmware(
-            FirmwareConfig("A", KIND, 1, catalogue_limits(KIND), feedback_rate_hz=1000.0)
-        )
+        config = FirmwareConfig("A", KIND, 1, catalogue_limits(KIND), feedback_rate_hz=1000.0)
+        self._wired = WiredFirmware(config)
+        self.firmware = self._wired.firmware
         self.now, self.seq = 0, 0
         self.commands: list[float] = []
         self.tell(Leaf.LEASE, LeaseRequest(**self.head(action="acquire")))
@@ -56,7 +58,7 @@ class HeldModule:
         self.now += MS
         imu = self.now // (4 * MS) * 4 * MS
         sample = SensorSample(self.now, imu, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 25.0, 24.0, 0, 0, 0, 0, 0, 9.8)
-        _, out = self.firmware.step(self.now, sample, incoming)
+        _, out = self._wired.tick(sample, incoming)
         for said in out:
             if isinstance(said, Publication) and said.leaf is Leaf.FEEDBACK:
                 feedback = decode(Feedback, said.payload, MAX_MESSAGE_BYTES)

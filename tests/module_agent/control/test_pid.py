@@ -1,6 +1,7 @@
 """The loops follow the manufacturer's order of operations; figures are worked out by hand."""
 
 import csv
+import math
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.control.controller import UNSET, Command, Controller
+from module_agent.control.controller import MOTOR_OFF, Command, Controller
 from module_agent.control.gains import default_gains
 from module_agent.control.pid import Pid
 from module_agent.model.catalogue import CATALOGUE
@@ -78,10 +79,10 @@ def test_terms_that_are_switched_off_take_no_part(ticks: list[tuple[float, float
     assert given_plain == pytest.approx(given_full, rel=0.0, abs=1e-298)
 
 
-def test_a_loop_whose_target_is_unset_gives_nothing_and_forgets_its_past() -> None:
+def test_a_loop_whose_target_is_nan_gives_0_and_forgets_its_past() -> None:
     pid, fresh = (loop(kp=1.0, ki=1.0, kd=1.0, i_clamp=10.0, output_lowpass=0.5) for _ in range(2))
     pid.update(1.0, 0.0)
-    assert pid.follow(None, 0.0) is None
+    assert pid.follow(math.nan, 0.0) == 0.0
     assert pid.follow(1.0, 0.5) == fresh.update(1.0, 0.5)
 
 
@@ -100,7 +101,7 @@ def test_the_output_never_leaves_its_limits(target: float, measured: list[float]
 def test_nothing_commanded_is_no_pwm(strategy: int) -> None:
     kind = CATALOGUE["X5-4"]
     controller = Controller(kind, default_gains(kind, strategy), DT)
-    assert controller.update(UNSET, 0.3, 1.0, 2.0) == 0.0
+    assert controller.update(MOTOR_OFF, 0.3, 1.0, 2.0) == 0.0
 
 
 def test_strategy_0_is_off_and_1_is_direct_pwm() -> None:
@@ -110,7 +111,7 @@ def test_strategy_0_is_off_and_1_is_direct_pwm() -> None:
     command = Command(1.0, 1.0, 0.4)
     assert off.update(command, 0.0, 0.0, 0.0) == 0.0
     assert direct.update(command, 0.0, 0.0, 0.0) == 0.4
-    assert direct.update(Command(None, None, 7.0), 0.0, 0.0, 0.0) == 1.0
+    assert direct.update(Command(math.nan, math.nan, 7.0), 0.0, 0.0, 0.0) == 1.0
 
 
 def test_strategy_4_turns_a_position_error_into_a_torque_target() -> None:
@@ -121,12 +122,14 @@ def test_strategy_4_turns_a_position_error_into_a_torque_target() -> None:
     full = 48.0 / motor.resistance_ohm * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
     target = 15.0 * 0.01
     expected = 0.25 * (target - 0.1) + target / full
-    assert controller.update(Command(0.01, None, None), 0.0, 0.0, 0.1) == pytest.approx(expected)
+    assert controller.update(Command(0.01, math.nan, math.nan), 0.0, 0.0, 0.1) == pytest.approx(expected)
 
 
 def test_strategy_2_and_4_differ_in_where_velocity_enters() -> None:
     kind = CATALOGUE["X5-4"]
-    second = Controller(kind, default_gains(kind, 2), DT).update(Command(None, 1.0, None), 0.0, 0.0, 0.0)
+    second = Controller(kind, default_gains(kind, 2), DT).update(
+        Command(math.nan, 1.0, math.nan), 0.0, 0.0, 0.0
+    )
     motor = kind.motor
     full = 48.0 / motor.resistance_ohm * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
     # Velocity outputs 0.2 Nm under strategy 2, which the effort loop turns into PWM.

@@ -17,14 +17,15 @@ from scipy import signal
 from scipy.linalg import block_diag
 
 from module_agent.control.controller import Command, Controller
-from module_agent.control.gains import default_gains
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits
-from module_agent.firmware.firmware import Answer, Firmware, Incoming
+from module_agent.control.gains import catalogue_limits, default_gains
+from module_agent.firmware.config import FirmwareConfig
+from module_agent.firmware.firmware import Answer, Incoming
 from module_agent.hardware.hardware import SensorSample
 from module_agent.model.catalogue import CATALOGUE, ModuleType
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ack, GainsCommand, GainSet, LeaseRequest, Message, PidGains, Setpoint
+from tests.module_agent.wired_firmware import WiredFirmware
 
 Array = NDArray[np.float64]
 KIND = CATALOGUE["X5-1"]
@@ -384,7 +385,7 @@ class Wired:
 
     def __init__(self, gains: GainSet):
         config = FirmwareConfig("A", KIND, 7, catalogue_limits(KIND), strategy=gains.strategy)
-        self._firmware = Firmware(config)
+        self._wired = WiredFirmware(config)
         self._now_ns, self._seq = 0, 0
         self._tick((0.0, 0.0, 0.0), [])
         self._tick(
@@ -396,7 +397,7 @@ class Wired:
         position, velocity, effort = target
         aims = {"position_rad": position, "velocity_rad_s": velocity, "effort_nm": effort}
         messages: list[tuple[Leaf, type[Message], dict[str, object]]] = [(Leaf.SETPOINT, Setpoint, aims)]
-        if self._firmware.state == "armed":
+        if self._wired.firmware.state == "armed":
             # Gains first: they begin without a past, as the model does.
             messages.insert(0, (Leaf.GAINS, GainsCommand, {"gains": self._gains}))
         return self._tick(seen, messages)
@@ -410,14 +411,14 @@ class Wired:
         ]
         still = (0.0, 0.0, 0.0, 30.0, 24.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.8)
         sample = SensorSample(self._now_ns, self._now_ns, *seen, *still)
-        out, sent = self._firmware.step(self._now_ns, sample, inbox)
+        out, sent = self._wired.tick(sample, inbox)
         answers = [decode(Ack, o.payload) for o in sent if isinstance(o, Answer)]
         assert all(a.accepted for a in answers), answers
         return out
 
     def _head(self, echo_ns: int) -> dict[str, object]:
         self._seq += 1
-        token = self._firmware.lease.token
+        token = self._wired.firmware.lease.token
         return {
             "serial": "A", "boot": 7, "seq": self._seq, "sender": "me", "token": token, "echo_ns": echo_ns,
         }  # fmt: skip

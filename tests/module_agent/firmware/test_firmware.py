@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from module_agent.firmware.config import FirmwareConfig, catalogue_limits, check_config
-from module_agent.firmware.firmware import Answer, Firmware, Incoming, Publication
+from module_agent.control.gains import catalogue_limits
+from module_agent.firmware.config import FirmwareConfig, check_config
+from module_agent.firmware.firmware import Answer, Incoming, Publication
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
 from module_agent.hardware.hardware import SensorSample
 from module_agent.model.catalogue import CATALOGUE
@@ -23,6 +24,7 @@ from module_agent.wire.messages import (
     ConstantMotion,
     Feedback,
     GainsCommand,
+    GainSet,
     GoTo,
     HistoryRequest,
     Info,
@@ -36,6 +38,7 @@ from module_agent.wire.messages import (
     WindowedSine,
 )
 from module_agent.wire.refusal import Refusal
+from tests.module_agent.wired_firmware import WiredFirmware
 
 MS = 1_000_000
 BOOT = 77
@@ -47,7 +50,9 @@ class Bench:
     def __init__(self, kind: str = "X5-9", **settings: Any) -> None:
         found = CATALOGUE[kind]  # type: ignore[index]
         limits = settings.pop("limits", catalogue_limits(found))
-        self.firmware = Firmware(FirmwareConfig("A", found, BOOT, limits, **settings))
+        self._wired = WiredFirmware(FirmwareConfig("A", found, BOOT, limits, **settings))
+        self.firmware = self._wired.firmware
+        self.m_stop = False
         self.now = 5_000 * MS
         self.position = 0.2
         self.winding_c = 40.0
@@ -62,9 +67,13 @@ class Bench:
         sample = SensorSample(
             self.now, imu, self.position, 0.0, 0.5, 0.0, 0.0, 0.1, self.winding_c, 24.0, 0, 0, 0, 0, 0, 9.8
         )
-        self.pwm, out = self.firmware.step(self.now, sample, incoming)
+        self.pwm, out = self._wired.tick(sample, incoming, self.m_stop)
         self.published += [o for o in out if isinstance(o, Publication)]
         return [o.payload for o in out if isinstance(o, Answer)]
+
+    @property
+    def gains(self) -> GainSet:
+        return self._wired.modules.information[0].gains
 
     def ticks(self, count: int) -> None:
         for _ in range(count):
@@ -359,7 +368,7 @@ def test_feedback_comes_at_its_rate_without_gaps_and_history_serves_every_row_ag
 def test_a_row_holds_the_sample_and_the_command_field_by_field() -> None:
     kind = CATALOGUE["X5-9"]
     config = FirmwareConfig("A", kind, BOOT, catalogue_limits(kind), feedback_rate_hz=1000.0, batch_rows=1)
-    firmware = Firmware(config)
+    wired = WiredFirmware(config)
     now = 5_000 * MS
     # Every value another one, and all of them exact in four bytes.
     sample = SensorSample(now, now - MS, *(0.25 + 0.5 * n for n in range(6)), 40.0, 24.0, *range(1, 7))
@@ -367,7 +376,7 @@ def test_a_row_holds_the_sample_and_the_command_field_by_field() -> None:
     values = {"position_rad": 0.75, "velocity_rad_s": None, "effort_nm": -0.5}
     acquire, setpoint = LeaseRequest(**head, token=0, action="acquire"), Setpoint(**head, token=1, **values)
     inbox = [Incoming(Leaf.LEASE, encode(acquire), None), Incoming(Leaf.SETPOINT, encode(setpoint), None)]
-    pwm, out = firmware.step(now, sample, inbox)
+    pwm, out = wired.tick(sample, inbox)
     (block,) = [o.payload for o in out if isinstance(o, Publication) and o.leaf is Leaf.FEEDBACK]
     (row,) = unpack(decode(Feedback, block, MAX_MESSAGE_BYTES))
     for name in set(SensorSample._fields) & set(row.dtype.names):
@@ -490,22 +499,40 @@ def test_a_fault_ends_the_motion_that_it_interrupts() -> None:
     assert not bench.move(5).accepted
 
 
+def test_an_m_stop_ends_the_motion_and_keeps_the_module_from_being_armed() -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.move(5)
+    bench.m_stop = True
+    bench.tick()
+    assert bench.firmware.state == "stopped"
+    status = bench.status()
+    assert status.motion is not None
+    assert status.motion.outcome == "stopped"
+    assert status.note == "M-stop pressed"
+    answer = bench.acquire()
+    assert refused(answer, Refusal.NOT_ARMED)
+    assert "M-stop" in answer.detail
+    bench.m_stop = False
+    assert bench.acquire().accepted
+
+
 def test_gains_end_with_the_lease_of_who_set_them() -> None:
     bench = Bench()
     bench.acquire()
-    factory = bench.firmware._controller.gains
+    factory = bench.gains
     stiff = factory.model_copy(update={"position": factory.position.model_copy(update={"kp": 6.0})})
     assert bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=stiff))).accepted
-    assert bench.firmware._controller.gains == stiff
+    assert bench.gains == stiff
     assert bench.ask(Leaf.LEASE, LeaseRequest(**bench.head(action="release"))).accepted
-    assert bench.firmware._controller.gains == factory
+    assert bench.gains == factory
 
 
 SEND: dict[Leaf, Callable[[Bench], Message]] = {
     Leaf.LEASE: lambda b: LeaseRequest(**b.head(action="renew")),
     Leaf.MOTION: lambda b: MotionCommand(**b.head(motion_id=9, pattern=Rest(duration_s=1.0))),
     Leaf.SETPOINT: lambda b: Setpoint(**b.head(position_rad=1.0, velocity_rad_s=None, effort_nm=None)),
-    Leaf.GAINS: lambda b: GainsCommand(**b.head(gains=b.firmware._controller.gains)),
+    Leaf.GAINS: lambda b: GainsCommand(**b.head(gains=b.gains)),
     Leaf.STOP: lambda b: Stop(serial="A", boot=0, seq=1, sender="me"),
 }
 

@@ -11,7 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.firmware.config import config_of
-from module_agent.hardware.hardware import HardwareModule, SensorSample
+from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.loop_inside import LoopInside
+from module_agent.hardware.wires import WiredModule
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.torque_information import module_information
 from module_agent.torque_information.service import Worker
@@ -32,7 +34,7 @@ ROWS = 300
 class Swinging:
     """Two modules that swing."""
 
-    modules = tuple(HardwareModule(serial, "X5-4", TICK_NS, STEP_NS) for serial in (OWN, BESIDE))
+    modules = tuple(WiredModule(serial, "X5-4", TICK_NS, STEP_NS) for serial in (OWN, BESIDE))
 
     def __init__(self) -> None:
         self.ticks = 0
@@ -87,9 +89,9 @@ class Bench:
 
     def __init__(self, worker: Worker):
         self.wires = Wires()
-        hardware = Swinging()
-        configs = [config_of(module, BOOT) for module in hardware.modules]
-        self.host = AgentHost(ROBOT, hardware, self.wires, configs, worker)
+        modules = LoopInside(Swinging())
+        configs = [config_of(module, BOOT) for module in modules.information]
+        self.host = AgentHost(ROBOT, modules, self.wires, configs, worker)
         for _ in range(4 * (ROWS + 5)):
             self.host.cycle()
         self.refusals = self.host.modules[0].firmware.admission.refusals

@@ -26,7 +26,8 @@ from module_agent.hardware.bus_frames import (
     unpack_hello,
     unpack_welcome,
 )
-from module_agent.hardware.hardware import HardwareLost, HardwareModule, SensorSample
+from module_agent.hardware.hardware import HardwareLost, SensorSample
+from module_agent.hardware.wires import WiredModule
 from sim.world.bus_server import BusInUse, BusServer
 
 ROOT = Path(__file__).parents[3]
@@ -35,8 +36,8 @@ LIMIT_S = 20.0
 # Sends a PWM that grows with every exchange; tells how many samples did not echo it, and every jump in time.
 AGENT = """
 import sys
-from module_agent.bus_client import BusClient
-from module_agent.hardware import HardwareLost
+from module_agent.hardware.bus_client import BusClient
+from module_agent.hardware.hardware import HardwareLost
 path, serials = sys.argv[1], sys.argv[2].split(",")
 client = BusClient(path, serials)
 last_ns = None
@@ -56,8 +57,8 @@ except HardwareLost as error:
 """
 
 
-def module(serial: str) -> HardwareModule:
-    return HardwareModule(serial, "X5-1", 1_000_000, 1_000_000)
+def module(serial: str) -> WiredModule:
+    return WiredModule(serial, "X5-1", 1_000_000, 1_000_000)
 
 
 class EchoWorld:

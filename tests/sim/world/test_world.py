@@ -4,11 +4,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from module_agent.hardware.hardware import Hardware, HardwareLost, SensorSample
+from module_agent.hardware.hardware import HardwareLost, SensorSample
+from module_agent.hardware.wires import Wires
 from sim.robot.robot_file import Robot, load_robot, parse_robot
 from sim.robot.robot_tree import true_chain
 from sim.sensors.module_clock import module_time
-from sim.world.world import InProcessHardware, World
+from sim.world.world import World, WorldWires
 
 IDEAL_ARM = "a2085_03"
 
@@ -177,16 +178,16 @@ def test_one_pwm_per_module_is_needed() -> None:
         World(load_robot("a2085_04"), seed=1).step([0.0] * 3)
 
 
-def test_hardware_in_process_steps_the_world_until_it_is_closed() -> None:
+def test_wires_in_process_step_the_world_until_it_is_closed() -> None:
     world = World(load_robot(IDEAL_ARM), seed=1)
-    hardware: Hardware = InProcessHardware(world)
-    assert [m.serial for m in hardware.modules] == ["shoulder-yaw", "shoulder-lift", "elbow"]
-    hardware.exchange([0.1] * 3)
+    wires: Wires = WorldWires(world)
+    assert [m.serial for m in wires.modules] == ["shoulder-yaw", "shoulder-lift", "elbow"]
+    wires.exchange([0.1] * 3)
     assert world.t_ns == 1_000_000
-    hardware.close()
-    hardware.close()
+    wires.close()
+    wires.close()
     with pytest.raises(HardwareLost):
-        hardware.exchange([0.1] * 3)
+        wires.exchange([0.1] * 3)
     world.step([0.0] * 3)
 
 
@@ -195,7 +196,7 @@ def test_a_closed_world_is_lost_hardware() -> None:
     world.close()
     world.close()
     with pytest.raises(HardwareLost, match="closed"):
-        InProcessHardware(world).exchange([0.0] * 3)
+        WorldWires(world).exchange([0.0] * 3)
 
 
 def test_a_world_takes_the_robots_own_noise_unless_told_otherwise() -> None:

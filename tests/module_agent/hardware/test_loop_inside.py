@@ -1,0 +1,127 @@
+"""What a simulated module does by itself: limits of temperature and position, brake, watchdog."""
+
+import math
+from typing import Any
+
+import pytest
+
+from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
+from module_agent.control.gains import default_gains
+from module_agent.hardware.hardware import LimitState, ModuleSample, SensorSample
+from module_agent.hardware.loop_inside import DEFAULT_LIFETIME_NS, LoopInside
+from module_agent.hardware.motor_guard import DAMPING_LIMIT_PWM
+from module_agent.model.catalogue import CATALOGUE
+from tests.module_agent.wired_firmware import MS, ScriptedWires
+
+NAN = math.nan
+PUSH = Command(NAN, NAN, 0.9)
+PULL = Command(NAN, NAN, -0.9)
+REST = SensorSample(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 40.0, 48.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.8)
+
+
+class Bench:
+    """One module, by DirectPWM; what it reads is what the test says."""
+
+    def __init__(self, kind: str = "SEA-snake") -> None:
+        self.wires = ScriptedWires(kind)
+        self.modules = LoopInside(self.wires)
+        self.modules.set_gains(0, default_gains(CATALOGUE[kind], 1))  # type: ignore[index]
+        self.now_ns = 0
+
+    def receive(self, **readings: Any) -> ModuleSample:
+        self.now_ns += MS
+        self.wires.sample = REST._replace(t_ns=self.now_ns, **readings)
+        (sample,) = self.modules.receive()
+        return sample
+
+    def drive(self, command: Command, **readings: Any) -> tuple[float, LimitState]:
+        """Return the PWM of a command, and which limits the next sample says acted on it."""
+        self.receive(**readings)
+        (pwm,) = self.modules.send([command])
+        return pwm, self.receive().limits
+
+
+def test_a_command_within_all_limits_is_followed_as_it_is() -> None:
+    assert Bench().drive(PUSH) == (0.9, LimitState.NONE)
+
+
+@pytest.mark.parametrize(
+    ("position_rad", "command", "pwm", "state"),
+    [
+        (1.6, PUSH, 0.0, LimitState.POSITION),
+        (1.6, PULL, -0.9, LimitState.NONE),
+        (-1.6, PULL, 0.0, LimitState.POSITION),
+        (-1.6, PUSH, 0.9, LimitState.NONE),
+    ],
+)
+def test_beyond_its_range_a_motor_is_driven_back_only(
+    position_rad: float, command: Command, pwm: float, state: LimitState
+) -> None:
+    assert Bench().drive(command, position_rad=position_rad) == (pwm, state)
+
+
+@pytest.mark.parametrize(
+    ("winding_c", "ceiling", "state"),
+    [(150.0, 0.8, LimitState.TEMPERATURE), (154.0, 0.0, LimitState.OVER_TEMPERATURE)],
+)
+def test_a_hot_winding_lowers_the_ceiling_to_nothing(
+    winding_c: float, ceiling: float, state: LimitState
+) -> None:
+    """1 - 1/(155 - T)."""
+    for command, sign in ((PUSH, 1.0), (PULL, -1.0)):
+        pwm, limits = Bench().drive(command, winding_temperature_c=winding_c)
+        assert pwm == pytest.approx(sign * ceiling)
+        assert limits is state
+
+
+def test_the_ceiling_is_one_of_the_duty_and_not_of_the_pwm_at_48_v() -> None:
+    pwm, _ = Bench().drive(PUSH, winding_temperature_c=150.0, voltage_v=24.0)
+    assert pwm == pytest.approx(0.4)
+
+
+def test_the_brake_is_proportional_to_the_motor_s_speed_and_bounded() -> None:
+    kind = CATALOGUE["X5-9"]
+    max_motor_rad_s = kind.gear_ratio * kind.max_speed_rad_s
+    bench = Bench("X5-9")
+    for share in (-0.1, 0.0, 0.1):
+        pwm, _ = bench.drive(BRAKE, motor_velocity_rad_s=share * max_motor_rad_s, velocity_rad_s=5.0)
+        assert pwm == pytest.approx(-share)
+    pwm, _ = bench.drive(BRAKE, motor_velocity_rad_s=-max_motor_rad_s)
+    assert pwm == DAMPING_LIMIT_PWM
+
+
+@pytest.mark.parametrize("between", [MOTOR_OFF, BRAKE])
+def test_loops_forget_their_past_while_the_motor_is_off_or_brakes(between: Command) -> None:
+    bench = Bench()
+    gains = default_gains(CATALOGUE["SEA-snake"], 3)
+    integral = gains.position.model_copy(update={"ki": 50.0, "i_clamp": 1.0})
+    bench.modules.set_gains(0, gains.model_copy(update={"position": integral}))
+    first, _ = bench.drive(Command(0.1, NAN, NAN))
+    later, _ = bench.drive(Command(0.1, NAN, NAN))
+    assert later > first
+    bench.drive(between)
+    assert bench.drive(Command(0.1, NAN, NAN))[0] == first
+
+
+def test_without_commands_the_loops_run_on_until_the_lifetime_is_over() -> None:
+    bench = Bench()
+    bench.receive()
+    bench.modules.send([PUSH])
+    lifetime = DEFAULT_LIFETIME_NS // MS
+    # The first tick carries out the command, and so do those up to the lifetime after its sample.
+    pwm = [bench.receive().pwm for _ in range(lifetime + 4)]
+    assert pwm == [0.9] * (lifetime + 1) + [0.0] * 3
+    assert bench.drive(PUSH)[0] == 0.9
+
+
+def test_before_the_first_command_the_motor_is_off() -> None:
+    bench = Bench()
+    assert [bench.receive().pwm for _ in range(5)] == [0.0] * 5
+
+
+def test_a_module_shows_which_one_it_is_until_it_is_told_otherwise() -> None:
+    bench = Bench()
+    bench.modules.identify(0, True)
+    assert bench.modules.identified == ("A",)
+    bench.modules.identify(0, False)
+    assert bench.modules.identified == ()
