@@ -27,6 +27,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import BIASES_ONLY, ImuPrior
 from module_agent.model.perturbation import apply_perturbation, frozen
 from module_agent.signals.autocorrelation import samples_per_independent
@@ -107,13 +108,14 @@ def refine_chain(
         prior: how well the IMUs are known beforehand.
 
     Raises:
-        ValueError: fewer samples than parameters; delays wanted without the readings' rates.
+        DataError: fewer samples than parameters.
+        ValueError: the prior leaves delays free, but `data` has no rates of the readings.
     """
     if prior.delay_s > 0.0 and data.imu_rates is None:
         raise ValueError("the IMUs' delays cannot be refined without the rates of their readings (imu_rates)")
     count = len(chain.serials)
     if 6 * data.q_rad.shape[0] < 12 * count:
-        raise ValueError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
+        raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
     flex = flex if flex is not None else rigid(count, len(data.q_rad))
     state = _State(chain, perfect(count), np.zeros(len(flex.links)))
     shape = (len(data.motions), count)

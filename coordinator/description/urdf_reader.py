@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from coordinator.dynamics.pseudo_inertia import parameters, pseudo_inertia
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.errors import UsageError
 
 STANDARD_GRAVITY = (0.0, 0.0, 9.81)
 _MOVING, _FIXED = ("revolute", "continuous"), "fixed"
 
 
-class UrdfError(ValueError):
+class UrdfError(UsageError):
     """A URDF file that cannot be read as a tree of revolute joints."""
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
-from coordinator.excitation.joint_limits import JointLimits
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation
 from coordinator.excitation.segment import SampledMotion, Segment, draw_segment, sampled, smaller, way
 from coordinator.excitation.self_collision import CLEARANCE_M, clearance_m
 from coordinator.parameter_fit.least_squares import MAX_SIGMA_KG
@@ -68,18 +68,13 @@ class Excitation(NamedTuple):
     refused: int
 
 
-class NoExcitation(ValueError):
-    """No motion, or too few, within the limits; the message says which limit refused most."""
-
-
 def design_excitation(
     task: ExcitationTask, rng: np.random.Generator, candidates: int = CANDIDATES
 ) -> Excitation:
     """Choose motions.
 
     Raises:
-        NoExcitation: fewer candidates than motions asked for stay within the limits.
-        ValueError: a joint has no room at all.
+        NoExcitation: fewer candidates than needed stay within the limits, or a joint has no room at all.
     """
     kept: list[Segment] = []
     pieces: list[Array] = []
@@ -115,7 +110,7 @@ def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | s
     """Draw one motion that the robot may run, or return what refuses it, however small it is made.
 
     Raises:
-        ValueError: a joint has no room at all.
+        NoExcitation: a joint has no room at all.
     """
     drawn = draw_segment(rng, task.limits, task.home_rad, task.reach_rad, task.segment_s)
     reason = ""

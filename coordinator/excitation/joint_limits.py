@@ -10,6 +10,7 @@ import numpy as np
 from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.catalogue import GRAVITY_M_S2, ModuleType
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
 from module_agent.wire.messages import Pattern
 
@@ -33,6 +34,10 @@ REACH_PER_MODULE_M = 0.12
 LEVEL_SHARE = 0.05
 # Of any motion: 100 a period at 4 Hz for 15 s.
 PEAK_SAMPLES = 6001
+
+
+class NoExcitation(DataError):
+    """No motion, or too few, within the limits; the message says which limit refused most."""
 
 
 class JointLimits(NamedTuple):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.excitation.joint_limits import JointLimits, motion_peaks
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation, motion_peaks
 from module_agent.wire.messages import MultiSine, Sine
 
 # Slow: several turns of gravity within the window. Fast: links and bases that give lengthen what they carry
@@ -48,7 +48,7 @@ def simultaneous_patterns(
     Slower joints get the lower frequencies, which ask less of them.
 
     Raises:
-        ValueError: a joint has no room to move about its home, or nothing left to accelerate with.
+        NoExcitation: a joint has no room to move about its home, or nothing left to accelerate with.
     """
     order = sorted(settings, key=lambda s: (settings[s].limits.speed_rad_s, s))
     slow, fast = np.linspace(*SLOW_HZ, len(order)), np.linspace(*FAST_HZ, len(order))
@@ -63,7 +63,7 @@ def _pattern(serial: str, setting: JointSetting, slow_hz: float, fast_hz: float,
     limits = setting.limits
     room = limits.room_rad(setting.home_rad)
     if room <= 0.0 or limits.accel_rad_s2 <= 0.0:
-        raise ValueError(
+        raise NoExcitation(
             f"{serial} cannot move about {setting.home_rad:.2f} rad: its range is {limits.low_rad:.2f} .. "
             f"{limits.high_rad:.2f} rad, it may accelerate by {limits.accel_rad_s2:.2f} rad/s^2"
         )

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind
+from module_agent.model.errors import UsageError
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GainSet, WindowedSine
 
 Mode = Literal["joint", "simultaneous"]
@@ -16,7 +17,7 @@ Excitation = Literal["joint-by-joint", "d-optimal"]
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
 
 
-class PlanFileError(ValueError):
+class PlanFileError(UsageError):
     """The file is no plan; the message names the file, the setting and what would be right."""
 
 

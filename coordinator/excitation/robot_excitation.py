@@ -7,8 +7,8 @@ import numpy as np
 
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
-from coordinator.excitation.d_optimal import ExcitationTask, NoExcitation, design_excitation, draw_possible
-from coordinator.excitation.joint_limits import JointLimits, joint_limits
+from coordinator.excitation.d_optimal import ExcitationTask, design_excitation, draw_possible
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation, joint_limits
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion, Segment
 from module_agent.model.catalogue import ModuleType
@@ -40,8 +40,8 @@ def robot_excitation(
     The same robot and seed have the same motions: a run that resumes goes on with those that it began with.
 
     Raises:
-        NoExcitation: too few motions are possible.
-        ValueError: a joint has no room at all, or there is not one module per joint.
+        NoExcitation: too few motions are possible, or a joint has no room at all.
+        ValueError: there is not one module per joint.
     """
     rng = np.random.default_rng(seed)
     task = excitation_task(chain, modules, plan)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.excitation.joint_limits import JointLimits, motion_peaks
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation, motion_peaks
 from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.chain import Array
 from module_agent.signals.filtering import differentiate
@@ -53,13 +53,13 @@ def draw_segment(
     The pose takes between nothing and all of the reach, the motion what is left of it and of the range.
 
     Raises:
-        ValueError: a joint has no room to move about its home.
+        NoExcitation: a joint has no room to move about its home.
     """
     patterns, poses = [], []
     for home, limit in zip(home_rad, limits, strict=True):
         room = min(reach_rad, limit.room_rad(float(home)))
         if room <= 0.0:
-            raise ValueError(
+            raise NoExcitation(
                 f"a joint has no room about {home:.2f} rad: its range is {limit.low_rad:.2f} .. "
                 f"{limit.high_rad:.2f} rad"
             )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.excitation.fisher_information import CircleSetting, JointPath, SensorNoise, circle_covariance
-from coordinator.excitation.joint_limits import JointLimits, motion_peaks
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation, motion_peaks
 from module_agent.control.waveform import duration_s, minimum_jerk_duration_s, waveform
 from module_agent.model.catalogue import GRAVITY_M_S2
 from module_agent.model.imu_prior import ImuPrior
@@ -81,14 +81,14 @@ def design_joint(task: JointTask, constant: ConstantMotion | None = None) -> Joi
     """Return the motions that leave the radius least uncertain; the slow one is `constant`, if it is given.
 
     Raises:
-        ValueError: nothing fits into range, limits and time, with all three.
+        NoExcitation: nothing fits into range, limits and time, with all three.
     """
     slow = [constant] if constant is not None else _sweeps(task)
     found = [
         _judged(task, one, sine) for one in slow for sine in _sines(task, task.budget_s - _other_s(task, one))
     ]
     if not found:
-        raise ValueError(
+        raise NoExcitation(
             f"no motion fits: {task.budget_s:.1f} s, {task.limits.room_rad(task.home_rad):.2f} rad to either "
             f"side, at most {task.limits.speed_rad_s:.2f} rad/s and {task.limits.accel_rad_s2:.2f} rad/s^2"
         )

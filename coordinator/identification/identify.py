@@ -23,7 +23,7 @@ from coordinator.identification.result_builder import build_result
 from coordinator.identification.robot_refinement import CUTOFF_HZ, refine_robot
 from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
-from coordinator.kinematics.assembly import AssemblyError, assemble
+from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circles_of_all
@@ -40,9 +40,10 @@ from coordinator.synchronisation.motion_windows import (
     window,
 )
 from coordinator.synchronisation.round_trips import map_clocks
-from coordinator.topology.topology import Topology, TopologyError
+from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import JointMotion, settling_samples
@@ -116,7 +117,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
         refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
-    except (TopologyError, AssemblyError, ValueError) as error:
+    except (DataError, ValueError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
         f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"

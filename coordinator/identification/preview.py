@@ -27,6 +27,7 @@ from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import MotionSeen, Topology, likely_topology
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.filtering import settling_samples
 from module_agent.wire.messages import Estimate
@@ -227,7 +228,7 @@ class Previewer:
             return found
         try:
             return _refined(found, self._kinds(found), self._parts_of(found), self._prior)
-        except (ValueError, np.linalg.LinAlgError):
+        except (DataError, ValueError, np.linalg.LinAlgError):
             return found
 
     def _is_refined(self, found: Preview) -> bool:

@@ -26,6 +26,7 @@ from coordinator.kinematics.initial_guess import initial_chain
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.perturbation import apply_perturbation, frozen, skew
 
 # A direction counts as resolved if its one sigma is below this (rad or m). A parallel pair of axes is never
@@ -60,7 +61,7 @@ class ChainFit(NamedTuple):
         return self.estimate.chain
 
 
-class AssemblyError(ValueError):
+class AssemblyError(DataError):
     """The observations contradict each other beyond any noise; the message names the worst pair."""
 
 
@@ -80,7 +81,8 @@ def assemble(
     truncated SVD), so that unresolved directions stay where the neutral first guess has put them.
 
     Raises:
-        ValueError: no rest observation, unknown serials or wrong shapes.
+        DataError: no rest observation.
+        ValueError: unknown serials or wrong shapes.
         AssemblyError: an axis comes out opposite to what was observed.
     """
     if len(types) != len(topology.serials):

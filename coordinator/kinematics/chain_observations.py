@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.perturbation import adjoint, skew
 from module_agent.wire.messages import Estimate
@@ -88,10 +89,11 @@ def pack(
     all.
 
     Raises:
-        ValueError: an unknown serial, a wrong shape, or no rest at all.
+        DataError: no rest observation.
+        ValueError: an unknown serial or a wrong shape.
     """
     if not rests:
-        raise ValueError("no rest observation: the directions to gravity are needed to assemble a chain")
+        raise DataError("no rest observation: the directions to gravity are needed to assemble a chain")
     index = {serial: k for k, serial in enumerate(serials)}
     _check(index, pairs, rests)
     used = [p for p in pairs if p.joint != p.observer]

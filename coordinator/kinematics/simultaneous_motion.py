@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from coordinator.kinematics.chain_observations import PairObservation
 from coordinator.topology.topology import MotionSeen
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.perturbation import frozen
 
 MOVED_ABOVE = 0.5
@@ -87,7 +88,7 @@ def simultaneous_response(
         bandwidth_hz: of their low-pass; there are 2 bandwidth / rate as many independent samples.
 
     Raises:
-        ValueError: a joint hardly turned, or two joints cannot be told apart, with their columns.
+        DataError: a joint hardly turned, or two joints cannot be told apart, with their columns.
     """
     _check_told_apart(data.qd_rad_s)
     independent = min(1.0, 2.0 * bandwidth_hz / rate_hz)
@@ -158,14 +159,14 @@ def _circle(
 def _check_told_apart(qd_rad_s: Array) -> None:
     size = np.sqrt(np.mean(qd_rad_s**2, axis=0))
     if size.min() < MIN_RATE_RAD_S:
-        raise ValueError(
+        raise DataError(
             f"the joint in column {int(size.argmin())} turned at only {size.min():.2g} rad/s rms while all "
             f"moved; {MIN_RATE_RAD_S} are needed"
         )
     alike = np.abs(qd_rad_s.T @ qd_rad_s) / len(qd_rad_s) / np.outer(size, size) - np.eye(len(size))
     if alike.max() > 0.9:
         i, k = np.unravel_index(int(alike.argmax()), alike.shape)
-        raise ValueError(
+        raise DataError(
             f"the joints in columns {i} and {k} moved alike (correlation {alike.max():.2f}): give them "
             "frequencies of their own"
         )

@@ -6,6 +6,7 @@ import numpy as np
 
 from coordinator.excitation.joint_limits import (
     JointLimits,
+    NoExcitation,
     joint_limits,
     least_accel_rad_s2,
     likely_inertia_kg_m2,
@@ -102,7 +103,7 @@ class MotionChoice:
         """Return the best motions; none if none fits into the time, and the plan's have to do."""
         try:
             return design_joint(self._task(serial, limits), slow)
-        except ValueError:
+        except NoExcitation:
             return None
 
     def _task(self, serial: str, limits: JointLimits) -> JointTask:

@@ -15,6 +15,7 @@ from coordinator.baseline.known_robot import baseline_within, keep_baseline, loa
 from coordinator.baseline.update import updated
 from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
+from coordinator.excitation.joint_limits import NoExcitation
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
@@ -54,6 +55,7 @@ from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.transport.transport import Transport
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
@@ -198,7 +200,7 @@ class Run:
         """Return the robot as far as it is known; only to be looked at, so that a run does not fail by it."""
         try:
             return self._looks.look(explored)
-        except (ValueError, KeyError) as error:
+        except (DataError, ValueError, KeyError) as error:
             logger.info("nothing to show of the robot so far: %s", error)
         except Exception:
             # A run must not end for want of a picture.
@@ -236,7 +238,7 @@ class Run:
         modules = [RobotModule(self._link.kind(s), self._link.info(s).limits) for s in chain.serials]
         try:
             return await self._compute(lambda: robot_excitation(chain, modules, plan))
-        except ValueError as error:
+        except NoExcitation as error:
             self._screen.note(f"{error}; exciting joint by joint instead")
             return ()
 

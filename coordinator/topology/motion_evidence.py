@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 
 BLOCKS = 6
 # Of a thousand observations, one has gone wrong in a way that is in no model: it tells nothing.
@@ -28,8 +29,8 @@ FEWEST_SAMPLES = 4 * BLOCKS
 GIVE_LEFT = 0.3
 
 
-class NotMoved(ValueError):
-    """The joint was told to move and hardly did; the message says how much."""
+class NotMoved(DataError):
+    """The joint was commanded to move and hardly did; the message says how much."""
 
 
 class MotionEvidence(NamedTuple):
@@ -88,11 +89,11 @@ def motion_evidence(
 
     Raises:
         NotMoved: the joint's rate is below `MIN_RATE_RAD_S` rms.
-        ValueError: fewer than `FEWEST_SAMPLES` samples.
+        DataError: fewer than `FEWEST_SAMPLES` samples.
     """
     rate = qd_rad_s[:, joint]
     if rate.size < FEWEST_SAMPLES:
-        raise ValueError(f"{rate.size} samples of the motion; at least {FEWEST_SAMPLES} are needed")
+        raise DataError(f"{rate.size} samples of the motion; at least {FEWEST_SAMPLES} are needed")
     size = float(np.sqrt(np.mean(rate**2)))
     if size < MIN_RATE_RAD_S:
         raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {MIN_RATE_RAD_S} is needed")

@@ -16,6 +16,7 @@ import numpy as np
 from coordinator.topology.forest_likelihood import Parents, ancestors, edge_log_odds, likeliest_forest, rivals
 from coordinator.topology.motion_evidence import carried_log_odds
 from module_agent.model.chain import BASE, Array
+from module_agent.model.errors import DataError
 
 # What is less likely than this (log-odds) to be right is worth another motion: 1 in 100 may be wrong.
 DOUBTFUL_BELOW = float(np.log(99.0))
@@ -119,7 +120,7 @@ class Topology(NamedTuple):
         return f", {_chance(least)} sure" if least < DOUBTFUL_BELOW else ""
 
 
-class TopologyError(ValueError):
+class TopologyError(DataError):
     """The observations describe no tree; `serials` are the modules that contradict each other."""
 
     def __init__(self, message: str, serials: tuple[str, ...]):

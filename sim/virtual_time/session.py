@@ -6,6 +6,7 @@ What it records is what a run's `session.mcap` holds, for experiments that need 
 import asyncio
 from collections.abc import Callable
 
+from coordinator.excitation.joint_limits import NoExcitation
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
@@ -116,5 +117,5 @@ class _Keeper:
         modules = [RobotModule(module_type(one.module_type), one.limits) for one in told if one is not None]
         try:
             return robot_excitation(chain, modules, self._plan)
-        except ValueError:
+        except NoExcitation:
             return ()

@@ -24,6 +24,7 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.null_space import name_null_space
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import BIASES_ONLY, UNCALIBRATED
 from module_agent.model.perturbation import apply_perturbation
 
@@ -325,7 +326,7 @@ def test_delays_need_the_rates_of_the_readings(robots: Any) -> None:
 def test_too_few_samples_are_refused(robots: Any) -> None:
     truth, _ = robots.random(0, joints=4)
     few = SensorData(*(signal[:5] for signal in _sensed(truth)[:5]))
-    with pytest.raises(ValueError, match="5 samples are too few to refine a chain of 4 modules"):
+    with pytest.raises(DataError, match="5 samples are too few to refine a chain of 4 modules"):
         refine_chain(truth, few)
 
 

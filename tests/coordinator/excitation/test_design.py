@@ -10,11 +10,10 @@ from coordinator.excitation.d_optimal import (
     TORQUE_SHARE,
     Excitation,
     ExcitationTask,
-    NoExcitation,
     design_excitation,
     information,
 )
-from coordinator.excitation.joint_limits import JointLimits, joint_limits, motion_peaks
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation, joint_limits, motion_peaks
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import SampledMotion, sampled, way
 from coordinator.excitation.self_collision import CLEARANCE_M, clearance_m
@@ -160,5 +159,5 @@ def test_a_robot_too_heavy_for_its_motors_is_told_so() -> None:
 def test_a_joint_at_the_end_of_its_range_is_told_so() -> None:
     task = task_of("a2085_04", segments=2)
     stuck = task._replace(limits=(JointLimits(1.0, 1.0, -1.0, 0.0), *task.limits[1:]))
-    with pytest.raises(ValueError, match="no room"):
+    with pytest.raises(NoExcitation, match="no room"):
         design_excitation(stuck, np.random.default_rng(0), candidates=4)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from coordinator.excitation.joint_limits import NoExcitation
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import END_RAD, RobotModule, excitation_task, robot_excitation
 from module_agent.control.gains import catalogue_limits
@@ -50,7 +51,7 @@ def test_speed_and_torque_are_those_that_modules_say() -> None:
 
 
 def test_a_module_that_may_not_leave_home_is_not_excited() -> None:
-    with pytest.raises(ValueError, match="no room"):
+    with pytest.raises(NoExcitation, match="no room"):
         robot_excitation(CHAIN, modules(min_position_rad=0.0, max_position_rad=1.0), PLAN)
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.excitation.joint_limits import JointLimits, joint_limits, motion_peaks
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation, joint_limits, motion_peaks
 from coordinator.excitation.single_joint import JointTask, design_joint, predicted_sigma_m
 from module_agent.control.gains import catalogue_limits
 from module_agent.control.motion import Motion, check_motion
@@ -40,7 +40,7 @@ def test_no_type_is_asked_for_more_than_it_can_do_and_the_time_is_kept(
     limits = joint_limits(kind, torque, inertia)
     task = TASK._replace(limits=limits, home_rad=home, budget_s=budget)
     if limits.accel_rad_s2 <= 0.0:
-        with pytest.raises(ValueError, match="no motion fits"):
+        with pytest.raises(NoExcitation, match="no motion fits"):
             design_joint(task)
         return
     try:
@@ -94,7 +94,7 @@ def test_a_joint_that_hardly_accelerates_is_given_a_slower_sweep() -> None:
 
 
 def test_without_time_or_room_that_is_said_with_the_figures() -> None:
-    with pytest.raises(ValueError, match=r"no motion fits: 2\.0 s, 3\.00 rad to either side"):
+    with pytest.raises(NoExcitation, match=r"no motion fits: 2\.0 s, 3\.00 rad to either side"):
         design_joint(TASK._replace(budget_s=2.0))
-    with pytest.raises(ValueError, match=r"0\.10 rad to either side"):
+    with pytest.raises(NoExcitation, match=r"0\.10 rad to either side"):
         design_joint(TASK._replace(home_rad=2.9))

@@ -16,6 +16,7 @@ from coordinator.kinematics.chain_observations import (
 )
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import apply_perturbation
 
@@ -261,7 +262,7 @@ def test_a_missing_rest_and_unknown_serials_are_refused(robots: Any) -> None:
     chain, types = robots.random(1, joints=2)
     positions = robots.positions(chain, 1)
     pairs, rest = robots.observe(chain, positions), robots.rest(chain, positions[0])
-    with pytest.raises(ValueError, match="gravity"):
+    with pytest.raises(DataError, match="gravity"):
         assemble(robots.topology(chain), types, pairs, [])
     with pytest.raises(ValueError, match="M99 is not in the topology"):
         assemble(robots.topology(chain), types, [pairs[0]._replace(joint="M99")], [rest])

@@ -18,6 +18,7 @@ from coordinator.kinematics.simultaneous_motion import (
 )
 from coordinator.topology.topology import find_topology
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 
 RATE_HZ = 250.0
 DURATION_S = 12.0
@@ -136,7 +137,7 @@ def test_joints_that_moved_alike_are_named() -> None:
     q, qd, qdd = multi_sines(3)
     qd[:, 2] = 2.0 * qd[:, 0]
     data = SimultaneousMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
-    with pytest.raises(ValueError, match="columns 0 and 2 moved alike"):
+    with pytest.raises(DataError, match="columns 0 and 2 moved alike"):
         simultaneous_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
 
 
@@ -144,5 +145,5 @@ def test_a_joint_that_did_not_turn_is_named() -> None:
     q, qd, qdd = multi_sines(3)
     qd[:, 1] = 0.0
     data = SimultaneousMotion(q, qd, qdd, np.zeros((len(q), 3, 3)), np.zeros((len(q), 3, 3)))
-    with pytest.raises(ValueError, match=r"column 1 turned at only 0 rad/s"):
+    with pytest.raises(DataError, match=r"column 1 turned at only 0 rad/s"):
         simultaneous_response(data, StillReading(np.zeros((3, 3)), np.zeros((3, 3))), RATE_HZ, 15.0)
