@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.model.chain import Array
+from module_agent.model.read_only import frozen, make_read_only
 from module_agent.signals.filtering import NS_PER_S, resample
 
 # Of a sampling interval; a fiftieth at 0.1 of the sampling rate is 1.3 % of the amplitude, between samples.
@@ -66,10 +67,10 @@ def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
     odd_ns = np.round(np.arange(0, 2 * count + 1, 2) * step_ns).astype(np.int64)
     even_ns = np.round(np.arange(1, 2 * count, 2) * step_ns).astype(np.int64)
     signals = [log.q_rad, log.tau_nm, *([] if log.qd_rad_s is None else [log.qd_rad_s])]
-    first = [_frozen(signal[1 : 2 * count : 2]) for signal in signals]
+    first = [frozen(signal[1 : 2 * count : 2]) for signal in signals]
     gap_ns = int(np.ceil(3.0 * step_ns))
     others = [
-        _frozen(resample([odd_ns], [signal[0 : 2 * count + 1 : 2]], even_ns, max_gap_ns=gap_ns)[:, 0])
+        frozen(resample([odd_ns], [signal[0 : 2 * count + 1 : 2]], even_ns, max_gap_ns=gap_ns)[:, 0])
         for signal in signals
     ]
     return _half(log, first), _half(log, others)
@@ -78,12 +79,6 @@ def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
 def _half(log: JointLog, signals: Sequence[Array]) -> JointLog:
     velocity = signals[2] if len(signals) > 2 else None
     return JointLog(0.5 * log.rate_hz, signals[0], velocity, signals[1], log.resampled)
-
-
-def _frozen(signal: Array) -> Array:
-    copy = np.array(signal)
-    copy.flags.writeable = False
-    return copy
 
 
 def read_log(path: Path, joints: Sequence[str]) -> JointLog:
@@ -250,8 +245,7 @@ def _log(table: _Table) -> JointLog:
     even = np.arange(times.size) / rate_hz
     uneven = bool(np.abs(times - times[0] - even).max() > _JITTER / rate_hz)
     found = {key: _even(times, values, even) if uneven else values for key, values in table.signals.items()}
-    for array in found.values():
-        array.flags.writeable = False
+    make_read_only(found.values())
     return JointLog(rate_hz, found["q"], found.get("qd"), found["tau"], uneven)
 
 

@@ -18,6 +18,7 @@ from coordinator.dynamics.pseudo_inertia import (
 from coordinator.parameter_fit.physically_consistent import physically_consistent
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from module_agent.model.chain import Array
+from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 
 # The belief that a link's distribution of mass is as claimed to about 30 % (`physical_fit.WEIGHTS`).
@@ -69,8 +70,7 @@ def real_bodies(problem: Problem, fit: WeightedFit, prior: Array, trust: float) 
     phi, drives = solution.x[: problem.inertial].copy(), solution.x[problem.inertial :].copy()
     back = [parameter_transform(np.linalg.inv(home)) for home in problem.robot.homes]
     own = [turn @ one for turn, one in zip(back, phi.reshape(-1, PER_BODY), strict=True)]
-    for array in (phi, drives, solution.divergence):
-        array.flags.writeable = False
+    make_read_only((phi, drives, solution.divergence))
     return RealBodies(phi, tuple(body(pseudo_inertia(one)) for one in own), drives, solution.divergence)
 
 

@@ -17,6 +17,7 @@ from coordinator.dynamics.drive_model import (
 )
 from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
 from module_agent.model.chain import Array
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, torque_regressor
 from module_agent.signals.torque_terms import TERM_KINDS, Term
 
@@ -148,8 +149,7 @@ def _regressor(robot: UrdfRobot, drives: Sequence[DriveColumn], log: FilteredLog
     inertial = torque_regressor(robot.chain, log.q_rad, log.qd_rad_s, log.qdd_rad_s2)
     further = drive_regressor(drives, _signals(drives, log, slow_rad_s), len(robot.bodies))
     found = np.concatenate([inertial, further], axis=2)
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:

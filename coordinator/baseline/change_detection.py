@@ -30,7 +30,8 @@ from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, sensor_data, window
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import UNCALIBRATED
-from module_agent.model.perturbation import adjoint, frozen, perturbation_between
+from module_agent.model.perturbation import adjoint, perturbation_between
+from module_agent.model.read_only import frozen
 from module_agent.signals.filtering import settling_samples
 
 # Scale and axes of an IMU that has been corrected for them: for the two sessions they are the same.

@@ -17,7 +17,8 @@ from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE
 from coordinator.identification.identified import Kinematics
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import adjoint, apply_perturbation, frozen, perturbation_between
+from module_agent.model.perturbation import adjoint, apply_perturbation, perturbation_between
+from module_agent.model.read_only import frozen
 
 # A direction that a known part does not tell is this uncertain, in rad or in m.
 UNTOLD = 1.0

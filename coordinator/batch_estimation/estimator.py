@@ -29,7 +29,8 @@ from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import BIASES_ONLY, ImuPrior
-from module_agent.model.perturbation import apply_perturbation, frozen
+from module_agent.model.perturbation import apply_perturbation
+from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 
 ITERATIONS = 20

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import frozen
+from module_agent.model.read_only import frozen
 
 PARALLEL_BELOW_RAD = 1e-7
 MEETING_BELOW_M = 1e-9

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from coordinator.kinematics.frames import distal_homes, proximal_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
-from module_agent.model.perturbation import adjoint, frozen, skew
+from module_agent.model.perturbation import adjoint, skew
+from module_agent.model.read_only import frozen
 
 Face = Literal["output", "housing"]
 PARAMETERS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")

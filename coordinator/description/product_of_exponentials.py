@@ -16,7 +16,8 @@ from scipy.spatial.transform import RigidTransform
 from coordinator.kinematics.frames import distal_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import frozen, skew
+from module_agent.model.perturbation import skew
+from module_agent.model.read_only import frozen
 
 
 class Tip(NamedTuple):

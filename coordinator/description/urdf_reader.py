@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from coordinator.dynamics.pseudo_inertia import parameters, pseudo_inertia
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import UsageError
+from module_agent.model.read_only import make_read_only, read_only
 
 STANDARD_GRAVITY = (0.0, 0.0, 9.81)
 _MOVING, _FIXED = ("revolute", "continuous"), "fixed"
@@ -91,8 +92,7 @@ def _robot(root: Element, gravity: Array) -> UrdfRobot:
     homes = np.array([placed[joint.child].pose for joint in moving])
     axis = np.array([home[:3, :3] @ j.axis for home, j in zip(homes, moving, strict=True)])
     point = homes[:, :3, 3].copy()
-    for array in (homes, axis, point, gravity):
-        array.flags.writeable = False
+    make_read_only((homes, axis, point, gravity))
     chain = Chain(
         serials=tuple(joint.name for joint in moving),
         parent=tuple(_body(placed, joint.parent) for joint in moving),
@@ -186,8 +186,7 @@ def _inertias(links: dict[str, Element], placed: dict[str, _Placed], joints: int
     if not claimed:
         return None
     phi = np.concatenate([parameters(pseudo) for pseudo in total])
-    phi.flags.writeable = False
-    return phi
+    return read_only(phi)
 
 
 def _link_inertia(inertial: Element, where: str) -> Array:

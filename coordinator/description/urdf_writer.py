@@ -23,6 +23,7 @@ from coordinator.dynamics.pseudo_inertia import (
 )
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, check_phi
 
 
@@ -107,8 +108,7 @@ def link_homes(chain: Chain) -> Array:
     for home, axis, point in zip(homes, chain.axis, chain.point, strict=True):
         home[:3, :3] = _shortest_turn(np.array([0.0, 0.0, 1.0]), axis)
         home[:3, 3] = point
-    homes.flags.writeable = False
-    return homes
+    return read_only(homes)
 
 
 def _shortest_turn(from_direction: Array, to_direction: Array) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.model.chain import Array
+from module_agent.model.read_only import read_only
 from module_agent.signals.torque_terms import DRIVE_TERMS, TERM_KINDS, Term, term_signal
 
 # Everything but `curved`, which is close to a sum of Coulomb and viscous friction in short recordings.
@@ -89,8 +90,7 @@ def drive_signals(
         signals[:, k] = term_signal(
             term, qd[:, at].sum(axis=1), qdd[:, at].sum(axis=1), float(slow[at].max())
         )
-    signals.flags.writeable = False
-    return signals
+    return read_only(signals)
 
 
 def drive_regressor(columns: Sequence[DriveColumn], signals: ArrayLike, joints: int) -> Array:
@@ -108,5 +108,4 @@ def drive_regressor(columns: Sequence[DriveColumn], signals: ArrayLike, joints: 
     regressor = np.zeros((len(values), joints, len(columns)))
     for k, column in enumerate(columns):
         regressor[:, list(column.joints), k] = values[:, k, None]
-    regressor.flags.writeable = False
-    return regressor
+    return read_only(regressor)

@@ -12,6 +12,7 @@ import numpy as np
 from coordinator.kinematics.frames import distal_homes, housing_homes, output_homes, proximal_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.read_only import make_read_only, read_only
 
 # What turns with a module's output: a flange and the last wheel of the gear. Not published; a flange of
 # aluminium of 36 mm by 6 mm has 16 g, the wheel and its bearing about as much.
@@ -36,8 +37,7 @@ def module_prior(chain: Chain, types: Sequence[ModuleType]) -> Array:
     for i, parent in enumerate(chain.parent):
         if parent != BASE:
             found[parent] += held[i]
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def sides_prior(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array]:
@@ -58,7 +58,7 @@ def sides_prior(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array
         parent = chain.parent[i]
         if parent != BASE:
             held[i] += _link(leaves[parent][:3, 3], enters[i][:3, 3])
-    turned.flags.writeable = held.flags.writeable = False
+    make_read_only((turned, held))
     return turned, held
 
 

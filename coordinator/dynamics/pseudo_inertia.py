@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.model.chain import Array
+from module_agent.model.read_only import make_read_only
 
 # Parameters in kg, kg m and kg m^2 have no common size. First moments are measured per 0.3 m and inertias per
 # (0.3 m)^2, a usual reach of a module with its link, so that all are in kg. A scale per column of the
@@ -95,7 +96,7 @@ def body(pseudo: ArrayLike) -> Body:
     mass, centre = float(matrix[3, 3]), matrix[:3, 3] / matrix[3, 3]
     spread = matrix[:3, :3] - mass * np.outer(centre, centre)
     inertia = np.trace(spread) * np.eye(3) - spread
-    centre.flags.writeable = inertia.flags.writeable = False
+    make_read_only((centre, inertia))
     return Body(mass, centre, inertia)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
 
@@ -68,8 +69,7 @@ def torque_error(
         [_ratio(_norm(e, 0), _norm(size, 0)) for e in errors],
     )
     samples = used.sum(axis=0, dtype=np.int64)
-    for array in (per_joint, mean_per_joint, samples):
-        array.flags.writeable = False
+    make_read_only((per_joint, mean_per_joint, samples))
     return TorqueError(overall, per_joint, mean_overall, mean_per_joint, samples)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from coordinator.excitation.joint_limits import JointLimits, NoExcitation, motion_peaks
 from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.chain import Array
+from module_agent.model.read_only import make_read_only, read_only
 from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import GoTo, MultiSine, Sine
 
@@ -114,8 +115,7 @@ def way(from_rad: Array, to_rad: Array, max_speed_rad_s: float, rate_hz: float) 
         ],
         axis=1,
     )
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def sampled(segment: Segment, rate_hz: float) -> SampledMotion:
@@ -125,5 +125,5 @@ def sampled(segment: Segment, rate_hz: float) -> SampledMotion:
     waves = [waveform(pattern, 0.0, t_s) for pattern in segment.patterns]
     q = segment.pose_rad + np.stack([wave.offset_rad for wave in waves], axis=1)
     qd = np.stack([wave.velocity_rad_s for wave in waves], axis=1)
-    q.flags.writeable = qd.flags.writeable = False
+    make_read_only((q, qd))
     return SampledMotion(q, qd, differentiate(qd, rate_hz))

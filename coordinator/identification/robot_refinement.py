@@ -25,7 +25,7 @@ from coordinator.synchronisation.motion_windows import RATE_HZ, Window, encoder_
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ImuPrior
-from module_agent.model.perturbation import frozen
+from module_agent.model.read_only import frozen
 
 # Six times the 2 Hz of the windowed sine, and above the resonance of a base that is worth the name.
 CUTOFF_HZ = 12.0

@@ -27,7 +27,8 @@ from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
-from module_agent.model.perturbation import apply_perturbation, frozen, skew
+from module_agent.model.perturbation import apply_perturbation, skew
+from module_agent.model.read_only import frozen
 
 # A direction counts as resolved if its one sigma is below this (rad or m). A parallel pair of axes is never
 # parallel to the last digit: the noise of the axes would "resolve" the offset along them to half a metre.

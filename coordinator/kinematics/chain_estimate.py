@@ -7,7 +7,8 @@ import numpy as np
 
 from coordinator.kinematics.null_space import Unresolved, name_null_space
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import frozen, skew
+from module_agent.model.perturbation import skew
+from module_agent.model.read_only import frozen
 
 
 @dataclass(frozen=True, eq=False)

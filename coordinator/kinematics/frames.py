@@ -12,7 +12,7 @@ import numpy as np
 
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import frozen
+from module_agent.model.read_only import frozen
 
 # Of the sine: below this two axes are parallel, and any tilt makes the angle grow.
 PARALLEL_BELOW = 1e-6

@@ -17,7 +17,7 @@ from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.forward_kinematics import body_displacements, screw_motion
-from module_agent.model.perturbation import frozen
+from module_agent.model.read_only import frozen
 
 # How far a mounting may be from neutral, in rad and m. It only fills in what no observation says better than
 # this; the refinement that follows knows nothing of it.

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import frozen
+from module_agent.model.read_only import frozen
 
 Kind = Literal[
     "offset_along_axis", "rotation_about_axis", "rotation_about_gravity", "position", "combination"

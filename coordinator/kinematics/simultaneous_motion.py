@@ -23,7 +23,7 @@ from coordinator.kinematics.chain_observations import PairObservation
 from coordinator.topology.topology import MotionSeen
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
-from module_agent.model.perturbation import frozen
+from module_agent.model.read_only import frozen
 
 MOVED_ABOVE = 0.5
 # What is left of taking the axes as constant, per square of the joints' swing [1 / rad^2]: joints between

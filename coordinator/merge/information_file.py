@@ -9,6 +9,7 @@ import numpy as np
 
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.information import JointInformation
+from module_agent.model.read_only import make_read_only
 
 VERSION = 2
 
@@ -91,8 +92,7 @@ def read_information(path: Path) -> RunInformation:
 
 
 def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
-    for array in arrays.values():
-        array.flags.writeable = False
+    make_read_only(arrays.values())
     joints = len(arrays["serials"])
     rest, samples = _checked(arrays["rest_nm2"], (joints,)), arrays["samples"]
     found = tuple(

@@ -20,6 +20,7 @@ from scipy.linalg import qr
 from scipy.stats import chi2
 
 from module_agent.model.chain import Array
+from module_agent.model.read_only import make_read_only
 
 
 class Evidence(NamedTuple):
@@ -146,12 +147,11 @@ def _explained(columns: Array, target: Array) -> Change:
     best: Array = covariance @ (columns.T @ target)
     off = columns @ best - target
     gain = float(target @ target - off @ off - best @ best)
-    for array in (best, covariance):
-        array.flags.writeable = False
+    make_read_only((best, covariance))
     return Change(gain, best, covariance)
 
 
 def _frozen(triangle: Array) -> Evidence:
     rows, target = triangle[:, :-1].copy(), triangle[:, -1].copy()
-    rows.flags.writeable = target.flags.writeable = False
+    make_read_only((rows, target))
     return Evidence(rows, target)

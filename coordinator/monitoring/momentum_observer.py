@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.signal import lfilter
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 
 # Of 8 Hz: two thirds of a blow's torque are there after 20 ms.
@@ -63,8 +64,7 @@ class MomentumObserver:
         )
         self._state = _State(momentum[-1], drive[-1], filtered[0])
         found = np.asarray(found)
-        found.flags.writeable = False
-        return found
+        return read_only(found)
 
     def _momentum(self, q: Array, qd: Array) -> Array:
         return inverse_dynamics(self._weightless, self._phi, q, np.zeros_like(q), qd)

@@ -42,6 +42,7 @@ from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.information import JointInformation, gather
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, inverse_dynamics
 
 # How far parameters may be from where a fit has them, per `parameter_scale`: bodies weigh some hundred grams.
@@ -309,8 +310,7 @@ def fitted_drive(kind: ModuleType, rows: Array, torque_nm: Array) -> Array:
     target = np.concatenate([(torque_nm - rows @ expected) / sigma, np.zeros(TERMS)])
     change = np.linalg.lstsq(stacked, target, rcond=None)[0]
     found: Array = expected + change
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def catalogued_drive(kind: ModuleType) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import DYNAMIC_CUTOFF_HZ, RATE_HZ, STEP_NS
 from module_agent.model.chain import Array
+from module_agent.model.read_only import make_read_only
 from module_agent.signals.autocorrelation import autocovariance
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
@@ -164,7 +165,7 @@ def _hole(serial: str, track: _Track, from_ns: int) -> Hole | None:
 def _block(grid: Times, tracks: Sequence[_Track]) -> Block:
     joint = np.stack([_cubic(track.t_ns, track.joint, grid) for track in tracks], axis=1)
     imu = np.stack([_cubic(track.imu_t_ns, track.imu, grid) for track in tracks], axis=1)
-    joint.flags.writeable = imu.flags.writeable = False
+    make_read_only((joint, imu))
     q, qd, tau, motor, current = (joint[..., k] for k in range(len(_JOINT)))
     return Block(grid, q, qd, tau, motor, current, imu[..., :3], imu[..., 3:])
 

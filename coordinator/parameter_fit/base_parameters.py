@@ -23,6 +23,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_trans
 from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from module_agent.model.chain import Array, Chain
 from module_agent.model.information import JointInformation
+from module_agent.model.read_only import make_read_only, read_only
 from module_agent.model.regressor import PER_BODY
 
 # A column that keeps less than this of its length beside the columns chosen before it is passed over, so that
@@ -223,9 +224,7 @@ def base_parameters(
         share=np.sum(space**2, axis=0),
         condition=float(values[0] / values[kept][-1]) if kept.any() else float("inf"),
     )
-    for array in found:
-        if isinstance(array, np.ndarray):
-            array.flags.writeable = False
+    make_read_only(found)
     return found
 
 
@@ -292,8 +291,7 @@ def joint_frames(chain: Chain) -> Array:
         x, origin = found
         frame[:3, :3] = np.column_stack([x, np.cross(axis, x), axis])
         frame[:3, 3] = origin
-    frames.flags.writeable = False
-    return frames
+    return read_only(frames)
 
 
 def _towards(axis: Array, point: Array, other: Array, there: Array) -> tuple[Array, Array] | None:

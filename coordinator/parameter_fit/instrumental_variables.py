@@ -31,6 +31,7 @@ from coordinator.parameter_fit.significance import SIGNIFICANT_F, f_statistic
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, known_scale, refine_scale, scaled
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
+from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 from module_agent.signals.torque_terms import READING_TERMS
 
@@ -192,6 +193,5 @@ def _terms(
         noise = fit.torque_sigma_nm[i] ** 2 / independent_fraction * (inverse @ inverse.T)
         sigma[i, one.used] = np.sqrt(np.diagonal(noise + through @ fit.covariance @ through.T))
     gain, used, spread = (np.array([one[k] for one in earned]) for k in range(3))
-    for array in (value, sigma, gain, used, spread):
-        array.flags.writeable = False
+    make_read_only((value, sigma, gain, used, spread))
     return TermsFit(value, sigma, gain, used, spread)

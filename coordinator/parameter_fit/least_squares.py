@@ -15,6 +15,7 @@ from scipy.linalg import qr
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress
+from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 
 # Rounding in the regressor is 1e-15 of the largest singular value and grows with the depth of the tree; the
@@ -258,7 +259,5 @@ def _fit(
         torque_sigma_nm=sigma,
         samples=np.array([piece.samples for piece in information], dtype=np.int64),
     )
-    for item in fit:
-        if isinstance(item, np.ndarray):
-            item.flags.writeable = False
+    make_read_only(fit)
     return fit

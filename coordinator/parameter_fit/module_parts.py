@@ -21,6 +21,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_transform, parameters
 from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY
 
 Role = Literal["turned", "held"]
@@ -71,8 +72,7 @@ def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
                 raise ValueError(f"{part.name} is not among the {len(parts)} parts")
             if body >= 0:
                 found[_ten(body), _ten(place[part])] = into_root
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> Array:
@@ -101,8 +101,7 @@ def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> A
             whole = part + part[0] * surplus[body] if body >= 0 else part
             found[place[Part(serial, role, bool(chain.reversed[k]))]] = into_imu @ whole
     flat = found.ravel()
-    flat.flags.writeable = False
-    return flat
+    return read_only(flat)
 
 
 def part_columns(parts: Sequence[Part]) -> Columns:

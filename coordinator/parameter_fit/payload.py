@@ -24,6 +24,7 @@ from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from coordinator.parameter_fit.physically_consistent import physically_consistent
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
+from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 
 # Before anything moved: some hundred grams, about as large as a fist, near the module that carries it. It
@@ -146,8 +147,7 @@ def find_payload(
     best = max(gains, key=lambda b: gains[b])
     rival = max((b for b in gains if b != best), key=lambda b: gains[b], default=None)
     one, pseudo = found[best], pseudo_inertia(found[best].phi)
-    for array in (one.phi, one.covariance, pseudo):
-        array.flags.writeable = False
+    make_read_only((one.phi, one.covariance, pseudo))
     return Payload(
         carrier=best,
         changed=float(none @ none) > FOUND_ABOVE + EXPLAINED_BELOW * len(none) or gains[best] > FOUND_ABOVE,

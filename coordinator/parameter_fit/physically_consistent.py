@@ -28,6 +28,7 @@ from coordinator.parameter_fit.least_squares import InertialFit
 from coordinator.parameter_fit.systematic_errors import whitened_effects
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
+from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 
 # Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 10 is the belief that a body's distribution of
@@ -144,8 +145,7 @@ def fit_physical(
         shifts = covariance @ (rows.T @ whitened_effects(effects, sigma, independent_fraction))
         covariance = covariance + shifts @ shifts.T
     pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
-    for array in (pseudo, found.x, covariance, found.divergence):
-        array.flags.writeable = False
+    make_read_only((pseudo, found.x, covariance, found.divergence))
     return PhysicalFit(found.x, covariance, pseudo, found.divergence, weight, error, best)
 
 

@@ -19,6 +19,7 @@ from scipy.linalg import qr
 
 from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from module_agent.model.chain import Array
+from module_agent.model.read_only import make_read_only
 from module_agent.signals.autocorrelation import autocovariance
 
 # 95 % as efficient as least squares on normal noise (Huber and Ronchetti 2009, Robust statistics, table 4.1).
@@ -156,9 +157,7 @@ def _fit(
         samples=samples,
         downweighted=np.sum(used & (weights < 1.0), axis=0) / samples,
     )
-    for array in fit:
-        if isinstance(array, np.ndarray):
-            array.flags.writeable = False
+    make_read_only(fit)
     return fit
 
 

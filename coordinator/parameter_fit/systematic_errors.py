@@ -16,6 +16,7 @@ from coordinator.parameter_fit.torque_sensor_scale import TorqueScale
 from module_agent.model.chain import Array, Chain
 from module_agent.model.information import JointInformation
 from module_agent.model.perturbation import apply_perturbation
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
 
@@ -32,8 +33,7 @@ def error_directions(covariance: Array) -> Array:
     values, vectors = np.linalg.eigh(covariance)
     kept = np.flatnonzero(values > _NEGLIGIBLE * max(values[-1], 0.0))[-_MAX_DIRECTIONS:]
     found = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: JointMotion) -> Array:

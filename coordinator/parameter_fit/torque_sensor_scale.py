@@ -20,6 +20,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_scale
 from module_agent.model.catalogue import TorqueKind
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
+from module_agent.model.read_only import make_read_only
 
 # Of a module's torque sensor, a spring whose stiffness is known to a few percent as delivered. That is a
 # guess: no figure is published.
@@ -93,7 +94,7 @@ def refine_scale(
     covariance = np.linalg.inv(curvature)
     change = -covariance @ (seen.T @ target + so_far.value / prior_sigma**2)
     value = so_far.value + change
-    value.flags.writeable = covariance.flags.writeable = False
+    make_read_only((value, covariance))
     return TorqueScale(value, covariance)
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from coordinator.batch_estimation.imu_prediction import turned
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import DELAY_RMS_S, DELAY_SPREAD_S, GYRO_BIAS_SIGMA_RAD_S
-from module_agent.model.perturbation import cross, frozen
+from module_agent.model.perturbation import cross
+from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass

@@ -13,6 +13,7 @@ import numpy as np
 
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
+from module_agent.model.read_only import frozen
 
 BLOCKS = 6
 # Of a thousand observations, one has gone wrong in a way that is in no model: it tells nothing.
@@ -108,7 +109,7 @@ def motion_evidence(
     scatter = ((without - without.mean(axis=0)) ** 2).sum(axis=(0, 2))
     give = (np.abs(rate @ qd_rad_s[:, others]) / power.sum()) @ left
     spread = np.sqrt((BLOCKS - 1) / BLOCKS * scatter)
-    return MotionEvidence(_frozen(coefficient), _frozen(spread), _frozen(give))
+    return MotionEvidence(frozen(coefficient), frozen(spread), frozen(give))
 
 
 def _given(rates: Array, axes: Array | None, imus: int) -> tuple[Array, Array]:
@@ -117,9 +118,3 @@ def _given(rates: Array, axes: Array | None, imus: int) -> tuple[Array, Array]:
         return np.zeros((len(rates), imus, 3)), np.ones((rates.shape[1], imus))
     given = np.tensordot(rates, np.nan_to_num(axes, nan=0.0), axes=1)
     return np.asarray(given), np.where(np.isnan(axes).any(axis=2), 1.0, GIVE_LEFT)
-
-
-def _frozen(array: Array) -> Array:
-    array = np.array(array)
-    array.flags.writeable = False
-    return array

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from module_agent.control.motion import effort_profile, profile_period_ns
 from module_agent.control.waveform import MINIMUM_JERK_PEAK, duration_s, waveform
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import EffortProfile, GoTo, Pattern, Rest
@@ -67,7 +68,7 @@ def joint_reference(
             samples = waveform(patterns[serial], origins_rad[serial], np.minimum(t_s, total_s))
             q[:, column] += samples.offset_rad
             qd[:, column] = samples.velocity_rad_s
-    return Reference(*(_frozen(array) for array in (t_s, q, qd, differentiate(qd, rate_hz))))
+    return Reference(*(read_only(array) for array in (t_s, q, qd, differentiate(qd, rate_hz))))
 
 
 def paths_together(
@@ -97,7 +98,7 @@ def standing(reference: Reference, row: int, length_s: float, rate_hz: float = R
     """Return a reference that stands for a while where another one is at a row (-1: its end)."""
     t_s = np.arange(round(length_s * rate_hz) + 1) / rate_hz
     q = np.tile(reference.q_rad[row], (t_s.size, 1))
-    return Reference(*(_frozen(array) for array in (t_s, q, np.zeros_like(q), np.zeros_like(q))))
+    return Reference(*(read_only(array) for array in (t_s, q, np.zeros_like(q), np.zeros_like(q))))
 
 
 def feed_forward(chain: Chain, phi: ArrayLike, reference: Reference) -> SetPoints:
@@ -139,8 +140,3 @@ def _common_duration_s(patterns: Mapping[str, Pattern], origins_rad: Mapping[str
             "has ended would miss what the others' motion asks of it, so all must end together"
         )
     return ends[last]
-
-
-def _frozen(array: Array) -> Array:
-    array.flags.writeable = False
-    return array

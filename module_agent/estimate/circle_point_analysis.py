@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
 from module_agent.estimate.windows import AlignedMotion, Array, ImuWindow
+from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import autocovariance
 from module_agent.wire.messages import CircleEstimate, Vector3
 
@@ -78,8 +79,8 @@ def rest_reading(rest: ImuWindow) -> RestReading:
     _enough(rest.t_ns.size, "rest")
     gyro, accel = rest.gyro_rad_s.mean(axis=0), rest.accel_m_s2.mean(axis=0)
     return RestReading(
-        _frozen(gyro),
-        _frozen(accel),
+        frozen(gyro),
+        frozen(accel),
         float(np.sqrt(np.mean((rest.gyro_rad_s - gyro) ** 2))),
         float(np.sqrt(np.mean((rest.accel_m_s2 - accel) ** 2))),
         int(rest.t_ns.size),
@@ -117,7 +118,7 @@ def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
     # Both directions across the axis count, and so does the offset's own error where the motion goes one way.
     variance = 0.5 * sum(_variance_of_mean(across[:, i]) for i in range(3))
     variance += (float(sign.mean()) * rest.gyro_scatter_rad_s) ** 2 / rest.samples
-    return JointAxis(_frozen(axis), float(np.sqrt(variance)) / rate, int(np.count_nonzero(steady)))
+    return JointAxis(frozen(axis), float(np.sqrt(variance)) / rate, int(np.count_nonzero(steady)))
 
 
 def circle_point_analysis(
@@ -168,13 +169,13 @@ def circle_point_analysis(
     )
     return CircleFit(
         axis=found.axis,
-        tangent=_frozen(tangent),
-        radial_m=_frozen(distance * np.cross(tangent, found.axis)),  # eq. 24
+        tangent=frozen(tangent),
+        radial_m=frozen(distance * np.cross(tangent, found.axis)),  # eq. 24
         distance_m=distance,
         sigma_axis_rad=found.sigma_rad,
         sigma_distance_m=float(np.sqrt(sum(blocks))),
         residual_rms_m_s2=float(np.sqrt(np.mean(residual**2))),
-        singular_values=_frozen(spread / np.sqrt(sine.t_s.size)),
+        singular_values=frozen(spread / np.sqrt(sine.t_s.size)),
         samples=int(sine.t_s.size),
     )
 
@@ -271,12 +272,6 @@ def _variance_of_mean(series: Array) -> float:
 def _enough(samples: int, what: str) -> None:
     if samples < MIN_SAMPLES:
         raise ValueError(f"{samples} samples of the {what}: at least {MIN_SAMPLES} are needed")
-
-
-def _frozen(values: Array) -> Array:
-    found = np.array(values, dtype=float)
-    found.flags.writeable = False
-    return found
 
 
 def _vector(values: Array) -> Vector3:

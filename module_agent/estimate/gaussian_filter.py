@@ -4,6 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve1d
 
+from module_agent.model.read_only import read_only
+
 TAPS = 11
 SIGMA_SAMPLES = 2.83
 
@@ -43,8 +45,7 @@ def gaussian_filter(
         widths = [(half, half)] + [(0, 0)] * (values.ndim - 1)
         padded = np.pad(values, widths, mode="reflect", reflect_type="odd")
         smooth = convolve1d(padded, weights, axis=0)[half:-half]
-    smooth.flags.writeable = False
-    return smooth
+    return read_only(smooth)
 
 
 def passes(

@@ -36,6 +36,7 @@ from module_agent.estimate.smoothing import COSINE, SINE, SQUARED, SmoothMotion,
 from module_agent.estimate.windows import Array
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.imu_prior import CALIBRATED, GYRO_BIAS_DRIFT_RAD_S, ImuPrior
+from module_agent.model.read_only import frozen
 from module_agent.wire.messages import RegressionEstimate, Vector3
 
 # The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.
@@ -370,26 +371,20 @@ def _result(best: _Optimum, problem: _Problem) -> JointRegression:
     radial = frame[:, :2] @ p[RADIAL]
     along = radial / max(distance, 1e-6)
     return JointRegression(
-        axis=_frozen(frame[:, 2]),
-        radial_m=_frozen(radial),
+        axis=frozen(frame[:, 2]),
+        radial_m=frozen(radial),
         distance_m=distance,
         sigma_axis_rad=float(np.sqrt(0.5 * np.trace(six[:3, :3]))),
         sigma_distance_m=float(np.sqrt(along @ six[3:, 3:] @ along)),
-        covariance=_frozen(six),
-        gravity_m_s2=_frozen(frame @ p[GRAVITY]),
-        accel_bias_m_s2=_frozen(frame @ p[ACCEL_BIAS]),
-        gyro_bias_rad_s=_frozen(frame @ p[GYRO_BIAS]),
+        covariance=frozen(six),
+        gravity_m_s2=frozen(frame @ p[GRAVITY]),
+        accel_bias_m_s2=frozen(frame @ p[ACCEL_BIAS]),
+        gyro_bias_rad_s=frozen(frame @ p[GYRO_BIAS]),
         compliance_s2=float(p[COMPLIANCE]),
         delays_s=tuple(float(x) for x in p[DELAY:]),
         samples=sum(len(row.t_s) for row in problem.rows),
         base_shakes=any(row.motion.base is not None for row in problem.rows),
     )
-
-
-def _frozen(values: Array) -> Array:
-    found = np.array(values, dtype=float)
-    found.flags.writeable = False
-    return found
 
 
 def _vector(values: Array) -> Vector3:

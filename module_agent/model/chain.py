@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.model.errors import DataError
+from module_agent.model.read_only import read_only
 
 Array = NDArray[np.float64]
 
@@ -142,5 +143,4 @@ def _checked(fields: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Ar
         raise ChainError(f"{name} has shape {array.shape}, {shape} is needed")
     if not np.isfinite(array).all():
         raise ChainError(f"{name} has a value that is not finite")
-    array.flags.writeable = False
-    return array
+    return read_only(array)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.read_only import read_only
 
 
 def body_displacements(chain: Chain, q_rad: ArrayLike) -> Array:
@@ -30,8 +31,7 @@ def body_displacements(chain: Chain, q_rad: ArrayLike) -> Array:
     for i, parent in enumerate(chain.parent):
         own = screw_motion(chain.axis[i], chain.point[i], q[:, i])
         found[:, i] = own if parent == BASE else found[:, parent] @ own
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def imu_poses(chain: Chain, q_rad: ArrayLike) -> Array:
@@ -46,8 +46,7 @@ def imu_poses(chain: Chain, q_rad: ArrayLike) -> Array:
         body = chain.carrier(k)
         home = chain.imu_home[k]
         poses[:, k] = home if body == BASE else displacement[:, body] @ home
-    poses.flags.writeable = False
-    return poses
+    return read_only(poses)
 
 
 def screw_motion(axis: ArrayLike, point: ArrayLike, angle_rad: ArrayLike) -> Array:
@@ -68,8 +67,7 @@ def places_on_axes(chain: Chain) -> Array:
     """
     off = chain.imu_home[:, :3, 3] - chain.point
     found = chain.point + np.einsum("ni,ni->n", off, chain.axis)[:, None] * chain.axis
-    found.flags.writeable = False
-    return np.asarray(found)
+    return read_only(found)
 
 
 def _positions(chain: Chain, q_rad: ArrayLike) -> NDArray[np.float64]:

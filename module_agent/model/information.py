@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY, torque_regressor
 
 # Bounds the memory: a block of 64 joints is 0.7 GB at most, one of 7 joints 8 MB.
@@ -151,5 +152,5 @@ def _triangular(y: Array, tau: NDArray[np.float64], rest: float, samples: int) -
     r = np.zeros((kept, y.shape[1]))
     r[:, felt] = rows[:kept, :-1]
     z = rows[:kept, -1].copy()
-    r.flags.writeable = z.flags.writeable = False
+    make_read_only((r, z))
     return JointInformation(r, z, rest + float(rows[kept:, -1] @ rows[kept:, -1]), samples)

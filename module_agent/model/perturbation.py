@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import frozen
 
 
 def apply_perturbation(chain: Chain, delta: ArrayLike) -> Chain:
@@ -54,13 +55,6 @@ def skew(vector: Array) -> Array:
     found = np.zeros((*vector.shape, 3))
     found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = -vector[..., 2], vector[..., 1], -vector[..., 0]
     found[..., 1, 0], found[..., 2, 0], found[..., 2, 1] = vector[..., 2], -vector[..., 1], vector[..., 0]
-    return found
-
-
-def frozen(values: ArrayLike) -> Array:
-    """Return a read-only copy."""
-    found = np.array(values, dtype=float)
-    found.flags.writeable = False
     return found
 
 

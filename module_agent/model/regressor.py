@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor_kernel import Index, fill_regressor
 
 BODY_PARAMETERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
@@ -45,8 +46,7 @@ def torque_regressor(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_ra
     carriers, depth = _carriers(chain)
     axis, point, gravity = (_plain(a) for a in (chain.axis, chain.point, chain.gravity))
     fill_regressor(carriers, depth, axis, point, gravity, _plain(q), _plain(qd), _plain(qdd), found)
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def inverse_dynamics(
@@ -65,8 +65,7 @@ def inverse_dynamics(
     for begin in range(0, q.shape[0], _BLOCK):
         part = slice(begin, begin + _BLOCK)
         torque[part] = torque_regressor(chain, q[part], qd[part], qdd[part]) @ parameters
-    torque.flags.writeable = False
-    return torque
+    return read_only(torque)
 
 
 def check_phi(chain: Chain, phi: ArrayLike) -> Array:

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import butter, sosfiltfilt
 
 from module_agent.model.chain import Array
+from module_agent.model.read_only import read_only
 
 FILTER_ORDER = 4
 NS_PER_S = 1_000_000_000
@@ -71,8 +72,7 @@ def resample(
             (known - known[0]) / NS_PER_S, np.asarray(values, dtype=float), k=1 if kind == "linear" else 3
         )
         found[:, column] = spline((common - known[0]) / NS_PER_S)
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def zero_phase_low_pass(signal: ArrayLike, rate_hz: float, cutoff_hz: float) -> Array:
@@ -93,8 +93,7 @@ def zero_phase_low_pass(signal: ArrayLike, rate_hz: float, cutoff_hz: float) -> 
         raise ValueError(f"{values.shape[0]} samples; a cut-off of {cutoff_hz} Hz needs more than {padding}")
     sections = butter(FILTER_ORDER, cutoff_hz, fs=rate_hz, output="sos")
     found: Array = sosfiltfilt(sections, values, axis=0, padlen=padding)
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def settling_samples(rate_hz: float, cutoff_hz: float) -> int:
@@ -111,8 +110,7 @@ def differentiate(signal: ArrayLike, rate_hz: float) -> Array:
     values = np.asarray(signal, dtype=float)
     t = np.arange(values.shape[0]) / rate_hz
     found: Array = np.asarray(CubicSpline(t, values, axis=0)(t, 1))
-    found.flags.writeable = False
-    return found
+    return read_only(found)
 
 
 def filtered_motion(
@@ -154,13 +152,7 @@ def filtered_motion(
     if kept.stop <= kept.start:
         raise ValueError(f"{times.size} samples; {edge} at either end are unsettled and nothing is left")
     motion = (filtered[0], velocity, differentiate(velocity, rate_hz), filtered[1])
-    return JointMotion(_frozen(times[kept]), *(_frozen(signal[kept]) for signal in motion))
-
-
-def _frozen(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    copy = array.copy()
-    copy.flags.writeable = False
-    return copy
+    return JointMotion(read_only(times[kept].copy()), *(read_only(signal[kept].copy()) for signal in motion))
 
 
 def _check_times(column: int, known: NDArray[np.int64], common: NDArray[np.int64], max_gap_ns: int) -> None:

@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from module_agent.model.chain import Array
+from module_agent.model.read_only import read_only
 from module_agent.signals.filtering import JointMotion, differentiate, zero_phase_low_pass
 
 Term = Literal["inertia", "viscous", "coulomb", "curved", "offset", "lag"]
@@ -101,5 +102,4 @@ def term_columns(motion: JointMotion, rate_hz: float, cutoff_hz: float) -> Array
         ],
         axis=2,
     )
-    stacked.flags.writeable = False
-    return stacked
+    return read_only(stacked)

@@ -14,6 +14,7 @@ import numpy as np
 
 from module_agent.model.chain import Chain
 from module_agent.model.information import JointInformation
+from module_agent.model.read_only import make_read_only
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.information_messages import GEOMETRY_BYTES, ChainPart, ClockPart
 
@@ -123,5 +124,5 @@ def unpack(block: bytes) -> JointInformation:
     r = np.zeros((rows, columns))
     r[:, felt] = kept
     z = values[upper:].copy()
-    r.flags.writeable = z.flags.writeable = False
+    make_read_only((r, z))
     return JointInformation(r, z, rest, samples)

@@ -22,9 +22,10 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.model.catalogue import ModuleType
+from module_agent.model.read_only import read_only
 from sim.actuator import actuator_kernel as kernel
 from sim.actuator.spring import build_springs
-from sim.geometry.pose import Array, read_only
+from sim.geometry.pose import Array
 from sim.imperfections.module_errors import Variation, alike
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.physics.skeleton import Skeleton

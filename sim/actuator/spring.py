@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.model.catalogue import ModuleType
-from sim.geometry.pose import Array, read_only
+from module_agent.model.read_only import read_only
+from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 
 # Published for modules made since 2019: 30-70 Nm/rad near zero, 300-1000 at full load, over a range of types

@@ -3,7 +3,8 @@
 import numpy as np
 
 from module_agent.model.compiled import compiled
-from sim.geometry.pose import Array, read_only
+from module_agent.model.read_only import read_only
+from sim.geometry.pose import Array
 
 AMBIENT_C = 25.0
 CAPACITIES_J_K = (0.367, 16.6, 1250.0)

@@ -11,7 +11,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from sim.geometry.pose import Array, pose, read_only
+from module_agent.model.read_only import read_only
+from sim.geometry.pose import Array, pose
 from sim.geometry.rigid_body import RigidBody, joined, tensor
 
 Length = Annotated[float, Field(ge=-10.0, le=10.0)]

@@ -6,14 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from module_agent.model.read_only import read_only
+
 Array = NDArray[np.float64]
-
-
-def read_only(array: Array) -> Array:
-    """Return the array as float64 with writing switched off."""
-    array = np.asarray(array, dtype=np.float64)
-    array.flags.writeable = False
-    return array
 
 
 def pose(

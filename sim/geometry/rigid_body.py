@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.geometry.pose import Array, read_only, skew
+from module_agent.model.read_only import read_only
+from sim.geometry.pose import Array, skew
 
 
 class RigidBody(NamedTuple):

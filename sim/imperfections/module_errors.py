@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.model.catalogue import ModuleType
-from sim.geometry.pose import Array, read_only
+from module_agent.model.read_only import read_only
+from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.imperfections.random_streams import generator
 

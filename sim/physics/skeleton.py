@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from module_agent.model.read_only import read_only
 from sim.geometry.link_parts import Hinge
-from sim.geometry.pose import Array, inverse, pose, read_only
+from sim.geometry.pose import Array, inverse, pose
 from sim.geometry.rigid_body import RigidBody, joined, moved, tensor
 from sim.robot.robot_file import BASE, BaseCompliance, Robot
 from sim.robot.robot_tree import RobotTree, Segment, build_tree

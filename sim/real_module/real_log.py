@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sim.geometry.pose import Array, read_only
+from module_agent.model.read_only import read_only
+from sim.geometry.pose import Array
 
 
 class LogFileError(ValueError):

@@ -10,8 +10,9 @@ import numpy as np
 
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Chain
+from module_agent.model.read_only import read_only
 from sim.geometry.link_parts import Hinge, Part, placed
-from sim.geometry.pose import Array, inverse, pose, read_only
+from sim.geometry.pose import Array, inverse, pose
 from sim.geometry.rigid_body import RigidBody, joined, moved, negative, parameters, tensor
 from sim.robot.robot_file import Module, Robot
 

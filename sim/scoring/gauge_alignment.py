@@ -14,7 +14,8 @@ from scipy.optimize import least_squares
 
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import imu_poses
-from module_agent.model.perturbation import adjoint, apply_perturbation, frozen
+from module_agent.model.perturbation import adjoint, apply_perturbation
+from module_agent.model.read_only import frozen
 
 # What a wrong orientation counts against a wrong position: the displacement at a usual module's reach.
 REACH_M = 0.3

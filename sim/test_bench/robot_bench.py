@@ -17,10 +17,11 @@ from coordinator.torque_control.feed_forward import SetPoints
 from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Firmware, Incoming
 from module_agent.hardware.loop_inside import LoopInside
+from module_agent.model.read_only import read_only
 from module_agent.network_emulation.channel import Channel
 from module_agent.network_emulation.profile import NetworkProfile, PathProfile
 from module_agent.wire.messages import EffortProfile, GainSet, Pattern
-from sim.geometry.pose import Array, read_only
+from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
 from sim.test_bench.module_bench import ModuleBench

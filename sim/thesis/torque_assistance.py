@@ -25,9 +25,9 @@ from coordinator.torque_control.motor_compensation import with_motor_compensatio
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import read_only
 from module_agent.network_emulation.profile_file import network
 from module_agent.wire.messages import GainSet, GoTo, Pattern, Rest
-from sim.geometry.pose import read_only
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.variants import somewhere

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sim.geometry.pose import read_only
+from module_agent.model.read_only import read_only
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
 from sim.thesis.torque_assistance import MODES, ON_MODULE, Model, standing_robot

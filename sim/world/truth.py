@@ -18,7 +18,8 @@ import numpy as np
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.wires import WiredModule
 from module_agent.model.chain import Chain
-from sim.geometry.pose import Array, read_only
+from module_agent.model.read_only import make_read_only, read_only
+from sim.geometry.pose import Array
 from sim.imperfections.module_errors import SensorErrors
 from sim.robot.robot_file import Robot
 from sim.robot.robot_tree import true_chain, true_inertia
@@ -140,8 +141,7 @@ class TruthLog:
         clocks = [[module_time(clock, t) for clock in self._world.clocks] for t in self._t_ns]
         clock_ns = np.array(clocks, dtype=np.int64).reshape(-1, n)
         columns = np.array(self._rows, dtype=np.float64).reshape(-1, 3, n)
-        for array in (stamps, clock_ns, columns):
-            array.flags.writeable = False
+        make_read_only((stamps, clock_ns, columns))
         return Motion(
             self._world.robot.serials, stamps, clock_ns, columns[:, 0], columns[:, 1], columns[:, 2]
         )
@@ -159,8 +159,7 @@ def read_motion(path: Path) -> Motion:
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in Motion._fields}
     serials = tuple(str(s) for s in arrays.pop("serials"))
-    for array in arrays.values():
-        array.flags.writeable = False
+    make_read_only(arrays.values())
     return Motion(serials, **arrays)
 
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from module_agent.hardware.hardware import HardwareLost, SensorSample
 from module_agent.hardware.wires import WiredModule
+from module_agent.model.read_only import read_only
 from sim.actuator.actuator import BUS_VOLTAGE_V, Actuators
 from sim.actuator.thermal import Windings
-from sim.geometry.pose import Array, read_only
+from sim.geometry.pose import Array
 from sim.imperfections.module_errors import SensorErrors, draw_variation
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.physics.equilibrium import equilibrium

@@ -21,10 +21,10 @@ from coordinator.torque_control.session import CompensationPlan, CompensationSes
 from coordinator.torque_control.summary import CompensationSummary
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import body_displacements
+from module_agent.model.read_only import read_only
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
 from sim.benchmark.row import Row, largest, ratio
-from sim.geometry.pose import read_only
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
