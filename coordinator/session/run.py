@@ -50,7 +50,7 @@ from coordinator.session.information_requests import InformationRequests
 from coordinator.session.session import Session
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION
 from coordinator.topology.next_motion import NextMotion
-from coordinator.viewer.feed import FILE, LIVE, Overlay, Screen, ViewerFeed
+from coordinator.viewer.feed import Overlay, Screen, ViewerFeed
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.catalogue import ModuleType, module_type
@@ -102,7 +102,7 @@ class Run:
         clock: Clock,
         post: Post,
         screen: Screen,
-        beside: Overlay | None = None,
+        overlay: Overlay | None = None,
     ):
         # Before anything is made of the new folder.
         if config.plan.topology_only:
@@ -128,7 +128,7 @@ class Run:
             config.out / VIEW, config.spawn_viewer, config.connect_viewer, config.serve_viewer
         )
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
-        self._feed = ViewerFeed(viewer, self.recording, FILE if config.inline else LIVE, beside)
+        self._feed = ViewerFeed(viewer, self.recording, overlay)
         self._looks = Previewer(self.recording, config.refined_previews)
         self._looking: asyncio.Task[None] | None = None
         self._chain: Chain | None = None
@@ -175,7 +175,7 @@ class Run:
     def step(self, index: int, total: int, text: str) -> None:
         """Pass on that a step begins."""
         self._screen.step(index, total, text)
-        self._feed.met({s: self._link.kind(s).name for s in self._link.serials}, self._clock())
+        self._feed.connected({s: self._link.kind(s).name for s in self._link.serials}, self._clock())
         self._feed.step(self._clock(), f"{index} of {total}: {text}")
 
     def note(self, text: str) -> None:
@@ -209,7 +209,7 @@ class Run:
 
     def _show_so_far(self, found: Preview | None) -> None:
         if found is not None:
-            self._feed.so_far(self._clock(), found)
+            self._feed.preview(self._clock(), found)
 
     async def _looked(self) -> None:
         """Wait for a look that is still being worked out: what comes after it is newer."""

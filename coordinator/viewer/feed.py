@@ -1,7 +1,4 @@
-"""Who may add to what the viewer shows of a run: somebody who knows more of the robot than the run does.
-
-What the viewer is shown of a session as it runs, from the messages as they are recorded.
-"""
+"""What a run shows in its viewer: the messages as they are recorded, and the results of its steps."""
 
 from typing import NamedTuple, Protocol
 
@@ -14,7 +11,7 @@ from coordinator.kinematics.frames import axis_angles
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.recording.recording import Entry, ModuleRecord, Recording
 from coordinator.synchronisation.round_trips import map_clock
-from coordinator.viewer.scene.blueprint import AXIS_ANGLE, LINK_LENGTH
+from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.scene.robot_geometry import side_by_side
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.chain import BASE, Array, Chain
@@ -23,53 +20,42 @@ from module_agent.wire.messages import Feedback, Message, Status
 
 
 class Overlay(Protocol):
-    """Draws beside what is identified: the run hands out its viewer and what it shows, and takes nothing."""
+    """Draws something in addition to the run, such as the true robot of a simulation."""
 
-    def met(self, viewer: Viewer, t_ns: int) -> None:
-        """The viewer knows all modules; `t_ns` is its time."""
+    def connected(self, viewer: Viewer, t_ns: int) -> None:
+        """Draw when all modules are connected, at `t_ns` of the viewer."""
         ...
 
     def chain(self, viewer: Viewer, t_ns: int, chain: Chain, unresolved: tuple[Unresolved, ...]) -> None:
-        """The viewer is about to show a chain, of some modules or all; so far `unresolved` is not known."""
+        """Draw before a chain is shown, of some or all modules; `unresolved` is not identified."""
         ...
 
 
+ROWS_PERIOD_NS = 100_000_000
 MAP_PERIOD_NS = 1_000_000_000
 POSE_PERIOD_NS = 33_000_000
 NETWORK_PERIOD_NS = 500_000_000
-# The lines of estimates go on while there are no newer ones.
+# The lines of estimates are prolonged while there are no newer estimates.
 ESTIMATES_PERIOD_NS = 2_000_000_000
 RECENT_TRIPS = 100
-# Name of the plot of what a module itself finds: its distance from the nearest joint that moves it.
-LOCAL = "own_distance"
+# Name of the plot of a module's own estimate: its distance from the nearest joint that moves it.
+OWN_DISTANCE = "own_distance"
 
 
 class Screen(Protocol):
-    """Shows a line of progress; the terminal implements it."""
+    """Shows the progress of a run; the terminal implements it."""
 
     def step(self, index: int, total: int, text: str) -> None:
-        """A step begins."""
+        """Show that a step begins."""
         ...
 
     def note(self, text: str) -> None:
-        """Something worth a line."""
+        """Show a line of text."""
         ...
 
 
-class Pace(NamedTuple):
-    """How long rows and poses are gathered until they are shown; a call costs as much for one as for many."""
-
-    rows_ns: int
-    poses_ns: int
-
-
-# 100 ms are soon enough for curves, a robot has to turn smoothly. A file has time.
-LIVE = Pace(rows_ns=100_000_000, poses_ns=0)
-FILE = Pace(rows_ns=4_000_000_000, poses_ns=4_000_000_000)
-
-
 class _Shown(NamedTuple):
-    """An estimate on the screen, which stays as it is until there is a newer one."""
+    """An estimate on the screen, which is valid until there is a newer one."""
 
     name: str
     serial: str
@@ -79,25 +65,20 @@ class _Shown(NamedTuple):
 
 
 class ViewerFeed:
-    """Feeds one viewer from one recording; the viewer's time counts from the beginning of the session.
+    """Feeds one viewer from one recording; the viewer's time is zero at the beginning of the session.
 
-    Rows and poses are gathered for as long as `pace` says; `close` shows what is left. `beside` draws what it
-    knows besides.
+    Rows are gathered for `ROWS_PERIOD_NS`; `close` shows the last ones. `overlay` draws in addition.
     """
 
-    def __init__(
-        self, viewer: Viewer, recording: Recording, pace: Pace = LIVE, beside: Overlay | None = None
-    ):
+    def __init__(self, viewer: Viewer, recording: Recording, overlay: Overlay | None = None):
         self._viewer = viewer
         self._recording = recording
-        self._beside = beside
-        self.pace = pace
+        self._overlay = overlay
         self._maps: dict[tuple[str, int], tuple[int, ClockMap]] = {}
         self._pending: dict[tuple[str, int], list[tuple[int, int]]] = {}
         self._rows_ns = 0
         self._drawn = False
         self._pose_ns = 0
-        self._poses: list[tuple[int, Array]] = []
         self._network_ns: dict[str, int] = {}
         self._known: tuple[str, ...] = ()
         self._origin_ns: int | None = None
@@ -105,7 +86,7 @@ class ViewerFeed:
         self._shown_ns = 0
 
     def on_message(self, entry: Entry, message: Message) -> None:
-        """Show one recorded message, if it is one that is shown."""
+        """Show one recorded message, if it is feedback or a status."""
         if message.serial not in self._known:
             return
         if isinstance(message, Feedback) and entry.kind == "publication":
@@ -113,7 +94,7 @@ class ViewerFeed:
             self._pose(entry.t_ns)
         elif isinstance(message, Status):
             self._on_status(entry, message)
-        if entry.t_ns - self._rows_ns >= self.pace.rows_ns:
+        if entry.t_ns - self._rows_ns >= ROWS_PERIOD_NS:
             self._show_rows(entry.t_ns)
         if entry.t_ns - self._shown_ns >= ESTIMATES_PERIOD_NS:
             self._show_again(entry.t_ns)
@@ -123,13 +104,13 @@ class ViewerFeed:
         return session_ns - self._start_ns(session_ns)
 
     def _start_ns(self, session_ns: int) -> int:
-        """Return the beginning of the session; the first one to ask says when that was."""
+        """Return the beginning of the session: the time of the first call."""
         if self._origin_ns is None:
             self._origin_ns = session_ns
         return self._origin_ns
 
     def _gather(self, feedback: Feedback) -> None:
-        """Note which rows have come; they are in the recording."""
+        """Note which rows were received; the rows themselves are in the recording."""
         spans = self._pending.setdefault((feedback.serial, feedback.boot), [])
         first, end = feedback.first_row, feedback.first_row + feedback.count
         if spans and spans[-1][1] == first:
@@ -138,7 +119,7 @@ class ViewerFeed:
             spans.append((first, end))
 
     def _show_rows(self, now_ns: int) -> None:
-        """Show the rows that have come since the last time, where a clock map says when they were taken."""
+        """Show the rows received since the last time, of modules whose clock map is known."""
         self._rows_ns = now_ns
         for (serial, boot), spans in self._pending.items():
             record = self._recording.module(serial, boot)
@@ -151,30 +132,21 @@ class ViewerFeed:
 
     def _map(self, record: ModuleRecord, now_ns: int) -> ClockMap | None:
         key = record.serial, record.boot
-        made_ns, found = self._maps.get(key, (-MAP_PERIOD_NS, None))
-        if record.round_trips and now_ns - made_ns >= MAP_PERIOD_NS:
-            found = map_clock(record.round_trips[-RECENT_TRIPS:])
-            self._maps[key] = (now_ns, found)
-        return found
+        fitted_ns, clock = self._maps.get(key, (-MAP_PERIOD_NS, None))
+        if record.round_trips and now_ns - fitted_ns >= MAP_PERIOD_NS:
+            clock = map_clock(record.round_trips[-RECENT_TRIPS:])
+            self._maps[key] = (now_ns, clock)
+        return clock
 
     def _pose(self, now_ns: int) -> None:
         if not self._drawn or now_ns - self._pose_ns < POSE_PERIOD_NS:
             return
         self._pose_ns = now_ns
-        self._poses.append((self.since_start(now_ns), self._positions()))
-        if self._poses[-1][0] - self._poses[0][0] >= self.pace.poses_ns:
-            self._show_poses()
-
-    def _show_poses(self) -> None:
-        if self._poses:
-            times, positions = zip(*self._poses, strict=True)
-            self._viewer.poses(times, positions, self._known)
-            self._poses.clear()
+        self._viewer.poses([self.since_start(now_ns)], [self._positions()], self._known)
 
     def close(self) -> None:
-        """Show what has been gathered, and close the viewer. May be called twice."""
+        """Show the rows that are left, and close the viewer. May be called twice."""
         self._show_rows(self._rows_ns)
-        self._show_poses()
         self._viewer.close()
 
     def _positions(self) -> Array:
@@ -199,18 +171,17 @@ class ViewerFeed:
             status.serial, self.since_start(entry.t_ns), round_trip_ms, age_ns / 1e6, refused
         )
 
-    def met(self, types: dict[str, str], session_ns: int) -> None:
-        """Show the modules that were found."""
+    def connected(self, types: dict[str, str], session_ns: int) -> None:
+        """Show the connected modules; `types` are their module types by serial."""
         if tuple(types) != self._known:
-            self._show_poses()  # of those before
             self._known = tuple(types)
             self._viewer.modules(self._known, types)
-            if self._beside is not None:
-                self._beside.met(self._viewer, self.since_start(session_ns))
+            if self._overlay is not None:
+                self._overlay.connected(self._viewer, self.since_start(session_ns))
                 self._drawn = True
 
     def step(self, session_ns: int, text: str) -> None:
-        """Show that a step begins; what is known by now is shown once more, so that it draws a line."""
+        """Show that a step begins, and the present estimates again, so that their lines reach this step."""
         self._viewer.phase(self.since_start(session_ns), text)
         self._show_again(session_ns)
 
@@ -224,31 +195,30 @@ class ViewerFeed:
         self._viewer.estimate(shown.name, shown.serial, now_ns, shown.value, shown.sigma, shown.units)
 
     def estimates(self, joint: str, session_ns: int) -> None:
-        """Show the distances from a joint that the modules found, where no nearer joint is known yet."""
-        for (moved, observer), found in self._recording.estimates.items():
-            circle = list(found.values())[-1].circle if moved == joint and observer != joint else None
+        """Show the modules' own estimates of their distance from a joint, unless another one is nearer."""
+        for (moved, observer), messages in self._recording.estimates.items():
+            circle = list(messages.values())[-1].circle if moved == joint and observer != joint else None
             if circle is None:
                 continue
-            known = self._shown.get((LOCAL, observer))
+            known = self._shown.get((OWN_DISTANCE, observer))
             if known is None or 1e3 * circle.distance_m <= known.value:
-                shown = _Shown(LOCAL, observer, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
+                shown = _Shown(OWN_DISTANCE, observer, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
                 self._show(self.since_start(session_ns), shown)
 
-    def so_far(self, session_ns: int, found: Preview) -> None:
-        """Show the robot as far as it is known, and the estimates of links that nothing can come between."""
-        self._draw(session_ns, found.fit)
-        self._show_links(session_ns, found.fit, found.beside)
+    def preview(self, session_ns: int, preview: Preview) -> None:
+        """Show the robot as far as it is known, and the links that are final: between adjacent modules."""
+        self._draw(session_ns, preview.fit)
+        self._show_links(session_ns, preview.fit, preview.beside)
 
     def chain(self, session_ns: int, fit: ChainEstimate) -> None:
-        """Show the identified robot; it then turns as the robot turns."""
+        """Show the identified robot; from then on it turns with the robot."""
         self._draw(session_ns, fit)
         self._show_links(session_ns, fit, tuple(parent != BASE for parent in fit.chain.parent))
 
     def _draw(self, session_ns: int, fit: ChainEstimate) -> None:
-        self._show_poses()  # of the chain before
         chain, now_ns = side_by_side(fit.chain), self.since_start(session_ns)
-        if self._beside is not None:
-            self._beside.chain(self._viewer, now_ns, chain, fit.unresolved)
+        if self._overlay is not None:
+            self._overlay.chain(self._viewer, now_ns, chain, fit.unresolved)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
         sigma = [s if np.isfinite(s) else 0.0 for s in fit.link_length_sigma_m.tolist()]
         self._viewer.chain(now_ns, chain, sigma)
@@ -263,13 +233,9 @@ class ViewerFeed:
                 self._show(now_ns, _Shown(LINK_LENGTH, serial, length, sigma))
                 self._show(now_ns, _Shown(AXIS_ANGLE, serial, float(angle[k]), float(spread[k]), "deg"))
 
-    def held_out(self, found: HeldOutMotion) -> None:
+    def held_out(self, motion: HeldOutMotion) -> None:
         """Show measured and predicted torques of the held-out motions."""
-        origin_ns = self._origin_ns or 0
-        for index, serial in enumerate(found.serials):
-            self._viewer.residuals(
-                serial,
-                found.session_ns - origin_ns,
-                found.tau_measured_nm[:, index],
-                found.tau_predicted_nm[:, index],
-            )
+        t_ns = motion.session_ns - (self._origin_ns or 0)
+        for index, serial in enumerate(motion.serials):
+            measured, predicted = motion.tau_measured_nm[:, index], motion.tau_predicted_nm[:, index]
+            self._viewer.residuals(serial, t_ns, measured, predicted)

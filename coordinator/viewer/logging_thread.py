@@ -3,11 +3,12 @@
 import logging
 import queue
 import threading
+import traceback
 from collections.abc import Callable
 
-# Ten seconds of feedback of 16 modules at 50 batches a second.
+# Half a minute of feedback of 16 modules at ten batches a second to a file and a live viewer.
 QUEUE_LENGTH = 8192
-# Places that data may not take, so that steps, topology and chain still fit behind a flood of rows.
+# Places that are kept for steps, topology and chain when there is too much data.
 RESERVED = 512
 IDLE_SECONDS = 0.25
 
@@ -17,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 
 class LoggingThread:
-    """Runs jobs in the order they come; drops and counts them when there are too many."""
+    """Runs jobs in the order of submission; drops and counts them when there are too many."""
 
     def __init__(
         self,
@@ -27,9 +28,9 @@ class LoggingThread:
         reserved: int = RESERVED,
         waits: bool = False,
     ) -> None:
-        """Start the thread; `on_idle` runs in it whenever nothing came for a while, `on_end` last of all.
+        """Start the thread; `on_idle` runs in it whenever there was no job for a while, `on_end` at the end.
 
-        With `waits`, `submit` waits for a place instead of dropping: for virtual time, where nobody hurries.
+        With `waits`, `submit` waits for a place instead of dropping the job: for virtual time.
         """
         self._waits = waits
         self._jobs: queue.Queue[Job | None] = queue.Queue(length + reserved)
@@ -39,7 +40,7 @@ class LoggingThread:
         self._dropped = 0
         self._failures: dict[str, int] = {}
         self._closed = False
-        # A run that ends without `close` must still be able to end.
+        # A daemon, so that a process that fails before `close` can end.
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
 
@@ -50,19 +51,14 @@ class LoggingThread:
 
     @property
     def failed(self) -> int:
-        """How many jobs raised; the first of every kind is in the log."""
+        """How many jobs raised; the first from every line of code is in the log."""
         return sum(self._failures.values())
 
     def submit(self, job: Job, *, essential: bool = False) -> bool:
-        """Queue a job and return at once; False if it was dropped. Data keeps out of the reserved places.
+        """Queue a job and return at once; False if it was dropped. Only essential jobs take reserved places.
 
-        A thread that was told to wait drops nothing.
-
-        Raises:
-            RuntimeError: the thread is closed.
+        A thread that waits drops nothing.
         """
-        if self._closed:
-            raise RuntimeError("the viewer is closed; nothing can be logged any more")
         if self._waits:
             self._jobs.put(job)
             return True
@@ -97,8 +93,14 @@ class LoggingThread:
         try:
             job()
         except Exception as failure:
-            # The next job is worth trying, and a run must not end for want of a picture.
-            kind = f"{type(failure).__name__}: {failure}"
+            # A run goes on without a picture, and the next job may succeed.
+            kind = _raised_at(failure)
             self._failures[kind] = self._failures.get(kind, 0) + 1
             if self._failures[kind] == 1:
                 logger.exception("the viewer could not log something")
+
+
+def _raised_at(failure: Exception) -> str:
+    """Return the type of an exception and where it was raised: of few values, unlike its text."""
+    last = traceback.extract_tb(failure.__traceback__)[-1]
+    return f"{type(failure).__name__} at {last.filename}:{last.lineno}"

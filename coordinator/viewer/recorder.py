@@ -1,6 +1,7 @@
-"""Logging as it is done in the logging thread: keeps what is known of the run and writes it to the stream."""
+"""What the logging thread does: keep the state of what is shown, and write it to one stream."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -17,16 +18,43 @@ from coordinator.viewer.scene import topology_graph as graphs
 from coordinator.viewer.scene.parameter_plot import Estimate, with_estimate
 from coordinator.viewer.scene.time_series import Batch, IntArray
 from module_agent.model.chain import Array, Chain
+from module_agent.wire.feedback_rows import Rows
 
-# Times the reach that the eye was set for.
+# The camera is moved when the reach of the robot exceeds this many times the reach it was set for.
 OUTGROWN = 1.25
+STYLES = {style.world: style for style in (robot_scene.ESTIMATE_STYLE, robot_scene.TRUTH_STYLE)}
+
+
+class Pace(NamedTuple):
+    """How long rows and poses are gathered before they are logged, and whether the layout follows the run.
+
+    One chunk costs some 2.6 kB in a file whatever it holds. A layout of four modules costs about 250 kB.
+    """
+
+    period_ns: int
+    layout_follows: bool
+
+
+LIVE = Pace(0, layout_follows=True)
+# A file gets its layout when the modules are known, and at the end.
+FILE = Pace(10_000_000_000, layout_follows=False)
 
 
 class Recorder:
-    """Everything that one run has logged so far; used by one thread only."""
+    """Writes one run to one stream; used by one thread only.
 
-    def __init__(self, stream: rr.RecordingStream, robot: str, lays_out: bool = True) -> None:
+    Args:
+        stream: where to.
+        robot: the robot's name, shown above it.
+        pace: how long data are gathered; of a killed run a file misses the last `period_ns`.
+        lays_out: send layouts at all.
+    """
+
+    def __init__(
+        self, stream: rr.RecordingStream, robot: str, pace: Pace = LIVE, lays_out: bool = True
+    ) -> None:
         self._stream = stream
+        self._pace = pace
         self._lays_out = lays_out
         self._palette = entity_paths.Palette()
         self._types: dict[str, str] = {}
@@ -37,72 +65,89 @@ class Recorder:
         self._q_rad: dict[str, float] = {}
         self._estimates: dict[tuple[str, str], Estimate] = {}
         self._truths: dict[tuple[str, str], float] = {}
+        self._rows: dict[str, list[Batch]] = {}
+        self._poses: list[tuple[IntArray, Array]] = []
+        self._posed: tuple[str, ...] = ()
 
     def modules(self, serials: Sequence[str], types: Mapping[str, str]) -> None:
-        """Make modules known: their types, names, colours and places in the layout."""
+        """Register modules with their types, names, colours and places in the layout."""
         self._types.update(types)
-        self._know(serials)
+        self._register(serials)
 
     def name_types(self, types: Mapping[str, str]) -> None:
-        """Make types known of modules that nobody may have heard of; what is known of others stays."""
+        """Set the types of modules whose types are not known yet."""
         self._types = {**types, **self._types}
 
-    def rows(self, batch: Batch) -> None:
-        """Log rows."""
-        self._know([batch.serial])
-        if batch.t_ns.size:
-            time_series.send_rows(self._stream, batch)
-            time_series.send_states(self._stream, batch.serial, *self._states.of(batch))
+    def rows(self, serial: str, t_ns: IntArray, rows: Rows) -> None:
+        """Log `rows` (m,), taken at `t_ns` (m,)."""
+        self._register([serial])
+        if t_ns.size:
+            gathered = self._rows.setdefault(serial, [])
+            gathered.append(Batch(serial, t_ns, rows))
+            if t_ns.max() - gathered[0].t_ns.min() >= self._pace.period_ns:
+                self._log_rows(serial)
         # Estimates of many modules come in bursts: one layout shows them all.
         self.show_if_new()
 
+    def _log_rows(self, serial: str) -> None:
+        gathered = self._rows.pop(serial)
+        batch = Batch(
+            serial, np.concatenate([b.t_ns for b in gathered]), np.concatenate([b.rows for b in gathered])
+        )
+        time_series.send_rows(self._stream, batch)
+        time_series.send_states(self._stream, serial, *self._states.changes(batch))
+
     def finish(self) -> None:
-        """Log the layout that the file opens with."""
+        """Log what was gathered, and the layout that the file opens with."""
+        for serial in tuple(self._rows):
+            self._log_rows(serial)
+        self._log_poses()
         self._show()
 
     def phase(self, t_ns: int, text: str) -> None:
         """Log a step of the run."""
-        self._show()
+        if self._pace.layout_follows:
+            self._show()
         progress.set_time(self._stream, t_ns)
         progress.log_phase(self._stream, text)
 
     def network(self, serial: str, t_ns: int, round_trip_ms: float, age_ms: float, refusals: int) -> None:
-        """Log a module's connection."""
-        self._know([serial])
+        """Log the state of a module's connection."""
+        self._register([serial])
         progress.set_time(self._stream, t_ns)
         progress.log_network(self._stream, serial, round_trip_ms, age_ms, refusals)
 
     def topology(self, t_ns: int, topology: graphs.Topology) -> None:
         """Log the tree of modules."""
-        self._know(topology.serials)
+        self._register(topology.serials)
         progress.set_time(self._stream, t_ns)
         for drawn in graphs.graph(topology, self._types, self._colours(topology.serials)):
             self._stream.log(entity_paths.TOPOLOGY, drawn)
         self._contents = self._contents._replace(topology=topology)
-        self._show()
+        self.show_if_new()
 
     def estimate(self, t_ns: int, estimate: Estimate) -> None:
-        """Log an estimated parameter, and the true value beside it where that is known.
+        """Log an estimated parameter, and its true value if that is known.
 
-        One that is shown once more, so that its line goes on, does not change its plot.
+        An estimate that is logged again, so that its line continues, does not change its plot.
         """
-        which = (estimate.name, estimate.serial)
-        truth, previous = self._truths.get(which), self._estimates.get(which)
+        key = (estimate.name, estimate.serial)
+        truth, previous = self._truths.get(key), self._estimates.get(key)
         colour = self._palette.colour(estimate.serial)
         if previous is None:
-            progress.log_interval_style(self._stream, *which, colour)
+            progress.log_interval_style(self._stream, *key, colour)
         if estimate != previous:
             before = None if previous is None else previous.value
             estimated = with_estimate(self._contents.estimated, estimate, before, truth)
             self._contents = self._contents._replace(estimated=estimated)
-            self._estimates[which] = estimate
+            self._estimates[key] = estimate
         progress.set_time(self._stream, t_ns)
         progress.log_estimate(self._stream, estimate, colour)
         if truth is not None:
-            progress.log_truth(self._stream, *which, truth)
+            progress.log_truth(self._stream, *key, truth)
 
     def true_value(self, name: str, serial: str, value: float, t_ns: Sequence[int]) -> None:
-        """Make the true value of a parameter known, to be drawn with its estimates."""
+        """Set the true value of a parameter, which is logged at `t_ns` and with every estimate."""
         if (name, serial) not in self._truths:
             progress.log_truth_style(self._stream, name, serial)
         self._truths[name, serial] = value
@@ -110,25 +155,25 @@ class Recorder:
             progress.set_time(self._stream, t)
             progress.log_truth(self._stream, name, serial, value)
 
-    def chain(
-        self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.SceneStyle
-    ) -> None:
-        """Draw the robot from now on, in the posture it was last seen in; at q = 0 before the first pose."""
-        self._know(chain.serials)
-        scene = robot_scene.build_scene(chain, self._types, self._colours(chain.serials), sigma_m, look)
+    def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, world: str) -> None:
+        """Draw the robot of a world from now on, in its latest posture; at q = 0 before the first pose."""
+        self._register(chain.serials)
+        self._log_poses()  # of the previous chain
+        style = STYLES[world]
+        scene = robot_scene.build_scene(chain, self._types, self._colours(chain.serials), sigma_m, style)
         progress.set_time(self._stream, t_ns)
-        before = self._scenes.get(look.world)
+        before = self._scenes.get(world)
         if before is not None:
-            robot_scene.clear_gone(self._stream, before, scene)
+            robot_scene.clear_removed(self._stream, before, scene)
         robot_scene.log_scene(self._stream, scene, self._posture(chain))
-        self._scenes[look.world] = scene
+        self._scenes[world] = scene
         self._contents = self._contents._replace(truth=entity_paths.TRUE_WORLD in self._scenes)
         self._frame(chain)
 
     def poses(self, t_ns: IntArray, q_rad: Array, serials: Sequence[str] | None) -> None:
         """Turn the robots that are drawn at `t_ns` (k,); `q_rad` (k, n) of `serials`.
 
-        Without `serials` it is in the identified chain's order. Joints that are not named stay as they are.
+        Without `serials` it is in the order of the identified chain. Other joints stay as they are.
         """
         first = self._scenes.get(entity_paths.ESTIMATED_WORLD, self._scenes.get(entity_paths.TRUE_WORLD))
         if first is None and serials is None:
@@ -136,20 +181,32 @@ class Recorder:
         named = tuple(serials or ()) if first is None or serials is not None else first.chain.serials
         if q_rad.shape != (t_ns.size, len(named)):
             raise ValueError(f"{t_ns.size} poses of shape {q_rad.shape} for a robot of {len(named)} joints")
-        self._q_rad.update(zip(named, q_rad[-1].tolist(), strict=True))
+        if named != self._posed:
+            self._log_poses()
+            self._posed = named
+        self._poses.append((t_ns, q_rad))
+        if t_ns[-1] - self._poses[0][0][0] >= self._pace.period_ns:
+            self._log_poses()
+
+    def _log_poses(self) -> None:
+        if not self._poses:
+            return
+        t_ns, q_rad = (np.concatenate(column) for column in zip(*self._poses, strict=True))
+        self._poses.clear()
+        self._q_rad.update(zip(self._posed, q_rad[-1].tolist(), strict=True))
         for scene in self._scenes.values():
             postures = np.tile(self._posture(scene.chain), (t_ns.size, 1))
             for column, serial in enumerate(scene.chain.serials):
-                if serial in named:
-                    postures[:, column] = q_rad[:, named.index(serial)]
+                if serial in self._posed:
+                    postures[:, column] = q_rad[:, self._posed.index(serial)]
             robot_scene.send_poses(self._stream, scene, t_ns, postures)
 
     def residuals(self, serial: str, t_ns: IntArray, measured_nm: Array, predicted_nm: Array) -> None:
         """Log held-out torque."""
-        self._know([serial])
+        self._register([serial])
         progress.send_residuals(self._stream, serial, t_ns, measured_nm, predicted_nm)
 
-    def _know(self, serials: Sequence[str]) -> None:
+    def _register(self, serials: Sequence[str]) -> None:
         new = [serial for serial in dict.fromkeys(serials) if serial not in self._contents.serials]
         if not new:
             return
@@ -162,10 +219,10 @@ class Recorder:
         placed = robot_geometry.modules(chain, self._types)
         reach = robot_geometry.reach_m(chain, placed)
         self._stream.log(entity_paths.GRAVITY, robot_scene.gravity_arrow(chain, reach))
-        # The eye stays in the hands of whoever looks, unless the robot has outgrown what is seen.
+        # The camera belongs to the user, unless the robot has outgrown the view.
         if self._contents.reach_m is None or reach > OUTGROWN * self._contents.reach_m:
             self._contents = self._contents._replace(reach_m=reach)
-            self._show()
+            self.show_if_new()
 
     def _posture(self, chain: Chain) -> Array:
         return np.array([self._q_rad.get(serial, 0.0) for serial in chain.serials])
@@ -174,13 +231,15 @@ class Recorder:
         return {serial: self._palette.colour(serial) for serial in serials}
 
     def show_if_new(self) -> None:
-        """Log the layout if it has other views than the one that stands."""
-        # A new layout puts the first tab in front again. Ranges of plots alone are not worth that in the
-        # middle of a step; they come with the next one.
-        if self._shown is None or blueprint.views(self._contents) != blueprint.views(self._shown):
+        """Send the layout if its views differ from those that are shown, and this stream follows the run."""
+        # A new layout puts the first tab in front again. Axis ranges alone are not worth that in the middle
+        # of a step; they come with the next one.
+        if self._pace.layout_follows and (
+            self._shown is None or blueprint.views(self._contents) != blueprint.views(self._shown)
+        ):
             self._show()
 
     def _show(self) -> None:
         if self._lays_out and self._contents != self._shown:
             self._shown = self._contents
-            self._stream.send_blueprint(blueprint.build(self._contents))
+            blueprint.send(self._stream, blueprint.build(self._contents))

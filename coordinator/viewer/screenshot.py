@@ -1,4 +1,4 @@
-"""Pictures of a recording without a screen: a headless viewer, waited for until it has stopped changing.
+"""Pictures of a recording without a screen, taken from a headless viewer once its picture is stable.
 
 Needs Vulkan in software, on Debian the packages `mesa-vulkan-drivers` and `libvulkan1`.
 """
@@ -38,8 +38,8 @@ def screenshot(
     Args:
         rrd: the recording.
         out: the PNG.
-        tab: one of `blueprint.TABS`; the one that the recording opens with if left out.
-        t_s: session time to show [s]; the recording's last if left out.
+        tab: one of `blueprint.TABS`; the tab that the recording opens with if left out.
+        t_s: session time to show [s]; the end of the recording if left out.
         size: width and height [pixels].
 
     Raises:
@@ -63,7 +63,7 @@ def screenshots(
     if not rrd.is_file():
         raise FileNotFoundError(f"no recording at {rrd}")
     if not is_recording(rrd):
-        raise ScreenshotFailed(f"{rrd} is no Rerun recording: it does not begin with {MAGIC.decode()!r}")
+        raise ScreenshotFailed(f"{rrd} is not a Rerun recording: it does not begin with {MAGIC.decode()!r}")
     port = viewer_process.free_port()
     viewer = _start(port, size)
     try:
@@ -76,8 +76,8 @@ def screenshots(
             out.parent.mkdir(parents=True, exist_ok=True)
             out.write_bytes(client.take_screenshot())
     except ConnectionError as failure:
-        # It listens before it draws, so without Vulkan it starts, and dies at the first picture.
-        raise ScreenshotFailed(_advice(viewer.told())) from failure
+        # It listens before it draws, so without Vulkan it starts, and ends at the first picture.
+        raise ScreenshotFailed(_advice(viewer.output_tail())) from failure
     finally:
         viewer_process.stop(viewer)
 
@@ -90,10 +90,10 @@ def _start(port: int, size: tuple[int, int]) -> viewer_process.ViewerProcess:
         raise ScreenshotFailed(_advice(str(failure))) from failure
 
 
-def _advice(said: str) -> str:
+def _advice(output: str) -> str:
     return (
         "the headless viewer does not run here; it needs Vulkan in software: "
-        f"`apt-get install mesa-vulkan-drivers libvulkan1`. It said:\n{said}"
+        f"`apt-get install mesa-vulkan-drivers libvulkan1`. Its output:\n{output}"
     )
 
 
@@ -112,7 +112,7 @@ def _open(client: ViewerClient, rrd: Path, t_s: float | None) -> None:
             break
         if time.monotonic() > deadline:
             raise ScreenshotFailed(
-                f"{rrd} has no timeline {entity_paths.TIMELINE!r}: it is no recording of a run"
+                f"{rrd} has no timeline {entity_paths.TIMELINE!r}: it is not the recording of a run"
             )
         time.sleep(_POLL_SECONDS)
     t_ns = ends[0] if t_s is None else round(1e9 * t_s)
@@ -125,7 +125,7 @@ def _turn_to(client: ViewerClient, tab: str) -> None:
 
 
 def with_active_tab(blueprint: Mapping[str, Any], tab: str) -> dict[str, Any]:
-    """Return a blueprint, as the viewer hands it out, in which the tab of that name is in front.
+    """Return a blueprint, in the form that the viewer returns, in which the tab of that name is in front.
 
     Raises:
         ScreenshotFailed: no tabs of it contain one of that name.
@@ -138,16 +138,16 @@ def with_active_tab(blueprint: Mapping[str, Any], tab: str) -> dict[str, Any]:
     named = [path for path, entry in containers.items() if entry.get("display_name") == tab]
     for path, entry in containers.items():
         inside = entry.get("contents", [])
-        # A single entry comes bare, and paths come with or without their slash.
+        # A single entry is not in a list, and paths are with or without a leading slash.
         inside = ["/" + p.lstrip("/") for p in ([inside] if isinstance(inside, str) else inside)]
         if entry.get("container_kind") == "Tabs" and named and named[0] in inside:
             turned = {"ContainerBlueprint": {**entry, "active_tab": named[0].lstrip("/")}}
             return {**blueprint, path: {**blueprint[path], **turned}}
-    raise ScreenshotFailed(f"the recording has no tab {tab!r}, so it is none of a run")
+    raise ScreenshotFailed(f"the recording has no tab {tab!r}, so it is not the recording of a run")
 
 
 def _settle(client: ViewerClient) -> None:
-    """Wait until pictures in a row are the same: the viewer says that it is ready before it has drawn."""
+    """Wait until consecutive pictures are the same: the viewer reports ready before it has drawn."""
     deadline = time.monotonic() + SETTLE_SECONDS
     last, same = b"", 0
     while same < SAME_PICTURES:

@@ -1,23 +1,24 @@
-"""Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page.
-
-Which live viewer a person asks for.
-"""
+"""Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page."""
 
 import logging
 import socket
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote, urlsplit
 
-import rerun as rr
-import rerun.blueprint as rrb
-
 from coordinator.viewer import viewer_process
+from coordinator.viewer.scene import entity_paths
+
+if TYPE_CHECKING:
+    import rerun as rr
 
 NATIVE_PORT = 9876
-# Attaching a sink with nobody listening blocks for seconds, so every target is tried with this patience.
+# Attaching a sink blocks for seconds if nothing listens there, so every address is tried first.
 PROBE_SECONDS = 0.5
 WEB_MEMORY = "256MB"
+SCHEMES = ("rerun", "rerun+http", "rerun+https")
+# Rows that are logged one by one, such as estimates, share a chunk of a file for this long.
+FILE_TICK_SECONDS = 10.0
 
 logger = logging.getLogger(__name__)
 
@@ -37,34 +38,66 @@ class ViewerTargets(NamedTuple):
     serve_port: int | None = None
 
 
+class ViewerChoice(NamedTuple):
+    """A native viewer to start, a web page to serve, or the address of a viewer that is open already."""
+
+    spawn: bool = False
+    serve: bool = False
+    connect: str | None = None
+
+
+def viewer_choice(text: str) -> ViewerChoice:
+    """Parse `none`, `spawn`, `serve` or an address.
+
+    Raises:
+        ValueError: none of these; the message lists what is allowed.
+    """
+    if text in ("none", "spawn", "serve"):
+        return ViewerChoice(text == "spawn", text == "serve")
+    scheme, separator, rest = text.partition("://")
+    if scheme not in SCHEMES or not separator or not rest:
+        raise ValueError(
+            f"--viewer {text}: it must be none, spawn, serve or an address like {proxy_url(NATIVE_PORT)}"
+        )
+    return ViewerChoice(connect=text)
+
+
 class Opened(NamedTuple):
-    """What came of the targets: whether anything records, and the web server to end with the run."""
+    """The streams that the targets need, and the web server to stop at the end of the run.
 
-    records: bool
-    live: tuple[str, ...]
-    web_server: viewer_process.ViewerProcess | None
+    A file gets few large chunks and a live viewer small ones at once, so they have a stream each, of the same
+    recording.
+    """
+
+    file: "rr.RecordingStream | None" = None
+    live: "rr.RecordingStream | None" = None
+    web_server: viewer_process.ViewerProcess | None = None
 
 
-def open_targets(
-    stream: rr.RecordingStream, targets: ViewerTargets, blueprint: rrb.Blueprint | None
-) -> Opened:
-    """Attach the stream to its targets; a live one that cannot be reached is reported and left out.
+def open_targets(run_id: str, targets: ViewerTargets) -> Opened:
+    """Open the targets; a live viewer that cannot be reached is reported and left out.
 
     Raises:
         OSError: the file cannot be written.
     """
-    sinks: list[rr.FileSink | rr.GrpcSink] = []
+    if targets == ViewerTargets():
+        return Opened()
+    import rerun as rr
+
+    file = live = None
     if targets.rrd is not None:
         targets.rrd.parent.mkdir(parents=True, exist_ok=True)
-        targets.rrd.open("wb").close()  # says why in the system's words if it cannot be written
-        sinks.append(rr.FileSink(str(targets.rrd)))
+        targets.rrd.open("wb").close()  # raises the error of the system if it cannot be written
+        batching = rr.ChunkBatcherConfig(flush_tick=FILE_TICK_SECONDS)
+        file = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id, batcher_config=batching)
+        file.set_sinks(rr.FileSink(str(targets.rrd)))
     web_server = _serve(targets.serve_port)
-    live = [url for url in (_native(targets.spawn), targets.connect, _web_url(web_server, targets)) if url]
-    reached = tuple(url for url in dict.fromkeys(live) if _reachable(url))
-    sinks += [rr.GrpcSink(url) for url in reached]
-    if sinks:
-        stream.set_sinks(*sinks, default_blueprint=blueprint)
-    return Opened(bool(sinks), reached, web_server)
+    urls = [url for url in (_native(targets.spawn), targets.connect, _web_url(web_server, targets)) if url]
+    reached = [url for url in dict.fromkeys(urls) if _reachable(url)]
+    if reached:
+        live = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id)
+        live.set_sinks(*(rr.GrpcSink(url) for url in reached))
+    return Opened(file, live, web_server)
 
 
 def proxy_url(port: int) -> str:
@@ -73,7 +106,7 @@ def proxy_url(port: int) -> str:
 
 
 def listens(host: str, port: int) -> bool:
-    """Return whether somebody accepts connections there."""
+    """Return whether connections are accepted there."""
     try:
         socket.create_connection((host, port), timeout=PROBE_SECONDS).close()
     except OSError:
@@ -83,7 +116,7 @@ def listens(host: str, port: int) -> bool:
 
 def _reachable(url: str) -> bool:
     parts = urlsplit(url)
-    if parts.scheme not in ("rerun", "rerun+http", "rerun+https") or parts.hostname is None:
+    if parts.scheme not in SCHEMES or parts.hostname is None:
         logger.warning("%r is no viewer's address; one looks like %r", url, proxy_url(NATIVE_PORT))
         return False
     if listens(parts.hostname, parts.port or NATIVE_PORT):
@@ -119,33 +152,5 @@ def _web_url(server: viewer_process.ViewerProcess | None, targets: ViewerTargets
     if server is None or targets.serve_port is None:
         return None
     url = proxy_url(targets.serve_port + 1)
-    logger.info("watch at http://127.0.0.1:%d?url=%s", targets.serve_port, quote(url, safe=""))
+    logger.info("open http://127.0.0.1:%d?url=%s in a browser", targets.serve_port, quote(url, safe=""))
     return url
-
-
-SCHEMES = ("rerun", "rerun+http", "rerun+https")
-
-
-class ViewerChoice(NamedTuple):
-    """A native viewer to start, a web page to serve, or the address of a viewer that is open already."""
-
-    spawn: bool = False
-    serve: bool = False
-    connect: str | None = None
-
-
-def viewer_choice(text: str) -> ViewerChoice:
-    """Read `none`, `spawn`, `serve` or an address.
-
-    Raises:
-        ValueError: none of these; the message says what would be right.
-    """
-    if text in ("none", "spawn", "serve"):
-        return ViewerChoice(text == "spawn", text == "serve")
-    scheme, separator, rest = text.partition("://")
-    if scheme not in SCHEMES or not separator or not rest:
-        raise ValueError(
-            f"--viewer {text}: it must be none, spawn, serve or an address like "
-            "rerun+http://127.0.0.1:9876/proxy"
-        )
-    return ViewerChoice(connect=text)

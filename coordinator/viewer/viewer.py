@@ -1,23 +1,27 @@
-"""The front of the viewer: what the coordinator calls; every call returns at once."""
+"""The interface of the viewer to the coordinator; every call returns at once.
+
+Rerun is imported when a viewer with a target is made, not with this module.
+"""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-import rerun as rr
 from numpy.typing import ArrayLike
 
 from coordinator.viewer import viewer_process
-from coordinator.viewer.logging_thread import Job, LoggingThread
-from coordinator.viewer.recorder import Recorder
-from coordinator.viewer.scene import blueprint, entity_paths, robot_scene
+from coordinator.viewer.logging_thread import LoggingThread
+from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.parameter_plot import Estimate
-from coordinator.viewer.scene.time_series import Batch, IntArray
 from coordinator.viewer.scene.topology_graph import as_topology
-from coordinator.viewer.targets import ViewerTargets, open_targets
+from coordinator.viewer.targets import Opened, ViewerTargets, open_targets
 from module_agent.model.chain import Chain
 from module_agent.wire.feedback_rows import Rows
+
+if TYPE_CHECKING:
+    from coordinator.viewer.recorder import Recorder
 
 POSE_PERIOD_NS = 33_333_333
 FLUSH_SECONDS = 5.0
@@ -42,23 +46,31 @@ class Viewer:
             robot: the robot's name, shown above it.
             run_id: the recording's identity; the same one in two processes makes one recording.
             targets: where to; with none at all, nothing is recorded and all calls do nothing.
-            waits: let calls wait when there is too much, instead of dropping it: for virtual time.
+            waits: if the queue is full, let calls wait instead of dropping data: for virtual time.
             lays_out: send layouts; without, what is logged adds to a run that has its layout from elsewhere.
 
         Raises:
-            OSError: the file cannot be written. A live viewer that is not there is only reported.
+            OSError: the file cannot be written. A live viewer that cannot be reached is only reported.
         """
-        self._stream = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id)
-        first = blueprint.build(blueprint.Contents(robot)) if lays_out else None
-        self._opened = open_targets(self._stream, targets, first)
-        self._recorder = Recorder(self._stream, robot, lays_out)
-        self._thread = (
-            LoggingThread(on_idle=self._recorder.show_if_new, on_end=self._recorder.finish, waits=waits)
-            if self._opened.records
-            else None
-        )
+        self._opened = open_targets(run_id, targets)
+        self._thread: LoggingThread | None = None
+        self._recorders: tuple[Recorder, ...] = ()
         self._next_pose_ns: int | None = None
         self._closed = False
+        if self._opened.file is None and self._opened.live is None:
+            return
+        from coordinator.viewer import recorder
+
+        self._recorders = tuple(
+            recorder.Recorder(stream, robot, pace, lays_out)
+            for stream, pace in ((self._opened.file, recorder.FILE), (self._opened.live, recorder.LIVE))
+            if stream is not None
+        )
+        self._thread = LoggingThread(
+            on_idle=partial(self._all, lambda each: each.show_if_new()),
+            on_end=partial(self._all, lambda each: each.finish()),
+            waits=waits,
+        )
 
     @property
     def dropped(self) -> int:
@@ -71,27 +83,30 @@ class Viewer:
         return self._thread.failed if self._thread else 0
 
     def modules(self, serials: Sequence[str], types: Mapping[str, str]) -> None:
-        """Name the modules and their types; their order is that of the views and of the colours."""
-        self._submit(partial(self._recorder.modules, tuple(serials), dict(types)), essential=True)
+        """Register modules and their types; their order is that of the views and of the colours."""
+        order, type_by_serial = tuple(serials), dict(types)
+        self._submit(lambda recorder: recorder.modules(order, type_by_serial))
 
-    def rows(self, serial: str, t_ns: IntArray, rows: Rows) -> None:
+    def rows(self, serial: str, t_ns: ArrayLike, rows: Rows) -> None:
         """Show feedback: `rows` (m,) records of `feedback_rows.ROW`, taken at `t_ns` (m,).
 
         Raises:
             ValueError: there is not one time per row.
         """
-        times = np.array(t_ns, dtype=np.int64)
+        times, copy = np.array(t_ns, dtype=np.int64), rows.copy()
         if times.shape != rows.shape:
             raise ValueError(f"times of shape {times.shape} for rows of shape {rows.shape} of {serial!r}")
-        self._submit(partial(self._recorder.rows, Batch(serial, times, rows.copy())))
+        self._submit(lambda recorder: recorder.rows(serial, times, copy), essential=False)
 
     def phase(self, t_ns: int, text: str) -> None:
         """Show the step that begins, in the log and above the robot."""
-        self._submit(partial(self._recorder.phase, t_ns, text), essential=True)
+        self._submit(lambda recorder: recorder.phase(t_ns, text))
 
     def network(self, serial: str, t_ns: int, round_trip_ms: float, age_ms: float, refusals: int) -> None:
         """Show a module's round trip, the age of its newest sample and its refusals so far."""
-        self._submit(partial(self._recorder.network, serial, t_ns, round_trip_ms, age_ms, refusals))
+        self._submit(
+            lambda recorder: recorder.network(serial, t_ns, round_trip_ms, age_ms, refusals), essential=False
+        )
 
     def topology(
         self, t_ns: int, serials: Sequence[str], parent: Sequence[int], reversed: Sequence[bool]
@@ -101,34 +116,36 @@ class Viewer:
         Raises:
             ValueError: not a tree with parents before children.
         """
-        found = as_topology(serials, parent, reversed)
-        self._submit(partial(self._recorder.topology, t_ns, found), essential=True)
+        tree = as_topology(serials, parent, reversed)
+        self._submit(lambda recorder: recorder.topology(t_ns, tree))
 
     def estimate(self, name: str, serial: str, t_ns: int, value: float, sigma: float, units: str) -> None:
-        """Show an estimate with its standard deviation; `sigma` not finite means that it is not known."""
-        found = Estimate(name, serial, float(value), float(sigma), units)
-        self._submit(partial(self._recorder.estimate, t_ns, found), essential=True)
+        """Show an estimate with its standard deviation; `sigma` is not finite if it is unknown."""
+        estimate = Estimate(name, serial, float(value), float(sigma), units)
+        self._submit(lambda recorder: recorder.estimate(t_ns, estimate))
 
     def true_value(self, name: str, serial: str, value: float, t_ns: Sequence[int] = ()) -> None:
-        """Draw the true value of a parameter with its estimates; only the simulator's tools know it.
+        """Draw the true value of a parameter with its estimates; known to the simulator's tools only.
 
-        It is drawn at `t_ns` too, for estimates that somebody else draws.
+        It is drawn at `t_ns` too, for estimates that another process draws.
         """
         times = tuple(int(t) for t in t_ns)
-        self._submit(partial(self._recorder.true_value, name, serial, float(value), times), essential=True)
+        self._submit(lambda recorder: recorder.true_value(name, serial, float(value), times))
 
     def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None = None) -> None:
-        """Draw the robot as identified, with (n,) standard deviations of its joints' places [m]."""
-        self._chain(t_ns, chain, sigma_m, robot_scene.ESTIMATE_STYLE)
+        """Draw the identified robot, with (n,) standard deviations of its joints' positions [m]."""
+        sigma = None if sigma_m is None else tuple(float(s) for s in sigma_m)
+        self._submit(lambda recorder: recorder.chain(t_ns, chain, sigma, entity_paths.ESTIMATED_WORLD))
 
     def true_chain(self, t_ns: int, chain: Chain, types: Mapping[str, str] | None = None) -> None:
-        """Draw the robot as it is, in grey; only the simulator's tools know it.
+        """Draw the true robot in grey; known to the simulator's tools only.
 
-        `types` are the module types of those that were not named by `modules`.
+        `types` are the module types of those that were not registered by `modules`.
         """
         if types is not None:
-            self._submit(partial(self._recorder.name_types, dict(types)), essential=True)
-        self._chain(t_ns, chain, None, robot_scene.TRUTH_STYLE)
+            type_by_serial = dict(types)
+            self._submit(lambda recorder: recorder.name_types(type_by_serial))
+        self._submit(lambda recorder: recorder.chain(t_ns, chain, None, entity_paths.TRUE_WORLD))
 
     def pose(self, t_ns: int, q_rad: ArrayLike) -> None:
         """Turn the robot to `q_rad` (n,), in the order of the chain; at most 30 times a second are shown."""
@@ -151,9 +168,11 @@ class Viewer:
         if serials is not None and postures.shape[1:] != (len(serials),):
             raise ValueError(f"poses of shape {postures.shape} for {len(serials)} serials")
         named = None if serials is None else tuple(serials)
-        self._submit(partial(self._recorder.poses, times, postures, named))
+        self._submit(lambda recorder: recorder.poses(times, postures, named), essential=False)
 
-    def residuals(self, serial: str, t_ns: IntArray, measured_nm: ArrayLike, predicted_nm: ArrayLike) -> None:
+    def residuals(
+        self, serial: str, t_ns: ArrayLike, measured_nm: ArrayLike, predicted_nm: ArrayLike
+    ) -> None:
         """Show held-out torque at `t_ns` (m,): measured (m,) and predicted (m,).
 
         Raises:
@@ -164,34 +183,46 @@ class Viewer:
         if not (times.shape == measured.shape == predicted.shape):
             shapes = f"{times.shape}, {measured.shape} and {predicted.shape}"
             raise ValueError(f"times, measured and predicted torque of {serial!r} have shapes {shapes}")
-        self._submit(partial(self._recorder.residuals, serial, times, measured, predicted), essential=True)
+        self._submit(lambda recorder: recorder.residuals(serial, times, measured, predicted))
 
     def close(self) -> None:
-        """Write what is queued, complete the file and let go of live viewers. May be called twice."""
-        if self._thread is None or self._closed:
+        """Write what is queued, complete the file and disconnect from live viewers. May be called twice."""
+        if self._closed:
             return
         self._closed = True
-        self._thread.close()
-        if self.dropped:
-            logger.warning("%d batches were dropped: they came faster than the viewer logs", self.dropped)
-        self._disconnect()
+        if self._thread is not None:
+            self._thread.close()
+            if self.dropped:
+                logger.warning("%d batches were dropped: they came faster than the viewer logs", self.dropped)
+            self._disconnect()
 
     def _disconnect(self) -> None:
-        try:
-            self._stream.flush(timeout_sec=FLUSH_SECONDS)
-        except (RuntimeError, ValueError) as failure:
-            # The file has its own sink and is complete; only the live viewer is gone.
-            logger.warning("a live viewer did not get everything: %s", failure)
-        self._stream.disconnect()
+        for stream in (self._opened.file, self._opened.live):
+            if stream is not None:
+                try:
+                    stream.flush(timeout_sec=FLUSH_SECONDS)
+                except (RuntimeError, ValueError) as failure:
+                    # The file has its own stream and is complete; only the live viewer was lost.
+                    logger.warning("a live viewer did not receive everything: %s", failure)
+                stream.disconnect()
         if self._opened.web_server is not None:
             viewer_process.stop(self._opened.web_server)
+        from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
-    def _chain(
-        self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, look: robot_scene.SceneStyle
-    ) -> None:
-        sigma = None if sigma_m is None else tuple(float(s) for s in sigma_m)
-        self._submit(partial(self._recorder.chain, t_ns, chain, sigma, look), essential=True)
+        # A stream has threads until nothing refers to it and it is cleaned up.
+        self._recorders, self._opened = (), Opened()
+        del stream
+        flush_and_cleanup_orphaned_recordings()
 
-    def _submit(self, job: Job, *, essential: bool = False) -> None:
-        if self._thread is not None:
-            self._thread.submit(job, essential=essential)
+    def _submit(self, log: "Callable[[Recorder], None]", *, essential: bool = True) -> None:
+        """Queue a call to every recorder, each as a job of its own: one may fail without the other."""
+        if self._thread is None:
+            return
+        if self._closed:
+            raise RuntimeError("the viewer is closed; nothing can be logged any more")
+        for recorder in self._recorders:
+            self._thread.submit(partial(log, recorder), essential=essential)
+
+    def _all(self, log: "Callable[[Recorder], None]") -> None:
+        for recorder in self._recorders:
+            log(recorder)

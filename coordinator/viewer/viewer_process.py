@@ -1,10 +1,8 @@
-"""Start the viewer's own program, which comes with the SDK: with a window, as a web server, or headless.
+"""The viewer's own program, which comes with the SDK: start it, and merge recordings of one run with it.
 
-Put recordings of one run together in one file, with the viewer's own program.
-
-The messages stay in their order, so that the file opens with the layout that came last. (Of the program's
-commands `filter` with nothing to filter does that; as of 0.41 `merge` loses the order, and `route` fails on
-files that it has not written.)
+It is started with a window, as a web server, or headless. A merge leaves the messages in their order, so that
+the file opens with the latest layout. (Of the program's commands `filter` without a filter does that; as of
+0.41 `merge` loses the order, and `route` fails on files that it has not written.)
 """
 
 import importlib.util
@@ -20,42 +18,44 @@ from typing import IO, NamedTuple
 
 START_SECONDS = 15.0
 _POLL_SECONDS = 0.05
-# The end of what it printed is where the reason is.
-LINES_TOLD = 30
+MERGE_SECONDS = 120.0
+MAGIC = b"RRF"
+# The reason of a failure is at the end of the output.
+REPORTED_LINES = 30
 
 
 class ViewerProcess(NamedTuple):
-    """A viewer that was started here, and the file that it prints to."""
+    """A viewer that this process has started, and the file with its output."""
 
     process: subprocess.Popen[bytes]
     output: IO[bytes]
 
-    def told(self) -> str:
-        """Return the end of what it has printed so far."""
+    def output_tail(self) -> str:
+        """Return the last lines of its output so far."""
         self.output.seek(0)
         lines = self.output.read().decode(errors="replace").strip().splitlines()
-        return "\n".join(lines[-LINES_TOLD:])
+        return "\n".join(lines[-REPORTED_LINES:])
 
 
 class ViewerNotStarted(RuntimeError):
-    """The viewer's program ended, or did not listen in time; the message has what it printed."""
+    """The viewer's program ended, or did not listen in time; the message contains its output."""
 
 
 def executable() -> Path:
-    """Return the viewer that belongs to the installed SDK, whether or not it is on the PATH.
+    """Return the path of the viewer that belongs to the installed SDK.
 
     Raises:
-        ViewerNotStarted: there is none.
+        ViewerNotStarted: there is none, neither in the SDK nor on the PATH.
     """
     package = importlib.util.find_spec("rerun_cli")
     if package is not None and package.origin is not None:
         bundled = Path(package.origin).parent / "rerun"
         if bundled.is_file():
             return bundled
-    found = shutil.which("rerun")
-    if found is None:
+    on_path = shutil.which("rerun")
+    if on_path is None:
         raise ViewerNotStarted("no viewer in the rerun-sdk package nor on the PATH; reinstall rerun-sdk")
-    return Path(found)
+    return Path(on_path)
 
 
 def start(options: Sequence[str], port: int, *, detached: bool) -> ViewerProcess:
@@ -66,7 +66,7 @@ def start(options: Sequence[str], port: int, *, detached: bool) -> ViewerProcess
     Raises:
         ViewerNotStarted: it ended or was not ready within `START_SECONDS`.
     """
-    # By default the viewer listens on all interfaces; a run is nobody else's business unless asked for.
+    # By default the viewer listens on all interfaces; a run is shown on this machine only.
     command = [str(executable()), "--bind", "127.0.0.1", "--port", str(port), *options]
     environment = {**os.environ, "RERUN_APP_ONLY": "true", "NO_COLOR": "1"}
     output = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the viewer
@@ -81,13 +81,13 @@ def start(options: Sequence[str], port: int, *, detached: bool) -> ViewerProcess
     started = ViewerProcess(process, output)
     if _wait_until_ready(process, port):
         return started
-    told = started.told()
+    output_tail = started.output_tail()
     stop(started)
-    raise ViewerNotStarted(f"{' '.join(command)} did not get ready:\n{told}")
+    raise ViewerNotStarted(f"{' '.join(command)} did not get ready:\n{output_tail}")
 
 
 def stop(viewer: ViewerProcess, patience_s: float = 5.0) -> None:
-    """End a viewer that was started here, by force if it does not end by itself."""
+    """Terminate a viewer that this process has started; kill it if it does not end in time."""
     viewer.process.terminate()
     try:
         viewer.process.wait(patience_s)
@@ -98,7 +98,7 @@ def stop(viewer: ViewerProcess, patience_s: float = 5.0) -> None:
 
 
 def free_port() -> int:
-    """Return a port of 127.0.0.1 that nobody uses now."""
+    """Return a port of 127.0.0.1 that is free now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -116,34 +116,30 @@ def _wait_until_ready(process: subprocess.Popen[bytes], port: int) -> bool:
     return False
 
 
-PATIENCE_S = 120.0
-MAGIC = b"RRF"
-
-
 class MergeFailed(RuntimeError):
-    """The files could not be put together; the message says why. Both are as before."""
+    """The files could not be merged; the message gives the reason. Both are unchanged."""
 
 
 def merge_into(recording: Path, addition: Path) -> None:
-    """Add a recording to another one of the same run; the file is the complete old or the complete new one.
+    """Add a recording to another one of the same run, atomically.
 
     Raises:
-        MergeFailed: one of them is no recording, or there is no viewer's program.
+        MergeFailed: one of them is not a recording, or the viewer's program is missing or fails.
         OSError: one of them cannot be read.
     """
     for path in (recording, addition):
-        # The program would leave out what it cannot read, and say that all went well.
+        # The program skips a file that it cannot read, and reports success.
         if not is_recording(path):
-            raise MergeFailed(f"{path} is no Rerun recording: it does not begin with {MAGIC.decode()!r}")
+            raise MergeFailed(f"{path} is not a Rerun recording: it does not begin with {MAGIC.decode()!r}")
     temporary = recording.with_name(recording.name + ".part")
     try:
         command = [str(executable()), "rrd", "filter", str(recording), str(addition)]
         done = subprocess.run(
-            [*command, "-o", str(temporary)], capture_output=True, timeout=PATIENCE_S, check=False
+            [*command, "-o", str(temporary)], capture_output=True, timeout=MERGE_SECONDS, check=False
         )
         if done.returncode != 0 or not is_recording(temporary):
-            told = done.stderr.decode(errors="replace").strip().splitlines()[-3:]
-            raise MergeFailed(f"{addition} was not added to {recording}: {' / '.join(told)}")
+            reason = " / ".join(done.stderr.decode(errors="replace").strip().splitlines()[-3:])
+            raise MergeFailed(f"{addition} was not added to {recording}: {reason}")
         os.replace(temporary, recording)
     except (ViewerNotStarted, subprocess.TimeoutExpired) as failure:
         raise MergeFailed(f"{addition} was not added to {recording}: {failure}") from failure

@@ -12,7 +12,7 @@ from coordinator.kinematics.chain_estimate import link_lengths
 from coordinator.kinematics.frames import axis_angles
 from coordinator.kinematics.gauge_fixing import gauge_freedoms, moved, nearest
 from coordinator.kinematics.null_space import Unresolved
-from coordinator.viewer.scene.blueprint import AXIS_ANGLE, LINK_LENGTH
+from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.chain import BASE, Chain
 from sim.scoring.gauge_alignment import move_root
@@ -25,7 +25,7 @@ class TruthView:
         self._truth = truth
         self._types = dict(zip(truth.serials, types, strict=True))
 
-    def met(self, viewer: Viewer, t_ns: int) -> None:
+    def connected(self, viewer: Viewer, t_ns: int) -> None:
         """Draw the robot as it stands."""
         viewer.true_chain(t_ns, self._truth, self._types)
         self.values(viewer)

@@ -8,18 +8,18 @@ from typing import NamedTuple
 
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun_bindings as bindings
 
 from coordinator.viewer.scene import entity_paths
-from coordinator.viewer.scene.parameter_plot import Parameter, is_dynamic
+from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Parameter, is_dynamic
 from coordinator.viewer.scene.topology_graph import Topology, extent
 
 IDENTIFICATION, DYNAMICS, IMU, NETWORK = TABS = ("Identification", "Dynamics", "IMU", "Network")
-LINK_LENGTH, AXIS_ANGLE = OF_LINKS = ("link_length", "axis_angle")
 
-# More than this on one page leaves plots too small to read; there are further pages for the rest.
+# More on one page would make plots too small to read; the rest is on further pages.
 MODULES_PER_PAGE = 4
 ROWS_PER_PAGE, COLUMNS_PER_PAGE = 3, 3
-# About a housing's length, which is seen around what the joints can reach.
+# About a housing's length: margin around the reach of the joints.
 HOUSING_M = 0.12
 
 _WHOLE_RUN = rr.TimeRange(
@@ -28,7 +28,7 @@ _WHOLE_RUN = rr.TimeRange(
 
 
 class Contents(NamedTuple):
-    """What there is to show."""
+    """Everything that the layout depends on."""
 
     robot: str
     serials: tuple[str, ...] = ()
@@ -39,12 +39,12 @@ class Contents(NamedTuple):
 
 
 def views(contents: Contents) -> Contents:
-    """Return the contents without the ranges of the plots: what differs in it has other views."""
+    """Return the contents without the ranges of the plots; contents that then differ need different views."""
     return contents._replace(estimated=tuple(p.without_ranges() for p in contents.estimated))
 
 
 def build(contents: Contents, active_tab: str = IDENTIFICATION) -> rrb.Blueprint:
-    """Return the layout for the modules, estimates and topology there are.
+    """Return the layout for modules, estimates and topology.
 
     Raises:
         ValueError: there is no such tab.
@@ -64,6 +64,23 @@ def build(contents: Contents, active_tab: str = IDENTIFICATION) -> rrb.Blueprint
     )
 
 
+def send(stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+    """Make a layout the active one, and the default of the recording.
+
+    As of Rerun 0.41 `RecordingStream.send_blueprint` leaves two threads and 3 MB behind for good: the stream
+    in which it builds the blueprint is held by its own memory sink. Here that stream is disconnected, so that
+    `flush_and_cleanup_orphaned_recordings` releases it; that waits for live viewers, so it comes at the end.
+    """
+    layout = rr.RecordingStream._from_native(
+        bindings.new_blueprint(entity_paths.APPLICATION_ID, make_default=False, make_thread_default=False)
+    )
+    layout.set_time("blueprint", sequence=0)
+    blueprint._log_to_stream(layout)
+    memory = layout.memory_recording()
+    bindings.send_blueprint(memory.storage, make_active=True, make_default=True, recording=stream.to_native())
+    layout.disconnect()
+
+
 def _left(contents: Contents) -> rrb.Vertical:
     return rrb.Vertical(
         rrb.TextDocumentView(origin=entity_paths.PHASE_NOW, name="Step"),
@@ -80,7 +97,7 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
     if contents.reach_m is not None:
         size = contents.reach_m + HOUSING_M
         eye = rrb.EyeControls3D(
-            # Far enough for all that the robot can reach, not only for where it stands now.
+            # Far enough for every posture, not only for the present one.
             position=[0.75 * size, -1.2 * size, 0.68 * size],
             look_target=[0.0, 0.0, 0.1 * size],
             eye_up=[0.0, 0.0, 1.0],
@@ -97,24 +114,27 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
 
 
 def _identification(contents: Contents) -> rrb.Vertical:
-    # The links of the identified robot come before what single modules made of single joints.
+    # The links of the identified robot come before the estimates of single modules.
     geometric = sorted(
         (parameter for parameter in contents.estimated if not is_dynamic(parameter)),
-        key=lambda parameter: (parameter.name not in OF_LINKS, parameter.name != LINK_LENGTH),
+        key=lambda parameter: (
+            parameter.name not in (LINK_LENGTH, AXIS_ANGLE),
+            parameter.name != LINK_LENGTH,
+        ),
     )
     log = rrb.TextLogView(
         origin=entity_paths.PHASE_LOG, name="Log", columns=rrb.TextLogColumns(text_log_columns=["Body"])
     )
     return rrb.Vertical(
-        _parameters(geometric, "Estimates", contents) if geometric else _awaited(contents),
+        _parameters(geometric, "Estimates", contents) if geometric else _no_estimates(contents),
         rrb.Horizontal(_topology(contents), log, column_shares=[2, 3]),
         row_shares=[3, 2],
         name=IDENTIFICATION,
     )
 
 
-def _awaited(contents: Contents) -> rrb.View:
-    # One empty plot says what to wait for.
+def _no_estimates(contents: Contents) -> rrb.View:
+    # One empty plot announces the first estimate.
     return rrb.TimeSeriesView(
         origin="/",
         contents=[entity_paths.estimate_path(LINK_LENGTH, serial) for serial in contents.serials],
@@ -123,9 +143,9 @@ def _awaited(contents: Contents) -> rrb.View:
 
 
 def _parameters(parameters: Sequence[Parameter], name: str, contents: Contents) -> rrb.Container:
-    """Give every parameter a row and every module a column, on as many pages as it takes."""
+    """Lay out parameters by row and modules by column, on as many pages as needed."""
     serials = list(dict.fromkeys(serial for p in parameters for serial in p.ranges_by_serial()))
-    # From the base to the tips, as far as that is known.
+    # From the base to the tips, as far as the topology is known.
     known = contents.topology.serials if contents.topology is not None else ()
     serials.sort(key=lambda serial: known.index(serial) if serial in known else len(known))
     rows = [parameters[i : i + ROWS_PER_PAGE] for i in range(0, len(parameters), ROWS_PER_PAGE)]
@@ -149,13 +169,13 @@ def _parameter_page(parameters: Sequence[Parameter], serials: Sequence[str], nam
 
 
 def _estimate(parameter: Parameter, serial: str) -> rrb.View:
-    seen = parameter.ranges_by_serial()[serial]
+    axis_range = parameter.ranges_by_serial()[serial]
     return rrb.TimeSeriesView(
         origin=entity_paths.estimate_path(parameter.name, serial),
         name=f"{serial} {parameter.title()} [{parameter.units}]",
-        # All in the same time, so that one sees what a motion does to each of them.
+        # One time axis for all, so that the effect of a motion on each of them is visible.
         axis_x=rrb.TimeAxis(view_range=_WHOLE_RUN),
-        axis_y=None if seen is None else rrb.ScalarAxis(range=seen),
+        axis_y=None if axis_range is None else rrb.ScalarAxis(range=axis_range),
         plot_legend=rrb.PlotLegend(visible=False),
     )
 
@@ -165,9 +185,7 @@ def _topology(contents: Contents) -> rrb.GraphView:
     if contents.topology is not None:
         x_min, x_max, y_min, y_max = extent(contents.topology)
         bounds = rrb.VisualBounds2D(x_range=(x_min, x_max), y_range=(y_min, y_max))
-    return rrb.GraphView(
-        origin=entity_paths.TOPOLOGY, name="Topology: who is mounted on whom", visual_bounds=bounds
-    )
+    return rrb.GraphView(origin=entity_paths.TOPOLOGY, name="Topology: parent → child", visual_bounds=bounds)
 
 
 def _dynamics(contents: Contents) -> rrb.Vertical:
@@ -208,7 +226,7 @@ def _imu(contents: Contents) -> rrb.Container:
         ):
             path = entity_paths.module_path(serial, group)
             plots.append(rrb.TimeSeriesView(origin=path, name=f"{serial} {title}"))
-    # No container around a single one: the viewer takes such out, and its name with it.
+    # No container around a single plot: the viewer removes such a container together with its name.
     return _paged(plots, 2 * MODULES_PER_PAGE, IMU)
 
 
@@ -238,7 +256,7 @@ def _of_modules(
 
 
 def _paged(views: Sequence[rrb.View], per_page: int, name: str) -> rrb.Container:
-    """Put views into two columns, on as many pages as it takes."""
+    """Lay out views in two columns, on as many pages as needed."""
     pages = [views[i : i + per_page] for i in range(0, len(views), per_page)]
     if len(pages) <= 1:
         return rrb.Grid(*views, grid_columns=2, name=name)

@@ -2,7 +2,7 @@
 
 /world/{est,true}/...           the robot as identified and, from the simulator's tools, as it is
 /modules/<serial>/<group>       one vector entity per group of sensors
-/estimates/<parameter>/<serial> value with variance; below it the 95 % interval and, if known, the truth
+/estimates/<parameter>/<serial> value with variance; below it the 95 % interval and, if known, the true value
 /residuals/<serial>/...         held-out torque, measured and predicted
 /network/<serial>/...           round trip, age of the newest sample, refusals
 /topology, /phase/...           the tree of modules; the steps of the run
@@ -10,8 +10,6 @@
 
 import colorsys
 from typing import Final
-
-import rerun as rr
 
 APPLICATION_ID: Final = "x5"
 TIMELINE: Final = "session_time"
@@ -21,11 +19,11 @@ Colour = tuple[int, int, int, int]
 ESTIMATE_COLOUR: Final[Colour] = (255, 150, 40, 150)
 PREDICTION_COLOUR: Final[Colour] = (255, 150, 40, 255)
 TRUTH_COLOUR: Final[Colour] = (165, 165, 170, 255)
-# In 3D it is seen through, so that it does not hide the estimate that it should coincide with.
+# Translucent in 3D, so that it does not hide the estimate, which should coincide with it.
 TRUE_BODY_COLOUR: Final[Colour] = (190, 190, 195, 110)
 COMMAND_COLOUR: Final[Colour] = (225, 225, 225, 255)
 
-# Far apart in hue and light enough for the dark background. Orange is the estimate's and grey is the truth's.
+# Far apart in hue and light enough for the dark background; orange is for estimates, grey for the truth.
 _FIRST_COLOURS: Final[tuple[Colour, ...]] = (
     (86, 180, 233, 255),
     (80, 200, 120, 255),
@@ -79,12 +77,12 @@ def interval_path(name: str, serial: str) -> str:
 
 
 def truth_path(name: str, serial: str) -> str:
-    """Return the entity of a parameter's true value, which only simulations know."""
+    """Return the entity of a parameter's true value, which is known in simulations only."""
     return f"{estimate_path(name, serial)}/true"
 
 
 def residual_path(serial: str, group: str) -> str:
-    """Return the entity of a module's held-out torque (`HELD_OUT`) or of what is left of it (`ERROR`)."""
+    """Return the entity of a module's held-out torque (`HELD_OUT`) or of its residual (`ERROR`)."""
     return f"/residuals/{part(serial)}/{group}"
 
 
@@ -100,24 +98,26 @@ def body_path(world: str, serial: str | None) -> str:
 
 def part(name: str) -> str:
     """Escape a name so that it is one part of an entity path, whatever characters it has."""
+    import rerun as rr  # here, so that those who only name a path do without
+
     return rr.escape_entity_path_part(name)
 
 
 class Palette:
-    """One colour per module, the same everywhere, kept for good once given."""
+    """Assigns each module one colour, the same in every view and for the whole run."""
 
     def __init__(self) -> None:
         self._colours: dict[str, Colour] = {}
 
     def colour(self, serial: str) -> Colour:
-        """Return the module's colour; a module not seen before gets the next one."""
+        """Return the module's colour; a new module gets the next one."""
         if serial not in self._colours:
             self._colours[serial] = nth_colour(len(self._colours))
         return self._colours[serial]
 
 
 def nth_colour(index: int) -> Colour:
-    """Return the colour of the module seen as number `index`; no hue is near the estimate's."""
+    """Return the colour of module number `index`; no hue is near that of the estimates."""
     if index < len(_FIRST_COLOURS):
         return _FIRST_COLOURS[index]
     # 0.16 to 1.0 leaves out red-orange to amber.

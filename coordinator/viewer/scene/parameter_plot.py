@@ -1,23 +1,25 @@
-"""An estimated parameter as it is plotted: whose it is, and a range in which its band can be seen."""
+"""The plot of an estimated parameter: its module, and an axis range in which its band is visible."""
 
 import math
 from typing import NamedTuple
 
 Range = tuple[float, float]
 
+LINK_LENGTH, AXIS_ANGLE = "link_length", "axis_angle"
+
 # The first band fills two fifths of the plot. Once it has shrunk below a thirtieth of it, the plot zooms in.
 FIRST_SIGMAS = 2.5
 ZOOM_BELOW = 1.0 / 30.0
 ZOOMED_SIGMAS = 8.0
 AGREEING_SIGMAS = 4.0
-# Of a normal distribution 95 % lie nearer to the middle.
+# Half width of the 95 % interval of a normal distribution.
 NINETY_FIVE_SIGMAS = 1.96
-# What is put into a plot besides, such as the truth, is this part of it away from its edge.
-BESIDE_EDGE = 0.06
+# Distance of a further value, such as the truth, from the edge of a plot, as a fraction of its height.
+EDGE_MARGIN = 0.06
 
 
 class Estimate(NamedTuple):
-    """One estimate of a parameter with its standard deviation; `serial` names what has it."""
+    """One estimate of a parameter of the module `serial` with its standard deviation."""
 
     name: str
     serial: str
@@ -29,7 +31,7 @@ class Estimate(NamedTuple):
 class Parameter(NamedTuple):
     """A parameter that has been estimated.
 
-    ranges: what has it, in the order of the first estimates, and its plot's range (None: the viewer's own).
+    ranges: (serial, axis range) in the order of the first estimates; None leaves the range to the viewer.
     """
 
     name: str
@@ -37,7 +39,7 @@ class Parameter(NamedTuple):
     ranges: tuple[tuple[str, Range | None], ...] = ()
 
     def ranges_by_serial(self) -> dict[str, Range | None]:
-        """Return the ranges as a dictionary in the same order."""
+        """Return the axis range by serial, in the same order."""
         return dict(self.ranges)
 
     def without_ranges(self) -> "Parameter":
@@ -45,24 +47,24 @@ class Parameter(NamedTuple):
         return self._replace(ranges=tuple((serial, None) for serial, _ in self.ranges))
 
     def title(self) -> str:
-        """Return the name as one reads it."""
+        """Return the name without underscores."""
         return self.name.replace("_", " ")
 
-    def seen(
+    def with_range(
         self, serial: str, value: float, sigma: float, previous: float | None, truth: float | None = None
     ) -> "Parameter":
-        """Return the parameter with a plot in which this estimate, its band and the truth can be seen."""
+        """Return the parameter with a range in which this estimate, its band and the truth are visible."""
         ranges = self.ranges_by_serial()
         ranges[serial] = including(fitting(ranges.get(serial), value, sigma, previous), truth)
         return self._replace(ranges=tuple(ranges.items()))
 
 
 def fitting(before: Range | None, value: float, sigma: float, previous: float | None) -> Range | None:
-    """Return the range for an estimate, the one before if that still does: a new one means a new layout.
+    """Return the axis range for an estimate, unchanged where that is possible: a new one needs a new layout.
 
     The viewer fits a plot to the lines and cuts their bands off, so the range has to be set. Without a finite
-    positive sigma there is no band, and the viewer's own choice stays. The plot zooms in only on an estimate
-    that agrees with the previous one: a jump of many sigmas says that sigma is wrong, and is to be seen.
+    positive sigma there is no band, and the range stays as it was. The plot zooms in only on an estimate
+    that agrees with the previous one: a jump of many sigmas means that sigma is wrong, and must stay visible.
     """
     if not (math.isfinite(value) and math.isfinite(sigma) and sigma > 0.0):
         return before
@@ -78,16 +80,16 @@ def fitting(before: Range | None, value: float, sigma: float, previous: float | 
 
 
 def including(around: Range | None, value: float | None) -> Range | None:
-    """Return a range in which a further value can be seen too."""
+    """Return a range in which a further value is visible too."""
     if around is None or value is None or not math.isfinite(value):
         return around
     low, high = around
-    edge = BESIDE_EDGE * (max(high, value) - min(low, value))
+    edge = EDGE_MARGIN * (max(high, value) - min(low, value))
     return (low if value > low else value - edge, high if value < high else value + edge)
 
 
 def is_dynamic(parameter: Parameter) -> bool:
-    """Return whether it belongs to dynamics: masses, moments, friction and springs have units of kg or Nm."""
+    """Return whether it is a parameter of the dynamics: its unit contains kg or Nm."""
     return "kg" in parameter.units or "Nm" in parameter.units
 
 
@@ -97,8 +99,10 @@ def with_estimate(
     previous: float | None,
     truth: float | None = None,
 ) -> tuple[Parameter, ...]:
-    """Return the parameters with this estimate among them; the units are those said first."""
+    """Return the parameters including this estimate; the units are those of the first estimate."""
     known = {parameter.name: parameter for parameter in parameters}
     parameter = known.get(estimate.name, Parameter(estimate.name, estimate.units))
-    known[estimate.name] = parameter.seen(estimate.serial, estimate.value, estimate.sigma, previous, truth)
+    known[estimate.name] = parameter.with_range(
+        estimate.serial, estimate.value, estimate.sigma, previous, truth
+    )
     return tuple(known.values())

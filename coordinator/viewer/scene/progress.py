@@ -1,4 +1,4 @@
-"""What is said as the run goes on: steps, estimates, held-out torque, the network."""
+"""Logging of single events: steps, estimates, held-out torque and the state of the network."""
 
 import math
 
@@ -8,37 +8,37 @@ from numpy.typing import NDArray
 
 from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS, Estimate
-from coordinator.viewer.scene.time_series import IntArray, send_scalars
+from coordinator.viewer.scene.time_series import IntArray, envelope, send_scalars
 
-LEGEND = "Band: 1σ. Thin lines and spheres: 95 %. Grey: the truth, where it is known."
+LEGEND = "Band: 1σ. Thin lines and spheres: 95 %. Grey: the truth, if known."
 
 
 def set_time(stream: rr.RecordingStream, t_ns: int) -> None:
-    """Set the session time of what is logged next; only the logging thread does so."""
+    """Set the session time of everything that is logged next."""
     stream.set_time(entity_paths.TIMELINE, duration=np.timedelta64(t_ns, "ns"))
 
 
 def log_phase(stream: rr.RecordingStream, text: str) -> None:
-    """Log a step of the run: a line of the log, and the heading that says what is going on."""
+    """Log a step of the run, as a line of the log and as the heading of the view."""
     stream.log(entity_paths.PHASE_LOG, rr.TextLog(text, level=rr.TextLogLevel.INFO))
     stream.log(entity_paths.PHASE_NOW, rr.TextDocument(f"**{text}**\n\n{LEGEND}", media_type="text/markdown"))
 
 
 def log_estimate(stream: rr.RecordingStream, estimate: Estimate, colour: entity_paths.Colour) -> None:
-    """Log a value with its variance and the ends of its 95 % interval; not finite sigma: neither.
+    """Log a value with its variance and its 95 % interval; without these if sigma is not finite.
 
-    The viewer draws a line in a band of one sigma, and two thin lines that are right 95 times in 100.
+    The viewer draws a line in a band of one sigma, and the ends of the interval as two thin lines.
     """
     known = math.isfinite(estimate.sigma)
     drawn = rr.Measurements(
         [estimate.value],
-        # None would leave the variance of the estimate before standing.
+        # With None the variance of the previous estimate would remain valid.
         variances=[estimate.sigma**2] if known else [],
         units=estimate.units,
         names=estimate.serial,
         colors=[colour],
         widths=[2.0],
-        # An estimate stays what it is until the next one.
+        # An estimate is valid until the next one.
         interpolation_mode="stepafter",
     )
     stream.log(entity_paths.estimate_path(estimate.name, estimate.serial), drawn)
@@ -50,7 +50,7 @@ def log_estimate(stream: rr.RecordingStream, estimate: Estimate, colour: entity_
 def log_interval_style(
     stream: rr.RecordingStream, name: str, serial: str, colour: entity_paths.Colour
 ) -> None:
-    """Log how the ends of a parameter's interval are drawn, static."""
+    """Log the static style of the ends of a parameter's interval."""
     style = rr.SeriesLines(
         names=["95 %: from", "95 %: to"],
         colors=[entity_paths.shade(colour, 0.75)] * 2,
@@ -61,7 +61,7 @@ def log_interval_style(
 
 
 def log_truth_style(stream: rr.RecordingStream, name: str, serial: str) -> None:
-    """Log how a parameter's true value is drawn, static."""
+    """Log the static style of a parameter's true value."""
     style = rr.SeriesLines(names="true", colors=[entity_paths.TRUTH_COLOUR], widths=[1.5])
     stream.log(entity_paths.truth_path(name, serial), style, static=True)
 
@@ -74,7 +74,7 @@ def log_truth(stream: rr.RecordingStream, name: str, serial: str, value: float) 
 def log_network(
     stream: rr.RecordingStream, serial: str, round_trip_ms: float, age_ms: float, refusals: int
 ) -> None:
-    """Log the state of a module's connection."""
+    """Log a module's round trip, the age of its newest sample and the number of refused commands."""
     stream.log(entity_paths.network_path(serial, entity_paths.ROUND_TRIP), rr.Scalars(round_trip_ms))
     stream.log(entity_paths.network_path(serial, entity_paths.AGE), rr.Scalars(age_ms))
     stream.log(entity_paths.network_path(serial, entity_paths.REFUSALS), rr.Scalars(float(refusals)))
@@ -87,8 +87,8 @@ def send_residuals(
     measured_nm: NDArray[np.float64],
     predicted_nm: NDArray[np.float64],
 ) -> None:
-    """Log held-out torque (m,) as measured and as predicted, and the difference."""
+    """Log the envelopes of held-out torque (m,), measured and predicted, and of the residual."""
     both = np.stack([measured_nm, predicted_nm], axis=1)
-    send_scalars(stream, entity_paths.residual_path(serial, entity_paths.HELD_OUT), t_ns, both)
+    send_scalars(stream, entity_paths.residual_path(serial, entity_paths.HELD_OUT), *envelope(t_ns, both))
     error = (measured_nm - predicted_nm)[:, None]
-    send_scalars(stream, entity_paths.residual_path(serial, entity_paths.ERROR), t_ns, error)
+    send_scalars(stream, entity_paths.residual_path(serial, entity_paths.ERROR), *envelope(t_ns, error))

@@ -1,9 +1,9 @@
-"""What an identified chain looks like: where housings, outputs, links and axes are at q = 0.
+"""Geometry of a drawn chain: poses of housings, outputs, links and axes.
 
 Everything is in the root frame at q = 0 and is grouped by the body that carries it, so that a body's
-displacement D_i(q) (`kinematics.forward`) moves all of it.
+displacement D_i(q) (`forward_kinematics.body_displacements`) moves all of it.
 
-Trees of a chain set apart, to be looked at: where they stand against each other is not known.
+The trees of a chain of several are drawn apart, because their relative pose is not known.
 """
 
 from collections.abc import Mapping
@@ -24,8 +24,12 @@ class Box(NamedTuple):
     centre: tuple[float, float, float]
 
 
+# Distance between the trees of a chain.
+GAP_M = 0.25
+
+
 class Module(NamedTuple):
-    """One module in its place.
+    """Geometry of one module of a chain.
 
     housing_body, output_body: the bodies that carry the housing and the output, `BASE` for the base.
     housing: (4, 4) pose of the housing frame.
@@ -43,7 +47,7 @@ class Module(NamedTuple):
 
 
 class Link(NamedTuple):
-    """A straight line from `start` (3,) to `end` (3,) that joins two modules, and its body."""
+    """A straight line from `start` (3,) to `end` (3,) between two modules, carried by `body`."""
 
     body: int
     start: Array
@@ -51,11 +55,11 @@ class Link(NamedTuple):
 
 
 def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
-    """Place every module of the chain.
+    """Return the geometry of every module of the chain.
 
     Args:
         chain: n joints.
-        types: the module type's name by serial, which says where the IMU and the output are in the housing.
+        types: name of the module type by serial; it gives the IMU and output poses in the housing.
 
     Raises:
         KeyError: a serial of the chain is not in `types`, or its type is not in the catalogue.
@@ -88,12 +92,12 @@ def _module(chain: Chain, k: int, types: Mapping[str, str]) -> Module:
 
 
 def links(chain: Chain, placed: tuple[Module, ...]) -> tuple[Link, ...]:
-    """Return what joins each module to its parent, or to the origin of the base for a root module.
+    """Return the link of each module to its parent, or to the origin of the base for a root module.
 
     A link runs from the parent's distal side (its output, or its housing if reversed) to the child's proximal
     side (its housing, or its output if reversed).
     """
-    found = []
+    joined = []
     for k, parent in enumerate(chain.parent):
         child = placed[k]
         end = child.output if chain.reversed[k] else child.housing[:3, 3]
@@ -102,14 +106,14 @@ def links(chain: Chain, placed: tuple[Module, ...]) -> tuple[Link, ...]:
         else:
             above = placed[parent]
             start = above.housing[:3, 3] if chain.reversed[parent] else above.output
-        found.append(Link(parent, start, end))
-    return tuple(found)
+        joined.append(Link(parent, start, end))
+    return tuple(joined)
 
 
 def upright(gravity: Array) -> Rotation:
-    """Return the least rotation of the root frame that points the specific force of rest (3,) along +z.
+    """Return the smallest rotation of the root frame that turns the specific force at rest (3,) to +z.
 
-    The heading about the vertical is not observable on a fixed base, so the least rotation is as good as any.
+    The heading about the vertical is not observable on a fixed base; the smallest rotation is chosen.
 
     Raises:
         ValueError: `gravity` has no direction.
@@ -121,17 +125,17 @@ def upright(gravity: Array) -> Rotation:
 
 
 def from_z(direction: Array) -> Rotation:
-    """Return the least rotation that turns +z into the unit vector `direction` (3,)."""
+    """Return the smallest rotation that turns +z into the unit vector `direction` (3,)."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     sine = float(np.linalg.norm(axis))
     angle = float(np.arctan2(sine, direction[2]))
-    # Along z the axis is not defined, and any horizontal one will do for the half turn.
+    # Along z the axis is not defined; any horizontal one serves for the half turn.
     unit = axis / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
     return Rotation.from_rotvec(angle * unit)
 
 
 def reach_m(chain: Chain, placed: tuple[Module, ...]) -> float:
-    """Return the greatest distance of a module from the root along the links; no posture exceeds it [m]."""
+    """Return the largest distance of a module from the root along the links [m]; no posture exceeds it."""
     along: list[float] = []
     for k, link in enumerate(links(chain, placed)):
         parent = chain.parent[k]
@@ -147,13 +151,10 @@ def _shift(by: Array) -> Array:
     return pose
 
 
-GAP_M = 0.25
-
-
 def side_by_side(chain: Chain) -> Chain:
-    """Return the chain with its trees in a row along the horizontal, the first where it is.
+    """Return the chain with its trees in a horizontal row; the first one is not moved.
 
-    Nothing that sensors on a fixed base tell depends on where a second tree stands.
+    The relative pose of two trees is not observable from sensors on a fixed base.
     """
     if len(chain.roots) == 1:
         return chain
@@ -169,7 +170,7 @@ def side_by_side(chain: Chain) -> Chain:
 
 
 def _horizontal(chain: Chain) -> Array:
-    """Return the level direction (3,) that is nearest to the root frame's y, or to its x."""
+    """Return the horizontal direction (3,) nearest to the root frame's y, or to its x if y is vertical."""
     up = chain.gravity / np.linalg.norm(chain.gravity)
     for candidate in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
         level = candidate - up * (up @ candidate)

@@ -19,22 +19,22 @@ OUTPUT_RADIUS_M = 0.024
 OUTPUT_THICKNESS_M = 0.008
 AXIS_LENGTH_M = 0.09
 IMU_AXIS_LENGTH_M = 0.05
-# Sigmas: as far as the 95 % intervals of the plots.
+# Radius in sigmas, as the 95 % intervals of the plots.
 SPREAD = NINETY_FIVE_SIGMAS
 
 Drawn = rr.AsComponents
 
 
 class SceneStyle(NamedTuple):
-    """How a robot is drawn in one world: `link` for what joins modules; `plain` paints everything so.
+    """How a robot is drawn in one world: colour of the links, and one `uniform` colour of the rest, if any.
 
-    The truth is translucent and without labels, so that it does not hide the estimate that it should coincide
-    with.
+    The truth is translucent and without labels, so that it does not hide the estimate, which should coincide
+    with it.
     """
 
     world: str
     link: entity_paths.Colour
-    plain: entity_paths.Colour | None
+    uniform: entity_paths.Colour | None
     fill: rr.components.FillMode
     labels: bool
 
@@ -56,10 +56,10 @@ TRUTH_STYLE = SceneStyle(
 
 
 class Scene(NamedTuple):
-    """Everything to log for a chain: (entity path, archetypes), in the root frame at q = 0."""
+    """Everything that is logged of a chain: (entity path, archetypes), in the root frame at q = 0."""
 
     chain: Chain
-    look: SceneStyle
+    style: SceneStyle
     drawn: tuple[tuple[str, tuple[Drawn, ...]], ...]
 
 
@@ -68,7 +68,7 @@ def build_scene(
     types: Mapping[str, str],
     colours: Mapping[str, entity_paths.Colour],
     sigma_m: Sequence[float] | None = None,
-    look: SceneStyle = ESTIMATE_STYLE,
+    style: SceneStyle = ESTIMATE_STYLE,
 ) -> Scene:
     """Draw a chain at q = 0.
 
@@ -76,8 +76,8 @@ def build_scene(
         chain: n joints.
         types: module type's name by serial.
         colours: the modules' colours by serial.
-        sigma_m: (n,) standard deviation of each joint's place [m]; not finite means that it is not known.
-        look: world and colours.
+        sigma_m: (n,) standard deviation of each joint's position [m]; not finite if unknown.
+        style: world and colours.
 
     Raises:
         KeyError: a serial has no type or colour.
@@ -86,15 +86,15 @@ def build_scene(
     if sigma_m is not None and len(sigma_m) != len(chain.serials):
         raise ValueError(f"{len(sigma_m)} sigmas for a chain of {len(chain.serials)} joints")
     placed = modules(chain, types)
-    paint = [look.plain or colours[serial] for serial in chain.serials]
-    drawn: list[tuple[str, tuple[Drawn, ...]]] = [(look.world, (_upright(chain.gravity),))]
+    paint = [style.uniform or colours[serial] for serial in chain.serials]
+    drawn: list[tuple[str, tuple[Drawn, ...]]] = [(style.world, (_upright(chain.gravity),))]
     for body in range(BASE, len(chain.serials)):
-        drawn += _body(chain, placed, paint, sigma_m, look, body)
-    return Scene(chain, look, tuple(drawn))
+        drawn += _body(chain, placed, paint, sigma_m, style, body)
+    return Scene(chain, style, tuple(drawn))
 
 
 def log_scene(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
-    """Log a scene at the stream's present time, in the posture `q_rad` (n,)."""
+    """Log a scene at the present time of the stream, in the posture `q_rad` (n,)."""
     for path, archetypes in scene.drawn:
         for archetype in archetypes:
             stream.log(path, archetype)
@@ -112,26 +112,26 @@ def send_poses(stream: rr.RecordingStream, scene: Scene, t_ns: IntArray, q_rad: 
         moved = rr.Transform3D.columns(
             translation=displaced[:, body, :3, 3], mat3x3=displaced[:, body, :3, :3]
         )
-        stream.send_columns(entity_paths.body_path(scene.look.world, serial), [time_column(t_ns)], moved)
+        stream.send_columns(entity_paths.body_path(scene.style.world, serial), [time_column(t_ns)], moved)
 
 
 def _log_pose(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
     displaced = body_displacements(scene.chain, q_rad[None, :])[0]
     for serial, motion in zip(scene.chain.serials, displaced, strict=True):
-        path = entity_paths.body_path(scene.look.world, serial)
+        path = entity_paths.body_path(scene.style.world, serial)
         stream.log(path, rr.Transform3D(translation=motion[:3, 3], mat3x3=motion[:3, :3]))
 
 
-def clear_gone(stream: rr.RecordingStream, before: Scene, after: Scene) -> None:
-    """Take away, from the stream's present time on, what the new scene no longer has."""
-    kept = {path for path, _ in after.drawn}
+def clear_removed(stream: rr.RecordingStream, before: Scene, after: Scene) -> None:
+    """Clear, from the present time of the stream on, the entities that the new scene no longer has."""
+    retained = {path for path, _ in after.drawn}
     for path, _ in before.drawn:
-        if path not in kept:
+        if path not in retained:
             stream.log(path, rr.Clear(recursive=False))
 
 
 def gravity_arrow(chain: Chain, reach_m: float) -> rr.Arrows3D:
-    """Return gravity as an arrow beside the robot, in the upright world."""
+    """Return gravity as an arrow next to the robot, in the upright world."""
     length = 0.25 * max(reach_m, 0.2)
     strength = float(np.linalg.norm(chain.gravity))
     return rr.Arrows3D(
@@ -149,29 +149,29 @@ def _body(
     placed: tuple[Module, ...],
     paint: Sequence[entity_paths.Colour],
     sigma_m: Sequence[float] | None,
-    look: SceneStyle,
+    style: SceneStyle,
     body: int,
 ) -> list[tuple[str, tuple[Drawn, ...]]]:
-    path = entity_paths.body_path(look.world, None if body == BASE else chain.serials[body])
+    path = entity_paths.body_path(style.world, None if body == BASE else chain.serials[body])
     housed = [k for k, module in enumerate(placed) if module.housing_body == body]
     drawn: list[tuple[str, tuple[Drawn, ...]]] = []
     if housed:
-        drawn.append((f"{path}/housing", (_housings(chain, placed, paint, sigma_m, look, housed),)))
-        if look.plain is None:
+        drawn.append((f"{path}/housing", (_housings(chain, placed, paint, sigma_m, style, housed),)))
+        if style.uniform is None:
             drawn += [(f"{path}/imu/{entity_paths.part(chain.serials[k])}", _imu(chain, k)) for k in housed]
     turning = [k for k, module in enumerate(placed) if module.output_body == body]
     if turning:
-        drawn.append((f"{path}/output", (_outputs(placed, paint, look, turning),)))
+        drawn.append((f"{path}/output", (_outputs(placed, paint, style, turning),)))
     if body != BASE:
         drawn.append((f"{path}/axis", (_axis(placed[body], paint[body]),)))
         if sigma_m is not None and np.isfinite(sigma_m[body]):
-            drawn.append((f"{path}/spread", (_spread(placed[body], sigma_m[body], look),)))
+            drawn.append((f"{path}/spread", (_spread(placed[body], sigma_m[body], style),)))
     joined = [link for link in links(chain, placed) if link.body == body and _length(link) > 1e-4]
-    if body == BASE and look.plain is not None:
-        # The base is where the identified robot's first module stands, and the truth may be drawn elsewhere.
+    if body == BASE and style.uniform is not None:
+        # The base is at the first module of the identified robot; the truth may be drawn elsewhere.
         joined = []
     if joined:
-        drawn.append((f"{path}/link", (_links(joined, look),)))
+        drawn.append((f"{path}/link", (_links(joined, style),)))
     return drawn
 
 
@@ -180,7 +180,7 @@ def _housings(
     placed: tuple[Module, ...],
     paint: Sequence[entity_paths.Colour],
     sigma_m: Sequence[float] | None,
-    look: SceneStyle,
+    style: SceneStyle,
     housed: Sequence[int],
 ) -> rr.Boxes3D:
     poses = [placed[k].housing for k in housed]
@@ -191,23 +191,26 @@ def _housings(
         ],
         quaternions=[_quaternion(Rotation.from_matrix(pose[:3, :3])) for pose in poses],
         colors=[paint[k] for k in housed],
-        fill_mode=look.fill,
+        fill_mode=style.fill,
         labels=[_label(chain, k, sigma_m) for k in housed],
-        show_labels=look.labels,
+        show_labels=style.labels,
     )
 
 
 def _label(chain: Chain, k: int, sigma_m: Sequence[float] | None) -> str:
     how = " (reversed)" if chain.reversed[k] else ""
-    if sigma_m is None or sigma_m[k] == 0.0:  # the root is where the others are measured from
+    if sigma_m is None or sigma_m[k] == 0.0:  # the root is the reference of the others
         return f"{chain.serials[k]}{how}"
     if not np.isfinite(sigma_m[k]):
-        return f"{chain.serials[k]}{how}  place not known"
+        return f"{chain.serials[k]}{how}  position unknown"
     return f"{chain.serials[k]}{how}  ±{1e3 * sigma_m[k]:.2g} mm"
 
 
 def _outputs(
-    placed: tuple[Module, ...], paint: Sequence[entity_paths.Colour], look: SceneStyle, turning: Sequence[int]
+    placed: tuple[Module, ...],
+    paint: Sequence[entity_paths.Colour],
+    style: SceneStyle,
+    turning: Sequence[int],
 ) -> rr.Cylinders3D:
     return rr.Cylinders3D(
         lengths=[OUTPUT_THICKNESS_M] * len(turning),
@@ -215,7 +218,7 @@ def _outputs(
         centers=[placed[k].output for k in turning],
         quaternions=[_quaternion(from_z(placed[k].axis)) for k in turning],
         colors=[entity_paths.shade(paint[k], 0.5) for k in turning],
-        fill_mode=look.fill,
+        fill_mode=style.fill,
     )
 
 
@@ -228,23 +231,23 @@ def _axis(module: Module, colour: entity_paths.Colour) -> rr.Arrows3D:
     )
 
 
-def _spread(module: Module, sigma_m: float, look: SceneStyle) -> rr.Ellipsoids3D:
+def _spread(module: Module, sigma_m: float, style: SceneStyle) -> rr.Ellipsoids3D:
     return rr.Ellipsoids3D(
         centers=[module.output],
         radii=[SPREAD * sigma_m],
-        colors=[look.link],
+        colors=[style.link],
         fill_mode="transparentfillmajorwireframe",
     )
 
 
-def _links(joined: Sequence[Link], look: SceneStyle) -> rr.Capsules3D:
+def _links(joined: Sequence[Link], style: SceneStyle) -> rr.Capsules3D:
     return rr.Capsules3D(
         lengths=[_length(link) for link in joined],
         radii=[LINK_RADIUS_M] * len(joined),
         translations=[link.start for link in joined],
         quaternions=[_quaternion(from_z((link.end - link.start) / _length(link))) for link in joined],
-        colors=[look.link] * len(joined),
-        fill_mode=look.fill,
+        colors=[style.link] * len(joined),
+        fill_mode=style.fill,
     )
 
 

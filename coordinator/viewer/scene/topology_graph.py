@@ -1,12 +1,13 @@
-"""The tree of modules as a graph: who is mounted on whom, and which way round."""
+"""The tree of modules as a graph: parent, child and mounting direction of every module."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
-
-import rerun as rr
+from typing import TYPE_CHECKING, NamedTuple
 
 from coordinator.viewer.scene import entity_paths
 from module_agent.model.chain import BASE
+
+if TYPE_CHECKING:
+    import rerun as rr
 
 BASE_NODE = "base"
 BASE_COLOUR: entity_paths.Colour = (200, 200, 210, 255)
@@ -23,7 +24,7 @@ class Topology(NamedTuple):
 
 
 def positions(topology: Topology) -> list[tuple[float, float]]:
-    """Return a place for the base, then for every module: the depth goes down, every leaf has its own column.
+    """Return the position of the base, then of every module: depth goes down, every leaf has its own column.
 
     A parent is above the middle of its children, so no two edges cross.
     """
@@ -53,8 +54,10 @@ def positions(topology: Topology) -> list[tuple[float, float]]:
 
 def graph(
     topology: Topology, types: Mapping[str, str], colours: Mapping[str, entity_paths.Colour]
-) -> tuple[rr.GraphNodes, rr.GraphEdges]:
-    """Draw the tree with fixed places, which need no settling."""
+) -> "tuple[rr.GraphNodes, rr.GraphEdges]":
+    """Draw the tree at fixed positions, which need no settling."""
+    import rerun as rr
+
     labels = [_label(topology, k, types) for k in range(len(topology.serials))]
     nodes = rr.GraphNodes(
         node_ids=[BASE_NODE, *topology.serials],
@@ -80,8 +83,8 @@ def extent(topology: Topology) -> tuple[float, float, float, float]:
     return (min(x) - LEAF, max(x) + LEAF, min(y) - 0.6 * LEVEL, max(y) + 0.6 * LEVEL)
 
 
-def complaint(topology: Topology) -> str | None:
-    """Return what is wrong with a topology, None if it is a tree in order (parents before children)."""
+def error_in(topology: Topology) -> str | None:
+    """Return what is wrong with a topology; None if it is a tree with parents before children."""
     count = len(topology.serials)
     if not (len(topology.parent) == len(topology.reversed) == count):
         return f"{count} serials, {len(topology.parent)} parents, {len(topology.reversed)} directions"
@@ -98,13 +101,13 @@ def _label(topology: Topology, k: int, types: Mapping[str, str]) -> str:
 
 
 def as_topology(serials: Sequence[str], parent: Sequence[int], reverse: Sequence[bool]) -> Topology:
-    """Make a topology of any sequences.
+    """Build a topology from sequences of any type.
 
     Raises:
         ValueError: the sequences differ in length, or a parent does not come before its child.
     """
     topology = Topology(tuple(serials), tuple(int(p) for p in parent), tuple(bool(r) for r in reverse))
-    wrong = complaint(topology)
+    wrong = error_in(topology)
     if wrong is not None:
         raise ValueError(f"not a tree with parents before children: {wrong}")
     return topology

@@ -87,5 +87,3 @@ def test_closing_twice_is_no_mistake() -> None:
     thread = LoggingThread(nothing, nothing)
     thread.close()
     thread.close()
-    with pytest.raises(RuntimeError, match="closed"):
-        thread.submit(nothing)

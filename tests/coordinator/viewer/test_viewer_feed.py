@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.recording.recording import Entry, Recording
-from coordinator.viewer.feed import FILE, LIVE, Pace, ViewerFeed
+from coordinator.viewer.feed import ROWS_PERIOD_NS, ViewerFeed
 from module_agent.model.chain import Chain
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Message
@@ -19,7 +19,7 @@ AHEAD_NS = 7_000 * MS
 
 
 class Shown:
-    """A viewer that keeps what it is told."""
+    """A viewer that records its calls."""
 
     def __init__(self) -> None:
         self.rows_of: dict[str, list[tuple[int, float]]] = {}
@@ -42,11 +42,11 @@ class Shown:
 class Rig:
     """A recording and the feed of a viewer, as a run feeds them."""
 
-    def __init__(self, wire: SimpleNamespace, pace: Pace):
+    def __init__(self, wire: SimpleNamespace):
         self.wire = wire
         self.recording = Recording()
         self.viewer: Any = Shown()
-        self.feed = ViewerFeed(self.viewer, self.recording, pace)
+        self.feed = ViewerFeed(self.viewer, self.recording)
         self.feed.since_start(0)
 
     def hear(self, entry: Entry) -> None:
@@ -60,7 +60,7 @@ class Rig:
             self.hear(self.wire.request(Leaf.STATUS, self.wire.ask(serial, seq=4), 0))
             answer = self.wire.status(serial, re=4, t_ns=AHEAD_NS)
             self.hear(self.wire.reply(Leaf.STATUS, answer, 0))
-        self.feed.met(dict.fromkeys(serials, "X5-4"), 0)
+        self.feed.connected(dict.fromkeys(serials, "X5-4"), 0)
 
     def publish(self, first: int, serial: str = "A", late_ns: int = 0) -> None:
         """Five rows, which arrive 2 ms after the last of them and `late_ns`."""
@@ -71,9 +71,9 @@ class Rig:
         self.hear(self.wire.publication(Leaf.FEEDBACK, feedback, arrival_ns))
 
 
-@pytest.fixture(params=[LIVE, FILE], ids=["live", "file"])
-def rig(wire: SimpleNamespace, request: pytest.FixtureRequest) -> Rig:
-    return Rig(wire, request.param)
+@pytest.fixture
+def rig(wire: SimpleNamespace) -> Rig:
+    return Rig(wire)
 
 
 def _fit(chain: Chain) -> ChainEstimate:
@@ -107,13 +107,13 @@ def test_rows_that_come_late_are_shown_when_they_come_and_lost_ones_are_not(rig:
     assert rig.viewer.rows_of["A"] == _rows(*numbers, *range(5000, 5005), *range(20, 25))
 
 
-def test_rows_are_handed_over_in_as_many_calls_as_the_pace_says(rig: Rig) -> None:
+def test_rows_are_shown_ten_times_a_second(rig: Rig) -> None:
     rig.meet("A", "B")
     for first in range(0, 5000, 5):
         rig.publish(first, "A")
         rig.publish(first, "B")
-    # 20 s of messages every 20 ms, of two modules; in each call whatever came since the last one.
-    expected = {LIVE.rows_ns: 2 * 200, FILE.rows_ns: 2 * 5}[rig.feed.pace.rows_ns]
+    # 20 s of messages every 20 ms, of two modules; each call has the rows since the last one.
+    expected = 2 * 20_000 * MS // ROWS_PERIOD_NS
     assert abs(rig.viewer.calls.count("rows") - expected) <= 2
 
 
@@ -126,7 +126,7 @@ def test_rows_of_a_module_that_fell_silent_are_shown_with_those_of_the_others(ri
 
 
 def test_nothing_is_shown_of_a_module_whose_clock_is_not_known(rig: Rig) -> None:
-    rig.feed.met({"A": "X5-4"}, 0)
+    rig.feed.connected({"A": "X5-4"}, 0)
     for first in range(0, 2000, 5):
         rig.publish(first)
     rig.feed.close()
@@ -140,13 +140,10 @@ def test_the_robot_turns_thirty_times_a_second_as_its_newest_rows_say(rig: Rig) 
     rig.feed.chain(0, fit)
     for first in range(0, 1000, 5):
         rig.publish(first)
-    live = rig.viewer.calls.count("poses")
     rig.feed.close()
     times = np.array([t_ns for t_ns, _ in rig.viewer.turned])
     # Messages come every 20 ms, so that every second one is the first after 33 ms.
     np.testing.assert_array_equal(np.diff(times), 40 * MS)
     assert times[-1] > 3_900 * MS
     assert [q for _, q in rig.viewer.turned] == [[round((t - 2 * MS) / (4 * MS))] for t in times.tolist()]
-    # One by one where somebody is watching.
-    assert (live == len(times)) == (rig.feed.pace == LIVE)
     assert rig.viewer.calls[-1] == "close"

@@ -6,8 +6,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
+from coordinator.viewer.recorder import FILE, LIVE, Pace, Recorder
+from coordinator.viewer.scene.parameter_plot import Estimate
+from coordinator.viewer.scene.time_series import INTERVAL_NS
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.chain import Chain
@@ -46,7 +50,7 @@ def done(viewer: Viewer) -> None:
     assert (viewer.dropped, viewer.failed) == (0, 0)
 
 
-def test_every_row_is_in_the_file_at_its_own_nanosecond(
+def test_rows_are_in_the_file_at_their_own_nanoseconds_two_per_interval(
     viewer: Viewer, file: Path, read: Read, make_rows: MakeRows
 ) -> None:
     t_ns = 10**15 + PERIOD_NS * np.arange(103)
@@ -55,17 +59,36 @@ def test_every_row_is_in_the_file_at_its_own_nanosecond(
         viewer.rows("a", t_ns[i : i + count], make_rows(i, count))
     done(viewer)
     gyro = read(file, "/modules/a/gyro")
-    assert times_ns(gyro) == t_ns.tolist()
-    expected = np.arange(103)[:, None] + np.array([0.0, 0.25, 0.5])
+    retained = np.flatnonzero(np.isin(t_ns, times_ns(gyro)))
+    assert times_ns(gyro) == t_ns[retained].tolist()
+    # Rising values are logged as they are: the first and the last of every interval.
+    intervals = t_ns // INTERVAL_NS
+    assert retained.tolist() == [
+        k
+        for k in range(103)
+        if k in (0, 102) or intervals[k - 1] != intervals[k] or intervals[k + 1] != intervals[k]
+    ]
+    expected = retained[:, None] + np.array([0.0, 0.25, 0.5])
     np.testing.assert_array_equal(column(gyro, "/modules/a/gyro:Scalars:scalars"), expected)
     position = column(read(file, "/modules/a/position"), "/modules/a/position:Scalars:scalars")
-    np.testing.assert_array_equal(position[:, 0], 0.001 * np.arange(103))
+    np.testing.assert_array_equal(position[:, 0], 0.001 * retained)
+
+
+def test_a_minute_of_feedback_needs_few_chunks(viewer: Viewer, file: Path, make_rows: MakeRows) -> None:
+    for i in range(0, 15_000, 25):
+        viewer.rows("a", 4_000_000 * np.arange(i, i + 25), make_rows(i, 25))
+        viewer.estimate("link_length", "a", 4_000_000 * i, 0.25, 0.01, "m")
+    done(viewer)
+    chunks = [chunk.entity_path for chunk in RrdReader(str(file)).stream()]
+    # Its styles, and a chunk for every ten seconds.
+    assert 6 <= chunks.count("/modules/a/gyro") <= 8
+    assert chunks.count("/estimates/link_length/a") <= 4
 
 
 def test_a_command_that_is_not_set_is_not_drawn_at_nought(
     viewer: Viewer, file: Path, make_rows: MakeRows, read: Read
 ) -> None:
-    viewer.rows("a", np.arange(5), make_rows(0, 5))
+    viewer.rows("a", INTERVAL_NS * np.arange(5), make_rows(0, 5))
     done(viewer)
     velocity = read(file, "/modules/a/velocity_command")
     assert column(velocity, "/modules/a/velocity_command:Scalars:scalars")[:, 0].tolist() == [0, 2, 4, 6, 8]
@@ -250,20 +273,39 @@ def test_the_blueprint_of_the_same_application_is_in_the_file(viewer: Viewer, fi
     reader = RrdReader(str(file))
     recordings = [(entry.application_id, entry.recording_id) for entry in reader.recordings()]
     assert recordings == [("x5", "run-1")]
-    # One that the file opens with, and one for the modules.
-    assert [entry.application_id for entry in reader.blueprints()] == ["x5", "x5"]
+    assert [entry.application_id for entry in reader.blueprints()] == ["x5"]
 
 
+@pytest.mark.parametrize(("pace", "layouts"), [(LIVE, 3), (FILE, 2)])
 def test_a_narrowing_estimate_does_not_change_the_layout_in_the_middle_of_a_step(
-    viewer: Viewer, file: Path, make_rows: MakeRows
+    file: Path, make_rows: MakeRows, pace: Pace, layouts: int
 ) -> None:
-    viewer.modules(["a"], {"a": "X5-9"})
+    stream = rr.RecordingStream("x5", recording_id="run-1")
+    stream.set_sinks(rr.FileSink(str(file)))
+    recorder = Recorder(stream, "arm", pace)
+    recorder.modules(["a"], {"a": "X5-9"})
     for i in range(100):
-        viewer.estimate("link_length", "a", 120_000_000 * i, 0.25, 0.1 / (1 + i), "m")
-        viewer.rows("a", 120_000_000 * i + np.array([0, 110_000_000]), make_rows(0, 2))
-    done(viewer)
-    # The first one, the modules, the new parameter, and at the end its narrower plot.
-    assert len(RrdReader(str(file)).blueprints()) == 4
+        recorder.estimate(120_000_000 * i, Estimate("link_length", "a", 0.25, 0.1 / (1 + i), "m"))
+        recorder.rows("a", 120_000_000 * i + np.array([0, 110_000_000]), make_rows(0, 2))
+    recorder.finish()
+    stream.disconnect()
+    # The modules, for a live viewer the new parameter, and at the end its narrower plot.
+    assert len(RrdReader(str(file)).blueprints()) == layouts
+
+
+def test_viewers_one_after_the_other_leave_no_threads_behind(tmp_path: Path, make_rows: MakeRows) -> None:
+    def threads() -> int:
+        return len(list(Path("/proc/self/task").iterdir()))
+
+    counts = []
+    for run in range(4):
+        viewer = Viewer("arm", f"run-{run}", ViewerTargets(rrd=tmp_path / f"{run}.rrd"))
+        viewer.modules(["a"], {"a": "X5-9"})
+        viewer.rows("a", np.arange(5), make_rows(0, 5))
+        viewer.estimate("link_length", "a", 5, 0.25, 0.01, "m")
+        done(viewer)
+        counts.append(threads())
+    assert counts[1:] == counts[:1] * 3
 
 
 def test_a_module_without_a_type_is_reported_and_the_run_goes_on(

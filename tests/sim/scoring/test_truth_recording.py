@@ -72,7 +72,7 @@ def test_what_is_no_recording_is_not_merged(tmp_path: Path) -> None:
     one, other = tmp_path / "one.rrd", tmp_path / "other.rrd"
     one.write_bytes(b"as it was")
     other.write_bytes(b"neither")
-    with pytest.raises(MergeFailed, match=r"one\.rrd is no Rerun recording"):
+    with pytest.raises(MergeFailed, match=r"one\.rrd is not a Rerun recording"):
         merge_into(one, other)
     assert one.read_bytes() == b"as it was"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.rrd", "other.rrd"]

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from coordinator.viewer.scene.entity_paths import Palette, axis_shades, nth_colour
 from coordinator.viewer.scene.parameter_plot import Estimate, Parameter, fitting, with_estimate
-from coordinator.viewer.scene.time_series import Batch, StateChanges
+from coordinator.viewer.scene.time_series import INTERVAL_NS, Batch, StateChanges, envelope
 from module_agent.wire.feedback_rows import ROW
 
 
@@ -16,8 +16,44 @@ def test_states_change_across_batches_and_an_unknown_state_is_shown_by_number() 
     for states in ([0, 0, 1], [1, 1], [9, 0]):
         rows = np.zeros(len(states), ROW)
         rows["state"] = states
-        found.append(changes.of(Batch("a", np.arange(len(states)), rows))[1])
+        found.append(changes.changes(Batch("a", np.arange(len(states)), rows))[1])
     assert found == [["idle", "armed"], [], ["state 9", "idle"]]
+
+
+numbers = st.floats(-1e6, 1e6) | st.just(float("nan"))
+
+
+@given(st.lists(st.tuples(st.integers(0, 10 * INTERVAL_NS), numbers, numbers), max_size=60))
+def test_the_envelope_keeps_every_peak_within_its_interval(rows: list[tuple[int, float, float]]) -> None:
+    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
+    values = np.array([row[1:] for row in rows], dtype=float).reshape(-1, 2)
+    t, v = envelope(t_ns, values)
+    assert set(t.tolist()) <= set(t_ns.tolist())
+    for column in range(2):
+        for interval in set((t_ns // INTERVAL_NS).tolist()):
+            before, after = (x[k // INTERVAL_NS == interval, column] for k, x in ((t_ns, values), (t, v)))
+            assert np.isnan(before).all() == np.isnan(after).all()
+            if not np.isnan(before).all():
+                assert np.nanmin(after) == np.nanmin(before)
+                assert np.nanmax(after) == np.nanmax(before)
+
+
+def test_the_envelope_has_two_rows_per_interval_in_the_order_of_their_values() -> None:
+    t_ns = np.arange(0, 2 * INTERVAL_NS, INTERVAL_NS // 10)
+    falling = -np.arange(20.0)
+    spike = np.where(np.arange(20) == 13, 5.0, 0.0)
+    t, v = envelope(t_ns, np.stack([falling, spike], axis=1))
+    assert t.tolist() == t_ns[[0, 9, 10, 19]].tolist()
+    assert v[:, 0].tolist() == [0.0, -9.0, -10.0, -19.0]
+    assert v[:, 1].tolist() == [0.0, 0.0, 0.0, 5.0]
+
+
+def test_slow_feedback_is_shown_row_by_row() -> None:
+    t_ns = INTERVAL_NS * np.arange(50) + 3
+    values = np.random.default_rng(1).normal(size=(50, 3))
+    t, v = envelope(t_ns, values)
+    np.testing.assert_array_equal(t, t_ns)
+    np.testing.assert_array_equal(v, values)
 
 
 @given(st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(1e-6, 1.0)), min_size=2, max_size=40))
