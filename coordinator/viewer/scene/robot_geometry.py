@@ -16,16 +16,15 @@ from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import apply_perturbation
 
+# Distance between the trees of a chain.
+GAP_M = 0.25
+
 
 class Box(NamedTuple):
     """A housing's outline in its own frame [m]."""
 
     size: tuple[float, float, float]
     centre: tuple[float, float, float]
-
-
-# Distance between the trees of a chain.
-GAP_M = 0.25
 
 
 class Module(NamedTuple):
