@@ -25,14 +25,14 @@ from scipy.stats import chi2
 from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics
-from coordinator.identification.robot_refinement import CUTOFF_HZ, KEEP_EVERY, MAX_IMU_SAMPLES
+from coordinator.identification.robot_refinement import KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, sensor_data, window
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import UNCALIBRATED
 from module_agent.model.perturbation import adjoint, perturbation_between
 from module_agent.model.read_only import frozen
-from module_agent.signals.filtering import settling_samples
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, settling_samples
 
 # Scale and axes of an IMU that has been corrected for them: for the two sessions they are the same.
 TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5)
@@ -61,7 +61,7 @@ def tied_fits(known: BaselineRobot, later: BaselineRobot) -> TiedFits:
 
 def exploration(run: BaselineRobot, serials: Sequence[str]) -> list[Window]:
     """Return what all modules read during the last exploration of every joint, in the order of `serials`."""
-    margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+    margin = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
     moving = run.recording.motions(*MOVING)
     # All take part in a motion of the whole robot: it is one stretch of the recording.
     last = {("" if e.purpose == "whole" else e.serial, e.purpose): e for e in moving}
@@ -87,7 +87,7 @@ def _turned(matrices: Array, vectors: Array) -> Array:
 def _fit(chain: Chain, windows: Sequence[Window]) -> Refinement:
     samples = sum(len(one.t_ns) for one in windows) * len(chain.serials)
     keep_every = max(KEEP_EVERY, -(-samples // MAX_IMU_SAMPLES))
-    return refine_chain(chain, sensor_data(windows, CUTOFF_HZ, keep_every), TIED)
+    return refine_chain(chain, sensor_data(windows, REFINEMENT_CUTOFF_HZ, keep_every), TIED)
 
 
 # What two sessions of unlike motions leave between them for each link, of the same robot: links and springs

@@ -11,16 +11,15 @@ from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.catalogue import GRAVITY_M_S2, ModuleType
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
-from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
+from module_agent.model.thermal import COPPER_PER_K, RESISTANCES_K_W
+from module_agent.signals.filtering import HELD_JOINT_CUTOFF_HZ, filtered_signals, settling_samples
 from module_agent.wire.messages import Pattern
 
 # Of the type's speed: back-EMF then leaves a third of the voltage for torque.
 SPEED_SHARE = 0.7
-# The maker's thermal resistances winding-housing, housing-body, body-ambient [K/W]; how much warmer than a
-# room of 25 C the winding may get, and how much more resistance copper then has (0.393 %/K).
-THERMAL_K_W = 4.626 + 1.0 + 8.0
+# How much warmer than a room of 25 C the winding may get, and how much more resistance copper then has.
 WINDING_RISE_K = 130.0
-HOT_RESISTANCE = 1.0 + 0.00393 * WINDING_RISE_K
+HOT_RESISTANCE = 1.0 + COPPER_PER_K * WINDING_RISE_K
 # Gravity may take all of the continuous torque. So much of the type's torque is still given to a motion,
 # which is over before the winding is warm; and so much is never asked for.
 MIN_SHARE = 0.1
@@ -56,7 +55,7 @@ class JointLimits(NamedTuple):
 def continuous_torque_nm(kind: ModuleType) -> float:
     """Return the torque that a module holds for ever: its winding's losses i^2 R warm it by 130 K."""
     motor = kind.motor
-    current_a = np.sqrt(WINDING_RISE_K / THERMAL_K_W / (motor.resistance_ohm * HOT_RESISTANCE))
+    current_a = np.sqrt(WINDING_RISE_K / sum(RESISTANCES_K_W) / (motor.resistance_ohm * HOT_RESISTANCE))
     torque = current_a * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
     return min(float(torque), kind.max_effort_nm)
 
@@ -106,8 +105,6 @@ def motion_peaks(pattern: Pattern, origin_rad: float = 0.0) -> tuple[float, floa
     return float(np.abs(velocity).max()), float(np.abs(np.gradient(velocity, t_s)).max())
 
 
-# Below what a held spring rings at; the ramps of a slow motion last 0.15 s and more.
-CUTOFF_HZ = 6.0
 # Whatever a joint carries, it has an output and a gear train of its own.
 MIN_KG_M2 = 2e-3
 
@@ -136,15 +133,14 @@ def measured_load(q_rad: Array, tau_nm: Array, rate_hz: float) -> Load:
     Raises:
         ValueError: a motion that is too short for the low-pass.
     """
-    q, tau = (zero_phase_low_pass(signal, rate_hz, CUTOFF_HZ) for signal in (q_rad, tau_nm))
-    rate = differentiate(q, rate_hz)
-    edge = settling_samples(rate_hz, CUTOFF_HZ) // 2
+    q, rate, acceleration, (tau,), _ = filtered_signals(q_rad, [tau_nm], rate_hz, HELD_JOINT_CUTOFF_HZ)
+    edge = settling_samples(rate_hz, HELD_JOINT_CUTOFF_HZ) // 2
     kept = slice(edge, len(q) - edge)
-    terms = np.column_stack([differentiate(rate, rate_hz), rate, q - q.mean(), np.ones(len(q))])[kept]
+    terms = np.column_stack([acceleration, rate, q - q.mean(), np.ones(len(q))])[kept]
     found, *_ = np.linalg.lstsq(terms, tau[kept], rcond=None)
     residual = tau[kept] - terms @ found
     # A low-passed sample is not independent of its neighbours.
-    independent = len(terms) * min(1.0, 2.0 * CUTOFF_HZ / rate_hz)
+    independent = len(terms) * min(1.0, 2.0 * HELD_JOINT_CUTOFF_HZ / rate_hz)
     freedom = max(independent - terms.shape[1], 1.0)
     scatter = float(residual @ residual) / len(terms) * independent / freedom
     variance = scatter * np.linalg.pinv(terms.T @ terms)[0, 0] * len(terms) / independent

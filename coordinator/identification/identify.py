@@ -20,7 +20,7 @@ from coordinator.identification.inertia.agent_information import gathered
 from coordinator.identification.inertia.inertia import Robot, find_inertia, without_terms
 from coordinator.identification.inertia.robot_bodies import RobotBodies, robot_bodies
 from coordinator.identification.result_builder import build_result
-from coordinator.identification.robot_refinement import CUTOFF_HZ, refine_robot
+from coordinator.identification.robot_refinement import refine_robot
 from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import assemble
@@ -46,7 +46,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import JointMotion, settling_samples
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, JointMotion, settling_samples
 from module_agent.wire.messages import Estimate
 
 # Of some 30 errors an IMU the largest is below this in 99 of 100.
@@ -239,7 +239,7 @@ def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topo
     if topology.reversed[0]:
         return None
     still = [e for e in _motions(recording, "rest") if e.serial == topology.serials[0]]
-    return noise_floor(window(recording, clocks, topology.serials, still[0]), CUTOFF_HZ, 0)
+    return noise_floor(window(recording, clocks, topology.serials, still[0]), REFINEMENT_CUTOFF_HZ, 0)
 
 
 def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
@@ -252,7 +252,7 @@ def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[J
 
 
 def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:
-    margin = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+    margin = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
     return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording, serials)]
 
 

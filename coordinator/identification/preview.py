@@ -29,7 +29,7 @@ from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
-from module_agent.signals.filtering import settling_samples
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, settling_samples
 from module_agent.wire.messages import Estimate
 
 # Of the weighted squares: far less than their noise.
@@ -195,7 +195,6 @@ def _part(topology: Topology, kept: Sequence[int]) -> Topology:
     )
 
 
-CUTOFF_HZ = 12.0
 # 50 samples a second are kept of every motion, for the loads of its links; the refinement has a quarter of
 # them: six of every period of the windowed sine.
 KEPT_EVERY, FITTED_EVERY = 5, 4
@@ -261,8 +260,8 @@ class Previewer:
         key = (event.serial, event.motion.motion_id, serials)
         if key not in self._parts:
             clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
-            margin_s = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
-            whole = filtered(window(self._recording, clocks, serials, event, margin_s), CUTOFF_HZ)
+            margin_s = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
+            whole = filtered(window(self._recording, clocks, serials, event, margin_s), REFINEMENT_CUTOFF_HZ)
             self._parts[key] = thinned([whole], KEPT_EVERY)
         return self._parts[key]
 

@@ -26,9 +26,8 @@ from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.read_only import frozen
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
 
-# Six times the 2 Hz of the windowed sine, and above the resonance of a base that is worth the name.
-CUTOFF_HZ = 12.0
 # Half the time constant of that low-pass: about as many independent samples as there are.
 KEEP_EVERY = 5
 # IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
@@ -101,7 +100,7 @@ def _parts(
     late_s: float = 0.0,
     step_rad: Array | None = None,
 ) -> list[SensorData]:
-    return [filtered(one, CUTOFF_HZ, floor, late_s, step_rad) for one in windows]
+    return [filtered(one, REFINEMENT_CUTOFF_HZ, floor, late_s, step_rad) for one in windows]
 
 
 def _giving(

@@ -12,12 +12,9 @@ from coordinator.kinematics.simultaneous_motion import (
 )
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
-from coordinator.synchronisation.motion_windows import RATE_HZ, Window, window
+from coordinator.synchronisation.motion_windows import RATE_HZ, window
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
-
-# Six times the fastest sine.
-CUTOFF_HZ = 15.0
+from module_agent.signals.filtering import SIMULTANEOUS_CUTOFF_HZ, filtered_signals, settling_samples
 
 
 def simultaneous_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent | None:
@@ -40,20 +37,12 @@ def respond(
     Raises:
         ValueError: see `simultaneous_response`; also a hole in the recording, or no rest.
     """
-    margin_s = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+    margin_s = settling_samples(RATE_HZ, SIMULTANEOUS_CUTOFF_HZ) / RATE_HZ
     one = window(recording, clocks, serials, event, margin_s)
-    return simultaneous_response(_filtered(one), _still(recording, serials), RATE_HZ, CUTOFF_HZ)
-
-
-def _filtered(one: Window) -> SimultaneousMotion:
-    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
-    q, gyro, accel = (
-        zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ)
-        for signal in (one.q_rad, one.gyro_rad_s, one.accel_m_s2)
-    )
-    # Velocities from positions, which are not late.
-    qd = differentiate(q, RATE_HZ)
-    return SimultaneousMotion(*(s[edge:-edge] for s in (q, qd, differentiate(qd, RATE_HZ), gyro, accel)))
+    others = [one.gyro_rad_s, one.accel_m_s2]
+    signals = filtered_signals(one.q_rad, others, RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
+    motion = SimultaneousMotion(*signals.settled())
+    return simultaneous_response(motion, _still(recording, serials), RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
 
 
 def _still(recording: Recording, serials: Sequence[str]) -> StillReading:

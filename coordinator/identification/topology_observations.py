@@ -19,11 +19,9 @@ from coordinator.topology.motion_evidence import MotionEvidence, NotMoved, motio
 from coordinator.topology.topology import DOUBTFUL_BELOW, MotionSeen, Observations, seen_again
 from module_agent.model.chain import Array
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
+from module_agent.signals.filtering import TOPOLOGY_CUTOFF_HZ, filtered_signals, settling_samples
 from module_agent.wire.messages import Estimate, MotionRecord
 
-# Joints that give ring at 3 to 20 Hz; the slow motion itself is over in about a second.
-CUTOFF_HZ = 10.0
 KEEP_EVERY = 5
 # An axis that joints between have turned by less is still where it was seen: what is left of it is some
 # tenths (`motion_evidence.GIVE_LEFT`).
@@ -120,13 +118,13 @@ def _of_motion(ear: _Ear, event: JournalEvent) -> Heard:
     watchers = _watchers(ear, event)
     if event.serial not in watchers:
         return Heard(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
-    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
+    edge = settling_samples(RATE_HZ, TOPOLOGY_CUTOFF_HZ)
     one = window(ear.recording, ear.clocks, watchers, event, edge / RATE_HZ)
-    q, gyro = (zero_phase_low_pass(signal, RATE_HZ, CUTOFF_HZ) for signal in (one.q_rad, one.gyro_rad_s))
-    kept = slice(edge, len(one.t_ns) - edge, KEEP_EVERY)
+    signals = filtered_signals(one.q_rad, [one.gyro_rad_s], RATE_HZ, TOPOLOGY_CUTOFF_HZ, KEEP_EVERY)
+    q, qd, _, gyro = signals.settled()
     offset = np.array([ear.offsets[s] for s in watchers])
-    mean = q[kept].mean(axis=0)
-    return Heard(event, tuple(watchers), mean, differentiate(q, RATE_HZ)[kept], gyro[kept], offset)
+    mean = q.mean(axis=0)
+    return Heard(event, tuple(watchers), mean, qd, gyro, offset)
 
 
 class Axes(NamedTuple):
@@ -211,7 +209,7 @@ def _watchers(ear: _Ear, event: JournalEvent) -> list[str]:
 
 
 def _covered(ear: _Ear, serials: Sequence[str], event: JournalEvent) -> bool:
-    margin_s = settling_samples(RATE_HZ, CUTOFF_HZ) / RATE_HZ
+    margin_s = settling_samples(RATE_HZ, TOPOLOGY_CUTOFF_HZ) / RATE_HZ
     try:
         found = window(ear.recording, ear.clocks, serials, event, margin_s)
     except ValueError:

@@ -13,12 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.recording.recording import Recording
-from coordinator.synchronisation.motion_windows import DYNAMIC_CUTOFF_HZ, RATE_HZ, STEP_NS
+from coordinator.synchronisation.motion_windows import RATE_HZ, STEP_NS
 from module_agent.model.chain import Array
 from module_agent.model.read_only import make_read_only
 from module_agent.signals.autocorrelation import autocovariance
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
+from module_agent.signals.filtering import (
+    DYNAMIC_CUTOFF_HZ,
+    differentiate,
+    filtered_signals,
+    settling_samples,
+    zero_phase_low_pass,
+)
 
 Times = NDArray[np.int64]
 
@@ -246,14 +252,8 @@ class Segmenter:
 
 
 def _stretch(block: Block) -> DataSegment:
-    kept = slice(_EDGE, len(block.t_ns) - _EDGE)
-    q, tau, gyro, accel = (
-        zero_phase_low_pass(signal, RATE_HZ, DYNAMIC_CUTOFF_HZ)
-        for signal in (block.q_rad, block.tau_nm, block.gyro_rad_s, block.accel_m_s2)
-    )
-    # The module's own velocity is late by its filter; positions are of their instant.
-    qd = differentiate(q, RATE_HZ)
-    qdd = differentiate(qd, RATE_HZ)
+    others = [block.tau_nm, block.gyro_rad_s, block.accel_m_s2]
+    q, qd, qdd, (tau, gyro, accel), kept = filtered_signals(block.q_rad, others, RATE_HZ, DYNAMIC_CUTOFF_HZ)
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
     return DataSegment(
         t_ns=block.t_ns[kept],

@@ -20,11 +20,9 @@ from module_agent.model.perturbation import cross
 from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
+from module_agent.signals.filtering import CLOCK_CUTOFF_HZ, filtered_signals
 
 RATE_HZ = 250.0
-# Seven times the 2 Hz of the windowed sine: a lag shows in how fast rates change.
-CUTOFF_HZ = 15.0
 # Half the time constant of that low-pass: about as many samples as are independent.
 KEEP_EVERY = 5
 # What shifts a single lag without any clock: a gyro that feels acceleration (0.1 deg/s/g on 0.3 m), a link
@@ -155,14 +153,11 @@ def _onto(n: int, imu: int, since_s: Array) -> Array:
 
 def _lags(chain: Chain, motion: Moved) -> list[tuple[int, _Normal]]:
     """Return what every IMU that was turned says of its lag."""
-    edge = settling_samples(RATE_HZ, CUTOFF_HZ)
-    kept = slice(edge, len(motion.t_ns) - edge, KEEP_EVERY)
-    q, gyro = (zero_phase_low_pass(x, RATE_HZ, CUTOFF_HZ) for x in (motion.q_rad, motion.gyro_rad_s))
-    qd = differentiate(q, RATE_HZ)
-    joints = tuple(x[kept] for x in (q, qd, differentiate(qd, RATE_HZ)))
+    signals = filtered_signals(motion.q_rad, [motion.gyro_rad_s], RATE_HZ, CLOCK_CUTOFF_HZ, KEEP_EVERY)
+    *joints, gyro = signals.settled()
     found = []
     for imu in range(len(chain.serials)):
-        lag = _lag(chain, imu, joints, gyro[kept, imu])
+        lag = _lag(chain, imu, tuple(joints), gyro[:, imu])
         if lag is not None:
             found.append((imu, lag))
     return found

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData, outstanding
 from coordinator.recording.journal import JournalEvent, Purpose
@@ -16,9 +15,12 @@ from coordinator.recording.recording import Recording
 from module_agent.model.chain import Array
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import (
+    DYNAMIC_CUTOFF_HZ,
+    INSTRUMENT_CUTOFF_HZ,
     JointMotion,
     differentiate,
     filtered_motion,
+    filtered_signals,
     resample,
     settling_samples,
     zero_phase_low_pass,
@@ -26,9 +28,6 @@ from module_agent.signals.filtering import (
 
 RATE_HZ = 250.0
 STEP_NS = 4_000_000
-# Four times the 2 Hz of the windowed sine. Loads of links are differentiated four times, which brings up an
-# encoder's noise with the fourth power of the frequency.
-INSTRUMENT_CUTOFF_HZ = 8.0
 # A joint whose position scatters by fewer steps of its encoder than this is taken to stand still.
 MOVING_STEPS = 20.0
 
@@ -182,24 +181,16 @@ def filtered(
     The joints are seen as late as the IMUs are. With the steps (n,) of their encoders, which make noise that
     differentiation brings up, the instrument is what stands out of it.
     """
-    edge = settling_samples(RATE_HZ, cutoff_hz)
-    kept = slice(edge, len(one.t_ns) - edge)
-    q, gyro, accel = (
-        zero_phase_low_pass(signal, RATE_HZ, cutoff_hz)
-        for signal in (one.q_rad, one.gyro_rad_s, one.accel_m_s2)
+    others = [one.gyro_rad_s, one.accel_m_s2]
+    q, qd, qdd, (gyro, accel), kept = filtered_signals(
+        one.q_rad, others, RATE_HZ, cutoff_hz, late_s=imu_late_s
     )
-    if imu_late_s:
-        t_s = np.arange(len(q)) / RATE_HZ
-        q = CubicSpline(t_s, q)(t_s - imu_late_s)
     instrument = None
     if step_rad is not None:
         slow = zero_phase_low_pass(q, RATE_HZ, INSTRUMENT_CUTOFF_HZ)
         smooth = np.where(q.std(axis=0) > MOVING_STEPS * step_rad, slow, q.mean(axis=0))
         speed = differentiate(smooth, RATE_HZ)
         instrument = np.concatenate([smooth, speed, differentiate(speed, RATE_HZ)], axis=1)[kept]
-    # The module's own velocity is late by its filter; positions are of their instant.
-    qd = differentiate(q, RATE_HZ)
-    qdd = differentiate(qd, RATE_HZ)
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
     base = None
     if floor is not None:
@@ -211,7 +202,6 @@ def filtered(
     )
 
 
-DYNAMIC_CUTOFF_HZ = 12.0
 # The low-pass leaves so many independent samples a sample.
 INDEPENDENT_FRACTION = min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
 

@@ -28,14 +28,12 @@ from coordinator.torque_control.feed_forward import RATE_HZ, SetPoints
 from module_agent.control.controller import NOMINAL_VOLTAGE_V, pwm_per_rad_s, torque_at_full_pwm_nm
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array
+from module_agent.model.thermal import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W
 from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import GainSet
 
-AMBIENT_C = 25.0
-WINDING_J_K, HOUSING_J_K = 0.367, 16.6
-WINDING_K_W, HOUSING_K_W = 4.626, 1.0
-# Copper's resistance grows by this share for every kelvin above the ambient, at which it is catalogued.
-COPPER_PER_K = 0.00393
+_WINDING_J_K, _HOUSING_J_K, _ = CAPACITIES_J_K
+_WINDING_K_W, _HOUSING_K_W, _ = RESISTANCES_K_W
 
 
 def winding_c(cold_w: Array, step_s: float, start_c: float) -> Array:
@@ -49,12 +47,12 @@ def winding_c(cold_w: Array, step_s: float, start_c: float) -> Array:
     found = np.empty(len(cold_w))
     winding = start_c
     warm_w = float(cold_w[0]) * _growth(winding)
-    body = housing = max(AMBIENT_C, winding - WINDING_K_W * warm_w)
+    body = housing = max(AMBIENT_C, winding - _WINDING_K_W * warm_w)
     for k, watt in enumerate(cold_w.tolist()):
         found[k] = winding
-        into_housing_w = (winding - housing) / WINDING_K_W
-        winding += step_s * (watt * _growth(winding) - into_housing_w) / WINDING_J_K
-        housing += step_s * (into_housing_w - (housing - body) / HOUSING_K_W) / HOUSING_J_K
+        into_housing_w = (winding - housing) / _WINDING_K_W
+        winding += step_s * (watt * _growth(winding) - into_housing_w) / _WINDING_J_K
+        housing += step_s * (into_housing_w - (housing - body) / _HOUSING_K_W) / _HOUSING_J_K
     return found
 
 

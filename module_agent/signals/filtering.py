@@ -18,6 +18,24 @@ from module_agent.model.chain import Array
 from module_agent.model.read_only import read_only
 
 FILTER_ORDER = 4
+
+# The cut-offs of `zero_phase_low_pass` [Hz]; `settling_samples` either side of a motion are needed for each.
+# One joint's slow motion, the others held: below what a held spring rings at; its ramps last 0.15 s and more.
+HELD_JOINT_CUTOFF_HZ = 6.0
+# Four times the 2 Hz of the windowed sine. Loads of links are differentiated four times, which amplifies an
+# encoder's noise with the fourth power of the frequency.
+INSTRUMENT_CUTOFF_HZ = 8.0
+# Compliant joints ring at 3 to 20 Hz; a slow motion itself ends in about a second.
+TOPOLOGY_CUTOFF_HZ = 10.0
+# Six times the 2 Hz of the windowed sine, and above the resonance of any base that is usable.
+REFINEMENT_CUTOFF_HZ = 12.0
+# The same for torques, so that agents and coordinator share their filtered motions.
+DYNAMIC_CUTOFF_HZ = 12.0
+# Six times the fastest sine of all joints moving at once.
+SIMULTANEOUS_CUTOFF_HZ = 15.0
+# Seven times the 2 Hz of the windowed sine: a clock's lag shows in how fast rates change.
+CLOCK_CUTOFF_HZ = 15.0
+
 NS_PER_S = 1_000_000_000
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -31,6 +49,23 @@ class JointMotion(NamedTuple):
     qd_rad_s: Array
     qdd_rad_s2: Array
     tau_nm: Array
+
+
+class FilteredSignals(NamedTuple):
+    """Positions (m, n) with their first two derivatives and other signals (m, ...), all through one low-pass.
+
+    Nothing is cut off; `kept` are the samples on which the low-pass has settled.
+    """
+
+    q_rad: Array
+    qd_rad_s: Array
+    qdd_rad_s2: Array
+    others: tuple[Array, ...]
+    kept: slice
+
+    def settled(self) -> tuple[Array, ...]:
+        """Return positions, velocities, accelerations and the other signals without the unsettled samples."""
+        return tuple(signal[self.kept] for signal in (*self[:3], *self.others))
 
 
 def resample(
@@ -111,6 +146,36 @@ def differentiate(signal: ArrayLike, rate_hz: float) -> Array:
     t = np.arange(values.shape[0]) / rate_hz
     found: Array = np.asarray(CubicSpline(t, values, axis=0)(t, 1))
     return read_only(found)
+
+
+def filtered_signals(
+    q_rad: ArrayLike,
+    others: Sequence[ArrayLike],
+    rate_hz: float,
+    cutoff_hz: float,
+    keep_every: int = 1,
+    late_s: float = 0.0,
+) -> FilteredSignals:
+    """Filter positions and other signals alike, and differentiate the positions twice.
+
+    Velocities come from positions because those that modules report are late by a filter of their own.
+
+    Args:
+        q_rad: (m, n) at `rate_hz`. others: (m, ...) each, sampled with them.
+        keep_every: thins the settled samples out, one in so many.
+        late_s: delays the positions, to match other signals that are late.
+
+    Raises:
+        ValueError: as `zero_phase_low_pass`.
+    """
+    edge = settling_samples(rate_hz, cutoff_hz)
+    q, *filtered = (zero_phase_low_pass(signal, rate_hz, cutoff_hz) for signal in (q_rad, *others))
+    if late_s:
+        t_s = np.arange(len(q)) / rate_hz
+        q = CubicSpline(t_s, q)(t_s - late_s)
+    qd = differentiate(q, rate_hz)
+    kept = slice(edge, len(q) - edge, keep_every)
+    return FilteredSignals(q, qd, differentiate(qd, rate_hz), tuple(filtered), kept)
 
 
 def filtered_motion(

@@ -4,13 +4,8 @@ import numpy as np
 
 from module_agent.model.compiled import compiled
 from module_agent.model.read_only import read_only
+from module_agent.model.thermal import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W
 from sim.geometry.pose import Array
-
-AMBIENT_C = 25.0
-CAPACITIES_J_K = (0.367, 16.6, 1250.0)
-RESISTANCES_K_W = (4.626, 1.0, 8.0)
-# Copper's resistance grows by this share for every kelvin above the ambient, at which it is catalogued.
-COPPER_PER_K = 0.00393
 
 
 def heat_flow(dt_s: float) -> Array:

@@ -18,10 +18,11 @@ from module_agent.firmware.firmware import Answer, Firmware, Incoming
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.read_only import read_only
+from module_agent.model.thermal import AMBIENT_C
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ack, LeaseRequest, Message, Setpoint
-from sim.actuator.thermal import AMBIENT_C, heat_flow
+from sim.actuator.thermal import heat_flow
 from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.real_module.real_log import RealLog

@@ -11,12 +11,12 @@ import numpy as np
 
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import ModuleRecord, Recording
-from coordinator.synchronisation.motion_windows import DYNAMIC_CUTOFF_HZ, RATE_HZ, STEP_NS, span, window
+from coordinator.synchronisation.motion_windows import RATE_HZ, STEP_NS, span, window
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.chain import Chain
 from module_agent.model.information import JointInformation
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import settling_samples
+from module_agent.signals.filtering import DYNAMIC_CUTOFF_HZ, settling_samples
 from module_agent.torque_information.serialisation import chain_of, chain_part, clock_part, clocks_of, unpack
 from module_agent.wire.information_messages import MAX_MODULES, InformationRequest, RowRange, SpanPart
 

@@ -26,7 +26,7 @@ from coordinator.synchronisation.motion_windows import RATE_HZ, Window
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import cross
-from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
+from module_agent.signals.filtering import differentiate, filtered_signals
 
 MotionSource = Literal["encoders", "structure", "imus"]
 
@@ -49,20 +49,15 @@ class Readings(NamedTuple):
 
 def readings(one: Window, refined: Refinement, cutoff_hz: float) -> Readings:
     """Filter a window as `differentiation.filtered_motion` does, and correct its IMUs by what they err."""
-    edge = settling_samples(RATE_HZ, cutoff_hz)
-    kept = slice(edge, len(one.t_ns) - edge)
-    q, gyro, accel = (
-        zero_phase_low_pass(signal, RATE_HZ, cutoff_hz)
-        for signal in (one.q_rad, one.gyro_rad_s, one.accel_m_s2)
-    )
-    qd = differentiate(q, RATE_HZ)
+    others = [one.gyro_rad_s, one.accel_m_s2]
+    q, qd, qdd, (gyro, accel), kept = filtered_signals(one.q_rad, others, RATE_HZ, cutoff_hz)
     imus = refined.intrinsics
     late_s = (refined.late_s + imus.errors[:, DELAY])[:, None]
     gyro, accel = (signal + late_s * differentiate(signal, RATE_HZ) for signal in (gyro, accel))
     force = _undone(imus.accel_matrix, accel - imus.accel_bias_m_s2)
     felt = np.einsum("nij,mnj->mni", imus.g_sensitivity_s_m, force)
     rate = _undone(imus.gyro_matrix, gyro - imus.gyro_bias_rad_s - felt)
-    return Readings(*(signal[kept] for signal in (q, qd, differentiate(qd, RATE_HZ), rate, force)))
+    return Readings(*(signal[kept] for signal in (q, qd, qdd, rate, force)))
 
 
 def body_motion_tracks(

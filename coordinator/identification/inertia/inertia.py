@@ -30,7 +30,6 @@ from coordinator.parameter_fit.instrumental_variables import (
 from coordinator.parameter_fit.systematic_errors import chain_effects, scale_effects
 from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE, SCALE_SIGMA, scaled
 from coordinator.synchronisation.motion_windows import (
-    DYNAMIC_CUTOFF_HZ,
     INDEPENDENT_FRACTION,
     RATE_HZ,
     Window,
@@ -40,7 +39,7 @@ from module_agent.model.catalogue import ModuleType, TorqueKind
 from module_agent.model.chain import Array, Chain
 from module_agent.model.information import JointInformation, compress, merge
 from module_agent.model.regressor import torque_regressor
-from module_agent.signals.filtering import JointMotion
+from module_agent.signals.filtering import DYNAMIC_CUTOFF_HZ, JointMotion
 from module_agent.signals.torque_terms import READING_TERMS, Term, term_columns
 
 MOTION_SOURCES: tuple[MotionSource, ...] = get_args(MotionSource)

@@ -11,8 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.thermal import CAPACITIES_J_K, RESISTANCES_K_W
 from sim.actuator.actuator import SPRING_LOSS_S, Actuators
-from sim.actuator.thermal import CAPACITIES_J_K, RESISTANCES_K_W, Windings, heat_flow
+from sim.actuator.thermal import Windings, heat_flow
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
 
 DT = 1e-3
