@@ -23,7 +23,7 @@ LIMIT_S = 20.0
 
 HUB = """
 import sys
-from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
+from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 transport = open_zenoh(ZenohConfig.hub(sys.argv[1]))
 print("open", flush=True)
 sys.stdin.read()
@@ -32,7 +32,7 @@ transport.close()
 
 AGENT = """
 import sys, threading
-from module_agent.wire.zenoh_transport import ZenohConfig, open_zenoh
+from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 endpoint, name = sys.argv[1:]
 transport = open_zenoh(ZenohConfig.spoke(endpoint))
 hears = name.encode() + b" hears "
