@@ -7,7 +7,7 @@ import signal
 import sys
 from contextlib import ExitStack
 from types import FrameType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,7 +15,6 @@ from module_agent.firmware.config import FirmwareConfig, config_of
 from module_agent.hardware.bus_client import BusClient
 from module_agent.hardware.hardware import HardwareLost, ModuleInformation
 from module_agent.hardware.loop_inside import LoopInside
-from module_agent.host import AgentHost
 from module_agent.network_emulation.impaired_transport import inject
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.profile_file import network as network_named
@@ -25,6 +24,9 @@ from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.messages import ExpiryAction
 from module_agent.worker import ThreadWorker
+
+if TYPE_CHECKING:
+    from module_agent.host import AgentHost
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -104,6 +106,9 @@ def main(
     strategy: Annotated[int, typer.Option(min=0, max=4, help="Control strategy at start.")] = 3,
 ) -> None:
     """Run the agent of one or several modules until the world ends or a signal comes."""
+    # Imported here: it brings the estimators, which `--help` does not need.
+    from module_agent.host import AgentHost
+
     signal.signal(signal.SIGTERM, _stop)
     signal.signal(signal.SIGINT, _stop)
     # Estimates run on a second thread; a tick must not wait for it the default 5 ms.
@@ -135,7 +140,7 @@ def main(
     _serve(host, worker)
 
 
-def _serve(host: AgentHost, worker: ThreadWorker) -> None:
+def _serve(host: "AgentHost", worker: ThreadWorker) -> None:
     names = ", ".join(module.serial for module in host.modules)
     typer.echo(f"x5-agent: {names}: {ATTACHED}, process {os.getpid()}", err=True)
     try:

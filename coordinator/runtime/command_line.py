@@ -96,7 +96,7 @@ def _loaded(name: str, command: LazyCommand) -> Any:
 def with_options(function: Callable[..., None]) -> Callable[..., None]:
     """Expand every parameter whose type is a dataclass into options, one for each of the dataclass' fields.
 
-    The fields are annotated and have defaults as the parameters of a typer command. The function is called
+    The fields are annotated as the parameters of a typer command. The function is called
     with instances of the dataclasses.
     """
     signature = inspect.signature(function)
@@ -128,7 +128,10 @@ def _fields(kind: Any) -> list[inspect.Parameter]:
     hints = get_type_hints(kind, include_extras=True)
     return [
         inspect.Parameter(
-            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=hints[field.name]
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if field.default is dataclasses.MISSING else field.default,
+            annotation=hints[field.name],
         )
         for field in dataclasses.fields(kind)
     ]

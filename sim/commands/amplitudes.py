@@ -7,6 +7,7 @@ from typing import Annotated, TypeVar
 import typer
 from rich.table import Table
 
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
 from sim.benchmark.case import Trial
@@ -18,7 +19,7 @@ from sim.commands.experiment import (
     profile_settings,
     trial_results,
 )
-from sim.commands.options import Seed, With, Without, fail
+from sim.commands.options import Seed, With, Without
 from sim.robot.noise_choice import NoiseChoice
 from sim.thesis.amplitude_report import Repeats, plot, repeats, write_results
 from sim.thesis.amplitude_sweep import AmplitudeTrial, Series, repeat_series, run_series, sweep_series

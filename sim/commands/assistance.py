@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.exit_codes import EXIT_FAILED
 from coordinator.runtime.terminal import print_table
 from sim.benchmark.case import Trial
@@ -21,7 +22,7 @@ from sim.commands.experiment import (
     profile_settings,
     trial_results,
 )
-from sim.commands.options import Seed, With, Without, fail
+from sim.commands.options import Seed, With, Without
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.thesis.torque_assistance import MODES, Follow, Model, identified_model, standing_robot
 from sim.thesis.torque_assistance_cases import Case, Combination, cases, robots_of, try_case

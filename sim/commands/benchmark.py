@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from coordinator.excitation.plan import Motions
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.cases.staubli_tx40 import MOTION, URDF
@@ -31,7 +32,7 @@ from sim.benchmark.report import Results, gathered, plot, write_results
 from sim.benchmark.row import Limit, Row
 from sim.benchmark.workers import run_cases
 from sim.commands.experiment import JsonFile, WorkerCount, check_writable, experiment, worker_count
-from sim.commands.options import Seed, fail
+from sim.commands.options import Seed
 
 EXIT_MISSED = 4
 

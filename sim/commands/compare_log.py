@@ -7,10 +7,12 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from coordinator.commands.options import AsJson
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
-from sim.commands.options import Seed, With, Without, fail
+from sim.commands.options import Seed, With, Without
 from sim.imperfections.noise_profile import NOISE_PROFILES, noise_profile, switched
 from sim.real_module.comparison import CommandRefused, SignalRow, compare, simulate
 from sim.real_module.real_log import LogFileError, read_log
@@ -26,7 +28,7 @@ def compare_log(
     with_effects: With = None,
     without_effects: Without = None,
     seed: Seed = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Run a real module's commands through the simulated module and compare what both did."""
     try:

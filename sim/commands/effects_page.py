@@ -1,5 +1,13 @@
-"""The table of effects as a page of Markdown: what `docs/effects.md` holds."""
+"""`x5-sim effects`: the table of effects, also as the page `docs/effects.md`."""
 
+import json
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from coordinator.commands.options import AsJson
+from coordinator.runtime.terminal import print_table
 from module_agent.model.catalogue import module_type
 from module_agent.network_emulation.profile import PROFILES
 from sim.actuator.actuator import BUS_VOLTAGE_V, SPRING_LOSS_S, STOP_NM_RAD
@@ -31,6 +39,24 @@ robot's structure is in its file. `x5-sim effects` prints the same table.
 """
 
 
+def effects(
+    as_json: AsJson = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print a page of Markdown.")] = False,
+) -> None:
+    """List the imperfections of a simulated module, which `--with` and `--without` switch."""
+    if markdown:
+        typer.echo(page(), nl=False)
+    elif as_json:
+        rows = [effect._asdict() | {"profiles": profiles_with(effect)} for effect in EFFECTS.values()]
+        typer.echo(json.dumps(rows, indent=2))
+    else:
+        table = Table("effect", "part", "model", "size", "in the profiles", show_lines=True)
+        for name, effect in EFFECTS.items():
+            profiles = ", ".join(profiles_with(effect))
+            table.add_row(name, effect.part, effect.model, default_size(effect), profiles)
+        print_table(table)
+
+
 def page() -> str:
     """Return the whole page, one table per part of a module, rows in the order of `EFFECTS`."""
     parts = dict.fromkeys(effect.part for effect in EFFECTS.values())
@@ -43,9 +69,9 @@ def sizes(effect: Effect, profile: NoiseProfile) -> str:
     return ", ".join(_size(field, value) for field, value in shown.items()) if any(shown.values()) else OFF
 
 
-def profiles_with(effect: Effect) -> str:
+def profiles_with(effect: Effect) -> list[str]:
     """Return the names of the profiles that have an effect."""
-    return ", ".join(name for name, profile in NOISE_PROFILES.items() if sizes(effect, profile) != OFF)
+    return [name for name, profile in NOISE_PROFILES.items() if sizes(effect, profile) != OFF]
 
 
 def _always() -> str:
@@ -165,7 +191,7 @@ def _table(part: str) -> str:
     for name, effect in EFFECTS.items():
         if effect.part != part:
             continue
-        size, where = default_size(effect), profiles_with(effect)
+        size, where = default_size(effect), ", ".join(profiles_with(effect))
         cells = (_title(name), effect.model, size, where, effect.source, f"`{name}`")
         rows.append(f"| {' | '.join(cells)} |")
     return "\n".join([*rows, ""])

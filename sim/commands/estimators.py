@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.exit_codes import EXIT_FAILED
 from coordinator.runtime.terminal import print_table
 from sim.benchmark.case import Trial
@@ -19,7 +20,7 @@ from sim.commands.experiment import (
     profile_settings,
     trial_results,
 )
-from sim.commands.options import Seed, With, Without, fail
+from sim.commands.options import Seed, With, Without
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.thesis.estimator_variants import Arm, EstimatorRow, compare, estimator_rows, write_estimators
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM, TRIALS

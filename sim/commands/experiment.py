@@ -9,12 +9,12 @@ from typing import Annotated, Any
 
 import typer
 
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.event_loop import SIGNALS
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from coordinator.runtime.terminal import Terminal
 from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trials
-from sim.commands.options import fail
 from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
 
 ProfileName = Annotated[str, typer.Option("--noise", help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")]

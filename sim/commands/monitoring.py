@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from coordinator.monitoring.findings import KINDS, UNITS, Kind
+from coordinator.runtime.command_line import fail
 from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
 from sim.benchmark.case import Trial
@@ -31,7 +32,7 @@ from sim.commands.experiment import (
     experiment,
     trial_results,
 )
-from sim.commands.options import Seed, fail
+from sim.commands.options import Seed
 from sim.imperfections.noise_profile import noise_profile
 from sim.robot.robot_file import RobotFileError, load_robot
 

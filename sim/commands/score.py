@@ -6,15 +6,15 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.runtime.exit_codes import EXIT_FAILED
+from coordinator.commands.options import AsJson
 from coordinator.runtime.terminal import print_table
-from sim.commands.options import fail
+from module_agent.model.errors import DataError
 from sim.scoring.score import Score, ScoreError, score, write_score
 
 
 def score_run(
     folder: Annotated[Path, typer.Argument(help="Folder of a run.")],
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare a run's result with the simulator's truth."""
     print_score(folder, as_json)
@@ -25,7 +25,7 @@ def print_score(folder: Path, as_json: bool = False) -> None:
     try:
         found = score(folder)
     except ScoreError as error:
-        fail(error, EXIT_FAILED)
+        raise DataError(str(error)) from error
     write_score(folder / "score.json", found)
     if as_json:
         typer.echo((folder / "score.json").read_text())

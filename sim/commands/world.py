@@ -1,0 +1,60 @@
+"""`x5-sim world`: the world of one robot, which agents attach to."""
+
+import gc
+import signal
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from coordinator.runtime.command_line import with_options
+from module_agent.model.errors import UsageError
+from sim.commands.options import WorldOptions, load
+from sim.robot.robot_file import RobotFileError
+from sim.world.bus_server import BusServer
+from sim.world.truth import LoggedWorld, write_truth
+from sim.world.world import World
+
+# How long the world waits for an agent that does not run on a busy machine, before it steps without it. The
+# world's clock may be stretched, while a motor without command in the middle of a motion spoils it. Agents
+# that died are noticed at once.
+PATIENCE_S = 0.2
+
+
+@with_options
+def world(
+    bus: Annotated[str, typer.Option(help="Path of the physics bus to open.")],
+    settings: WorldOptions,
+    truth: Annotated[
+        Path | None, typer.Option(help="Folder for truth.json and truth.npz, written at the end.")
+    ] = None,
+) -> None:
+    """Run the world of one robot until a signal comes; agents attach to its bus."""
+    robot, speed = load(settings.robot), settings.check_speed()
+    noise, pushes = settings.noise_of(robot), settings.pushes_on(robot)
+    stopping: list[int] = []
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        stopping.append(number)
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        plant = World(robot, settings.seed, noise.of(robot), pushes=pushes)
+        logged = LoggedWorld(plant)
+        server = BusServer(bus, logged, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
+    except (RobotFileError, OSError) as error:
+        raise UsageError(str(error)) from error
+    typer.echo(f"{robot.name}: {len(plant.modules)} modules on {bus}", err=True)
+    # A full collection of what the imports have left would stop all modules' ticks.
+    gc.collect()
+    gc.freeze()
+    with server:
+        report = server.run(speed, lambda: bool(stopping))
+    typer.echo(f"{report.simulated_s:.1f} s at {report.achieved_speed:.2f} times real time", err=True)
+    if truth is not None:
+        truth.mkdir(parents=True, exist_ok=True)
+        write_truth(truth / "truth.json", robot, plant)
+        logged.log.save(truth / "truth.npz")
+    plant.close()
