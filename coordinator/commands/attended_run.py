@@ -3,9 +3,10 @@
 from pathlib import Path
 
 from coordinator.baseline.known_robot import BaselineRobot
-from coordinator.commands.options import ConnectOptions, Place, open_connection, sender_name
+from coordinator.commands.options import ConnectOptions
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
+from coordinator.live_robot.connection import Place, open_connection, sender_name
 from coordinator.runtime.command_line import fail
 from coordinator.runtime.event_loop import (
     SIGNALS,
@@ -54,7 +55,7 @@ def run_attended(config: RunConfig, place: Place, speed: float, terminal: Termin
 
 def _prepared(config: RunConfig, place: Place, loop: ScaledLoop, terminal: Terminal) -> Run:
     """Open everything, or nothing."""
-    transport = open_connection(place, terminal).transport
+    transport = open_connection(place, terminal.note).transport
     try:
         return Run(config, transport, loop.clock_ns, loop.call_soon_threadsafe, terminal)
     except BaseException as error:

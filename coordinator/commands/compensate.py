@@ -8,14 +8,8 @@ import typer
 
 from coordinator.commands.attended_run import checked_speed
 from coordinator.commands.compensate_view import CompensationView
-from coordinator.commands.options import (
-    AsJson,
-    ConnectOptions,
-    DynamicsFolder,
-    Speed,
-    open_connection,
-    sender_name,
-)
+from coordinator.commands.options import AsJson, ConnectOptions, DynamicsFolder, Speed
+from coordinator.live_robot.connection import open_connection, sender_name
 from coordinator.runtime.command_line import fail, with_options
 from coordinator.runtime.event_loop import SIGNALS, Interruption, ScaledLoop, ignore_signals, run_to_end
 from coordinator.runtime.exit_codes import explain
@@ -69,7 +63,7 @@ def compensate_robot(
     _check_damping(damping, model)
     settings = CompensationSettings(damping, max_speed, velocity_forces=velocity_forces)
     plan = CompensationPlan(settings, rate, for_s, hold_s, back)
-    transport = open_connection(place, Terminal(at.quiet)).transport
+    transport = open_connection(place, Terminal(at.quiet).note).transport
     loop = ScaledLoop(speed)
     view = CompensationView(model.chain.serials, loop.time, as_json, at.quiet)
     summary = _attended(loop, place.robot, model, plan, transport, view)

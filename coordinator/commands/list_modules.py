@@ -3,7 +3,8 @@
 import typer
 from rich.table import Table
 
-from coordinator.commands.options import AsJson, ConnectOptions, Expect, Place, open_connection
+from coordinator.commands.options import AsJson, ConnectOptions, Expect
+from coordinator.live_robot.connection import Place, open_connection
 from coordinator.live_robot.discovery import AS_HUB_S, Search, listed
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal
@@ -40,7 +41,7 @@ def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = Fa
 
 def open_search(place: Place, quiet: bool, expect: int | None) -> tuple[Transport, Search]:
     """Join a robot's network to look for its modules; as its hub, wait for the agents to connect."""
-    connection = open_connection(place, Terminal(quiet))
+    connection = open_connection(place, Terminal(quiet).note)
     return connection.transport, Search(least_s=AS_HUB_S if connection.is_hub else 0.0, expect=expect)
 
 

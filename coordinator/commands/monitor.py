@@ -11,14 +11,8 @@ import typer
 from coordinator.baseline.known_robot import load_baseline
 from coordinator.commands.attended_run import checked_speed
 from coordinator.commands.monitor_view import MonitorScreen
-from coordinator.commands.options import (
-    ConnectOptions,
-    DynamicsFolder,
-    Place,
-    Speed,
-    open_connection,
-    sender_name,
-)
+from coordinator.commands.options import ConnectOptions, DynamicsFolder, Speed
+from coordinator.live_robot.connection import Place, open_connection, sender_name
 from coordinator.live_robot.messenger import Messenger
 from coordinator.monitoring.live import KEPT_ROWS, LOOK_S, LiveMonitor
 from coordinator.monitoring.monitor import Watcher
@@ -111,7 +105,7 @@ def _monitor_live(
     watcher: Watcher, screen: MonitorScreen, place: Place, for_s: float | None, speed: float
 ) -> None:
     """Monitor until the time is up, or a signal comes."""
-    transport = open_connection(place, Terminal()).transport
+    transport = open_connection(place, Terminal().note).transport
     loop = ScaledLoop(speed)
     try:
         screen.start_ns = loop.clock_ns()

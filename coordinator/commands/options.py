@@ -1,29 +1,21 @@
 """Options that several commands share, each declared once, and the connection that they describe."""
 
 import dataclasses
-import os
-import secrets
-import socket
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import typer
 from pydantic import ValidationError
 
 from coordinator.excitation.plan import Excitation, Mode, Motions, Plan, PlanFileError, load_plan
-from coordinator.runtime.terminal import Terminal
+from coordinator.live_robot.connection import Place
 from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.model.errors import UsageError
-from module_agent.network_emulation.impaired_transport import inject
-from module_agent.network_emulation.profile import PROFILES, NetworkProfile
+from module_agent.network_emulation.profile import PROFILES
 from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
-from module_agent.transport.transport import EndpointInUse, Transport, TransportError
-from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.keys import check_chunk
-
-JOIN_TIMEOUT_S = 5.0
 
 BaselineFolder = Annotated[Path, typer.Argument(help="Folder of an earlier run of this robot, its baseline.")]
 DynamicsFolder = Annotated[
@@ -37,23 +29,6 @@ Expect = Annotated[
 Speed = Annotated[float, typer.Option(help="Speed of a simulated world, relative to real time.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
-
-
-class Place(NamedTuple):
-    """A robot on a network: the endpoint to listen on, or routers to connect to, and the injected network."""
-
-    robot: str
-    listen: str
-    connect: tuple[str, ...]
-    network: NetworkProfile = PROFILES["none"]
-    seed: int = 0
-
-
-class Connection(NamedTuple):
-    """The robot's network, and whether this program is its hub."""
-
-    transport: Transport
-    is_hub: bool
 
 
 @dataclass(frozen=True)
@@ -157,34 +132,3 @@ def planned(path: Path | None, **given: object) -> Plan:
     except ValidationError as error:
         first = error.errors()[0]
         raise UsageError(f"{first['loc'][0]} = {first['input']}: {first['msg']}") from error
-
-
-def open_connection(place: Place, terminal: Terminal) -> Connection:
-    """Join a robot's network: at its routers, as its hub, or as a client of the hub that it has already.
-
-    Raises:
-        UsageError: it cannot be joined.
-    """
-    is_hub = False
-    try:
-        if place.connect:
-            opened = open_zenoh(_client(place.connect))
-        else:
-            try:
-                opened, is_hub = open_zenoh(ZenohConfig.hub(place.listen)), True
-            except EndpointInUse:
-                # By another coordinator, or a router.
-                opened = open_zenoh(_client((place.listen,)))
-                terminal.note(f"{place.listen} is in use: joined the hub there")
-    except (OSError, TransportError) as error:
-        raise UsageError(str(error)) from error
-    return Connection(inject(opened, place.network, place.seed, "coordinator"), is_hub)
-
-
-def _client(connect: tuple[str, ...]) -> ZenohConfig:
-    return ZenohConfig(mode="client", connect=connect, connect_timeout_s=JOIN_TIMEOUT_S)
-
-
-def sender_name() -> str:
-    """Return the unique name under which this program holds leases."""
-    return f"coordinator-{os.getpid()}@{socket.gethostname()}-{secrets.token_hex(2)}"[:64]

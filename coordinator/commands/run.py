@@ -8,8 +8,9 @@ import typer
 from rich.table import Table
 
 from coordinator.commands.attended_run import checked_speed, run_attended
-from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed, sender_name
+from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed
 from coordinator.identification.result import DynamicsPart, Result
+from coordinator.live_robot.connection import sender_name
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal
 from coordinator.session.run import RunConfig

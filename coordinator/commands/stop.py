@@ -1,7 +1,8 @@
 """`x5-coordinator stop`: every module stops, without a lease."""
 
 from coordinator.commands.list_modules import check_count, open_search
-from coordinator.commands.options import ConnectOptions, Expect, sender_name
+from coordinator.commands.options import ConnectOptions, Expect
+from coordinator.live_robot.connection import sender_name
 from coordinator.live_robot.discovery import stop_robot
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import Terminal
