@@ -23,7 +23,7 @@ FORCE, RATE, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 SLOPE, CURVE = slice(9, 12), slice(12, 15)
 _LOADING = [0, 1, 8]
 # Chi^2 of 12 coefficients, all of them noise, is above this once in 10,000.
-SHAKES_ABOVE = 39.0
+SHAKE_CHI2 = 39.0
 # An IMU that reads this much of the joint's rate about the axis sits on the moving side: its module is
 # mounted reversed, and knows nothing of what carries the joint.
 CARRIED_ABOVE = 0.5
@@ -72,10 +72,10 @@ class BaseMotion:
 
     def about_the_axis(self) -> "BaseMotion":
         """Return only what needs no direction across the axis: the swing about it, and the push along it."""
-        found = copy(self)
-        found._known = np.zeros(15)
-        found._known[[2, 5, 8, 11, 14]] = 1.0
-        return found
+        reduced = copy(self)
+        reduced._known = np.zeros(15)
+        reduced._known[[2, 5, 8, 11, 14]] = 1.0
+        return reduced
 
 
 def _turned_back(vectors: Array, angle: Array) -> Array:
@@ -96,8 +96,8 @@ def _shakes(t_ns: Times, readings: Array, angle: Array, smooth_s: float) -> tupl
     columns = np.stack([rate, acceleration], axis=1)
     columns = columns - columns.mean(axis=0)
     normal = columns.T @ columns
-    found = np.linalg.solve(normal, columns.T @ smooth)
-    if abs(found[0, 5]) > CARRIED_ABOVE:
+    coefficients = np.linalg.solve(normal, columns.T @ smooth)
+    if abs(coefficients[0, 5]) > CARRIED_ABOVE:
         return False, 0.0
     # The noise is what the low-pass takes, as shake is slow and the gears' noise is white; it grows with the
     # speed, and so weighs most where the columns are largest.
@@ -109,7 +109,7 @@ def _shakes(t_ns: Times, readings: Array, angle: Array, smooth_s: float) -> tupl
     scatter = np.einsum("ni,nj,nk->kij", columns, columns, white)
     inverse = np.linalg.inv(normal)
     covariance = inverse @ scatter @ inverse
-    chi2 = np.einsum("ik,kij,jk->k", found, np.linalg.inv(covariance), found)
+    chi2 = np.einsum("ik,kij,jk->k", coefficients, np.linalg.inv(covariance), coefficients)
     noise = float(covariance[0, 1, 1] + covariance[1, 1, 1])
-    push2 = float(found[1, 0] ** 2 + found[1, 1] ** 2) - noise
-    return bool(chi2.sum() > SHAKES_ABOVE), float(np.sqrt(max(push2, 0.0)))
+    push2 = float(coefficients[1, 0] ** 2 + coefficients[1, 1] ** 2) - noise
+    return bool(chi2.sum() > SHAKE_CHI2), float(np.sqrt(max(push2, 0.0)))

@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 MIN_SAMPLES = 3 * TAPS
 MIN_RATE_RAD_S = 0.02  # 15 times the gyro's noise; slower motions say nothing about an axis
 MIN_ACCELERATION_RAD_S2 = 0.1  # 100 mm give 0.01 m/s^2, below the noise of one sample
-QUIET_S = (
+REST_S = (
     0.1  # the window of 5.6 s leaves 2 % of the amplitude in its first 0.1 s, 0.4 mrad of angle at 0.2 rad
 )
 
@@ -125,7 +125,7 @@ def circle_point_analysis(
     rest: ImuWindow,
     constant: AlignedMotion,
     sine: AlignedMotion,
-    quiet_s: float = QUIET_S,
+    quiet_s: float = REST_S,
     taps: int = TAPS,
 ) -> CircleFit:
     """Run eqs. 12 to 24 and 30: axis from the constant motion, radial vector from the windowed sine motion.
@@ -150,10 +150,10 @@ def circle_point_analysis(
     """
     _enough(sine.t_s.size, "windowed sine motion")
     at_rest = rest_reading(rest)
-    found = joint_axis(constant, at_rest)
+    joint = joint_axis(constant, at_rest)
     alpha = angular_acceleration(sine, taps)
     quiet = sine.t_s <= quiet_s
-    turns = _turns(found.axis, sine, quiet)
+    turns = _turns(joint.axis, sine, quiet)
     dynamic = _dynamic_acceleration(sine, turns, quiet)
     _, spread, basis = np.linalg.svd(dynamic, full_matrices=False)  # eq. 20
     tangent = basis[0]  # eq. 21; its sign follows from d >= 0
@@ -165,14 +165,14 @@ def circle_point_analysis(
     blocks = (
         float(residual @ residual) / residual.size / power * _widening(residual, alpha),
         _gravity_variance(alpha, turns, tangent, at_rest, int(np.count_nonzero(quiet))),
-        _tilt_variance(alpha, sine.position_rad, at_rest, found.sigma_rad),
+        _tilt_variance(alpha, sine.position_rad, at_rest, joint.sigma_rad),
     )
     return CircleFit(
-        axis=found.axis,
+        axis=joint.axis,
         tangent=frozen(tangent),
-        radial_m=frozen(distance * np.cross(tangent, found.axis)),  # eq. 24
+        radial_m=frozen(distance * np.cross(tangent, joint.axis)),  # eq. 24
         distance_m=distance,
-        sigma_axis_rad=found.sigma_rad,
+        sigma_axis_rad=joint.sigma_rad,
         sigma_distance_m=float(np.sqrt(sum(blocks))),
         residual_rms_m_s2=float(np.sqrt(np.mean(residual**2))),
         singular_values=frozen(spread / np.sqrt(sine.t_s.size)),
@@ -229,8 +229,8 @@ def _dynamic_acceleration(sine: AlignedMotion, turns: Array, quiet: Mask) -> Arr
 
 def _gravity_variance(alpha: Array, turns: Array, tangent: Array, rest: RestReading, quiet: int) -> float:
     """Return the variance of d that the noise of the initial gravity causes through eqs. 16 and 23 [m^2]."""
-    seen = np.einsum("nij,i->nj", turns, tangent)  # n . (R_n g0) = seen_n . g0
-    gain = alpha @ (seen - seen.mean(axis=0)) / float(alpha @ alpha)
+    turned = np.einsum("nij,i->nj", turns, tangent)  # n . (R_n g0) = seen_n . g0
+    gain = alpha @ (turned - turned.mean(axis=0)) / float(alpha @ alpha)
     return float(gain @ gain) * rest.accel_scatter_m_s2**2 / max(quiet, 1)
 
 

@@ -8,21 +8,19 @@ zero-phase low-pass (`smooth_motion`),
     accel = (1 + E) f + b_a,     f = g(phi) + a (j x r) - w^2 r
     g(phi) = (g . j) j + (g - (g . j) j) cos phi - (j x g) sin phi
 
-The tangential term a (j x r) and the gravity's sin phi are all but collinear in a sine of one frequency; slow
-motion, where the tangential term vanishes, tells them apart, so that gravity is estimated and not believed.
+In a sine of one frequency the tangential term a (j x r) is nearly collinear with gravity's sin phi; slow
+motion, where the tangential term vanishes, separates them, so that gravity is estimated and not assumed.
 
 A link bends quasi-statically under the load L = q'' + (pull of gravity along the tangent) / d of what it
-carries: phi = q - c L, w = q' - c L', a = q'' - c L'', with c its inertia over its stiffness. The gyro tells
-c, as it reads a fast motion too large by c (2 pi f)^2 and a slow one right. A bend whose hinge is away from
-the joint's axis by the share h of the distance d gives the tangential term a + h c L'' instead.
+carries: phi = q - c L, w = q' - c L', a = q'' - c L'', with c its inertia over its stiffness. The gyro
+determines c: it reads a fast motion too large by c (2 pi f)^2 and a slow one correctly. If the hinge of the
+bend is away from the joint's axis by the share h of the distance d, the tangential term is a + h c L''.
 
-The readings are late by a delay of their own in each motion: the clocks', and that of the IMU's low-pass. k
-is the axis as the gyro reads it, G what the gyro feels of specific force, E (3 x 3, its columns across j) the
-accelerometer's scale and misalignment, all near their perfect values as far as the `ImuPrior` says.
-Gravity's known strength calibrates E in the plane in which the joint turns it; where it does not, the
-covariance of r keeps the uncertainty of before.
-
-What is known of an IMU, a link and a housing before any motion: the beliefs of the joint regression.
+The readings are late by a delay of their own in each motion, that of the clocks and of the IMU's low-pass. k
+is the axis as the gyro reads it, G the gyro's sensitivity to specific force, E (3 x 3, its columns across j)
+the accelerometer's scale and misalignment. Their priors are near the ideal values (`ImuPrior`). The known
+magnitude of gravity calibrates E in the plane in which the joint turns it; elsewhere the covariance of r
+keeps the prior uncertainty.
 """
 
 from typing import NamedTuple
@@ -35,27 +33,27 @@ from module_agent.estimate.windows import Array
 from module_agent.model.catalogue import GRAVITY_M_S2
 from module_agent.model.imu_prior import DELAY_S, DELAY_SIGMA_S, HINGE_SHARE, HINGE_SHARE_SIGMA, ImuPrior
 
-# Where the parameters are in their vector; directions are (e1, e2, j), across and along the axis. The delays
-# of the motions come last.
+# The places of the parameters in their vector; directions are (e1, e2, j), across and along the axis. The
+# delays of the motions come last.
 TURN, RADIAL, GRAVITY = slice(0, 2), slice(2, 4), slice(4, 7)
-ACCEL_BIAS, GYRO_BIAS, KAPPA = slice(7, 10), slice(10, 13), slice(13, 16)
-ACCEL_MATRIX, FELT = slice(16, 22), slice(22, 28)
+ACCEL_BIAS, GYRO_BIAS, GYRO_AXIS = slice(7, 10), slice(10, 13), slice(13, 16)
+ACCEL_MATRIX, G_SENSITIVITY = slice(16, 22), slice(22, 28)
 COMPLIANCE, HINGE = 28, 29
-# Of what carries the joint: the angle from e1 to the housing's x at q = 0, by how much its IMU is late, where
-# the joint's axis is from its IMU across the axis, and how far the child's IMU is from its own along it.
-BEARING, LATE, PIVOT, HEIGHT = 30, 31, slice(32, 34), 34
+# Of the joint's base: the angle from e1 to the housing's x at q = 0, the delay of its IMU, the joint's axis
+# from that IMU across the axis, and the child's IMU from it along the axis.
+BASE_HEADING, BASE_DELAY, PIVOT, HEIGHT = 30, 31, slice(32, 34), 34
 DELAY = 35
-ALONG = 6  # gravity along the axis
+GRAVITY_ALONG = 6
 
-_MIN_DISTANCE_M = 0.05  # where gravity's pull over the distance would grow beyond all bounds
-# Readings are polynomials of what these are steps of, so differences are as good as derivatives.
+_MIN_DISTANCE_M = 0.05  # bounds gravity's pull over the distance
+# Readings are polynomials in these parameters, so differences with these steps are exact enough.
 _STEPS = {COMPLIANCE: 1e-7, HINGE: 1e-2}
-_BASE_STEPS = {BEARING: 1e-4, PIVOT.start: 1e-2, PIVOT.start + 1: 1e-2, HEIGHT: 1e-2}
+_BASE_STEPS = {BASE_HEADING: 1e-4, PIVOT.start: 1e-2, PIVOT.start + 1: 1e-2, HEIGHT: 1e-2}
 _STEP_S = 1e-4
 
 
 class Motion(NamedTuple):
-    """A joint's motion, and that of what carries it where it shakes."""
+    """A joint's motion, and that of its base if the base shakes."""
 
     joint: SmoothMotion
     base: BaseMotion | None
@@ -64,7 +62,7 @@ class Motion(NamedTuple):
 def predict(motion: Motion, t_s: Array, p: Array, delay: int) -> tuple[Array, Array]:
     """Return readings (n, 6), gyro first, along (e1, e2, j), and their derivatives by parameters (n, 6, k).
 
-    The derivatives leave out how radial vector and gravity change the load that bends the link: 2e-3 of them.
+    The derivatives neglect how radial vector and gravity change the load that bends the link, 2e-3 of them.
 
     Args:
         motion: of the joint; t_s (n,): times of the readings since its first sample, but for the delay.
@@ -81,7 +79,9 @@ def predict(motion: Motion, t_s: Array, p: Array, delay: int) -> tuple[Array, Ar
     steps = _STEPS
     if shake is not None:
         steps = _STEPS | _BASE_STEPS
-        jacobian[:, :, LATE] = (readings(values, after, p) - readings(values, before, p)) / (2.0 * _STEP_S)
+        jacobian[:, :, BASE_DELAY] = (readings(values, after, p) - readings(values, before, p)) / (
+            2.0 * _STEP_S
+        )
     for column, step in steps.items():
         up, down = p.copy(), p.copy()
         up[column] += step
@@ -100,34 +100,34 @@ def readings(values: Array, shake: Array | None, p: Array) -> Array:
 
     Args:
         values: the columns of `SmoothMotion.values`.
-        shake: those of `BaseMotion.values`, or None for what stands still.
+        shake: those of `BaseMotion.values`, or None for a base that stands still.
     """
     rate, *carried = _carried(values, shake, p)
     force = _force_across(carried, p)
-    turning = rate[:, None] * (p[KAPPA] + _AXIS)
-    along = np.full(len(values), p[ALONG])
+    turning = rate[:, None] * (p[GYRO_AXIS] + _AXIS)
+    along = np.full(len(values), p[GRAVITY_ALONG])
     if shake is not None:
         across, turn, twist, push = _base_across(values, shake, p)
         force = force + across
         turning[:, :2] += turn
         along += push + twist @ (p[3], -p[2]) + 2.0 * rate * (turn @ p[RADIAL])
-    found = force @ _mix(p).T
-    found[:, :3] += turning + p[GYRO_BIAS]
-    found[:, 3:] += p[ACCEL_BIAS]
-    found[:, 5] += along
-    return np.asarray(found)
+    predicted = force @ _mix(p).T
+    predicted[:, :3] += turning + p[GYRO_BIAS]
+    predicted[:, 3:] += p[ACCEL_BIAS]
+    predicted[:, 5] += along
+    return np.asarray(predicted)
 
 
 def _shake(motion: Motion, at: Array, p: Array) -> Array | None:
-    return None if motion.base is None else motion.base.values(at + p[LATE])
+    return None if motion.base is None else motion.base.values(at + p[BASE_DELAY])
 
 
 def _base_across(values: Array, shake: Array, p: Array) -> tuple[Array, Array, Array, Array]:
-    """Return what the base's shake is at the joint's axis, in the child's axes.
+    """Return the base's shake at the joint's axis, in the child's axes.
 
     Specific force, rate and angular acceleration across the axis (n, 2), and specific force along it (n,).
     """
-    height, turn = p[HEIGHT], _bearing(p)
+    height, turn = p[HEIGHT], _base_rotation(p)
     cosine, sine = values[:, COSINE], values[:, SINE]
     (s1, s2), (w1, w2, _), (a1, a2, a3) = p[PIVOT], shake[:, RATE].T, shake[:, ACCELERATION].T
     # The pivot stands in the housing, and so turns backwards in axes that turn with the child.
@@ -139,8 +139,8 @@ def _base_across(values: Array, shake: Array, p: Array) -> tuple[Array, Array, A
     return force @ turn, rate @ turn, twist @ turn, push
 
 
-def felt_columns(force: Array) -> Array:
-    """Return (n, 3, 6): what the elements of G make of specific forces (n, 2) across the axis."""
+def g_sensitivity_columns(force: Array) -> Array:
+    """Return (n, 3, 6): the derivatives by the elements of G for specific forces (n, 2) across the axis."""
     columns = np.zeros((len(force), 3, 6))
     for row in range(3):
         columns[:, row, 2 * row : 2 * row + 2] = force
@@ -151,7 +151,7 @@ _AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def _carried(values: Array, shake: Array | None, p: Array) -> list[Array]:
-    """Return how the body turns: rate, tangential acceleration, squared rate, cosine and sine; (n,) each.
+    """Return the motion of the body: rate, tangential acceleration, squared rate, cosine and sine; (n,) each.
 
     The tangential acceleration is that at the IMU over its distance, which is not the angular acceleration
     where the link's hinge is not on the axis.
@@ -170,9 +170,9 @@ def _carried(values: Array, shake: Array | None, p: Array) -> list[Array]:
 
 
 def _load(values: Array, shake: Array | None, p: Array) -> list[Array]:
-    """Return what bends the link, as an acceleration of what it carries [rad/s^2], and its two derivatives.
+    """Return the load that bends the link, as an acceleration of its load [rad/s^2], and its two derivatives.
 
-    That is q'' and gravity's pull; the base's swing and what of its push is along the tangent; and to first
+    That is q'' and gravity's pull; the base's swing and the part of its push along the tangent; and to first
     order in c the acceleration of the bending itself: - c q''''.
     """
     rate, acceleration, jerk, snap, fifth, sixth, cosine, sine, squared = values.T
@@ -187,14 +187,14 @@ def _load(values: Array, shake: Array | None, p: Array) -> list[Array]:
     ]
     if shake is None:
         return loads
-    tangent = _bearing(p) @ (-r2, r1) / square
+    tangent = _base_rotation(p) @ (-r2, r1) / square
     pushes = (shake[:, [0, 1, 8]], shake[:, SLOPE], shake[:, CURVE])
     return [load + push[:, :2] @ tangent + push[:, 2] for load, push in zip(loads, pushes, strict=True)]
 
 
-def _bearing(p: Array) -> Array:
+def _base_rotation(p: Array) -> Array:
     """Return (2, 2): vectors of the housing (n, 2), in rows, times this are along e1 and e2."""
-    cosine, sine = np.cos(p[BEARING]), np.sin(p[BEARING])
+    cosine, sine = np.cos(p[BASE_HEADING]), np.sin(p[BASE_HEADING])
     return np.array([[cosine, sine], [-sine, cosine]])
 
 
@@ -208,12 +208,12 @@ def _force_across(carried: list[Array], p: Array) -> Array:
 
 
 def _mix(p: Array) -> Array:
-    """Return (6, 2): what gyro and accelerometer make of specific force across the axis."""
-    return np.vstack([p[FELT].reshape(3, 2), np.eye(3, 2) + p[ACCEL_MATRIX].reshape(3, 2)])
+    """Return (6, 2): the response of gyro and accelerometer to specific force across the axis."""
+    return np.vstack([p[G_SENSITIVITY].reshape(3, 2), np.eye(3, 2) + p[ACCEL_MATRIX].reshape(3, 2)])
 
 
 def _linear(values: Array, shake: Array | None, p: Array) -> Array:
-    """Return the derivatives (n, 6, k) by all that the readings are linear in; the others are zero."""
+    """Return the derivatives (n, 6, k) by the linear parameters; those by the others are zero."""
     rate, *carried = _carried(values, shake, p)
     tangential, squared, cosine, sine = carried
     jacobian, mix = np.zeros((len(values), 6, p.size)), _mix(p)
@@ -225,51 +225,51 @@ def _linear(values: Array, shake: Array | None, p: Array) -> Array:
     )
     for column, first, second in columns:
         jacobian[:, :, column] = first[:, None] * mix[:, 0] + second[:, None] * mix[:, 1]
-    jacobian[:, 5, ALONG] = 1.0
+    jacobian[:, 5, GRAVITY_ALONG] = 1.0
     jacobian[:, 3:, ACCEL_BIAS] = np.eye(3)
     jacobian[:, :3, GYRO_BIAS] = np.eye(3)
-    jacobian[:, :3, KAPPA] = np.eye(3) * rate[:, None, None]
+    jacobian[:, :3, GYRO_AXIS] = np.eye(3) * rate[:, None, None]
     force = _force_across(carried, p)
     if shake is not None:
         across, turn, twist, _ = _base_across(values, shake, p)
         force = force + across
         jacobian[:, 5, RADIAL] += np.stack([-twist[:, 1], twist[:, 0]], axis=1) + 2.0 * rate[:, None] * turn
-    felt = felt_columns(force)
-    jacobian[:, :3, FELT] = felt
-    jacobian[:, 3:, ACCEL_MATRIX] = felt
+    g_sensitivity = g_sensitivity_columns(force)
+    jacobian[:, :3, G_SENSITIVITY] = g_sensitivity
+    jacobian[:, 3:, ACCEL_MATRIX] = g_sensitivity
     return jacobian
 
 
 # A link bends so that it rings at 12 Hz or above: c = 1 / (2 pi f)^2.
 _COMPLIANCE_SIGMA_S2 = 2e-4
-# Of the clocks' rough mapping and of the IMU's low-pass together.
+# Error of the rough clock mapping, and the delay of the IMU's low-pass.
 _DELAY_S = 0.02
-# Housings are some 60 mm wide, and a link leads the child's IMU off along the axis by about as much.
+# Housings are about 60 mm wide, and a link offsets the child's IMU along the axis by about as much.
 _PIVOT_SIGMA_M, _HEIGHT_M, _HEIGHT_SIGMA_M = 0.03, 0.05, 0.1
 
 
-class Beliefs(NamedTuple):
-    """Means of all parameters and their weights 1 / sigma^2, zero where nothing is believed."""
+class ParameterPriors(NamedTuple):
+    """Prior means of all parameters and their weights 1 / sigma^2, zero without a prior."""
 
     mean: Array
     weight: Array
 
 
-def beliefs(knowledge: ImuPrior, motions: int) -> Beliefs:
-    """Return the beliefs about the parameters of `joint_model` with that many delays."""
+def parameter_priors(knowledge: ImuPrior, motions: int) -> ParameterPriors:
+    """Return the priors of all parameters for a number of motions, each with its own delay."""
     sigma = np.full(DELAY + motions, np.inf)
     scale, turn = knowledge.scale, knowledge.misalignment_rad
-    # What the scale makes of gravity along the axis cannot be told from a bias.
+    # The scale error times gravity along the axis is indistinguishable from a bias.
     sigma[ACCEL_BIAS] = np.hypot(knowledge.accel_bias_m_s2, GRAVITY_M_S2 * max(scale, turn))
-    sigma[KAPPA] = turn, turn, scale
+    sigma[GYRO_AXIS] = turn, turn, scale
     sigma[ACCEL_MATRIX] = scale, turn, turn, scale, turn, turn
-    sigma[FELT] = knowledge.g_sensitivity_s_m
+    sigma[G_SENSITIVITY] = knowledge.g_sensitivity_s_m
     sigma[COMPLIANCE], sigma[HINGE] = _COMPLIANCE_SIGMA_S2, HINGE_SHARE_SIGMA
     sigma[GYRO_BIAS] = knowledge.gyro_bias_rad_s
-    sigma[LATE], sigma[PIVOT], sigma[HEIGHT] = DELAY_SIGMA_S, _PIVOT_SIGMA_M, _HEIGHT_SIGMA_M
-    # Any direction will do where no shake asks for it.
-    sigma[BEARING] = np.pi
+    sigma[BASE_DELAY], sigma[PIVOT], sigma[HEIGHT] = DELAY_SIGMA_S, _PIVOT_SIGMA_M, _HEIGHT_SIGMA_M
+    # Without shake the direction is irrelevant.
+    sigma[BASE_HEADING] = np.pi
     sigma[DELAY:] = _DELAY_S
     mean = np.zeros_like(sigma)
-    mean[HINGE], mean[LATE], mean[HEIGHT] = HINGE_SHARE, DELAY_S, _HEIGHT_M
-    return Beliefs(mean, 1.0 / sigma**2)
+    mean[HINGE], mean[BASE_DELAY], mean[HEIGHT] = HINGE_SHARE, DELAY_S, _HEIGHT_M
+    return ParameterPriors(mean, 1.0 / sigma**2)

@@ -1,9 +1,8 @@
 """The estimate of one joint in one IMU's frame: least squares over rest, slow and fast motion together.
 
-The model is that of `joint_model`. What cannot be told from one another in a sine of one frequency - the
-tangential acceleration and gravity's sine, the gyro's scale and a bending link - slow motion tells apart;
-what no motion of this joint tells keeps the uncertainty that it had before (`ImuPrior`), and with it the
-covariance of the result.
+The model is that of `joint_model`. In a sine of one frequency the tangential acceleration is collinear with
+gravity's sine, and the gyro's scale with the link's bending; slow motion separates them. What no motion of
+this joint determines keeps its prior uncertainty (`ImuPrior`), which enters the covariance of the result.
 """
 
 from collections.abc import Sequence
@@ -15,20 +14,20 @@ from scipy.spatial.transform import Rotation
 from module_agent.estimate.circle_point_analysis import RestReading
 from module_agent.estimate.joint_model import (
     ACCEL_BIAS,
-    ALONG,
-    BEARING,
+    BASE_HEADING,
     COMPLIANCE,
     DELAY,
-    FELT,
+    G_SENSITIVITY,
     GRAVITY,
+    GRAVITY_ALONG,
     GYRO_BIAS,
     HINGE,
     RADIAL,
     TURN,
-    Beliefs,
     Motion,
-    beliefs,
-    felt_columns,
+    ParameterPriors,
+    g_sensitivity_columns,
+    parameter_priors,
     predict,
 )
 from module_agent.estimate.observed_motion import ObservedMotion
@@ -43,20 +42,20 @@ from module_agent.wire.messages import RegressionEstimate, Vector3
 STRIDE = 7
 ITERATIONS = 12
 SETTLED = 0.03  # of every parameter's deviation, were it the only one
-MIN_CARRIED = 0.25
-# With less of gravity across the axis than this, two IMUs do not agree on directions across it.
+MIN_RATE_SHARE = 0.25
+# With less of gravity across the axis, two IMUs cannot agree on a direction across it.
 MIN_ACROSS_M_S2 = 1.0
-PINNED = 1e6  # the weight of a parameter that is to stay as it is
+PINNED = 1e6  # the weight that fixes a parameter at its prior mean
 
 
 class JointRegression(NamedTuple):
-    """What one IMU says of one joint; vectors (3,) in frame u, arrays read-only.
+    """The estimate of one joint by one IMU; vectors (3,) in frame u, arrays read-only.
 
     gravity_m_s2: the specific force of rest at q = 0.
-    compliance_s2: c of the module's text; a motion of f Hz is larger by c (2 pi f)^2 than the encoder says.
+    compliance_s2: c of `joint_model`; at f Hz the IMU moves by c (2 pi f)^2 more than the encoder reports.
     delays_s: per motion, beyond its offset.
     covariance: (6, 6) of axis [rad] and radial vector [m], both in frame u; singular along the axis.
-    base_shakes: whether what carries the joint was seen to shake, and that was taken off.
+    base_shakes: whether the shake of the joint's base was measured and subtracted.
     """
 
     axis: Array
@@ -74,23 +73,23 @@ class JointRegression(NamedTuple):
     base_shakes: bool
 
 
-def regression_estimate(found: JointRegression, delay_s: float) -> RegressionEstimate:
+def regression_estimate(regression: JointRegression, delay_s: float) -> RegressionEstimate:
     """Return the result as the part of a message that carries it; `delay_s` is that of its last motion."""
-    upper = found.covariance[np.triu_indices(6)]
+    upper = regression.covariance[np.triu_indices(6)]
     return RegressionEstimate(
-        axis=_vector(found.axis),
-        radial_m=_vector(found.radial_m),
-        distance_m=found.distance_m,
-        sigma_axis_rad=min(found.sigma_axis_rad, 10.0),
-        sigma_distance_m=min(found.sigma_distance_m, 1e3),
+        axis=_vector(regression.axis),
+        radial_m=_vector(regression.radial_m),
+        distance_m=regression.distance_m,
+        sigma_axis_rad=min(regression.sigma_axis_rad, 10.0),
+        sigma_distance_m=min(regression.sigma_distance_m, 1e3),
         covariance=tuple(float(np.clip(value, -1e6, 1e6)) for value in upper),
-        gravity_m_s2=_vector(found.gravity_m_s2),
-        gyro_bias_rad_s=_vector(found.gyro_bias_rad_s),
-        accel_bias_m_s2=_vector(found.accel_bias_m_s2),
-        compliance_s2=found.compliance_s2,
+        gravity_m_s2=_vector(regression.gravity_m_s2),
+        gyro_bias_rad_s=_vector(regression.gyro_bias_rad_s),
+        accel_bias_m_s2=_vector(regression.accel_bias_m_s2),
+        compliance_s2=regression.compliance_s2,
         delay_s=delay_s,
-        base_shakes=found.base_shakes,
-        samples=found.samples,
+        base_shakes=regression.base_shakes,
+        samples=regression.samples,
     )
 
 
@@ -115,16 +114,16 @@ class _Rows(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """All that the parameters are found from; `untold_m` is what shake of unknown direction may do to d."""
+    """The data of the fit; `unresolved_m` is how much shake of unknown direction may change d."""
 
     rows: tuple[_Rows, ...]
-    beliefs: Beliefs
+    priors: ParameterPriors
     rest: RestReading | None
-    untold_m: float
+    unresolved_m: float
 
 
 class _Optimum(NamedTuple):
-    """Where the fit ended, and the covariance of the parameters."""
+    """The optimum of the fit, and the covariance of the parameters."""
 
     state: _State
     covariance: Array
@@ -164,9 +163,9 @@ def distance_bound_m(
 ) -> float:
     """Return the Cramer-Rao bound of the radial distance for white noise of gyro and accelerometer [SI].
 
-    All else that `regress_joint` does not know is unknown here too, but for the place of a bent link's hinge.
-    It is taken where the fit has its optimum, and holds for the motions as they are handed over: whoever asks
-    for the bound of a recording smooths them as little as the encoder's noise allows.
+    Every other parameter of `regress_joint` is unknown here too, except the place of a bent link's hinge. The
+    bound is evaluated at the optimum of the fit, for the motions as given: smooth them as little as the
+    encoder's noise allows to get the bound of a recording.
 
     Raises:
         ValueError: as `regress_joint`.
@@ -177,7 +176,7 @@ def distance_bound_m(
     known = np.arange(len(normal)) != HINGE
     covariance = np.zeros_like(normal)
     covariance[np.ix_(known, known)] = _inverse(normal[np.ix_(known, known)])
-    bound = _result(best._replace(covariance=covariance), problem._replace(untold_m=0.0))
+    bound = _result(best._replace(covariance=covariance), problem._replace(unresolved_m=0.0))
     return bound.sigma_distance_m
 
 
@@ -208,40 +207,41 @@ def _problem(
     if not motions:
         raise ValueError("no motion of the joint: at least one is needed")
     rows = [_rows(motion) for motion in motions]
-    known = beliefs(knowledge, len(motions))
-    guess = _first_guess(rows, known)
+    priors = parameter_priors(knowledge, len(motions))
+    guess = _first_guess(rows, priors)
     bases = [motion.base for motion in motions if motion.base is not None]
-    untold_m = 0.0
+    unresolved_m = 0.0
     if len(bases) == len(motions) and any(base.shakes for base in bases):
         across, housing = guess.values[GRAVITY][:2], bases[-1].gravity
         if min(np.hypot(*across), np.hypot(*housing)) < MIN_ACROSS_M_S2:
-            # The longest motion tells best; half of a push of unknown direction is along the radius.
-            untold_m = max(bases, key=lambda base: base.end_s - base.start_s).push_m / np.sqrt(2.0)
+            # The longest motion is the most accurate; half a push of unknown direction is along the radius.
+            unresolved_m = max(bases, key=lambda base: base.end_s - base.start_s).push_m / np.sqrt(2.0)
             bases = [base.about_the_axis() for base in bases]
-            # The bearing turns only the pivot then, which is believed alike in all directions: one is as good
-            # as the other, and free it makes the steps swing about the optimum.
-            known.weight[BEARING] = PINNED
+            # The base's heading then turns only the pivot, whose prior is the same in all directions. Left
+            # free it makes the steps oscillate about the optimum.
+            priors.weight[BASE_HEADING] = PINNED
         else:
-            guess.values[BEARING] = np.arctan2(across[1], across[0]) - np.arctan2(housing[1], housing[0])
-            known.mean[BEARING] = guess.values[BEARING]
+            guess.values[BASE_HEADING] = np.arctan2(across[1], across[0]) - np.arctan2(housing[1], housing[0])
+            priors.mean[BASE_HEADING] = guess.values[BASE_HEADING]
         rows = [r._replace(motion=Motion(r.motion.joint, b)) for r, b in zip(rows, bases, strict=True)]
-    return _Problem(tuple(rows), known, rest, float(untold_m)), guess
+    return _Problem(tuple(rows), priors, rest, float(unresolved_m)), guess
 
 
-def _rows(seen: ObservedMotion) -> _Rows:
-    since_ns = seen.imu.t_ns - seen.offset_ns - seen.joint.origin_ns
+def _rows(observed: ObservedMotion) -> _Rows:
+    since_ns = observed.imu.t_ns - observed.offset_ns - observed.joint.origin_ns
     t_s = since_ns.astype(np.float64) * 1e-9
-    # A little is kept for the delay to move in.
-    inside = np.flatnonzero((t_s > seen.joint.start_s + 0.01) & (t_s < seen.joint.end_s - 0.01))[::STRIDE]
+    # 10 ms at either end leave room for the delay to change.
+    begin, end = observed.joint.start_s + 0.01, observed.joint.end_s - 0.01
+    inside = np.flatnonzero((t_s > begin) & (t_s < end))[::STRIDE]
     if inside.size < 20:
         raise ValueError(f"{inside.size} IMU samples fall into the joint's motion: at least 20 are needed")
-    readings = np.hstack([seen.imu.gyro_rad_s[inside], seen.imu.accel_m_s2[inside]])
-    step_s = 1e-9 * float(seen.imu.t_ns[-1] - seen.imu.t_ns[0]) / (seen.imu.t_ns.size - 1)
-    white = white_ratio(seen.imu.t_ns, float(np.hypot(seen.imu.smooth_s, STRIDE * step_s)))
-    return _Rows(Motion(seen.joint, None), readings, t_s[inside], white, seen.instrument)
+    readings = np.hstack([observed.imu.gyro_rad_s[inside], observed.imu.accel_m_s2[inside]])
+    step_s = 1e-9 * float(observed.imu.t_ns[-1] - observed.imu.t_ns[0]) / (observed.imu.t_ns.size - 1)
+    white = white_ratio(observed.imu.t_ns, float(np.hypot(observed.imu.smooth_s, STRIDE * step_s)))
+    return _Rows(Motion(observed.joint, None), readings, t_s[inside], white, observed.instrument)
 
 
-def _first_guess(rows: Sequence[_Rows], known: Beliefs) -> _State:
+def _first_guess(rows: Sequence[_Rows], priors: ParameterPriors) -> _State:
     """Solve the model without compliance, delay and sensor errors, where it is linear."""
     values = np.concatenate([row.motion.joint.values(row.t_s) for row in rows])
     readings = np.concatenate([row.readings for row in rows])
@@ -250,7 +250,7 @@ def _first_guess(rows: Sequence[_Rows], known: Beliefs) -> _State:
     one = np.ones_like(rate)
     gyro = np.linalg.lstsq(np.stack([rate, one], axis=1), readings[:, :3], rcond=None)[0]
     size = float(np.linalg.norm(gyro[0]))
-    if size < MIN_CARRIED:
+    if size < MIN_RATE_SHARE:
         raise ValueError(
             f"the gyro turned by {size:.2g} of what the joint did: this IMU does not move with it"
         )
@@ -261,11 +261,11 @@ def _first_guess(rows: Sequence[_Rows], known: Beliefs) -> _State:
     # Across the axis, from the cosine's and the sine's coefficients alike.
     gravity = 0.5 * (force[1] + np.cross(axis, force[2]))
     frame = _frame(axis)
-    found = known.mean.copy()
-    found[RADIAL], found[GRAVITY] = (frame.T @ radial)[:2], frame.T @ gravity
-    found[ALONG] = axis @ force[0]
-    found[GYRO_BIAS] = frame.T @ gyro[1]
-    return _State(frame, found)
+    guess = priors.mean.copy()
+    guess[RADIAL], guess[GRAVITY] = (frame.T @ radial)[:2], frame.T @ gravity
+    guess[GRAVITY_ALONG] = axis @ force[0]
+    guess[GYRO_BIAS] = frame.T @ gyro[1]
+    return _State(frame, guess)
 
 
 def _frame(axis: Array) -> Array:
@@ -279,8 +279,8 @@ def _frame(axis: Array) -> Array:
 
 def _equations(problem: _Problem, state: _State, noise: Array) -> _Equations:
     """Set up the normal equations at a state, for noise of one sample (gyro, accel)."""
-    normal = np.diag(problem.beliefs.weight)
-    gradient = problem.beliefs.weight * (problem.beliefs.mean - state.values)
+    normal = np.diag(problem.priors.weight)
+    gradient = problem.priors.weight * (problem.priors.mean - state.values)
     _add_gravity(normal, gradient, state)
     if problem.rest is not None:
         _add_rest(normal, gradient, problem.rest, state)
@@ -324,7 +324,7 @@ def _slow(residual: Array) -> Array:
 
 
 def _add_gravity(normal: Array, gradient: Array, state: _State) -> None:
-    """Add that gravity's strength is known."""
+    """Add the prior of gravity's magnitude."""
     size = float(np.linalg.norm(state.values[GRAVITY]))
     along = state.values[GRAVITY] / size
     normal[GRAVITY, GRAVITY] += np.outer(along, along) / GRAVITY_SIGMA_M_S2**2
@@ -332,11 +332,11 @@ def _add_gravity(normal: Array, gradient: Array, state: _State) -> None:
 
 
 def _add_rest(normal: Array, gradient: Array, rest: RestReading, state: _State) -> None:
-    """Add the gyro's reading at rest, which is its bias and what it makes of gravity there."""
-    felt = state.frame.T @ rest.specific_force_m_s2
+    """Add the gyro's reading at rest: its bias and its response to gravity."""
+    force = state.frame.T @ rest.specific_force_m_s2
     slopes = np.zeros((3, len(gradient)))
     slopes[:, GYRO_BIAS] = np.eye(3)
-    slopes[:, FELT] = felt_columns(felt[None, :2])[0]
+    slopes[:, G_SENSITIVITY] = g_sensitivity_columns(force[None, :2])[0]
     predicted = slopes @ state.values
     slopes[:, TURN] = np.cross(np.eye(3)[:2], predicted).T
     error = state.frame.T @ rest.gyro_offset_rad_s - predicted
@@ -350,7 +350,7 @@ def _in_frame(readings: Array, frame: Array) -> Array:
 
 
 def _moved(state: _State, step: Array) -> _State:
-    """Turn the frame by the step's turn, and all that is in it with it."""
+    """Apply a step: change the values, and turn the frame by the step's turn."""
     values = state.values + step
     turn = np.array([step[0], step[1], 0.0])
     values[TURN] = 0.0
@@ -367,7 +367,7 @@ def _result(best: _Optimum, problem: _Problem) -> JointRegression:
     gain[3:, :2] = np.outer(frame[:, 2], [r2, -r1])
     gain[3:, RADIAL] = frame[:, :2]
     six = gain @ best.covariance @ gain.T
-    six[3:, 3:] += problem.untold_m**2 * frame[:, :2] @ frame[:, :2].T
+    six[3:, 3:] += problem.unresolved_m**2 * frame[:, :2] @ frame[:, :2].T
     radial = frame[:, :2] @ p[RADIAL]
     along = radial / max(distance, 1e-6)
     return JointRegression(

@@ -101,8 +101,8 @@ class Observer:
             delay = clock_delay(own, joint, rough)
             aligned = align(own, joint, delay.offset_ns)
             windows = MotionWindows(own, joint, imu_window(motion.rows), delay.offset_ns)
-            seen = detect_motion([aligned], still.gyro_offset_rad_s)
-            moved, ratio = seen.moved, seen.rate_ratio
+            detection = detect_motion([aligned], still.gyro_offset_rad_s)
+            moved, ratio = detection.moved, detection.rate_ratio
             if motion.record.pattern.kind == "constant":
                 self._constant[motion.serial] = _Constant(
                     motion.boot, motion.record.motion_id, aligned, windows, moved
@@ -128,11 +128,11 @@ class Observer:
 
     def _regress(self, circle: CircleEstimate, windows: list[MotionWindows], still: RestReading) -> _Local:
         try:
-            found = regress_joint(observed_motions(windows), still, self.knowledge)
+            regression = regress_joint(observed_motions(windows), still, self.knowledge)
         except ValueError as error:
             return _Local(circle, None, f"no joint regression: {error}")
-        delay_s = circle.delay_s + found.delays_s[-1]
-        return _Local(circle, regression_estimate(found, delay_s), "")
+        delay_s = circle.delay_s + regression.delays_s[-1]
+        return _Local(circle, regression_estimate(regression, delay_s), "")
 
     def _constant_of(self, motion: JointMotion) -> _Constant:
         constant = self._constant.get(motion.serial)

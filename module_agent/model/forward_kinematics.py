@@ -27,11 +27,11 @@ def body_displacements(chain: Chain, q_rad: ArrayLike) -> Array:
         ValueError: `q_rad` is not (m, n).
     """
     q = _positions(chain, q_rad)
-    found = np.empty((*q.shape, 4, 4))
+    displacement = np.empty((*q.shape, 4, 4))
     for i, parent in enumerate(chain.parent):
         own = screw_motion(chain.axis[i], chain.point[i], q[:, i])
-        found[:, i] = own if parent == BASE else found[:, parent] @ own
-    return read_only(found)
+        displacement[:, i] = own if parent == BASE else displacement[:, parent] @ own
+    return read_only(displacement)
 
 
 def imu_poses(chain: Chain, q_rad: ArrayLike) -> Array:
@@ -66,8 +66,8 @@ def places_on_axes(chain: Chain) -> Array:
     A chain's `point` may be anywhere on the axis; the module is there.
     """
     off = chain.imu_home[:, :3, 3] - chain.point
-    found = chain.point + np.einsum("ni,ni->n", off, chain.axis)[:, None] * chain.axis
-    return read_only(found)
+    nearest = chain.point + np.einsum("ni,ni->n", off, chain.axis)[:, None] * chain.axis
+    return read_only(nearest)
 
 
 def _positions(chain: Chain, q_rad: ArrayLike) -> NDArray[np.float64]:

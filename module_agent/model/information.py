@@ -69,8 +69,8 @@ def gather(
     total: tuple[JointInformation, ...] = ()
     for begin in range(0, max(tau.shape[0], 1), _BLOCK):
         part = slice(begin, begin + _BLOCK)
-        found = compress(torque_regressor(chain, *(signal[part] for signal in signals)), tau[part])
-        total = merge(total, found) if total else found
+        block = compress(torque_regressor(chain, *(signal[part] for signal in signals)), tau[part])
+        total = merge(total, block) if total else block
     return total
 
 
@@ -103,8 +103,8 @@ def gather_joint(
         part = slice(begin, begin + _BLOCK)
         bodies = _own_rows(chain, joint, [signal[part] for signal in signals])
         own = np.column_stack([bodies, beside[part]])
-        found = _triangular(own, tau[part], 0.0, len(own))
-        total = found if total is None else merge_joint(total, found)
+        block = _triangular(own, tau[part], 0.0, len(own))
+        total = block if total is None else merge_joint(total, block)
     assert total is not None
     return total
 

@@ -44,18 +44,18 @@ def perturbation_between(before: Chain, after: Chain) -> Array:
 def adjoint(pose: Array) -> Array:
     """Return the (..., 6, 6) adjoints of (..., 4, 4) poses, for twists as [rotation, translation]."""
     turn = pose[..., :3, :3]
-    found = np.zeros((*pose.shape[:-2], 6, 6))
-    found[..., :3, :3] = found[..., 3:, 3:] = turn
-    found[..., 3:, :3] = skew(pose[..., :3, 3]) @ turn
-    return found
+    matrix = np.zeros((*pose.shape[:-2], 6, 6))
+    matrix[..., :3, :3] = matrix[..., 3:, 3:] = turn
+    matrix[..., 3:, :3] = skew(pose[..., :3, 3]) @ turn
+    return matrix
 
 
 def skew(vector: Array) -> Array:
     """Return the (..., 3, 3) matrices with skew(v) w = v x w."""
-    found = np.zeros((*vector.shape, 3))
-    found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = -vector[..., 2], vector[..., 1], -vector[..., 0]
-    found[..., 1, 0], found[..., 2, 0], found[..., 2, 1] = vector[..., 2], -vector[..., 1], vector[..., 0]
-    return found
+    matrix = np.zeros((*vector.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -vector[..., 2], vector[..., 1], -vector[..., 0]
+    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = vector[..., 2], -vector[..., 1], vector[..., 0]
+    return matrix
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -66,8 +66,8 @@ def cross(a: Array, b: Array) -> Array:
     ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
     bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
     first = ay * bz
-    found = np.empty((*first.shape[:-1], 3, first.shape[-1]))
-    np.subtract(first, az * by, out=found[..., 0, :])
-    np.subtract(az * bx, ax * bz, out=found[..., 1, :])
-    np.subtract(ax * by, ay * bx, out=found[..., 2, :])
-    return found
+    product = np.empty((*first.shape[:-1], 3, first.shape[-1]))
+    np.subtract(first, az * by, out=product[..., 0, :])
+    np.subtract(az * bx, ax * bz, out=product[..., 1, :])
+    np.subtract(ax * by, ay * bx, out=product[..., 2, :])
+    return product

@@ -42,11 +42,11 @@ def torque_regressor(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_ra
     """
     q, qd, qdd = _check_motion(chain, q_rad, qd_rad_s, qdd_rad_s2)
     samples, joints = q.shape
-    found = np.zeros((samples, joints, PER_BODY * joints))
+    regressor = np.zeros((samples, joints, PER_BODY * joints))
     carriers, depth = _carriers(chain)
     axis, point, gravity = (_plain(a) for a in (chain.axis, chain.point, chain.gravity))
-    fill_regressor(carriers, depth, axis, point, gravity, _plain(q), _plain(qd), _plain(qdd), found)
-    return read_only(found)
+    fill_regressor(carriers, depth, axis, point, gravity, _plain(q), _plain(qd), _plain(qdd), regressor)
+    return read_only(regressor)
 
 
 def inverse_dynamics(

@@ -75,15 +75,15 @@ def load_network(path: Path) -> NetworkProfile:
 def _read_traces(data: dict[str, Any], path: Path, text: str) -> None:
     """Put the traces in the place of their files' names."""
     for table in ((), ("to_modules",), ("to_coordinator",)):
-        found = data.get(table[0]) if table else data
-        if not isinstance(found, dict) or "trace" not in found:
+        path_table = data.get(table[0]) if table else data
+        if not isinstance(path_table, dict) or "trace" not in path_table:
             continue
         location: Location = (*table, "trace")
         where = f"{path}:{line_of(text, location)}: {_words(location)}"
-        if not isinstance(found["trace"], str):
+        if not isinstance(path_table["trace"], str):
             raise NetworkError(f"{where}: must be the name of a CSV file")
         try:
-            found["trace"] = read_trace(path.parent / found["trace"])
+            path_table["trace"] = read_trace(path.parent / path_table["trace"])
         except TraceError as error:
             raise NetworkError(f"{where}: {error}") from error
 

@@ -12,10 +12,10 @@ _AT_LINE = re.compile(r"\(at line (\d+), column \d+\)")
 
 def syntax_error_line(error: tomllib.TOMLDecodeError, text: str) -> tuple[int, str]:
     """Return the line (from 1) and the reason of a syntax error."""
-    found = _AT_LINE.search(str(error))
-    if found is None:
+    match = _AT_LINE.search(str(error))
+    if match is None:
         return max(1, len(text.splitlines())), str(error)
-    return int(found.group(1)), _AT_LINE.sub("", str(error)).strip()
+    return int(match.group(1)), _AT_LINE.sub("", str(error)).strip()
 
 
 def line_of(text: str, location: Location) -> int:
@@ -55,9 +55,9 @@ def _table(names: list[str], repeated: bool, counts: dict[Location, int]) -> Loc
     return path
 
 
-def _within(text: str, known: dict[Location, int], found: Location, rest: Location) -> int:
+def _within(text: str, known: dict[Location, int], parent: Location, rest: Location) -> int:
     """Follow the remaining names through the lines of a value that spans several."""
-    start = known[found]
+    start = known[parent]
     ends = [n for n in known.values() if n > start]
     end = min(ends, default=len(text.splitlines()) + 1)
     lines = text.splitlines()

@@ -26,7 +26,7 @@ from typing import NamedTuple
 from pydantic import BaseModel, ConfigDict
 
 HEADER = ["time_s", "delay_ms", "lost"]
-LONGEST_DELAY_MS = 10_000.0
+MAX_DELAY_MS = 10_000.0
 
 
 class TraceError(ValueError):
@@ -114,8 +114,8 @@ def _row(cells: list[str], last_s: float | None) -> TraceRow:
     if last_s is not None and time_s < last_s:
         raise ValueError(f"time_s: {time_text} is before the row above")
     delay_ms = 0.0 if lost and not delay_text else _number("delay_ms", delay_text)
-    if not 0.0 <= delay_ms <= LONGEST_DELAY_MS:
-        raise ValueError(f"delay_ms: {delay_text} must be from 0 to {LONGEST_DELAY_MS:g}")
+    if not 0.0 <= delay_ms <= MAX_DELAY_MS:
+        raise ValueError(f"delay_ms: {delay_text} must be from 0 to {MAX_DELAY_MS:g}")
     return TraceRow(time_s, delay_ms, lost)
 
 

@@ -98,7 +98,7 @@ def resample(
         raise ValueError(
             f"{len(t_ns)} time bases for {len(signals)} signals; one of each per module is needed"
         )
-    found = np.empty((common.size, len(signals), *np.shape(signals[0])[1:]))
+    resampled = np.empty((common.size, len(signals), *np.shape(signals[0])[1:]))
     for column, (times, values) in enumerate(zip(t_ns, signals, strict=True)):
         known = np.asarray(times, dtype=np.int64)
         _check_times(column, known, common, max_gap_ns)
@@ -106,8 +106,8 @@ def resample(
         spline = make_interp_spline(
             (known - known[0]) / NS_PER_S, np.asarray(values, dtype=float), k=1 if kind == "linear" else 3
         )
-        found[:, column] = spline((common - known[0]) / NS_PER_S)
-    return read_only(found)
+        resampled[:, column] = spline((common - known[0]) / NS_PER_S)
+    return read_only(resampled)
 
 
 def zero_phase_low_pass(signal: ArrayLike, rate_hz: float, cutoff_hz: float) -> Array:
@@ -127,8 +127,8 @@ def zero_phase_low_pass(signal: ArrayLike, rate_hz: float, cutoff_hz: float) -> 
     if values.shape[0] <= padding:
         raise ValueError(f"{values.shape[0]} samples; a cut-off of {cutoff_hz} Hz needs more than {padding}")
     sections = butter(FILTER_ORDER, cutoff_hz, fs=rate_hz, output="sos")
-    found: Array = sosfiltfilt(sections, values, axis=0, padlen=padding)
-    return read_only(found)
+    filtered: Array = sosfiltfilt(sections, values, axis=0, padlen=padding)
+    return read_only(filtered)
 
 
 def settling_samples(rate_hz: float, cutoff_hz: float) -> int:
@@ -144,8 +144,8 @@ def differentiate(signal: ArrayLike, rate_hz: float) -> Array:
     """
     values = np.asarray(signal, dtype=float)
     t = np.arange(values.shape[0]) / rate_hz
-    found: Array = np.asarray(CubicSpline(t, values, axis=0)(t, 1))
-    return read_only(found)
+    derivative: Array = np.asarray(CubicSpline(t, values, axis=0)(t, 1))
+    return read_only(derivative)
 
 
 def filtered_signals(

@@ -52,8 +52,8 @@ def own_information(
         own = _motion(chain, joint, clocks, request, span, tracks[span.motion_id])
         terms = term_columns(own, NS_PER_S / request.step_ns, request.cutoff_hz)[:, joint]
         motion = own.q_rad, own.qd_rad_s, own.qdd_rad_s2
-        found = gather_joint(chain, joint, *motion, own.tau_nm[:, joint], terms)
-        total = found if total is None else merge_joint(total, found)
+        one = gather_joint(chain, joint, *motion, own.tau_nm[:, joint], terms)
+        total = one if total is None else merge_joint(total, one)
     assert total is not None
     return total
 

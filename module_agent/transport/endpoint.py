@@ -16,16 +16,16 @@ def check_endpoint(text: str) -> str:
     Raises:
         ValueError: it cannot, whatever the network does; the message says what would be right.
     """
-    found = _FORM.match(text)
-    if found is None:
+    match = _FORM.match(text)
+    if match is None:
         raise ValueError(f"endpoint {text!r}: it must look like {DEFAULT_ENDPOINT}")
-    protocol = found["protocol"]
+    protocol = match["protocol"]
     if protocol in _OTHERS:
         return text
     if protocol not in _WITH_PORT:
         known = ", ".join((*_WITH_PORT, *_OTHERS))
         raise ValueError(f"endpoint {text!r}: unknown protocol {protocol!r}, known are {known}")
-    host, _, port = found["address"].rpartition(":")
+    host, _, port = match["address"].rpartition(":")
     if not host or not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
         raise ValueError(
             f"endpoint {text!r}: an address of {protocol} is HOST:PORT, with a port of 1 to 65535"

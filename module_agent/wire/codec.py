@@ -69,7 +69,7 @@ def _unpack(data: bytes, max_bytes: int) -> dict[str, Any]:
 def _reason(error: ValidationError) -> WireError:
     """Pick the error that comes first in the order types, finiteness, range."""
     ranks = {Refusal.TYPES: 0, Refusal.NOT_FINITE: 1, Refusal.RANGE: 2}
-    found: list[tuple[int, str, Refusal]] = []
+    errors: list[tuple[int, str, Refusal]] = []
     for item in error.errors(include_url=False, include_context=False):
         kind = item["type"]
         reason = Refusal.TYPES
@@ -80,8 +80,8 @@ def _reason(error: ValidationError) -> WireError:
         where = ".".join(str(part) for part in item["loc"])
         # An array whose elements are wrong counts as too short as well: the elements say why.
         rank = len(ranks) if kind == "too_short" else ranks[reason]
-        found.append((rank, f"{where}: {item['msg']}", reason))
-    _, detail, reason = min(found, key=lambda row: row[0])
+        errors.append((rank, f"{where}: {item['msg']}", reason))
+    _, detail, reason = min(errors, key=lambda row: row[0])
     return WireError(reason, detail[:480])
 
 

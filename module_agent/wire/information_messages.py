@@ -17,14 +17,14 @@ MAX_PART_BYTES = 65_536
 GEOMETRY_BYTES = 8 * (3 + 3 + 16)
 
 # Of a module in one motion: 400 s at 250 Hz.
-LONGEST_ROWS = 100_000
+MAX_ROWS_PER_MOTION = 100_000
 # Samples of all motions together, times modules squared, to which the time of computing goes: under a minute.
 MAX_WORK = 200_000_000
 # 85 years, of Unix time until 2055: sums of three such times, and a tenth for the drift, fit in 64 bits.
-FARTHEST_NS = 2_700_000_000_000_000_000
-FARTHEST_OFFSET_NS = 2.7e18
+MAX_TIME_NS = 2_700_000_000_000_000_000
+MAX_OFFSET_NS = 2.7e18
 
-Instant = Annotated[int, Field(ge=-FARTHEST_NS, le=FARTHEST_NS)]
+Instant = Annotated[int, Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)]
 
 
 def out_of_range(detail: str) -> PydanticCustomError:
@@ -42,10 +42,10 @@ class RowRange(Part):
 
     @model_validator(mode="after")
     def _check_length(self) -> Self:
-        if not 0 < self.end_row - self.first_row <= LONGEST_ROWS:
+        if not 0 < self.end_row - self.first_row <= MAX_ROWS_PER_MOTION:
             raise out_of_range(
                 f"rows {self.first_row} to {self.end_row} of {self.serial}: "
-                f"1 to {LONGEST_ROWS} rows of a motion are kept"
+                f"1 to {MAX_ROWS_PER_MOTION} rows of a motion are kept"
             )
         return self
 
@@ -82,8 +82,8 @@ class ChainPart(Part):
 class ClockPart(Part):
     """How a module's clock maps to the session's (`dynamics.clock_map.ClockMap`)."""
 
-    origin_ns: Annotated[int, Field(ge=0, le=FARTHEST_NS)]
-    offset_ns: Annotated[float, Field(ge=-FARTHEST_OFFSET_NS, le=FARTHEST_OFFSET_NS)]
+    origin_ns: Annotated[int, Field(ge=0, le=MAX_TIME_NS)]
+    offset_ns: Annotated[float, Field(ge=-MAX_OFFSET_NS, le=MAX_OFFSET_NS)]
     drift: Annotated[float, Field(ge=-0.1, le=0.1)]
 
 

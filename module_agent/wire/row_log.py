@@ -11,7 +11,7 @@ from module_agent.wire.refusal import Refusal, WireError
 
 _GROWTH = 4096
 # Four hours at 250 Hz, or one at 1 kHz: what is farther off is no row of this session.
-LONGEST_ROWS = 4_000_000
+MAX_ROWS = 4_000_000
 
 
 class RowLog:
@@ -55,7 +55,7 @@ class RowLog:
         return rows
 
     def _reserve(self, first: int, end: int, base: int) -> None:
-        if max(end, self._end) - min(first, base) > LONGEST_ROWS:
+        if max(end, self._end) - min(first, base) > MAX_ROWS:
             raise WireError(
                 Refusal.RANGE,
                 f"row {first} is too far from rows {base} to {self._end} to be of this boot",
@@ -101,10 +101,10 @@ class RowLog:
         """
         arrived = np.flatnonzero(self._have)
         t_ns = self._rows["t_ns"][arrived]
-        found = arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]
-        if self._base is None or not len(found):
+        within = arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]
+        if self._base is None or not len(within):
             return 0, 0
-        return self._base + int(found[0]), self._base + int(found[-1]) + 1
+        return self._base + int(within[0]), self._base + int(within[-1]) + 1
 
     def forget_before(self, row: int) -> None:
         """Drop rows below `row`, for listeners with little memory."""

@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 
 from module_agent.estimate.base_shake import BaseMotion
 from module_agent.estimate.joint_model import (
-    BEARING,
+    BASE_HEADING,
     COMPLIANCE,
     DELAY,
     GRAVITY,
+    GYRO_AXIS,
     HEIGHT,
     HINGE,
-    KAPPA,
     PIVOT,
     RADIAL,
     Motion,
@@ -50,7 +50,7 @@ def numeric(read: Callable[[np.ndarray], np.ndarray], p: np.ndarray, column: int
 def test_derivatives_are_those_of_the_readings(motion: SmoothMotion) -> None:
     p = parameters()
     _, jacobian = predict(Motion(motion, None), T_S, p, DELAY)
-    for column in [*range(2, BEARING), DELAY]:
+    for column in [*range(2, BASE_HEADING), DELAY]:
         step = 1e-6 if column == COMPLIANCE else 1e-4
         expected = numeric(lambda at: predict(Motion(motion, None), T_S, at, DELAY)[0], p, column, step)
         # Differences of readings of 10 m/s^2 over such steps are good to 1e-8; the compliance's are of 1e3.
@@ -71,7 +71,7 @@ def shaking(motion: SmoothMotion) -> Motion:
 
 def test_derivatives_are_those_of_the_readings_on_a_base_that_shakes(motion: SmoothMotion) -> None:
     p, carried = parameters(), shaking(motion)
-    p[BEARING], p[PIVOT], p[HEIGHT] = 0.7, (0.02, -0.03), 0.06
+    p[BASE_HEADING], p[PIVOT], p[HEIGHT] = 0.7, (0.02, -0.03), 0.06
     _, jacobian = predict(carried, T_S, p, DELAY)
     for column in range(2, DELAY + 1):
         step = 1e-6 if column == COMPLIANCE else 1e-4
@@ -105,7 +105,7 @@ def test_on_a_base_that_turns_the_imu_feels_what_a_rigid_body_does() -> None:
     carrier = ImuWindow(t_ns, rate_of(housing), housing.inv().apply(second(shift)))
     window = JointWindow(t_ns, q, np.zeros_like(q))
     p = np.zeros(DELAY + 1)
-    p[RADIAL], p[BEARING], p[PIVOT], p[HEIGHT] = radial, bearing, pivot, height
+    p[RADIAL], p[BASE_HEADING], p[PIVOT], p[HEIGHT] = radial, bearing, pivot, height
     moves = Motion(SmoothMotion(window, 0.006), BaseMotion(window, carrier, np.zeros(6), 0.006))
     still = Motion(moves.joint, None)
     inner = slice(300, 2700, 40)
@@ -125,7 +125,7 @@ def test_a_bending_link_changes_the_other_derivatives_by_what_is_left_out_at_mos
 ) -> None:
     p = parameters(compliance=3e-5)
     _, jacobian = predict(Motion(motion, None), T_S, p, DELAY)
-    for column in (2, 3, 4, 5, 6, KAPPA.start, COMPLIANCE, HINGE, DELAY):
+    for column in (2, 3, 4, 5, 6, GYRO_AXIS.start, COMPLIANCE, HINGE, DELAY):
         expected = numeric(lambda at: predict(Motion(motion, None), T_S, at, DELAY)[0], p, column, 1e-7)
         scale = float(np.abs(expected).max())
         # The load's own dependence on gravity and radius is c g / d: 2e-3 of the readings' derivatives.

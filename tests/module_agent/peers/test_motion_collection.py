@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from module_agent.firmware.feedback import History
 from module_agent.peers.motion_listener import ANSWER_TIMEOUT_NS, AskHistory
 from module_agent.peers.row_collection import GIVE_UP_NS, MAX_MOTIONS, MotionCollection, OwnRows
-from module_agent.wire.information_messages import LONGEST_ROWS, CollectRequest, RowRange
+from module_agent.wire.information_messages import MAX_ROWS_PER_MOTION, CollectRequest, RowRange
 from module_agent.wire.messages import Feedback
 from module_agent.wire.refusal import Refusal, WireError
 
@@ -154,11 +154,11 @@ def test_what_was_kept_of_a_motion_outlives_a_demand_for_it_that_is_refused() ->
     assert collection.tracks(1) == before
 
 
-@pytest.mark.parametrize("length", [0, -1, LONGEST_ROWS + 1])
+@pytest.mark.parametrize("length", [0, -1, MAX_ROWS_PER_MOTION + 1])
 def test_there_is_no_range_of_no_rows_or_of_more_than_are_kept(length: int) -> None:
     with pytest.raises(ValidationError, match="1 to 100000 rows"):
         RowRange(serial=OWN, boot=7, first_row=10, end_row=10 + length)
-    assert RowRange(serial=OWN, boot=7, first_row=10, end_row=10 + LONGEST_ROWS).first_row == 10
+    assert RowRange(serial=OWN, boot=7, first_row=10, end_row=10 + MAX_ROWS_PER_MOTION).first_row == 10
 
 
 def test_a_refusal_of_one_range_leaves_the_other_motions_of_the_module_open() -> None:

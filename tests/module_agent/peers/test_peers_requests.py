@@ -19,7 +19,7 @@ from module_agent.torque_information import module_information
 from module_agent.torque_information.service import Worker
 from module_agent.transport.transport import Reply, Request, Sink
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
-from module_agent.wire.information_messages import FARTHEST_NS, FARTHEST_OFFSET_NS, Information
+from module_agent.wire.information_messages import MAX_OFFSET_NS, MAX_TIME_NS, Information
 from module_agent.wire.keys import Leaf, key
 from module_agent.wire.messages import Ack, HistoryRequest
 from module_agent.wire.refusal import WireError
@@ -319,8 +319,8 @@ COLLECTING = st.builds(
     FEW_MOTIONS | NUMBERS,
 )
 # So large that they matter, so small that they are computed with.
-TIMES = st.integers(-(10**9), 10**10) | st.integers(-FARTHEST_NS, FARTHEST_NS)
-OFFSETS = st.floats(-1e9, 1e9) | st.floats(-FARTHEST_OFFSET_NS, FARTHEST_OFFSET_NS)
+TIMES = st.integers(-(10**9), 10**10) | st.integers(-MAX_TIME_NS, MAX_TIME_NS)
+OFFSETS = st.floats(-1e9, 1e9) | st.floats(-MAX_OFFSET_NS, MAX_OFFSET_NS)
 CLOCK = st.fixed_dictionaries(
     {"origin_ns": TIMES | NUMBERS, "offset_ns": OFFSETS | FLOATS, "drift": st.floats(-0.1, 0.1)}
 )

@@ -7,19 +7,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.torque_information.serialisation import clocks_of
-from module_agent.wire.information_messages import FARTHEST_NS, FARTHEST_OFFSET_NS, ClockPart
+from module_agent.wire.information_messages import MAX_OFFSET_NS, MAX_TIME_NS, ClockPart
 
 # A tenth of 1e19 ns, the longest time since an origin, is a double to 128 ns; a few roundings make that. Sums
 # that leave 64 bits are off by 1.8e19 ns.
 TOLERANCE_NS = 2000
-ENDS = st.sampled_from([FARTHEST_NS, -FARTHEST_NS])
+ENDS = st.sampled_from([MAX_TIME_NS, -MAX_TIME_NS])
 
 
 @settings(max_examples=500, deadline=None, derandomize=True)
 @given(
-    session_ns=ENDS | st.integers(-FARTHEST_NS, FARTHEST_NS),
-    origin_ns=st.just(FARTHEST_NS) | st.integers(0, FARTHEST_NS),
-    offset_ns=ENDS.map(float) | st.floats(-FARTHEST_OFFSET_NS, FARTHEST_OFFSET_NS),
+    session_ns=ENDS | st.integers(-MAX_TIME_NS, MAX_TIME_NS),
+    origin_ns=st.just(MAX_TIME_NS) | st.integers(0, MAX_TIME_NS),
+    offset_ns=ENDS.map(float) | st.floats(-MAX_OFFSET_NS, MAX_OFFSET_NS),
     drift=st.sampled_from([-0.1, 0.1]) | st.floats(-0.1, 0.1),
 )
 def test_the_farthest_times_map_as_in_exact_arithmetic_and_back(
