@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from coordinator.description.urdf_reader import read_urdf
     from coordinator.identification.identify import identify
     from coordinator.library import (
+        connect,
         denavit_hartenberg,
         export_hrdf,
         export_urdf,
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from module_agent.model.regressor import inverse_dynamics, torque_regressor
 
 _HOMES = {
+    "connect": "coordinator.library",
     "denavit_hartenberg": "coordinator.library",
     "export_hrdf": "coordinator.library",
     "export_urdf": "coordinator.library",
@@ -38,6 +40,7 @@ _HOMES = {
 }
 
 __all__ = [
+    "connect",
     "denavit_hartenberg",
     "export_hrdf",
     "export_urdf",

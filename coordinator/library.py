@@ -10,7 +10,10 @@ frame (`apply_perturbation`). To first order the twist of a module's pose is J d
 differences, and its covariance is J C J^T.
 """
 
-from collections.abc import Mapping
+import asyncio
+import time
+from collections.abc import AsyncIterator, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -25,19 +28,29 @@ from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
 from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
-from coordinator.recording.recording import Recording
+from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.live_robot.messenger import Messenger
+from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, RESULT, SESSION
 from coordinator.recording.run_folder import load_recording as read_recording
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.torque_control.gravity_model import weight_of
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import LostError
 from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import apply_perturbation
 from module_agent.signals.clock_map import ClockMap
+from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.messages import GoTo, Message
+from module_agent.wire.refusal import WireError
 
 _STEP = 1e-6
 _NS = 1e-9
+# Feedback is published whether a module is held or not; a network may lose some.
+_FEEDBACK_S = 3.0
 
 
 class Signals(NamedTuple):
@@ -268,3 +281,133 @@ def _described(robot: SavedRun | Identified) -> tuple[Chain, Array | None, Mappi
     if isinstance(robot, SavedRun):
         return robot.chain, robot.phi, robot.result.types, robot.result.robot
     return robot.kinematics.fit.chain, robot.real_phi, robot.result.types, robot.result.robot
+
+
+# ---------------------------------------------------------------------- live robots
+
+
+class LiveRobot:
+    """A connected robot: everything that it sends is in `recording`; `group` takes commands.
+
+    Modules that are not held move for other programs and send their feedback all the same.
+    """
+
+    def __init__(self, messenger: Messenger, group: ModuleGroup, recording: Recording):
+        self.group = group
+        self.recording = recording
+        self._messenger = messenger
+        self._keeper: asyncio.Task[None] | None = None
+
+    @property
+    def serials(self) -> tuple[str, ...]:
+        """Serials of the modules, sorted."""
+        return self.group.serials
+
+    @property
+    def without_feedback(self) -> list[str]:
+        """Serials of the modules that have sent no feedback so far."""
+        return [serial for serial in self.serials if not len(self.latest(serial))]
+
+    def latest(self, serial: str, count: int = 1) -> Rows:
+        """Return the newest `count` rows of a module (dtype `feedback_rows.ROW`), fewer if fewer came.
+
+        Raises:
+            KeyError: no such module.
+        """
+        log = self.recording.modules[serial].rows
+        return log.rows(log.end_row - count, log.end_row)
+
+    async def hold(self, serials: Sequence[str] | None = None) -> None:
+        """Take the lease of modules (all by default) and renew it until the connection ends.
+
+        Raises:
+            Refused: another program holds one; the message names it and the time left.
+        """
+        for serial in serials or self.serials:
+            await self.group.acquire(serial)
+        if self._keeper is None:
+            self._keeper = asyncio.create_task(self.group.keep_alive())
+
+    async def move_to(self, position_rad: Mapping[str, float], max_speed_rad_s: float = 0.5) -> None:
+        """Move joints of held modules to positions, all at the same time, by minimum jerk.
+
+        Raises:
+            MotionInterrupted, ModuleLost, Refused: a motion did not come to its end; the message says why.
+        """
+        await self.group.run(
+            {s: GoTo(target_rad=q, max_speed_rad_s=max_speed_rad_s) for s, q in position_rad.items()}
+        )
+
+    async def close(self) -> None:
+        """Release what is held, so that its motors are off, and leave the network."""
+        if self._keeper is not None:
+            self._keeper.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._keeper
+            await self.group.release_all()
+        self._messenger.close()
+
+
+@asynccontextmanager
+async def connect(
+    robot: str = "robot",
+    *,
+    listen: str = DEFAULT_ENDPOINT,
+    routers: Sequence[str] = (),
+    expect: int | None = None,
+    timeout_s: float = 15.0,
+) -> AsyncIterator[LiveRobot]:
+    """Connect to a robot on the network: `async with connect("my_arm", expect=4) as arm: ...`.
+
+    Args:
+        robot: its name, part of every key.
+        listen: the Zenoh endpoint that its agents connect to; a hub that is there already is joined.
+        routers: Zenoh routers to connect to instead.
+        expect: how many modules there are; by default all that answer until none has come for a second.
+        timeout_s: how long to wait for them.
+
+    Raises:
+        UsageError: the network cannot be joined.
+        LostError: no module, or fewer than expected, answered within the time, or one sends no feedback.
+    """
+    loop = asyncio.get_running_loop()
+    recording = Recording()
+
+    def record(entry: Entry) -> Message | None:
+        try:
+            message = recording.add(entry)
+        except WireError:
+            return None  # counted in `recording.refused`
+        return message if isinstance(message, Message) else None
+
+    transport = open_connection(Place(robot, listen, tuple(routers)), lambda text: None).transport
+    messenger = Messenger(transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, record)
+    live = LiveRobot(
+        messenger, ModuleGroup(messenger, recording, time.monotonic_ns, sender_name()), recording
+    )
+    try:
+        messenger.start()
+        await live.group.meet(await _present(messenger, robot, expect, timeout_s))
+        if not await live.group.wait(lambda: not live.without_feedback, _FEEDBACK_S):
+            raise LostError(f"no feedback from {', '.join(live.without_feedback)} within {_FEEDBACK_S:g} s")
+        yield live
+    finally:
+        await live.close()
+
+
+async def _present(messenger: Messenger, robot: str, expect: int | None, timeout_s: float) -> list[str]:
+    end = quiet = time.monotonic()
+    end += timeout_s
+    present: set[str] = set()
+    while time.monotonic() < end:
+        await asyncio.sleep(0.02)
+        if messenger.alive != present:
+            present, quiet = set(messenger.alive), time.monotonic()
+        complete = time.monotonic() - quiet > 1.0 if expect is None else len(present) >= expect
+        if present and complete:
+            return sorted(present)
+    wanted = "at least one module" if expect is None else f"{expect} modules"
+    raise LostError(
+        f"{wanted} of robot {robot!r} expected within {timeout_s:g} s, {len(present)} answered: "
+        f"{', '.join(sorted(present)) or 'none'}; are the agents running, and is the robot's name right?"
+    )

@@ -12,7 +12,7 @@ endpoint, seconds = sys.argv[1], float(sys.argv[2]) if len(sys.argv) > 2 else 5.
 
 def show(sample: zenoh.Sample) -> None:
     """Print the newest row of a batch."""
-    batch = decode_feedback(sample.payload.to_bytes())
+    batch = decode_feedback(sample.payload)
     newest = batch.rows[-1]
     print(f"{batch.serial}: {newest['position_rad']:+.4f} rad, {newest['effort_nm']:+.3f} Nm", flush=True)
 
