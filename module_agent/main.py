@@ -15,11 +15,12 @@ from module_agent.firmware.config import FirmwareConfig, config_of
 from module_agent.hardware.bus_client import BusClient
 from module_agent.hardware.hardware import HardwareLost, ModuleInformation
 from module_agent.hardware.loop_inside import LoopInside
+from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
 from module_agent.network_emulation.impaired_transport import inject
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
-from module_agent.transport.transport import NoHub, Transport, TransportError
+from module_agent.transport.transport import NoHub, Transport
 from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.keys import check_chunk
 from module_agent.wire.messages import ExpiryAction
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
-EXIT_USAGE, EXIT_LOST = 2, 3
 CONNECT_ATTEMPT_S = 1.0
 # What an agent says when it is up; the launcher waits for it.
 ATTACHED = "attached to the bus and the network"
@@ -118,7 +118,7 @@ def main(
             check_chunk("robot", robot)
             injected = network_named(network)
             if expiry not in ("motor_off", "hold", "damping"):
-                raise ValueError(f"--expiry {expiry}: it must be motor_off, hold or damping")
+                raise UsageError(f"--expiry {expiry}: it must be motor_off, hold or damping")
             action: ExpiryAction = expiry  # type: ignore[assignment]
             transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], injected, seed)
             opened.callback(transport.close)
@@ -131,10 +131,8 @@ def main(
             opened.callback(modules.close)
             configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in modules.information]
             host = AgentHost(robot, modules, transport, configs, worker := ThreadWorker())
-        except (ValueError, KeyError, OSError, TransportError) as error:
-            # A KeyError shows its message in quotes.
-            text = error.args[0] if isinstance(error, KeyError) else error
-            typer.echo(f"x5-agent: {text}", err=True)
+        except (RobotError, OSError) as error:
+            typer.echo(f"x5-agent: {error}", err=True)
             raise typer.Exit(EXIT_USAGE) from error
         opened.pop_all()
     _serve(host, worker)

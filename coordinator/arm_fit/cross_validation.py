@@ -16,6 +16,7 @@ from coordinator.arm_fit.problem import Problem
 from coordinator.dynamics.torque_prediction import TorqueError, torque_error
 from coordinator.parameter_fit.robust_least_squares import WeightedFit, fit_weighted
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.signals.torque_terms import Term
 
 Index = NDArray[np.int64]
@@ -56,11 +57,11 @@ def halves(samples: int, settling: int) -> tuple[slice, slice]:
     """Return both halves of `samples`, with a gap of `settling` between them, over which the low-pass mixes.
 
     Raises:
-        ValueError: too few samples to divide.
+        DataError: too few samples to divide.
     """
     middle, gap = samples // 2, -(-settling // 2)
     if middle - gap < 2:
-        raise ValueError(f"{samples} samples cannot be halved: {2 * gap} between the halves are mixed")
+        raise DataError(f"{samples} samples cannot be halved: {2 * gap} between the halves are mixed")
     return slice(0, middle - gap), slice(middle + gap, samples)
 
 
@@ -68,7 +69,7 @@ def fit_part(problem: Problem, some: slice) -> WeightedFit:
     """Fit to the moving samples of a part of the recording.
 
     Raises:
-        ValueError: a joint with too few samples.
+        DataError: a joint with too few samples.
     """
     return fit_weighted(
         problem.regressor[some],
@@ -101,7 +102,7 @@ def held_out_errors(problem: Problem, predictor: Predictor) -> tuple[HeldOutErro
     """Try a predictor on either half and on both together: filtered and raw, all samples and masked.
 
     Raises:
-        ValueError: too few samples, see `halves` and `fit_part`.
+        DataError: too few samples, see `halves` and `fit_part`.
     """
     parts = list(_predictions(problem, predictor))
     parts.append(
@@ -114,7 +115,7 @@ def errors_elsewhere(both: Problem, predictor: Predictor, seen: int) -> tuple[He
     """Try a predictor that saw the first `seen` samples of two recordings (`joined`) on the second one.
 
     Raises:
-        ValueError: too few samples, see `fit_part`.
+        DataError: too few samples, see `fit_part`.
     """
     samples = len(both.log.tau_nm)
     predicted = predictor(slice(0, seen), slice(seen, samples))
@@ -136,7 +137,7 @@ def length_curve(problem: Problem) -> Iterator[CurvePoint]:
     for part in CURVE_PARTS:
         try:
             errors = held_out_errors(problem, _shortened(problem, part))
-        except ValueError:
+        except DataError:
             continue
         first = halves(len(problem.log.tau_nm), problem.log.settling)[0]
         yield CurvePoint(part * (first.stop - first.start) / problem.log.rate_hz, *overall(errors))
@@ -146,7 +147,7 @@ def gain_of_terms(problem: Problem) -> Iterator[TermGain]:
     """Yield what each kind of term is worth: the held-out error of the model without it.
 
     Raises:
-        ValueError: too few samples.
+        DataError: too few samples.
     """
     for term in problem.choice.terms:
         lacking = _without(problem, term)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.model.chain import Array
+from module_agent.model.errors import UsageError
 from module_agent.model.read_only import frozen, make_read_only
 from module_agent.signals.filtering import NS_PER_S, resample
 
@@ -26,7 +27,7 @@ _JITTER = 0.02
 _BRIDGED = 5.0
 
 
-class DataFileError(ValueError):
+class DataFileError(UsageError):
     """A recording that cannot be read, or does not fit the robot."""
 
 

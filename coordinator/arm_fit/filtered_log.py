@@ -7,6 +7,7 @@ from scipy.signal import welch
 
 from coordinator.arm_fit.data_file import JointLog
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.signals.filtering import NS_PER_S, filtered_motion, settling_samples, zero_phase_low_pass
 
 # Of the speed's power in what counts as the motion, and how many times its highest frequency passes. Friction
@@ -83,7 +84,7 @@ def filtered_log(log: JointLog, cutoff_hz: float, most: int | None = None) -> Fi
     """Return a recording through one low-pass (`filtered_motion`), with at most `most` samples.
 
     Raises:
-        ValueError: a cut-off out of range, or too few samples for it.
+        DataError: a cut-off out of range, or too few samples for it.
     """
     t_ns = np.round(np.arange(len(log.q_rad)) * (NS_PER_S / log.rate_hz)).astype(np.int64)
     motion = filtered_motion(t_ns, log.q_rad, log.qd_rad_s, log.tau_nm, log.rate_hz, cutoff_hz)
@@ -116,7 +117,7 @@ def filtered_log(log: JointLog, cutoff_hz: float, most: int | None = None) -> Fi
 def _thinned(fine: Array, edge: int, step: int) -> Array:
     """Return some of the samples, without the ends, where what is filtered once more has not settled."""
     if len(fine) <= 2 * edge:
-        raise ValueError(
+        raise DataError(
             f"{len(fine) + 2 * edge} samples, of which the low-pass unsettles {4 * edge}; a longer recording "
             "or a higher cut-off is needed"
         )

@@ -52,6 +52,7 @@ from coordinator.parameter_fit.report_parts import base_parameter_parts, body_pa
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from coordinator.parameter_fit.significance import SIGNIFICANT_CHANCE, chance_of, f_statistic
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.regressor import PER_BODY
 
 _ROUNDING = 1e-9
@@ -140,7 +141,7 @@ def named(problem: Problem, fit: WeightedFit) -> BaseParameters:
 def _real(problem: Problem, fit: WeightedFit, trust: float) -> tuple[RealBodies | None, str]:
     try:
         return real_bodies(problem, fit, claimed_bodies(problem.robot), trust), ""
-    except (ValueError, NotSolvedError) as error:
+    except DataError as error:
         return None, str(error)
 
 

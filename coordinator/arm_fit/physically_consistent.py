@@ -18,6 +18,7 @@ from coordinator.dynamics.pseudo_inertia import (
 from coordinator.parameter_fit.physically_consistent import physically_consistent
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 
@@ -44,14 +45,14 @@ def claimed_bodies(robot: UrdfRobot) -> Array:
     """Return the pseudo-inertias (n, 4, 4) that a URDF claims, in the root frame, made real if they are not.
 
     Raises:
-        ValueError: a body has no mass, so that nothing is known of it beforehand.
+        DataError: a body has no mass, so that nothing is known of it beforehand.
     """
     phi = np.zeros(PER_BODY * len(robot.bodies)) if robot.phi is None else robot.phi
     found = []
     for link, own in zip(robot.bodies, phi.reshape(-1, PER_BODY), strict=True):
         pseudo = pseudo_inertia(own)
         if not pseudo[3, 3] > 0.0:
-            raise ValueError(f"the URDF gives no mass to {link!r}; only sums of parameters are fitted")
+            raise DataError(f"the URDF gives no mass to {link!r}; only sums of parameters are fitted")
         pseudo[:3, :3] += pseudo[3, 3] * SMEAR_M**2 * np.eye(3)
         found.append(pseudo if is_consistent(pseudo) else nearest_consistent(pseudo))
     return np.stack(found)
@@ -61,7 +62,7 @@ def real_bodies(problem: Problem, fit: WeightedFit, prior: Array, trust: float) 
     """Return the real bodies nearest to the torques of a fit and to the prior (n, 4, 4).
 
     Raises:
-        ValueError: a trust that is not positive.
+        DataError: a trust that is not positive.
         NotSolvedError: numerical trouble.
     """
     # So many rows count as one; the joints' weights among each other stay those of the fit.

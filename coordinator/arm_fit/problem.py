@@ -17,6 +17,7 @@ from coordinator.dynamics.drive_model import (
 )
 from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError, UsageError
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, torque_regressor
 from module_agent.signals.torque_terms import TERM_KINDS, Term
@@ -99,10 +100,10 @@ def problem(
     """
     for name, part in (("slow", choice.slow_part), ("mask", choice.mask_part)):
         if not 0.0 < part < 1.0:
-            raise ValueError(f"the {name} part of the top speed is {part}; it must be between 0 and 1")
+            raise UsageError(f"the {name} part of the top speed is {part}; it must be between 0 and 1")
     top_rad_s = log.top_rad_s if top_rad_s is None else top_rad_s
     if (still := np.flatnonzero(top_rad_s < 1e-6)).size:
-        raise ValueError(f"joint {robot.chain.serials[still[0]]!r} never moves; nothing shows its friction")
+        raise DataError(f"joint {robot.chain.serials[still[0]]!r} never moves; nothing shows its friction")
     drives = drive_columns(len(robot.bodies), choice.terms, choice.coupled)
     slow_rad_s = choice.slow_part * top_rad_s
     moving = np.abs(log.qd_rad_s) > choice.mask_part * top_rad_s
@@ -126,7 +127,7 @@ def joined(one: Problem, other: Problem) -> Problem:
         ValueError: the two have different columns.
     """
     if one.columns.names != other.columns.names:
-        raise ValueError("two recordings with different columns cannot be joined")
+        raise DataError("two recordings with different columns cannot be joined")
     log, more = one.log, other.log
     return one._replace(
         log=log._replace(

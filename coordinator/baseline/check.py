@@ -76,7 +76,7 @@ def check(known: BaselineRobot, later: BaselineRobot) -> CheckReport:
         )
     try:
         fits = tied_fits(known, later)
-    except (DataError, ValueError) as error:
+    except DataError as error:
         raise CheckError(f"{later.folder} cannot be compared with {known.folder}: {error}") from error
     return compared(session, fits.before.chain, fits.after.chain, find_changes(fits))
 

@@ -5,7 +5,6 @@ from coordinator.baseline.payload_report import PayloadReport, payload_report
 from coordinator.excitation.plan import Plan
 from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.parameter_fit.payload import find_payload
-from coordinator.parameter_fit.physically_consistent import NotSolvedError
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, dynamic_motion
 from module_agent.model.chain import Chain
@@ -56,7 +55,7 @@ def search_payload(known: BaselineRobot, later: BaselineRobot) -> PayloadReport:
             # The other way round: with it before, and without it later.
             lost = find_payload(later_said, information, places, sigma, INDEPENDENT_FRACTION)
             found, taken_off = (lost, True) if lost.found else (found, False)
-    except (ValueError, NotSolvedError) as error:
+    except DataError as error:
         raise PayloadError(f"{later.folder} cannot be compared with {known.folder}: {error}") from error
     # All joints at once: one stretch without a gap.
     spent_s = 1e-9 * float(moved.t_ns[-1] - moved.t_ns[0])

@@ -7,6 +7,7 @@ from coordinator.commands.options import ConnectOptions
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
 from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.recording.session_file import SessionFileError
 from coordinator.runtime.command_line import fail
 from coordinator.runtime.event_loop import (
     SIGNALS,
@@ -60,21 +61,9 @@ def _prepared(config: RunConfig, place: Place, loop: ScaledLoop, terminal: Termi
         return Run(config, transport, loop.clock_ns, loop.call_soon_threadsafe, terminal)
     except BaseException as error:
         transport.close()
-        if isinstance(error, ValueError | OSError):
+        if isinstance(error, SessionFileError | OSError):
             raise UsageError(str(error)) from error
         raise
-
-
-def checked_speed(speed: float) -> float:
-    """Return the speed of a simulated world.
-
-    Raises:
-        UsageError: it is no positive number.
-    """
-    try:
-        return check_speed(speed)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
 
 
 def run_short(
@@ -84,4 +73,4 @@ def run_short(
     place = at.place(baseline.name)
     config = RunConfig(robot=place.robot, out=out, sender=sender_name(), plan=plan, expect=expect)
     with Terminal(at.quiet) as terminal:
-        run_attended(config, place, checked_speed(speed), terminal, advice="")
+        run_attended(config, place, check_speed(speed), terminal, advice="")

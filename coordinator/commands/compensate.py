@@ -6,12 +6,18 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from coordinator.commands.attended_run import checked_speed
 from coordinator.commands.compensate_view import CompensationView
 from coordinator.commands.options import AsJson, ConnectOptions, DynamicsFolder, Speed
 from coordinator.live_robot.connection import open_connection, sender_name
 from coordinator.runtime.command_line import fail, with_options
-from coordinator.runtime.event_loop import SIGNALS, Interruption, ScaledLoop, ignore_signals, run_to_end
+from coordinator.runtime.event_loop import (
+    SIGNALS,
+    Interruption,
+    ScaledLoop,
+    check_speed,
+    ignore_signals,
+    run_to_end,
+)
 from coordinator.runtime.exit_codes import explain
 from coordinator.runtime.terminal import Terminal
 from coordinator.torque_control.gains import most_damping_nm_s_rad
@@ -57,7 +63,7 @@ def compensate_robot(
     was exceeded; others as of `run`.
     """
     model = gravity_model(baseline)
-    place, speed = at.place(model.robot), checked_speed(speed)
+    place, speed = at.place(model.robot), check_speed(speed)
     _check_numbers(rate, max_speed)
     _check_times(for_s, hold_s)
     _check_damping(damping, model)

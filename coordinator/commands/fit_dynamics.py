@@ -20,7 +20,7 @@ from coordinator.description.urdf_update import friction_of, write_fitted_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
 from coordinator.runtime.command_line import fail
 from coordinator.runtime.terminal import Terminal, print_table
-from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE
+from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, RobotError
 from module_agent.signals.torque_terms import DRIVE_TERMS, Term
 
 _UP = ",".join(f"{part:g}" for part in STANDARD_GRAVITY)
@@ -108,7 +108,7 @@ def fit_dynamics(
         elsewhere = None if held_out is None else Elsewhere(held_out, _elsewhere(posed, held_out))
         try:
             found = identified(urdf, data, log, posed, step, trust, elsewhere)
-        except ValueError as error:
+        except RobotError as error:
             fail(f"{data}: {error}", EXIT_FAILED)
     for line in notes(found.report):
         terminal.note(line)
@@ -159,7 +159,7 @@ def _posed(
             return problem(robot, filtered_log(log, cutoff_hz, most), choice)
         one, again = (filtered_log(half, cutoff_hz, most) for half in in_two(log))
         return problem(robot, one, choice, again)
-    except ValueError as error:
+    except RobotError as error:
         fail(error, EXIT_USAGE)
 
 
@@ -173,7 +173,7 @@ def _elsewhere(posed: Problem, data: Path) -> Problem:
         fail(f"{error.filename}: {error.strerror}", EXIT_USAGE)
     except DataFileError as error:
         fail(error, EXIT_USAGE)
-    except ValueError as error:
+    except RobotError as error:
         fail(f"{data}: {error}", EXIT_USAGE)
 
 

@@ -7,12 +7,12 @@ import typer
 from rich.table import Table
 
 from coordinator.commands.options import AsJson
-from coordinator.merge.information_file import InformationFileError, read_information
+from coordinator.merge.information_file import read_information
 from coordinator.merge.merge_runs import merge_runs
 from coordinator.merge.report import MERGED, MergeReport, merge_report, write_report
 from coordinator.recording.run_folder import INFORMATION
 from coordinator.runtime.terminal import print_table
-from module_agent.model.errors import DataError, UsageError
+from module_agent.model.errors import UsageError
 
 # Above this the robot was not the same in all runs, or the covariance of a chain is too small.
 INCONSISTENT_ABOVE = 5.0
@@ -30,10 +30,7 @@ def merge(
     """
     if len(runs) < 2:
         raise UsageError("give two or more runs: the parameters of a single one are in its result.json")
-    try:
-        report = merge_report(merge_runs([read_information(run / INFORMATION) for run in runs]))
-    except (InformationFileError, ValueError) as error:
-        raise DataError(str(error)) from error
+    report = merge_report(merge_runs([read_information(run / INFORMATION) for run in runs]))
     out.mkdir(parents=True, exist_ok=True)
     write_report(out / MERGED, report)
     if as_json:

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from coordinator.baseline.known_robot import load_baseline
-from coordinator.commands.attended_run import checked_speed
 from coordinator.commands.monitor_view import MonitorScreen
 from coordinator.commands.options import ConnectOptions, DynamicsFolder, Speed
 from coordinator.live_robot.connection import Place, open_connection, sender_name
@@ -22,7 +21,7 @@ from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import SessionFileError, read_session
 from coordinator.runtime.command_line import with_options
-from coordinator.runtime.event_loop import SIGNALS, ScaledLoop
+from coordinator.runtime.event_loop import SIGNALS, ScaledLoop, check_speed
 from coordinator.runtime.terminal import Terminal
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import EXIT_FINDING, DataError, RobotError, UsageError
@@ -68,7 +67,7 @@ def monitor_robot(
         if recording is not None:
             _monitor_file(watcher, screen, recording)
         else:
-            _monitor_live(watcher, screen, at.place(reference.name), for_s, checked_speed(speed))
+            _monitor_live(watcher, screen, at.place(reference.name), for_s, check_speed(speed))
         screen.sum_up()
     if watcher.ledger.all:
         raise typer.Exit(EXIT_FINDING)

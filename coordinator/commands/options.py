@@ -58,11 +58,8 @@ class ConnectOptions:
             UsageError: the name or the network cannot be.
         """
         name = self.robot or robot
-        try:
-            check_chunk("robot", name)
-            return Place(name, self.listen, tuple(self.connect or ()), network_named(self.network), self.seed)
-        except ValueError as error:
-            raise UsageError(str(error)) from error
+        check_chunk("robot", name)
+        return Place(name, self.listen, tuple(self.connect or ()), network_named(self.network), self.seed)
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.commands.attended_run import checked_speed, run_attended
+from coordinator.commands.attended_run import run_attended
 from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed
 from coordinator.identification.result import DynamicsPart, Result
 from coordinator.live_robot.connection import sender_name
 from coordinator.runtime.command_line import with_options
+from coordinator.runtime.event_loop import check_speed
 from coordinator.runtime.terminal import Terminal
 from coordinator.session.run import RunConfig
 from coordinator.viewer.targets import viewer_choice
-from module_agent.model.errors import UsageError
 
 
 @with_options
@@ -47,11 +47,8 @@ def run(
 
     Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 130 interrupted.
     """
-    place, speed = at.place(), checked_speed(speed)
-    try:
-        shown = viewer_choice(viewer)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    place, speed = at.place(), check_speed(speed)
+    shown = viewer_choice(viewer)
     config = RunConfig(
         robot=place.robot,
         out=out,

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from coordinator.runtime.command_line import fail
-from coordinator.viewer.screenshot import ScreenshotFailed
 from coordinator.viewer.screenshot import screenshot as picture
 from module_agent.model.errors import EXIT_FAILED
 
@@ -19,5 +18,5 @@ def screenshot(
     """Render a recording as the viewer shows it, without a screen."""
     try:
         picture(recording, out, tab)
-    except (ScreenshotFailed, ValueError, OSError) as error:
+    except OSError as error:
         fail(error, EXIT_FAILED)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
@@ -58,10 +59,10 @@ def torque_error(
     if tau.ndim != 2 or predicted.shape != tau.shape or mean.shape != tau.shape[1:]:
         raise ValueError(f"torques {tau.shape}, predicted {predicted.shape} and mean {mean.shape} do not fit")
     if not all(np.isfinite(a).all() for a in (tau, predicted, mean)):
-        raise ValueError("a torque is not finite")
+        raise DataError("a torque is not finite")
     used = np.broadcast_to(True if mask is None else np.asarray(mask, dtype=bool), tau.shape)
     if not used.any():
-        raise ValueError("no samples to compare: the mask lets none through")
+        raise DataError("no samples to compare: the mask lets none through")
     size = np.where(used, tau, 0.0)
     errors = (np.where(used, predicted - tau, 0.0), np.where(used, mean - tau, 0.0))
     (overall, mean_overall), (per_joint, mean_per_joint) = (

@@ -19,6 +19,7 @@ from coordinator.batch_estimation.imu_intrinsics import slopes
 from coordinator.batch_estimation.imu_prediction import turned
 from module_agent.model.catalogue import GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.perturbation import cross, skew
 
@@ -98,10 +99,10 @@ def circle_covariance(
     """Return the covariance (7, 7) of radius, axis and gravity after all these motions of the joint.
 
     Raises:
-        ValueError: no motion.
+        DataError: no motion.
     """
     if not paths:
-        raise ValueError("no motion: nothing is told of the circle")
+        raise DataError("no motion: nothing is told of the circle")
     free = prior.sigmas > 0.0
     information = np.diag(np.concatenate([np.full(GEOMETRY, 1e-9), prior.sigmas[free] ** -2.0]))
     up = setting.gravity_m_s2 / np.linalg.norm(setting.gravity_m_s2)

@@ -13,10 +13,11 @@ from coordinator.kinematics.assembly import ChainFit
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.topology.topology import Topology
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 
 
-class IdentificationError(ValueError):
+class IdentificationError(DataError):
     """The recording does not hold what is needed; the message says what is missing and where."""
 
 

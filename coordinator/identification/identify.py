@@ -117,7 +117,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
         refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
-    except (DataError, ValueError) as error:
+    except (DataError, np.linalg.LinAlgError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
         f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"

@@ -52,7 +52,7 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     """Assemble what the joints explored so far tell; None as long as they tie no module to another.
 
     Raises:
-        ValueError: the estimates contradict each other, or modules were not seen at rest.
+        DataError: the estimates contradict each other, or modules were not seen at rest.
     """
     rests = _rests(recording)
     serials = sorted(rests)
@@ -139,7 +139,7 @@ def _mean_position(recording: Recording, joint: str, motion_ids: Sequence[int]) 
         if e.motion is not None and e.motion.end_row is not None and e.motion.motion_id == motion_ids[-1]
     ]
     if not rows or not len(rows[-1]):
-        raise ValueError(f"no rows of the motion of joint {joint} that was estimated")
+        raise DataError(f"no rows of the motion of joint {joint} that was estimated")
     return float(rows[-1].mean())
 
 
@@ -159,7 +159,7 @@ def _rest(recording: Recording, rests: dict[str, tuple[int, int]], serials: Sequ
     rows = [recording.rows(s, *rests[s]) for s in serials]
     bare = [s for s, one in zip(serials, rows, strict=True) if not len(one)]
     if bare:
-        raise ValueError(f"no rows at rest of {', '.join(bare)}")
+        raise DataError(f"no rows at rest of {', '.join(bare)}")
     force = np.array([one["accel_m_s2"].astype(float).mean(axis=0) for one in rows])
     scatter = [float(one["accel_m_s2"].std(axis=0).max()) / np.sqrt(len(one)) for one in rows]
     position = np.array([float(one["position_rad"].mean()) for one in rows])
@@ -169,7 +169,7 @@ def _rest(recording: Recording, rests: dict[str, tuple[int, int]], serials: Sequ
 def _type(recording: Recording, serial: str) -> str:
     info = recording.modules[serial].info
     if info is None:
-        raise ValueError(f"module {serial} has not told its type")
+        raise DataError(f"module {serial} has not told its type")
     return info.module_type
 
 
@@ -220,14 +220,14 @@ class Previewer:
         Where samples are missing, or do not fit, it is as assembled.
 
         Raises:
-            ValueError: see `preview`.
+            DataError: see `preview`.
         """
         found = preview(self._recording, explored)
         if found is None or not self._is_refined(found):
             return found
         try:
             return _refined(found, self._kinds(found), self._parts_of(found), self._prior)
-        except (DataError, ValueError, np.linalg.LinAlgError):
+        except (DataError, np.linalg.LinAlgError):
             return found
 
     def _is_refined(self, found: Preview) -> bool:
@@ -250,7 +250,7 @@ class Previewer:
                 events[event.serial, event.purpose] = event
         moved = [event for event in events.values() if event.serial in serials and event.motion is not None]
         if not moved:
-            raise ValueError("no motion of these modules is recorded")
+            raise DataError("no motion of these modules is recorded")
         everybody = tuple(sorted(self._recording.modules))
         order = [everybody.index(s) for s in serials]
         return [_columns(self._part(event, everybody), order) for event in moved]

@@ -13,6 +13,7 @@ from coordinator.kinematics.simultaneous_motion import (
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, window
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import SIMULTANEOUS_CUTOFF_HZ, filtered_signals, settling_samples
 
@@ -35,7 +36,7 @@ def respond(
     """Regress what all modules saw on what all joints did; columns in the order of `serials`.
 
     Raises:
-        ValueError: see `simultaneous_response`; also a hole in the recording, or no rest.
+        DataError: see `simultaneous_response`; also a hole in the recording, or no rest.
     """
     margin_s = settling_samples(RATE_HZ, SIMULTANEOUS_CUTOFF_HZ) / RATE_HZ
     one = window(recording, clocks, serials, event, margin_s)
@@ -53,7 +54,7 @@ def _still(recording: Recording, serials: Sequence[str]) -> StillReading:
     }
     missing = [s for s in serials if s not in events]
     if missing:
-        raise ValueError(
+        raise DataError(
             f"no rest of {', '.join(missing)} was recorded: the offsets of its gyro are not known"
         )
     rows = [recording.rows(s, events[s].start_row, events[s].end_row or 0) for s in serials]

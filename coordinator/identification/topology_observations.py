@@ -18,6 +18,7 @@ from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.motion_evidence import MotionEvidence, NotMoved, motion_evidence
 from coordinator.topology.topology import DOUBTFUL_BELOW, MotionSeen, Observations, seen_again
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import TOPOLOGY_CUTOFF_HZ, filtered_signals, settling_samples
 from module_agent.wire.messages import Estimate, MotionRecord
@@ -212,7 +213,7 @@ def _covered(ear: _Ear, serials: Sequence[str], event: JournalEvent) -> bool:
     margin_s = settling_samples(RATE_HZ, TOPOLOGY_CUTOFF_HZ) / RATE_HZ
     try:
         found = window(ear.recording, ear.clocks, serials, event, margin_s)
-    except ValueError:
+    except DataError:
         return False
     # A window is cut to what all modules have: one that fell silent early must not cut the others short.
     whole = window(ear.recording, ear.clocks, [event.serial], event, margin_s)

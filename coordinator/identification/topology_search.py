@@ -51,7 +51,7 @@ def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
     try:
         observations, unmoved = _usable(_seen(recording, serials))
         doubts = likely_topology(observations, unmoved).doubts
-    except (DataError, ValueError):
+    except DataError:
         return ()  # nothing to go by; whoever assembles the robot next says what is missing
     first = 0 if simultaneous_motion(recording, serials) is not None else 1
     repeated = {s: len(slow_motions(recording, s)) - first for s in serials}

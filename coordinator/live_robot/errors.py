@@ -1,11 +1,13 @@
 """How the hold on a robot is not to be had, or lost in the middle of a session; each names the module."""
 
+from module_agent.model.errors import LostError, RobotError
 
-class UnfitLink(RuntimeError):
+
+class UnfitLink(RobotError):
     """The network cannot carry a session; nothing has moved. The message says what was measured."""
 
 
-class ModuleLost(RuntimeError):
+class ModuleLost(LostError):
     """A module left in the middle of the session; `serial` says which."""
 
     def __init__(self, serial: str, why: str):
@@ -13,7 +15,7 @@ class ModuleLost(RuntimeError):
         self.serial = serial
 
 
-class RobotStopped(RuntimeError):
+class RobotStopped(RobotError):
     """Somebody said stop in the middle of the session; a program does not overrule that."""
 
     def __init__(self, serial: str, note: str):
@@ -21,7 +23,7 @@ class RobotStopped(RuntimeError):
         self.serial = serial
 
 
-class MotionInterrupted(RuntimeError):
+class MotionInterrupted(RobotError):
     """A motion ended before its end; it can be tried again after re-arming."""
 
     def __init__(self, serial: str, outcome: str):

@@ -9,6 +9,7 @@ import asyncio
 from collections.abc import Callable, Coroutine, Iterable
 
 from coordinator.recording.recording import Entry
+from module_agent.model.errors import RobotError
 from module_agent.transport.inbox import Inbox
 from module_agent.transport.transport import CLOSED, Event, Liveness, Reply, Sample, Transport, Undeclare
 from module_agent.wire.codec import encode
@@ -24,7 +25,7 @@ Post = Callable[[Callable[[], None]], object]
 Record = Callable[[Entry], Message | None]
 
 
-class NoAnswer(TimeoutError):
+class NoAnswer(RobotError):
     """A module did not answer; the message says which, on what, and why."""
 
     def __init__(self, serial: str, leaf: Leaf, why: str):
@@ -32,7 +33,7 @@ class NoAnswer(TimeoutError):
         self.serial = serial
 
 
-class Refused(RuntimeError):
+class Refused(RobotError):
     """A module refused a command; the message names the reason."""
 
     def __init__(self, serial: str, leaf: Leaf, ack: Ack):

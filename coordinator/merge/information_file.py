@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from module_agent.model.chain import Array, Chain, ChainError
+from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError, RobotError
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 
@@ -41,7 +42,7 @@ class RunInformation(NamedTuple):
     scale_sigma: float
 
 
-class InformationFileError(ValueError):
+class InformationFileError(RobotError):
     """The file is not there, or does not hold what it should; the message names it."""
 
 
@@ -85,9 +86,7 @@ def read_information(path: Path) -> RunInformation:
         raise InformationFileError(
             f"{path}: {error.strerror or error}; a run with dynamics writes it, and so does replaying one"
         ) from error
-    except (KeyError, ValueError, ChainError, zipfile.BadZipFile) as error:
-        if isinstance(error, InformationFileError):
-            raise
+    except (KeyError, ValueError, DataError, zipfile.BadZipFile) as error:  # ValueError: numpy's parser
         raise InformationFileError(f"{path} is not the information of a run: {error}") from error
 
 
@@ -122,5 +121,5 @@ def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
 
 def _checked(array: Any, shape: tuple[int, ...]) -> Array:
     if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"an array of shape {array.shape}, finite {shape} is needed")
+        raise DataError(f"an array of shape {array.shape}, finite {shape} is needed")
     return np.asarray(array, dtype=float)

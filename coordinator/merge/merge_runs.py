@@ -22,6 +22,7 @@ from coordinator.parameter_fit.least_squares import ESTIMATED_CHAIN_TOLERANCE, M
 from coordinator.parameter_fit.module_parts import Part, bodies_from_parts, part_columns, parts_of
 from coordinator.parameter_fit.systematic_errors import body_shifts, whitened_effects
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 
 # Torques without noise, as a simulation may have them, would weigh infinitely.
 _MIN_SIGMA_NM = 1e-9
@@ -80,7 +81,7 @@ def merge_runs(
             for chains that were themselves estimated.
 
     Raises:
-        ValueError: no runs, the same run twice, or runs with no module in common: together they say no more
+        DataError: no runs, the same run twice, or runs with no module in common: together they say no more
             than each by itself.
     """
     _check(runs)
@@ -99,17 +100,17 @@ def merge_runs(
 
 def _check(runs: Sequence[RunInformation]) -> None:
     if not runs:
-        raise ValueError("no runs to merge")
+        raise DataError("no runs to merge")
     known: dict[str, str] = {}
     for run in runs:
         if run.session in known:
-            raise ValueError(
+            raise DataError(
                 f"the runs {known[run.session]} and {run.name} are of the same recording, which says no more "
                 "when it is counted twice: give each once"
             )
         known[run.session] = run.name
     if not set.intersection(*(set(run.chain.serials) for run in runs)):
-        raise ValueError(f"the runs {', '.join(run.name for run in runs)} have no module in common")
+        raise DataError(f"the runs {', '.join(run.name for run in runs)} have no module in common")
 
 
 def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:

@@ -10,10 +10,10 @@ from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer
 from coordinator.monitoring.monitor import Heard, Watcher
 from coordinator.recording.recording import Entry, Recording
 from coordinator.synchronisation.round_trips import map_clocks
+from module_agent.model.errors import RobotError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ask, Message
-from module_agent.wire.refusal import WireError
 
 # How often the watch looks: a blow is said by so much later.
 LOOK_S = 0.02
@@ -44,7 +44,7 @@ class LiveMonitor:
         """Take in what was heard."""
         try:
             message = self.recording.add(entry)
-        except (WireError, ValueError):
+        except RobotError:
             return None  # counted by the recording, by reason
         return message if isinstance(message, Message) else None
 

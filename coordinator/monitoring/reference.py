@@ -39,7 +39,7 @@ from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ, dynamic_motion
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
-from module_agent.model.errors import UsageError
+from module_agent.model.errors import DataError, UsageError
 from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.model.information import JointInformation, gather, merge
 
@@ -111,7 +111,7 @@ def build_reference(known: BaselineRobot) -> Reference:
     types = tuple(recorded_type(recording, serial) for serial in chain.serials)
     try:
         motion = dynamic_motion(recording, known.kinematics.clocks, chain.serials, "dynamic")
-    except ValueError as error:
+    except DataError as error:
         raise NoReference(f"{known.folder}: {error}") from error
     signals = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm
     phi = solve_weighted(gather(chain, *signals), INDEPENDENT_FRACTION).phi

@@ -8,6 +8,7 @@ from coordinator.monitoring.likelihood_ratio import gain_above
 from coordinator.monitoring.reference import Reference
 from coordinator.monitoring.segments import SEGMENT_S
 from module_agent.model.chain import Array
+from module_agent.model.errors import UsageError
 from module_agent.model.regressor import PER_BODY
 
 # What is asked for, of all tests together.
@@ -32,10 +33,10 @@ def thresholds(reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR) -
     """Share the allowed rate among contacts, payloads, links and drives, and that of each among its tests.
 
     Raises:
-        ValueError: a rate that is not positive.
+        UsageError: a rate that is not positive.
     """
     if not (np.isfinite(alarms_per_hour) and alarms_per_hour > 0.0):
-        raise ValueError(f"{alarms_per_hour} false alarms an hour cannot be asked for; it must be above 0")
+        raise UsageError(f"{alarms_per_hour} false alarms an hour cannot be asked for; it must be above 0")
     each, count = alarms_per_hour / 4.0, len(reference.chain.serials)
     effort = np.array([kind.max_effort_nm for kind in reference.types])
     looks = len(SPANS) * 3600.0 / SEGMENT_S

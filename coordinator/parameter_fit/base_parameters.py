@@ -22,6 +22,7 @@ from scipy.linalg import block_diag, qr, solve_triangular
 from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_transform
 from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only, read_only
 from module_agent.model.regressor import PER_BODY
@@ -162,7 +163,7 @@ def whitened(
     """
     sigma = np.asarray(sigma_nm, dtype=float)
     if sigma.shape != (len(information),) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
-        raise ValueError(f"sigma_nm must be {len(information)} positive numbers, one per joint; got {sigma}")
+        raise DataError(f"sigma_nm must be {len(information)} positive numbers, one per joint; got {sigma}")
     if not 0.0 < independent_fraction <= 1.0:
         raise ValueError(f"independent_fraction is {independent_fraction}; it must be above 0 and at most 1")
     weight = np.sqrt(independent_fraction) / sigma
@@ -203,7 +204,7 @@ def base_parameters(
     left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
     kept = (values > tolerance * values[0]) & (values > sigma / max_sigma)
     if not values.any():
-        raise ValueError("the rows show no parameter: without gravity or motion the torques say nothing")
+        raise DataError("the rows show no parameter: without gravity or motion the torques say nothing")
     space = directions[kept]
     chosen = _independent(space, columns.preferred)
     # x = scale * y and y = space^T (space y): beta in units of scale is (space[:, chosen])^-1 space y.
@@ -238,7 +239,7 @@ def _rows(
     if common.ndim != 2 or len(common) != len(rows) or not np.isfinite(common).all():
         raise ValueError(f"common errors {common.shape} must be finite, {len(rows)} rows of them")
     if not (np.isfinite(rows).all() and np.isfinite(seen).all() and sigma > 0.0):
-        raise ValueError("the rows or the target hold a value that is not finite, or sigma is not positive")
+        raise DataError("the rows or the target hold a value that is not finite, or sigma is not positive")
     return rows, seen, common
 
 

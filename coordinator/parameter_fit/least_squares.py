@@ -14,6 +14,7 @@ from scipy.linalg import qr
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation, compress
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
@@ -172,7 +173,7 @@ def _system(
     weight = np.ones(joints) if weights is None else np.asarray(weights, dtype=float)
     prior = np.zeros(size) if prior_phi is None else np.asarray(prior_phi, dtype=float).reshape(-1)
     if weight.shape != (joints,) or not (np.isfinite(weight).all() and (weight > 0.0).all()):
-        raise ValueError(f"weights must be {joints} positive numbers, one per joint; got {weight}")
+        raise DataError(f"weights must be {joints} positive numbers, one per joint; got {weight}")
     if prior.shape != (size,) or not np.isfinite(prior).all():
         raise ValueError(f"prior_phi must be {size} finite numbers; got {prior.size}")
     scale = parameter_scale(joints)
@@ -189,7 +190,7 @@ def _spectrum(system: _System) -> _Spectrum:
     square[: triangle.shape[0]] = triangle
     left, values, rows = np.linalg.svd(square[:, :-1])
     if not values[0] > 0.0:
-        raise ValueError("the regressor is zero: without gravity or motion the torques say nothing")
+        raise DataError("the regressor is zero: without gravity or motion the torques say nothing")
     return _Spectrum(values, rows.T, left.T @ square[:, -1])
 
 
@@ -220,7 +221,7 @@ def _residual(
         total = float(misfit @ misfit) + piece.rest
         freedom = piece.samples - float(np.sum(rows**2))
         if freedom < 1.0:
-            raise ValueError(
+            raise DataError(
                 f"joint {i} has {piece.samples} samples for {piece.samples - freedom:.1f} parameters; "
                 "nothing is left to tell the noise from"
             )

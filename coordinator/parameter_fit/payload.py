@@ -23,6 +23,7 @@ from coordinator.parameter_fit.base_parameters import whitened
 from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from coordinator.parameter_fit.physically_consistent import physically_consistent
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
@@ -124,7 +125,8 @@ def find_payload(
         carriers: the bodies that may carry it; all when None.
 
     Raises:
-        ValueError: shapes that do not fit, noise that is not positive, or no carrier.
+        ValueError: shapes that do not fit.
+        DataError: noise that is not positive, or no carrier.
         NotSolvedError: numerical trouble.
     """
     likely = np.asarray(places_m, dtype=float)
@@ -136,7 +138,7 @@ def find_payload(
         )
     candidates = range(len(before)) if carriers is None else carriers
     if not len(candidates):
-        raise ValueError("no body may carry the payload")
+        raise DataError("no body may carry the payload")
     stacked = np.vstack([known, rows])
     none, beyond = _complement(stacked, np.concatenate([known_target, target]))
     found: dict[int, PayloadOn] = {}

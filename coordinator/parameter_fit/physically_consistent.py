@@ -27,6 +27,7 @@ from coordinator.parameter_fit.base_parameters import whitened
 from coordinator.parameter_fit.least_squares import InertialFit
 from coordinator.parameter_fit.systematic_errors import whitened_effects
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
@@ -56,7 +57,7 @@ _UNITS = np.stack([pseudo_inertia(unit) for unit in np.eye(PER_BODY)])
 _TRACE = np.trace(_UNITS, axis1=1, axis2=2)
 
 
-class NotSolvedError(ArithmeticError):
+class NotSolvedError(DataError):
     """Newton's method did not come to an end; the message says how far it came."""
 
 
@@ -128,7 +129,7 @@ def fit_physical(
     bodies = np.asarray(prior, dtype=float)
     size = float(np.sqrt(sum(piece.z @ piece.z + piece.rest for piece in information)))
     if not size > 0.0:
-        raise ValueError("all torques are zero: no bodies explain them")
+        raise DataError("all torques are zero: no bodies explain them")
     best = _relative_error(information, least_squares.phi, size)
     # Least squares fits its own noise too: by so much the true bodies themselves would be worse.
     sigma = _common_sigma(information, least_squares, size)
@@ -316,7 +317,7 @@ def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float
     try:
         roots = np.linalg.cholesky(bodies)
     except np.linalg.LinAlgError as error:
-        raise ValueError("a body of the prior cannot exist: its pseudo-inertia is not positive") from error
+        raise DataError("a body of the prior cannot exist: its pseudo-inertia is not positive") from error
     scale = block_diag(*(parameter_transform(root) for root in roots), np.eye(free))
     square = qr(np.column_stack([matrix @ scale, seen]), mode="r", check_finite=False)[0]
     # The last row is what no parameters explain: dropped, so that small gains are not lost beside it.

@@ -19,6 +19,7 @@ from scipy.linalg import qr
 
 from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only
 from module_agent.signals.autocorrelation import autocovariance
 
@@ -109,14 +110,15 @@ def fit_weighted(
             least squares.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, or a joint with too few samples.
+        ValueError: shapes that do not fit.
+        DataError: values that are not finite, or a joint with too few samples.
     """
     y, tau = np.asarray(regressor, dtype=float), np.asarray(tau_nm, dtype=float)
     counted, size = np.ones(tau.shape, bool) if used is None else np.asarray(used, bool), np.asarray(scale)
     _check(y, tau, size, counted)
     other = None if instruments is None else np.asarray(instruments, dtype=float)
     if other is not None and (other.shape != y.shape or not np.isfinite(other).all()):
-        raise ValueError(f"instruments {other.shape} must be finite and of the regressor's shape {y.shape}")
+        raise DataError(f"instruments {other.shape} must be finite and of the regressor's shape {y.shape}")
     weights, sigma = counted.astype(float), np.ones(tau.shape[1])
     joints = _joint_rows(y, tau, other, weights)
     for _ in range(_MAX_ROUNDS):
@@ -200,7 +202,7 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool
     rows, target = whole[:, :-1], whole[:, -1]
     _, values, right = np.linalg.svd(rows * scale, full_matrices=False)
     if not values[0] > 0.0:
-        raise ValueError("the regressor is zero: without gravity or motion the torques say nothing")
+        raise DataError("the regressor is zero: without gravity or motion the torques say nothing")
     kept = values > RANK_TOLERANCE * values[0]
     inverse = scale[:, None] * right[kept].T / values[kept]
     condition = float(values[0] / values[kept][-1])
@@ -246,7 +248,7 @@ def _freedom(solution: _Solution, used: NDArray[np.bool_]) -> Array:
     count = used.sum(axis=0)
     taken = np.array([float(np.sum(rows**2)) for rows in solution.hat])
     if (short := np.flatnonzero(count - taken < 1.0)).size:
-        raise ValueError(
+        raise DataError(
             f"joint {short[0] + 1} has {count[short[0]]} samples for {taken[short[0]]:.0f} parameters; "
             "nothing is left to tell the noise from"
         )
@@ -261,6 +263,6 @@ def _check(y: Array, tau: Array, scale: Array, used: NDArray[np.bool_]) -> None:
             "fit: (m, n, p), (m, n) twice and (p,) are needed"
         )
     if not (np.isfinite(y).all() and np.isfinite(tau).all()):
-        raise ValueError("the regressor or a torque holds a value that is not finite")
+        raise DataError("the regressor or a torque holds a value that is not finite")
     if (idle := np.flatnonzero(~used.any(axis=0))).size:
-        raise ValueError(f"joint {idle[0] + 1} has no samples to fit to: it never moves fast enough")
+        raise DataError(f"joint {idle[0] + 1} has no samples to fit to: it never moves fast enough")

@@ -8,6 +8,7 @@ from pydantic import ValidationError
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.recording.session_file import SessionFileError, read_session
+from module_agent.model.errors import UsageError
 from module_agent.wire.refusal import WireError
 
 SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION = (
@@ -22,7 +23,7 @@ SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION = (
 ASIDE = "session.crashed.mcap"
 
 
-class RunFolderError(ValueError):
+class RunFolderError(UsageError):
     """The folder cannot be used; the message says why and what to do."""
 
 

@@ -16,6 +16,7 @@ from mcap.writer import CompressionType, Writer
 
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Entry, Kind
+from module_agent.model.errors import RobotError
 from module_agent.wire.keys import parse
 from module_agent.wire.messages import Ack, Message
 from module_agent.wire.topics import TOPICS
@@ -26,7 +27,7 @@ MCAP0_MAGIC = b"\x89MCAP0\r\n"
 KINDS: tuple[Kind, ...] = ("publication", "request", "reply", "journal")
 
 
-class SessionFileError(ValueError):
+class SessionFileError(RobotError):
     """The file is not a recording of a session; the message names it."""
 
 

@@ -26,7 +26,7 @@ class CommandFailed(RobotError):
 
     def __init__(self, text: str, exit_code: int):
         super().__init__(text)
-        self.code = exit_code
+        self.exit_code = exit_code
 
 
 def fail(text: object, exit_code: int) -> NoReturn:
@@ -63,8 +63,7 @@ def lazy_app(program: str, help_text: str, table: Mapping[str, LazyCommand]) -> 
                 return super().invoke(ctx)
             except RobotError as error:
                 typer.echo(f"{program}: {error}", err=True)
-                code = error.code if isinstance(error, CommandFailed) else error.exit_code
-                raise typer.Exit(code) from error
+                raise typer.Exit(error.exit_code) from error
 
     app = typer.Typer(
         name=program,

@@ -10,15 +10,17 @@ import signal
 import time
 from typing import TypeVar
 
+from module_agent.model.errors import UsageError
+
 
 def check_speed(speed: float) -> float:
     """Return a speed that a clock can run at.
 
     Raises:
-        ValueError: not positive, or not finite.
+        UsageError: not positive, or not finite.
     """
     if not (math.isfinite(speed) and speed > 0.0):
-        raise ValueError(f"speed {speed}: it must be a positive number, 1 for real time")
+        raise UsageError(f"speed {speed}: it must be a positive number, 1 for real time")
     return speed
 
 
@@ -36,7 +38,7 @@ class ScaledLoop(asyncio.SelectorEventLoop):
     """Sleeps and time-outs are in session seconds: `speed` of them pass in a real second.
 
     Raises:
-        ValueError: see `check_speed`.
+        UsageError: see `check_speed`.
     """
 
     def __init__(self, speed: float = 1.0):

@@ -10,6 +10,7 @@ from coordinator.identification.inertia.agent_information import dynamic_steps, 
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, gather_all
 from coordinator.recording.recording import Recording
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.information_messages import CollectRequest, Information, InformationRequest
 from module_agent.wire.keys import Leaf
@@ -45,7 +46,7 @@ class InformationRequests:
             self._kept.add(number)
             try:
                 rows = rows_to_keep(self._recording, serials, event)
-            except ValueError as error:
+            except DataError as error:
                 self._note(f"the agents do not share motion {event.step}: {error}")
                 continue
             await gather_all(
@@ -76,7 +77,7 @@ class InformationRequests:
         """Ask every module of a chain what its torques tell; the answers are in the recording."""
         try:
             asked = question(self._recording, chain, clocks, self._sender)
-        except ValueError as error:
+        except DataError as error:
             self._note(f"the agents are not asked for what their torques say: {error}")
             return
         await gather_all(self._ask_one(serial, asked) for serial in chain.serials)

@@ -55,10 +55,9 @@ from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Chain
-from module_agent.model.errors import DataError
+from module_agent.model.errors import DataError, RobotError, UsageError
 from module_agent.transport.transport import Transport
 from module_agent.wire.messages import Message
-from module_agent.wire.refusal import WireError
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
@@ -91,7 +90,7 @@ class Run:
     """One run in one folder.
 
     Raises:
-        ValueError: a plan that leaves out what a run needs; a folder that is not to be used, or that tells no
+        UsageError: a plan that leaves out what a run needs; a folder that is not to be used, or that tells no
             robot.
     """
 
@@ -106,7 +105,7 @@ class Run:
     ):
         # Before anything is made of the new folder.
         if config.plan.topology_only:
-            raise ValueError(
+            raise UsageError(
                 "the plan sets topology_only, which leaves out the fast motions; a run identifies the chain "
                 "too, and needs them: set it to false"
             )
@@ -154,7 +153,7 @@ class Run:
         self._writer.write(entry)
         try:
             message = self.recording.add(entry)
-        except (WireError, ValueError):
+        except RobotError:
             return None  # counted by the recording, by reason
         if isinstance(message, Message):
             self._feed.on_message(entry, message)
@@ -200,7 +199,7 @@ class Run:
         """Return the robot as far as it is known; only to be looked at, so that a run does not fail by it."""
         try:
             return self._looks.look(explored)
-        except (DataError, ValueError, KeyError) as error:
+        except (DataError, KeyError) as error:
             logger.info("nothing to show of the robot so far: %s", error)
         except Exception:
             # A run must not end for want of a picture.

@@ -20,6 +20,7 @@ from coordinator.recording.journal import JournalEvent, Purpose, exclusion_event
 from coordinator.recording.recording import Recording
 from coordinator.session.motion_selection import MotionChoice
 from coordinator.topology.next_motion import MAX_REPEATS, NextMotion
+from module_agent.model.errors import RobotError
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
 # Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
@@ -61,7 +62,7 @@ class Reporter(Protocol):
         ...
 
 
-class NoModulesFound(RuntimeError):
+class NoModulesFound(RobotError):
     """No module, or not as many as expected, announced itself."""
 
 

@@ -13,6 +13,7 @@ from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData, out
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import (
     DYNAMIC_CUTOFF_HZ,
@@ -59,7 +60,7 @@ def window(
     The window is cut to what all modules have recorded.
 
     Raises:
-        ValueError: a hole in the recording, with the module or its column.
+        DataError: a hole in the recording, with the module or its column.
     """
     start_ns, end_ns = span(recording, clocks, event, margin_s)
     tracks = [_track(recording, clocks[s], s, event, start_ns, end_ns) for s in serials]
@@ -87,7 +88,7 @@ def _track(
     first_ns, last_ns = clock.module_span(start_ns, end_ns, STEP_NS)
     rows = recording.modules[serial].rows.between(first_ns, last_ns)
     if not len(rows):
-        raise ValueError(_no_row(serial, event))
+        raise DataError(_no_row(serial, event))
     # An IMU that is slower than the rows repeats its samples.
     imu_t_ns, fresh = np.unique(rows["imu_t_ns"], return_index=True)
     return _Track(
@@ -110,14 +111,14 @@ def span(
     """Return from when to when a motion lasted in session time, with a margin on either side.
 
     Raises:
-        ValueError: no row of the motion is recorded.
+        DataError: no row of the motion is recorded.
     """
     assert event.motion is not None
     assert event.motion.end_row is not None
     log = recording.modules[event.serial].rows
     rows = log.rows(event.motion.start_row, event.motion.end_row)
     if not len(rows):
-        raise ValueError(_no_row(event.serial, event))
+        raise DataError(_no_row(event.serial, event))
     session = clocks[event.serial].to_session(rows["t_ns"][[0, -1]].astype(np.int64))
     margin_ns = round(margin_s * 1e9)
     return int(session[0]) - margin_ns, int(session[1]) + margin_ns
@@ -214,12 +215,12 @@ def dynamic_windows(
     Of a step that was done again the latest counts.
 
     Raises:
-        ValueError: there is no such motion, or the recording has a hole in it.
+        DataError: there is no such motion, or the recording has a hole in it.
     """
     # Joints that move at once share their step, and its window.
     steps = {event.step: event for event in recording.motions(*purposes)}
     if not steps:
-        raise ValueError(f"the recording holds no motion for {' or '.join(purposes)}")
+        raise DataError(f"the recording holds no motion for {' or '.join(purposes)}")
     margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
     return [window(recording, clocks, serials, event, margin) for event in steps.values()]
 
@@ -230,7 +231,7 @@ def dynamic_motion(
     """Return all motions of some purposes one after the other, filtered; see `dynamic_windows`.
 
     Raises:
-        ValueError: as there.
+        DataError: as there.
     """
     motions = [filtered_window(one) for one in dynamic_windows(recording, clocks, serials, *purposes)]
     return joined_motions(motions)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.recording.recording import RoundTrip
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap, Times
 
 # Half a tick of waiting inside the module: trips closer than this to the quickest are equally good.
@@ -35,7 +36,7 @@ def map_clock(trips: Sequence[RoundTrip]) -> ClockMap:
     """Fit a module's clock to its round trips.
 
     Raises:
-        ValueError: no round trip.
+        DataError: no round trip.
     """
     return _map(_columns(trips))
 
@@ -57,7 +58,7 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
     stretch. Two modules that were asked at the same moment tell their clocks apart, whatever that moment was.
 
     Raises:
-        ValueError: a module has no round trip.
+        DataError: a module has no round trip.
     """
     columns = {name: _columns(trips[name]) for name in sorted(trips)}
     reference, *others = columns
@@ -92,7 +93,7 @@ def _beside(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
 
 def _columns(trips: Sequence[RoundTrip]) -> _Columns:
     if not trips:
-        raise ValueError("no round trip with this module: its clock cannot be mapped")
+        raise DataError("no round trip with this module: its clock cannot be mapped")
     sent, received, module = (np.array(column, dtype=np.int64) for column in zip(*trips, strict=True))
     return sent, received, module
 

@@ -59,10 +59,10 @@ def seen_again(motions: Sequence[MotionSeen]) -> MotionSeen:
     One that went wrong is outvoted by two that did not, where an average would fit nothing.
 
     Raises:
-        ValueError: no motion.
+        DataError: no motion.
     """
     if not motions:
-        raise ValueError("no motion was seen")
+        raise DataError("no motion was seen")
     total = sum(seen.log_odds for seen in motions)
     agreeing = [seen for seen in motions if seen.moved == (total > 0.0)] or list(motions)
     clearest = max(agreeing, key=lambda seen: abs(seen.log_odds))

@@ -2,6 +2,7 @@
 
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ModuleType
+from module_agent.model.errors import UsageError
 from module_agent.wire.messages import GainSet
 
 # Under this strategy all three loops speak newton metres, so that a position or a velocity loop that is off
@@ -24,11 +25,11 @@ def compensation_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
     """Return the gains under which a module floats: the factory's effort loop, and a damper.
 
     Raises:
-        ValueError: the damping is negative, not finite, or more than a module of this type takes.
+        UsageError: the damping is negative, not finite, or more than a module of this type takes.
     """
     most = most_damping_nm_s_rad(kind)
     if not 0.0 <= damping_nm_s_rad <= most:
-        raise ValueError(
+        raise UsageError(
             f"damping of {damping_nm_s_rad} Nm s/rad: module type {kind.name} takes 0 to {most:g} Nm s/rad"
         )
     return _torque_gains(kind, damping_nm_s_rad)

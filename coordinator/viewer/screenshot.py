@@ -16,13 +16,14 @@ from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.blueprint import TABS
 from coordinator.viewer.targets import proxy_url
 from coordinator.viewer.viewer_process import MAGIC, is_recording
+from module_agent.model.errors import RobotError, UsageError
 
 SETTLE_SECONDS = 40.0
 SAME_PICTURES = 3
 _POLL_SECONDS = 0.4
 
 
-class ScreenshotFailed(RuntimeError):
+class ScreenshotFailed(RobotError):
     """No picture could be taken; the message says what to do."""
 
 
@@ -45,7 +46,7 @@ def screenshot(
     Raises:
         FileNotFoundError: there is no such recording.
         ScreenshotFailed: no software Vulkan, not a recording of a run, or the viewer did not settle.
-        ValueError: there is no such tab.
+        UsageError: there is no such tab.
     """
     screenshots(rrd, [(tab, out)], t_s, size)
 
@@ -59,7 +60,7 @@ def screenshots(
     """Write several pictures, as (tab, PNG), with one start of the viewer. See `screenshot`."""
     for tab, _ in pictures:
         if tab is not None and tab not in TABS:
-            raise ValueError(f"no tab {tab!r}; there are {', '.join(TABS)}")
+            raise UsageError(f"no tab {tab!r}; there are {', '.join(TABS)}")
     if not rrd.is_file():
         raise FileNotFoundError(f"no recording at {rrd}")
     if not is_recording(rrd):

@@ -16,6 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
+from module_agent.model.errors import RobotError
+
 START_SECONDS = 15.0
 _POLL_SECONDS = 0.05
 MERGE_SECONDS = 120.0
@@ -37,7 +39,7 @@ class ViewerProcess(NamedTuple):
         return "\n".join(lines[-REPORTED_LINES:])
 
 
-class ViewerNotStarted(RuntimeError):
+class ViewerNotStarted(RobotError):
     """The viewer's program ended, or did not listen in time; the message contains its output."""
 
 
@@ -116,7 +118,7 @@ def _wait_until_ready(process: subprocess.Popen[bytes], port: int) -> bool:
     return False
 
 
-class MergeFailed(RuntimeError):
+class MergeFailed(RobotError):
     """The files could not be merged; the message gives the reason. Both are unchanged."""
 
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
 from module_agent.estimate.windows import AlignedMotion, Array, ImuWindow
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import autocovariance
 from module_agent.wire.messages import CircleEstimate, Vector3
@@ -74,7 +75,7 @@ def rest_reading(rest: ImuWindow) -> RestReading:
     """Average an IMU at rest: the gyro offset of eq. 30, and gravity.
 
     Raises:
-        ValueError: too few samples.
+        DataError: too few samples.
     """
     _enough(rest.t_ns.size, "rest")
     gyro, accel = rest.gyro_rad_s.mean(axis=0), rest.accel_m_s2.mean(axis=0)
@@ -95,12 +96,12 @@ def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
     offset.
 
     Raises:
-        ValueError: too few samples, no motion of the joint, or none of the IMU.
+        DataError: too few samples, no motion of the joint, or none of the IMU.
     """
     _enough(constant.t_s.size, "constant motion")
     speed = np.abs(constant.velocity_rad_s)
     if speed.max() < MIN_RATE_RAD_S:
-        raise ValueError(
+        raise DataError(
             f"the joint turned at {speed.max():.2g} rad/s at most in the constant motion, "
             f"at least {MIN_RATE_RAD_S} is needed for its axis"
         )
@@ -110,7 +111,7 @@ def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
     mean = gyro.mean(axis=0)
     rate = float(np.linalg.norm(mean))
     if rate < 0.25 * MIN_RATE_RAD_S:
-        raise ValueError(
+        raise DataError(
             f"the gyro saw {rate:.2g} rad/s while the joint turned: this IMU does not move with it"
         )
     axis = mean / rate
@@ -146,7 +147,7 @@ def circle_point_analysis(
         warrants; its radial direction then means nothing.
 
     Raises:
-        ValueError: too few samples or too little motion, with what would be enough.
+        DataError: too few samples or too little motion, with what would be enough.
     """
     _enough(sine.t_s.size, "windowed sine motion")
     at_rest = rest_reading(rest)
@@ -184,12 +185,12 @@ def angular_acceleration(motion: AlignedMotion, taps: int = TAPS) -> Array:
     """Differentiate the joint's rate and smooth it by the Gaussian of 11 taps (thesis 6.2.1.2): (n,) rad/s^2.
 
     Raises:
-        ValueError: the joint hardly accelerated, or `taps` is not odd and positive.
+        DataError: the joint hardly accelerated, or `taps` is not odd and positive.
     """
     alpha = gaussian_filter(np.gradient(motion.velocity_rad_s, motion.t_s), taps)
     rms = float(np.sqrt(np.mean(alpha**2)))
     if rms < MIN_ACCELERATION_RAD_S2:
-        raise ValueError(
+        raise DataError(
             f"the joint accelerated by {rms:.2g} rad/s^2 rms in the windowed sine motion, "
             f"at least {MIN_ACCELERATION_RAD_S2} is needed for its radial distance"
         )
@@ -271,7 +272,7 @@ def _variance_of_mean(series: Array) -> float:
 
 def _enough(samples: int, what: str) -> None:
     if samples < MIN_SAMPLES:
-        raise ValueError(f"{samples} samples of the {what}: at least {MIN_SAMPLES} are needed")
+        raise DataError(f"{samples} samples of the {what}: at least {MIN_SAMPLES} are needed")
 
 
 def _vector(values: Array) -> Vector3:

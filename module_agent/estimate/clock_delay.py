@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from module_agent.estimate.gaussian_filter import SIGMA_SAMPLES, TAPS, gaussian_filter
 from module_agent.estimate.windows import Array, ImuWindow, JointWindow
+from module_agent.model.errors import DataError
 
 SEARCH_S = 0.08  # round trips are off by up to 60 ms, and the optimum must lie inside the grid
 GRID_S = 0.004
@@ -47,13 +48,13 @@ def clock_delay(
     ppm over 5 s are 0.5 ms from end to end, and what is found is the mean.
 
     Raises:
-        ValueError: fewer than 3 filter lengths of samples, or windows that do not overlap by as much.
+        DataError: fewer than 3 filter lengths of samples, or windows that do not overlap by as much.
     """
     rate = _RateSpline(joint)
     t_s = 1e-9 * (imu.t_ns - rough_offset_ns - int(joint.t_ns[0]))
     inside = (t_s >= search_s) & (t_s <= rate.end_s - search_s)
     if np.count_nonzero(inside) < 3 * TAPS:
-        raise ValueError(
+        raise DataError(
             f"only {np.count_nonzero(inside)} IMU samples lie {search_s} s inside the joint's window of "
             f"{rate.end_s:.2f} s; {3 * TAPS} are needed"
         )
@@ -78,9 +79,7 @@ class _RateSpline:
 
     def __init__(self, joint: JointWindow):
         if joint.t_ns.size < 3 * TAPS:
-            raise ValueError(
-                f"{joint.t_ns.size} joint samples; {3 * TAPS} are needed to find a clock's delay"
-            )
+            raise DataError(f"{joint.t_ns.size} joint samples; {3 * TAPS} are needed to find a clock's delay")
         knots = 1e-9 * (joint.t_ns - int(joint.t_ns[0]))
         self.spline = CubicSpline(knots, gaussian_filter(joint.velocity_rad_s))
         self.end_s = float(knots[-1])

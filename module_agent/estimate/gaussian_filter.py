@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import convolve1d
 
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import read_only
 
 TAPS = 11
@@ -38,7 +39,7 @@ def gaussian_filter(
     weights = kernel(taps, sigma_samples)
     half = taps // 2
     if values.shape[0] <= half:
-        raise ValueError(f"{values.shape[0]} samples: a filter of {taps} taps needs at least {half + 1}")
+        raise DataError(f"{values.shape[0]} samples: a filter of {taps} taps needs at least {half + 1}")
     if half == 0:
         smooth = values.copy()
     else:

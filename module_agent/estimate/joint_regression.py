@@ -34,6 +34,7 @@ from module_agent.estimate.observed_motion import ObservedMotion
 from module_agent.estimate.smoothing import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
 from module_agent.estimate.windows import Array
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import CALIBRATED, GYRO_BIAS_DRIFT_RAD_S, ImuPrior
 from module_agent.model.read_only import frozen
 from module_agent.wire.messages import RegressionEstimate, Vector3
@@ -148,7 +149,7 @@ def regress_joint(
     """Fit the model of `joint_model` to all motions of one joint, and what the IMU read at rest.
 
     Raises:
-        ValueError: no motion, too few samples of one, or an IMU that did not move with the joint.
+        DataError: no motion, too few samples of one, or an IMU that did not move with the joint.
     """
     problem, guess = _problem(motions, rest, knowledge)
     best = _minimise(problem, guess)
@@ -168,7 +169,7 @@ def distance_bound_m(
     encoder's noise allows to get the bound of a recording.
 
     Raises:
-        ValueError: as `regress_joint`.
+        DataError: as `regress_joint`.
     """
     problem, guess = _problem(motions, rest, knowledge)
     best = _minimise(problem, guess)
@@ -205,7 +206,7 @@ def _problem(
 ) -> tuple[_Problem, _State]:
     """Return the problem, and a first guess of its solution."""
     if not motions:
-        raise ValueError("no motion of the joint: at least one is needed")
+        raise DataError("no motion of the joint: at least one is needed")
     rows = [_rows(motion) for motion in motions]
     priors = parameter_priors(knowledge, len(motions))
     guess = _first_guess(rows, priors)
@@ -234,7 +235,7 @@ def _rows(observed: ObservedMotion) -> _Rows:
     begin, end = observed.joint.start_s + 0.01, observed.joint.end_s - 0.01
     inside = np.flatnonzero((t_s > begin) & (t_s < end))[::STRIDE]
     if inside.size < 20:
-        raise ValueError(f"{inside.size} IMU samples fall into the joint's motion: at least 20 are needed")
+        raise DataError(f"{inside.size} IMU samples fall into the joint's motion: at least 20 are needed")
     readings = np.hstack([observed.imu.gyro_rad_s[inside], observed.imu.accel_m_s2[inside]])
     step_s = 1e-9 * float(observed.imu.t_ns[-1] - observed.imu.t_ns[0]) / (observed.imu.t_ns.size - 1)
     white = white_ratio(observed.imu.t_ns, float(np.hypot(observed.imu.smooth_s, STRIDE * step_s)))
@@ -251,7 +252,7 @@ def _first_guess(rows: Sequence[_Rows], priors: ParameterPriors) -> _State:
     gyro = np.linalg.lstsq(np.stack([rate, one], axis=1), readings[:, :3], rcond=None)[0]
     size = float(np.linalg.norm(gyro[0]))
     if size < MIN_RATE_SHARE:
-        raise ValueError(
+        raise DataError(
             f"the gyro turned by {size:.2g} of what the joint did: this IMU does not move with it"
         )
     axis = gyro[0] / size

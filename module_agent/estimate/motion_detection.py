@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.estimate.windows import AlignedMotion, Array
+from module_agent.model.errors import DataError
 
 MOVED_ABOVE = 0.5
 
@@ -42,15 +43,15 @@ def detect_motion(motions: Sequence[AlignedMotion], gyro_offset_rad_s: ArrayLike
         gyro_offset_rad_s: (3,) gyro offset at rest (thesis eq. 30).
 
     Raises:
-        ValueError: no motion, or the joint did not turn in any.
+        DataError: no motion, or the joint did not turn in any.
     """
     if not motions:
-        raise ValueError("no motion to judge by: at least one window of the moving joint is needed")
+        raise DataError("no motion to judge by: at least one window of the moving joint is needed")
     rate = np.concatenate([m.velocity_rad_s for m in motions])
     gyro = np.concatenate([m.gyro_rad_s for m in motions]) - np.asarray(gyro_offset_rad_s, dtype=float)
     power = float(rate @ rate)
     if power <= 1e-6 * rate.size:
-        raise ValueError(
+        raise DataError(
             f"the joint turned at only {np.sqrt(power / max(rate.size, 1)):.2g} rad/s rms; 1e-3 is needed"
         )
     coefficient = rate @ gyro / power

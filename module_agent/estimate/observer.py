@@ -7,6 +7,8 @@ the firmware's tick.
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from module_agent.estimate.circle_point_analysis import (
     RestReading,
     circle_estimate,
@@ -19,6 +21,7 @@ from module_agent.estimate.motion_detection import detect_motion
 from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, imu_window, joint_window
 from module_agent.firmware.feedback import History
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import UNCALIBRATED, ImuPrior
 from module_agent.peers.motion_listener import JointMotion
 from module_agent.wire.feedback_rows import Rows
@@ -117,7 +120,7 @@ class Observer:
                     circle = circle_estimate(fit, delay.delay_s)
                     local = self._regress(circle, [constant.windows, windows], still)
             note = "" if local is None else local.note
-        except ValueError as error:
+        except (DataError, np.linalg.LinAlgError) as error:
             # Said to whoever listens: an estimate that cannot be had is a finding too.
             note = str(error)
         if local is None:
@@ -129,7 +132,7 @@ class Observer:
     def _regress(self, circle: CircleEstimate, windows: list[MotionWindows], still: RestReading) -> _Local:
         try:
             regression = regress_joint(observed_motions(windows), still, self.knowledge)
-        except ValueError as error:
+        except (DataError, np.linalg.LinAlgError) as error:
             return _Local(circle, None, f"no joint regression: {error}")
         delay_s = circle.delay_s + regression.delays_s[-1]
         return _Local(circle, regression_estimate(regression, delay_s), "")
@@ -137,7 +140,7 @@ class Observer:
     def _constant_of(self, motion: JointMotion) -> _Constant:
         constant = self._constant.get(motion.serial)
         if constant is None or constant.boot != motion.boot:
-            raise ValueError(f"no constant motion of {motion.serial} was seen: its axis is not known")
+            raise DataError(f"no constant motion of {motion.serial} was seen: its axis is not known")
         return constant
 
 

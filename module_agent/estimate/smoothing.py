@@ -13,6 +13,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from module_agent.estimate.windows import Array, ImuWindow, JointWindow, Times
+from module_agent.model.errors import DataError
 
 # Passes 2 Hz with 0.969 and 4 Hz with 0.88. Encoder counts of 2 pi / 2^16 at 250 Hz become 0.014 rad/s^2 of
 # noise in the acceleration, which shortens d by 5e-5 where the joint's is 2 rad/s^2 rms.
@@ -42,7 +43,7 @@ class SmoothMotion:
     """A joint's motion behind the low-pass, at any time within it.
 
     Raises:
-        ValueError: too few samples for the filter, or unevenly spaced ones.
+        DataError: too few samples for the filter, or unevenly spaced ones.
     """
 
     def __init__(self, joint: JointWindow, smooth_s: float = SMOOTH_S):
@@ -76,7 +77,7 @@ def smooth_imu(imu: ImuWindow, smooth_s: float = SMOOTH_S) -> SmoothImu:
     """Filter an IMU's samples; those whose filter would reach beyond the window are left out.
 
     Raises:
-        ValueError: as `SmoothMotion`.
+        DataError: as `SmoothMotion`.
     """
     t_ns, gyro = low_passed(imu.t_ns, imu.gyro_rad_s, smooth_s)
     _, accel = low_passed(imu.t_ns, imu.accel_m_s2, smooth_s)
@@ -94,7 +95,7 @@ def low_passed(t_ns: Times, signal: Array, smooth_s: float, order: int = 0) -> t
     """Return the times whose filter lies within the window, and the `order`-th derivative there.
 
     Raises:
-        ValueError: as `SmoothMotion`.
+        DataError: as `SmoothMotion`.
     """
     step_s = _step_s(t_ns, "IMU", smooth_s)
     reach = _reach(step_s, smooth_s)
@@ -131,15 +132,15 @@ def _reach(step_s: float, smooth_s: float) -> int:
 
 def _step_s(t_ns: Times, whose: str, smooth_s: float) -> float:
     if t_ns.size < 2:
-        raise ValueError(f"{t_ns.size} {whose} samples: too few for the low-pass of {1e3 * smooth_s:.0f} ms")
+        raise DataError(f"{t_ns.size} {whose} samples: too few for the low-pass of {1e3 * smooth_s:.0f} ms")
     steps = 1e-9 * np.diff(t_ns)
     step_s = float(steps.mean())
     if np.abs(steps - step_s).max() > EVEN_WITHIN * step_s:
-        raise ValueError(
+        raise DataError(
             f"the {whose} samples are {1e3 * steps.min():.2f} to {1e3 * steps.max():.2f} ms apart; the local "
             "estimate needs evenly spaced ones"
         )
     least = 2 * (_reach(step_s, smooth_s) + _reach(step_s, BRIEF_S)) + 8
     if t_ns.size < least:
-        raise ValueError(f"{t_ns.size} {whose} samples: the low-pass needs at least {least}")
+        raise DataError(f"{t_ns.size} {whose} samples: the low-pass needs at least {least}")
     return step_s

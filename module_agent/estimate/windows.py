@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from module_agent.model.errors import DataError
 from module_agent.wire.feedback_rows import Rows
 
 Array = NDArray[np.float64]
@@ -63,15 +64,15 @@ def align(imu: ImuWindow, joint: JointWindow, offset_ns: int) -> AlignedMotion:
     IMU samples outside the joint's window are left out: nothing is extrapolated.
 
     Raises:
-        ValueError: the windows do not overlap, or hold too few samples to interpolate.
+        DataError: the windows do not overlap, or hold too few samples to interpolate.
     """
     if joint.t_ns.size < 4:
-        raise ValueError(f"{joint.t_ns.size} joint samples: at least 4 are needed to interpolate")
+        raise DataError(f"{joint.t_ns.size} joint samples: at least 4 are needed to interpolate")
     t_joint = imu.t_ns - offset_ns
     inside = (t_joint >= joint.t_ns[0]) & (t_joint <= joint.t_ns[-1])
     if not inside.any():
         apart_s = 1e-9 * float(t_joint[0] - joint.t_ns[0]) if t_joint.size else float("nan")
-        raise ValueError(
+        raise DataError(
             f"no IMU sample falls into the joint's window; they begin {apart_s:.3f} s apart. Check the offset"
         )
     # Seconds from a common origin: nanoseconds of a long uptime do not fit a float64 mantissa.

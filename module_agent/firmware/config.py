@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 from module_agent.hardware.hardware import ModuleInformation
 from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.errors import UsageError
 from module_agent.wire.messages import ExpiryAction, GainSet, Info, Limits
 
 FIRMWARE_NAME = "x5-agent 0.1"
@@ -56,15 +57,15 @@ def check_config(config: FirmwareConfig) -> FirmwareConfig:
     """Return the configuration if it can be run.
 
     Raises:
-        ValueError: a lifetime that is infinite or over 1 s, or a rate that the tick or a message cannot
+        UsageError: a lifetime that is infinite or over 1 s, or a rate that the tick or a message cannot
         carry.
     """
     if not 0 < config.lifetime_ns <= MAX_LIFETIME_NS:
-        raise ValueError(f"lifetime {config.lifetime_ns / 1e6:.0f} ms: it must be over 0 and at most 1000 ms")
+        raise UsageError(f"lifetime {config.lifetime_ns / 1e6:.0f} ms: it must be over 0 and at most 1000 ms")
     if not 1.0 <= config.feedback_rate_hz <= MAX_FEEDBACK_RATE_HZ:
-        raise ValueError(f"feedback rate {config.feedback_rate_hz} Hz: it must be 1 to 1000 Hz")
+        raise UsageError(f"feedback rate {config.feedback_rate_hz} Hz: it must be 1 to 1000 Hz")
     if not 1 <= config.batch_rows <= 64:
-        raise ValueError(f"{config.batch_rows} rows a batch: it must be 1 to 64")
+        raise UsageError(f"{config.batch_rows} rows a batch: it must be 1 to 64")
     module_type(config.kind.name)
     return config
 

@@ -25,6 +25,7 @@ import msgpack
 
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.wires import WiredModule
+from module_agent.model.errors import RobotError
 
 BUS_VERSION = 1
 MAX_HANDSHAKE_BYTES = 64 * 1024
@@ -32,7 +33,7 @@ _TICK = struct.Struct("<Q")
 _SAMPLE = struct.Struct("<qq14d")
 
 
-class FrameError(ValueError):
+class FrameError(RobotError):
     """A packet that is not the frame that is due."""
 
 

@@ -13,6 +13,7 @@ from enum import IntFlag
 from typing import NamedTuple, Protocol
 
 from module_agent.control.controller import Command
+from module_agent.model.errors import LostError
 from module_agent.wire.messages import GainSet, Limits
 
 
@@ -84,7 +85,7 @@ class ModuleInformation(NamedTuple):
     imu_period_ns: int
 
 
-class HardwareLost(ConnectionError):
+class HardwareLost(LostError):
     """The hardware is gone (closed bus, dead world); the agent must end its processes cleanly."""
 
 

@@ -4,6 +4,8 @@ import tomllib
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from module_agent.model.errors import RobotError
+
 _FILE = Path(__file__).with_name("module_types.toml")
 
 Vector = tuple[float, float, float]
@@ -94,7 +96,7 @@ def _read_catalogue() -> dict[str, ModuleType]:
 CATALOGUE = _read_catalogue()
 
 
-class UnknownModuleType(KeyError):
+class UnknownModuleType(RobotError):
     """The catalogue has no such type; the message lists those that it has."""
 
     def __str__(self) -> str:

@@ -6,15 +6,13 @@ ends the program with a traceback. A RobotError is therefore never a ValueError:
 and catching one kind would catch the other.
 """
 
-from typing import ClassVar
-
 EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
 
 
 class RobotError(Exception):
     """The robot, its data or its network keep an operation from succeeding; the text says what to do."""
 
-    exit_code: ClassVar[int] = EXIT_FAILED
+    exit_code: int = EXIT_FAILED
 
 
 class UsageError(RobotError):

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY, torque_regressor
 
@@ -42,7 +43,8 @@ def compress(regressor: ArrayLike, tau_nm: ArrayLike) -> tuple[JointInformation,
     The columns are the 10 n of `torque_regressor`, and any further ones behind them.
 
     Raises:
-        ValueError: shapes that do not fit, no samples, or values that are not finite.
+        ValueError: shapes that do not fit.
+        DataError: no samples, or values that are not finite.
     """
     y = np.asarray(regressor, dtype=float)
     tau = np.asarray(tau_nm, dtype=float)
@@ -52,7 +54,7 @@ def compress(regressor: ArrayLike, tau_nm: ArrayLike) -> tuple[JointInformation,
             "(m, n, 10 n or more) and (m, n) with m > 0 are needed"
         )
     if not (np.isfinite(y).all() and np.isfinite(tau).all()):
-        raise ValueError("the regressor or a torque holds a value that is not finite")
+        raise DataError("the regressor or a torque holds a value that is not finite")
     return tuple(_triangular(y[:, i], tau[:, i], 0.0, y.shape[0]) for i in range(y.shape[1]))
 
 
@@ -62,7 +64,8 @@ def gather(
     """Return the information of every joint from a motion, all (m, n), without holding its whole regressor.
 
     Raises:
-        ValueError: shapes that do not fit, no samples, or values that are not finite.
+        ValueError: shapes that do not fit.
+        DataError: no samples, or values that are not finite.
     """
     signals = [np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2)]
     tau = np.asarray(tau_nm, dtype=float)
@@ -89,14 +92,15 @@ def gather_joint(
     are columns (m, k) of this joint beside the bodies'.
 
     Raises:
-        ValueError: shapes that do not fit, no samples, or values that are not finite.
+        ValueError: shapes that do not fit.
+        DataError: no samples, or values that are not finite.
     """
     signals = [np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2)]
     tau = np.asarray(tau_nm, dtype=float)
-    if tau.ndim != 1 or not tau.size or tau.shape != signals[0].shape[:1] or not np.isfinite(tau).all():
-        raise ValueError(
-            f"torques {tau.shape} do not fit a motion {signals[0].shape}, are none or not finite"
-        )
+    if tau.ndim != 1 or tau.shape != signals[0].shape[:1]:
+        raise ValueError(f"torques {tau.shape} do not fit a motion {signals[0].shape}")
+    if not tau.size or not np.isfinite(tau).all():
+        raise DataError(f"{tau.size} torques: at least one is needed, and all finite")
     beside = np.zeros((tau.size, 0)) if further is None else np.asarray(further, dtype=float)
     total: JointInformation | None = None
     for begin in range(0, tau.size, _BLOCK):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor_kernel import Index, fill_regressor
 
@@ -79,7 +80,7 @@ def check_phi(chain: Chain, phi: ArrayLike) -> Array:
     if flat.size != PER_BODY * joints:
         raise ValueError(f"phi has {flat.size} values; a chain of {joints} joints needs {PER_BODY * joints}")
     if not np.isfinite(flat).all():
-        raise ValueError("phi holds a value that is not finite")
+        raise DataError("phi holds a value that is not finite")
     return flat
 
 
@@ -93,7 +94,7 @@ def _check_motion(chain: Chain, *signals: ArrayLike) -> tuple[Array, ...]:
                 f"the same for positions, velocities and accelerations"
             )
         if not np.isfinite(array).all():
-            raise ValueError(f"{name} holds a value that is not finite")
+            raise DataError(f"{name} holds a value that is not finite")
     return arrays
 
 

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from module_agent.model.errors import UsageError
 from module_agent.network_emulation.trace import NetworkTrace
 
 # Who a message goes to; a path may be another in each direction.
@@ -179,8 +180,8 @@ def profile(name: str) -> NetworkProfile:
     """Look up a profile by name; `network_file.network` takes files as well.
 
     Raises:
-        KeyError: unknown profile; the message lists the known ones.
+        UsageError: unknown profile; the message lists the known ones.
     """
     if name not in PROFILES:
-        raise KeyError(f"unknown network profile {name!r}; known are {', '.join(PROFILES)}")
+        raise UsageError(f"unknown network profile {name!r}; known are {', '.join(PROFILES)}")
     return PROFILES[name]

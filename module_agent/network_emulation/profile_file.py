@@ -18,12 +18,13 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from module_agent.model.errors import UsageError
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.toml_location import Location, line_of, syntax_error_line
 from module_agent.network_emulation.trace import TraceError, read_trace
 
 
-class NetworkError(ValueError):
+class NetworkError(UsageError):
     """No such network, or a file that describes none; the message names file, line and key."""
 
 

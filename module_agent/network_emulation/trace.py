@@ -25,11 +25,13 @@ from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict
 
+from module_agent.model.errors import UsageError
+
 HEADER = ["time_s", "delay_ms", "lost"]
 MAX_DELAY_MS = 10_000.0
 
 
-class TraceError(ValueError):
+class TraceError(UsageError):
     """A file that is no trace; the message names file, line and column."""
 
 
@@ -94,7 +96,7 @@ def parse_trace(text: str, name: str) -> NetworkTrace:
             continue
         try:
             rows.append(_row(cells, rows[-1].time_s if rows else None))
-        except ValueError as error:
+        except TraceError as error:
             raise TraceError(f"{name}:{lines.line_num}: {error}") from error
     if not rows:
         raise TraceError(f"{name}:1: no rows after the header")
@@ -105,17 +107,17 @@ def parse_trace(text: str, name: str) -> NetworkTrace:
 
 def _row(cells: list[str], last_s: float | None) -> TraceRow:
     if len(cells) != len(HEADER):
-        raise ValueError(f"{len(cells)} values, there must be {len(HEADER)}: {','.join(HEADER)}")
+        raise TraceError(f"{len(cells)} values, there must be {len(HEADER)}: {','.join(HEADER)}")
     time_text, delay_text, lost_text = (cell.strip() for cell in cells)
     if lost_text not in ("0", "1"):
-        raise ValueError(f"lost: {lost_text!r} must be 0 or 1")
+        raise TraceError(f"lost: {lost_text!r} must be 0 or 1")
     lost = lost_text == "1"
     time_s = _number("time_s", time_text)
     if last_s is not None and time_s < last_s:
-        raise ValueError(f"time_s: {time_text} is before the row above")
+        raise TraceError(f"time_s: {time_text} is before the row above")
     delay_ms = 0.0 if lost and not delay_text else _number("delay_ms", delay_text)
     if not 0.0 <= delay_ms <= MAX_DELAY_MS:
-        raise ValueError(f"delay_ms: {delay_text} must be from 0 to {MAX_DELAY_MS:g}")
+        raise TraceError(f"delay_ms: {delay_text} must be from 0 to {MAX_DELAY_MS:g}")
     return TraceRow(time_s, delay_ms, lost)
 
 
@@ -123,7 +125,7 @@ def _number(column: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise ValueError(f"{column}: {text!r} is not a number") from None
+        raise TraceError(f"{column}: {text!r} is not a number") from None
     if not isfinite(value):
-        raise ValueError(f"{column}: {text} is not finite")
+        raise TraceError(f"{column}: {text} is not finite")
     return value

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.signal import butter, sosfiltfilt
 
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import read_only
 
 FILTER_ORDER = 4
@@ -90,12 +91,12 @@ def resample(
         (m, n), or (m, n, k), read-only.
 
     Raises:
-        ValueError: times out of order, a hole that is too long, or a common time outside a module's samples;
+        DataError: times out of order, a hole that is too long, or a common time outside a module's samples;
             the message gives the column.
     """
     common = np.asarray(t_common_ns, dtype=np.int64)
     if len(t_ns) != len(signals):
-        raise ValueError(
+        raise DataError(
             f"{len(t_ns)} time bases for {len(signals)} signals; one of each per module is needed"
         )
     resampled = np.empty((common.size, len(signals), *np.shape(signals[0])[1:]))
@@ -118,14 +119,14 @@ def zero_phase_low_pass(signal: ArrayLike, rate_hz: float, cutoff_hz: float) -> 
     the first and last `settling_samples` are less exact.
 
     Raises:
-        ValueError: a cut-off outside (0, rate / 2), or fewer samples than the reflection needs.
+        DataError: a cut-off outside (0, rate / 2), or fewer samples than the reflection needs.
     """
     if not 0.0 < cutoff_hz < 0.5 * rate_hz:
-        raise ValueError(f"cutoff_hz {cutoff_hz} is outside 0 to {0.5 * rate_hz}, half the sampling rate")
+        raise DataError(f"cutoff_hz {cutoff_hz} is outside 0 to {0.5 * rate_hz}, half the sampling rate")
     values = np.asarray(signal, dtype=float)
     padding = settling_samples(rate_hz, cutoff_hz)
     if values.shape[0] <= padding:
-        raise ValueError(f"{values.shape[0]} samples; a cut-off of {cutoff_hz} Hz needs more than {padding}")
+        raise DataError(f"{values.shape[0]} samples; a cut-off of {cutoff_hz} Hz needs more than {padding}")
     sections = butter(FILTER_ORDER, cutoff_hz, fs=rate_hz, output="sos")
     filtered: Array = sosfiltfilt(sections, values, axis=0, padlen=padding)
     return read_only(filtered)
@@ -200,13 +201,13 @@ def filtered_motion(
         `2 * cutoff_hz / rate_hz` independent samples per sample (see `solve_pseudo_inverse`).
 
     Raises:
-        ValueError: shapes that differ, times that are not uniform, too few samples, or a bad cut-off.
+        DataError: shapes that differ, times that are not uniform, too few samples, or a bad cut-off.
     """
     times = np.asarray(t_ns, dtype=np.int64)
     signals = [np.asarray(s, dtype=float) for s in (q_rad, tau_nm, *([] if qd_rad_s is None else [qd_rad_s]))]
     for signal in signals:
         if signal.shape != signals[0].shape or signal.shape[0] != times.size or signal.ndim != 2:
-            raise ValueError(
+            raise DataError(
                 f"a signal has shape {signal.shape}; ({times.size}, joints) is needed for all alike"
             )
     _check_uniform(times, rate_hz)
@@ -215,28 +216,28 @@ def filtered_motion(
     edge = settling_samples(rate_hz, cutoff_hz)
     kept = slice(edge, times.size - edge)
     if kept.stop <= kept.start:
-        raise ValueError(f"{times.size} samples; {edge} at either end are unsettled and nothing is left")
+        raise DataError(f"{times.size} samples; {edge} at either end are unsettled and nothing is left")
     motion = (filtered[0], velocity, differentiate(velocity, rate_hz), filtered[1])
     return JointMotion(read_only(times[kept].copy()), *(read_only(signal[kept].copy()) for signal in motion))
 
 
 def _check_times(column: int, known: NDArray[np.int64], common: NDArray[np.int64], max_gap_ns: int) -> None:
     if known.size < 4:
-        raise ValueError(f"column {column} has {known.size} samples; at least 4 are needed to interpolate")
+        raise DataError(f"column {column} has {known.size} samples; at least 4 are needed to interpolate")
     steps = np.diff(known)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
-        raise ValueError(
+        raise DataError(
             f"column {column}: the time of sample {row} is not after that of the sample before it"
         )
     if common.size and (common.min() < known[0] or common.max() > known[-1]):
-        raise ValueError(
+        raise DataError(
             f"column {column} has samples from {known[0]} to {known[-1]} ns; the common times run from "
             f"{common.min()} to {common.max()} ns, and nothing is extrapolated"
         )
     if steps.max() > max_gap_ns:
         row = int(np.argmax(steps)) + 1
-        raise ValueError(
+        raise DataError(
             f"column {column} has a hole of {steps.max() / 1e6:.1f} ms before sample {row}; "
             f"at most {max_gap_ns / 1e6:.1f} ms are bridged"
         )
@@ -247,7 +248,7 @@ def _check_uniform(times: NDArray[np.int64], rate_hz: float) -> None:
     # Integer nanoseconds round by up to one; a drifting module clock is the business of `resample`.
     if off.size and off.max() > 1.0:
         sample = int(np.argmax(off)) + 1
-        raise ValueError(
+        raise DataError(
             f"t_ns is not uniform at {rate_hz} Hz: sample {sample} is {off.max() / 1e3:.1f} us off; "
             "resample first"
         )

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation, gather_joint, merge_joint
 from module_agent.peers.row_collection import Track
 from module_agent.signals.clock_map import ClockMap
@@ -37,12 +38,12 @@ def own_information(
         tracks: by motion and serial, at least those of all `coupled` modules.
 
     Raises:
-        ValueError: a request that contradicts itself or is not about this module; a hole in the rows.
+        DataError: a request that contradicts itself or is not about this module; a hole in the rows.
         KeyError: a track is missing.
     """
     chain = chain_of(request.chain)
     if serial not in chain.serials or len(request.clocks) != len(chain.serials):
-        raise ValueError(
+        raise DataError(
             f"a chain of {', '.join(chain.serials)} with {len(request.clocks)} clocks is asked of {serial}"
         )
     joint = chain.serials.index(serial)
@@ -83,7 +84,7 @@ def _within(track: Track, clock: ClockMap, span: SpanPart, step_ns: int) -> tupl
         np.searchsorted(track.t_ns, first_ns, side="left"), np.searchsorted(track.t_ns, last_ns, side="right")
     )
     if track.t_ns[part].size == 0:
-        raise ValueError(f"no row of motion {span.motion_id} lies within its times")
+        raise DataError(f"no row of motion {span.motion_id} lies within its times")
     return clock.to_session(track.t_ns[part]), np.column_stack(
         [track.position_rad[part], track.effort_nm[part]]
     )

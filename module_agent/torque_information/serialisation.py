@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 from module_agent.signals.clock_map import ClockMap
@@ -23,7 +24,7 @@ def chain_part(chain: Chain) -> ChainPart:
     """Return a chain as it goes over the wire.
 
     Raises:
-        ValueError: more modules than a message carries.
+        DataError: more modules than a message carries.
     """
     joints, fields = len(chain.serials), chain.to_dict()
     columns = [chain.axis, chain.point, chain.imu_home.reshape(joints, 16)]
@@ -41,12 +42,12 @@ def chain_of(part: ChainPart) -> Chain:
     """Return the chain that a message carries; its arrays are read-only.
 
     Raises:
-        ValueError: parts that do not fit, a parent that does not come before its child, a serial twice, or a
+        DataError: parts that do not fit, a parent that does not come before its child, a serial twice, or a
             value that is not finite.
     """
     joints = len(part.serials)
     if len(part.geometry) != joints * GEOMETRY_BYTES:
-        raise ValueError(
+        raise DataError(
             f"{len(part.geometry)} bytes of geometry, {joints} modules need {joints * GEOMETRY_BYTES}"
         )
     values = np.frombuffer(part.geometry, "<f8").reshape(joints, 22)
@@ -81,13 +82,13 @@ def pack(information: JointInformation) -> bytes:
     """Return the bytes of what `information.gather_joint` or `merge_joint` has returned.
 
     Raises:
-        ValueError: more than `MAX_COLUMNS` columns, or rows that are not triangular.
+        DataError: more than `MAX_COLUMNS` columns, or rows that are not triangular.
     """
     rows, columns = information.r.shape
     felt = np.flatnonzero(information.r.any(axis=0))
     kept = information.r[:, felt]
     if columns > MAX_COLUMNS or rows > felt.size or np.tril(kept, -1).any():
-        raise ValueError(
+        raise DataError(
             f"{rows} rows of {columns} columns: triangular ones of at most {MAX_COLUMNS} columns are packed"
         )
     upper = kept[np.triu_indices(rows, 0, felt.size)]
@@ -100,25 +101,25 @@ def unpack(block: bytes) -> JointInformation:
     """Return the information that `pack` has made bytes of; its arrays are read-only.
 
     Raises:
-        ValueError: the bytes are not what they announce, or hold a value that is not finite.
+        DataError: the bytes are not what they announce, or hold a value that is not finite.
     """
     if len(block) < _HEAD.size:
-        raise ValueError(f"{len(block)} bytes of information, the head alone has {_HEAD.size}")
+        raise DataError(f"{len(block)} bytes of information, the head alone has {_HEAD.size}")
     columns, rows, felt_count, samples, rest = _HEAD.unpack_from(block)
     if not rows <= felt_count <= columns <= MAX_COLUMNS:
-        raise ValueError(
+        raise DataError(
             f"{rows} rows in {felt_count} of {columns} columns: at most {MAX_COLUMNS}, and rows in as many"
         )
     upper = felt_count * rows - rows * (rows - 1) // 2
     due = _HEAD.size + 2 * felt_count + 8 * (upper + rows)
     if len(block) != due:
-        raise ValueError(f"{len(block)} bytes of information, {due} are announced")
+        raise DataError(f"{len(block)} bytes of information, {due} are announced")
     felt = np.frombuffer(block, "<u2", felt_count, _HEAD.size).astype(np.int64)
     values = np.frombuffer(block, "<f8", upper + rows, _HEAD.size + 2 * felt_count).astype(np.float64)
     if not (np.diff(felt, prepend=-1) > 0).all() or (felt >= columns).any():
-        raise ValueError("the columns of the information are out of order, or out of range")
+        raise DataError("the columns of the information are out of order, or out of range")
     if not (np.isfinite(values).all() and np.isfinite(rest) and rest >= 0.0):
-        raise ValueError("the information holds a value that is not finite, or a negative square")
+        raise DataError("the information holds a value that is not finite, or a negative square")
     kept = np.zeros((rows, felt_count))
     kept[np.triu_indices(rows, 0, felt_count)] = values[:upper]
     r = np.zeros((rows, columns))

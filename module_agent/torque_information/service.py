@@ -102,7 +102,7 @@ def _compute(serial: str, request: InformationRequest, tracks: Mapping[int, Mapp
         return _Result(pack(own_information(serial, request, tracks)), "")
     except KeyError as error:
         return _Result(b"", f"no rows of {error.args[0]} were kept for a motion")
-    except (ValueError, RobotError) as error:
+    except RobotError as error:
         # A finding too, to be told to whoever asks.
         return _Result(b"", str(error))
     except Exception as error:

@@ -2,6 +2,8 @@
 
 import re
 
+from module_agent.model.errors import UsageError
+
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _WITH_PORT = ("tcp", "tls", "quic", "udp", "ws")
 _OTHERS = ("serial", "unixpipe", "unixsock-stream", "vsock")
@@ -14,20 +16,20 @@ def check_endpoint(text: str) -> str:
     Zenoh itself takes an unknown protocol or a missing port for a hub that does not answer yet.
 
     Raises:
-        ValueError: it cannot, whatever the network does; the message says what would be right.
+        UsageError: it cannot, whatever the network does; the message says what would be right.
     """
     match = _FORM.match(text)
     if match is None:
-        raise ValueError(f"endpoint {text!r}: it must look like {DEFAULT_ENDPOINT}")
+        raise UsageError(f"endpoint {text!r}: it must look like {DEFAULT_ENDPOINT}")
     protocol = match["protocol"]
     if protocol in _OTHERS:
         return text
     if protocol not in _WITH_PORT:
         known = ", ".join((*_WITH_PORT, *_OTHERS))
-        raise ValueError(f"endpoint {text!r}: unknown protocol {protocol!r}, known are {known}")
+        raise UsageError(f"endpoint {text!r}: unknown protocol {protocol!r}, known are {known}")
     host, _, port = match["address"].rpartition(":")
     if not host or not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
-        raise ValueError(
+        raise UsageError(
             f"endpoint {text!r}: an address of {protocol} is HOST:PORT, with a port of 1 to 65535"
         )
     return text

@@ -10,6 +10,8 @@ The errors that a `Reply` without payload carries, the same whatever the transpo
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+from module_agent.model.errors import RobotError
+
 # A session of which nothing is heard for so long is gone, for the others: its liveliness tokens vanish.
 LEASE_S = 1.0
 
@@ -49,7 +51,7 @@ Event = Sample | Request | Reply | Liveness
 Sink = Callable[[Event], None]
 
 
-class TransportError(ConnectionError):
+class TransportError(RobotError):
     """The transport could not be opened or is closed; the message says what to check."""
 
 

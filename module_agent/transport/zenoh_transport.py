@@ -24,6 +24,7 @@ from typing import Literal, Protocol, Self
 import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
+from module_agent.model.errors import UsageError
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from module_agent.transport.transport import (
     CLOSED,
@@ -330,7 +331,7 @@ def open_zenoh(config: ZenohConfig) -> ZenohTransport:
     try:
         for endpoint in (*config.listen, *config.connect):
             check_endpoint(endpoint)
-    except ValueError as error:
+    except UsageError as error:
         raise TransportError(str(error)) from error
     try:
         return ZenohTransport(zenoh.open(_session_config(config)))

@@ -8,6 +8,8 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import NamedTuple
 
+from module_agent.model.errors import DataError, UsageError
+
 ROOT = "x5"
 _CHUNK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z")
 
@@ -42,10 +44,10 @@ def check_chunk(what: str, name: str) -> str:
     """Return `name` if it can stand as one chunk of a key.
 
     Raises:
-        ValueError: otherwise, saying what would be right.
+        UsageError: otherwise, saying what would be right.
     """
     if not _CHUNK.match(name):
-        raise ValueError(
+        raise UsageError(
             f"{what} {name!r} cannot be part of a key: use 1-64 letters, digits, '_', '-' or '.', "
             "beginning with a letter or digit"
         )
@@ -67,9 +69,9 @@ def parse(text: str) -> KeyParts:
     """Take a key apart.
 
     Raises:
-        ValueError: not a key of this system.
+        DataError: not a key of this system.
     """
     chunks = text.split("/")
     if len(chunks) != 4 or chunks[0] != ROOT or chunks[3] not in Leaf._value2member_map_:
-        raise ValueError(f"{text!r} is not a key of the form {ROOT}/robot/serial/leaf")
+        raise DataError(f"{text!r} is not a key of the form {ROOT}/robot/serial/leaf")
     return KeyParts(chunks[1], chunks[2], Leaf(chunks[3]))

@@ -2,6 +2,8 @@
 
 from enum import StrEnum
 
+from module_agent.model.errors import RobotError
+
 
 class Refusal(StrEnum):
     """A reason that a module counts, publishes in its status and names in its answer."""
@@ -25,7 +27,7 @@ class Refusal(StrEnum):
     UNFIT = "unfit"
 
 
-class WireError(ValueError):
+class WireError(RobotError):
     """Bytes that are not a valid message; `reason` is what a module counts."""
 
     def __init__(self, reason: Refusal, detail: str):

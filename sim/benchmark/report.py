@@ -13,6 +13,7 @@ from math import ceil, floor, isfinite, log10
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from module_agent.model.errors import UsageError
 from sim.benchmark.case import CaseResult
 from sim.benchmark.row import Row
 
@@ -113,13 +114,13 @@ def plot(rows: Sequence[Row], path: Path) -> None:
     """Draw the rows that have a bar and save them (PNG, SVG or PDF by suffix), one panel for every figure.
 
     Raises:
-        ValueError: no row has a bar, or a suffix that matplotlib cannot write.
+        UsageError: no row has a bar, or a suffix that matplotlib cannot write.
     """
     from matplotlib.figure import Figure
 
     panels = _panels(rows)
     if not panels:
-        raise ValueError("no row has a bar: nothing to draw")
+        raise UsageError("no row has a bar: nothing to draw")
     columns = _columns(panels)
     height = max(sum(panel.height_inch for panel in column) for column in columns) + 0.7
     figure = Figure(figsize=(_WIDTH_INCH, height), dpi=110)

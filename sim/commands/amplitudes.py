@@ -8,8 +8,8 @@ import typer
 from rich.table import Table
 
 from coordinator.runtime.command_line import fail
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
+from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE
 from sim.benchmark.case import Trial
 from sim.commands.experiment import (
     ProfileName,

@@ -9,8 +9,8 @@ import typer
 from rich.table import Table
 
 from coordinator.runtime.command_line import fail
-from coordinator.runtime.exit_codes import EXIT_FAILED
 from coordinator.runtime.terminal import print_table
+from module_agent.model.errors import EXIT_FAILED, UsageError
 from sim.benchmark.case import Trial
 from sim.commands.experiment import (
     JsonFile,
@@ -60,7 +60,7 @@ def assistance(
         if picture is not None:
             title = f"Torque assistance: profile {profile.name}, seed {seed}; * unstable"
             plot_assistance(combinations, picture, title)
-    except (OSError, ValueError) as error:
+    except (UsageError, OSError) as error:
         fail(f"cannot write: {error}", EXIT_FAILED)
 
 

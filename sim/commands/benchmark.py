@@ -13,7 +13,7 @@ from rich.table import Table
 
 from coordinator.excitation.plan import Motions
 from coordinator.runtime.command_line import fail
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
+from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, UsageError
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.cases.staubli_tx40 import MOTION, URDF
 from sim.benchmark.cases.suites import (
@@ -168,7 +168,7 @@ def _report(results: Results, json_file: Path | None, plot_file: Path | None) ->
             plot(results.rows, plot_file)
     except OSError as error:
         fail(f"cannot write {error.filename}: {error.strerror}", EXIT_FAILED)
-    except ValueError as error:
+    except UsageError as error:
         fail(f"cannot draw {plot_file}: {error}", EXIT_FAILED)
 
 

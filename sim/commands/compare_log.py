@@ -9,9 +9,9 @@ from rich.table import Table
 
 from coordinator.commands.options import AsJson
 from coordinator.runtime.command_line import fail
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
+from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, UsageError
 from sim.commands.options import Seed, With, Without
 from sim.imperfections.noise_profile import NOISE_PROFILES, noise_profile, switched
 from sim.real_module.comparison import CommandRefused, SignalRow, compare, simulate
@@ -36,8 +36,8 @@ def compare_log(
         profile = switched(noise_profile(noise), tuple(with_effects or ()), tuple(without_effects or ()))
     except UnknownModuleType as error:
         fail(f"--type: {error}", EXIT_USAGE)
-    except (KeyError, ValueError) as error:
-        fail(error.args[0], EXIT_USAGE)
+    except UsageError as error:
+        fail(error, EXIT_USAGE)
     try:
         recorded = read_log(log)
     except LogFileError as error:

@@ -11,8 +11,8 @@ import typer
 
 from coordinator.runtime.command_line import fail
 from coordinator.runtime.event_loop import SIGNALS
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from coordinator.runtime.terminal import Terminal
+from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
 from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trials
 from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
@@ -25,11 +25,8 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file to writ
 
 
 def chosen_profile(name: str, on: Sequence[str] | None, off: Sequence[str] | None) -> NoiseProfile:
-    """Return a noise profile with effects switched on and off, or end the command."""
-    try:
-        return switched(noise_profile(name), tuple(on or ()), tuple(off or ()))
-    except (KeyError, ValueError) as error:
-        fail(error.args[0], EXIT_USAGE)
+    """Return a noise profile with effects switched on and off."""
+    return switched(noise_profile(name), tuple(on or ()), tuple(off or ()))
 
 
 def profile_settings(name: str, on: Sequence[str] | None, off: Sequence[str] | None) -> dict[str, object]:

@@ -10,8 +10,8 @@ from rich.table import Table
 
 from coordinator.monitoring.findings import KINDS, UNITS, Kind
 from coordinator.runtime.command_line import fail
-from coordinator.runtime.exit_codes import EXIT_FAILED, EXIT_USAGE
 from coordinator.runtime.terminal import print_table
+from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, UsageError
 from sim.benchmark.case import Trial
 from sim.benchmark.cases.monitoring import (
     AFTER_S,
@@ -34,7 +34,7 @@ from sim.commands.experiment import (
 )
 from sim.commands.options import Seed
 from sim.imperfections.noise_profile import noise_profile
-from sim.robot.robot_file import RobotFileError, load_robot
+from sim.robot.robot_file import load_robot
 
 _KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
 # A false alarm's trial: long ones would leave a process idle at the end.
@@ -162,8 +162,8 @@ def _subject(robot: str, noise: str, seed: int) -> Subject:
     try:
         load_robot(robot)
         noise_profile(noise)
-    except (RobotFileError, KeyError, OSError) as error:
-        fail(error.args[0] if isinstance(error, KeyError) else error, EXIT_USAGE)
+    except (UsageError, OSError) as error:
+        fail(error, EXIT_USAGE)
     return Subject(robot=robot, noise=noise, seed=seed)
 
 

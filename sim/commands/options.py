@@ -48,10 +48,7 @@ class WorldOptions:
         Raises:
             UsageError: it is no positive number.
         """
-        try:
-            return check_speed(self.speed)
-        except ValueError as error:
-            raise UsageError(str(error)) from error
+        return check_speed(self.speed)
 
     def noise_of(self, robot: Robot) -> NoiseChoice:
         """Return the noise profile and effects that were chosen.
@@ -60,10 +57,7 @@ class WorldOptions:
             UsageError: there is no such profile or effect.
         """
         choice = NoiseChoice(self.noise, tuple(self.with_effects or ()), tuple(self.without_effects or ()))
-        try:
-            choice.of(robot)
-        except (KeyError, ValueError) as error:
-            raise UsageError(str(error.args[0])) from error
+        choice.of(robot)
         return choice
 
     def pushes_on(self, robot: Robot) -> tuple[Push, ...]:
@@ -72,12 +66,9 @@ class WorldOptions:
         Raises:
             UsageError: a text describes none, or the robot has no such module.
         """
-        try:
-            pushes = tuple(parse_push(text) for text in self.push or ())
-            for push in pushes:
-                check_pushed(push, robot.serials)
-        except ValueError as error:
-            raise UsageError(str(error)) from error
+        pushes = tuple(parse_push(text) for text in self.push or ())
+        for push in pushes:
+            check_pushed(push, robot.serials)
         return pushes
 
 
@@ -100,12 +91,9 @@ class LaunchOptions:
         Raises:
             UsageError: there is no such network, or no such endpoint.
         """
-        try:
-            if self.network is not None:
-                network_named(self.network)
-            check_endpoint(self.endpoint)
-        except ValueError as error:
-            raise UsageError(str(error)) from error
+        if self.network is not None:
+            network_named(self.network)
+        check_endpoint(self.endpoint)
 
     def new_folder(self, robot: Robot) -> Path:
         """Return the folder of the run; it must not hold one, since the truth is written there as well.

@@ -69,10 +69,7 @@ def launch(
     viewer: Annotated[str, typer.Option(help="Live viewer: none, spawn, serve, or an address.")] = "spawn",
 ) -> None:
     """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
-    try:
-        choice = viewer_choice(viewer)
-    except ValueError as error:
-        raise UsageError(str(error)) from error
+    choice = viewer_choice(viewer)
     config = _launch_config(settings, launched, motions, "--viewer", viewer)
     _run_processes(config)
     # Where the viewer can still be reached when the run is over.

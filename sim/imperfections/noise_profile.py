@@ -10,6 +10,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from module_agent.model.catalogue import ImuKind
+from module_agent.model.errors import UsageError
 from sim.imperfections.effects import EFFECTS, Effect
 
 Amount = Annotated[float, Field(ge=0.0, le=1e4)]
@@ -140,10 +141,10 @@ def noise_profile(name: str) -> NoiseProfile:
     """Look up a profile by name.
 
     Raises:
-        KeyError: unknown profile; the message lists the known ones.
+        UsageError: unknown profile; the message lists the known ones.
     """
     if name not in NOISE_PROFILES:
-        raise KeyError(f"unknown noise profile {name!r}; known are {', '.join(NOISE_PROFILES)}")
+        raise UsageError(f"unknown noise profile {name!r}; known are {', '.join(NOISE_PROFILES)}")
     return NOISE_PROFILES[name]
 
 
@@ -153,11 +154,11 @@ def switched(profile: NoiseProfile, on: tuple[str, ...] = (), off: tuple[str, ..
     An effect that the profile has already keeps its size there.
 
     Raises:
-        KeyError: unknown effect; the message lists the known ones.
-        ValueError: an effect is switched both on and off.
+        UsageError: unknown effect; the message lists the known ones.
+        UsageError: an effect is switched both on and off.
     """
     if both := [name for name in on if name in off]:
-        raise ValueError(f"effect {both[0]!r} is switched both on and off")
+        raise UsageError(f"effect {both[0]!r} is switched both on and off")
     sizes: dict[str, float] = {}
     for effect in map(_effect, on):
         if not any(getattr(profile, field) for field in effect.sizes):
@@ -169,7 +170,7 @@ def switched(profile: NoiseProfile, on: tuple[str, ...] = (), off: tuple[str, ..
 
 def _effect(name: str) -> Effect:
     if name not in EFFECTS:
-        raise KeyError(f"unknown effect {name!r}; known are {', '.join(EFFECTS)}")
+        raise UsageError(f"unknown effect {name!r}; known are {', '.join(EFFECTS)}")
     return EFFECTS[name]
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from module_agent.main import ATTACHED
+from module_agent.model.errors import RobotError
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from sim.robot.noise_choice import NoiseChoice
 
@@ -24,7 +25,7 @@ _LONGEST_NAME = 100
 _PR_SET_PDEATHSIG = 1
 
 
-class LaunchError(RuntimeError):
+class LaunchError(RobotError):
     """A process did not come up or died; the message says which and what it printed last."""
 
 

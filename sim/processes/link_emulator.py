@@ -19,13 +19,13 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
+from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.processes.network_namespace import open_tun
 from sim.processes.packet_switch import LinkCounts, PacketSwitch
 
 # What it says when packets pass.
 UP = "the links are up"
-EXIT_USAGE, EXIT_LOST = 2, 3
 _LONGEST_PACKET_BYTES = 65_535
 # How long it may take to notice that it is to end.
 _LOOK_S = 0.1
@@ -42,7 +42,7 @@ def host(text: str) -> Host:
     """Read a host as it is given on the command line, such as `/proc/4711/ns/net=10.77.0.1/24`.
 
     Raises:
-        ValueError: it is of another form; the message says what would be right.
+        UsageError: it is of another form; the message says what would be right.
     """
     namespace, _, address = text.rpartition("=")
     try:
@@ -50,7 +50,7 @@ def host(text: str) -> Host:
     except ValueError:
         namespace = ""
     if not namespace:
-        raise ValueError(f"host {text!r}: it must look like /proc/4711/ns/net=10.77.0.1/24")
+        raise UsageError(f"host {text!r}: it must look like /proc/4711/ns/net=10.77.0.1/24")
     return Host(Path(namespace), interface)
 
 
@@ -104,7 +104,7 @@ def main() -> int:
         addresses = [each.interface.ip for each in hosts]
         switch = PacketSwitch(addresses, network_named(asked.network), asked.seed)
         tuns = [open_tun(*each) for each in hosts]
-    except (ValueError, OSError) as error:
+    except (RobotError, OSError) as error:
         print(f"link emulator: {error}", file=sys.stderr)
         return EXIT_USAGE
     print(UP, file=sys.stderr, flush=True)

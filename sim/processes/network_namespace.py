@@ -13,6 +13,8 @@ from contextlib import suppress
 from ipaddress import IPv4Interface
 from pathlib import Path
 
+from module_agent.model.errors import RobotError
+
 OPEN_TIMEOUT_S = 10.0
 INTERFACE = "x5"
 _TUN = "/dev/net/tun"
@@ -25,7 +27,7 @@ _IFF_TUN = 0x0001
 _IFF_NO_PI = 0x1000
 
 
-class NamespaceError(OSError):
+class NamespaceError(RobotError):
     """The machine does not allow it; the message says what is missing."""
 
 

@@ -17,6 +17,7 @@ from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Answer, Firmware, Incoming
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.loop_inside import LoopInside
+from module_agent.model.errors import RobotError
 from module_agent.model.read_only import read_only
 from module_agent.model.thermal import AMBIENT_C
 from module_agent.wire.codec import decode, encode
@@ -84,7 +85,7 @@ class SignalRow(NamedTuple):
     settled_ratio: float | None
 
 
-class CommandRefused(RuntimeError):
+class CommandRefused(RobotError):
     """The firmware refused a command of the log; the message says which and why."""
 
 

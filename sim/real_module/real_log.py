@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from module_agent.model.errors import UsageError
 from module_agent.model.read_only import read_only
 from sim.geometry.pose import Array
 
 
-class LogFileError(ValueError):
+class LogFileError(UsageError):
     """A file that is no such log; the message names file, line and column."""
 
 

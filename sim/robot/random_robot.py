@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.catalogue import CATALOGUE, module_type
+from module_agent.model.errors import RobotError
 from sim.geometry.link_parts import BRACKETS
 from sim.geometry.pose import Array, inverse
 from sim.geometry.rigid_body import about_origin, joined, moved
@@ -30,7 +31,7 @@ _TRIES = 40
 _SHRINK = 0.85
 
 
-class RobotNotDrawn(RuntimeError):
+class RobotNotDrawn(RobotError):
     """No robot that carries itself was found; the message gives the seed."""
 
 

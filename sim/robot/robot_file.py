@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 from module_agent.model.catalogue import module_type
+from module_agent.model.errors import RobotError, UsageError
 from module_agent.network_emulation.profile_file import network, network_beside
 from module_agent.network_emulation.toml_location import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
@@ -41,7 +42,7 @@ MOUNTS: dict[MountName, tuple[float, float, float]] = {
 }
 
 
-class RobotFileError(ValueError):
+class RobotFileError(UsageError):
     """A robot file that describes no robot; the message names file, line and key."""
 
 
@@ -52,8 +53,8 @@ def _in_a_list(value: Any) -> Any:
 def _known(value: str, lookup: Any) -> str:
     try:
         lookup(value)
-    except KeyError as error:
-        raise ValueError(error.args[0]) from error
+    except RobotError as error:
+        raise ValueError(str(error)) from error
     return value
 
 

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from coordinator.identification.identified import Identified
 from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart
 from module_agent.model.chain import Array, Chain, ChainError
+from module_agent.model.errors import DataError, RobotError
 from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.world.truth import Motion, read_motion, read_truth
@@ -26,7 +27,7 @@ from sim.world.truth import Motion, read_motion, read_truth
 MIN_TORQUE_NM = 0.02
 
 
-class ScoreError(ValueError):
+class ScoreError(RobotError):
     """A run that cannot be scored; the message names the file and what is wrong with it."""
 
 
@@ -214,7 +215,7 @@ def _true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], source: s
     column = motion.serials.index(serial)
     try:
         found = resample([motion.clock_ns[:, column]], [motion.spring_torque_nm[:, column]], t_ns)
-    except ValueError as error:
+    except DataError as error:
         raise ScoreError(
             f"{source} does not cover the held-out motion of module {serial}: {error}"
         ) from error
@@ -274,9 +275,7 @@ def _read_truth(path: Path) -> Chain:
         return read_truth(_existing(path)).chain
     except KeyError as error:
         raise ScoreError(f"{path} lacks {error}") from error
-    except ScoreError:
-        raise
-    except (ValueError, TypeError, ChainError) as error:
+    except (ValueError, TypeError, DataError) as error:  # ValueError: JSON and its numbers
         raise ScoreError(f"{path} is broken: {error}") from error
 
 
@@ -285,8 +284,6 @@ def _read_motion(path: Path) -> Motion:
         return read_motion(_existing(path))
     except KeyError as error:
         raise ScoreError(f"{path} lacks the array {error}") from error
-    except ScoreError:
-        raise
     except (ValueError, OSError, zipfile.BadZipFile) as error:
         raise ScoreError(f"{path} is broken: {error}") from error
 
@@ -297,8 +294,6 @@ def _read_held_out(path: Path, joints: int) -> _HeldOut:
             found = _HeldOut(*(np.asarray(file[name]) for name in _HeldOut._fields))
     except KeyError as error:
         raise ScoreError(f"{path} lacks an array: {error}") from error
-    except ScoreError:
-        raise
     except (ValueError, OSError, zipfile.BadZipFile) as error:
         raise ScoreError(f"{path} is broken: {error}") from error
     for name, array in zip(_HeldOut._fields, found, strict=True):

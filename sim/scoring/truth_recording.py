@@ -18,8 +18,8 @@ from coordinator.recording.run_folder import RESULT, SESSION, VIEW, load_recordi
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
-from coordinator.viewer.viewer_process import MergeFailed, merge_into
-from module_agent.model.chain import ChainError
+from coordinator.viewer.viewer_process import merge_into
+from module_agent.model.errors import DataError, RobotError
 from sim.geometry.pose import Array
 from sim.scoring.truth_view import TruthView
 from sim.world.truth import Motion, read_motion, read_truth
@@ -54,7 +54,7 @@ def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None
         drawn.poses(shown.t_ns, shown.q_rad, shown.serials)
         drawn.close()
         merge_into(run / VIEW, run / ADDITION)
-    except (OSError, ValueError, KeyError, ChainError, MergeFailed) as failure:
+    except (RobotError, OSError, ValueError, KeyError) as failure:
         say(f"the true robot is not in {run / VIEW}: {failure}")
     finally:
         (run / ADDITION).unlink(missing_ok=True)
@@ -68,18 +68,18 @@ def _motion(recording: Recording, motion: Motion) -> _Shown:
     """Return the true motion from the last exploration on, thirty times a second.
 
     Raises:
-        ValueError: the session does not say when it began, or nothing of the motion is after its exploration.
+        DataError: the session does not say when it began, or nothing of the motion is after its exploration.
     """
     begun = [event.t_ns for event in recording.journal if event.what == "session"]
     explored = [e.t_ns for e in recording.journal if e.what == "done" and e.step.startswith("explore/")]
     if not begun or not explored:
-        raise ValueError("its journal has no beginning, or no exploration that was done")
+        raise DataError("its journal has no beginning, or no exploration that was done")
     serial = next(s for s in motion.serials if recording.modules[s].round_trips)
     clock = map_clocks({serial: recording.modules[serial].round_trips})[serial]
     session_ns = clock.to_session(motion.clock_ns[:, motion.serials.index(serial)])
     kept = np.flatnonzero((session_ns >= explored[-1]) & (session_ns <= recording.journal[-1].t_ns))
     if not kept.size:
-        raise ValueError("the true motion ends before the exploration")
+        raise DataError("the true motion ends before the exploration")
     step = max(1, round(PERIOD_NS / float(np.median(np.diff(session_ns)))))
     rows = kept[::step]
     return _Shown(motion.serials, session_ns[rows] - begun[-1], motion.q_rad[rows])

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from module_agent.control.controller import Command
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, Publication
 from module_agent.hardware.hardware import ModuleSample
+from module_agent.model.errors import RobotError
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.keys import Leaf
@@ -31,7 +32,7 @@ _KEEP_ALIVE_NS = 60_000_000
 _ASKED = 1
 
 
-class ExperimentFailed(RuntimeError):
+class ExperimentFailed(RobotError):
     """A module refused a command or broke a motion off; the message says which module, and why."""
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from module_agent.model.errors import UsageError
 from sim.thesis.amplitude_sweep import AmplitudeTrial
 from sim.thesis.published import ALIGNMENTS, Alignment, ThesisLength, thesis_length
 
@@ -97,14 +98,14 @@ def plot(trials: Sequence[AmplitudeTrial], path: Path, title: str) -> None:
     """Draw the sweep and save it (PNG, SVG or PDF by suffix): one row per alignment, one column per length.
 
     Raises:
-        ValueError: no trial of a sweep, or a suffix that matplotlib cannot write.
+        UsageError: no trial of a sweep, or a suffix that matplotlib cannot write.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
     sweep = [trial for trial in trials if trial.purpose == "sweep"]
     if not sweep:
-        raise ValueError("no trial of a sweep over amplitudes: nothing to draw")
+        raise UsageError("no trial of a sweep over amplitudes: nothing to draw")
     lengths = list(dict.fromkeys(trial.length_mm for trial in sweep))
     width = max(3.1 * len(lengths) + 0.9, 6.0)
     figure = Figure(figsize=(width, 7.0), dpi=150)

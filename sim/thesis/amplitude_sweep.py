@@ -12,6 +12,7 @@ import numpy as np
 from coordinator.excitation.plan import Plan
 from module_agent.estimate.circle_point_analysis import CircleFit
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
+from module_agent.model.errors import DataError
 from module_agent.wire.feedback_rows import Rows
 from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import Robot, load_robot
@@ -166,7 +167,7 @@ def _fit(rows: TrialRows, taps: int) -> tuple[CircleFit | None, str]:
     """Return the fit, or why there is none."""
     try:
         return analyse(rows, taps), ""
-    except ValueError as error:
+    except DataError as error:
         return None, str(error)
 
 

@@ -16,6 +16,7 @@ from coordinator.recording.recording import Recording
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import Estimate
 
@@ -26,7 +27,7 @@ def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | No
     The topology is given: the thesis' own motions tell it as well as any.
 
     Raises:
-        ValueError: a module has not told its type, or was not recorded at rest.
+        DataError: a module has not told its type, or was not recorded at rest.
     """
     types = [_type(recording, serial) for serial in topology.serials]
     rest = _rest(recording, topology.serials)
@@ -67,7 +68,7 @@ def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
     for serial in serials:
         event = _last(recording, "rest", serial)
         if event is None:
-            raise ValueError(f"module {serial} was not recorded at rest")
+            raise DataError(f"module {serial} was not recorded at rest")
         rows = _rows(recording, event)
         accel = rows["accel_m_s2"].astype(float)
         force.append(accel.mean(axis=0))
@@ -85,12 +86,12 @@ def _last(recording: Recording, purpose: Purpose, serial: str) -> JournalEvent |
 def _rows(recording: Recording, event: JournalEvent) -> Rows:
     motion = event.motion
     if motion is None or motion.end_row is None:
-        raise ValueError(f"a motion of module {event.serial} has no end")
+        raise DataError(f"a motion of module {event.serial} has no end")
     return recording.rows(event.serial, motion.start_row, motion.end_row)
 
 
 def _type(recording: Recording, serial: str) -> ModuleType:
     info = recording.modules[serial].info
     if info is None:
-        raise ValueError(f"module {serial} has not told its type")
+        raise DataError(f"module {serial} has not told its type")
     return module_type(info.module_type)

@@ -28,6 +28,7 @@ from module_agent.estimate.joint_regression import JointRegression, regress_join
 from module_agent.estimate.observed_motion import MotionWindows, ObservedMotion, observed_motions
 from module_agent.estimate.smoothing import SmoothMotion
 from module_agent.estimate.windows import Array, ImuWindow, JointWindow, imu_window
+from module_agent.model.errors import DataError
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
@@ -79,7 +80,7 @@ def judge_all(trial: TrialRows, profile: NoiseProfile, true_m: float) -> Compari
     for name, variant in VARIANTS.items():
         try:
             distance_m, sigma_m = variant(trial, profile)
-        except ValueError:
+        except DataError:
             continue
         found[name] = Found(distance_m - true_m, sigma_m)
     return Comparison(found, bound_m(trial, profile))

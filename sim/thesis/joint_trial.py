@@ -20,6 +20,7 @@ from module_agent.estimate.circle_point_analysis import rest_reading
 from module_agent.estimate.joint_regression import distance_bound_m
 from module_agent.estimate.observed_motion import observed_motions
 from module_agent.estimate.windows import imu_window
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED, ImuPrior
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import load_robot
@@ -143,5 +144,5 @@ def judge(rig: OneJointRig, rows: TrialRows, profile: NoiseProfile) -> JointTria
 def _thesis_error_m(rows: TrialRows, true_m: float) -> float | None:
     try:
         return analyse(rows).distance_m - true_m
-    except ValueError:
+    except DataError:
         return None

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ModuleType
+from module_agent.model.errors import UsageError
 from module_agent.wire.messages import GainSet, PidGains
 
 Alignment = Literal["horizontal", "vertical"]
@@ -43,12 +44,12 @@ def thesis_length(alignment: Alignment, length_mm: int) -> ThesisLength:
     """Look up what the thesis found for an arm.
 
     Raises:
-        KeyError: the thesis had no such arm; the message lists its lengths.
+        UsageError: the thesis had no such arm; the message lists its lengths.
     """
     for found in THESIS_LENGTHS:
         if (found.alignment, found.length_mm) == (alignment, length_mm):
             return found
-    raise KeyError(
+    raise UsageError(
         f"the thesis had no {alignment} arm of {length_mm} mm; its lengths are "
         f"{', '.join(map(str, LENGTHS_MM))} mm"
     )
@@ -95,12 +96,12 @@ def setting(name: str) -> PidSetting:
     """Look up a setting by the thesis' name for it.
 
     Raises:
-        KeyError: there is no such setting; the message lists those that there are.
+        UsageError: there is no such setting; the message lists those that there are.
     """
     for found in SETTINGS:
         if found.name == name:
             return found
-    raise KeyError(f"no PID setting {name!r}; the thesis has {', '.join(s.name for s in SETTINGS)}")
+    raise UsageError(f"no PID setting {name!r}; the thesis has {', '.join(s.name for s in SETTINGS)}")
 
 
 def thesis_gains(kind: ModuleType, chosen: PidSetting, reading: Reading) -> GainSet:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from math import pi
 from typing import Literal, NamedTuple
 
+from module_agent.model.errors import UsageError
 from module_agent.wire.messages import DynamicPattern, MultiSine, Pattern, Sine, WindowedSine
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS, Alignment, Reading, thesis_length
@@ -125,7 +126,7 @@ def stage_of(case: Case, seed: int) -> Stage:
     """Return robot and motion of a case, at the place that the seed draws.
 
     Raises:
-        KeyError: an arm of six joints has no such pose.
+        UsageError: an arm of six joints has no such pose.
     """
     robot = standing_robot(case.robot, seed)
     alignment = case.alignment
@@ -134,7 +135,7 @@ def stage_of(case: Case, seed: int) -> Stage:
         return Stage(robot, dict.fromkeys(robot.serials, 0.0), {joint: _pattern(case.motion, alignment)})
     poses = {(pose.robot, pose.name): pose for pose in POSES}
     if (case.robot, case.pose) not in poses:
-        raise KeyError(f"no pose {case.pose!r} of {case.robot}")
+        raise UsageError(f"no pose {case.pose!r} of {case.robot}")
     start = poses[case.robot, case.pose].start_rad
     # Every joint has a frequency of its own, so that all meet each other in all ways; 0.25 rad at 0.4 to
     # 0.9 Hz is at most 0.63 to 1.4 rad/s, which every type can do.

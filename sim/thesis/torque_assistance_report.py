@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from module_agent.model.errors import UsageError
 from module_agent.model.read_only import read_only
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
@@ -152,13 +153,13 @@ def plot_assistance(found: Sequence[Combination], path: Path, title: str) -> Non
     """Draw the thesis' settings and save (PNG, SVG or PDF by suffix): a panel for each with all modes.
 
     Raises:
-        ValueError: none of the combinations is one of the thesis', or matplotlib cannot write the suffix.
+        UsageError: none of the combinations is one of the thesis', or matplotlib cannot write the suffix.
     """
     from matplotlib.figure import Figure
 
     panels = [_first(found, alignment, each.name) for alignment in ALIGNMENTS[::-1] for each in SETTINGS]
     if not any(panels):
-        raise ValueError("no combination of the thesis' arm and settings: nothing to draw")
+        raise UsageError("no combination of the thesis' arm and settings: nothing to draw")
     figure = Figure(figsize=(13.5, 12.0), dpi=120)
     grid: Any = figure.subplots(len(panels) // _COLUMNS, _COLUMNS, squeeze=False)
     for axes, one in zip(grid.flat, panels, strict=True):

@@ -20,8 +20,8 @@ from coordinator.runtime.event_loop import run_to_end
 from coordinator.session.session import Session
 from coordinator.topology.next_motion import NextMotion
 from module_agent.model.catalogue import module_type
+from module_agent.model.errors import RobotError
 from module_agent.wire.messages import Message
-from module_agent.wire.refusal import WireError
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 
@@ -87,7 +87,7 @@ class _Keeper:
     def record(self, entry: Entry) -> Message | None:
         try:
             message = self.recording.add(entry)
-        except (WireError, ValueError):
+        except RobotError:
             return None  # counted by the recording, by reason
         return message if isinstance(message, Message) else None
 

@@ -27,6 +27,7 @@ from module_agent.hardware.bus_frames import (
 )
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.wires import WiredModule
+from module_agent.model.errors import UsageError
 
 _BACKLOG = 128
 _MAX_LAG_S = 0.020
@@ -45,7 +46,7 @@ class World(Protocol):
         ...
 
 
-class BusInUse(OSError):
+class BusInUse(UsageError):
     """Another world listens on the path."""
 
 
@@ -90,7 +91,7 @@ class BusServer:
 
     Raises:
         BusInUse: another world listens on the path.
-        OSError: the path cannot be bound; a file that is no socket is left alone.
+        UsageError: the path cannot be bound; a file that is no socket is left alone.
     """
 
     def __init__(
@@ -334,7 +335,7 @@ def _listen(path: str) -> socket.socket:
     except OSError as error:
         listener.close()
         hint = "; the path of a Unix socket has at most 107 bytes" if len(os.fsencode(path)) > 107 else ""
-        raise OSError(f"cannot make the bus socket {path}: {error}{hint}") from error
+        raise UsageError(f"cannot make the bus socket {path}: {error}{hint}") from error
     listener.listen(_BACKLOG)
     listener.setblocking(False)
     return listener
@@ -350,7 +351,7 @@ def _clear(path: str) -> None:
         # Binding will tell what is wrong with the path.
         return
     if not stat.S_ISSOCK(mode):
-        raise OSError(f"{path} is a file, not a socket; give another bus path")
+        raise UsageError(f"{path} is a file, not a socket; give another bus path")
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
         try:
             probe.connect(path)

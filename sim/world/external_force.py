@@ -7,6 +7,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from module_agent.model.errors import UsageError
 from sim.geometry.link_parts import Xyz
 
 _NOTHING = (0.0, 0.0, 0.0)
@@ -62,10 +63,10 @@ def parse_push(text: str) -> Push:
         found: object = tomllib.loads(f"push = {{{quoted}}}")["push"]
         return Push.model_validate(found)
     except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{text!r} is no push: {error}; one is {_EXAMPLE}") from error
+        raise UsageError(f"{text!r} is no push: {error}; one is {_EXAMPLE}") from error
     except ValidationError as error:
         faults = "; ".join(_fault(dict(e)) for e in error.errors(include_url=False))
-        raise ValueError(f"{text!r} is no push: {faults}; one is {_EXAMPLE}") from error
+        raise UsageError(f"{text!r} is no push: {faults}; one is {_EXAMPLE}") from error
 
 
 def _fault(error: dict[str, object]) -> str:
@@ -84,6 +85,6 @@ def check_pushed(push: Push, serials: Sequence[str]) -> None:
         ValueError: it is not; the message lists them.
     """
     if push.serial not in serials:
-        raise ValueError(
+        raise UsageError(
             f"a push on {push.serial!r}, which is no module here; there are {', '.join(serials)}"
         )

@@ -18,6 +18,7 @@ import numpy as np
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.wires import WiredModule
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only, read_only
 from sim.geometry.pose import Array
 from sim.imperfections.module_errors import SensorErrors
@@ -94,11 +95,11 @@ def read_truth(path: Path) -> Truth:
     """Read what `write_truth` wrote.
 
     Raises:
-        ValueError: not such a file, or of another version.
+        DataError: not such a file, or of another version.
     """
     document = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(document, dict) or document.get("version") != VERSION:
-        raise ValueError(f"{path}: not a truth file of version {VERSION}")
+        raise DataError(f"{path}: not a truth file of version {VERSION}")
     # Files of runs before sensors had more than biases lack the rest of their errors.
     clocks, bias, errors = document["clocks"], document["imu_bias"], document.get("sensor_errors")
     return Truth(
@@ -119,7 +120,7 @@ class TruthLog:
 
     def __init__(self, world: World, every: int = 4):
         if every < 1:
-            raise ValueError(f"every {every} ticks: at least 1")
+            raise DataError(f"every {every} ticks: at least 1")
         self._world = world
         self._every = every
         self._ticks = 0

@@ -13,10 +13,11 @@ from typer.testing import CliRunner
 
 from coordinator.baseline.check import check, check_plan
 from coordinator.baseline.known_robot import BaselineError, BaselineRobot, load_baseline
-from coordinator.commands.check import CHECK, EXIT_CHANGED
+from coordinator.commands.check import CHECK
 from coordinator.excitation.plan import Plan
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
+from module_agent.model.errors import EXIT_FINDING
 from sim.benchmark.cases.link_change import Wear, draw_link_change, worn
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
@@ -101,7 +102,7 @@ def test_the_command_says_so_and_exits_with_4(days: Days) -> None:
     sound = CliRunner().invoke(app, [*arguments, str(days.sound.folder)])
     assert sound.exit_code == 0, sound.output
     slipped = CliRunner().invoke(app, [*arguments, str(days.worn.folder), "--json"])
-    assert slipped.exit_code == EXIT_CHANGED
+    assert slipped.exit_code == EXIT_FINDING
     written = json.loads((days.worn.folder / CHECK).read_text())
     assert written["changed"] is True
     assert [link["child"] for link in written["links"] if link["changed"]] == [days.wear.child]

@@ -14,6 +14,7 @@ from coordinator.recording.recording import ModuleRecord, Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, STEP_NS, span, window
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import DYNAMIC_CUTOFF_HZ, settling_samples
@@ -52,7 +53,7 @@ def rows_to_keep(recording: Recording, serials: Sequence[str], event: JournalEve
     """Return which rows of every module are to be kept of a motion.
 
     Raises:
-        ValueError: a module has no rows of it, or no round trip by which to tell when it was.
+        DataError: a module has no rows of it, or no round trip by which to tell when it was.
     """
     clocks = map_clocks({s: recording.modules[s].trips for s in serials})
     start_ns, end_ns = span(recording, clocks, event, _MARGIN_S)
@@ -62,7 +63,7 @@ def rows_to_keep(recording: Recording, serials: Sequence[str], event: JournalEve
         around = clocks[serial].module_span(start_ns - _SPARE_NS, end_ns + _SPARE_NS, STEP_NS)
         first, end = record.rows.range_between(*around)
         if first == end or record.rows.missing(first, end):
-            raise ValueError(f"rows of {serial} in the motion of {event.step} are missing")
+            raise DataError(f"rows of {serial} in the motion of {event.step} are missing")
         found.append(RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end))
     return tuple(found)
 
@@ -73,11 +74,11 @@ def question(
     """Return what every module is asked; whom, by which sequence number, and from where on is to be put in.
 
     Raises:
-        ValueError: there is no dynamic motion, a hole in its rows, or more than a message carries.
+        DataError: there is no dynamic motion, a hole in its rows, or more than a message carries.
     """
     steps = dynamic_steps(recording)
     if not steps or len(chain.serials) > MAX_MODULES:
-        raise ValueError(f"{len(steps)} dynamic motions of {len(chain.serials)} modules")
+        raise DataError(f"{len(steps)} dynamic motions of {len(chain.serials)} modules")
     return InformationRequest(
         serial="",
         boot=0,
@@ -127,7 +128,7 @@ def gathered(
     for k, serial in enumerate(chain.serials):
         try:
             theirs = _answer(recording.modules[serial], digest)
-        except ValueError as error:
+        except DataError as error:
             reasons.append(f"{serial}: {error}")
             continue
         apart.append(difference(theirs, own[k]))
@@ -189,11 +190,11 @@ def _answer(module: ModuleRecord, digest: bytes) -> JointInformation:
     """Put the parts of an answer together.
 
     Raises:
-        ValueError: it is not whole, or not information.
+        DataError: it is not whole, or not information.
     """
     parts = module.information.get(digest, {})
     block = b"".join(parts[offset].part for offset in sorted(parts))
     total = next(iter(parts.values())).total_bytes if parts else 0
     if not parts or len(block) != total:
-        raise ValueError(f"{len(block)} of {total or '?'} bytes of its answer have come")
+        raise DataError(f"{len(block)} of {total or '?'} bytes of its answer have come")
     return unpack(block)

@@ -13,6 +13,7 @@ import rerun_bindings as bindings
 from coordinator.viewer.scene import entity_paths
 from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Parameter, is_dynamic
 from coordinator.viewer.scene.topology_graph import Topology, extent
+from module_agent.model.errors import UsageError
 
 IDENTIFICATION, DYNAMICS, IMU, NETWORK = TABS = ("Identification", "Dynamics", "IMU", "Network")
 
@@ -47,10 +48,10 @@ def build(contents: Contents, active_tab: str = IDENTIFICATION) -> rrb.Blueprint
     """Return the layout for modules, estimates and topology.
 
     Raises:
-        ValueError: there is no such tab.
+        UsageError: there is no such tab.
     """
     if active_tab not in TABS:
-        raise ValueError(f"no tab {active_tab!r}; there are {', '.join(TABS)}")
+        raise UsageError(f"no tab {active_tab!r}; there are {', '.join(TABS)}")
     tabs = (_identification(contents), _dynamics(contents), _imu(contents), _network(contents))
     return rrb.Blueprint(
         rrb.Horizontal(

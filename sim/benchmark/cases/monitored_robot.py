@@ -20,8 +20,8 @@ from coordinator.recording.recording import Entry, Recording
 from coordinator.runtime.event_loop import run_to_end
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Chain
+from module_agent.model.errors import RobotError
 from module_agent.wire.messages import GoTo, Message
-from module_agent.wire.refusal import WireError
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.world.world import World
@@ -108,7 +108,7 @@ def _kept(recording: Recording) -> Callable[[Entry], Message | None]:
     def keep(entry: Entry) -> Message | None:
         try:
             message = recording.add(entry)
-        except (WireError, ValueError):
+        except RobotError:
             return None  # counted by the recording, by reason
         return message if isinstance(message, Message) else None
 

@@ -6,6 +6,7 @@ from numpy.random import default_rng
 
 from coordinator.arm_fit.data_file import JointLog
 from coordinator.arm_fit.filtered_log import filtered_log, most_samples, usual_cutoff_hz
+from module_agent.model.errors import DataError
 
 RATE_HZ = 1000.0
 
@@ -73,5 +74,5 @@ def test_a_long_recording_is_thinned_until_it_fits() -> None:
 
 
 def test_a_recording_too_short_for_its_cut_off_is_refused() -> None:
-    with pytest.raises(ValueError, match="more than 2000"):
+    with pytest.raises(DataError, match="more than 2000"):
         filtered_log(waving(1.0, seconds=1.0), 1.0)

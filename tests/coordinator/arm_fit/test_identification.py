@@ -15,6 +15,7 @@ from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.report import ErrorPart, FitReport
 from coordinator.description.urdf_reader import read_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
+from module_agent.model.errors import DataError
 
 TX40 = Path(__file__).resolve().parents[3] / ".." / "shared" / "data" / "tx40"
 # Of the robot in conftest.py.
@@ -222,7 +223,7 @@ def test_another_recording_is_predicted_by_what_the_first_one_told(recording: An
 def test_a_recording_too_short_to_halve_is_refused(recording: Any) -> None:
     _, found = posed(recording.urdf, recording.npz, SHARED)
     short = found.log._replace(tau_nm=found.log.tau_nm[: found.log.settling])
-    with pytest.raises(ValueError, match="cannot be halved"):
+    with pytest.raises(DataError, match="cannot be halved"):
         held_out_errors(found._replace(log=short), fitted(found))
 
 
@@ -231,7 +232,7 @@ def test_a_joint_that_never_moves_is_named(recording: Any) -> None:
     still = recording.q_rad.copy()
     still[:, 1] = 0.3
     log = JointLog(RATE_HZ, still, None, recording.tau_nm, False)
-    with pytest.raises(ValueError, match="joint 'elbow' never moves"):
+    with pytest.raises(DataError, match="joint 'elbow' never moves"):
         problem(robot, filtered_log(log, 10.0), SHARED)
 
 

@@ -22,6 +22,7 @@ from coordinator.description.urdf_reader import read_urdf
 from coordinator.description.urdf_update import friction_of, write_fitted_urdf
 from coordinator.dynamics.drive_model import DriveColumn
 from coordinator.dynamics.pseudo_inertia import is_consistent, pseudo_inertia
+from module_agent.model.errors import DataError
 
 SHARED = ModelChoice(coupled=((1, 2),))
 
@@ -120,7 +121,7 @@ def test_a_body_without_mass_is_named(recording: Any, tmp_path: Path) -> None:
     text: str = recording.urdf.read_text()
     path = tmp_path / "light.urdf"
     path.write_text(text.replace('<mass value="2.0"/>', '<mass value="0"/>'))
-    with pytest.raises(ValueError, match="gives no mass to 'fore'"):
+    with pytest.raises(DataError, match="gives no mass to 'fore'"):
         claimed_bodies(read_urdf(path))
 
 

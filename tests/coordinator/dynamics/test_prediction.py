@@ -7,6 +7,7 @@ from numpy.random import default_rng
 from coordinator.dynamics.torque_prediction import check_held_out, torque_error
 from coordinator.parameter_fit.least_squares import solve_information
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import gather
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion, filtered_motion
@@ -38,9 +39,9 @@ def test_a_joint_without_torque_has_no_relative_error() -> None:
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="do not fit"):
         torque_error(np.ones((2, 2)), np.ones((2, 1)), np.ones(2))
-    with pytest.raises(ValueError, match="lets none through"):
+    with pytest.raises(DataError, match="lets none through"):
         torque_error(np.ones((2, 2)), np.ones((2, 2)), np.ones(2), mask=np.zeros((2, 2)))
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(DataError, match="not finite"):
         torque_error(np.full((2, 2), np.nan), np.ones((2, 2)), np.ones(2))
 
 

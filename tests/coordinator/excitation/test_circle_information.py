@@ -14,6 +14,7 @@ from coordinator.excitation.fisher_information import (
     radial_directions,
 )
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import BIASES_ONLY, CALIBRATED, UNCALIBRATED, ImuPrior
 
 RATE_HZ = 250.0
@@ -128,5 +129,5 @@ def test_gravity_calibrates_the_scale_of_a_link_that_swings_in_it_and_not_of_one
 
 
 def test_no_motion_is_refused() -> None:
-    with pytest.raises(ValueError, match="no motion"):
+    with pytest.raises(DataError, match="no motion"):
         circle_covariance(hanging(), [], SensorNoise(), CALIBRATED)

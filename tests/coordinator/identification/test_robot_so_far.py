@@ -11,6 +11,7 @@ import pytest
 from coordinator.identification.preview import beside, preview
 from coordinator.kinematics.chain_estimate import link_lengths
 from module_agent.model.chain import Chain
+from module_agent.model.errors import DataError
 from module_agent.wire.feedback_rows import ROW
 
 RESTED, MOVED = 100, 200
@@ -150,5 +151,5 @@ def test_a_module_that_has_not_told_its_type_is_named(robots: Any) -> None:
     chain, types = robots.random(1, joints=3)
     recording: Any = Seen(robots, chain, types, chain.serials)
     recording.modules[chain.serials[1]].info = None
-    with pytest.raises(ValueError, match=f"module {chain.serials[1]} has not told its type"):
+    with pytest.raises(DataError, match=f"module {chain.serials[1]} has not told its type"):
         preview(recording, chain.serials)

@@ -25,6 +25,7 @@ from coordinator.parameter_fit.module_parts import bodies_from_parts, parts_of
 from coordinator.parameter_fit.systematic_errors import chain_effects, error_directions
 from coordinator.recording.run_folder import INFORMATION
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import compress, merge
 from module_agent.model.perturbation import apply_perturbation
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
@@ -272,7 +273,7 @@ def test_every_sum_is_as_uncertain_as_claimed_where_only_chains_err() -> None:
 def test_a_run_is_not_counted_twice() -> None:
     rng = default_rng(18)
     one, two = (measured(rng, assembled(rng), name=name) for name in ("one", "two"))
-    with pytest.raises(ValueError, match="the runs one and copy are of the same recording"):
+    with pytest.raises(DataError, match="the runs one and copy are of the same recording"):
         merge_runs([one, two, one._replace(name="copy")])
     assert len(merge_runs([one, two]).runs) == 2
 
@@ -281,9 +282,9 @@ def test_runs_of_other_modules_are_not_merged() -> None:
     rng = default_rng(11)
     run = measured(rng, assembled(rng))
     other = run._replace(name="other", session="another", chain=run.chain._replace(serials=("X", "Y", "Z")))
-    with pytest.raises(ValueError, match="the runs run, other have no module in common"):
+    with pytest.raises(DataError, match="the runs run, other have no module in common"):
         merge_runs([run, other])
-    with pytest.raises(ValueError, match="no runs"):
+    with pytest.raises(DataError, match="no runs"):
         merge_runs([])
 
 

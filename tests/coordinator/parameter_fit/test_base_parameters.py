@@ -19,6 +19,7 @@ from coordinator.parameter_fit.least_squares import solve_information
 from coordinator.parameter_fit.systematic_errors import scale_effects, whitened_effects
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import gather
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
 
@@ -238,9 +239,9 @@ def test_what_does_not_fit_is_named_and_results_cannot_be_written_to(rng: Genera
     columns = inertial_columns(1)
     with pytest.raises(ValueError, match=r"rows \(5, 9\) and target \(5,\) do not fit 10 named columns"):
         base_parameters(np.ones((5, 9)), np.ones(5), columns)
-    with pytest.raises(ValueError, match="the torques say nothing"):
+    with pytest.raises(DataError, match="the torques say nothing"):
         base_parameters(np.zeros((5, 10)), np.ones(5), columns)
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(DataError, match="not finite"):
         base_parameters(np.full((5, 10), np.nan), np.ones(5), columns)
     with pytest.raises(ValueError, match=r"common errors \(4, 1\) must be finite, 5 rows"):
         base_parameters(np.ones((5, 10)), np.ones(5), columns, common_errors=np.ones((4, 1)))

@@ -9,6 +9,7 @@ from numpy.random import Generator, default_rng
 from coordinator.dynamics.pseudo_inertia import REACH_M
 from coordinator.parameter_fit.least_squares import solve_information, solve_pseudo_inverse, solve_weighted
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import compress, gather, merge
 from module_agent.model.regressor import torque_regressor
 
@@ -228,11 +229,11 @@ def test_what_does_not_fit_is_named(rng: Generator) -> None:
         solve_pseudo_inverse(y, tau, weights=[1.0, 0.0])
     with pytest.raises(ValueError, match="prior_phi must be 20 finite numbers; got 10"):
         solve_pseudo_inverse(y, tau, prior_phi=np.zeros(10))
-    with pytest.raises(ValueError, match="joint 0 has 3 samples"):
+    with pytest.raises(DataError, match="joint 0 has 3 samples"):
         solve_pseudo_inverse(y[:3], tau[:3])
-    with pytest.raises(ValueError, match="torques say nothing"):
+    with pytest.raises(DataError, match="torques say nothing"):
         solve_pseudo_inverse(np.zeros_like(y), tau)
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(DataError, match="not finite"):
         compress(y, np.full_like(tau, np.nan))
     with pytest.raises(ValueError, match="2 joints cannot be merged with that of 1"):
         merge(compress(y, tau), compress(y[:, :1, :10], tau[:, :1]))

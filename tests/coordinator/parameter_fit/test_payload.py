@@ -5,6 +5,7 @@ import pytest
 
 from coordinator.parameter_fit.payload import Payload, find_payload
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.forward_kinematics import places_on_axes
 from module_agent.model.information import JointInformation, gather
 from module_agent.model.regressor import inverse_dynamics
@@ -138,5 +139,5 @@ def test_shapes_that_do_not_fit_are_named() -> None:
     known = said(ROBOT, 0, 2.0)
     with pytest.raises(ValueError, match="do not fit"):
         find_payload(known, known, places_on_axes(CHAIN)[:-1], SIGMA_NM)
-    with pytest.raises(ValueError, match="no body"):
+    with pytest.raises(DataError, match="no body"):
         find_payload(known, known, places_on_axes(CHAIN), SIGMA_NM, carriers=[])

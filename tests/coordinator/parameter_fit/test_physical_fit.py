@@ -25,6 +25,7 @@ from coordinator.parameter_fit.physically_consistent import (
 from coordinator.parameter_fit.systematic_errors import scale_effects
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation, gather
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
 from sim.robot.random_robot import random_robot
@@ -276,11 +277,11 @@ def test_what_does_not_fit_is_named(arm: Case) -> None:
         physically_consistent(np.zeros((3, 30)), np.zeros(3), arm.prior, 1.0)
     with pytest.raises(ValueError, match="weight is 0"):
         physically_consistent(np.zeros((3, 40)), np.zeros(3), arm.prior, 0.0)
-    with pytest.raises(ValueError, match="a body of the prior cannot exist"):
+    with pytest.raises(DataError, match="a body of the prior cannot exist"):
         physically_consistent(np.zeros((3, 40)), np.zeros(3), -arm.prior, 1.0)
     with pytest.raises(NotSolvedError, match="the rows do not determine them"):
         physically_consistent(np.zeros((3, 41)), np.zeros(3), arm.prior, 1.0)
     still = tuple(JointInformation(p.r, np.zeros_like(p.z), 0.0, p.samples) for p in arm.information)
-    with pytest.raises(ValueError, match="all torques are zero"):
+    with pytest.raises(DataError, match="all torques are zero"):
         fit_physical(still, arm.prior, arm.least_squares)
     assert not any(array.flags.writeable for array in arm.fit if isinstance(array, np.ndarray))

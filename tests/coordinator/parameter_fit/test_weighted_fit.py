@@ -7,6 +7,7 @@ from scipy.signal import lfilter
 
 from coordinator.parameter_fit.robust_least_squares import correlation_times, fit_weighted
 from module_agent.model.chain import Array
+from module_agent.model.errors import DataError
 
 TRUTH = np.array([1.0, -2.0, 0.5])
 
@@ -124,7 +125,7 @@ def test_instruments_that_are_the_regressor_are_least_squares(rng: Generator) ->
     plain, tooled = (fit_weighted(y, tau, np.ones(3), instruments=z) for z in (None, y))
     np.testing.assert_allclose(tooled.parameters, plain.parameters, rtol=1e-9)
     np.testing.assert_allclose(tooled.covariance, plain.covariance, rtol=1e-6)
-    with pytest.raises(ValueError, match="must be finite and of the regressor's shape"):
+    with pytest.raises(DataError, match="must be finite and of the regressor's shape"):
         fit_weighted(y, tau, np.ones(3), instruments=y[:10])
 
 
@@ -132,7 +133,7 @@ def test_too_little_to_fit_is_said_joint_by_joint(rng: Generator) -> None:
     y = smooth_columns(rng, 50)
     used = np.ones((50, 2), bool)
     used[:, 1] = False
-    with pytest.raises(ValueError, match="joint 2 has no samples to fit to: it never moves fast enough"):
+    with pytest.raises(DataError, match="joint 2 has no samples to fit to: it never moves fast enough"):
         fit_weighted(y, y @ TRUTH, np.ones(3), used)
-    with pytest.raises(ValueError, match=r"joint 1 has 1 samples for \d parameters; nothing is left"):
+    with pytest.raises(DataError, match=r"joint 1 has 1 samples for \d parameters; nothing is left"):
         fit_weighted(y[:1], y[:1] @ TRUTH, np.ones(3))

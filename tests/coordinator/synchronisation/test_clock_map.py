@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from coordinator.recording.recording import RoundTrip
 from coordinator.synchronisation.round_trips import map_clock, map_clocks
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 
 MS = 1_000_000
@@ -96,7 +97,7 @@ def test_later_stays_later() -> None:
 
 
 def test_a_module_that_never_answered_has_no_clock() -> None:
-    with pytest.raises(ValueError, match="no round trip"):
+    with pytest.raises(DataError, match="no round trip"):
         map_clock([])
 
 

@@ -16,6 +16,7 @@ from coordinator.synchronisation.motion_windows import (
     sensor_data,
     window,
 )
+from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.keys import Leaf
@@ -120,14 +121,14 @@ def test_rows_that_came_twice_and_samples_that_repeat_change_nothing(wire: Simpl
 
 
 def test_a_hole_is_named_by_its_module_and_not_bridged(wire: SimpleNamespace) -> None:
-    with pytest.raises(ValueError, match=r"column 1 has a hole of 84\.0 ms"):
+    with pytest.raises(DataError, match=r"column 1 has a hole of 84\.0 ms"):
         window(_recording(wire, {"B": (600, 620)}), CLOCKS, SERIALS, _event(wire))
 
 
 def test_a_module_without_any_row_in_the_motion_is_named(wire: SimpleNamespace) -> None:
-    with pytest.raises(ValueError, match="module C has no row"):
+    with pytest.raises(DataError, match="module C has no row"):
         window(_recording(wire, {"C": (300, 1100)}), CLOCKS, SERIALS, _event(wire))
-    with pytest.raises(ValueError, match="module A has no row"):
+    with pytest.raises(DataError, match="module A has no row"):
         window(_recording(wire, {"A": (300, 1100)}), CLOCKS, SERIALS, _event(wire))
 
 

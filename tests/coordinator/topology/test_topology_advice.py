@@ -5,6 +5,7 @@ import pytest
 
 from coordinator.topology.next_motion import MAX_REPEATS, next_motions
 from coordinator.topology.topology import Doubt, MotionSeen, likely_topology, seen_again
+from module_agent.model.errors import DataError
 from module_agent.wire.messages import ConstantMotion
 
 CHAIN = ("A", "B", "C")
@@ -82,5 +83,5 @@ def test_a_motion_that_went_wrong_is_outvoted_by_two_that_did_not() -> None:
     assert not both.moved
     assert both.rate_ratio == 0.02
     assert both.log_odds == pytest.approx(right.log_odds, abs=0.5)
-    with pytest.raises(ValueError, match="no motion"):
+    with pytest.raises(DataError, match="no motion"):
         seen_again([])

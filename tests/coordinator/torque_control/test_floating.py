@@ -26,6 +26,7 @@ from coordinator.torque_control.session import first_of_newest
 from module_agent.control.gains import catalogue_limits
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.chain import Chain
+from module_agent.model.errors import UsageError
 from module_agent.wire.messages import Limits
 from sim.benchmark.cases.gravity_compensation import true_weight
 from sim.robot.robot_file import load_robot
@@ -418,7 +419,7 @@ def test_under_the_gains_of_floating_nothing_but_the_damper_answers_a_velocity()
 
 @pytest.mark.parametrize("damping", [-0.1, float("nan"), float("inf"), 1e6, 1.3])
 def test_a_damping_that_no_module_can_give_makes_no_gains(damping: float) -> None:
-    with pytest.raises(ValueError, match=r"module type X5-4 takes 0 to 1\.2 Nm s/rad"):
+    with pytest.raises(UsageError, match=r"module type X5-4 takes 0 to 1\.2 Nm s/rad"):
         compensation_gains(X5_4, damping)
     assert compensation_gains(X5_4, most_damping_nm_s_rad(X5_4)).velocity.kp == pytest.approx(1.2)
 

@@ -15,6 +15,7 @@ from module_agent.estimate.circle_point_analysis import (
 )
 from module_agent.estimate.gaussian_filter import passes
 from module_agent.estimate.windows import align
+from module_agent.model.errors import DataError
 from module_agent.wire.messages import CircleEstimate
 
 
@@ -122,12 +123,12 @@ def test_too_little_to_go_by_is_refused_in_words(horizontal_link: Any) -> None:
     rest = horizontal_link.rest(np.random.default_rng(0))
     cm, sine = align(*horizontal_link.constant(1.0, 1), 0), align(*horizontal_link.sine(0.1, 2), 0)
     still = align(*horizontal_link._replace(noise=0.0).sine(0.0, 2), 0)
-    with pytest.raises(ValueError, match=r"turned at .* in the constant motion"):
+    with pytest.raises(DataError, match=r"turned at .* in the constant motion"):
         circle_point_analysis(rest, still, sine)
-    with pytest.raises(ValueError, match=r"accelerated by .* in the windowed sine"):
+    with pytest.raises(DataError, match=r"accelerated by .* in the windowed sine"):
         circle_point_analysis(rest, cm, still)
-    with pytest.raises(ValueError, match="10 samples of the rest"):
+    with pytest.raises(DataError, match="10 samples of the rest"):
         circle_point_analysis(type(rest)(*(column[:10] for column in rest)), cm, sine)
     unmoved = cm._replace(gyro_rad_s=np.broadcast_to(horizontal_link.gyro_offset, cm.gyro_rad_s.shape))
-    with pytest.raises(ValueError, match="does not move with it"):
+    with pytest.raises(DataError, match="does not move with it"):
         circle_point_analysis(rest, unmoved, sine)

@@ -7,6 +7,7 @@ import pytest
 
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.windows import JointWindow, align
+from module_agent.model.errors import DataError
 
 OFFSET_NS = 7_300_000_000
 
@@ -79,9 +80,9 @@ def test_a_joint_that_reports_at_another_rate_and_with_gaps_still_tells_the_offs
 
 def test_windows_that_do_not_overlap_are_refused(horizontal_link: Any) -> None:
     imu, joint = horizontal_link.sine(0.1, 8)
-    with pytest.raises(ValueError, match="inside the joint's window"):
+    with pytest.raises(DataError, match="inside the joint's window"):
         clock_delay(imu, joint, 60_000_000_000)
-    with pytest.raises(ValueError, match="Check the offset"):
+    with pytest.raises(DataError, match="Check the offset"):
         align(imu, joint, 60_000_000_000)
 
 

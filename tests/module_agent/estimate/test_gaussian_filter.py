@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from module_agent.estimate.gaussian_filter import gaussian_filter, kernel, passes
+from module_agent.model.errors import DataError
 
 
 def test_it_passes_0_9924_of_two_hertz_at_250_hertz() -> None:
@@ -34,7 +35,7 @@ def test_white_noise_shrinks_as_the_sum_of_the_squared_weights() -> None:
 
 
 def test_too_short_signals_and_even_filters_are_refused() -> None:
-    with pytest.raises(ValueError, match="at least 6"):
+    with pytest.raises(DataError, match="at least 6"):
         gaussian_filter(np.zeros(5))
     with pytest.raises(ValueError, match="odd"):
         gaussian_filter(np.zeros(50), taps=10)

@@ -11,6 +11,7 @@ from module_agent.estimate.joint_regression import JointRegression, regress_join
 from module_agent.estimate.observed_motion import ObservedMotion
 from module_agent.estimate.smoothing import SmoothMotion, smooth_imu
 from module_agent.estimate.windows import ImuWindow, JointWindow, align
+from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from module_agent.wire.messages import RegressionEstimate
 
@@ -144,16 +145,16 @@ def test_gravity_calibrates_the_scale_where_the_joint_turns_the_imu_in_it(link: 
 
 def test_an_imu_that_stands_still_is_refused_by_what_it_lacks(link: Any) -> None:
     still = link._replace(carried=0.1)
-    with pytest.raises(ValueError, match=r"turned by 0\.1 of what the joint did"):
+    with pytest.raises(DataError, match=r"turned by 0\.1 of what the joint did"):
         regressed(still, 0)
-    with pytest.raises(ValueError, match="at least one is needed"):
+    with pytest.raises(DataError, match="at least one is needed"):
         regress_joint([], None)
 
 
 def test_gaps_in_the_samples_are_refused(link: Any) -> None:
     imu, joint = link.sine(0.1, 0)
     kept = np.delete(np.arange(imu.t_ns.size), slice(300, 340))
-    with pytest.raises(ValueError, match="evenly spaced"):
+    with pytest.raises(DataError, match="evenly spaced"):
         seen((ImuWindow(*(column[kept] for column in imu)), joint))
 
 

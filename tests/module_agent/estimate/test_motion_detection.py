@@ -7,6 +7,7 @@ import pytest
 
 from module_agent.estimate.motion_detection import detect_motion
 from module_agent.estimate.windows import AlignedMotion, align
+from module_agent.model.errors import DataError
 
 
 def motions(hinge: Any, seed: int = 0) -> list[AlignedMotion]:
@@ -50,7 +51,7 @@ def test_a_constant_motion_alone_is_enough(horizontal_link: Any) -> None:
 
 def test_a_joint_at_rest_is_refused(horizontal_link: Any) -> None:
     still = align(*horizontal_link._replace(noise=0.0).sine(0.0, 0), 0)
-    with pytest.raises(ValueError, match="turned at only"):
+    with pytest.raises(DataError, match="turned at only"):
         detect_motion([still], horizontal_link.gyro_offset)
-    with pytest.raises(ValueError, match="no motion"):
+    with pytest.raises(DataError, match="no motion"):
         detect_motion([], horizontal_link.gyro_offset)

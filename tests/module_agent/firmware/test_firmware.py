@@ -15,6 +15,7 @@ from module_agent.firmware.firmware import Answer, Incoming, Publication
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
 from module_agent.hardware.hardware import SensorSample
 from module_agent.model.catalogue import CATALOGUE
+from module_agent.model.errors import UsageError
 from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import STATE_NAMES, unpack
 from module_agent.wire.keys import Leaf
@@ -595,5 +596,5 @@ def test_every_transition_leads_to_a_state_that_can_be_left_again() -> None:
 )
 def test_a_configuration_that_cannot_be_run_is_refused(settings: dict[str, Any]) -> None:
     kind = CATALOGUE["X5-1"]
-    with pytest.raises(ValueError, match="must be"):
+    with pytest.raises(UsageError, match="must be"):
         check_config(FirmwareConfig("A", kind, 1, catalogue_limits(kind), **settings))

@@ -8,6 +8,7 @@ from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.information import (
     JointInformation,
     compress,
@@ -108,7 +109,7 @@ def test_further_columns_are_carried_beside_those_of_the_bodies(rng: Generator) 
         assert one.r.shape[1] == 22
         assert far(one, other) < EXACT
         assert far(unpack(pack(one)), one) == 0.0
-    with pytest.raises(ValueError, match="22 columns cannot be merged with that in 20"):
+    with pytest.raises(DataError, match="22 columns cannot be merged with that in 20"):
         merge_joint(half[0], gather(chain, q, qd, qdd, tau)[0])
 
 
@@ -130,7 +131,7 @@ def test_the_bytes_hold_every_double_as_it_is(joints: int, samples: int, seed: i
 def test_bytes_of_anybody_are_refused_or_are_information(block: bytes) -> None:
     try:
         found = unpack(block)
-    except ValueError:
+    except DataError:
         return
     assert np.isfinite(found.r).all()
 
@@ -144,13 +145,13 @@ def test_bytes_that_lie_are_refused_by_what_is_wrong(rng: Generator) -> None:
         (block[:28] + b"\x63\x00" + block[30:], "out of order"),
         (block[:-8] + np.array([np.nan]).tobytes(), "not finite"),
     ):
-        with pytest.raises(ValueError, match=why):
+        with pytest.raises(DataError, match=why):
             unpack(wrong)
 
 
 def test_rows_that_are_not_triangular_are_not_packed(rng: Generator) -> None:
     full = JointInformation(rng.normal(size=(5, 10)), np.zeros(5), 0.0, 5)
-    with pytest.raises(ValueError, match="triangular"):
+    with pytest.raises(DataError, match="triangular"):
         pack(full)
 
 

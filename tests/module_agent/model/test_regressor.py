@@ -9,6 +9,7 @@ from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
 from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.regressor import PER_BODY, inverse_dynamics, torque_regressor
 
@@ -220,7 +221,7 @@ def test_wrong_shapes_and_values_are_named(rng: Generator) -> None:
     q, qd, qdd = random_motion(rng, 4, 2)
     with pytest.raises(ValueError, match=r"qd_rad_s has shape \(4, 1\)"):
         torque_regressor(chain, q, qd[:, :1], qdd)
-    with pytest.raises(ValueError, match="q_rad holds a value that is not finite"):
+    with pytest.raises(DataError, match="q_rad holds a value that is not finite"):
         torque_regressor(chain, np.full_like(q, np.nan), qd, qdd)
     with pytest.raises(ValueError, match="phi has 10 values; a chain of 2 joints needs 20"):
         inverse_dynamics(chain, np.ones(10), q, qd, qdd)

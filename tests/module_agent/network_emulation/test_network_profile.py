@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from module_agent.model.errors import UsageError
 from module_agent.network_emulation.channel import Channel
 from module_agent.network_emulation.profile import (
     PROFILES,
@@ -180,5 +181,5 @@ def test_what_is_computed_of_a_profile_is_what_its_channels_do() -> None:
 
 
 def test_an_unknown_name_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(KeyError, match=f"'pigeons'; known are {', '.join(PROFILES)}"):
+    with pytest.raises(UsageError, match=f"'pigeons'; known are {', '.join(PROFILES)}"):
         profile("pigeons")

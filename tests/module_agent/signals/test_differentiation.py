@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 
+from module_agent.model.errors import DataError
 from module_agent.signals.filtering import (
     differentiate,
     filtered_motion,
@@ -43,7 +44,7 @@ def test_noise_above_the_cutoff_is_gone() -> None:
 
 @pytest.mark.parametrize("cutoff_hz", [0.0, 125.0, -1.0])
 def test_a_cutoff_beyond_half_the_rate_is_refused(cutoff_hz: float) -> None:
-    with pytest.raises(ValueError, match=r"outside 0 to 125\.0"):
+    with pytest.raises(DataError, match=r"outside 0 to 125\.0"):
         zero_phase_low_pass(np.zeros(1000), RATE_HZ, cutoff_hz)
 
 
@@ -75,7 +76,7 @@ def test_clocks_that_drift_apart_come_onto_one_time_base(rng: Generator) -> None
 def test_nothing_is_extrapolated_and_no_hole_is_bridged_in_silence() -> None:
     t = np.arange(100) * 4_000_000
     x = np.zeros(100)
-    with pytest.raises(ValueError, match="column 1 has samples from 4000000 to 396000000 ns"):
+    with pytest.raises(DataError, match="column 1 has samples from 4000000 to 396000000 ns"):
         resample([t, t[1:]], [x, x[1:]], t)
     with pytest.raises(ValueError, match=r"column 0 has a hole of 64\.0 ms before sample 30"):
         resample([np.delete(t, slice(30, 45))], [np.delete(x, slice(30, 45))], t)
@@ -116,5 +117,5 @@ def test_the_motion_is_read_only_and_needs_uniform_times() -> None:
     assert motion.q_rad.shape == (500 - 2 * edge, 2)
     assert not any(signal.flags.writeable for signal in motion)
     t_ns[100:] += 500_000
-    with pytest.raises(ValueError, match=r"sample 100 is 500\.0 us off"):
+    with pytest.raises(DataError, match=r"sample 100 is 500\.0 us off"):
         filtered_motion(t_ns, x, x, x, RATE_HZ, 20.0)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from module_agent.model.errors import UsageError
 from sim.benchmark.case import Case, Failed, Summary, Trial, concluded, trial_seed
 from sim.benchmark.report import SCHEMA, Cost, Results, gathered, plot, write_results
 from sim.benchmark.row import Row
@@ -92,7 +93,7 @@ def test_the_picture_shows_every_case_under_its_figure(tmp_path: Path) -> None:
 
 
 def test_without_a_bar_there_is_nothing_to_draw(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no row has a bar"):
+    with pytest.raises(UsageError, match="no row has a bar"):
         plot([ROWS[3]], tmp_path / "found.png")
 
 

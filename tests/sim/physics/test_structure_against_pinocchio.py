@@ -12,7 +12,7 @@ from scipy.linalg import eigh
 from sim.actuator.actuator import SPRING_LOSS_S, Actuators
 from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, switched
-from sim.physics.equilibrium import equilibrium
+from sim.physics.equilibrium import FallsOver, equilibrium
 from sim.physics.multibody import Multibody
 from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import Skeleton, build_skeleton
@@ -356,5 +356,5 @@ def test_a_base_too_soft_to_carry_its_robot_is_refused() -> None:
     text += 'type = "X5-9"\nparent = "base"\nlink = { tube = { length_m = 0.5 } }\n'
     text += '[[module]]\nserial = "b"\ntype = "X5-9"\nparent = "a"\n'
     text += "link = { pose = { xyz_m = [0.0, 0.0, 0.5] } }\n"
-    with pytest.raises(ValueError, match="'soft' falls over"):
+    with pytest.raises(FallsOver, match="'soft' falls over"):
         World(parse_robot(text, "soft.toml"), seed=1, noise=GIVING)

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from module_agent.model.errors import UsageError
 from module_agent.network_emulation.profile import NetworkProfile, PathProfile, profile
 from sim.processes.link_emulator import counts_by_address, host
 from sim.processes.packet_switch import PacketSwitch
@@ -130,5 +131,5 @@ def test_a_host_is_a_namespace_and_an_address_with_its_network() -> None:
     assert str(found.namespace) == "/proc/4711/ns/net"
     assert str(found.interface) == "10.77.0.1/24"
     for wrong in ("10.77.0.1", "/proc/1/ns/net=here"):
-        with pytest.raises(ValueError, match=r"it must look like /proc/4711/ns/net=10\.77\.0\.1/24"):
+        with pytest.raises(UsageError, match=r"it must look like /proc/4711/ns/net=10\.77\.0\.1/24"):
             host(wrong)

@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from coordinator.torque_control.feed_forward import Reference
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import CATALOGUE
+from module_agent.model.errors import UsageError
 from sim.benchmark.case import Trial
 from sim.benchmark.workers import Done
 from sim.commands.assistance import assistance_table
@@ -171,7 +172,7 @@ def test_without_velocity_no_set_point_of_it_acts() -> None:
 
 
 def test_an_unknown_setting_is_answered_with_those_that_there_are() -> None:
-    with pytest.raises(KeyError, match="no PID setting '#7'; the thesis has #1, #2, #3, #4, #5, #6"):
+    with pytest.raises(UsageError, match="no PID setting '#7'; the thesis has #1, #2, #3, #4, #5, #6"):
         setting("#7")
 
 

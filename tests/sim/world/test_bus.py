@@ -28,6 +28,7 @@ from module_agent.hardware.bus_frames import (
 )
 from module_agent.hardware.hardware import HardwareLost, SensorSample
 from module_agent.hardware.wires import WiredModule
+from module_agent.model.errors import UsageError
 from sim.world.bus_server import BusInUse, BusServer
 
 ROOT = Path(__file__).parents[3]
@@ -328,13 +329,13 @@ def test_a_second_world_on_the_same_path_is_refused_and_harms_nothing(path) -> N
 
 def test_a_file_in_the_way_is_left_alone(path) -> None:
     Path(path).write_text("precious")
-    with pytest.raises(OSError, match="not a socket"):
+    with pytest.raises(UsageError, match="not a socket"):
         BusServer(path, EchoWorld(["A"]))
     assert Path(path).read_text() == "precious"
 
 
 def test_a_path_that_is_too_long_is_explained(tmp_path) -> None:
-    with pytest.raises(OSError, match="107 bytes"):
+    with pytest.raises(UsageError, match="107 bytes"):
         BusServer(str(tmp_path / ("x" * 120)), EchoWorld(["A"]))
 
 

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from module_agent.model.chain import Chain
+from module_agent.model.errors import UsageError
 from module_agent.model.forward_kinematics import body_displacements
 from sim.geometry.link_parts import FreePose
 from sim.geometry.pose import Array
@@ -129,7 +130,7 @@ def test_a_push_is_read_from_one_line_with_or_without_quotation_marks() -> None:
     ],
 )
 def test_a_text_that_is_no_push_is_refused_with_the_key_and_an_example(text: str, words: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(words)) as refused:
+    with pytest.raises(UsageError, match=re.escape(words)) as refused:
         parse_push(text)
     assert "one is serial=X-00011" in str(refused.value)
 

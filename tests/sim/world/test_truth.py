@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from module_agent.model.errors import DataError
 from sim.robot.robot_file import load_robot
 from sim.sensors.module_clock import module_time
 from sim.world.truth import Truth, TruthLog, read_motion, read_truth, truth_of, write_truth
@@ -60,7 +61,7 @@ def test_truth_written_before_sensors_had_more_errors_than_biases_is_read(tmp_pa
 def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "truth.json"
     path.write_text(json.dumps({"version": 99}))
-    with pytest.raises(ValueError, match="version 1"):
+    with pytest.raises(DataError, match="version 1"):
         read_truth(path)
 
 

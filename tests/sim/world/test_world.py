@@ -6,6 +6,7 @@ import pytest
 
 from module_agent.hardware.hardware import HardwareLost, SensorSample
 from module_agent.hardware.wires import Wires
+from module_agent.model.errors import UsageError
 from sim.robot.robot_file import Robot, load_robot, parse_robot
 from sim.robot.robot_tree import true_chain
 from sim.sensors.module_clock import module_time
@@ -205,5 +206,5 @@ def test_a_world_takes_the_robots_own_noise_unless_told_otherwise() -> None:
     ideal = World(robot, seed=1, noise="ideal")
     assert not any(ideal.imu_bias.ravel())
     assert [c.offset_ns for c in ideal.clocks] == [0, 0, 0]
-    with pytest.raises(KeyError, match="known are ideal, x5"):
+    with pytest.raises(UsageError, match="known are ideal, x5"):
         World(robot, seed=1, noise="quiet")
