@@ -246,7 +246,7 @@ def test_what_does_not_fit_is_named_and_results_cannot_be_written_to(rng: Genera
     with pytest.raises(ValueError, match=r"common errors \(4, 1\) must be finite, 5 rows"):
         base_parameters(np.ones((5, 10)), np.ones(5), columns, common_errors=np.ones((4, 1)))
     pieces = gather(random_tree(rng, 1), *motion(rng, 20, 1), np.ones((20, 1)))
-    with pytest.raises(ValueError, match="sigma_nm must be 1 positive numbers, one per joint"):
+    with pytest.raises(DataError, match="sigma_nm must be 1 positive numbers, one per joint"):
         whitened(pieces, [0.0])
     with pytest.raises(ValueError, match="independent_fraction is 2"):
         whitened(pieces, [1.0], 2.0)

@@ -225,7 +225,7 @@ def test_what_does_not_fit_is_named(rng: Generator) -> None:
     tau = y @ bodies(rng, 2)
     with pytest.raises(ValueError, match=r"regressor \(40, 2, 20\) and torques \(39, 2\) do not fit"):
         solve_pseudo_inverse(y, tau[:-1])
-    with pytest.raises(ValueError, match="weights must be 2 positive numbers"):
+    with pytest.raises(DataError, match="weights must be 2 positive numbers"):
         solve_pseudo_inverse(y, tau, weights=[1.0, 0.0])
     with pytest.raises(ValueError, match="prior_phi must be 20 finite numbers; got 10"):
         solve_pseudo_inverse(y, tau, prior_phi=np.zeros(10))

@@ -109,7 +109,7 @@ def test_further_columns_are_carried_beside_those_of_the_bodies(rng: Generator) 
         assert one.r.shape[1] == 22
         assert far(one, other) < EXACT
         assert far(unpack(pack(one)), one) == 0.0
-    with pytest.raises(DataError, match="22 columns cannot be merged with that in 20"):
+    with pytest.raises(ValueError, match="22 columns cannot be merged with that in 20"):
         merge_joint(half[0], gather(chain, q, qd, qdd, tau)[0])
 
 
