@@ -8,6 +8,7 @@ from urllib.parse import quote, urlsplit
 
 from coordinator.viewer import viewer_process
 from coordinator.viewer.scene import entity_paths
+from module_agent.model.errors import UsageError
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -50,13 +51,13 @@ def viewer_choice(text: str) -> ViewerChoice:
     """Parse `none`, `spawn`, `serve` or an address.
 
     Raises:
-        ValueError: none of these; the message lists what is allowed.
+        UsageError: none of these; the message lists what is allowed.
     """
     if text in ("none", "spawn", "serve"):
         return ViewerChoice(text == "spawn", text == "serve")
     scheme, separator, rest = text.partition("://")
     if scheme not in SCHEMES or not separator or not rest:
-        raise ValueError(
+        raise UsageError(
             f"--viewer {text}: it must be none, spawn, serve or an address like {proxy_url(NATIVE_PORT)}"
         )
     return ViewerChoice(connect=text)

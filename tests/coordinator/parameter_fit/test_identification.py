@@ -167,13 +167,13 @@ def test_information_merges_exactly_in_any_order_and_does_not_grow(rng: Generato
     torques = [torque_regressor(chain, *part) @ bodies(rng, 3) for part in parts]
     pieces = [gather(chain, *part, tau) for part, tau in zip(parts, torques, strict=True)]
     whole = [np.concatenate(signal) for signal in zip(*parts, strict=True)]
-    merged = solve_pseudo_inverse(torque_regressor(chain, *whole), np.concatenate(torques))
+    at_once = solve_pseudo_inverse(torque_regressor(chain, *whole), np.concatenate(torques))
     for order in ((0, 1, 2), (2, 0, 1)):
         merged = merge(merge(pieces[order[0]], pieces[order[1]]), pieces[order[2]])
         assert [piece.r.shape for piece in merged] == [(30, 30), (20, 30), (10, 30)]
         fit = solve_information(merged)
-        np.testing.assert_allclose(fit.phi, merged.phi, atol=1e-9 * merged.condition)
-        np.testing.assert_allclose(fit.residual_rms_nm, merged.residual_rms_nm, rtol=1e-9)
+        np.testing.assert_allclose(fit.phi, at_once.phi, atol=1e-9 * at_once.condition)
+        np.testing.assert_allclose(fit.residual_rms_nm, at_once.residual_rms_nm, rtol=1e-9)
         assert fit.samples.tolist() == [247] * 3
 
 
