@@ -13,8 +13,8 @@ from coordinator.commands.monitor_view import MonitorScreen
 from coordinator.commands.options import ConnectOptions, DynamicsFolder, Speed
 from coordinator.live_robot.connection import Place, open_connection, sender_name
 from coordinator.live_robot.messenger import Messenger
-from coordinator.monitoring.live import KEPT_ROWS, LOOK_S, LiveMonitor
-from coordinator.monitoring.monitor import Watcher
+from coordinator.monitoring.live import RETAINED_ROWS, UPDATE_S, LiveMonitor
+from coordinator.monitoring.monitor import Monitor
 from coordinator.monitoring.reference import build_reference
 from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
 from coordinator.recording.recording import Recording
@@ -58,24 +58,24 @@ def monitor_robot(
     if recording is not None and not recording.is_file():
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
     reference = build_reference(load_baseline(baseline))
-    watcher = Watcher(reference, alarms_per_hour)
+    monitor = Monitor(reference, alarms_per_hour)
     try:
-        screen = MonitorScreen(watcher, json_file, at.quiet)
+        screen = MonitorScreen(monitor, json_file, at.quiet)
     except OSError as error:
         raise UsageError(f"{json_file}: {error.strerror or error}") from error
     with screen:
         if recording is not None:
-            _monitor_file(watcher, screen, recording)
+            _monitor_file(monitor, screen, recording)
         else:
-            _monitor_live(watcher, screen, at.place(reference.name), for_s, check_speed(speed))
-        screen.sum_up()
-    if watcher.ledger.all:
+            _monitor_live(monitor, screen, at.place(reference.name), for_s, check_speed(speed))
+        screen.show_summary()
+    if monitor.finding_log.all:
         raise typer.Exit(EXIT_FINDING)
 
 
-def _monitor_file(watcher: Watcher, screen: MonitorScreen, path: Path) -> None:
+def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
     """Monitor a recorded session as if it were live."""
-    serials = watcher.reference.chain.serials
+    serials = monitor.reference.chain.serials
     try:
         whole = load_recording(path)
         missing = [s for s in serials if s not in whole.modules or not whole.modules[s].round_trips]
@@ -90,27 +90,27 @@ def _monitor_file(watcher: Watcher, screen: MonitorScreen, path: Path) -> None:
                 recording.add(entry)
             except WireError:
                 continue  # counted by the recording, by reason
-            if entry.t_ns - looked_ns > LOOK_S * 1e9:
+            if entry.t_ns - looked_ns > UPDATE_S * 1e9:
                 looked_ns = entry.t_ns
-                screen.say(watcher.advance(recording, clocks))
+                screen.report(monitor.advance(recording, clocks))
                 for module in recording.modules.values():
-                    module.rows.forget_before(module.rows.end_row - KEPT_ROWS)
-        screen.say(watcher.advance(recording, clocks))
+                    module.rows.forget_before(module.rows.end_row - RETAINED_ROWS)
+        screen.report(monitor.advance(recording, clocks))
     except SessionFileError as error:
         raise DataError(str(error)) from error
 
 
 def _monitor_live(
-    watcher: Watcher, screen: MonitorScreen, place: Place, for_s: float | None, speed: float
+    monitor: Monitor, screen: MonitorScreen, place: Place, for_s: float | None, speed: float
 ) -> None:
     """Monitor until the time is up, or a signal comes."""
     transport = open_connection(place, Terminal().note).transport
     loop = ScaledLoop(speed)
     try:
         screen.start_ns = loop.clock_ns()
-        live = LiveMonitor(watcher, loop.clock_ns, sender_name(), screen.say)
+        live = LiveMonitor(monitor, loop.clock_ns, sender_name(), screen.report)
         radio = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
-        task = loop.create_task(_attend(live, radio, watcher, for_s, loop.clock_ns))
+        task = loop.create_task(_attend(live, radio, monitor, for_s, loop.clock_ns))
         for number in SIGNALS:
             loop.add_signal_handler(number, task.cancel)
         # A signal cancels the task; the summary of the findings follows.
@@ -118,8 +118,8 @@ def _monitor_live(
             loop.run_until_complete(task)
     finally:
         loop.close()
-    if not watcher.looked_s:
-        serials = ", ".join(watcher.reference.chain.serials)
+    if not monitor.monitored_s:
+        serials = ", ".join(monitor.reference.chain.serials)
         raise RobotError(
             f"not all modules of robot {place.robot!r} sent feedback within {_FIRST_FEEDBACK_S:.0f} s; "
             f"needed: {serials}"
@@ -127,13 +127,13 @@ def _monitor_live(
 
 
 async def _attend(
-    live: LiveMonitor, radio: Messenger, watcher: Watcher, for_s: float | None, clock: Callable[[], int]
+    live: LiveMonitor, radio: Messenger, monitor: Monitor, for_s: float | None, clock: Callable[[], int]
 ) -> None:
     start_ns = clock()
     radio.start()
     try:
-        await live.watch(radio, start_ns + round(_FIRST_FEEDBACK_S * 1e9), lambda: watcher.looked_s > 0.0)
-        if watcher.looked_s > 0.0:
+        await live.watch(radio, start_ns + round(_FIRST_FEEDBACK_S * 1e9), lambda: monitor.monitored_s > 0.0)
+        if monitor.monitored_s > 0.0:
             await live.watch(radio, None if for_s is None else clock() + round(for_s * 1e9))
     finally:
         radio.close()

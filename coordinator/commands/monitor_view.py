@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from coordinator.monitoring.findings import Finding, Key
-from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 
 _NOTES = 6
 
@@ -20,9 +20,9 @@ _NOTES = 6
 class MonitorScreen:
     """Shows what a watcher says. Times are seconds since `start_ns`, which is set before anything is said."""
 
-    def __init__(self, watcher: Watcher, json_file: Path | None, quiet: bool = False):
+    def __init__(self, monitor: Monitor, json_file: Path | None, quiet: bool = False):
         self.start_ns = 0
-        self._watcher = watcher
+        self._watcher = monitor
         self._file: TextIO | None = json_file.open("w", encoding="utf-8") if json_file else None
         self._console = Console(highlight=False, quiet=quiet)
         self._live: Live | None = None
@@ -43,31 +43,31 @@ class MonitorScreen:
         if self._file is not None:
             self._file.close()
 
-    def say(self, heard: Heard) -> None:
+    def report(self, update: MonitorUpdate) -> None:
         """Show what is new."""
-        for note in heard.notes:
+        for note in update.notes:
             self._line(note)
             self._write({"note": note})
-        for finding in heard.findings:
+        for finding in update.findings:
             self._line(self.sentence(finding))
             self._write({"finding": finding.model_dump()})
-        for key in heard.withdrawn:
+        for key in update.withdrawn:
             self._line(f"taken back: {_named(key, self.start_ns)}; what is said above explains it")
             self._write({"withdrawn": list(key)})
 
-    def sum_up(self) -> None:
+    def show_summary(self) -> None:
         """Show all that was found, as it is held at the end."""
-        found, watcher = self._watcher.ledger.all, self._watcher
+        found, monitor = self._watcher.finding_log.all, self._watcher
         self._write(
             {
-                "watched_s": round(watcher.looked_s, 3),
+                "watched_s": round(monitor.monitored_s, 3),
                 "findings": [finding.model_dump() for finding in found],
             }
         )
         if self._live is not None:
             self._live.refresh()
             return
-        self._console.print(f"watched for {watcher.looked_s:.1f} s", markup=False)
+        self._console.print(f"watched for {monitor.monitored_s:.1f} s", markup=False)
         for finding in found:
             self._console.print(f"  {self.sentence(finding)}", markup=False, soft_wrap=True)
         if not found:
@@ -92,12 +92,14 @@ class MonitorScreen:
             self._file.flush()
 
     def _shown(self) -> Group:
-        watcher, outside = self._watcher, self._watcher.outside_nm
-        table = Table("joint", "from outside [Nm]", "level [Nm]", title=f"{watcher.looked_s:.0f} s watched")
-        for k, serial in enumerate(watcher.reference.chain.serials):
+        monitor, outside = self._watcher, self._watcher.outside_nm
+        table = Table(
+            "joint", "from outside [Nm]", "level [Nm]", title=f"{monitor.monitored_s:.0f} s watched"
+        )
+        for k, serial in enumerate(monitor.reference.chain.serials):
             now = "-" if outside is None else f"{outside[k]:+.2f}"
-            table.add_row(serial, now, f"{watcher.thresholds.contact_nm[k]:.2f}")
-        return Group(table, *_lines(self.sentence(f) for f in watcher.ledger.all), *_lines(self._notes))
+            table.add_row(serial, now, f"{monitor.thresholds.contact_nm[k]:.2f}")
+        return Group(table, *_lines(self.sentence(f) for f in monitor.finding_log.all), *_lines(self._notes))
 
 
 def _lines(texts: Iterable[str]) -> list[Text]:

@@ -11,9 +11,9 @@ from module_agent.model.chain import Array
 
 # What begins anew is not believed before it has settled.
 _SETTLING_NS = 800_000_000
-_KEPT_NS = 20_000_000_000
+_RETAINED_NS = 20_000_000_000
 # Of the torque that has come on: so much of it is no more exactly as the changed model has it.
-_LADEN_SHARE = 0.2
+_LOADED_SHARE = 0.2
 _REMEMBER_S = 10.0
 
 
@@ -46,7 +46,7 @@ class CollisionDetector:
         The levels rise by a share of what the robot was loaded with when it was judged by the former ones.
         """
         self._observer = MomentumObserver(self._chain, phi, RATE_HZ)
-        self._detector = ContactDetector(self._level_nm + _LADEN_SHARE * self._largest_nm)
+        self._detector = ContactDetector(self._level_nm + _LOADED_SHARE * self._largest_nm)
         self.reset()
 
     def advance(self, block: Block) -> list[Contact]:
@@ -59,10 +59,10 @@ class CollisionDetector:
         if self._settled_ns is None:
             self._settled_ns = int(block.t_ns[0]) + _SETTLING_NS
         kept = block.t_ns >= self._settled_ns
-        said = self._detector.advance(block.t_ns[kept], fast[kept])
-        for contact in said:
+        findings = self._detector.advance(block.t_ns[kept], fast[kept])
+        for contact in findings:
             self.contacts = [c for c in self.contacts if c.start_ns != contact.start_ns]
             self.contacts.append(contact)
-        oldest = int(block.t_ns[-1]) - _KEPT_NS
+        oldest = int(block.t_ns[-1]) - _RETAINED_NS
         self.contacts = [c for c in self.contacts if c.end_ns is None or c.end_ns > oldest]
-        return said
+        return findings

@@ -113,7 +113,7 @@ class ContactDetector:
 
     def advance(self, t_ns: NDArray[np.int64], fast_nm: Array) -> list[Contact]:
         """Take the next samples, (m,) and (m, n); return contacts that begin or end in them."""
-        said = []
+        findings = []
         for at_ns, sample in zip(t_ns, fast_nm, strict=True):
             at = int(at_ns)
             share = np.abs(sample) / self.level_nm
@@ -122,16 +122,16 @@ class ContactDetector:
                 if (self._above >= IN_A_ROW).any():
                     self._now = Contact(at, None, (), np.zeros_like(sample))
                     self._now = self._grown(self._now, sample)
-                    said.append(self._now)
+                    findings.append(self._now)
                     self._quiet_ns = at
                 continue
             self._now = self._grown(self._now, sample)
             if (share > 1.0).any():
                 self._quiet_ns = at
             elif at - self._quiet_ns > OVER_S * 1e9:
-                said.append(self._now._replace(end_ns=self._quiet_ns))
+                findings.append(self._now._replace(end_ns=self._quiet_ns))
                 self._now = None
-        return said
+        return findings
 
     def _grown(self, contact: Contact, sample: Array) -> Contact:
         larger = np.abs(sample) > np.abs(contact.peak_nm)

@@ -11,16 +11,16 @@ import numpy as np
 from scipy.stats import chi2
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
-from coordinator.monitoring.likelihood_ratio import Change, Evidence, joined, without_own
+from coordinator.monitoring.likelihood_ratio import Change, WhitenedRows, joined, without_own
 from coordinator.monitoring.reference import Reference
 from coordinator.monitoring.residual_tests import (
-    LARGE_KG,
+    UNIT_PAYLOAD_KG,
     displacement,
-    drive_evidence,
     drive_window,
-    imu_evidence,
+    imu_rows,
     information_of,
-    torque_evidence,
+    torque_rows,
+    whitened_drive_rows,
 )
 from coordinator.monitoring.segments import DataSegment
 from coordinator.monitoring.thresholds import Thresholds
@@ -34,21 +34,21 @@ from module_agent.model.regressor import PER_BODY
 # What nobody would call a displaced link: IMUs sit on boards, and links give by as much.
 MIN_SHIFT_M, MIN_TURN_RAD = 3e-3, 3e-3
 # Under a payload links give by more than they did; what that is taken for is below.
-LADEN_SHIFT_M, LADEN_TURN_RAD = 6e-3, 6e-3
+LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3
 # Friction changes by more than that with the weather.
 MIN_FRICTION = 0.1
 # A payload leaves no more of the misfit than chance does in one window of so many.
 ONE_IN = 1e4
 
 
-class Piece(NamedTuple):
+class SegmentInformation(NamedTuple):
     """What one stretch says: evidence of torques, IMUs (own parameters first) and every drive."""
 
     start_ns: int
     end_ns: int
     information: tuple[JointInformation, ...]
-    imu: Evidence
-    drives: tuple[Evidence | None, ...]
+    imu: WhitenedRows
+    drives: tuple[WhitenedRows | None, ...]
 
 
 class LinkShift(NamedTuple):
@@ -93,45 +93,47 @@ class Diagnosis(NamedTuple):
     load: LoadShift | None
 
 
-def piece_of(reference: Reference, stretch: DataSegment) -> Piece:
+def segment_information(reference: Reference, segment: DataSegment) -> SegmentInformation:
     """Return what a stretch says."""
     drives = tuple(
-        drive_evidence(model, stretch, joint) for joint, model in enumerate(reference.drive_models)
+        whitened_drive_rows(model, segment, joint) for joint, model in enumerate(reference.drive_models)
     )
-    return Piece(
-        int(stretch.t_ns[0]),
-        int(stretch.t_ns[-1]),
-        information_of(reference.chain, stretch),
-        imu_evidence(reference.imu_model, stretch),
+    return SegmentInformation(
+        int(segment.t_ns[0]),
+        int(segment.t_ns[-1]),
+        information_of(reference.chain, segment),
+        imu_rows(reference.imu_model, segment),
         drives,
     )
 
 
-def judge(
-    reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece], laden: bool = False
+def diagnose(
+    reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool = False
 ) -> Diagnosis:
     """Judge a window of one piece at least, of stretches in which no blow met the robot.
 
     laden: whether the robot is known to carry a payload.
     """
     return Diagnosis(
-        _drives(reference, thresholds, pieces),
-        _link(reference, thresholds, pieces, laden),
-        _load(reference, thresholds, pieces),
+        _drives(reference, thresholds, window),
+        _link(reference, thresholds, window, loaded),
+        _load(reference, thresholds, window),
     )
 
 
-def information_in(pieces: Sequence[Piece]) -> tuple[JointInformation, ...]:
+def information_in(window: Sequence[SegmentInformation]) -> tuple[JointInformation, ...]:
     """Return what all pieces say of the inertial parameters."""
-    whole = pieces[0].information
-    for piece in pieces[1:]:
-        whole = merge(whole, piece.information)
+    whole = window[0].information
+    for segment in window[1:]:
+        whole = merge(whole, segment.information)
     return whole
 
 
-def weigh(reference: Reference, pieces: Sequence[Piece], load: LoadShift) -> Payload | None:
+def weigh_payload(
+    reference: Reference, window: Sequence[SegmentInformation], load: LoadShift
+) -> Payload | None:
     """Return a payload that can exist on the body that carries it, or has lost it; None if there is none."""
-    later, before = information_in(pieces), reference.information
+    later, before = information_in(window), reference.information
     if load.taken_off:
         later, before = before, later
     try:
@@ -146,10 +148,12 @@ def weigh(reference: Reference, pieces: Sequence[Piece], load: LoadShift) -> Pay
         return None
 
 
-def _drives(reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece]) -> tuple[DriveShift, ...]:
+def _drives(
+    reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation]
+) -> tuple[DriveShift, ...]:
     found = []
     for joint, (model, known) in enumerate(zip(reference.drive_models, reference.drives, strict=True)):
-        parts = [piece.drives[joint] for piece in pieces]
+        parts = [segment.drives[joint] for segment in window]
         told = [part for part in parts if part is not None]
         if known is None or not told:
             continue
@@ -163,19 +167,19 @@ def _drives(reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece
 
 
 def _link(
-    reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece], laden: bool
+    reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool
 ) -> LinkShift | None:
     children = reference.chain.linked
     if not children:
         return None
-    later = without_own(joined([piece.imu for piece in pieces]), reference.imu_model.own_sigma)
+    later = without_own(joined([segment.imu for segment in window]), reference.imu_model.own_sigma)
     found = reference.imu.test(later)
     best = found.changes[found.best]
     if best.gain < thresholds.link:
         return None
     child = children[found.best]
     shift_m, sigma_m, turn_rad = _length(reference, child, best)
-    least = (LADEN_SHIFT_M, LADEN_TURN_RAD) if laden else (MIN_SHIFT_M, MIN_TURN_RAD)
+    least = (LOADED_SHIFT_M, LOADED_TURN_RAD) if loaded else (MIN_SHIFT_M, MIN_TURN_RAD)
     if shift_m < least[0] + 2.0 * sigma_m and turn_rad < least[1]:
         return None
     return LinkShift(child, shift_m, sigma_m, turn_rad, best.gain)
@@ -190,13 +194,15 @@ def _length(reference: Reference, child: int, change: Change) -> tuple[float, fl
     return length, float(np.sqrt(slope @ change.covariance @ slope)), float(np.linalg.norm(turn))
 
 
-def _load(reference: Reference, thresholds: Thresholds, pieces: Sequence[Piece]) -> LoadShift | None:
-    later = torque_evidence(information_in(pieces), reference.phi, reference.torque_sigma_nm)
+def _load(
+    reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation]
+) -> LoadShift | None:
+    later = torque_rows(information_in(window), reference.phi, reference.torque_sigma_nm)
     found = reference.torque.test(later)
     best: Change = found.changes[found.best]
     if best.gain < thresholds.payload:
         return None
-    change = LARGE_KG * parameter_scale(1) * best.size
+    change = UNIT_PAYLOAD_KG * parameter_scale(1) * best.size
     return LoadShift(found.best, best.gain, found.misfit - best.gain, change)
 
 

@@ -37,8 +37,8 @@ class Finding(BaseModel):
     kind: Kind
     serial: str
     since_ns: int
-    found_ns: int
-    said_ns: int
+    detected_ns: int
+    reported_ns: int
     until_ns: int | None
     size: float
     sigma: float
@@ -64,7 +64,7 @@ class Finding(BaseModel):
 Key = tuple[str, str | int]
 
 # A size is said again when it moved by more than this share of itself, and by more than two sigmas.
-WORTH_SAYING = 0.1
+REPORTED_CHANGE = 0.1
 # A change that no window has shown for so long is over: longer than the longest window.
 OVER_NS = 8_000_000_000
 
@@ -75,8 +75,8 @@ class FindingLog:
     def __init__(self) -> None:
         self.held: dict[Key, Finding] = {}
         self.ended: list[Finding] = []
-        self._said: dict[Key, Finding] = {}
-        self._seen_ns: dict[Key, int] = {}
+        self._reported: dict[Key, Finding] = {}
+        self._observed_ns: dict[Key, int] = {}
 
     @property
     def all(self) -> tuple[Finding, ...]:
@@ -87,48 +87,50 @@ class FindingLog:
         """Take in a finding; return it if it is worth saying."""
         earlier = self.held.get(finding.key)
         if earlier is not None and earlier.kind == finding.kind:
-            known = {"since_ns": earlier.since_ns, "found_ns": earlier.found_ns}
+            known = {"since_ns": earlier.since_ns, "found_ns": earlier.detected_ns}
             finding = finding.model_copy(update=known)
-        self._seen_ns[finding.key] = finding.said_ns
+        self._observed_ns[finding.key] = finding.reported_ns
         self.held[finding.key] = finding
-        if not _news(self._said.get(finding.key), finding):
+        if not _news(self._reported.get(finding.key), finding):
             return []
-        self._said[finding.key] = finding
+        self._reported[finding.key] = finding
         return [finding]
 
-    def see(self, key: Key, now_ns: int) -> None:
+    def observe(self, key: Key, now_ns: int) -> None:
         """Note that a finding still holds."""
-        self._seen_ns[key] = now_ns
+        self._observed_ns[key] = now_ns
 
     def withdraw(self, keys: Iterable[Key]) -> list[Key]:
         """Take back findings; return the keys of those that were held."""
-        gone = [key for key in keys if key in self.held]
-        for key in gone:
+        withdrawn = [key for key in keys if key in self.held]
+        for key in withdrawn:
             del self.held[key]
-            self._said.pop(key, None)
-        return gone
+            self._reported.pop(key, None)
+        return withdrawn
 
     def end_unseen(self, now_ns: int) -> list[Finding]:
         """End the changes that have not been seen of late; return them."""
-        said = []
+        findings = []
         for key, finding in list(self.held.items()):
             if finding.kind == "collision":
                 if finding.until_ns is not None and now_ns - finding.until_ns > OVER_NS:
                     self._end(key, finding)
-            elif now_ns - self._seen_ns[key] > OVER_NS:
-                said.append(finding.model_copy(update={"until_ns": self._seen_ns[key]}))
-                self._end(key, said[-1])
-        return said
+            elif now_ns - self._observed_ns[key] > OVER_NS:
+                findings.append(finding.model_copy(update={"until_ns": self._observed_ns[key]}))
+                self._end(key, findings[-1])
+        return findings
 
     def _end(self, key: Key, finding: Finding) -> None:
         self.ended.append(finding)
         self.withdraw([key])
 
 
-def _news(said: Finding | None, finding: Finding) -> bool:
-    if said is None or (said.kind, said.serial) != (finding.kind, finding.serial):
+def _news(findings: Finding | None, finding: Finding) -> bool:
+    if findings is None or (findings.kind, findings.serial) != (finding.kind, finding.serial):
         return True
-    if (said.until_ns is None) != (finding.until_ns is None):
+    if (findings.until_ns is None) != (finding.until_ns is None):
         return True
-    moved = abs(finding.size - said.size)
-    return finding.kind != "collision" and moved > max(WORTH_SAYING * abs(said.size), 2.0 * said.sigma)
+    moved = abs(finding.size - findings.size)
+    return finding.kind != "collision" and moved > max(
+        REPORTED_CHANGE * abs(findings.size), 2.0 * findings.sigma
+    )

@@ -23,7 +23,7 @@ from module_agent.model.chain import Array
 from module_agent.model.read_only import make_read_only
 
 
-class Evidence(NamedTuple):
+class WhitenedRows(NamedTuple):
     """Rows (k, p) and targets (k,) of a stretch of time, in standard deviations, read-only."""
 
     rows: Array
@@ -59,7 +59,7 @@ class ChangeTest(NamedTuple):
         return int(np.argmax([change.gain for change in self.changes]))
 
 
-def compressed(rows: ArrayLike, target: ArrayLike) -> Evidence:
+def compressed(rows: ArrayLike, target: ArrayLike) -> WhitenedRows:
     """Return evidence that says the same of the parameters in at most p rows.
 
     What no parameters explain of the targets is left out: it is noise, whatever has changed.
@@ -76,7 +76,7 @@ def compressed(rows: ArrayLike, target: ArrayLike) -> Evidence:
     return _frozen(triangle[: matrix.shape[1]])
 
 
-def joined(parts: Sequence[Evidence]) -> Evidence:
+def joined(parts: Sequence[WhitenedRows]) -> WhitenedRows:
     """Return the evidence of several stretches of time together.
 
     Raises:
@@ -87,7 +87,7 @@ def joined(parts: Sequence[Evidence]) -> Evidence:
     return compressed(np.vstack([p.rows for p in parts]), np.concatenate([p.target for p in parts]))
 
 
-def without_own(evidence: Evidence, own_sigma: ArrayLike) -> Evidence:
+def without_own(evidence: WhitenedRows, own_sigma: ArrayLike) -> WhitenedRows:
     """Return what is left when the first parameters are this stretch's own, known before to `own_sigma`."""
     sigma = np.asarray(own_sigma, dtype=float)
     prior = np.zeros((sigma.size, evidence.parameters))
@@ -99,7 +99,7 @@ def without_own(evidence: Evidence, own_sigma: ArrayLike) -> Evidence:
 
 
 def find_change(
-    before: Evidence, later: Evidence, prior_sigma: ArrayLike, changes: Sequence[Array]
+    before: WhitenedRows, later: WhitenedRows, prior_sigma: ArrayLike, changes: Sequence[Array]
 ) -> ChangeTest:
     """Test what may have changed between two stretches of time.
 
@@ -151,7 +151,7 @@ def _explained(columns: Array, target: Array) -> Change:
     return Change(gain, best, covariance)
 
 
-def _frozen(triangle: Array) -> Evidence:
+def _frozen(triangle: Array) -> WhitenedRows:
     rows, target = triangle[:, :-1].copy(), triangle[:, -1].copy()
     make_read_only((rows, target))
-    return Evidence(rows, target)
+    return WhitenedRows(rows, target)

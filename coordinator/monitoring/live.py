@@ -1,13 +1,13 @@
 """Watching a robot that somebody moves: hears feedback, asks for status, holds no lease, moves nothing.
 
-The watch itself is `watching.watcher`; here is its place on a network and on a clock, real or virtual.
+The watch itself is `watching.monitor`; here is its place on a network and on a clock, real or virtual.
 """
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer
-from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.recording.recording import Entry, Recording
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import RobotError
@@ -16,26 +16,26 @@ from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ask, Message
 
 # How often the watch looks: a blow is said by so much later.
-LOOK_S = 0.02
+UPDATE_S = 0.02
 ASK_S, REMAP_S = 0.25, 5.0
 # What a clock is mapped by: the last minute's trips; so many are enough to begin with.
-MAX_TRIPS, FEWEST_TRIPS = 240, 6
+MAX_TRIPS, MIN_TRIPS = 240, 6
 # Rows that are kept, at 250 a second; none is older than the cubic's and the filter's reach.
-KEPT_ROWS = 2000
+RETAINED_ROWS = 2000
 
-Say = Callable[[Heard], None]
+Report = Callable[[MonitorUpdate], None]
 
 
 class LiveMonitor:
     """One watch over a radio. `record` is what the radio is given to hear with."""
 
-    def __init__(self, watcher: Watcher, clock: Clock, sender: str, say: Say):
+    def __init__(self, monitor: Monitor, clock: Clock, sender: str, report: Report):
         self.recording = Recording()
-        self._watcher = watcher
+        self._watcher = monitor
         self._clock = clock
         self._sender = sender
-        self._say = say
-        self._serials: Sequence[str] = watcher.reference.chain.serials
+        self._report = report
+        self._serials: Sequence[str] = monitor.reference.chain.serials
         self._clocks: Mapping[str, ClockMap] | None = None
         self._boots: dict[str, int] = {}
         self._left: tuple[str, ...] = ()
@@ -56,7 +56,7 @@ class LiveMonitor:
         mapped_ns = 0
         try:
             while (until_ns is None or self._clock() < until_ns) and not enough():
-                await asyncio.sleep(LOOK_S)
+                await asyncio.sleep(UPDATE_S)
                 self._note_presence(radio)
                 if self._clocks is None or self._clock() - mapped_ns > REMAP_S * 1e9:
                     self._map_clocks()
@@ -71,13 +71,13 @@ class LiveMonitor:
         """Look at what was heard since the last look."""
         if self._clocks is None:
             return
-        heard = self._watcher.advance(self.recording, self._clocks)
-        if any(heard):
-            self._say(heard)
+        update = self._watcher.advance(self.recording, self._clocks)
+        if any(update):
+            self._report(update)
         for serial in self._serials:
             record = self.recording.modules.get(serial)
             if record is not None:
-                record.rows.forget_before(record.rows.end_row - KEPT_ROWS)
+                record.rows.forget_before(record.rows.end_row - RETAINED_ROWS)
                 del record.arrivals[:-1]
                 del record.round_trips[:-MAX_TRIPS]
         for found in self.recording.estimates.values():
@@ -99,7 +99,7 @@ class LiveMonitor:
 
     def _map_clocks(self) -> None:
         records = [self.recording.modules.get(serial) for serial in self._serials]
-        if any(record is None or len(record.round_trips) < FEWEST_TRIPS for record in records):
+        if any(record is None or len(record.round_trips) < MIN_TRIPS for record in records):
             return
         known = [record for record in records if record is not None]
         boots = {record.serial: record.boot for record in known}
@@ -107,7 +107,7 @@ class LiveMonitor:
         self._boots = boots
         self._clocks = map_clocks({record.serial: record.round_trips for record in known})
         if notes:
-            self._say(Heard((), (), tuple(notes)))
+            self._report(MonitorUpdate((), (), tuple(notes)))
 
     def _note_presence(self, radio: Messenger) -> None:
         # Only of those that were there: at the beginning all are on their way.
@@ -117,4 +117,4 @@ class LiveMonitor:
         notes = [f"module {s} has left the network" for s in left if s not in self._left]
         notes += [f"module {s} is back" for s in self._left if s not in left]
         self._left = left
-        self._say(Heard((), (), tuple(notes)))
+        self._report(MonitorUpdate((), (), tuple(notes)))

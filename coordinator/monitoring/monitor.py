@@ -10,7 +10,14 @@ from typing import NamedTuple
 
 from coordinator.monitoring.collision_detector import CollisionDetector
 from coordinator.monitoring.contact import Contact
-from coordinator.monitoring.diagnosis import Diagnosis, Piece, explains, judge, piece_of, weigh
+from coordinator.monitoring.diagnosis import (
+    Diagnosis,
+    SegmentInformation,
+    diagnose,
+    explains,
+    segment_information,
+    weigh_payload,
+)
 from coordinator.monitoring.finding_text import (
     collision_finding,
     friction_finding,
@@ -20,7 +27,7 @@ from coordinator.monitoring.finding_text import (
 )
 from coordinator.monitoring.findings import Finding, FindingLog, Key
 from coordinator.monitoring.reference import Reference
-from coordinator.monitoring.segments import Alignment, Block, Hole, Segmenter
+from coordinator.monitoring.segments import Alignment, Block, Gap, Segmenter
 from coordinator.monitoring.thresholds import ALARMS_PER_HOUR, SPANS, Thresholds, thresholds
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ
@@ -29,9 +36,9 @@ from module_agent.model.regressor import PER_BODY
 from module_agent.signals.clock_map import ClockMap
 
 # A contact that is felt longer than this is no blow: what is torque then is looked at.
-LONGEST_BLOW_NS = 1_000_000_000
+MAX_COLLISION_NS = 1_000_000_000
 # Contacts that follow on each other so soon are one.
-AGAIN_NS = 2_000_000_000
+MERGED_WITHIN_NS = 2_000_000_000
 # Of a blow, what is not to be taken for a change: before, as the filter looks ahead, and after, as it rings.
 BEFORE_NS, AFTER_NS = 200_000_000, 300_000_000
 # Clocks that are known worse than this set samples of different instants beside each other: at 1 rad/s and
@@ -49,7 +56,7 @@ SETTLED_AFTER = 12
 ADAPT_AFTER = (CONFIRMED, 8)
 
 
-class Heard(NamedTuple):
+class MonitorUpdate(NamedTuple):
     """What is to be said: findings, each new or in place of an earlier one with its key; what is no longer
     held, by key; and notes on what hinders the watch."""
 
@@ -58,17 +65,17 @@ class Heard(NamedTuple):
     notes: tuple[str, ...]
 
 
-class _Verdict(NamedTuple):
+class _Hypothesis(NamedTuple):
     """What the newest windows show: the kind of change and the module it is at, by what, and since when."""
 
     kind: str
     where: int
-    judged: Diagnosis
-    pieces: Sequence[Piece]
+    diagnosis: Diagnosis
+    window: Sequence[SegmentInformation]
     since_ns: int
 
 
-class Watcher:
+class Monitor:
     """Watches one robot.
 
     ledger: what it holds to be so. looked_s: how long all modules were heard together.
@@ -77,12 +84,12 @@ class Watcher:
     def __init__(self, reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR):
         self.reference = reference
         self.thresholds: Thresholds = thresholds(reference, alarms_per_hour)
-        self.ledger = FindingLog()
-        self.looked_s = 0.0
+        self.finding_log = FindingLog()
+        self.monitored_s = 0.0
         self._alignment = Alignment(reference.chain.serials)
-        self._stretches = Segmenter()
-        self._touch = CollisionDetector(reference, self.thresholds.contact_nm)
-        self._pieces: deque[Piece] = deque(maxlen=max(SPANS))
+        self._segmenter = Segmenter()
+        self._collisions = CollisionDetector(reference, self.thresholds.contact_nm)
+        self._pieces: deque[SegmentInformation] = deque(maxlen=max(SPANS))
         self._agreed: tuple[str, int] | None = None
         self._agreed_for = 0
         self._since_ns = 0
@@ -92,54 +99,56 @@ class Watcher:
     @property
     def outside_nm(self) -> Array | None:
         """The latest torques from outside (n,) [Nm], None before any."""
-        return self._touch.outside_nm
+        return self._collisions.outside_nm
 
-    def advance(self, recording: Recording, clocks: Mapping[str, ClockMap]) -> Heard:
+    def advance(self, recording: Recording, clocks: Mapping[str, ClockMap]) -> MonitorUpdate:
         """Look at what has been recorded since the last call."""
         notes: list[str] = []
-        said: list[Finding] = []
-        gone: list[Key] = []
+        findings: list[Finding] = []
+        withdrawn: list[Key] = []
         while True:
             aligned = self._alignment.advance(recording, clocks)
-            notes += self._hindered(aligned.holes, aligned.silent)
+            notes += self._hindered(aligned.gaps, aligned.silent)
             notes += self._timed(clocks)
             if aligned.block is not None:
                 found, dropped = self._look(aligned.block)
-                said += found
-                gone += dropped
-            elif not aligned.holes:
+                findings += found
+                withdrawn += dropped
+            elif not aligned.gaps:
                 break
-        return Heard(tuple(said), tuple(gone), tuple(notes))
+        return MonitorUpdate(tuple(findings), tuple(withdrawn), tuple(notes))
 
     def _look(self, block: Block) -> tuple[list[Finding], list[Key]]:
         now_ns = int(block.t_ns[-1])
-        said: list[Finding] = []
-        gone: list[Key] = []
-        self.looked_s += len(block.t_ns) / RATE_HZ
-        for contact in self._touch.advance(block):
+        findings: list[Finding] = []
+        withdrawn: list[Key] = []
+        self.monitored_s += len(block.t_ns) / RATE_HZ
+        for contact in self._collisions.advance(block):
             if not self._untimed:
-                said += self.ledger.put(collision_finding(self.reference, self.thresholds, contact, now_ns))
-        for stretch in self._stretches.add(block):
-            self._pieces.append(piece_of(self.reference, stretch))
-            judged = self._judged()
-            said += self._drives(judged, now_ns)
+                findings += self.finding_log.put(
+                    collision_finding(self.reference, self.thresholds, contact, now_ns)
+                )
+        for segment in self._segmenter.add(block):
+            self._pieces.append(segment_information(self.reference, segment))
+            diagnosis = self._diagnosed()
+            findings += self._drives(diagnosis, now_ns)
             if self._untimed:
                 continue
-            verdict = self._verdict(judged)
-            said += self._change(verdict, now_ns)
-            gone += self._withdrawn(said, now_ns)
-            gone += self._adapted(verdict, now_ns)
-            said += self._ended(now_ns)
-        return said, gone
+            hypothesis = self._hypothesis(diagnosis)
+            findings += self._change(hypothesis, now_ns)
+            withdrawn += self._withdrawn(findings, now_ns)
+            withdrawn += self._adapted(hypothesis, now_ns)
+            findings += self._ended(now_ns)
+        return findings, withdrawn
 
     # ------------------------------------------------------------------ judging
 
-    def _calm(self) -> list[Piece]:
+    def _calm(self) -> list[SegmentInformation]:
         """Return the pieces into which no blow falls."""
-        blows = [_blow(start, end) for start, end in _together(self._touch.contacts)]
-        return [p for p in self._pieces if not any(p.start_ns < b and a < p.end_ns for a, b in blows)]
+        collisions = [_collision_span(start, end) for start, end in _together(self._collisions.contacts)]
+        return [p for p in self._pieces if not any(p.start_ns < b and a < p.end_ns for a, b in collisions)]
 
-    def _judged(self) -> list[tuple[Diagnosis, Sequence[Piece]]]:
+    def _diagnosed(self) -> list[tuple[Diagnosis, Sequence[SegmentInformation]]]:
         calm = self._calm()
         newest = self._pieces[-1]
         # A judgement that has been made already is not made again.
@@ -149,116 +158,122 @@ class Watcher:
         since = [p for p in calm if p.start_ns >= self._since_ns] if self._agreed is not None else []
         if len(since) >= CONFIRMED:
             windows.append(since)
-        laden = any(finding.kind == "payload" for finding in self.ledger.held.values())
-        return [(judge(self.reference, self.thresholds, window, laden), window) for window in windows]
+        loaded = any(finding.kind == "payload" for finding in self.finding_log.held.values())
+        return [(diagnose(self.reference, self.thresholds, window, loaded), window) for window in windows]
 
-    def _drives(self, judged: Sequence[tuple[Diagnosis, Sequence[Piece]]], now_ns: int) -> list[Finding]:
+    def _drives(
+        self, diagnosis: Sequence[tuple[Diagnosis, Sequence[SegmentInformation]]], now_ns: int
+    ) -> list[Finding]:
         # Friction is in no hurry, and in a short window other things pass for it.
-        long = [(one, window) for one, window in judged if len(window) >= max(SPANS)]
+        long = [(one, window) for one, window in diagnosis if len(window) >= max(SPANS)]
         found = {d.joint: (d, window[0].start_ns) for one, window in long for d in one.drives}
         return [
-            said
+            findings
             for shift, since_ns in found.values()
-            for said in self.ledger.put(
+            for findings in self.finding_log.put(
                 friction_finding(self.reference, self.thresholds, shift, since_ns, now_ns)
             )
         ]
 
-    def _verdict(self, judged: Sequence[tuple[Diagnosis, Sequence[Piece]]]) -> _Verdict | None:
+    def _hypothesis(
+        self, diagnosis: Sequence[tuple[Diagnosis, Sequence[SegmentInformation]]]
+    ) -> _Hypothesis | None:
         """Return what explains the newest windows; those since the change began come first."""
         found = None
-        for one, window in reversed(judged):
+        for one, window in reversed(diagnosis):
             load = one.load
             if one.link is not None:
-                found = _Verdict("wear", one.link.child, one, window, 0)
+                found = _Hypothesis("wear", one.link.child, one, window, 0)
             elif load is not None and explains(self.reference, load) and found is None:
-                found = _Verdict("payload", load.carrier, one, window, 0)
+                found = _Hypothesis("payload", load.carrier, one, window, 0)
             if found is not None and found.kind == "wear":
                 break
         if found is None:
             # What the newest stretches do not show any more was a blow too weak to be felt as one.
-            if not judged or judged[0][0].load is None:
+            if not diagnosis or diagnosis[0][0].load is None:
                 self._agreed, self._agreed_for = None, 0
                 return None
-            found = _Verdict("unexplained", 0, *judged[0], 0)
+            found = _Hypothesis("unexplained", 0, *diagnosis[0], 0)
         if self._agreed is None:
-            self._since_ns = self._began(found.pieces[0].start_ns)
+            self._since_ns = self._began(found.window[0].start_ns)
         same = self._agreed == (found.kind, found.where)
         self._agreed, self._agreed_for = (found.kind, found.where), self._agreed_for + 1 if same else 1
         return found._replace(since_ns=self._since_ns)
 
     def _began(self, seen_ns: int) -> int:
         """Return when a change began that was seen first in a window that begins at a time."""
-        starts = [c.start_ns for c in self._touch.contacts if -BEGAN_WITHIN_NS < c.start_ns - seen_ns < 2e9]
+        starts = [
+            c.start_ns for c in self._collisions.contacts if -BEGAN_WITHIN_NS < c.start_ns - seen_ns < 2e9
+        ]
         return min(starts, default=seen_ns)
 
     # ------------------------------------------------------------------ saying
 
-    def _change(self, verdict: _Verdict | None, now_ns: int) -> list[Finding]:
-        if verdict is None:
+    def _change(self, hypothesis: _Hypothesis | None, now_ns: int) -> list[Finding]:
+        if hypothesis is None:
             return []
-        needed = UNEXPLAINED_AFTER if verdict.kind == "unexplained" else CONFIRMED
+        needed = UNEXPLAINED_AFTER if hypothesis.kind == "unexplained" else CONFIRMED
         if self._agreed_for < needed:
             return []
-        if verdict.kind != "wear" and any(f.kind == "wear" for f in self.ledger.held.values()):
+        if hypothesis.kind != "wear" and any(f.kind == "wear" for f in self.finding_log.held.values()):
             return []
-        held = self.ledger.held.get(("load", 0))
-        settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == verdict.kind
-        if settled and verdict.kind == "payload" and self._agreed_for % SETTLED_AFTER:
+        held = self.finding_log.held.get(("load", 0))
+        settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == hypothesis.kind
+        if settled and hypothesis.kind == "payload" and self._agreed_for % SETTLED_AFTER:
             # It takes a while to weigh it, and it will not be another.
-            self.ledger.see(("load", 0), now_ns)
+            self.finding_log.observe(("load", 0), now_ns)
             return []
-        finding = self._finding(verdict, now_ns)
-        return [] if finding is None else self.ledger.put(finding)
+        finding = self._finding(hypothesis, now_ns)
+        return [] if finding is None else self.finding_log.put(finding)
 
-    def _finding(self, verdict: _Verdict, now_ns: int) -> Finding | None:
-        reference, link, load = self.reference, verdict.judged.link, verdict.judged.load
-        if verdict.kind == "wear" and link is not None:
-            return wear_finding(reference, self.thresholds, link, verdict.since_ns, now_ns)
+    def _finding(self, hypothesis: _Hypothesis, now_ns: int) -> Finding | None:
+        reference, link, load = self.reference, hypothesis.diagnosis.link, hypothesis.diagnosis.load
+        if hypothesis.kind == "wear" and link is not None:
+            return wear_finding(reference, self.thresholds, link, hypothesis.since_ns, now_ns)
         if load is None:
             return None
-        if verdict.kind == "unexplained":
-            return unexplained_finding(reference, self.thresholds, load, verdict.since_ns, now_ns)
-        found = weigh(reference, verdict.pieces, load)
+        if hypothesis.kind == "unexplained":
+            return unexplained_finding(reference, self.thresholds, load, hypothesis.since_ns, now_ns)
+        found = weigh_payload(reference, hypothesis.window, load)
         if found is None or not found.explains or found.mass_kg < MIN_SIGMAS * found.mass_sigma_kg:
             return None
-        return load_finding(reference, self.thresholds, load, found, verdict.since_ns, now_ns)
+        return load_finding(reference, self.thresholds, load, found, hypothesis.since_ns, now_ns)
 
-    def _adapted(self, verdict: _Verdict | None, now_ns: int) -> list[Key]:
+    def _adapted(self, hypothesis: _Hypothesis | None, now_ns: int) -> list[Key]:
         """Tell contacts from torques as they are since a change; take back those that were told otherwise."""
-        if verdict is None or verdict.judged.load is None or self._agreed_for not in ADAPT_AFTER:
+        if hypothesis is None or hypothesis.diagnosis.load is None or self._agreed_for not in ADAPT_AFTER:
             return []
-        if not any(finding.kind in ("payload", "wear") for finding in self.ledger.held.values()):
+        if not any(finding.kind in ("payload", "wear") for finding in self.finding_log.held.values()):
             return []
-        load, phi = verdict.judged.load, self.reference.phi.copy()
+        load, phi = hypothesis.diagnosis.load, self.reference.phi.copy()
         phi[PER_BODY * load.carrier : PER_BODY * (load.carrier + 1)] += load.change
-        self._touch.adapt(phi)
-        return self._without_collisions(verdict.since_ns, now_ns)
+        self._collisions.adapt(phi)
+        return self._without_collisions(hypothesis.since_ns, now_ns)
 
     def _without_collisions(self, since_ns: int, now_ns: int) -> list[Key]:
-        return self.ledger.withdraw(
+        return self.finding_log.withdraw(
             [
                 key
-                for key, finding in self.ledger.held.items()
+                for key, finding in self.finding_log.held.items()
                 if finding.kind == "collision" and since_ns <= finding.since_ns <= now_ns
             ]
         )
 
-    def _withdrawn(self, said: Sequence[Finding], now_ns: int) -> list[Key]:
+    def _withdrawn(self, findings: Sequence[Finding], now_ns: int) -> list[Key]:
         """Take back what a change explains: loads if a link is displaced, contacts of its beginning."""
-        lasting = [f for f in said if f.kind in ("payload", "wear", "unexplained")]
-        gone: list[Key] = []
+        lasting = [f for f in findings if f.kind in ("payload", "wear", "unexplained")]
+        withdrawn: list[Key] = []
         if any(f.kind == "wear" for f in lasting):
-            gone += self.ledger.withdraw([("load", 0)])
+            withdrawn += self.finding_log.withdraw([("load", 0)])
         for change in lasting:
-            gone += self._without_collisions(change.since_ns, now_ns)
-        return gone
+            withdrawn += self._without_collisions(change.since_ns, now_ns)
+        return withdrawn
 
     def _ended(self, now_ns: int) -> list[Finding]:
-        said = self.ledger.end_unseen(now_ns)
-        if any(f.kind != "friction" for f in said):
-            self._touch.adapt(self.reference.phi)
-        return said
+        findings = self.finding_log.end_unseen(now_ns)
+        if any(f.kind != "friction" for f in findings):
+            self._collisions.adapt(self.reference.phi)
+        return findings
 
     # ------------------------------------------------------------------ what hinders
 
@@ -277,15 +292,15 @@ class Watcher:
             "watched, each drive by itself"
         ]
 
-    def _hindered(self, holes: Sequence[Hole], silent: tuple[str, ...]) -> list[str]:
+    def _hindered(self, gaps: Sequence[Gap], silent: tuple[str, ...]) -> list[str]:
         notes = [
-            f"module {hole.serial}: {1e-6 * (hole.to_ns - hole.from_ns):.0f} ms of its feedback are missing; "
+            f"module {gap.serial}: {1e-6 * (gap.to_ns - gap.from_ns):.0f} ms of its feedback are missing; "
             "the watch begins anew after them"
-            for hole in holes
+            for gap in gaps
         ]
-        if holes:
-            self._stretches.reset()
-            self._touch.reset()
+        if gaps:
+            self._segmenter.reset()
+            self._collisions.reset()
             self._pieces.clear()
             self._agreed, self._agreed_for = None, 0
         if silent != self._silent:
@@ -305,16 +320,16 @@ def _together(contacts: Sequence[Contact]) -> list[tuple[int, int]]:
     """Return from when to when something touched the robot, contacts soon after each other as one."""
     found: list[tuple[int, int]] = []
     for contact in sorted(contacts, key=lambda c: c.start_ns):
-        end = contact.end_ns if contact.end_ns is not None else contact.start_ns + LONGEST_BLOW_NS
-        if found and contact.start_ns - found[-1][1] < AGAIN_NS:
+        end = contact.end_ns if contact.end_ns is not None else contact.start_ns + MAX_COLLISION_NS
+        if found and contact.start_ns - found[-1][1] < MERGED_WITHIN_NS:
             found[-1] = found[-1][0], max(end, found[-1][1])
         else:
             found.append((contact.start_ns, end))
     return found
 
 
-def _blow(start_ns: int, end_ns: int) -> tuple[int, int]:
+def _collision_span(start_ns: int, end_ns: int) -> tuple[int, int]:
     """Return from when to when nothing is to be taken for a change."""
     # What lasts is more than a blow; only its beginning is left out.
-    end = start_ns if end_ns - start_ns > LONGEST_BLOW_NS else end_ns
+    end = start_ns if end_ns - start_ns > MAX_COLLISION_NS else end_ns
     return start_ns - BEFORE_NS, end + AFTER_NS

@@ -14,24 +14,24 @@ from scipy.stats import chi2
 from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.identification.identify import recorded_type
 from coordinator.monitoring.contact import ContactModel, contact_model, fast_part
-from coordinator.monitoring.likelihood_ratio import ChangeTest, Evidence, find_change, joined, without_own
+from coordinator.monitoring.likelihood_ratio import ChangeTest, WhitenedRows, find_change, joined, without_own
 from coordinator.monitoring.momentum_observer import MomentumObserver
 from coordinator.monitoring.residual_tests import (
     PRIOR_KG,
     DriveModel,
     ImuModel,
     catalogued_drive,
-    drive_evidence,
     drive_rows,
     drive_window,
     fitted_drive,
-    imu_evidence,
+    imu_rows,
     information_of,
     lasting_residual,
     link_changes,
     payload_changes,
-    torque_evidence,
     torque_residual,
+    torque_rows,
+    whitened_drive_rows,
     without_delay,
 )
 from coordinator.monitoring.segments import Alignment, Block, DataSegment, Segmenter, noise_level, part_of
@@ -46,7 +46,7 @@ from module_agent.model.information import JointInformation, gather, merge
 # How long a window of the watch is, in stretches.
 WINDOW = 10
 # Fewer windows than this say nothing of how the tests scatter.
-FEWEST_WINDOWS = 4
+MIN_WINDOWS = 4
 # A robot does other motions later than those that it is known from, and the model is wrong about them in
 # other ways: without this, an arm of six joints that had not changed was said to have a link displaced.
 MARGIN = 3.0
@@ -54,19 +54,19 @@ MARGIN = 3.0
 _FIRST_S = 1.0
 
 
-class NoReference(UsageError):
+class UnsuitableBaseline(UsageError):
     """The run does not hold what the watch needs; the message says what is missing."""
 
 
-class Known(NamedTuple):
+class BaselineTest(NamedTuple):
     """Evidence of the known run about one thing, and by how much its tests' gains are inflated there."""
 
-    evidence: Evidence
+    evidence: WhitenedRows
     prior_sigma: Array
     changes: tuple[Array, ...]
     inflation: float
 
-    def test(self, later: Evidence) -> ChangeTest:
+    def test(self, later: WhitenedRows) -> ChangeTest:
         """Test a later window; gains are those of well-behaved noise."""
         found = find_change(self.evidence, later, self.prior_sigma, self.changes)
         return ChangeTest(
@@ -91,11 +91,11 @@ class Reference(NamedTuple):
     phi: Array
     torque_sigma_nm: Array
     information: tuple[JointInformation, ...]
-    torque: Known
+    torque: BaselineTest
     imu_model: ImuModel
-    imu: Known
+    imu: BaselineTest
     drive_models: tuple[DriveModel, ...]
-    drives: tuple[Known | None, ...]
+    drives: tuple[BaselineTest | None, ...]
     contact: ContactModel
 
 
@@ -107,28 +107,28 @@ def build_reference(known: BaselineRobot) -> Reference:
     """
     chain, recording = known.chain, known.recording
     if not recording.motions("dynamic"):
-        raise NoReference(f"{known.folder} has no motions for inertia: it was run with --no-dynamics")
+        raise UnsuitableBaseline(f"{known.folder} has no motions for inertia: it was run with --no-dynamics")
     types = tuple(recorded_type(recording, serial) for serial in chain.serials)
     try:
         motion = dynamic_motion(recording, known.kinematics.clocks, chain.serials, "dynamic")
     except DataError as error:
-        raise NoReference(f"{known.folder}: {error}") from error
+        raise UnsuitableBaseline(f"{known.folder}: {error}") from error
     signals = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm
     phi = solve_weighted(gather(chain, *signals), INDEPENDENT_FRACTION).phi
     aligned = Alignment(chain.serials).advance(recording, known.kinematics.clocks)
     if aligned.block is None:
-        lost = ", ".join(f"module {h.serial}" for h in aligned.holes) or "a module"
-        raise NoReference(f"{known.folder}: its recording has a hole in the rows of {lost}")
+        lost = ", ".join(f"module {h.serial}" for h in aligned.gaps) or "a module"
+        raise UnsuitableBaseline(f"{known.folder}: its recording has a hole in the rows of {lost}")
     block = part_of(aligned.block, round(_FIRST_S * RATE_HZ), len(aligned.block.t_ns))
-    stretches = Segmenter().add(block)
-    if len(stretches) < FEWEST_WINDOWS * WINDOW:
-        raise NoReference(
-            f"{known.folder} lasts {0.5 * len(stretches):.0f} s: too short to tell what is normal; "
-            f"at least {0.5 * FEWEST_WINDOWS * WINDOW:.0f} s are needed"
+    segments = Segmenter().add(block)
+    if len(segments) < MIN_WINDOWS * WINDOW:
+        raise UnsuitableBaseline(
+            f"{known.folder} lasts {0.5 * len(segments):.0f} s: too short to tell what is normal; "
+            f"at least {0.5 * MIN_WINDOWS * WINDOW:.0f} s are needed"
         )
-    sigma, information, torque = _torque(chain, phi, stretches)
-    model, imu = _imu(known, stretches)
-    models, drives = _drives(types, stretches)
+    sigma, information, torque = _torque(chain, phi, segments)
+    model, imu = _imu(known, segments)
+    models, drives = _drives(types, segments)
     return Reference(
         name=known.name,
         chain=chain,
@@ -146,12 +146,12 @@ def build_reference(known: BaselineRobot) -> Reference:
 
 
 def _torque(
-    chain: Chain, phi: Array, stretches: Sequence[DataSegment]
-) -> tuple[Array, tuple[JointInformation, ...], Known]:
-    sigma, counted = noise_level([torque_residual(chain, phi, one) for one in stretches])
+    chain: Chain, phi: Array, segments: Sequence[DataSegment]
+) -> tuple[Array, tuple[JointInformation, ...], BaselineTest]:
+    sigma, counted = noise_level([torque_residual(chain, phi, one) for one in segments])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
     windows = []
-    for part in _windows(stretches):
+    for part in _window_segments(segments):
         whole: tuple[JointInformation, ...] = ()
         for one in part:
             found = information_of(chain, one)
@@ -160,33 +160,33 @@ def _torque(
     total = windows[0]
     for more in windows[1:]:
         total = merge(total, more)
-    evidence = [torque_evidence(window, phi, independent) for window in windows]
+    evidence = [torque_rows(window, phi, independent) for window in windows]
     count = len(chain.serials)
     prior = np.full(phi.size, PRIOR_KG)
-    return independent, total, _known(evidence, prior, payload_changes(count))
+    return independent, total, _calibrated(evidence, prior, payload_changes(count))
 
 
-def _imu(known: BaselineRobot, stretches: Sequence[DataSegment]) -> tuple[ImuModel, Known]:
+def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuModel, BaselineTest]:
     chain, refinement = known.chain, known.kinematics.refinement
     count = len(chain.serials)
     rough = ImuModel(
         chain, without_delay(refinement.intrinsics), IMU_PRIORS[known.imu], np.full((count, 6), 0.05)
     )
-    sigma, counted = noise_level(lasting_residual(rough, stretches))
+    sigma, counted = noise_level(lasting_residual(rough, segments))
     model = rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
     evidence = [
-        without_own(joined([imu_evidence(model, one) for one in part]), model.own_sigma)
-        for part in _windows(stretches)
+        without_own(joined([imu_rows(model, one) for one in part]), model.own_sigma)
+        for part in _window_segments(segments)
     ]
-    return model, _known(evidence, model.prior_sigma, link_changes(chain))
+    return model, _calibrated(evidence, model.prior_sigma, link_changes(chain))
 
 
 def _drives(
-    types: Sequence[ModuleType], stretches: Sequence[DataSegment]
-) -> tuple[tuple[DriveModel, ...], tuple[Known | None, ...]]:
+    types: Sequence[ModuleType], segments: Sequence[DataSegment]
+) -> tuple[tuple[DriveModel, ...], tuple[BaselineTest | None, ...]]:
     models, found = [], []
     for joint, kind in enumerate(types):
-        parts = [drive_rows(kind, one, joint) for one in stretches]
+        parts = [drive_rows(kind, one, joint) for one in segments]
         rows = np.concatenate([part[0] for part in parts])
         torque = np.concatenate([part[1] for part in parts])
         theta = fitted_drive(kind, rows, torque) if len(rows) else catalogued_drive(kind)
@@ -196,22 +196,24 @@ def _drives(
         else:
             noise = kind.max_effort_nm
         models.append(DriveModel(kind, theta, noise))
-        found.append(_drive(models[-1], stretches, joint))
+        found.append(_drive(models[-1], segments, joint))
     return tuple(models), tuple(found)
 
 
-def _drive(model: DriveModel, stretches: Sequence[DataSegment], joint: int) -> Known | None:
+def _drive(model: DriveModel, segments: Sequence[DataSegment], joint: int) -> BaselineTest | None:
     evidence = []
-    for part in _windows(stretches):
-        pieces = [e for one in part if (e := drive_evidence(model, one, joint)) is not None]
-        if pieces:
-            evidence.append(drive_window(pieces))
-    if len(evidence) < FEWEST_WINDOWS:
+    for part in _window_segments(segments):
+        window = [e for one in part if (e := whitened_drive_rows(model, one, joint)) is not None]
+        if window:
+            evidence.append(drive_window(window))
+    if len(evidence) < MIN_WINDOWS:
         return None
-    return _known(evidence, model.prior_sigma, (model.change,))
+    return _calibrated(evidence, model.prior_sigma, (model.change,))
 
 
-def _known(windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array, ...]) -> Known:
+def _calibrated(
+    windows: Sequence[WhitenedRows], prior_sigma: Array, changes: tuple[Array, ...]
+) -> BaselineTest:
     """Return what all windows say, and by how much the tests of each against the others exceed chance."""
     exceeding = []
     for k, window in enumerate(windows):
@@ -223,12 +225,12 @@ def _known(windows: Sequence[Evidence], prior_sigma: Array, changes: tuple[Array
     # The largest that chance makes of so many, of which every second window's largest is below.
     expected = [chi2.isf(0.5 / len(exceeding), freedom) for _, freedom in exceeding]
     largest = max([1.0, *(gain / level for (gain, _), level in zip(exceeding, expected, strict=True))])
-    return Known(joined(windows), prior_sigma, changes, MARGIN * largest)
+    return BaselineTest(joined(windows), prior_sigma, changes, MARGIN * largest)
 
 
-def _windows(stretches: Sequence[DataSegment]) -> list[Sequence[DataSegment]]:
-    whole = len(stretches) // WINDOW
-    return [stretches[WINDOW * k : WINDOW * (k + 1)] for k in range(whole)]
+def _window_segments(segments: Sequence[DataSegment]) -> list[Sequence[DataSegment]]:
+    whole = len(segments) // WINDOW
+    return [segments[WINDOW * k : WINDOW * (k + 1)] for k in range(whole)]
 
 
 def _contact(chain: Chain, phi: Array, block: Block) -> ContactModel:

@@ -35,7 +35,7 @@ from coordinator.batch_estimation.imu_intrinsics import (
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.dynamics.pseudo_inertia import parameter_scale
-from coordinator.monitoring.likelihood_ratio import Evidence, compressed, joined, without_own
+from coordinator.monitoring.likelihood_ratio import WhitenedRows, compressed, joined, without_own
 from coordinator.monitoring.segments import DataSegment
 from coordinator.parameter_fit.base_parameters import whitened
 from module_agent.model.catalogue import ModuleType
@@ -48,21 +48,21 @@ from module_agent.model.regressor import PER_BODY, inverse_dynamics
 # How far parameters may be from where a fit has them, per `parameter_scale`: bodies weigh some hundred grams.
 PRIOR_KG = 0.5
 # Of a payload: a change of 1 is one of a kilogram at the body's place.
-LARGE_KG = 1.0
+UNIT_PAYLOAD_KG = 1.0
 
 
-def information_of(chain: Chain, stretch: DataSegment) -> tuple[JointInformation, ...]:
+def information_of(chain: Chain, segment: DataSegment) -> tuple[JointInformation, ...]:
     """Return the information of every joint."""
-    return gather(chain, stretch.q_rad, stretch.qd_rad_s, stretch.qdd_rad_s2, stretch.tau_nm)
+    return gather(chain, segment.q_rad, segment.qd_rad_s, segment.qdd_rad_s2, segment.tau_nm)
 
 
-def torque_residual(chain: Chain, phi: Array, stretch: DataSegment) -> Array:
+def torque_residual(chain: Chain, phi: Array, segment: DataSegment) -> Array:
     """Return what a model leaves of the torques, (m, n) [Nm]."""
-    predicted = inverse_dynamics(chain, phi, stretch.q_rad, stretch.qd_rad_s, stretch.qdd_rad_s2)
-    return np.asarray(stretch.tau_nm - predicted)
+    predicted = inverse_dynamics(chain, phi, segment.q_rad, segment.qd_rad_s, segment.qdd_rad_s2)
+    return np.asarray(segment.tau_nm - predicted)
 
 
-def torque_evidence(information: Sequence[JointInformation], phi: Array, sigma_nm: Array) -> Evidence:
+def torque_rows(information: Sequence[JointInformation], phi: Array, sigma_nm: Array) -> WhitenedRows:
     """Return the evidence (k, 10 n) about phi's deviation from `phi`, in kilograms by `parameter_scale`.
 
     sigma_nm: (n,) noise as if samples were independent.
@@ -73,7 +73,7 @@ def torque_evidence(information: Sequence[JointInformation], phi: Array, sigma_n
 
 def payload_changes(count: int) -> tuple[Array, ...]:
     """Return the hypotheses: all ten parameters of one body change."""
-    unit = LARGE_KG * np.eye(PER_BODY * count)
+    unit = UNIT_PAYLOAD_KG * np.eye(PER_BODY * count)
     return tuple(unit[:, PER_BODY * b : PER_BODY * (b + 1)] for b in range(count))
 
 
@@ -121,22 +121,22 @@ def without_delay(intrinsics: ImuIntrinsics) -> ImuIntrinsics:
     return ImuIntrinsics(errors)
 
 
-def imu_residual(model: ImuModel, stretch: DataSegment) -> Array:
+def imu_residual(model: ImuModel, segment: DataSegment) -> Array:
     """Return what the model leaves of the readings, (m, n, 6): rates, then specific forces."""
-    at = _thinned(stretch)
+    at = _thinned(segment)
     bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
     ideal = readings_on(model.chain, bodies)
     gyro, accel = read(model.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
     return np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
 
 
-def lasting_residual(model: ImuModel, stretches: Sequence[DataSegment]) -> list[Array]:
+def lasting_residual(model: ImuModel, segments: Sequence[DataSegment]) -> list[Array]:
     """Return what the model leaves of the readings but for biases and delays that are the same in all.
 
     Per stretch (m, 6 n).
     """
-    left = [imu_residual(model, one) for one in stretches]
-    rates = [-one.imu_rates[::KEEP_EVERY] for one in stretches]
+    left = [imu_residual(model, one) for one in segments]
+    rates = [-one.imu_rates[::KEEP_EVERY] for one in segments]
     whole, late = np.concatenate(left), np.concatenate(rates)
     whole, late = whole - whole.mean(axis=0), late - late.mean(axis=0)
     # One delay for all six axes of an IMU, weighed by what each scatters.
@@ -147,12 +147,12 @@ def lasting_residual(model: ImuModel, stretches: Sequence[DataSegment]) -> list[
     return [part.reshape(len(part), -1) for part in np.split(settled, ends)]
 
 
-def imu_evidence(model: ImuModel, stretch: DataSegment) -> Evidence:
+def imu_rows(model: ImuModel, segment: DataSegment) -> WhitenedRows:
     """Return the evidence (k, p): own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
-    at, count = _thinned(stretch), len(model.chain.serials)
+    at, count = _thinned(segment), len(model.chain.serials)
     bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
     ideal = readings_on(model.chain, bodies)
-    residual = imu_residual(model, stretch)
+    residual = imu_residual(model, segment)
     samples, own = len(at.q_rad), len(_OWN) * count
     rows = np.zeros((count, samples, 6, own + len(model.prior_sigma)))
     free = np.ones(SIZE, dtype=bool)
@@ -197,15 +197,15 @@ def displacement(chain: Chain, child: int, size: Array) -> tuple[Array, Array]:
     return turn, shift + np.cross(turn, chain.imu_home[child, :3, 3])
 
 
-def _thinned(stretch: DataSegment) -> DataSegment:
+def _thinned(segment: DataSegment) -> DataSegment:
     kept = slice(None, None, KEEP_EVERY)
-    return stretch._replace(
-        q_rad=stretch.q_rad[kept],
-        qd_rad_s=stretch.qd_rad_s[kept],
-        qdd_rad_s2=stretch.qdd_rad_s2[kept],
-        gyro_rad_s=stretch.gyro_rad_s[kept],
-        accel_m_s2=stretch.accel_m_s2[kept],
-        imu_rates=stretch.imu_rates[kept],
+    return segment._replace(
+        q_rad=segment.q_rad[kept],
+        qd_rad_s=segment.qd_rad_s[kept],
+        qdd_rad_s2=segment.qdd_rad_s2[kept],
+        gyro_rad_s=segment.gyro_rad_s[kept],
+        accel_m_s2=segment.accel_m_s2[kept],
+        imu_rates=segment.imu_rates[kept],
     )
 
 
@@ -216,7 +216,7 @@ _COULOMB, _VISCOUS = 2, 3
 SLOW_SHARE = 0.04
 # Of the low-pass: what is farther has no say.
 REACH_SAMPLES = 10
-FEWEST = 20
+MIN_SAMPLES = 20
 # Of c and l: what a joint that carries little tells of them is not what they are under another load.
 OWN_SIGMA = np.array([0.1, 0.1])
 
@@ -265,35 +265,35 @@ class DriveModel(NamedTuple):
         return np.asarray(size * [self.kind.motor.coulomb_nm, self.kind.motor.viscous_nm_s_rad])
 
 
-def drive_rows(kind: ModuleType, stretch: DataSegment, joint: int) -> tuple[Array, Array]:
+def drive_rows(kind: ModuleType, segment: DataSegment, joint: int) -> tuple[Array, Array]:
     """Return the rows (k, 6) and motor torques (k,) [Nm] of the samples in which the motor of a joint turns.
 
     All signals went through the same low-pass, which reaches into what is around a sample.
     """
-    speed = stretch.raw.motor_rad_s[:, joint] / kind.gear_ratio
+    speed = segment.raw.motor_rad_s[:, joint] / kind.gear_ratio
     slow = np.abs(speed) < SLOW_SHARE * kind.max_speed_rad_s
     turning = np.convolve(slow, np.ones(2 * REACH_SAMPLES + 1), mode="same") == 0
-    driving, driven, loss, sign, turned, change = stretch.drive[:, joint].T
+    driving, driven, loss, sign, turned, change = segment.drive[:, joint].T
     per_amp = kind.gear_ratio * kind.motor.back_emf_v_s_rad
     motor = per_amp * (kind.motor.efficiency * driving + driven)
     speeds = turned / kind.gear_ratio, change / kind.gear_ratio
-    rows = np.column_stack([stretch.tau_nm[:, joint], loss, sign, *speeds, np.ones_like(sign)])
+    rows = np.column_stack([segment.tau_nm[:, joint], loss, sign, *speeds, np.ones_like(sign)])
     return rows[turning], motor[turning]
 
 
-def drive_evidence(model: DriveModel, stretch: DataSegment, joint: int) -> Evidence | None:
+def whitened_drive_rows(model: DriveModel, segment: DataSegment, joint: int) -> WhitenedRows | None:
     """Return the evidence about the drive's deviation from its model; None if the motor stood.
 
     Before the six parameters are those of how torque is passed on, the stretch's own (2,): see `OWN_SIGMA`.
     """
-    rows, torque = drive_rows(model.kind, stretch, joint)
-    if len(rows) < FEWEST:
+    rows, torque = drive_rows(model.kind, segment, joint)
+    if len(rows) < MIN_SAMPLES:
         return None
     weighted = np.column_stack([rows[:, : OWN_SIGMA.size], rows]) / model.sigma_nm
     return compressed(weighted, (torque - rows @ model.theta) / model.sigma_nm)
 
 
-def drive_window(parts: Sequence[Evidence]) -> Evidence:
+def drive_window(parts: Sequence[WhitenedRows]) -> WhitenedRows:
     """Return the evidence (k, 6) of a window's stretches together."""
     return without_own(joined(parts), OWN_SIGMA)
 

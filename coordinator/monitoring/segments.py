@@ -29,7 +29,7 @@ from module_agent.signals.filtering import (
 Times = NDArray[np.int64]
 
 # As many rows are bridged as two messages hold.
-LONGEST_HOLE_NS = 48_000_000
+MAX_GAP_NS = 48_000_000
 # Who is behind the others by so much is silent.
 SILENT_NS = 500_000_000
 _JOINT = (
@@ -58,7 +58,7 @@ class Block(NamedTuple):
     accel_m_s2: Array
 
 
-class Hole(NamedTuple):
+class Gap(NamedTuple):
     """Where a module's rows have a hole that is too long: from its last row before, to its next [ns]."""
 
     serial: str
@@ -70,7 +70,7 @@ class Aligned(NamedTuple):
     """A block, if there is one, and what is missing: holes that ended the block before it, who is silent."""
 
     block: Block | None
-    holes: tuple[Hole, ...]
+    gaps: tuple[Gap, ...]
     silent: tuple[str, ...]
 
 
@@ -104,15 +104,15 @@ class Alignment:
             self._next_ns = _on_grid(max(first for first, _ in known))
         end = min(last for _, last in known)
         tracks = [_track(recording, clocks[s], s, self._next_ns, end) for s in self._serials]
-        holes = tuple(
-            hole
+        gaps = tuple(
+            gap
             for s, track in zip(self._serials, tracks, strict=True)
-            if track is not None and (hole := _hole(s, track, self._next_ns)) is not None
+            if track is not None and (gap := _gap(s, track, self._next_ns)) is not None
         )
-        if holes:
+        if gaps:
             # What lies before the last hole is given up: it is shorter than what any test looks at.
-            self._next_ns = _on_grid(max(hole.to_ns for hole in holes))
-            return Aligned(None, holes, silent)
+            self._next_ns = _on_grid(max(gap.to_ns for gap in gaps))
+            return Aligned(None, gaps, silent)
         whole = [track for track in tracks if track is not None and len(track.t_ns) > _ROWS_AROUND]
         if len(whole) < len(tracks):
             return Aligned(None, (), silent)
@@ -145,7 +145,7 @@ def _on_grid(t_ns: int) -> int:
 
 
 def _track(recording: Recording, clock: ClockMap, serial: str, start_ns: int, end_ns: int) -> _Track | None:
-    around = np.array([start_ns - LONGEST_HOLE_NS - 2 * STEP_NS, end_ns + STEP_NS])
+    around = np.array([start_ns - MAX_GAP_NS - 2 * STEP_NS, end_ns + STEP_NS])
     first, last = (int(t) for t in clock.to_module(around))
     rows = recording.modules[serial].rows.between(first, last)
     if len(rows) < 2:
@@ -159,13 +159,13 @@ def _track(recording: Recording, clock: ClockMap, serial: str, start_ns: int, en
     )
 
 
-def _hole(serial: str, track: _Track, from_ns: int) -> Hole | None:
+def _gap(serial: str, track: _Track, from_ns: int) -> Gap | None:
     """Return the last hole after a time, if there is one that is too long."""
     steps = np.diff(track.t_ns)
-    bad = np.flatnonzero((steps > LONGEST_HOLE_NS) & (track.t_ns[1:] > from_ns))
+    bad = np.flatnonzero((steps > MAX_GAP_NS) & (track.t_ns[1:] > from_ns))
     if not bad.size:
         return None
-    return Hole(serial, int(track.t_ns[bad[-1]]), int(track.t_ns[bad[-1] + 1]))
+    return Gap(serial, int(track.t_ns[bad[-1]]), int(track.t_ns[bad[-1] + 1]))
 
 
 def _block(grid: Times, tracks: Sequence[_Track]) -> Block:
@@ -245,13 +245,13 @@ class Segmenter:
         whole = joined_blocks(self._held)
         found, begin = [], 0
         while begin + SEGMENT_SAMPLES + 2 * _EDGE <= len(whole.t_ns):
-            found.append(_stretch(part_of(whole, begin, begin + SEGMENT_SAMPLES + 2 * _EDGE)))
+            found.append(_segment(part_of(whole, begin, begin + SEGMENT_SAMPLES + 2 * _EDGE)))
             begin += SEGMENT_SAMPLES
         self._held = [part_of(whole, begin, len(whole.t_ns))]
         return found
 
 
-def _stretch(block: Block) -> DataSegment:
+def _segment(block: Block) -> DataSegment:
     others = [block.tau_nm, block.gyro_rad_s, block.accel_m_s2]
     q, qd, qdd, (tau, gyro, accel), kept = filtered_signals(block.q_rad, others, RATE_HZ, DYNAMIC_CUTOFF_HZ)
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)

@@ -64,10 +64,10 @@ def monitoring(
     subject = _subject(robot, noise, seed)._replace(brief=quick)
     check_writable(json_file)
     if quick:
-        trials, after_s, stretches = 1, _QUICK_AFTER_S, [_QUICK_STRETCH_S]
+        trials, after_s, segments = 1, _QUICK_AFTER_S, [_QUICK_STRETCH_S]
     else:
-        after_s, stretches = AFTER_S, [_STRETCH_S] * max(1, round(3600.0 * hours / _STRETCH_S))
-    found = _run(subject, trials, after_s, stretches, processes)
+        after_s, segments = AFTER_S, [_STRETCH_S] * max(1, round(3600.0 * hours / _STRETCH_S))
+    found = _run(subject, trials, after_s, segments, processes)
     happened = [one for one in found if isinstance(one, MonitoringTrial)]
     quiet = [one for one in found if isinstance(one, Alarms)]
     alarms = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
@@ -168,7 +168,7 @@ def _subject(robot: str, noise: str, seed: int) -> Subject:
 
 
 def _run(
-    subject: Subject, trials: int, after_s: float, stretches: Sequence[float], processes: int | None
+    subject: Subject, trials: int, after_s: float, segments: Sequence[float], processes: int | None
 ) -> list[MonitoringTrial | Alarms]:
     work = [
         Trial(monitoring_trial, (kind, day, subject, after_s), _COST_SHARE * (after_s + 10.0))
@@ -177,7 +177,7 @@ def _run(
     ]
     work += [
         Trial(false_alarms, (_UNCHANGED_DAY + k, for_s, subject), _COST_SHARE * for_s)
-        for k, for_s in enumerate(stretches)
+        for k, for_s in enumerate(segments)
     ]
     with experiment() as terminal:
         return trial_results(terminal, work, processes, lambda _: "monitoring")

@@ -2,7 +2,7 @@
 
 import pytest
 
-from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from sim.benchmark.cases.monitored_robot import Happening, watched
 from sim.benchmark.cases.monitoring import (
     Alarms,
@@ -16,28 +16,28 @@ from sim.benchmark.cases.monitoring import (
 ARM = Subject(robot="a2085_03", seed=3, brief=True)
 
 
-def notes_of(subject: Subject, for_s: float, *happenings: Happening) -> tuple[Watcher, list[str]]:
+def notes_of(subject: Subject, for_s: float, *happenings: Happening) -> tuple[Monitor, list[str]]:
     known = known_subject(ARM)
-    watcher = Watcher(known.reference)
+    monitor = Monitor(known.reference)
     notes: list[str] = []
 
-    def say(heard: Heard, now_ns: int) -> None:
-        notes.extend(heard.notes)
+    def report(update: MonitorUpdate, now_ns: int) -> None:
+        notes.extend(update.notes)
 
-    watched(settings_of(known.robot, subject, 9), known.motions, for_s, watcher, say, happenings)
-    return watcher, notes
+    watched(settings_of(known.robot, subject, 9), known.motions, for_s, monitor, report, happenings)
+    return monitor, notes
 
 
 def test_nothing_is_found_of_a_robot_that_has_not_changed() -> None:
-    watcher, notes = notes_of(ARM, 12.0)
-    assert watcher.ledger.all == ()
+    monitor, notes = notes_of(ARM, 12.0)
+    assert monitor.finding_log.all == ()
     assert notes == []
-    assert watcher.looked_s > 11.0
+    assert monitor.monitored_s > 11.0
 
 
 def test_a_poor_network_is_named_and_nothing_is_concluded_from_what_it_leaves() -> None:
-    watcher, notes = notes_of(ARM._replace(network="bad"), 12.0)
-    assert watcher.ledger.all == ()
+    monitor, notes = notes_of(ARM._replace(network="bad"), 12.0)
+    assert monitor.finding_log.all == ()
     assert any("the network is slow" in note for note in notes)
 
 

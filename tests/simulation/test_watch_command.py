@@ -44,16 +44,16 @@ def watch(*words: str) -> tuple[int, str]:
 
 
 def test_the_run_that_a_robot_is_known_from_is_quiet(known: Path) -> None:
-    code, said = watch(str(known), "--recording", str(known / "session.mcap"))
-    assert code == 0, said
-    assert "nothing is other than it was" in said
+    code, findings = watch(str(known), "--recording", str(known / "session.mcap"))
+    assert code == 0, findings
+    assert "nothing is other than it was" in findings
 
 
 def test_what_the_robot_grasped_meanwhile_is_found_and_written_down(known: Path, tmp_path: Path) -> None:
     later = lived(tmp_path / "later", 1, True)
     file = tmp_path / "found.jsonl"
-    code, said = watch(str(known), "--recording", str(later / "session.mcap"), "--json", str(file))
-    assert code == 4, said
+    code, findings = watch(str(known), "--recording", str(later / "session.mcap"), "--json", str(file))
+    assert code == 4, findings
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     (finding,) = lines[-1]["findings"]
     assert (finding["kind"], finding["serial"]) == ("payload", ARM.serials[-1])
@@ -64,7 +64,7 @@ def test_what_the_robot_grasped_meanwhile_is_found_and_written_down(known: Path,
 
 def test_wrong_usage_is_answered_with_what_would_be_right(known: Path, tmp_path: Path) -> None:
     assert watch(str(tmp_path))[0] == 2
-    code, said = watch(str(known), "--recording", str(tmp_path / "none.mcap"))
+    code, findings = watch(str(known), "--recording", str(tmp_path / "none.mcap"))
     assert code == 2
-    assert "none.mcap" in said
+    assert "none.mcap" in findings
     assert watch(str(known), "--json", str(tmp_path / "no" / "file"), "--recording", "x")[0] == 2

@@ -3,7 +3,7 @@
 import pytest
 
 from coordinator.monitoring.findings import Finding
-from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from sim.benchmark.cases.monitored_robot import Happening, watched
 from sim.benchmark.cases.monitoring import (
     Happens,
@@ -60,16 +60,16 @@ def test_a_link_that_slipped_is_no_payload_as_imus_see_it_too() -> None:
 
 def test_a_hand_that_holds_the_arm_for_seconds_is_not_weighed() -> None:
     known = known_subject(ARM)
-    watcher = Watcher(known.reference)
+    monitor = Monitor(known.reference)
     hand = Push(serial="elbow", force_n=(6.0, 8.0, -4.0), at_m=(0.1, 0.0, 0.0), from_s=5.0, for_s=3.0)
     happening = Happening(4.0, lambda world: world.push(hand))
-    said: list[Finding] = []
+    findings: list[Finding] = []
 
-    def say(heard: Heard, now_ns: int) -> None:
-        said.extend(heard.findings)
+    def report(update: MonitorUpdate, now_ns: int) -> None:
+        findings.extend(update.findings)
 
-    watched(settings_of(known.robot, ARM, 5), known.motions, 9.0, watcher, say, (happening,))
+    watched(settings_of(known.robot, ARM, 5), known.motions, 9.0, monitor, report, (happening,))
     # At first it is a blow like any other.
-    assert said[0].kind == "collision"
-    assert said[0].since_ns == pytest.approx(5.0e9, abs=0.1e9)
-    assert {finding.kind for finding in said} <= {"collision", "unexplained"}
+    assert findings[0].kind == "collision"
+    assert findings[0].since_ns == pytest.approx(5.0e9, abs=0.1e9)
+    assert {finding.kind for finding in findings} <= {"collision", "unexplained"}

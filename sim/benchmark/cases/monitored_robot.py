@@ -15,7 +15,7 @@ from coordinator.live_robot.errors import MotionInterrupted
 from coordinator.live_robot.messenger import Messenger, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.monitoring.live import LiveMonitor
-from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.recording.recording import Entry, Recording
 from coordinator.runtime.event_loop import run_to_end
 from module_agent.model.catalogue import module_type
@@ -30,7 +30,7 @@ MOVER, WATCHER = "mover", "watcher"
 TRAVEL_RAD_S = 1.5
 SETTLE_S = 0.3
 
-Say = Callable[[Heard, int], None]
+Report = Callable[[MonitorUpdate, int], None]
 
 
 class Happening(NamedTuple):
@@ -55,13 +55,13 @@ def watched(
     settings: VirtualSettings,
     motions: Sequence[RobotMotion],
     for_s: float,
-    watcher: Watcher,
-    say: Say,
+    monitor: Monitor,
+    report: Report,
     happenings: Sequence[Happening] = (),
 ) -> None:
     """Move a robot for a while, over and over by the same motions, and let the watcher look at it.
 
-    `say` hears what the watcher says, and when [ns] of virtual time.
+    `report` hears what the watcher says, and when [ns] of virtual time.
 
     Raises:
         what `ModuleGroup` raises, if the robot is lost.
@@ -72,7 +72,7 @@ def watched(
     mover = Messenger(
         robot.endpoint(MOVER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, _kept(recording)
     )
-    watch = LiveMonitor(watcher, lambda: loop.now_ns, WATCHER, lambda heard: say(heard, loop.now_ns))
+    watch = LiveMonitor(monitor, lambda: loop.now_ns, WATCHER, lambda update: report(update, loop.now_ns))
     ears = Messenger(
         robot.endpoint(WATCHER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
     )

@@ -20,7 +20,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.identify import identify_kinematics
 from coordinator.monitoring.findings import Finding
-from coordinator.monitoring.monitor import Heard, Watcher
+from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.monitoring.reference import Reference, build_reference
 from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
 from module_agent.model.chain import Chain
@@ -150,25 +150,25 @@ def monitoring_trial(
     known = known_subject(subject)
     rng = np.random.default_rng((seed, subject.seed, 0x3A7C))
     event = _draw(happens, rng, known.robot, float(rng.uniform(*subject.between_s)))
-    watcher = Watcher(known.reference)
-    said: list[Finding] = []
+    monitor = Monitor(known.reference)
+    findings: list[Finding] = []
 
-    def say(heard: Heard, now_ns: int) -> None:
-        said.extend(heard.findings)
+    def report(update: MonitorUpdate, now_ns: int) -> None:
+        findings.extend(update.findings)
 
     happening = () if event.happening is None else (event.happening,)
     settings = settings_of(known.robot, subject, 1 + seed)
-    watched(settings, known.motions, event.at_s + after_s, watcher, say, happening)
-    return _trial(happens, event, watcher, said)
+    watched(settings, known.motions, event.at_s + after_s, monitor, report, happening)
+    return _trial(happens, event, monitor, findings)
 
 
 def false_alarms(seed: int, for_s: float, subject: Subject = ARM) -> Alarms:
     """Watch a robot for a while to which nothing happens."""
     known = known_subject(subject)
-    watcher = Watcher(known.reference)
+    monitor = Monitor(known.reference)
     settings = settings_of(known.robot, subject, 1 + seed)
-    watched(settings, known.motions, for_s, watcher, lambda heard, now_ns: None)
-    return Alarms(len(watcher.ledger.all), watcher.looked_s)
+    watched(settings, known.motions, for_s, monitor, lambda update, now_ns: None)
+    return Alarms(len(monitor.finding_log.all), monitor.monitored_s)
 
 
 @lru_cache(maxsize=2)
@@ -241,30 +241,30 @@ def _weight(rng: np.random.Generator, mass_kg: float) -> FreePose:
     return FreePose(mass_kg=mass_kg, com_xyz_m=(x, y, z), inertia=(own, own, own, 0.0, 0.0, 0.0))
 
 
-def _trial(happens: Happens, event: _Event, watcher: Watcher, said: Sequence[Finding]) -> MonitoringTrial:
+def _trial(happens: Happens, event: _Event, monitor: Monitor, findings: Sequence[Finding]) -> MonitoringTrial:
     at_ns = round(1e9 * event.at_s)
-    held = watcher.ledger.all
+    held = monitor.finding_log.all
     # A change is known to within the windows of the watch.
-    early = [f for f in held if f.found_ns < at_ns]
-    later = [f for f in held if f.found_ns >= at_ns]
+    early = [f for f in held if f.detected_ns < at_ns]
+    later = [f for f in held if f.detected_ns >= at_ns]
     right = [f for f in later if f.kind == happens]
     found: Found = "nothing"
     if later:
         found = later[0].kind
     others = [f for f in later if f.kind != happens]
-    first = [f.said_ns for f in said if f.said_ns >= at_ns]
-    named = [f.said_ns for f in said if f.said_ns >= at_ns and f.kind == happens]
+    first = [f.reported_ns for f in findings if f.reported_ns >= at_ns]
+    named = [f.reported_ns for f in findings if f.reported_ns >= at_ns and f.kind == happens]
     own = right[0] if right else None
     return MonitoringTrial(
         happened=happens,
         found=found,
-        located=own is not None and _is_there(watcher.reference.chain, own, event.serial),
+        located=own is not None and _is_there(monitor.reference.chain, own, event.serial),
         latency_s=1e-9 * (first[0] - at_ns) if first else None,
         named_s=1e-9 * (named[0] - at_ns) if named and own is not None else None,
         size=event.size or 0.0,
         size_error=own.size - event.size if own is not None and event.size is not None else None,
         false_alarms=len(early) + len(others),
-        watched_s=watcher.looked_s,
+        watched_s=monitor.monitored_s,
         words=tuple(f.words for f in held),
     )
 
@@ -304,7 +304,7 @@ class Watches(NamedTuple):
     quiet: tuple[Alarms, ...]
 
 
-def monitoring_cases(trials: int, stretches: int, seed: int, shortened: bool = False) -> list[Case]:
+def monitoring_cases(trials: int, segments: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return the one case: every kind so many times, and stretches of no change.
 
     `shortened`: trials and stretch are short, all in one process, which learns to know the robot once.
@@ -313,15 +313,15 @@ def monitoring_cases(trials: int, stretches: int, seed: int, shortened: bool = F
     after_s, stretch_s = (_QUICK_AFTER_S, _QUICK_STRETCH_S) if shortened else (AFTER_S, SEGMENT_S)
     name = f"{ARM.robot}, watched"
     drawn = [(kind, seed * 100 + number) for number in range(trials) for kind in kinds]
-    quiet = [_UNCHANGED_DAY + number for number in range(stretches)]
-    pieces = [(tuple(drawn), tuple(quiet))] if shortened else _shares(drawn, quiet)
+    quiet = [_UNCHANGED_DAY + number for number in range(segments)]
+    window = [(tuple(drawn), tuple(quiet))] if shortened else _shares(drawn, quiet)
     work = tuple(
         Trial(
             watches_of_one_robot,
             (own, still, after_s, stretch_s, shortened),
             _KNOWN_COST_S + _COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * stretch_s),
         )
-        for own, still in pieces
+        for own, still in window
     )
     return [Case(name, work, partial(_summary, name))]
 
@@ -356,12 +356,12 @@ def _summary(case: str, found: Sequence[Watches]) -> Summary:
     for kind in dict.fromkeys(trial.happened for trial in trials):
         own = [trial for trial in trials if trial.happened == kind]
         wrong = sum(not (trial.found == kind and trial.located) for trial in own)
-        said = [trial.named_s for trial in own if trial.named_s is not None]
+        findings = [trial.named_s for trial in own if trial.named_s is not None]
         # With as many trials chance makes so many of that share.
         limit = float(binom.isf(1.0 / ONE_IN, len(own), MISSED_SHARE))
         rows += [
             Row(case, f"{kind}: missed or misplaced, of {len(own)}", None, float(wrong), None, limit),
-            Row(case, f"{kind}: named after, median [s]", None, median(said) if said else None),
+            Row(case, f"{kind}: named after, median [s]", None, median(findings) if findings else None),
         ]
     total = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
     low, high = total.interval_per_hour()

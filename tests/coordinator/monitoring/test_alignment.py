@@ -71,7 +71,7 @@ def test_rows_in_any_order_and_twice_are_as_good() -> None:
 def test_a_lost_message_is_bridged() -> None:
     feeds = [f for f in both(0, 300) if f != ("B", 100, 5)]
     found = run(Alignment(SERIALS), Recording(), feeds)
-    assert not any(one.holes for one in found)
+    assert not any(one.gaps for one in found)
     block = blocks(found)
     # 24 ms of 2 Hz by a cubic.
     np.testing.assert_allclose(block.q_rad[2:, 1], angle(block.t_ns[2:], "B"), atol=1e-4)
@@ -80,13 +80,13 @@ def test_a_lost_message_is_bridged() -> None:
 def test_a_hole_is_named_and_the_grid_begins_anew_after_it() -> None:
     feeds = [f for f in both(0, 400) if not (f[0] == "B" and 100 <= f[1] < 130)]
     found = run(Alignment(SERIALS), Recording(), feeds)
-    (hole,) = [hole for one in found for hole in one.holes]
-    assert hole.serial == "B"
+    (gap,) = [gap for one in found for gap in one.gaps]
+    assert gap.serial == "B"
     # 30 rows are missing: 31 steps of 4 ms.
-    assert hole.to_ns - hole.from_ns == pytest.approx(124e6, rel=1e-3)
-    after = next(k for k, one in enumerate(found) if one.holes)
+    assert gap.to_ns - gap.from_ns == pytest.approx(124e6, rel=1e-3)
+    after = next(k for k, one in enumerate(found) if one.gaps)
     first = next(one.block for one in found[after:] if one.block is not None)
-    assert first.t_ns[0] >= hole.to_ns
+    assert first.t_ns[0] >= gap.to_ns
 
 
 def test_a_module_that_vanishes_holds_the_grid_and_is_named() -> None:

@@ -6,7 +6,7 @@ from numpy.random import Generator
 from scipy.stats import chi2
 
 from coordinator.monitoring.likelihood_ratio import (
-    Evidence,
+    WhitenedRows,
     compressed,
     find_change,
     gain_above,
@@ -93,8 +93,8 @@ def test_own_parameters_are_left_out_as_a_schur_complement_does(rng: Generator) 
 
 
 def test_evidence_about_other_parameters_is_refused() -> None:
-    one = Evidence(np.eye(3), np.zeros(3))
-    other = Evidence(np.eye(4), np.zeros(4))
+    one = WhitenedRows(np.eye(3), np.zeros(3))
+    other = WhitenedRows(np.eye(4), np.zeros(4))
     with pytest.raises(ValueError, match="cannot be joined"):
         joined([one, other])
     with pytest.raises(ValueError, match="prior of 3"):
