@@ -1,7 +1,8 @@
 """A simulated robot in virtual time, every module an agent process of its own, to be broken at will."""
 
 import asyncio
-from collections.abc import Callable, Coroutine, Sequence
+import itertools
+from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,24 +14,17 @@ from coordinator.live_robot.messenger import Messenger
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.session.run import Run, RunConfig
-from module_agent.firmware.config import config_of
-from module_agent.hardware.hardware import SensorSample
-from module_agent.hardware.loop_inside import LoopInside
-from module_agent.hardware.wires import WiredModule
-from module_agent.host import AgentHost, InlineWorker
-from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile, profile
 from module_agent.transport.transport import Event, Reply, Request, Sample, Transport, Undeclare
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
 from sim.robot.robot_file import load_robot
-from sim.virtual_time.loop import LoopScheduler, VirtualLoop
+from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.network import VirtualNetwork
-from sim.world.truth import TruthLog, write_truth
-from sim.world.world import World
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.world.truth import write_truth
 
 T = TypeVar("T")
-TICK_S = 1e-3
 
 
 class Notes:
@@ -44,24 +38,6 @@ class Notes:
 
     def note(self, text: str) -> None:
         self.lines.append(text)
-
-
-class _Wires:
-    """The hardware of one module of the rig's world."""
-
-    def __init__(self, rig: "Rig", index: int):
-        self._rig = rig
-        self._index = index
-
-    @property
-    def modules(self) -> Sequence[WiredModule]:
-        return [self._rig.world.modules[self._index]]
-
-    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
-        return [self._rig.samples[self._index]]
-
-    def close(self) -> None:
-        self._rig.pwm[self._index] = 0.0
 
 
 class _Cuttable:
@@ -107,8 +83,8 @@ class _Cuttable:
         return pass_on
 
 
-class Rig:
-    """World, network and agents of one robot; `cut` severs the coordinator from all of them.
+class Rig(VirtualRobot):
+    """World, network and agents of one robot that ticks from the start; `cut` severs the coordinator from it.
 
     `beside` is a rig whose network, and with it whose time, this one shares.
     """
@@ -123,76 +99,17 @@ class Rig:
         beside: "Rig | None" = None,
         **firmware: Any,
     ):
-        self.robot = load_robot(robot)
         self._guest = beside is not None
-        self.loop = VirtualLoop() if beside is None else beside.loop
-        self.world = World(self.robot, seed, noise)
-        self.network = VirtualNetwork(self.loop, tap) if beside is None else beside.network
-        self.serials = self.robot.serials
         self.cut = False
-        self.truth = TruthLog(self.world)
-        self.pwm = [0.0] * len(self.serials)
-        self.samples: Sequence[SensorSample] = []
-        self.watchers: list[Callable[[], None]] = []
-        self._profile = profile(network) if isinstance(network, str) else network
-        self._seeds = np.random.SeedSequence(seed)
-        self._firmware = firmware
-        self._boots = 100 + 1000 * seed
-        self.hosts: dict[str, AgentHost] = {}
-        self._loops: dict[str, LoopInside] = {}
-        for serial in self.serials:
-            self.boot(serial)
-        self._ticking = True
-        self.loop.call_soon(self._tick, self.loop.time() + TICK_S)
+        loop = VirtualLoop() if beside is None else beside.loop
+        shared = VirtualNetwork(loop, tap) if beside is None else beside.network
+        impaired = profile(network) if isinstance(network, str) else network
+        super().__init__(VirtualSettings(load_robot(robot), impaired, seed, noise), loop, shared, **firmware)
+        self.start()
 
-    def boot(self, serial: str, **settings: Any) -> None:
-        """Start the agent of a module, under a boot id of its own; `settings` of its firmware come first."""
-        index = self.serials.index(serial)
-        loop_inside = self._loops[serial] = LoopInside(_Wires(self, index))
-        (module,) = loop_inside.information
-        self._boots += 1
-        config = config_of(module, self._boots, **self._firmware)._replace(**settings)
-        self.hosts[serial] = AgentHost(
-            self.robot.name,
-            loop_inside,
-            self.endpoint(f"agent-{serial}"),
-            [config],
-            InlineWorker(),
-        )
-
-    def kill(self, serial: str) -> None:
-        """Do to an agent what SIGKILL does; its motor then gets zero PWM."""
-        self.network.kill(f"agent-{serial}")
-        del self.hosts[serial]
-        self.pwm[self.serials.index(serial)] = 0.0
-
-    def freeze(self, serial: str) -> None:
-        """Stop an agent in its tracks: its token stays, nothing else does."""
-        del self.hosts[serial]
-        self.pwm[self.serials.index(serial)] = 0.0
-
-    def endpoint(self, name: str) -> Transport:
-        rng = np.random.default_rng(self._seeds.spawn(1)[0])
-        return ImpairedTransport(
-            self.network.endpoint(name),
-            self._profile,
-            rng,
-            LoopScheduler(self.loop),
-            receiver="module" if name.startswith("agent-") else "coordinator",
-        )
-
-    def _tick(self, next_s: float) -> None:
-        if not self._ticking:
-            return
-        self.samples = self.world.step(self.pwm)
-        for serial, host in list(self.hosts.items()):
-            host.cycle()
-            # On the bus this PWM goes into the next exchange, and so into the very next step of the world.
-            (self.pwm[self.serials.index(serial)],) = self._loops[serial].pwm
-        self.truth.record()
-        for watcher in self.watchers:
-            watcher()
-        self.loop.call_at(next_s, self._tick, next_s + TICK_S)
+    def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:
+        """Boot ids in order, so that those of a restarted module are known and tell rigs apart."""
+        return np.random.SeedSequence(settings.seed), itertools.count(101 + 1000 * settings.seed)
 
     def state(self, serial: str) -> str:
         return self.hosts[serial].modules[0].firmware.state
@@ -277,11 +194,9 @@ class Rig:
         self.loop.run_until_complete(end())
 
     def close(self) -> None:
-        self._ticking = False
+        self.stop()
         if not self._guest:
             self.end_tasks()
-        for host in self.hosts.values():
-            host.close()
-        self.world.close()
+        super().close()
         if not self._guest:
             self.loop.close()

@@ -1,7 +1,7 @@
 """One robot in virtual time: world, network, and one agent for every module, on one event loop."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from sim.world.world import TICK_NS, World
 
 
 class VirtualSettings(NamedTuple):
-    """What a virtual robot is told; every seed in it follows from `seed`.
+    """The settings of a virtual robot; every seed in it follows from `seed`.
 
     `noise_seed` makes it another day of the same robot: other noise and network, the same modules.
     `pushes` act on the world from outside.
@@ -60,12 +60,25 @@ class VirtualRobot:
     """Ticks the world and all agents once a virtual millisecond.
 
     Every agent has its own endpoint on the network, impaired by its own draws, as a process of its own has.
+    `pwm` is what the motors get in the next tick; `watchers` are called at the end of every tick.
+
+    Args:
+        settings: robot, network, noise and seeds.
+        loop: the event loop in whose time it lives.
+        network: the network of another robot to be part of; by default its own.
+        firmware: settings of all modules' firmware, as in `FirmwareConfig`.
     """
 
-    def __init__(self, settings: VirtualSettings, loop: VirtualLoop):
-        day = settings.seed if settings.noise_seed is None else (settings.seed, settings.noise_seed)
-        seeds = np.random.SeedSequence(day).spawn(2)
+    def __init__(
+        self,
+        settings: VirtualSettings,
+        loop: VirtualLoop,
+        network: VirtualNetwork | None = None,
+        **firmware: Any,
+    ):
         self.loop = loop
+        self.robot = settings.robot
+        self.serials = settings.robot.serials
         self.world = World(
             settings.robot,
             settings.seed,
@@ -73,37 +86,44 @@ class VirtualRobot:
             noise_seed=settings.noise_seed,
             pushes=settings.pushes,
         )
-        self.network = VirtualNetwork(loop)
+        self.network = VirtualNetwork(loop) if network is None else network
         self.truth = TruthLog(self.world)
-        self.pwm = [0.0] * len(self.world.modules)
+        self.pwm = [0.0] * len(self.serials)
         self.samples: Sequence[SensorSample] = ()
+        self.watchers: list[Callable[[], None]] = []
         self._profile = settings.profile
-        self._network_seeds = seeds[0]
-        boots = np.random.default_rng(seeds[1]).integers(1, 2**63, size=len(self.world.modules))
-        self.hosts: dict[str, AgentHost] = {}
+        self._endpoint_seeds, self._boot_ids = self._draws(settings)
+        self._firmware = {"feedback_rate_hz": settings.feedback_rate_hz, **firmware}
         self._loops: dict[str, LoopInside] = {}
-        for index, (serial, boot) in enumerate(zip(settings.robot.serials, boots, strict=True)):
-            loop_inside = self._loops[serial] = LoopInside(_Wires(self, index))
-            (module,) = loop_inside.information
-            self.hosts[serial] = AgentHost(
-                settings.robot.name,
-                loop_inside,
-                self.endpoint(serial),
-                [config_of(module, int(boot), feedback_rate_hz=settings.feedback_rate_hz)],
-                InlineWorker(),
-            )
-        self._index = {module.serial: index for index, module in enumerate(self.world.modules)}
+        self.hosts: dict[str, AgentHost] = {}
+        for serial in self.serials:
+            self.boot(serial)
         self._running = False
+
+    def _draws(self, settings: VirtualSettings) -> tuple[np.random.SeedSequence, Iterator[int]]:
+        """Return the seeds of endpoints, and boot ids."""
+        day = settings.seed if settings.noise_seed is None else (settings.seed, settings.noise_seed)
+        endpoints, boots = np.random.SeedSequence(day).spawn(2)
+        ids = np.random.default_rng(boots).integers(1, 2**63, size=len(self.serials))
+        return endpoints, iter(ids.tolist())
 
     def endpoint(self, name: str) -> Transport:
         """Return a transport of the virtual network, impaired as the profile says."""
-        rng = np.random.default_rng(self._network_seeds.spawn(1)[0])
+        rng = np.random.default_rng(self._endpoint_seeds.spawn(1)[0])
         return ImpairedTransport(
             self.network.endpoint(name),
             self._profile,
             rng,
             LoopScheduler(self.loop),
-            receiver="module" if any(name == m.serial for m in self.world.modules) else "coordinator",
+            receiver="module" if name in self.serials else "coordinator",
+        )
+
+    def boot(self, serial: str, **firmware: Any) -> None:
+        """Start the agent of a module, under a boot id of its own; `firmware` are settings of it alone."""
+        modules = self._loops[serial] = LoopInside(_Wires(self, self.serials.index(serial)))
+        config = config_of(modules.information[0], next(self._boot_ids), **self._firmware)
+        self.hosts[serial] = AgentHost(
+            self.robot.name, modules, self.endpoint(serial), [config._replace(**firmware)], InlineWorker()
         )
 
     def start(self) -> None:
@@ -116,16 +136,22 @@ class VirtualRobot:
             return
         self.samples = self.world.step(self.pwm)
         self.truth.record()
-        for serial, host in self.hosts.items():
+        for serial, host in list(self.hosts.items()):
             host.cycle()
-            (self.pwm[self._index[serial]],) = self._loops[serial].pwm
+            (self.pwm[self.serials.index(serial)],) = self._loops[serial].pwm
+        for watcher in self.watchers:
+            watcher()
         self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)
 
     def kill(self, serial: str) -> None:
         """End an agent as SIGKILL does: its motor gets zero PWM, its network endpoint is gone."""
-        del self.hosts[serial]
+        self.freeze(serial)
         self.network.kill(serial)
-        self.pwm[self._index[serial]] = 0.0
+
+    def freeze(self, serial: str) -> None:
+        """Run an agent no more, as SIGSTOP does: its motor gets zero PWM, its endpoint stays."""
+        del self.hosts[serial]
+        self.pwm[self.serials.index(serial)] = 0.0
 
     def stop(self) -> None:
         """Tick no more."""

@@ -14,7 +14,6 @@ from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.session.session import NoModulesFound, Session
 from coordinator.topology.next_motion import NextMotion
-from module_agent.firmware.config import config_of
 from module_agent.wire.keys import Leaf, parse
 from sim.benchmark.cases.topology import PLAN, topology_trial
 from sim.virtual_time.network import VirtualEndpoint
@@ -176,8 +175,7 @@ def test_a_module_that_sends_no_feedback_is_left_out_by_name(
 
 def narrow_elbow(arm: Any) -> None:
     """Let the elbow allow less than exploring it takes."""
-    module = arm.world.modules[arm.serials.index("elbow")]
-    limits = config_of(module, 1).limits
+    limits = arm.hosts["elbow"].modules[0].firmware.config.limits
     narrow = limits.model_copy(update={"min_position_rad": -0.1, "max_position_rad": 0.1})
     arm.kill("elbow")
     arm.boot("elbow", limits=narrow)
