@@ -1,6 +1,6 @@
-"""One module's firmware and who commands it: a lease held, gains set and motions started, with no network.
+"""The firmware of one module under command: a lease held, gains set and motions started, with no network.
 
-All that is sent goes through the firmware's inbox, encoded, as it would come from a network.
+All messages go through the firmware's inbox, encoded, as they would come from a network.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ _ASKED = 1
 
 
 class ExperimentFailed(RobotError):
-    """A module refused a command or broke a motion off; the message says which module, and why."""
+    """A module refused a command or interrupted a motion; the message names the module and the reason."""
 
 
 class ModuleBench:
@@ -67,10 +67,10 @@ class ModuleBench:
         out = self.firmware.publish(pwm)
         self.published_rows = any(isinstance(one, Publication) and one.leaf is Leaf.FEEDBACK for one in out)
         for outgoing in out:
-            self._hear(outgoing)
+            self._note(outgoing)
 
     def start(self, pattern: Pattern, effort: EffortProfile | None = None) -> None:
-        """Start a motion in the next tick, with the efforts that it is fed forward if there are any."""
+        """Start a motion in the next tick, with feed-forward efforts if given."""
         self._motions += 1
         command = MotionCommand(**self._head(), motion_id=self._motions, pattern=pattern, effort=effort)
         self._record = None
@@ -83,7 +83,7 @@ class ModuleBench:
     def setpoint(
         self, position_rad: float | None, velocity_rad_s: float | None, effort_nm: float | None, echo_ns: int
     ) -> Incoming:
-        """Return a set-point to hand to `step` when it arrives; `echo_ns` is what its sender knew."""
+        """Return a set-point to hand to `step` when it arrives; `echo_ns` is the feedback its sender has."""
         message = Setpoint(
             **self._head() | {"echo_ns": echo_ns},
             position_rad=position_rad,
@@ -96,13 +96,13 @@ class ModuleBench:
         """Return the record of the last motion that was started, None while it runs.
 
         Raises:
-            ExperimentFailed: the motion was broken off.
+            ExperimentFailed: the motion was interrupted.
         """
         record = self._record
         if record is None or record.outcome == "running":
             return None
         if record.outcome != "done":
-            raise ExperimentFailed(f"a motion of module {self.serial} was broken off: {record.outcome}")
+            raise ExperimentFailed(f"a motion of module {self.serial} was interrupted: {record.outcome}")
         return record
 
     def rows(self, first: int, end: int) -> Rows:
@@ -121,7 +121,7 @@ class ModuleBench:
         self._renewed_ns = self.now_ns
 
     def _head(self) -> dict[str, Any]:
-        """Return what every command carries."""
+        """Return the fields that every command has."""
         self._seq += 1
         return {
             "serial": self.serial,
@@ -132,7 +132,7 @@ class ModuleBench:
             "echo_ns": self.now_ns,
         }
 
-    def _hear(self, outgoing: Outgoing) -> None:
+    def _note(self, outgoing: Outgoing) -> None:
         if isinstance(outgoing, Answer):
             ack = decode(Ack, outgoing.payload)
             if not ack.accepted:

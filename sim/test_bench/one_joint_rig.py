@@ -1,11 +1,9 @@
-"""The thesis' one-joint arm on the bench: world, firmware of both modules, and the motions of one trial.
+"""The thesis' one-joint arm on the bench, and the motions and estimates of one trial.
 
-A trial is what chapter 6.2.1 of the thesis prescribes: rest, constant motion, windowed sine motion. What the
-modules' feedback rows say of it goes through the agents' own estimator.
+A trial is what chapter 6.2.1 of the thesis prescribes: rest, constant motion, windowed sine motion. The
+modules' feedback rows go through the agents' own estimator.
 """
 
-from collections.abc import Mapping
-from types import TracebackType
 from typing import NamedTuple
 
 from coordinator.excitation.plan import Plan
@@ -16,16 +14,12 @@ from module_agent.estimate.joint_regression import JointRegression, regress_join
 from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.observer import MARGIN_NS
 from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
-from module_agent.firmware.config import config_of
-from module_agent.firmware.firmware import Firmware
-from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.imu_prior import CALIBRATED, ImuPrior
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
-from sim.test_bench.module_bench import ModuleBench
-from sim.world.world import TICK_NS, World, WorldWires
+from sim.test_bench.robot_bench import BenchRobot
 
 JOINT, IMU = 0, 1
 
@@ -47,61 +41,21 @@ class TrialRows(NamedTuple):
     sine: MotionRows
 
 
-class OneJointRig:
-    """An arm of two modules: the first one's joint moves the second one's IMU.
+class OneJointRig(BenchRobot):
+    """An arm of two modules: the joint of the first moves the IMU of the second.
 
     Raises:
-        ValueError: the robot has not two modules, one upon the other.
+        ValueError: the robot is not two modules in a row.
         KeyError: unknown noise profile.
     """
 
     def __init__(self, robot: Robot, seed: int, noise: str | NoiseProfile | None = None):
         if robot.parents != (-1, 0):
-            raise ValueError(f"robot {robot.name} is no arm of two modules, one upon the other")
+            raise ValueError(
+                f"robot {robot.name} has the parents {robot.parents}; this rig takes an arm of two modules"
+            )
         self.robot = robot
-        self.world = World(robot, seed, noise)
-        self._hardware = LoopInside(WorldWires(self.world))
-        self.modules = tuple(
-            ModuleBench(Firmware(config_of(module, index + 1), self._hardware, index))
-            for index, module in enumerate(self._hardware.information)
-        )
-        # In their first tick both modules are taken under command, and hold still.
-        self.tick()
-
-    def __enter__(self) -> "OneJointRig":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def tick(self) -> None:
-        """Advance world and firmware by one tick; the PWM acts in the next, as on the bus."""
-        samples = self._hardware.receive()
-        commands = [module.step(sample) for module, sample in zip(self.modules, samples, strict=True)]
-        for module, pwm in zip(self.modules, self._hardware.send(commands), strict=True):
-            module.publish(pwm)
-
-    def wait(self, duration_s: float) -> None:
-        """Let time pass."""
-        for _ in range(round(duration_s * 1e9 / TICK_NS)):
-            self.tick()
-
-    def run(self, patterns: Mapping[int, Pattern]) -> list[MotionRecord]:
-        """Run one motion on each of some modules, by index, and return their records in that order.
-
-        Raises:
-            ExperimentFailed: a module refused its motion, or it was broken off.
-        """
-        for index, pattern in patterns.items():
-            self.modules[index].start(pattern)
-        running = [self.modules[index] for index in patterns]
-        while True:
-            self.tick()
-            records = [record for module in running if (record := module.finished()) is not None]
-            if len(records) == len(running):
-                return records
+        super().__init__(robot, seed, noise)
 
     def trial(self, plan: Plan) -> TrialRows:
         """Run rest, constant motion through home and windowed sine about home.
@@ -110,7 +64,7 @@ class OneJointRig:
             ExperimentFailed: as `run`.
         """
         self._go(plan, plan.home_rad)
-        rest = self.run({JOINT: Rest(duration_s=plan.rest_s), IMU: Rest(duration_s=plan.rest_s)})[IMU]
+        rest = self.run(dict.fromkeys(self.by_serial, Rest(duration_s=plan.rest_s)))[IMU]
         still = self.modules[IMU].rows(rest.start_row, _end(rest))
         constant = plan.constant()
         travel = constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
@@ -119,20 +73,19 @@ class OneJointRig:
         self._go(plan, plan.home_rad)
         return TrialRows(still, through, self._observe(plan.sine(self.modules[JOINT].firmware.config.kind)))
 
-    def close(self) -> None:
-        """End the world."""
-        self.world.close()
-
     def _go(self, plan: Plan, target_rad: float) -> None:
-        self.run({JOINT: GoTo(target_rad=target_rad, max_speed_rad_s=plan.travel_speed_rad_s)})
+        self._move(GoTo(target_rad=target_rad, max_speed_rad_s=plan.travel_speed_rad_s))
         self.wait(plan.settle_s)
 
+    def _move(self, pattern: Pattern) -> MotionRecord:
+        return self.run({self.modules[JOINT].serial: pattern})[0]
+
     def _observe(self, pattern: Pattern) -> MotionRows:
-        record = self.run({JOINT: pattern})[0]
+        record = self._move(pattern)
         self.wait(MARGIN_NS * 1e-9)
         joint, imu = self.modules[JOINT], self.modules[IMU]
         rows = joint.rows(record.start_row, _end(record))
-        # Read off both clocks at the same tick; the motion itself then tells it to microseconds.
+        # Both clocks read at the same tick; the motion itself then gives the offset to microseconds.
         offset_ns = imu.now_ns - joint.now_ns
         history = imu.firmware.history
         own = imu.rows(history.first_row, history.next_row)
@@ -142,7 +95,7 @@ class OneJointRig:
 
 
 def analyse(trial: TrialRows, taps: int = TAPS) -> CircleFit:
-    """Run the agents' circle point analysis on a trial; `taps` = 1 leaves the thesis' filter out.
+    """Run the agents' circle point analysis on a trial; `taps` = 1 omits the thesis' filter.
 
     Raises:
         ValueError: too little motion, with what would be enough.
@@ -165,14 +118,14 @@ def windows(trial: TrialRows) -> list[MotionWindows]:
     """Return the trial's motions as the joint regression takes them.
 
     Raises:
-        ValueError: too few samples to tell the clocks apart.
+        ValueError: too few samples to estimate the offset of the clocks.
     """
-    found = []
+    motions = []
     for motion in (trial.constant, trial.sine):
         own, joint = imu_window(motion.imu), joint_window(motion.joint)
         offset_ns = clock_delay(own, joint, motion.rough_offset_ns).offset_ns
-        found.append(MotionWindows(own, joint, imu_window(motion.joint), offset_ns))
-    return found
+        motions.append(MotionWindows(own, joint, imu_window(motion.joint), offset_ns))
+    return motions
 
 
 def _aligned(motion: MotionRows) -> AlignedMotion:

@@ -1,15 +1,13 @@
-"""One direction of a network for messages that keep their order, asked tick by tick.
+"""A robot on the bench: its world, and every module's firmware under command, without agents.
 
-A robot of any number of modules on the bench: its world, and every module's firmware under command.
-
-Motions run on the modules, or a host streams set-points to them through a network. Leases are kept without
-one: it is the set-points that are on trial.
+Motions run on the modules, or a host streams set-points to them through an emulated network. The leases are
+kept without a network: the set-points are what is tested.
 """
 
 import heapq
 from collections.abc import Mapping, Sequence
 from types import TracebackType
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -20,7 +18,7 @@ from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.read_only import read_only
 from module_agent.network_emulation.channel import Channel
 from module_agent.network_emulation.profile import NetworkProfile, PathProfile
-from module_agent.wire.messages import EffortProfile, GainSet, Pattern
+from module_agent.wire.messages import EffortProfile, GainSet, MotionRecord, Pattern
 from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
@@ -31,7 +29,7 @@ T = TypeVar("T")
 
 
 class MessagePath(Generic[T]):
-    """What is sent comes out late, twice or not at all, as a path's profile has it (see `PathProfile`)."""
+    """One direction of a network, asked tick by tick: messages are late, doubled or lost (`PathProfile`)."""
 
     def __init__(self, path: PathProfile, rng: np.random.Generator):
         self._channel = Channel(path, rng)
@@ -53,11 +51,11 @@ class MessagePath(Generic[T]):
             self._put(t_ns + round(fate.copy_delay_s * 1e9), message)
 
     def arrived(self, t_ns: int) -> list[T]:
-        """Return what has come since the last call, in the order in which it came."""
-        found = []
+        """Return the messages that have arrived since the last call, in the order of their arrival."""
+        messages = []
         while self._under_way and self._under_way[0][0] <= t_ns:
-            found.append(heapq.heappop(self._under_way)[2])
-        return found
+            messages.append(heapq.heappop(self._under_way)[2])
+        return messages
 
     def _put(self, at_ns: int, message: T) -> None:
         # The count keeps messages that come at the same time in order, and from being compared themselves.
@@ -66,7 +64,7 @@ class MessagePath(Generic[T]):
 
 
 class Track(NamedTuple):
-    """What the joints really did, tick by tick, (m, n) each and read-only; duty as the bridges applied it."""
+    """The true motion of the joints at every tick, (m, n) each, read-only; duty as applied by the bridges."""
 
     q_rad: Array
     spring_torque_nm: Array
@@ -74,9 +72,9 @@ class Track(NamedTuple):
 
 
 class Streaming(NamedTuple):
-    """How a host streams set-points: through which network, how often, and which of their values.
+    """How a host streams set-points: the network, their rate, and which targets they have.
 
-    velocity, effort: whether set-points have them; without, their loops are off.
+    velocity, effort: whether set-points have these targets; without one its loop is off.
     """
 
     network: NetworkProfile
@@ -86,7 +84,13 @@ class Streaming(NamedTuple):
 
 
 class BenchRobot:
-    """All modules of a robot, held from the first tick on; `seed` as in `World`, `noise_seed` the day.
+    """The world of a robot and the firmware of all its modules, leased from the first tick on.
+
+    Args:
+        robot: the robot.
+        seed: draws the modules and their noise, as in `World`.
+        noise: name of a noise profile, or one; by default that of the robot.
+        noise_seed: draws the noise anew for the same modules.
 
     Raises:
         KeyError: unknown noise profile.
@@ -103,11 +107,11 @@ class BenchRobot:
             for index, module in enumerate(self._hardware.information)
         )
         self.by_serial = {module.serial: module for module in self.modules}
-        self._taken: list[tuple[Array, Array, Array]] = []
-        # In their first tick all modules are taken under command, and hold still.
+        self._track: list[tuple[Array, Array, Array]] | None = None
+        # In their first tick all modules are leased, and hold their positions.
         self.tick()
 
-    def __enter__(self) -> "BenchRobot":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -129,8 +133,9 @@ class BenchRobot:
         ]
         for module, pwm in zip(self.modules, self._hardware.send(commands), strict=True):
             module.publish(pwm)
-        plant = self.world.plant
-        self._taken.append((plant.q_rad, plant.spring_torque_nm, plant.duty))
+        if self._track is not None:
+            plant = self.world.plant
+            self._track.append((plant.q_rad, plant.spring_torque_nm, plant.duty))
 
     def wait(self, duration_s: float) -> None:
         """Let time pass."""
@@ -145,44 +150,57 @@ class BenchRobot:
 
     def run(
         self, patterns: Mapping[str, Pattern], efforts: Mapping[str, EffortProfile] | None = None
-    ) -> Track:
-        """Run one motion on each of some modules, by serial, beginning in the same tick.
+    ) -> list[MotionRecord]:
+        """Run one motion on each of some modules, by serial, in the same time; return their records.
 
         Raises:
-            ExperimentFailed: a module refused its motion, or it was broken off.
+            ExperimentFailed: a module refused its motion, or it was interrupted.
         """
         for serial, pattern in patterns.items():
             self.by_serial[serial].start(pattern, (efforts or {}).get(serial))
         running = [self.by_serial[serial] for serial in patterns]
-        self._taken.clear()
         while True:
             self.tick()
-            # Every one is asked in every tick, so that one that is broken off is heard at once.
-            if None not in [module.finished() for module in running]:
-                return self._track()
+            # Every module is asked in every tick, so that an interrupted motion raises at once.
+            records = [record for module in running if (record := module.finished()) is not None]
+            if len(records) == len(running):
+                return records
 
-    def stream(self, serials: Sequence[str], points: SetPoints, how: Streaming, seed: int) -> Track:
-        """Stream set-points to some modules, in the order of the points' columns.
-
-        Every one holds what the reference says at the moment when it is sent.
+    def record(
+        self, patterns: Mapping[str, Pattern], efforts: Mapping[str, EffortProfile] | None = None
+    ) -> Track:
+        """Run motions as `run` does, and return the true motion of the joints meanwhile.
 
         Raises:
-            ExperimentFailed: a module refused what it was asked.
+            ExperimentFailed: as `run`.
+        """
+        self._track = []
+        self.run(patterns, efforts)
+        return self._taken()
+
+    def stream(self, serials: Sequence[str], points: SetPoints, how: Streaming, seed: int) -> Track:
+        """Stream set-points to some modules, in the order of the points' columns; return the true motion.
+
+        Every set-point holds the values of the reference at the time when it is sent.
+
+        Raises:
+            ExperimentFailed: a module refused a request.
         """
         host = _Host([self.by_serial[serial] for serial in serials], points, how, seed)
-        self._taken.clear()
+        self._track = []
         for row in range(len(points.reference.t_s)):
             self.tick(host.exchange(self.world.t_ns, row))
             host.listen(self.world.t_ns)
-        return self._track()
+        return self._taken()
 
-    def _track(self) -> Track:
-        q, torque, duty = np.array(self._taken).transpose(1, 0, 2)
+    def _taken(self) -> Track:
+        q, torque, duty = np.array(self._track).transpose(1, 0, 2)
+        self._track = None
         return Track(read_only(q), read_only(torque), read_only(duty))
 
 
 class _Host:
-    """Who streams: it hears the modules' feedback, and echoes in every set-point the newest that it knows."""
+    """The sender of set-points: each echoes the newest feedback of its module that has reached the sender."""
 
     def __init__(self, modules: Sequence[ModuleBench], points: SetPoints, how: Streaming, seed: int):
         self._modules, self._points, self._how = modules, points, how
@@ -191,19 +209,19 @@ class _Host:
         to_module, to_host = how.network.path("module"), how.network.path("coordinator")
         self._down = [MessagePath[Incoming](to_module, rng) for rng in down.spawn(len(modules))]
         self._up = [MessagePath[int](to_host, rng) for rng in up.spawn(len(modules))]
-        self._heard_ns = [module.now_ns for module in modules]
+        self._echo_ns = [module.now_ns for module in modules]
 
     def exchange(self, t_ns: int, row: int) -> dict[str, list[Incoming]]:
         """Send what is due, and return what arrives at every module in this tick."""
         reference, effort = self._points.reference, self._points.effort_nm
         for column, module in enumerate(self._modules):
-            self._heard_ns[column] = max([self._heard_ns[column], *self._up[column].arrived(t_ns)])
+            self._echo_ns[column] = max([self._echo_ns[column], *self._up[column].arrived(t_ns)])
             if row % self._every == 0:
                 message = module.setpoint(
                     float(reference.q_rad[row, column]),
                     float(reference.qd_rad_s[row, column]) if self._how.velocity else None,
                     float(effort[row, column]) if self._how.effort else None,
-                    self._heard_ns[column],
+                    self._echo_ns[column],
                 )
                 self._down[column].send(t_ns, message)
         return {
@@ -211,7 +229,7 @@ class _Host:
         }
 
     def listen(self, t_ns: int) -> None:
-        """Send off the modules' feedback that was published in this tick, as far as it matters: its time."""
+        """Send off the time of the modules' feedback that was published in this tick."""
         for module, path in zip(self._modules, self._up, strict=True):
             if module.published_rows:
                 path.send(t_ns, module.now_ns)

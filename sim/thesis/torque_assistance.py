@@ -260,7 +260,7 @@ def _on_module(bench: BenchRobot, stage: Stage, points: list[SetPoints], mode: I
     tracks = []
     for patterns, phase in zip((rest, stage.patterns, rest), points, strict=True):
         efforts = dict(zip(stage.patterns, on_module(phase), strict=True)) if mode == 3 else None
-        tracks.append(bench.run(patterns, efforts))
+        tracks.append(bench.record(patterns, efforts))
     return tracks
 
 
