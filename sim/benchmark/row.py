@@ -71,6 +71,11 @@ def largest(values: Sequence[float | None]) -> float | None:
     return float(np.max(known)) if known else None
 
 
+def highest(values: Sequence[float]) -> float | None:
+    """Return the largest value, None if there is none."""
+    return float(max(values)) if values else None
+
+
 def ratio(over: float | None, under: float | None) -> float | None:
     """Return a ratio, None where one of the two is not known or the lower one is 0."""
     return None if over is None or not under else over / under

@@ -1,4 +1,4 @@
-"""`x5-sim monitoring`: what the watch makes of simulated robots to which something happens, or nothing."""
+"""`x5-sim monitoring`: the monitor on simulated robots with an event, or without."""
 
 import json
 from collections.abc import Sequence
@@ -38,9 +38,9 @@ from sim.robot.robot_file import load_robot
 
 _KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
 # A false alarm's trial: long ones would leave a process idle at the end.
-_STRETCH_S = 300.0
+_SEGMENT_S = 300.0
 # Of the quick form.
-_QUICK_AFTER_S, _QUICK_STRETCH_S = 5.0, 8.0
+_QUICK_AFTER_S, _QUICK_SEGMENT_S = 5.0, 8.0
 _COST_SHARE = 0.2
 # Trials of unchanged robots are days of their own.
 _UNCHANGED_DAY = 500
@@ -52,31 +52,31 @@ def monitoring(
     noise: ProfileName = ARM.noise,
     trials: Annotated[int, typer.Option(min=1, max=400, help="Trials of each kind.")] = 10,
     hours: Annotated[
-        float, typer.Option(min=0.01, max=30.0, help="How long unchanged robots are watched.")
+        float, typer.Option(min=0.01, max=30.0, help="Time for which unchanged robots are monitored.")
     ] = 1.0,
     quick: Annotated[
-        bool, typer.Option("--quick", help="One short trial of each kind, and some seconds of no change.")
+        bool, typer.Option("--quick", help="One short trial of each kind, and some seconds without change.")
     ] = False,
     processes: WorkerCount = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Let something happen to a known robot while it moves, or nothing, and count what the watch says."""
+    """Monitor known robots that move, with an event or without, and count the findings."""
     subject = _subject(robot, noise, seed)._replace(brief=quick)
     check_writable(json_file)
     if quick:
-        trials, after_s, segments = 1, _QUICK_AFTER_S, [_QUICK_STRETCH_S]
+        trials, after_s, segments = 1, _QUICK_AFTER_S, [_QUICK_SEGMENT_S]
     else:
-        after_s, segments = AFTER_S, [_STRETCH_S] * max(1, round(3600.0 * hours / _STRETCH_S))
+        after_s, segments = AFTER_S, [_SEGMENT_S] * max(1, round(3600.0 * hours / _SEGMENT_S))
     found = _run(subject, trials, after_s, segments, processes)
     happened = [one for one in found if isinstance(one, MonitoringTrial)]
     quiet = [one for one in found if isinstance(one, Alarms)]
-    alarms = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
+    alarms = Alarms(sum(one.alarms for one in quiet), sum(one.monitored_s for one in quiet))
     print_table(confusion_table(happened))
     print_table(size_table(happened))
     low, high = alarms.interval_per_hour()
     typer.echo(
-        f"{alarms.alarms} false alarms in {alarms.watched_s / 3600.0:.2f} h of motion: {alarms.per_hour:.2f} "
-        f"an hour, 95 % interval {low:.2f} to {high:.2f}"
+        f"{alarms.alarms} false alarms in {alarms.monitored_s / 3600.0:.2f} h of motion: "
+        f"{alarms.per_hour:.2f} an hour, 95 % interval {low:.2f} to {high:.2f}"
     )
     if json_file is not None:
         try:
@@ -86,10 +86,10 @@ def monitoring(
 
 
 def confusion_table(trials: Sequence[MonitoringTrial]) -> Table:
-    """Return what happened, by what the watch took it for."""
+    """Return the confusion matrix: kinds of events by kinds of findings."""
     counted = confusion(trials)
     columns: tuple[Found, ...] = ("nothing", *KINDS)
-    table = Table("happened", *columns, "right module", title="What was found")
+    table = Table("event", *columns, "right module", title="Findings by event")
     for happened, row in counted.items():
         own = [trial for trial in trials if trial.happened == happened]
         cells = [str(row[column]) if column in row else "-" for column in columns]
@@ -98,10 +98,10 @@ def confusion_table(trials: Sequence[MonitoringTrial]) -> Table:
 
 
 def size_table(trials: Sequence[MonitoringTrial]) -> Table:
-    """Return how soon things were said, and how large they were said to be."""
+    """Return latencies and errors of sizes by kind of event."""
     table = Table(
-        "happened",
-        "first word [s]",
+        "event",
+        "first finding [s]",
         "its kind [s]",
         "size",
         "error, rms",
@@ -151,7 +151,7 @@ def figures(trials: Sequence[MonitoringTrial], alarms: Alarms) -> dict[str, obje
         "confusion": confusion(trials),
         "kinds": summary(trials),
         "false_alarms": alarms.alarms,
-        "watched_s": alarms.watched_s,
+        "monitored_s": alarms.monitored_s,
         "per_hour": alarms.per_hour,
         "per_hour_interval_95": alarms.interval_per_hour(),
         "trials": [trial._asdict() for trial in trials],

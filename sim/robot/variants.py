@@ -1,7 +1,4 @@
-"""A robot that carries something: a payload on what one of its joints turns.
-
-Where on the Earth a simulated robot stands, as far as its IMUs feel it: by how strong gravity is there.
-"""
+"""Variants of a robot: with a payload, with a displaced link, and at a random site on the Earth."""
 
 import numpy as np
 
@@ -24,10 +21,11 @@ def loaded(robot: Robot, serial: str, payload: FreePose) -> Robot:
     return robot.model_copy(update={"modules": tuple(modules)})
 
 
+# Gravity on the surface of the Earth.
 MIN_M_S2, MAX_M_S2 = 9.764, 9.834
 
 
-def somewhere(robot: Robot, seed: int) -> Robot:
-    """Return the robot at a place drawn by the seed; the same seed draws the same place."""
+def at_random_site(robot: Robot, seed: int) -> Robot:
+    """Return the robot with the strength of gravity at a site drawn by the seed."""
     drawn = float(np.random.default_rng((seed, 0x6A17)).uniform(MIN_M_S2, MAX_M_S2))
     return robot.model_copy(update={"base": robot.base.model_copy(update={"gravity_m_s2": drawn})})

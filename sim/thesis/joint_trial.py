@@ -25,7 +25,7 @@ from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED, ImuPrior
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.scoring.chain_score import link_length_m
 from sim.sensors.imu import WHITE_RATE_HZ
 from sim.test_bench.one_joint_rig import IMU, JOINT, OneJointRig, TrialRows, analyse, regress, windows
@@ -114,7 +114,7 @@ def joint_trial(
     """
     profile = noise_profile(noise) if isinstance(noise, str) else noise
     wanted = plan if plan is not None else trial_plan(thesis_length(alignment, length_mm), profile)
-    robot = somewhere(load_robot(f"thesis_{length_mm}_{alignment}"), seed)
+    robot = at_random_site(load_robot(f"thesis_{length_mm}_{alignment}"), seed)
     with OneJointRig(robot, seed, profile) as rig:
         rows = rig.trial(wanted)
         return judge(rig, rows, profile)

@@ -30,7 +30,7 @@ from module_agent.network_emulation.profile_file import network
 from module_agent.wire.messages import GainSet, GoTo, Pattern, Rest
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import Robot, load_robot
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.test_bench.module_bench import ExperimentFailed
 from sim.test_bench.robot_bench import BenchRobot, Streaming, Track
 from sim.thesis.published import Reading, setting, thesis_gains, without_velocity
@@ -136,7 +136,7 @@ def identified_model(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | 
 
 def standing_robot(name: str, seed: int) -> Robot:
     """Return a shipped robot at the place that the seed draws."""
-    return somewhere(load_robot(name), seed)
+    return at_random_site(load_robot(name), seed)
 
 
 def follow(

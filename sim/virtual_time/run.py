@@ -24,7 +24,7 @@ COORDINATOR = "coordinator"
 
 
 class VirtualConfig(NamedTuple):
-    """What a virtual run is told; all randomness follows from `seed`, and from `noise_seed` if given.
+    """Settings of a virtual run; all randomness follows from `seed`, and from `noise_seed` if given.
 
     `baseline` and `refined_previews` as in `RunConfig`; by default there is no preview.
     `pushes` act on the robot from outside.
@@ -44,16 +44,26 @@ class VirtualConfig(NamedTuple):
     pushes: tuple[Push, ...] = ()
 
 
+class SilentScreen:
+    """A screen that shows nothing."""
+
+    def step(self, index: int, total: int, text: str) -> None:
+        """Ignore the beginning of a step."""
+
+    def note(self, text: str) -> None:
+        """Ignore a note."""
+
+
 def run_virtual(
     config: VirtualConfig,
-    screen: Screen,
+    screen: Screen = SilentScreen(),  # noqa: B008 - it has no state
     between: Callable[[VirtualRobot], None] | None = None,
     on_signal: Callable[[Interruption], None] = lambda interruption: None,
 ) -> Result:
     """Run one identification in virtual time and write the run's folder, truth included.
 
-    `between` is handed the robot before the run begins, to schedule faults on its loop; `on_signal` is handed
-    what a signal handler is to call, and the run then ends with `asyncio.CancelledError` after its clean-up.
+    `between` receives the robot before the run begins, to schedule faults on its loop; `on_signal` receives
+    the function that a signal handler calls to end the run with `asyncio.CancelledError` after its clean-up.
     """
     loop = VirtualLoop()
     settings = VirtualSettings(

@@ -54,7 +54,7 @@ class Simulation:
 def simulate(
     robot: Robot | str | Path,
     *,
-    noise: NoiseProfile | str = "x5-uncalibrated",
+    noise: NoiseProfile | str | None = "x5-uncalibrated",
     network: str = "none",
     seed: int = 0,
     plan: Plan | None = None,
@@ -66,7 +66,7 @@ def simulate(
 
     Args:
         robot: name of a shipped robot (`x5-sim robots`), a robot file, or a robot.
-        noise: noise profile, by name (`x5-sim effects`) or as an object.
+        noise: noise profile, by name (`x5-sim effects`) or as an object; the robot's own when None.
         network: network profile by name (none, lan, wifi, ...), or a TOML file of one.
         seed: of all randomness; the same seed gives the same recording, bit by bit.
         plan: the motions; by default the standard ones, with IMU priors that fit the noise profile.
@@ -83,7 +83,7 @@ def simulate(
         IdentificationError: the robot could not be identified.
     """
     described = robot if isinstance(robot, Robot) else load_robot(str(robot))
-    profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise)
+    profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or described.noise)
     planned = Plan(imu=imu_kind(profile)) if plan is None else plan
     if dynamics is not None:
         planned = planned.model_copy(update={"dynamics": dynamics})
@@ -104,7 +104,7 @@ def simulate(
 
 def _written(config: VirtualConfig) -> Simulation:
     check_free(config.out)
-    run_virtual(config, _Silent())
+    run_virtual(config)
     return Simulation(
         robot=config.robot,
         folder=config.out,
@@ -112,13 +112,3 @@ def _written(config: VirtualConfig) -> Simulation:
         truth=read_truth(config.out / "truth.json"),
         motion=read_motion(config.out / "truth.npz"),
     )
-
-
-class _Silent:
-    """A screen that shows nothing."""
-
-    def step(self, index: int, total: int, text: str) -> None:
-        """Ignore the beginning of a step."""
-
-    def note(self, text: str) -> None:
-        """Ignore a note."""

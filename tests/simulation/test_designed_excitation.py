@@ -21,6 +21,9 @@ from sim.robot.robot_tree import build_tree, true_chain, true_inertia
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("designed_excitation")
+
 ARM, MOTIONS = "a2085_03", 3
 PLAN = Plan(excitation="d-optimal", excitation_motions=MOTIONS, excitation_s=4.0, imu="calibrated")
 

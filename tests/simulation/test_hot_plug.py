@@ -18,6 +18,9 @@ from sim.scoring.score import score
 from sim.virtual_time.run import VirtualConfig, run_virtual
 from tests.rig import Notes
 
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("hot_plug")
+
 ARM = "a2085_03"
 
 

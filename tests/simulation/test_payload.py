@@ -21,6 +21,9 @@ from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import loaded
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("payload")
+
 ARM = "a2085_03"
 HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
 PLAN = Plan(excitation="d-optimal", excitation_motions=3, excitation_s=4.0, imu="calibrated")

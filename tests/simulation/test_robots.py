@@ -1,33 +1,31 @@
 """Every shipped robot is recognised over good and poor networks, the thesis' arms are measured closely.
 
 Modules are as delivered, with uncalibrated IMUs, on bases and links that give, unless a test says otherwise.
-
-Robots share one run per network between their tests; the group keeps those in one process.
+Whole identifications are run once and shared by tests; their group keeps those in one process. Where only the
+topology is asked for, a session without fast motions and without refinement says as much.
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
-from coordinator.runtime.terminal import Terminal
+from coordinator.identification.topology_search import search_topology
+from module_agent.network_emulation.profile_file import network as network_profile
+from sim import simulate
+from sim.benchmark.cases.topology import differences
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
 from sim.robot.robot_file import load_robot, shipped_robots
-from sim.scoring.score import Score, score
-from sim.virtual_time.run import VirtualConfig, run_virtual
+from sim.scoring.score import Score
+from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.session import record_session
 
 THESIS = tuple(name for name in shipped_robots() if name.startswith("thesis"))
-# Sixteen joints take long: 54 s of robot time with these, 87 s without.
-SHORTER = {
-    "settle_s": 0.2,
-    "constant_duration_s": 0.4,
-    "sine_centre_s": 0.8,
-    "sine_sigma_s": 0.35,
-    "travel_speed_rad_s": 2.5,
-}
+OTHERS = tuple(name for name in shipped_robots() if name not in THESIS)
+# Sixteen joints take long.
+SHORTER = {"settle_s": 0.2, "constant_duration_s": 0.4, "travel_speed_rad_s": 2.5}
 
 
 class Scored(NamedTuple):
@@ -42,16 +40,14 @@ Runs = Callable[..., Scored]
 
 
 @pytest.fixture(scope="session")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+def runs() -> Runs:
     done: dict[tuple[str, str, Plan, str], Scored] = {}
 
     def run(name: str, network: str, plan: Plan, noise: NoiseProfile | None = None) -> Scored:
         case = (name, network, plan, repr(noise))
         if case not in done:
-            out: Path = tmp_path_factory.mktemp("run") / "run"
-            config = VirtualConfig(load_robot(name), out, seed=0, network=network, plan=plan, noise=noise)
-            result = run_virtual(config, Terminal(quiet=True))
-            done[case] = Scored(result, score(out))
+            simulation = simulate(name, noise=noise, network=network, plan=plan)
+            done[case] = Scored(simulation.identified.result, simulation.score())
         return done[case]
 
     return run
@@ -65,15 +61,29 @@ def _grouped(names: tuple[str, ...], *networks: str) -> list[object]:
     ]
 
 
-@pytest.mark.parametrize(("name", "network"), _grouped(shipped_robots(), "lan", "wifi"))
-def test_who_is_mounted_on_whom_and_how_is_found(
+@pytest.mark.parametrize(("name", "network"), _grouped(THESIS, "lan"))
+def test_topology_and_mounting_of_the_thesis_arms_are_identified(
     runs: Runs, quick_plan: Plan, name: str, network: str
 ) -> None:
-    found = runs(name, network, quick_plan.model_copy(update=SHORTER) if name == "snake16" else quick_plan)
+    found = runs(name, network, quick_plan)
     assert found.score.topology_differences == []
     assert found.result.serials[0] == load_robot(name).serials[0]
-    # The odds of the least certain answer; where held joints give by a quarter it is the lowest.
     assert found.result.topology_confidence > 0.95
+
+
+@pytest.mark.parametrize(
+    ("name", "network"),
+    [(name, "wifi") for name in THESIS] + [(name, network) for name in OTHERS for network in ("lan", "wifi")],
+)
+def test_topology_and_mounting_are_identified(quick_plan: Plan, name: str, network: str) -> None:
+    robot = load_robot(name)
+    plan = quick_plan.model_copy(update={"topology_only": True} | (SHORTER if name == "snake16" else {}))
+    recording = record_session(VirtualSettings(robot, network_profile(network)), plan)
+    topology = search_topology(recording, robot.serials).topology
+    assert differences(robot, topology) == ()
+    assert topology.serials[0] == robot.serials[0]
+    # The odds of the least certain answer; where held joints give by a quarter it is the lowest.
+    assert topology.confidence > 0.95
 
 
 @pytest.mark.parametrize(("name", "network"), _grouped(THESIS, "lan"))

@@ -22,6 +22,9 @@ from sim.robot.robot_file import load_robot
 from sim.virtual_time.robot import VirtualRobot
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("shared_torques")
+
 ARM = "thesis_171_horizontal"
 SERIALS = ("X-00009", "X-00010")
 SHORT = Plan(

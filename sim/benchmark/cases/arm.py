@@ -1,9 +1,7 @@
-"""One identification of a whole robot in virtual time, scored beside the thesis' way on the same recording.
+"""Whole robots: links, axes and tips against the truth, with the thesis' chain on the same recordings.
 
-The thesis' chain is the one that is put together from the agents' circle point analyses; ours is what the
-batch refinement makes of all motions.
-
-Whole robots: links, axes and tips against the truth, the thesis' chain on the same recordings.
+The thesis' chain is assembled from the agents' circle point analyses; ours is the batch refinement over all
+motions.
 """
 
 import time
@@ -29,7 +27,7 @@ from sim.benchmark.row import Row, count, for_few, largest, mean_abs, rms, scale
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.scoring.gauge_alignment import tip_error
 from sim.thesis.circle_chain import thesis_chain
@@ -69,12 +67,11 @@ class TipErrors(NamedTuple):
 
 
 class ArmTrial(NamedTuple):
-    """What came of one trial; of one that did not come to its end only the first five fields tell.
+    """The result of one trial; of one that failed only the first five fields are set.
 
-    why: what ended it, empty if nothing did. differences: what is wrong with the topology, in words; tips are
-    not compared then. tip_bound: the errors to expect from the sensors' noise alone, by the curvature of the
-    fit (Cramer and Rao) at the noise that is left in it. identify_s: processor time from the recording to the
-    chain.
+    why: the reason for a failure, empty without one. differences: errors of the topology, described; tips are
+    not compared then. tip_bound: errors expected from the sensors' noise alone (Cramer-Rao, by the curvature
+    of the fit at its residual noise). identify_s: processor time from the recording to the chain.
     """
 
     robot: str
@@ -104,15 +101,15 @@ def arm_trial(
     Args:
         robot: a shipped robot, a robot file, or a robot.
         noise: its profile; the IMUs count as calibrated where it has no errors of scale and misalignment.
-        seed: of the modules, their noise, the network, and the place where the robot stands.
+        seed: of the modules, their noise, the network, and the site.
         mode: one joint after the other, or all at once.
         network: a network profile or file.
-        plan: other motions than those of the mode.
+        plan: motions; those of the mode when None.
     """
-    described = somewhere(robot if isinstance(robot, Robot) else load_robot(robot), seed)
-    found = noise if isinstance(noise, NoiseProfile) else noise_profile(noise)
-    planned = plan or arm_plan(mode, imu_kind(found))
-    settings = VirtualSettings(described, named_network(network), seed, found)
+    described = at_random_site(robot if isinstance(robot, Robot) else load_robot(robot), seed)
+    profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise)
+    planned = plan or arm_plan(mode, imu_kind(profile))
+    settings = VirtualSettings(described, named_network(network), seed, profile)
     joints = len(described.modules)
     try:
         recording = record_session(settings, planned)
@@ -159,14 +156,14 @@ def _tip(chain: Chain, truth: Chain, null_basis: Array) -> TipErrors:
 
 
 def expected_tip(chain: Chain, covariance: Array, seed: int) -> TipErrors:
-    """Return the errors of the tips that a covariance (6 n, 6 n) of increments stands for, by draws."""
+    """Return the tips' errors for a covariance (6 n, 6 n) of perturbations, by random draws."""
     rng = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(covariance)
     spread = vectors * np.sqrt(np.maximum(values, 0.0))
     q = rng.uniform(-np.pi, np.pi, (BOUND_POSES, len(chain.serials)))
     drawn = rng.standard_normal((BOUND_DRAWS, len(covariance)))
-    found = [tip_error(apply_perturbation(chain, spread @ each), chain, q) for each in drawn]
-    squares = np.mean(np.square(found), axis=0)
+    errors = [tip_error(apply_perturbation(chain, spread @ each), chain, q) for each in drawn]
+    squares = np.mean(np.square(errors), axis=0)
     return TipErrors(float(np.sqrt(squares[0])), float(np.degrees(np.sqrt(squares[1]))))
 
 
@@ -179,7 +176,7 @@ def _links(truth: Chain, kinematics: Kinematics, thesis: Chain | None) -> tuple[
             continue
         ours = link_errors(fit.chain, truth, child)
         theirs = None if thesis is None else link_errors(thesis, truth, child)
-        # Without a link of ours there is no place of it in our chain either.
+        # A link that was not identified is not in our chain either.
         own = fit.chain.serials.index(truth.serials[child]) if ours is not None else None
         found.append(
             ArmLink(
@@ -265,7 +262,7 @@ def _case(arm: str, noise: str, plan: Plan, trials: int, seed: int, shortened: b
 
 
 def _summary(case: str, noise: str, mode: Mode, shortened: bool, trials: Sequence[ArmTrial]) -> Summary:
-    """Return the rows of an arm; a trial that ended early, or with another topology, is counted as wrong."""
+    """Return the rows of an arm; a trial that failed, or has another topology, is counted as wrong."""
     rows = [
         _wrong(case, trials),
         *_tip_rows(case, noise, trials),
@@ -334,7 +331,7 @@ def _link_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, 
 
 
 def _time_rows(case: str, mode: Mode, shortened: bool, trials: Sequence[ArmTrial]) -> tuple[Row, ...]:
-    """Return how long the robot was at work; of shortened motions that meets no bar."""
+    """Return the robot time; shortened motions have no bar."""
     done = [trial for trial in trials if not trial.why]
     if mode == "simultaneous":
         spent = largest([trial.robot_time_s for trial in done])

@@ -1,9 +1,7 @@
-"""A robot floats in virtual time: how far it drifts, and what it takes to lead it by hand.
+"""Gravity compensation in virtual time: how far an arm drifts, and what force guides it by hand.
 
-The same session as `x5-coordinator float` runs on a simulated robot over a simulated network; a hand is a
-push at the tip.
-
-Gravity compensation: an arm stays where it is left, and a light hand leads it.
+The session of `x5-coordinator compensate` runs on a simulated robot over a simulated network; a hand is an
+external force at the tip.
 """
 
 import asyncio
@@ -28,25 +26,25 @@ from sim.benchmark.row import Row, largest, ratio
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.session import record_session
 from sim.world.external_force import Push
 
 COORDINATOR = "coordinator"
-# From the start of the world to a robot that floats, and half a second more.
+# From the start of the world to a released robot, and half a second more.
 FREE_S = 3.0
-# A hand's force grows in steps, slowly enough for what gives: to 5 N a robot that is free, to 60 N one that
-# is held. It is led when its tip has gone so far.
-GROWING_S, STEP_S, LED_M = 5.0, 0.05, 0.02
-FREE_MOST_N, HELD_MOST_N = 5.0, 60.0
-# A hand that leads for a moment, and how long after it the arm has come to rest.
-_LEAD_N, _LEAD_S, _REST_S = 4.0, 0.6, 1.0
+# A hand's force grows in steps, slowly enough for the springs: to 5 N on a released robot, to 60 N on a held
+# one. The robot counts as guided when its tip has moved by so much.
+GROWING_S, STEP_S, GUIDED_M = 5.0, 0.05, 0.02
+FREE_MAX_N, HELD_MAX_N = 5.0, 60.0
+# A hand that guides for a moment, and how long after it the arm has come to rest.
+_GUIDE_N, _GUIDE_S, _REST_S = 4.0, 0.6, 1.0
 
 
 class Pose(NamedTuple):
-    """Where joints are as a float begins [rad]; those that are not named where the robot's file has them."""
+    """Joint positions at the start [rad]; joints that are not named start where the robot's file has them."""
 
     name: str
     start_rad: Mapping[str, float]
@@ -61,26 +59,26 @@ POSES = (
 
 
 class CompensationTrial(NamedTuple):
-    """What came of floating.
+    """The result of one trial.
 
-    drift_deg: how far any joint went by itself, in any pose, in `drift_s`. led_deg: how far a hand led one of
-    them in a moment, and rest_deg how far any joint went in the seconds after it was left alone.
-    guiding_n: the force that moves the tip by 20 mm; held_n: the same of the arm that is held in position,
+    drift_deg: largest motion of a joint without external force, in any pose, in `drift_s`. guided_deg: how
+    far a hand moved a joint in a moment; rest_deg: how far any joint moved in the seconds after that.
+    guiding_n: the force that moves the tip by 20 mm; held_n: the same of an arm that is held in position,
     infinite if no force up to 60 N does.
     """
 
     drift_deg: float
     drift_s: float
-    led_deg: float
+    guided_deg: float
     rest_deg: float
     guiding_n: float
     held_n: float
 
 
 class CompensationRun(NamedTuple):
-    """One float: what the session says of it, and what the joints truly did.
+    """One session of gravity compensation: its summary, and the true motion of the joints.
 
-    phase: (m,) at every set-point, t_s (m,) world time, q_rad (m, n) the true positions then.
+    phases: (m,) at every set-point; t_s: (m,) world time; q_rad: (m, n) true positions at these times.
     """
 
     summary: CompensationSummary
@@ -88,8 +86,8 @@ class CompensationRun(NamedTuple):
     t_s: Array
     q_rad: Array
 
-    def floating(self) -> "CompensationRun":
-        """Return the part of it in which the robot was free."""
+    def released(self) -> "CompensationRun":
+        """Return the part in which the robot was released."""
         free = np.array([phase == "floating" for phase in self.phases])
         phases = tuple(phase for phase in self.phases if phase == "floating")
         return CompensationRun(self.summary, phases, self.t_s[free], self.q_rad[free])
@@ -103,7 +101,7 @@ def compensation_trial(
     drift_s: float = 10.0,
     poses: Sequence[Pose] = POSES,
 ) -> CompensationTrial:
-    """Let a robot float in some poses, lead it in the last but one by hand, and hold it against the hand.
+    """Compensate gravity in some poses; in the second (or only) one also guide the arm, and hold it.
 
     Raises:
         what `CompensationSession.run` raises.
@@ -111,35 +109,35 @@ def compensation_trial(
     free = CompensationPlan(for_s=drift_s, then_hold_s=0.0, is_led_back=False)
     drifts = []
     for pose in poses:
-        alone = compensate_robot(posed(robot, pose.start_rad), weight, free, seed, noise).floating()
-        drifts.append(_most_deg(alone.q_rad - alone.q_rad[0]))
+        alone = compensate_robot(posed(robot, pose.start_rad), weight, free, seed, noise).released()
+        drifts.append(_max_deg(alone.q_rad - alone.q_rad[0]))
     here = posed(robot, poses[min(1, len(poses) - 1)].start_rad)
     tip = here.serials[-1]
-    lead = Push(serial=tip, force_n=(0.0, 0.0, _LEAD_N), from_s=FREE_S, for_s=_LEAD_S)
-    led = compensate_robot(here, weight, free, seed, noise, pushes=(lead,)).floating()
-    left = led.q_rad[led.t_s > FREE_S + _LEAD_S + _REST_S]
+    guide = Push(serial=tip, force_n=(0.0, 0.0, _GUIDE_N), from_s=FREE_S, for_s=_GUIDE_S)
+    moved = compensate_robot(here, weight, free, seed, noise, pushes=(guide,)).released()
+    left = moved.q_rad[moved.t_s > FREE_S + _GUIDE_S + _REST_S]
     long = free._replace(for_s=FREE_S + GROWING_S)
-    guided = compensate_robot(here, weight, long, seed, noise, pushes=_growing(tip, FREE_MOST_N))
-    # Held from the moment at which it would float.
+    guided = compensate_robot(here, weight, long, seed, noise, pushes=_growing(tip, FREE_MAX_N))
+    # Held from the moment at which it would be released.
     still = free._replace(for_s=0.0, then_hold_s=FREE_S + GROWING_S)
-    held = compensate_robot(here, weight, still, seed, noise, pushes=_growing(tip, HELD_MOST_N))
+    held = compensate_robot(here, weight, still, seed, noise, pushes=_growing(tip, HELD_MAX_N))
     return CompensationTrial(
         drift_deg=max(drifts),
         drift_s=drift_s,
-        led_deg=_most_deg(left[0] - led.q_rad[led.t_s <= FREE_S][-1]),
-        rest_deg=_most_deg(left - left[0]),
-        guiding_n=_leading_force_n(weight.chain, guided, FREE_MOST_N),
-        held_n=_leading_force_n(weight.chain, held, HELD_MOST_N),
+        guided_deg=_max_deg(left[0] - moved.q_rad[moved.t_s <= FREE_S][-1]),
+        rest_deg=_max_deg(left - left[0]),
+        guiding_n=_guiding_force_n(weight.chain, guided, FREE_MAX_N),
+        held_n=_guiding_force_n(weight.chain, held, HELD_MAX_N),
     )
 
 
-def _growing(serial: str, most_n: float) -> list[Push]:
+def _growing(serial: str, max_n: float) -> list[Push]:
     """Return a force on a module's output, upwards, that grows from nothing in small steps."""
     steps = round(GROWING_S / STEP_S)
     return [
         Push(
             serial=serial,
-            force_n=(0.0, 0.0, most_n * (k + 1) / steps),
+            force_n=(0.0, 0.0, max_n * (k + 1) / steps),
             from_s=FREE_S + k * STEP_S,
             for_s=STEP_S,
         )
@@ -147,29 +145,29 @@ def _growing(serial: str, most_n: float) -> list[Push]:
     ]
 
 
-def _leading_force_n(chain: Chain, floated: "CompensationRun", most_n: float) -> float:
-    """Return the force at which the tip has gone far enough; infinite if it never has."""
+def _guiding_force_n(chain: Chain, run: "CompensationRun", max_n: float) -> float:
+    """Return the force at which the tip has moved by `GUIDED_M`; infinite if it never has."""
     tip = np.append(chain.point[-1], 1.0)
-    place = (body_displacements(chain, floated.q_rad)[:, -1] @ tip)[:, :3]
-    before = place[floated.t_s <= FREE_S][-1]
-    led = (np.linalg.norm(place - before, axis=1) > LED_M) & (floated.t_s > FREE_S)
-    if not led.any():
+    place = (body_displacements(chain, run.q_rad)[:, -1] @ tip)[:, :3]
+    before = place[run.t_s <= FREE_S][-1]
+    guided = (np.linalg.norm(place - before, axis=1) > GUIDED_M) & (run.t_s > FREE_S)
+    if not guided.any():
         return float(np.inf)
-    return float(most_n * (floated.t_s[np.argmax(led)] - FREE_S) / GROWING_S)
+    return float(max_n * (run.t_s[np.argmax(guided)] - FREE_S) / GROWING_S)
 
 
-def _most_deg(away_rad: Array) -> float:
+def _max_deg(away_rad: Array) -> float:
     return float(np.degrees(np.abs(away_rad).max()))
 
 
 def true_weight(robot: Robot) -> GravityModel:
-    """Return what a simulated robot weighs, as if it had been identified without error."""
+    """Return the true gravity model of a simulated robot, in place of an identified one."""
     types = tuple(module.type for module in robot.modules)
     return GravityModel(robot.name, types, true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
 
 
 def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> GravityModel:
-    """Return what a robot weighs by a whole session on it, as a run would write it down.
+    """Return the gravity model of a robot that a whole session identifies.
 
     Raises:
         what `record_session` and `identify` raise.
@@ -180,7 +178,7 @@ def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan |
 
 
 def posed(robot: Robot, start_rad: Mapping[str, float]) -> Robot:
-    """Return a robot that begins elsewhere; joints that are not named stay."""
+    """Return a robot with other start positions; joints that are not named keep theirs."""
     modules = tuple(
         m.model_copy(update={"start_rad": start_rad.get(m.serial, m.start_rad)}) for m in robot.modules
     )
@@ -196,7 +194,7 @@ def compensate_robot(
     network_name: str = "lan",
     pushes: Sequence[Push] = (),
 ) -> CompensationRun:
-    """Let a robot float as the plan says, from where its file has it.
+    """Run gravity compensation as planned, from the start positions of the robot's file.
 
     Raises:
         what `CompensationSession.run` raises.
@@ -204,7 +202,7 @@ def compensate_robot(
     loop = VirtualLoop()
     settings = VirtualSettings(robot, network(network_name), seed, noise, noise_seed=1, pushes=tuple(pushes))
     virtual = VirtualRobot(settings, loop)
-    watcher = _Watcher(virtual)
+    watcher = _TruthAtSetPoints(virtual)
     session = CompensationSession(
         virtual.endpoint(COORDINATOR),
         robot.name,
@@ -232,8 +230,8 @@ async def _to_end(session: CompensationSession, virtual: VirtualRobot) -> Compen
         await asyncio.sleep(0)
 
 
-class _Watcher:
-    """Takes down where the joints truly are at every set-point."""
+class _TruthAtSetPoints:
+    """Records the true joint positions at every set-point."""
 
     def __init__(self, virtual: VirtualRobot):
         self._virtual = virtual
@@ -242,10 +240,10 @@ class _Watcher:
         self.q_rad: list[Array] = []
 
     def note(self, text: str) -> None:
-        """Nobody reads."""
+        """Ignore a note."""
 
     def moment(self, now: Moment) -> None:
-        """Take down one moment."""
+        """Record one set-point."""
         plant = self._virtual.world.plant
         self.phases.append(now.phase)
         self.t_s.append(1e-9 * plant.t_ns)
@@ -254,24 +252,25 @@ class _Watcher:
 
 ROBOT = "a2085_04"
 DRIFT_S, QUICK_DRIFT_S = 10.0, 3.0
-# A tip at 0.7 m stays within an inch, and a hand needs a quarter of the force.
+# A tip at 0.7 m stays within an inch, and guiding needs a quarter of the force.
 DRIFT_DEG, LIGHT = 2.0, 0.25
+# Seeds follow from this name, so that results stay comparable.
+_SEED_NAME = f"{ROBOT}, x5, floating, known without error"
 _COST_S, _QUICK_COST_S = 10.0, 5.0
 
 
 def compensation_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return the one case; `shortened`: of one pose, and for some seconds."""
-    name = f"{ROBOT}, x5, floating, known without error"
+    name = f"{ROBOT}, x5, gravity compensation, true model"
     cost_s = _QUICK_COST_S if shortened else _COST_S
-    work = tuple(
-        Trial(floated, (trial_seed(seed, name, number), shortened), cost_s) for number in range(trials)
-    )
+    seeds = [trial_seed(seed, _SEED_NAME, number) for number in range(trials)]
+    work = tuple(Trial(compensated, (own, shortened), cost_s) for own in seeds)
     return [Case(name, work, partial(_summary, name))]
 
 
-def floated(seed: int, shortened: bool) -> CompensationTrial:
-    """Let an arm float that knows its weight without error: what is left is the modules' own."""
-    robot = somewhere(load_robot(ROBOT), seed)
+def compensated(seed: int, shortened: bool) -> CompensationTrial:
+    """Compensate gravity with the true model: the remaining error is that of the modules themselves."""
+    robot = at_random_site(load_robot(ROBOT), seed)
     drift_s, poses = (QUICK_DRIFT_S, POSES[1:2]) if shortened else (DRIFT_S, POSES)
     return compensation_trial(seed, robot, true_weight(robot), "x5", drift_s, poses)
 
@@ -282,9 +281,9 @@ def _summary(case: str, trials: Sequence[CompensationTrial]) -> Summary:
     guiding = largest([trial.guiding_n for trial in trials])
     light = largest([ratio(trial.guiding_n, trial.held_n) for trial in trials])
     rows = (
-        Row(case, "drift left alone, most [deg]", None, alone, None, DRIFT_DEG),
-        Row(case, "force that leads the tip, most [N]", None, guiding),
+        Row(case, "drift without a hand, largest [deg]", None, alone, None, DRIFT_DEG),
+        Row(case, "force that guides the tip, largest [N]", None, guiding),
         Row(case, "the same over that of an arm held in position", None, light, None, LIGHT),
-        Row(case, "drift after a hand has led it [deg]", None, after, None, DRIFT_DEG),
+        Row(case, "drift after guiding [deg]", None, after, None, DRIFT_DEG),
     )
     return Summary(rows)

@@ -1,9 +1,7 @@
-"""One identification of a robot's inertia in virtual time, against the truth.
+"""Inertial identification in virtual time against the truth: base parameters, held-out torques, bodies.
 
-The thesis' way on the same recording is the pseudo-inverse of what the encoders and the torque readings say
-as they are (thesis eq. 29).
-
-Arms that find out their inertia: base parameters, held-out torques, real bodies, and what IMUs add.
+The thesis' estimate on the same recording is the pseudo-inverse solution of raw encoder and torque readings
+(eq. 29).
 """
 
 import time
@@ -21,7 +19,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Identified
 from coordinator.identification.identify import base_floor, identify, recorded_type
 from coordinator.identification.inertia.body_motion import MotionSource
-from coordinator.identification.inertia.inertia import Robot as SeenRobot
+from coordinator.identification.inertia.inertia import Robot as MeasuredRobot
 from coordinator.identification.inertia.inertia import find_inertia
 from coordinator.parameter_fit.base_parameters import joint_frames
 from coordinator.parameter_fit.least_squares import solve_information
@@ -35,11 +33,11 @@ from module_agent.network_emulation.profile_file import network
 from module_agent.signals.filtering import JointMotion, resample
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
 from sim.benchmark.cases.arm import SHORTENED
-from sim.benchmark.row import Row, count, largest, scaled
+from sim.benchmark.row import Row, count, highest, largest, scaled
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.session import record_session
 from sim.world.truth import Motion
@@ -47,20 +45,21 @@ from sim.world.truth import Motion
 # A base parameter is known whose standard deviation is less than this share of it.
 KNOWN_BELOW = 0.1
 LARGEST = 10
-# What makes torques other than a rigid robot's.
-GIVING = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
+# Effects that a rigid robot without friction does not have.
+NON_RIGID = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
 
 
 class InertiaTrial(NamedTuple):
-    """What came of one trial; of one that did not come to its end only the first four fields tell.
+    """The result of one trial; of one that failed only the first four fields are set.
 
-    why: what ended it, empty if nothing did. rank, most_rank: base parameters that were found, and that any
-    motion could show. known: how many of them are known to 10 %. sigmas_off: |error| / sigma of these.
-    largest: relative errors of the largest ten of them, and largest_sigma what is claimed.
-    held_out: relative torque errors on held-out motions against the torque without noise; with_true_chain
-    with the chain as it is, thesis the thesis' way; bodies: that of real bodies. not_definite: poses out of
-    `poses` where the bodies' mass matrix is not positive definite. eyes: what the motion was seen by; gain:
-    by how much that leaves less in the torques than encoders.
+    why: the reason for a failure, empty without one. rank, max_rank: number of base parameters identified,
+    and identifiable by any motion. known: how many of them are known to 10 %. sigmas_off: |error| / sigma of
+    these. largest: relative errors of the largest ten of them; largest_sigma: as claimed.
+    held_out: relative error of predicted torque on held-out motions against the torque without noise;
+    with_true_chain: the same with the true chain; thesis: the same of the thesis' estimate; bodies: the same
+    of physically consistent bodies. not_definite: poses out of `poses` in which the bodies' mass matrix is
+    not positive definite. motion_source: sensors that the motion was computed from; gain: encoders' torque
+    residual over theirs.
     """
 
     robot: str
@@ -68,7 +67,7 @@ class InertiaTrial(NamedTuple):
     seed: int
     why: str
     rank: int = 0
-    most_rank: int = 0
+    max_rank: int = 0
     known: int = 0
     sigmas_off: tuple[float, ...] = ()
     largest: tuple[float, ...] = ()
@@ -79,7 +78,7 @@ class InertiaTrial(NamedTuple):
     bodies: float = float("nan")
     poses: int = 0
     not_definite: int = 0
-    eyes: MotionSource = "encoders"
+    motion_source: MotionSource = "encoders"
     gain: float = 1.0
     robot_time_s: float = 0.0
     identify_s: float = 0.0
@@ -91,43 +90,44 @@ class _Recorded(NamedTuple):
 
 
 def rigid_profile() -> NoiseProfile:
-    """Return the x5 profile of a robot that does not give and has no friction."""
-    return switched(noise_profile("x5"), off=GIVING)
+    """Return the x5 profile of a rigid robot without friction."""
+    return switched(noise_profile("x5"), off=NON_RIGID)
 
 
 def inertia_trial(
     robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, poses: int, label: str = ""
 ) -> InertiaTrial:
-    """Identify a robot, somewhere on the Earth, and compare its inertia with the truth.
+    """Identify a robot at a random site and compare its inertia with the truth.
 
     Args:
-        robot: name or file. noise: profile; `label` is what to call it.
+        robot: name or file.
+        noise: profile; `label` is its name in the result.
         seed: of all noise.
         plan: of the session.
-        poses: how many poses the mass matrix is looked at in.
+        poses: number of random poses in which the mass matrix is checked.
     """
-    found = somewhere(load_robot(robot), seed)
+    described = at_random_site(load_robot(robot), seed)
     name = label or (noise if isinstance(noise, str) else noise.name)
-    nothing = InertiaTrial(robot, name, seed, "")
-    settings = VirtualSettings(found, network("lan"), seed, noise)
-    kept: list[Motion] = []
+    trial = InertiaTrial(robot, name, seed, "")
+    settings = VirtualSettings(described, network("lan"), seed, noise)
+    motions: list[Motion] = []
 
     def keep(simulated: VirtualRobot) -> None:
-        kept.append(simulated.truth.motion())
+        motions.append(simulated.truth.motion())
 
     try:
         recording = record_session(settings, plan, keep)
-        begun = time.process_time()
+        start_s = time.process_time()
         identified = identify(recording)
-        spent_s = time.process_time() - begun
-        return _compared(
-            nothing, identified, _Recorded(recording, kept[0]), true_chain(found), true_inertia(found), poses
-        )._replace(identify_s=spent_s)
+        spent_s = time.process_time() - start_s
+        recorded = _Recorded(recording, motions[0])
+        chain, phi = true_chain(described), true_inertia(described)
+        return _compared(trial, identified, recorded, chain, phi, poses)._replace(identify_s=spent_s)
     except Exception as error:
         failure = explain(error)
         if failure is None:
             raise
-        return nothing._replace(why=failure.text)
+        return trial._replace(why=failure.text)
 
 
 def _compared(
@@ -136,7 +136,7 @@ def _compared(
     kinematics, inertia, bodies = found.kinematics, found.inertia, found.bodies
     serials = kinematics.topology.serials
     if inertia is None or bodies is None or serials != chain.serials:
-        return trial._replace(why=f"no inertia was found of {', '.join(chain.serials)}")
+        return trial._replace(why=f"no inertia was identified of {', '.join(chain.serials)}")
     base = bodies.base
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in joint_frames(chain)))
     true = base.grouping @ (into @ phi.ravel())
@@ -151,7 +151,7 @@ def _compared(
     real = bodies.fit.phi if bodies.fit is not None else np.full_like(seen.fit.phi, np.nan)
     return trial._replace(
         rank=base.rank,
-        most_rank=_most_rank(chain),
+        max_rank=_max_rank(chain),
         known=int(known.sum()),
         sigmas_off=tuple((np.abs(base.value - true) / base.sigma)[known].tolist()),
         largest=tuple((np.abs(base.value - true) / np.abs(true))[largest].tolist()),
@@ -162,7 +162,7 @@ def _compared(
         bodies=_relative(inverse_dynamics(estimated, real, *joints), torque),
         poses=poses,
         not_definite=_not_definite(estimated, real, poses, trial.seed),
-        eyes=inertia.eyes,
+        motion_source=inertia.eyes,
         gain=inertia.gain,
         robot_time_s=found.result.robot_time_s,
     )
@@ -181,10 +181,10 @@ def _true_torque(motion: JointMotion, found: Identified, truth: Motion) -> Array
 def _by_true_chain(
     found: Identified, recorded: _Recorded, chain: Chain, joints: tuple[Array, Array, Array]
 ) -> Array:
-    """Return the torques predicted by inertia that was found with the chain as it is."""
+    """Return the torques predicted by inertia that was identified with the true chain."""
     kinematics, recording = found.kinematics, recorded.recording
     serials = kinematics.topology.serials
-    robot = SeenRobot(
+    robot = MeasuredRobot(
         chain,
         [recorded_type(recording, serial) for serial in serials],
         kinematics.refinement,
@@ -200,13 +200,13 @@ def _thesis(found: Identified, recorded: _Recorded, joints: tuple[Array, Array, 
     kinematics = found.kinematics
     motion = dynamic_motion(recorded.recording, kinematics.clocks, kinematics.topology.serials, "dynamic")
     chain = kinematics.fit.chain
-    said = gather(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
-    fit = solve_information(said, independent_fraction=INDEPENDENT_FRACTION)
+    information = gather(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
+    fit = solve_information(information, independent_fraction=INDEPENDENT_FRACTION)
     return inverse_dynamics(chain, fit.phi, *joints)
 
 
-def _most_rank(chain: Chain) -> int:
-    """Return the rank at positions, rates and accelerations at random: what any motion at all could show."""
+def _max_rank(chain: Chain) -> int:
+    """Return the rank at random positions, rates and accelerations: the most that a motion can excite."""
     joints = len(chain.serials)
     motion = np.random.default_rng(0).uniform(-3.0, 3.0, (3, 60 * joints, joints))
     regressor = torque_regressor(chain, *motion).reshape(-1, 10 * joints) * parameter_scale(joints)
@@ -234,7 +234,7 @@ def _relative(predicted: Array, true: Array) -> float:
 
 
 ARMS = ("a2085_04", "a2085_06")
-# What is asked of held-out torques, of a rigid arm and of one with friction, springs and a base that gives.
+# Bars of held-out torques: of a rigid arm, and of one with friction, springs and a compliant base.
 HELD_OUT_PERCENT = {"rigid": 1.0, "x5": 3.0}
 SIGMAS = 3.0
 LARGEST_PERCENT = 1.0
@@ -251,7 +251,7 @@ _COST_S = {"a2085_04": 10.0, "a2085_06": 18.0}
 
 
 def inertia_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return one case for every arm, as good as rigid and with all that real ones do.
+    """Return one case for every arm, rigid and with all effects of a real one.
 
     `shortened`: all joints are explored at once, excitation is half as long, with a tenth of the poses.
     """
@@ -278,7 +278,7 @@ def _summary(case: str, label: str, trials: Sequence[InertiaTrial]) -> Summary:
     off = tuple(value for trial in done for value in trial.sigmas_off)
     rows = [
         count(case, "runs without inertia", [bool(trial.why) for trial in trials]),
-        count(case, "runs with fewer parameters than there are", [t.rank < t.most_rank for t in done]),
+        count(case, "runs with fewer parameters than there are", [t.rank < t.max_rank for t in done]),
         *_sigma_rows(case, off),
         *_largest_rows(case, done),
         *_torque_rows(case, label, done),
@@ -291,10 +291,10 @@ def _summary(case: str, label: str, trials: Sequence[InertiaTrial]) -> Summary:
 def _sigma_rows(case: str, off: Sequence[float]) -> list[Row]:
     """Return how many errors are beyond three sigmas; as many may be as of normal ones in 99 of 100 cases."""
     beyond = float(sum(abs(value) > SIGMAS for value in off))
-    most = float(binom.isf(0.01, len(off), 2.0 * norm.sf(SIGMAS))) if off else None
+    limit = float(binom.isf(0.01, len(off), 2.0 * norm.sf(SIGMAS))) if off else None
     figure = f"base parameters known to 10 %, beyond {SIGMAS:.0f} sigma, of {len(off)}"
     return [
-        Row(case, figure, None, beyond if off else None, None, most if off else 0.0),
+        Row(case, figure, None, beyond if off else None, None, limit if off else 0.0),
         Row(case, "the same: worst error [sigma]", None, largest(off)),
     ]
 
@@ -333,8 +333,8 @@ def _torque_rows(case: str, label: str, done: Sequence[InertiaTrial]) -> list[Ro
             largest(percent["with_true_chain"]),
             HELD_OUT_PERCENT[label],
         ),
-        Row(case, "the same over that with the true chain", None, _most(ratios), None, TRUE_CHAIN_RATIO),
-        Row(case, "real bodies worse by [points]", None, _most(worse), None, BODIES_POINTS),
+        Row(case, "the same over that with the true chain", None, highest(ratios), None, TRUE_CHAIN_RATIO),
+        Row(case, "real bodies worse by [points]", None, highest(worse), None, BODIES_POINTS),
     ]
 
 
@@ -344,7 +344,3 @@ def _poses(done: Sequence[InertiaTrial]) -> list[bool]:
 
 def _median(values: Sequence[float]) -> float | None:
     return median(values) if values else None
-
-
-def _most(values: Sequence[float]) -> float | None:
-    return max(values) if values else None

@@ -1,9 +1,7 @@
-"""Wear: a link of a known robot is displaced by a little, and a check on another day is to find it.
+"""Link change: a displaced link of a known robot is detected, located and sized; no other is reported.
 
-The robot is recorded once, and checked on many days: the modules and their errors are the same, noise, drift
-and network are another day's.
-
-Wear: a link of a known arm that has changed is found, located and sized; no other is called changed.
+The robot is recorded once and checked on many days: the modules and their errors stay the same, noise, drift
+and network differ.
 """
 
 from collections.abc import Sequence
@@ -25,7 +23,7 @@ from sim.benchmark.row import Row, count, largest, scaled
 from sim.geometry.link_parts import FreePose, Part
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 
@@ -35,14 +33,14 @@ PARALLEL = 0.999
 
 
 class LinkChangeTrial(NamedTuple):
-    """What one check made of a robot of which one link was displaced, or none.
+    """The result of one check of a robot with one displaced link, or none.
 
-    found: it said that something has changed. located: and that of all links it was this one alone.
-    size_error_m: by how much it got the displacement's length wrong, vector_error_m: the displacement; None
-    if it was not located. false_alarm: it named a link that had not changed. child: whose link it was.
+    detected: the check reported a change. located: it named exactly the displaced link.
+    size_error_m: error of the displacement's length, vector_error_m: of the displacement; None if it was not
+    located. false_alarm: it named a link that had not changed. child: the module of the displaced link.
     """
 
-    found: bool
+    detected: bool
     located: bool
     size_error_m: float | None
     false_alarm: bool
@@ -52,7 +50,7 @@ class LinkChangeTrial(NamedTuple):
     words: tuple[str, ...]
 
 
-class Wear(NamedTuple):
+class LinkChange(NamedTuple):
     """A link's far end displaced by `displacement_m` (3,), in the frame of the IMU of its module `child`."""
 
     child: str
@@ -60,7 +58,7 @@ class Wear(NamedTuple):
 
 
 class _Subject(NamedTuple):
-    """Which robot, and what it is checked with."""
+    """A robot and the settings of its checks."""
 
     robot: str
     noise: str
@@ -78,46 +76,48 @@ def link_change_trial(
     change_m: float = 2e-3,
     plan: Plan | None = None,
 ) -> LinkChangeTrial:
-    """Check a robot that is known, with one link displaced or as it was.
+    """Check a known robot with one link displaced, or unchanged.
 
     Args:
-        seed: `DAYS` successive ones are days of the same robot; the link and the direction follow from it.
+        seed: `DAYS` successive seeds are days of the same robot; link and direction follow from it.
         changed: whether a link is displaced.
         robot: a shipped robot, or a robot file.
         noise, network: profiles.
-        change_m: by how much.
-        plan: of the session that the robot is known from, which says how it is checked.
+        change_m: the displacement.
+        plan: of the session that the robot is known from; its motions are those of the check.
     """
     subject = _Subject(robot, noise, network, seed // DAYS, plan or Plan(dynamics=False))
-    wear = draw_link_change(load_robot(robot), seed, change_m) if changed else None
+    change = draw_link_change(load_robot(robot), seed, change_m) if changed else None
     known = _known(subject)
-    later = _recorded(subject, 1 + seed % DAYS, check_plan(known, Plan()), wear)
-    return _trial(check(known, later), wear)
+    later = _recorded(subject, 1 + seed % DAYS, check_plan(known, Plan()), change)
+    return _trial(check(known, later), change)
 
 
-def worn(robot: Robot, wear: Wear) -> Robot:
-    """Return a robot with one link displaced at its far end, and all beyond it with it.
+def with_link_change(robot: Robot, change: LinkChange) -> Robot:
+    """Return a robot with one link displaced at its far end, with everything beyond it.
 
     Raises:
         ValueError: the robot has no such module.
     """
-    if wear.child not in robot.serials:
-        raise ValueError(f"robot {robot.name} has no module {wear.child}; it has {', '.join(robot.serials)}")
-    k = robot.serials.index(wear.child)
+    if change.child not in robot.serials:
+        raise ValueError(
+            f"robot {robot.name} has no module {change.child}; it has {', '.join(robot.serials)}"
+        )
+    k = robot.serials.index(change.child)
     # The link ends in the module's housing frame, or in its output frame: at q = 0 both are parallel to its
     # IMU's.
-    x, y, z = (float(v) for v in wear.displacement_m)
+    x, y, z = (float(v) for v in change.displacement_m)
     part = Part(pose=FreePose(xyz_m=(x, y, z)))
     module = robot.modules[k]
     longer = module.model_copy(update={"link": (*module.link, part)})
     return robot.model_copy(update={"modules": (*robot.modules[:k], longer, *robot.modules[k + 1 :])})
 
 
-def draw_link_change(robot: Robot, seed: int, change_m: float) -> Wear:
-    """Draw a link and a direction: any that some motion can show.
+def draw_link_change(robot: Robot, seed: int, change_m: float) -> LinkChange:
+    """Draw a link and an observable direction.
 
     A displacement along an axis shows in the motions of the joints further up; where all of these have
-    parallel axes, as at the first link of an arm, it moves nothing that any joint could tell.
+    parallel axes, as at the first link of an arm, no joint's motion shows it.
     """
     rng = np.random.default_rng((seed, 0x57EA2))
     chain = true_chain(robot)
@@ -127,11 +127,11 @@ def draw_link_change(robot: Robot, seed: int, change_m: float) -> Wear:
     if hidden is not None:
         direction -= hidden * (hidden @ direction)
     root = direction / np.linalg.norm(direction)
-    return Wear(chain.serials[k], change_m * chain.imu_home[k, :3, :3].T @ root)
+    return LinkChange(chain.serials[k], change_m * chain.imu_home[k, :3, :3].T @ root)
 
 
 def _hidden(chain: Chain, child: int) -> Array | None:
-    """Return the direction along which no joint shows that a module is displaced, in the root frame."""
+    """Return the unobservable direction of a displacement in the root frame, None if there is none."""
     parent = chain.parent[child]
     axes = chain.axis[list(chain.ancestors(parent))] if parent != BASE else np.zeros((0, 3))
     return axes[-1] if len(axes) and np.all(np.abs(axes @ axes[-1]) > PARALLEL) else None
@@ -142,10 +142,10 @@ def _known(subject: _Subject) -> BaselineRobot:
     return _recorded(subject, 0, subject.plan, None)
 
 
-def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> BaselineRobot:
-    robot = somewhere(load_robot(subject.robot), subject.seed)
+def _recorded(subject: _Subject, day: int, plan: Plan, change: LinkChange | None) -> BaselineRobot:
+    robot = at_random_site(load_robot(subject.robot), subject.seed)
     settings = VirtualSettings(
-        robot if wear is None else worn(robot, wear),
+        robot if change is None else with_link_change(robot, change),
         network_named(subject.network),
         subject.seed,
         subject.noise,
@@ -156,16 +156,16 @@ def _recorded(subject: _Subject, day: int, plan: Plan, wear: Wear | None) -> Bas
     return BaselineRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
 
 
-def _trial(report: CheckReport, wear: Wear | None) -> LinkChangeTrial:
+def _trial(report: CheckReport, change: LinkChange | None) -> LinkChangeTrial:
     named = [link for link in report.links if link.changed]
-    child = wear.child if wear is not None else None
+    child = change.child if change is not None else None
     located = [link.child for link in named] == [child]
-    errors = _errors(named, wear) if located and wear is not None else (None, None)
+    errors = _errors(named, change) if located and change is not None else (None, None)
     return LinkChangeTrial(
-        found=report.changed,
+        detected=report.changed,
         located=located,
         size_error_m=errors[0],
-        false_alarm=report.changed if wear is None else any(link.child != child for link in named),
+        false_alarm=report.changed if change is None else any(link.child != child for link in named),
         robot_time_s=report.robot_time_s,
         vector_error_m=errors[1],
         child=child,
@@ -173,13 +173,13 @@ def _trial(report: CheckReport, wear: Wear | None) -> LinkChangeTrial:
     )
 
 
-def _errors(named: Sequence[LinkCheck], wear: Wear) -> tuple[float, float]:
-    """Return how far off the found displacement is, in length and as a vector [m]."""
-    found = 1e-3 * np.array(named[0].displacement_mm)
-    true = wear.displacement_m
+def _errors(named: Sequence[LinkCheck], change: LinkChange) -> tuple[float, float]:
+    """Return the error of the estimated displacement, of its length and as a vector [m]."""
+    estimated = 1e-3 * np.array(named[0].displacement_mm)
+    true = change.displacement_m
     return (
-        float(abs(np.linalg.norm(found) - np.linalg.norm(true))),
-        float(np.linalg.norm(found - true)),
+        float(abs(np.linalg.norm(estimated) - np.linalg.norm(true))),
+        float(np.linalg.norm(estimated - true)),
     )
 
 
@@ -201,7 +201,7 @@ class Checks(NamedTuple):
 
 
 def link_change_cases(changed: int, unchanged: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return the one case; each of its trials is about one robot, recorded once for all its checks.
+    """Return the one case; each of its trials is one robot, recorded once for all its checks.
 
     `shortened`: the robot is known and checked by a motion of all joints at once, not joint by joint.
     """
@@ -211,11 +211,11 @@ def link_change_cases(changed: int, unchanged: int, seed: int, shortened: bool =
     days = [range(first + DAYS * robot, first + DAYS * (robot + 1)) for robot in range(robots)]
     work = []
     for robot, own in enumerate(days):
-        worn, same = own[: _share(changed, robots, robot)], own[: _share(unchanged, robots, robot)]
-        cost_s = _KNOWN_COST_S + _CHECK_COST_S * (len(worn) + len(same))
+        changed_on, same = own[: _share(changed, robots, robot)], own[: _share(unchanged, robots, robot)]
+        cost_s = _KNOWN_COST_S + _CHECK_COST_S * (len(changed_on) + len(same))
         plan, share = (AT_ONCE, _AT_ONCE_SHARE) if shortened else (None, 1.0)
-        work.append(Trial(checks_of_one_robot, (tuple(worn), tuple(same), plan), share * cost_s))
-    name = f"{ROBOT}, wear" + (", by all joints at once" if shortened else "")
+        work.append(Trial(checks_of_one_robot, (tuple(changed_on), tuple(same), plan), share * cost_s))
+    name = f"{ROBOT}, link change" + (", by all joints at once" if shortened else "")
     return [Case(name, tuple(work), partial(_summary, name))]
 
 
@@ -228,7 +228,7 @@ def checks_of_one_robot(changed: Sequence[int], unchanged: Sequence[int], plan: 
 
 
 def _share(checks: int, robots: int, robot: int) -> int:
-    """Return how many of the checks are those of one robot."""
+    """Return the number of checks of one robot."""
     return checks // robots + (robot < checks % robots)
 
 
@@ -240,7 +240,11 @@ def _summary(case: str, robots: Sequence[Checks]) -> Summary:
     what = f"{1e3 * CHANGE_M:.0f} mm"
     return Summary(
         (
-            count(case, f"{what} not found, or not located", [not (c.found and c.located) for c in changed]),
+            count(
+                case,
+                f"{what} not detected, or not located",
+                [not (c.detected and c.located) for c in changed],
+            ),
             Row(case, f"size of the {what}, largest error [mm]", None, size_mm, None, SIZE_MM),
             count(case, "false alarms without a change", [check.false_alarm for check in unchanged]),
             Row(case, "robot time of a check, longest [s]", None, spent_s, None, CHECK_S),

@@ -1,7 +1,7 @@
-"""A simulated robot that somebody moves while somebody else watches it, and to which something happens.
+"""A simulated robot that one coordinator moves while another one monitors it, with events in the world.
 
-Mover and watcher are two coordinators on one virtual network: the one holds the leases and runs motions one
-after the other, the other hears feedback and asks for status, as anybody may.
+Both coordinators are on one virtual network: the mover holds the leases and runs motions one after the other,
+the monitor receives feedback and asks for status, which needs no lease.
 """
 
 import asyncio
@@ -26,45 +26,47 @@ from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.world.world import World
 
-MOVER, WATCHER = "mover", "watcher"
+MOVER, MONITOR = "mover", "watcher"
 TRAVEL_RAD_S = 1.5
 SETTLE_S = 0.3
 
 Report = Callable[[MonitorUpdate, int], None]
 
 
-class Happening(NamedTuple):
-    """Something that is done to the world at a time [s] of the run."""
+class WorldEvent(NamedTuple):
+    """A change of the world at a time [s] of the run."""
 
     at_s: float
     what: Callable[[World], None]
 
 
 def ordinary_motions(chain: Chain, recording: Recording, plan: Plan, seed: int) -> tuple[RobotMotion, ...]:
-    """Return motions of all joints at once, such as the robot may run one after the other.
+    """Return motions of all joints at once that the robot can run one after the other.
 
     Raises:
         ValueError: none are possible.
     """
-    told = [recording.modules[serial].info for serial in chain.serials]
-    modules = [RobotModule(module_type(one.module_type), one.limits) for one in told if one is not None]
+    information = [recording.modules[serial].info for serial in chain.serials]
+    modules = [
+        RobotModule(module_type(one.module_type), one.limits) for one in information if one is not None
+    ]
     return robot_excitation(chain, modules, plan, seed)
 
 
-def watched(
+def monitor_robot(
     settings: VirtualSettings,
     motions: Sequence[RobotMotion],
     for_s: float,
     monitor: Monitor,
     report: Report,
-    happenings: Sequence[Happening] = (),
+    events: Sequence[WorldEvent] = (),
 ) -> None:
-    """Move a robot for a while, over and over by the same motions, and let the watcher look at it.
+    """Move a robot by the same motions over and over for `for_s`, and monitor it.
 
-    `report` hears what the watcher says, and when [ns] of virtual time.
+    `report` receives what the monitor reports, and the virtual time [ns].
 
     Raises:
-        what `ModuleGroup` raises, if the robot is lost.
+        ModuleLost, RobotStopped: see `ModuleGroup`.
     """
     loop = VirtualLoop()
     robot = VirtualRobot(settings, loop)
@@ -72,19 +74,19 @@ def watched(
     mover = Messenger(
         robot.endpoint(MOVER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, _kept(recording)
     )
-    watch = LiveMonitor(monitor, lambda: loop.now_ns, WATCHER, lambda update: report(update, loop.now_ns))
-    ears = Messenger(
-        robot.endpoint(WATCHER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
+    watch = LiveMonitor(monitor, lambda: loop.now_ns, MONITOR, lambda update: report(update, loop.now_ns))
+    listener = Messenger(
+        robot.endpoint(MONITOR), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
     )
     link = ModuleGroup(mover, recording, lambda: loop.now_ns, MOVER)
-    for one in happenings:
+    for one in events:
         loop.schedule_ns(round(one.at_s * 1e9), lambda one=one: one.what(robot.world))  # type: ignore[misc]
     robot.start()
 
     async def live() -> None:
         mover.start()
-        ears.start()
-        attending = asyncio.create_task(watch.watch(ears))
+        listener.start()
+        attending = asyncio.create_task(watch.watch(listener))
         try:
             await _move(link, mover, motions, len(settings.robot.modules), round(for_s * 1e9), loop)
         finally:
@@ -93,7 +95,7 @@ def watched(
             if isinstance(failure, Exception):
                 raise failure
             mover.close()
-            ears.close()
+            listener.close()
             robot.stop()
             await asyncio.sleep(0)
 
@@ -139,7 +141,7 @@ async def _move(
             await asyncio.sleep(SETTLE_S)
             await link.run(dict(motion.patterns))
         except MotionInterrupted:
-            # A blow may make a module let go; whoever moves the robot takes it again.
+            # A collision may make a module drop its lease; the mover acquires it again.
             await gather_all(link.acquire(serial) for serial in link.serials)
     await link.release_all()
     keeper.cancel()

@@ -1,9 +1,7 @@
-"""Watching: something happens to a robot that is known, while it moves, and the watch is to say what.
+"""Monitoring: an event on a moving robot is detected, named and located; without one there is no alarm.
 
 The robot is recorded once, on a day of its own; each trial is another day: the modules and their errors are
-the same, noise, drift and network are not. What happens is drawn by the seed: where, how large, and when.
-
-Watching: what happens to a robot that moves is named; where nothing happens there is no alarm.
+the same, noise, drift and network differ. The seed draws the event: kind, module, size and time.
 """
 
 from collections.abc import Sequence
@@ -26,12 +24,12 @@ from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
 from module_agent.model.chain import Chain
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.benchmark.case import Case, Summary, Trial
-from sim.benchmark.cases.link_change import Wear, draw_link_change, worn
-from sim.benchmark.cases.monitored_robot import Happening, ordinary_motions, watched
+from sim.benchmark.cases.link_change import LinkChange, draw_link_change, with_link_change
+from sim.benchmark.cases.monitored_robot import WorldEvent, monitor_robot, ordinary_motions
 from sim.benchmark.row import Row
 from sim.geometry.link_parts import FreePose
 from sim.robot.robot_file import Robot, load_robot
-from sim.robot.variants import loaded, somewhere
+from sim.robot.variants import at_random_site, loaded
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 from sim.world.external_force import Push
@@ -42,26 +40,26 @@ Found = Literal["nothing", "collision", "payload", "friction", "wear", "unexplai
 
 # Trials that share a robot, each a day of it; a robot's own day is the first.
 DAYS = 1000
-# A run by which a robot gets known: all joints at once, and six motions for its inertia.
+# The run that a robot is known from: all joints at once, and six motions for its inertia.
 KNOWN_PLAN = Plan(
     mode="simultaneous", excitation="d-optimal", excitation_motions=6, excitation_s=5.0, imu="calibrated"
 )
 BRIEF = {"excitation_motions": 4, "excitation_s": 4.0}
 MOTION_S, MOTIONS = 4.0, 6
-# It happens in here; the watch goes on for so long.
+# The event is drawn between these times; monitoring goes on for so long after it.
 EARLIEST_S, LATEST_S, AFTER_S = 8.0, 12.0, 14.0
-# What is drawn: masses, friction, displacements, and how hard and how long somebody pushes.
+# Ranges of what is drawn: masses, friction factors, displacements, forces and durations of a push.
 MASS_KG, FRICTION, SHIFT_M = (0.05, 0.3), (1.25, 1.75), (6e-3, 12e-3)
 FORCE_N, PUSH_S, LEVER_M = (6.0, 20.0), (0.05, 0.3), 0.1
 
 
 class MonitoringTrial(NamedTuple):
-    """What the watch made of one robot to which something happened, or nothing.
+    """The result of monitoring one robot during one event, or none.
 
-    found: the kind of the first lasting word on it, "nothing" if there was none. located: it named the right
-    module. latency_s: from when it happened to the first word of any kind, named_s: to that of the right
-    kind; size, size_error: of what happened, in the finding's unit, the latter None where the watch gives no
-    size that the truth has. false_alarms: findings that nothing explains. watched_s: how long it looked.
+    found: kind of the first retained finding, "nothing" if there was none. located: it named the right
+    module. latency_s: from the event to the first finding of any kind, named_s: to that of the right kind.
+    size, size_error: of the event, in the finding's unit; the latter is None for findings without a size.
+    false_alarms: findings without an event. monitored_s: time monitored.
     """
 
     happened: Happens
@@ -72,33 +70,33 @@ class MonitoringTrial(NamedTuple):
     size: float
     size_error: float | None
     false_alarms: int
-    watched_s: float
+    monitored_s: float
     words: tuple[str, ...]
 
 
 class Alarms(NamedTuple):
-    """False alarms of robots to which nothing happened, and for how long they were watched [s]."""
+    """False alarms of unchanged robots, and the time monitored [s]."""
 
     alarms: int
-    watched_s: float
+    monitored_s: float
 
     @property
     def per_hour(self) -> float:
-        """How many an hour."""
-        return 3600.0 * self.alarms / self.watched_s
+        """False alarms per hour."""
+        return 3600.0 * self.alarms / self.monitored_s
 
     def interval_per_hour(self, confidence: float = 0.95) -> tuple[float, float]:
-        """Return the rates between which the true one lies, by Poisson's law (Garwood 1936)."""
+        """Return the confidence interval of the rate, for Poisson counts (Garwood 1936)."""
         tail = 0.5 * (1.0 - confidence)
         low = 0.5 * chi2.ppf(tail, 2 * self.alarms) if self.alarms else 0.0
         high = 0.5 * chi2.isf(tail, 2 * self.alarms + 2)
-        return 3600.0 * float(low) / self.watched_s, 3600.0 * float(high) / self.watched_s
+        return 3600.0 * float(low) / self.monitored_s, 3600.0 * float(high) / self.monitored_s
 
 
 class Subject(NamedTuple):
-    """Which robot is watched: `seed` draws its modules and the place where it stands.
+    """The monitored robot; `seed` draws its modules and its site.
 
-    brief: it is known from half as much motion, and things happen sooner.
+    brief: it is known from half as much motion, and events come sooner.
     """
 
     robot: str = "a2085_03"
@@ -114,7 +112,7 @@ class Subject(NamedTuple):
 
     @property
     def between_s(self) -> tuple[float, float]:
-        """Between which times it happens, whatever it is."""
+        """The range of times in which the event is drawn [s]."""
         return (4.0, 5.0) if self.brief else (EARLIEST_S, LATEST_S)
 
 
@@ -122,7 +120,7 @@ ARM = Subject()
 
 
 class MonitoredRobot(NamedTuple):
-    """The robot itself, what is known of it, and the motions that it does."""
+    """The robot, its model, and the motions that it runs."""
 
     robot: Robot
     reference: Reference
@@ -130,22 +128,24 @@ class MonitoredRobot(NamedTuple):
 
 
 class _Event(NamedTuple):
-    """What happens, on which module, how large in the finding's unit, and what the world does."""
+    """An event: its module, size in the finding's unit, time, and what it does to the world."""
 
     serial: str
     size: float | None
     at_s: float
-    happening: Happening | None
+    happening: WorldEvent | None
 
 
 def monitoring_trial(
     happens: Happens, seed: int, subject: Subject = ARM, after_s: float = AFTER_S
 ) -> MonitoringTrial:
-    """Watch a known robot move while something happens to it.
+    """Monitor a known robot that moves while an event happens to it.
 
     Args:
-        happens: what. seed: draws where, how large and when, and the day's noise; below `DAYS`.
-        after_s: how long the watch goes on after it.
+        happens: kind of the event.
+        seed: draws module, size and time of the event, and the day's noise; below `DAYS`.
+        subject: the robot.
+        after_s: for how long monitoring goes on after the event.
     """
     known = known_subject(subject)
     rng = np.random.default_rng((seed, subject.seed, 0x3A7C))
@@ -158,27 +158,26 @@ def monitoring_trial(
 
     happening = () if event.happening is None else (event.happening,)
     settings = settings_of(known.robot, subject, 1 + seed)
-    watched(settings, known.motions, event.at_s + after_s, monitor, report, happening)
+    monitor_robot(settings, known.motions, event.at_s + after_s, monitor, report, happening)
     return _trial(happens, event, monitor, findings)
 
 
 def false_alarms(seed: int, for_s: float, subject: Subject = ARM) -> Alarms:
-    """Watch a robot for a while to which nothing happens."""
+    """Monitor an unchanged robot for some time [s]."""
     known = known_subject(subject)
     monitor = Monitor(known.reference)
     settings = settings_of(known.robot, subject, 1 + seed)
-    watched(settings, known.motions, for_s, monitor, lambda update, now_ns: None)
+    monitor_robot(settings, known.motions, for_s, monitor, lambda update, now_ns: None)
     return Alarms(len(monitor.finding_log.all), monitor.monitored_s)
 
 
 @lru_cache(maxsize=2)
 def known_subject(subject: Subject) -> MonitoredRobot:
-    """Return a robot, what a run tells of it, and other motions than those of that run."""
-    robot = somewhere(load_robot(subject.robot), subject.seed)
+    """Return a robot, its model from one run, and other motions than those of that run."""
+    robot = at_random_site(load_robot(subject.robot), subject.seed)
     recording = record_session(settings_of(robot, subject, 0), subject.plan)
     known = BaselineRobot(Path("the known run"), recording, identify_kinematics(recording))
     plan = KNOWN_PLAN.model_copy(update={"excitation_s": MOTION_S, "excitation_motions": MOTIONS})
-    # Other motions than those that it is known from.
     motions = ordinary_motions(known.chain, recording, plan, 1000 + subject.seed)
     return MonitoredRobot(robot, build_reference(known), motions)
 
@@ -204,35 +203,35 @@ def _draw(happens: Happens, rng: np.random.Generator, robot: Robot, at_s: float)
         case "payload":
             mass = float(rng.uniform(*MASS_KG))
             changed = loaded(robot, robot.serials[-1], _weight(rng, mass))
-            return _Event(robot.serials[-1], mass, at_s, Happening(at_s, lambda w: w.become(changed)))
+            return _Event(robot.serials[-1], mass, at_s, WorldEvent(at_s, lambda w: w.become(changed)))
         case "friction":
             factor = float(rng.uniform(*FRICTION))
-            happening = Happening(at_s, lambda w: w.change_friction(serial, factor))
+            happening = WorldEvent(at_s, lambda w: w.change_friction(serial, factor))
             return _Event(serial, 100.0 * (factor - 1.0), at_s, happening)
         case "wear":
-            wear = draw_link_change(robot, int(rng.integers(2**31)), float(rng.uniform(*SHIFT_M)))
+            change = draw_link_change(robot, int(rng.integers(2**31)), float(rng.uniform(*SHIFT_M)))
             return _Event(
-                wear.child,
-                1e3 * float(np.linalg.norm(wear.displacement_m)),
+                change.child,
+                1e3 * float(np.linalg.norm(change.displacement_m)),
                 at_s,
-                _slipped(robot, wear, at_s),
+                _changed(robot, change, at_s),
             )
 
 
-def _slipped(robot: Robot, wear: Wear, at_s: float) -> Happening:
-    changed = worn(robot, wear)
-    return Happening(at_s, lambda w: w.become(changed))
+def _changed(robot: Robot, change: LinkChange, at_s: float) -> WorldEvent:
+    changed = with_link_change(robot, change)
+    return WorldEvent(at_s, lambda w: w.become(changed))
 
 
 def _collision(rng: np.random.Generator, robot: Robot, at_s: float) -> _Event:
-    """Push what a joint turns, across its axis, so that the joint feels it."""
+    """Push the body that a joint turns, at a lever, so that the push loads the joint."""
     serial = str(rng.choice(robot.serials))
     direction = rng.standard_normal(3)
     force = float(rng.uniform(*FORCE_N)) * direction / np.linalg.norm(direction)
     x, y, z = (float(f) for f in force)
     lasting = float(rng.uniform(*PUSH_S))
     push = Push(serial=serial, force_n=(x, y, z), at_m=(LEVER_M, 0.0, 0.0), from_s=at_s, for_s=lasting)
-    return _Event(serial, None, at_s, Happening(at_s, lambda w: w.push(push)))
+    return _Event(serial, None, at_s, WorldEvent(at_s, lambda w: w.push(push)))
 
 
 def _weight(rng: np.random.Generator, mass_kg: float) -> FreePose:
@@ -243,14 +242,12 @@ def _weight(rng: np.random.Generator, mass_kg: float) -> FreePose:
 
 def _trial(happens: Happens, event: _Event, monitor: Monitor, findings: Sequence[Finding]) -> MonitoringTrial:
     at_ns = round(1e9 * event.at_s)
-    held = monitor.finding_log.all
-    # A change is known to within the windows of the watch.
-    early = [f for f in held if f.detected_ns < at_ns]
-    later = [f for f in held if f.detected_ns >= at_ns]
+    retained = monitor.finding_log.all
+    # The time of a change is known to within the windows of the monitor.
+    early = [f for f in retained if f.detected_ns < at_ns]
+    later = [f for f in retained if f.detected_ns >= at_ns]
     right = [f for f in later if f.kind == happens]
-    found: Found = "nothing"
-    if later:
-        found = later[0].kind
+    found: Found = later[0].kind if later else "nothing"
     others = [f for f in later if f.kind != happens]
     first = [f.reported_ns for f in findings if f.reported_ns >= at_ns]
     named = [f.reported_ns for f in findings if f.reported_ns >= at_ns and f.kind == happens]
@@ -264,13 +261,13 @@ def _trial(happens: Happens, event: _Event, monitor: Monitor, findings: Sequence
         size=event.size or 0.0,
         size_error=own.size - event.size if own is not None and event.size is not None else None,
         false_alarms=len(early) + len(others),
-        watched_s=monitor.monitored_s,
-        words=tuple(f.words for f in held),
+        monitored_s=monitor.monitored_s,
+        words=tuple(f.words for f in retained),
     )
 
 
 def _is_there(chain: Chain, finding: Finding, serial: str) -> bool:
-    """Return whether it happened where it was found: of a collision, at the module or beyond."""
+    """Return whether a finding names the right module; for a collision also one that bears it."""
     if finding.kind != "collision":
         return finding.serial == serial
     named, where = (chain.serials.index(s) for s in (finding.serial, serial))
@@ -278,7 +275,7 @@ def _is_there(chain: Chain, finding: Finding, serial: str) -> bool:
 
 
 def confusion(trials: Sequence[MonitoringTrial]) -> dict[Happens, dict[Found, int]]:
-    """Return how often what happened was taken for what."""
+    """Return how often each kind of event was found as which kind."""
     table: dict[Happens, dict[Found, int]] = {}
     for trial in trials:
         row = table.setdefault(trial.happened, {})
@@ -286,58 +283,58 @@ def confusion(trials: Sequence[MonitoringTrial]) -> dict[Happens, dict[Found, in
     return table
 
 
-# Of what happens: some of what is drawn turns no joint, or stays in the noise.
+# Share of events that may be missed: some of those drawn load no joint, or stay in the noise.
 MISSED_SHARE = 0.2
-# That chance alone leaves a bar: one case in so many.
+# Chance alone misses a bar in one case of so many.
 ONE_IN = 100.0
 SEGMENT_S = 300.0
-_QUICK_AFTER_S, _QUICK_STRETCH_S = 5.0, 8.0
+_QUICK_AFTER_S, _QUICK_SEGMENT_S = 5.0, 8.0
 # Trials of unchanged robots are days of their own.
 _UNCHANGED_DAY = 500
 _KNOWN_COST_S, _COST_PER_S = 8.0, 0.2
 
 
-class Watches(NamedTuple):
-    """What became of trials, and of stretches without any change."""
+class MonitoredSegments(NamedTuple):
+    """Trials with an event, and segments without any change."""
 
     trials: tuple[MonitoringTrial, ...]
-    quiet: tuple[Alarms, ...]
+    unchanged: tuple[Alarms, ...]
 
 
 def monitoring_cases(trials: int, segments: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return the one case: every kind so many times, and stretches of no change.
+    """Return the one case: every kind of event so many times, and segments without change.
 
-    `shortened`: trials and stretch are short, all in one process, which learns to know the robot once.
+    `shortened`: trials and segments are short, all in one process, which records the robot once.
     """
     kinds = [one for one in HAPPENS if one != "nothing"]
-    after_s, stretch_s = (_QUICK_AFTER_S, _QUICK_STRETCH_S) if shortened else (AFTER_S, SEGMENT_S)
-    name = f"{ARM.robot}, watched"
+    after_s, segment_s = (_QUICK_AFTER_S, _QUICK_SEGMENT_S) if shortened else (AFTER_S, SEGMENT_S)
+    name = f"{ARM.robot}, monitored"
     drawn = [(kind, seed * 100 + number) for number in range(trials) for kind in kinds]
-    quiet = [_UNCHANGED_DAY + number for number in range(segments)]
-    window = [(tuple(drawn), tuple(quiet))] if shortened else _shares(drawn, quiet)
+    days = [_UNCHANGED_DAY + number for number in range(segments)]
+    pieces = [(tuple(drawn), tuple(days))] if shortened else _shares(drawn, days)
     work = tuple(
         Trial(
-            watches_of_one_robot,
-            (own, still, after_s, stretch_s, shortened),
-            _KNOWN_COST_S + _COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * stretch_s),
+            monitor_one_robot,
+            (own, still, after_s, segment_s, shortened),
+            _KNOWN_COST_S + _COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * segment_s),
         )
-        for own, still in window
+        for own, still in pieces
     )
     return [Case(name, work, partial(_summary, name))]
 
 
-def watches_of_one_robot(
+def monitor_one_robot(
     drawn: Sequence[tuple[Happens, int]],
     quiet: Sequence[int],
     after_s: float,
-    stretch_s: float,
+    segment_s: float,
     shortened: bool,
-) -> Watches:
-    """Let a process learn to know a robot, and watch it for all of its trials."""
+) -> MonitoredSegments:
+    """Record a robot once, and monitor it in all of its trials."""
     subject = ARM._replace(brief=shortened)
-    return Watches(
+    return MonitoredSegments(
         tuple(monitoring_trial(kind, seed, subject, after_s) for kind, seed in drawn),
-        tuple(false_alarms(day, stretch_s, subject) for day in quiet),
+        tuple(false_alarms(day, segment_s, subject) for day in quiet),
     )
 
 
@@ -349,26 +346,26 @@ def _shares(
     return [(tuple(drawn[k::count]), tuple(quiet[k::count])) for k in range(count)]
 
 
-def _summary(case: str, found: Sequence[Watches]) -> Summary:
-    trials = [trial for one in found for trial in one.trials]
-    quiet = [alarms for one in found for alarms in one.quiet]
+def _summary(case: str, robots: Sequence[MonitoredSegments]) -> Summary:
+    trials = [trial for one in robots for trial in one.trials]
+    unchanged = [alarms for one in robots for alarms in one.unchanged]
     rows = []
     for kind in dict.fromkeys(trial.happened for trial in trials):
         own = [trial for trial in trials if trial.happened == kind]
         wrong = sum(not (trial.found == kind and trial.located) for trial in own)
-        findings = [trial.named_s for trial in own if trial.named_s is not None]
-        # With as many trials chance makes so many of that share.
+        named_s = [trial.named_s for trial in own if trial.named_s is not None]
+        # By chance so many of the trials may be missed.
         limit = float(binom.isf(1.0 / ONE_IN, len(own), MISSED_SHARE))
         rows += [
             Row(case, f"{kind}: missed or misplaced, of {len(own)}", None, float(wrong), None, limit),
-            Row(case, f"{kind}: named after, median [s]", None, median(findings) if findings else None),
+            Row(case, f"{kind}: named after, median [s]", None, median(named_s) if named_s else None),
         ]
-    total = Alarms(sum(one.alarms for one in quiet), sum(one.watched_s for one in quiet))
+    total = Alarms(sum(one.alarms for one in unchanged), sum(one.monitored_s for one in unchanged))
     low, high = total.interval_per_hour()
-    hours = total.watched_s / 3600.0
-    beside = sum(trial.false_alarms for trial in trials)
+    hours = total.monitored_s / 3600.0
+    additional = sum(trial.false_alarms for trial in trials)
     rows += [
-        Row(case, f"something else said beside it, in {len(trials)} trials", None, float(beside)),
+        Row(case, f"additional findings, in {len(trials)} trials", None, float(additional)),
         Row(case, f"false alarms in {hours:.2g} h", None, float(total.alarms)),
         Row(case, "false alarms, 95 % sure to be above [1/h]", None, low, None, ALARMS_PER_HOUR),
         Row(case, "false alarms, 95 % sure to be below [1/h]", None, high),

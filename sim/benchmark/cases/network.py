@@ -1,8 +1,6 @@
-"""One identification of a simulated robot over a network, scored: what latency, jitter and loss cost.
+"""Networks: the cost of latency, jitter, loss and differing clocks for the estimates.
 
-Trials of one seed on different networks are of the same modules, clocks included, so that they come in pairs.
-
-Networks: what latency, jitter, loss and clocks that differ do to the estimates.
+Trials of one seed on different networks have the same modules, clocks included, so that they come in pairs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +22,7 @@ from sim.benchmark.row import Row, count, coverage, for_few, ratio, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.scoring.chain_score import link_errors, tip_errors, topology_differences
 from sim.sensors.module_clock import ModuleClock, module_time
 from sim.virtual_time.robot import VirtualSettings
@@ -38,20 +36,19 @@ INSTANTS = 200
 
 
 class NetworkTrial(NamedTuple):
-    """What came of one trial; of one that did not come to its end only the first four fields tell.
+    """The result of one trial; of one that failed only the first four fields are set.
 
-    why: what ended the trial before its end, empty if nothing did. again: motions that were interrupted and
-    done again. Links are in the order of the robot's file, those that were not found left out: errors of
-    their lengths, claimed sigmas, errors of their parents' axes. clock_error_s: the root mean square, over
-    modules and times, of how far the modules' clocks are mapped apart from one another; clock_sigma_s: the
-    same as claimed.
+    why: the reason for a failure, empty without one. repeats: motions that were interrupted and run again.
+    link_error_m, link_sigma_m, axis_error_deg: errors of lengths, claimed sigmas and errors of the parents'
+    axes of all links that were identified, in the order of the robot's file. clock_error_s: root mean square,
+    over modules and times, of the differences between the modules' mapped clocks; clock_sigma_s: as claimed.
     """
 
     robot: str
     network: str
     seed: int
     why: str
-    again: int = 0
+    repeats: int = 0
     robot_time_s: float = 0.0
     topology_right: bool = False
     link_error_m: tuple[float, ...] = ()
@@ -71,23 +68,23 @@ def network_trial(
     Args:
         robot: a shipped robot or a robot file.
         network: a network profile or file.
-        noise: a noise profile; `apart` gives it clocks that differ by 50 ms and 100 ppm.
-        seed: of the modules, their noise, the network, and the place where the robot stands.
+        noise: a noise profile; `with_clock_errors` adds clocks that differ by 50 ms and 100 ppm.
+        seed: of the modules, their noise, the network, and the site.
         plan: of the session; None for that of `arm_trial`.
     """
-    described = somewhere(load_robot(robot), seed)
-    found = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or described.noise)
-    settings = VirtualSettings(described, named_network(network), seed, found)
+    described = at_random_site(load_robot(robot), seed)
+    profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or described.noise)
+    settings = VirtualSettings(described, named_network(network), seed, profile)
     begun = NetworkTrial(robot, network, seed, "")
     try:
-        recording = record_session(settings, plan or arm_plan("joint", imu_kind(found)))
+        recording = record_session(settings, plan or arm_plan("joint", imu_kind(profile)))
         kinematics = identify_kinematics(recording)
     except Exception as error:
         failure = explain(error)
         if failure is None:
             raise
         return begun._replace(why=failure.text)
-    world = World(described, seed, found)
+    world = World(described, seed, profile)
     try:
         clocks = dict(zip(described.serials, world.clocks, strict=True))
     finally:
@@ -102,17 +99,16 @@ def scored(
     recording: Recording,
     kinematics: Kinematics,
 ) -> NetworkTrial:
-    """Return the trial with everything that comparing the result with the truth says."""
+    """Return the trial with its comparison of result and truth."""
     truth, fit = true_chain(robot), kinematics.fit
     differences = topology_differences(fit.chain, truth)
     tip = (None, None) if differences else tip_errors(fit.chain, truth, fit.null_basis)
     children = [child for child, parent in enumerate(truth.parent) if parent >= 0]
-    errors = {child: found for child in children if (found := link_errors(fit.chain, truth, child))}
+    errors = {child: error for child in children if (error := link_errors(fit.chain, truth, child))}
     own = [fit.chain.serials.index(truth.serials[child]) for child in errors]
     end_s = 1e-9 * float(np.ptp([event.t_ns for event in recording.journal]))
-    found_clocks = kinematics.clocks
     return begun._replace(
-        again=sum(e.what == "note" and "the motion of module" in e.text for e in recording.journal),
+        repeats=sum(e.what == "note" and "the motion of module" in e.text for e in recording.journal),
         robot_time_s=end_s,
         topology_right=not differences,
         link_error_m=tuple(error.length_m for error in errors.values()),
@@ -120,28 +116,30 @@ def scored(
         axis_error_deg=tuple(error.axis_deg for error in errors.values()),
         tip_position_m=None if tip[0] is None else 1e-3 * tip[0],
         tip_orientation_deg=tip[1],
-        clock_error_s=clock_error_s(found_clocks, clocks, end_s),
-        clock_sigma_s=_rms([1e-9 * clock.sigma_ns for clock in found_clocks.values()]),
+        clock_error_s=clock_error_s(kinematics.clocks, clocks, end_s),
+        clock_sigma_s=_rms([1e-9 * clock.sigma_ns for clock in kinematics.clocks.values()]),
     )
 
 
-def apart(noise: NoiseProfile, offset_s: float = OFFSET_S, drift_ppm: float = DRIFT_PPM) -> NoiseProfile:
+def with_clock_errors(
+    noise: NoiseProfile, offset_s: float = OFFSET_S, drift_ppm: float = DRIFT_PPM
+) -> NoiseProfile:
     """Return a profile whose clocks differ by up to `offset_s`, and by `drift_ppm` (one sigma)."""
     return noise.model_copy(
         update={"clock_offset_min_s": 0.0, "clock_offset_max_s": offset_s, "clock_drift_ppm": drift_ppm}
     )
 
 
-def clock_error_s(found: Mapping[str, ClockMap], true: Mapping[str, ModuleClock], end_s: float) -> float:
-    """Return how far the same instants of all modules are mapped apart, root mean square over both.
+def clock_error_s(estimated: Mapping[str, ClockMap], true: Mapping[str, ModuleClock], end_s: float) -> float:
+    """Return the root mean square, over modules and times, of differences between mapped clocks.
 
-    Instants are spread over a session from the world's start to `end_s`.
+    The same instants of all modules are mapped, spread from the world's start to `end_s`.
     """
     instants = [round(1e9 * t) for t in np.linspace(0.0, end_s, INSTANTS)]
     mapped = np.stack(
         [
             clock.to_session(np.array([module_time(true[s], t) for t in instants], dtype=np.int64))
-            for s, clock in found.items()
+            for s, clock in estimated.items()
         ],
         axis=1,
     )
@@ -154,7 +152,7 @@ def _rms(values: Sequence[float] | np.ndarray[tuple[int], np.dtype[np.float64]])
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-# Clocks are 50 ms and 100 ppm apart, see `network_trial.apart`.
+# Clocks are 50 ms and 100 ppm apart, see `with_clock_errors`.
 ROBOT = "a2085_04"
 PERFECT, POOR, BAD = "none", "wifi", "bad"
 OVER_PERFECT = 1.2
@@ -162,8 +160,8 @@ _COST_S = 9.0
 
 
 def network_cases(trials: int, seed: int, plan: Plan | None = None) -> list[Case]:
-    """Return `wifi` beside a perfect network on the same modules, and `bad` by itself."""
-    noise = apart(noise_profile("x5"))
+    """Return a case of `wifi` against a perfect network on the same modules, and one of `bad`."""
+    noise = with_clock_errors(noise_profile("x5"))
 
     def work(*networks: str) -> tuple[Trial, ...]:
         return tuple(
@@ -180,7 +178,7 @@ def network_cases(trials: int, seed: int, plan: Plan | None = None) -> list[Case
 
 
 def _pairs(case: str, trials: Sequence[NetworkTrial]) -> Summary:
-    """Compare trials on the same modules; a pair of which one came to no result is left out of the ratios."""
+    """Compare trials on the same modules; a pair with a failure is excluded from the ratios."""
     by_seed = {(trial.network, trial.seed): trial for trial in trials}
     whole = [
         (perfect, by_seed[POOR, perfect.seed])

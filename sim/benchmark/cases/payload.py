@@ -1,7 +1,4 @@
-"""An arm that knows its inertia is handed something: mass and centre against the truth.
-
-Payloads: what an arm is handed is found on the right body, as heavy and where it is; nothing is not.
-"""
+"""Payloads: one is detected on the right body, with its mass and centre; without one none is detected."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -14,7 +11,6 @@ from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.baseline.payload import payload_plan, search_payload
 from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan
-from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.network_emulation.profile_file import network
@@ -25,20 +21,20 @@ from sim.geometry.link_parts import FreePose
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
-from sim.robot.variants import loaded, somewhere
+from sim.robot.variants import at_random_site, loaded
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 
 MASS_KG = 0.2
-# About as large as a fist, and beside the flange.
+# About as large as a fist, off the flange's axis.
 HELD = FreePose(mass_kg=MASS_KG, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
 
 
 class PayloadTrial(NamedTuple):
-    """What came of one search: whether a payload was found, and on the body that carries it.
+    """The result of one search for a payload.
 
-    mass_error: relative. com_error_m: by the last axis and the one before it. motion_s: how long the robot
-    was moved for it.
+    found: a payload was reported; on_its_body: on the right body. mass_error: relative. com_error_m: in the
+    frame of the last axis and the one before it. motion_s: duration of the motion.
     """
 
     robot: str
@@ -53,57 +49,56 @@ class PayloadTrial(NamedTuple):
 def payload_trial(
     robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, carries: bool = True
 ) -> PayloadTrial:
-    """Let a robot find out its inertia, hand it a payload, or nothing, and ask it what that is.
+    """Identify a robot, add a payload or none, and search for it.
 
     Raises:
-        what the session raises, and `PayloadError`.
+        PayloadError: the runs do not suffice for a search.
     """
-    bare = somewhere(load_robot(robot), seed)
-    carrier = bare.serials[-1]
-    full = loaded(bare, carrier, HELD)
-    known = _lived(bare, noise, seed, 0, plan)
-    later = _lived(full if carries else bare, noise, seed, 1, payload_plan(known, Plan()))
+    unloaded = at_random_site(load_robot(robot), seed)
+    carrier = unloaded.serials[-1]
+    full = loaded(unloaded, carrier, HELD)
+    known = _recorded(unloaded, noise, seed, 0, plan)
+    later = _recorded(full if carries else unloaded, noise, seed, 1, payload_plan(known, Plan()))
     report = search_payload(known, later)
     if not report.found or not carries:
         return PayloadTrial(robot, seed, report.found, False, np.nan, np.nan, report.motion_s)
-    added = (true_inertia(full) - true_inertia(bare))[-1]
-    there = _from_axis(true_chain(bare), added[1:4] / added[0])
+    added = (true_inertia(full) - true_inertia(unloaded))[-1]
+    there = _from_axis(true_chain(unloaded), added[1:4] / added[0])
     body = known.chain.serials.index(report.carrier)
     centre = (link_homes(known.chain)[body] @ np.append(1e-3 * np.array(report.com_mm), 1.0))[:3]
-    apart = _from_axis(known.chain, centre) - there
+    offset = _from_axis(known.chain, centre) - there
     return PayloadTrial(
         robot,
         seed,
         True,
         report.carrier == carrier,
         report.mass_kg / MASS_KG - 1.0,
-        float(np.linalg.norm(apart)),
+        float(np.linalg.norm(offset)),
         report.motion_s,
     )
 
 
-def _lived(robot: Robot, noise: str | NoiseProfile, seed: int, day: int, plan: Plan) -> BaselineRobot:
-    """Return a robot after a session; the same seed has the same modules, another day other noise."""
+def _recorded(robot: Robot, noise: str | NoiseProfile, seed: int, day: int, plan: Plan) -> BaselineRobot:
+    """Record a session of a robot; another day of the same seed has the same modules and other noise."""
     settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=1000 * seed + day)
     recording = record_session(settings, plan)
-    kinematics: Kinematics = identify_kinematics(recording)
-    return BaselineRobot(Path(f"day {day}"), recording, kinematics)
+    return BaselineRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
 
 
-def _from_axis(chain: Chain, place_m: Array) -> Array:
-    """Return a place (3,) by the last axis and the one before it: the root frame is known but for a turn.
+def _from_axis(chain: Chain, point_m: Array) -> Array:
+    """Return a point (3,) in the frame of the last two axes, since the root frame is known up to a rotation.
 
     x across both axes, z along the last one, from where the last axis is nearest to the one before.
     """
     body = len(chain.serials) - 1
     before = chain.parent[body]
     if before == BASE:
-        raise ValueError(f"{chain.serials[body]} is alone: nothing tells where its axis begins")
+        raise ValueError(f"{chain.serials[body]} has no parent: no frame of two axes")
     z, other = chain.axis[body], chain.axis[before]
     x = np.cross(other, z)
     x = x / np.linalg.norm(x)
     along, _, _ = np.linalg.solve(np.column_stack([z, -other, x]), chain.point[before] - chain.point[body])
-    off = place_m - (chain.point[body] + along * z)
+    off = point_m - (chain.point[body] + along * z)
     return np.array([off @ x, off @ np.cross(z, x), off @ z])
 
 
@@ -126,10 +121,10 @@ def _case(name: str, carries: bool, trials: int, seed: int, plan: Plan, cost_s: 
         Trial(payload_trial, (ROBOT, "x5", trial_seed(seed, name, number), plan, carries), cost_s)
         for number in range(trials)
     )
-    return Case(name, work, partial(_carrying if carries else _bare, name))
+    return Case(name, work, partial(_loaded_rows if carries else _unloaded_rows, name))
 
 
-def _carrying(case: str, trials: Sequence[PayloadTrial]) -> Summary:
+def _loaded_rows(case: str, trials: Sequence[PayloadTrial]) -> Summary:
     found = [trial for trial in trials if trial.found]
     rows = (
         count(case, "payloads not found, or on another body", [not t.on_its_body for t in trials]),
@@ -154,5 +149,5 @@ def _carrying(case: str, trials: Sequence[PayloadTrial]) -> Summary:
     return Summary(rows)
 
 
-def _bare(case: str, trials: Sequence[PayloadTrial]) -> Summary:
+def _unloaded_rows(case: str, trials: Sequence[PayloadTrial]) -> Summary:
     return Summary((count(case, "payloads found where none is", [t.found for t in trials]),))

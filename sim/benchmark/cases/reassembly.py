@@ -1,10 +1,8 @@
-"""What three assemblies of the same modules tell together that none of them tells by itself.
+"""Merging three assemblies of the same modules identifies more parameters than any of them alone.
 
-A small arm measures itself as it is, then with its base on a wall, then with its modules in another order,
-each with the link that leads to it. Where gravity pulls otherwise, and where a module carries others, shows
-other sums of the same parts' parameters.
-
-Modules that share the work: what agents gathered, and what three assemblies tell together.
+A small arm is identified as it is, then with its base on a wall, then with its modules in another order, each
+with the link that leads to it. Another direction of gravity, or another load, excites other base parameters
+of the same parts. The information that the agents gathered must equal the coordinator's.
 """
 
 import tempfile
@@ -20,7 +18,7 @@ from coordinator.merge.information_file import RunInformation, read_information
 from coordinator.merge.merge_runs import MergedInformation, merge_runs
 from coordinator.recording.run_folder import INFORMATION
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
-from sim.benchmark.row import Row, largest
+from sim.benchmark.row import Row, highest, largest
 from sim.robot.robot_file import BASE, Robot, load_robot
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
@@ -38,13 +36,13 @@ QUICK = Plan(
 
 
 class Reassembly(NamedTuple):
-    """What came of one trial.
+    """The result of one trial.
 
-    parameters: of all parts. rank_alone: of every assembly. rank_merged: of all together.
-    sigma_ratio: the median, over the sums that the assemblies tell by themselves, of their standard deviation
-    by all over that alone; sigma_ratios of every assembly. The same assembly three times would make 0.58.
-    difference: the largest between what an agent and what the coordinator gathered, relative.
-    strain: see `merged_information.RunShare`, of every assembly.
+    parameters: number of all parts' parameters. rank_alone: of every assembly. rank_merged: of all together.
+    sigma_ratio: median, over the base parameters of single assemblies, of the merged standard deviation over
+    the single one; sigma_ratios of every assembly. The same assembly three times would make 0.58.
+    difference: largest relative difference between an agent's information and the coordinator's.
+    inconsistency_sigma: see `merge_runs.RunShare`, of every assembly.
     """
 
     parameters: int
@@ -56,18 +54,8 @@ class Reassembly(NamedTuple):
     inconsistency_sigma: tuple[float, ...]
 
 
-class _Nobody:
-    """A screen that nobody watches."""
-
-    def step(self, index: int, total: int, text: str) -> None:
-        pass
-
-    def note(self, text: str) -> None:
-        pass
-
-
 def reassembly_trial(seed: int, folder: Path, robot: str | Robot = ROBOT, plan: Plan = QUICK) -> Reassembly:
-    """Let a robot measure itself in three assemblies, in virtual time, and merge what their torques say.
+    """Identify a robot in three assemblies, in virtual time, and merge their torque information.
 
     Args:
         seed: of the modules, which are the same in all three, and of their noise, which is not.
@@ -79,20 +67,20 @@ def reassembly_trial(seed: int, folder: Path, robot: str | Robot = ROBOT, plan: 
         ValueError: an agent did not answer, so that there is nothing to compare.
     """
     runs: list[RunInformation] = []
-    apart: list[float] = []
+    differences: list[float] = []
     described = robot if isinstance(robot, Robot) else load_robot(robot)
     for number, (name, assembled) in enumerate(assemblies(described).items()):
         out = folder / name
         config = VirtualConfig(assembled, out, seed=seed, noise_seed=number, plan=plan)
-        found = run_virtual(config, _Nobody()).dynamics
-        if found is None or found.gathered_difference is None:
-            raise ValueError(f"no agent of the assembly {name} has said what its torques tell")
-        apart.append(found.gathered_difference)
+        dynamics = run_virtual(config).dynamics
+        if dynamics is None or dynamics.gathered_difference is None:
+            raise ValueError(f"no agent of the assembly {name} sent its torque information")
+        differences.append(dynamics.gathered_difference)
         runs.append(read_information(out / INFORMATION))
-    return _told(merge_runs(runs), max(apart))
+    return _reassembly(merge_runs(runs), max(differences))
 
 
-def _told(merged: MergedInformation, difference: float) -> Reassembly:
+def _reassembly(merged: MergedInformation, difference: float) -> Reassembly:
     return Reassembly(
         parameters=len(merged.base.columns.names),
         rank_alone=tuple(run.base.rank for run in merged.runs),
@@ -137,7 +125,7 @@ def reassembly_cases(trials: int, seed: int) -> list[Case]:
 
 
 def reassembly_in_folder(seed: int) -> Reassembly:
-    """Run a trial in a folder that is gone afterwards."""
+    """Run a trial in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
         return reassembly_trial(seed, Path(folder))
 
@@ -153,23 +141,15 @@ def _summary(case: str, trials: Sequence[Reassembly]) -> Summary:
             None,
             AGREES_BELOW,
         ),
-        Row(case, "rank of the best alone less that of all merged", None, _most(gained), None, -1.0),
-        Row(case, "rank of all merged", None, _least([t.rank_merged for t in trials])),
+        Row(case, "rank of the best alone less that of all merged", None, highest(gained), None, -1.0),
+        Row(case, "rank of all merged", None, min((float(t.rank_merged) for t in trials), default=None)),
         Row(
             case,
             "standard deviations merged over alone, median",
             None,
-            _most([t.sigma_ratio for t in trials]),
+            highest([t.sigma_ratio for t in trials]),
             None,
             1.0,
         ),
     )
     return Summary(rows)
-
-
-def _most(values: Sequence[float]) -> float | None:
-    return float(max(values)) if values else None
-
-
-def _least(values: Sequence[float]) -> float | None:
-    return float(min(values)) if values else None

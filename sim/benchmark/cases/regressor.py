@@ -1,8 +1,6 @@
-"""The regressor beside pinocchio's: the same torques, and what each costs in the same process.
+"""The regressor against pinocchio's: equality, and processor time in the same process.
 
-Pinocchio is a development dependency; without it only our own cost is measured.
-
-The regressor: equal to pinocchio's, and what it costs beside it.
+Pinocchio is a development dependency; without it only our own time is measured.
 """
 
 import time
@@ -25,10 +23,10 @@ _PINOCCHIO = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
 
 
 class RegressorTrial(NamedTuple):
-    """Microseconds a sample of a batch, in chunks of `CHUNK`, and of pinocchio's loop; the least of repeats.
+    """Microseconds per sample of a batch, in chunks of `CHUNK`, and of pinocchio's loop; minima of repeats.
 
-    difference: the largest from pinocchio's regressor on random trees, relative to the largest entry.
-    Pinocchio's are None if it is not installed.
+    difference: largest difference from pinocchio's regressor on random trees, relative to the largest entry.
+    loop_us and difference are None if pinocchio is not installed.
     """
 
     batch_us: float
@@ -61,8 +59,10 @@ def regressor_trial(seed: int, repeats: int) -> RegressorTrial:
         for q, qd, qdd in zip(*motion, strict=True):
             pin.computeJointTorqueRegressor(model, data, q, qd, qdd)
 
-    apart = max(_difference(pin, rng) for _ in range(_TREES))
-    return RegressorTrial(_cost_us(batch, repeats), _cost_us(chunks, repeats), _cost_us(loop, repeats), apart)
+    difference = max(_difference(pin, rng) for _ in range(_TREES))
+    return RegressorTrial(
+        _cost_us(batch, repeats), _cost_us(chunks, repeats), _cost_us(loop, repeats), difference
+    )
 
 
 def _pinocchio() -> Any | None:
@@ -79,7 +79,7 @@ def _cost_us(work: Callable[[], None], repeats: int) -> float:
         begun = time.process_time()
         work()
         spent.append(time.process_time() - begun)
-    # What others take of caches and memory only adds.
+    # Other processes only add to it.
     return 1e6 * min(spent) / SAMPLES
 
 
@@ -146,13 +146,13 @@ _REPEATS = 9
 
 
 def regressor_cases(seed: int) -> list[Case]:
-    """Return the one case; of pinocchio's there is nothing to tell where it is not installed."""
+    """Return the one case; it compares with pinocchio where that is installed."""
     name = f"regressor, {JOINTS} joints, {SAMPLES} samples"
     return [Case(name, (Trial(regressor_trial, (seed, _REPEATS), 4.0),), partial(_summary, name))]
 
 
 def _summary(case: str, trials: Sequence[RegressorTrial]) -> Summary:
-    there = [trial for trial in trials if trial.loop_us is not None]
+    compared = [trial for trial in trials if trial.loop_us is not None]
     rows = [
         Row(
             case,
@@ -163,9 +163,9 @@ def _summary(case: str, trials: Sequence[RegressorTrial]) -> Summary:
             CHUNK_US,
         )
     ]
-    if there:
-        shares = [ratio(trial.batch_us, trial.loop_us) for trial in there]
-        differences = [trial.difference for trial in there]
+    if compared:
+        shares = [ratio(trial.batch_us, trial.loop_us) for trial in compared]
+        differences = [trial.difference for trial in compared]
         rows += [
             Row(
                 case, "difference from pinocchio's [relative]", None, largest(differences), None, EQUAL_BELOW

@@ -1,7 +1,4 @@
-"""The benchmark of kinematics: its cases, and what holds over all of them.
-
-The benchmark of dynamics: its cases, and what holds over all of them.
-"""
+"""The benchmarks of kinematics and of dynamics: their cases and efforts, and the coverage over all cases."""
 
 from collections.abc import Sequence
 from fnmatch import fnmatch
@@ -30,7 +27,7 @@ ALL = "all cases"
 
 
 class KinematicEffort(NamedTuple):
-    """How many trials there are of everything; `shortened`: whether arms move less long than they may."""
+    """Numbers of trials of the kinematic cases; `shortened`: arms move for a shorter time."""
 
     joints: int
     arms: int
@@ -65,12 +62,12 @@ def kinematic_cases(effort: KinematicEffort, seed: int, motions: Motions | None 
 
 
 def chosen(cases: Sequence[Case], pattern: str) -> list[Case]:
-    """Return the cases whose name holds the pattern, in which * and ? stand for anything."""
+    """Return the cases whose name contains the pattern; * and ? are wildcards."""
     return [case for case in cases if fnmatch(case.name, f"*{pattern}*")]
 
 
 def over_all(results: Sequence[CaseResult]) -> list[Row]:
-    """Return the rows that are about all cases together; none where no case claimed an interval."""
+    """Return the rows over all cases; none if no case claimed an interval."""
     off = [value for result in results for value in result.summary.sigmas_off]
     return [coverage(ALL, off)] if off else []
 
@@ -79,14 +76,17 @@ DYNAMIC_TRIALS = 5
 
 
 class DynamicEffort(NamedTuple):
-    """How many trials there are of everything; `shortened`: whether robots move less long than they may."""
+    """Numbers of trials of the dynamic cases; `shortened`: robots move for a shorter time.
+
+    segments: of monitoring without any change, five minutes each.
+    """
 
     inertias: int
     payloads: int
     reassemblies: int
-    floats: int
-    watches: int
-    stretches: int
+    compensations: int
+    monitorings: int
+    segments: int
     shortened: bool = False
 
 
@@ -94,8 +94,8 @@ QUICK_DYNAMICS = DynamicEffort(1, 1, 1, 1, 1, 1, shortened=True)
 
 
 def full_dynamics(trials: int = DYNAMIC_TRIALS) -> DynamicEffort:
-    """Return the effort with that many trials a case, and an hour of watching without any change."""
-    return DynamicEffort(trials, trials, trials, trials, watches=2 * trials, stretches=12)
+    """Return the effort with that many trials a case, and an hour of monitoring without any change."""
+    return DynamicEffort(trials, trials, trials, trials, monitorings=2 * trials, segments=12)
 
 
 def dynamic_cases(effort: DynamicEffort, seed: int, tx40: Path | None = None) -> list[Case]:
@@ -106,7 +106,7 @@ def dynamic_cases(effort: DynamicEffort, seed: int, tx40: Path | None = None) ->
         *reassembly_cases(effort.reassemblies, seed),
         *payload_cases(effort.payloads, seed, effort.shortened),
         *assistance_cases(seed, effort.shortened),
-        *compensation_cases(effort.floats, seed, effort.shortened),
-        *monitoring_cases(effort.watches, effort.stretches, seed, effort.shortened),
+        *compensation_cases(effort.compensations, seed, effort.shortened),
+        *monitoring_cases(effort.monitorings, effort.segments, seed, effort.shortened),
         *([] if tx40 is None else recorded_cases(tx40)),
     ]

@@ -1,9 +1,7 @@
-"""Does a robot that nobody has drawn find out how it is built? The coordinator's session on random robots.
+"""Topology: parents and mounting must be identified rightly for every random robot.
 
 Everything but the fast motions is as in a run: the agents' firmware and estimates, the network's faults, the
 session's discovery, link check, leases, travel, rest and slow motions, and those that it repeats in doubt.
-
-Random robots: who is mounted on whom, and how, must be right on every one.
 """
 
 from collections.abc import Sequence
@@ -40,11 +38,11 @@ PLAN = Plan(
 
 
 class TopologyTrial(NamedTuple):
-    """What came out for one robot. `differences` say in words what is wrong, empty if all is right.
+    """The result for one robot.
 
-    confidence: the probability that the coordinator itself gives to its least certain answer; 0 without one.
-    repeats: the motions that it repeated for doubt. robot_time_s: from discovery to the robot's release; NaN
-        of a session that did not come to its end.
+    differences: errors of the topology, described; empty if all is right. confidence: the coordinator's
+    probability of its least certain answer, 0 without one. repeats: motions repeated for doubt.
+    robot_time_s: from discovery to the robot's release; NaN of a session that failed.
     """
 
     seed: int
@@ -58,9 +56,9 @@ class TopologyTrial(NamedTuple):
 def topology_trial(
     seed: int, noise: str | NoiseProfile = "x5-uncalibrated", network: str = "lan", plan: Plan = PLAN
 ) -> TopologyTrial:
-    """Let the random robot of a seed find its topology in virtual time, all chance of the same seed.
+    """Identify the topology of the random robot of a seed in virtual time; all noise has the same seed.
 
-    A session that does not come to its end has found nothing, and why is the difference.
+    A session that fails has its reason as the difference.
     """
     robot = random_robot(seed)
     try:
@@ -70,15 +68,15 @@ def topology_trial(
         if failure is None:
             raise
         return TopologyTrial(seed, len(robot.modules), (failure.text,), 0.0, 0, float("nan"))
-    return judged(robot, seed, recording)
+    return compared(robot, seed, recording)
 
 
-def judged(robot: Robot, seed: int, recording: Recording) -> TopologyTrial:
+def compared(robot: Robot, seed: int, recording: Recording) -> TopologyTrial:
     """Find the topology in a recording and compare it with the robot's."""
     wrong: tuple[str, ...]
     try:
-        found = search_topology(recording, robot.serials).topology
-        wrong, confidence = differences(robot, found), found.confidence
+        topology = search_topology(recording, robot.serials).topology
+        wrong, confidence = differences(robot, topology), topology.confidence
     except TopologyError as error:
         wrong, confidence = (str(error),), 0.0
     return TopologyTrial(
@@ -91,14 +89,12 @@ def judged(robot: Robot, seed: int, recording: Recording) -> TopologyTrial:
     )
 
 
-def differences(robot: Robot, found: Topology) -> tuple[str, ...]:
-    """Say in words what is wrong with a topology, in the robot's order."""
-    words = [f"module {s} does not exist" for s in found.serials if s not in robot.serials]
-    on = {
-        serial: found.serials[p] if p >= 0 else BASE
-        for serial, p in zip(found.serials, found.parent, strict=True)
-    }
-    turned = dict(zip(found.serials, found.reversed, strict=True))
+def differences(robot: Robot, topology: Topology) -> tuple[str, ...]:
+    """Describe the errors of a topology, in the order of the robot's modules."""
+    serials = topology.serials
+    words = [f"module {s} does not exist" for s in serials if s not in robot.serials]
+    on = {s: serials[p] if p >= 0 else BASE for s, p in zip(serials, topology.parent, strict=True)}
+    turned = dict(zip(serials, topology.reversed, strict=True))
     for module in robot.modules:
         if module.serial not in on:
             words.append(f"module {module.serial} was not found")

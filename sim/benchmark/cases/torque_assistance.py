@@ -39,7 +39,7 @@ def assistance_cases(seed: int, shortened: bool = False) -> list[Case]:
             )
             for robot in robots
         )
-        name += ", known without error" if shortened else ""
+        name += ", true model" if shortened else ""
         found.append(Case(name, work, partial(_summary, name, _limit(chosen[0]))))
     return found
 

@@ -15,7 +15,7 @@ from sim.physics.skeleton import build_skeleton
 from sim.physics.skeleton_urdf import urdf_text
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import build_tree, true_chain, true_inertia
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.world.world import World
 
 ROBOTS = ["arm6", "tree_y", "a2085_04"]
@@ -88,7 +88,7 @@ def _moving(world: World, ticks: int, amplitude: float) -> Any:
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_moving_imus_feel_what_newton_and_euler_say(name: str) -> None:
-    robot = somewhere(load_robot(name), 4)
+    robot = at_random_site(load_robot(name), 4)
     reference, world = Reference(robot), World(robot, seed=1, noise="ideal")
     errors = [
         _read(samples) - reference.felt(plant.q_rad, plant.qd_rad_s, plant.qdd_rad_s2)
@@ -103,7 +103,7 @@ def test_moving_imus_feel_what_newton_and_euler_say(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_springs_exert_what_the_motion_needs(name: str) -> None:
-    robot = somewhere(load_robot(name), 4)
+    robot = at_random_site(load_robot(name), 4)
     reference, world = Reference(robot), World(robot, seed=1, noise="ideal")
     errors, torques = [], []
     for _, plant in _moving(world, 600, 0.15):
@@ -117,7 +117,7 @@ def test_the_springs_exert_what_the_motion_needs(name: str) -> None:
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_the_compiled_equations_have_the_same_mass_matrix_and_bias(name: str) -> None:
-    robot = somewhere(load_robot(name), 4)
+    robot = at_random_site(load_robot(name), 4)
     reference = Reference(robot)
     rng = np.random.default_rng(2)
     n = len(robot.modules)
@@ -131,7 +131,7 @@ def test_the_compiled_equations_have_the_same_mass_matrix_and_bias(name: str) ->
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_the_true_chain_puts_every_imu_where_the_physics_has_it(name: str) -> None:
-    robot = somewhere(load_robot(name), 4)
+    robot = at_random_site(load_robot(name), 4)
     reference, chain = Reference(robot), true_chain(robot)
     to_root = inverse(reference.tree.housing[0])
     q = np.random.default_rng(4).uniform(-2.0, 2.0, (3, len(robot.modules)))
@@ -146,7 +146,7 @@ def test_the_true_chain_puts_every_imu_where_the_physics_has_it(name: str) -> No
 
 @pytest.mark.parametrize("name", [*ROBOTS, "snake16"])
 def test_the_true_inertia_is_that_of_the_physics_at_home(name: str) -> None:
-    robot = somewhere(load_robot(name), 4)
+    robot = at_random_site(load_robot(name), 4)
     reference = Reference(robot)
     to_root = inverse(reference.tree.housing[0])
     shift = pinocchio.SE3(to_root[:3, :3], to_root[:3, 3])
@@ -160,7 +160,7 @@ def test_the_true_inertia_is_that_of_the_physics_at_home(name: str) -> None:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_world_begins_with_its_springs_carrying_the_weight(name: str) -> None:
-    robot = somewhere(load_robot(name), 4)
+    robot = at_random_site(load_robot(name), 4)
     reference, world = Reference(robot), World(robot, seed=1, noise="ideal")
     zero = np.zeros(len(robot.modules))
     samples = world.step(list(zero))

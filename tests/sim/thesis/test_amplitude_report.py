@@ -2,10 +2,6 @@
 
 import csv
 import json
-import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -95,29 +91,4 @@ def test_wrong_usage_is_answered_with_what_is_right(
     done = CliRunner().invoke(app, ["amplitudes", "--out", str(tmp_path / "out"), *arguments])
     assert done.exit_code == 2, done.output
     assert words in done.output
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_command_and_its_processes_and_writes_nothing(
-    tmp_path: Path, number: signal.Signals
-) -> None:
-    command = [sys.executable, "-m", "sim.main", "amplitudes", "--out", str(tmp_path / "out")]
-    options = ["--lengths", "171", "--amplitudes", "0.1", "--rigs", "60", "--trials", "0", "--processes", "1"]
-    with subprocess.Popen(
-        [*command, *options],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        start_new_session=True,
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("[1/120] 171 mm ")
-        os.killpg(process.pid, number) if number is signal.SIGINT else process.send_signal(number)
-        # To the end of what holds the pipe, and that are the processes that share the work as well.
-        said = process.stdout.read()
-        assert process.wait(timeout=30) == 130
-    assert "interrupted; nothing is written" in said
-    assert "Traceback" not in said
     assert not (tmp_path / "out").exists()

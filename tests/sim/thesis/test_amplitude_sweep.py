@@ -22,6 +22,9 @@ from sim.thesis.amplitude_sweep import (
 )
 from sim.thesis.published import ALIGNMENTS, AMPLITUDES_RAD, LENGTHS_MM, Alignment, thesis_length
 
+# Tests of this file share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("amplitude_sweep")
+
 # Followed by every arm, and far beyond the 1.5 rad/s at which the X5-9 cuts off what it is commanded.
 FOLLOWED_RAD, SATURATED_RAD = 0.08, 0.24
 SEED = 0

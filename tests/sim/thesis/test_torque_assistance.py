@@ -46,6 +46,9 @@ from sim.thesis.torque_assistance_cases import (
 )
 from sim.thesis.torque_assistance_report import bars, true_model, write_assistance
 
+# Tests of this file share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("torque_assistance")
+
 X5 = NOISE_PROFILES["x5"]
 SEED = 0
 VERTICAL = thesis_robot("vertical")

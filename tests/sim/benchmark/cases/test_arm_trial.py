@@ -12,7 +12,7 @@ from sim.benchmark.cases.arm import ArmTrial, arm_plan, arm_trial, expected_tip
 from sim.imperfections.noise_profile import NOISE_PROFILES, imu_kind
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
-from sim.robot.variants import somewhere
+from sim.robot.variants import at_random_site
 from sim.scoring.score import score
 from sim.thesis.circle_chain import thesis_chain
 from sim.virtual_time.robot import VirtualSettings
@@ -31,7 +31,7 @@ def test_a_session_in_memory_is_message_for_message_that_of_a_run_with_a_folder(
     tmp_path: Path, trial: ArmTrial
 ) -> None:
     plan = arm_plan("joint", "calibrated")
-    robot = somewhere(load_robot(ROBOT), SEED)
+    robot = at_random_site(load_robot(ROBOT), SEED)
     result = run_virtual(
         VirtualConfig(robot, tmp_path / "run", SEED, "lan", "x5", plan), Terminal(quiet=True)
     )

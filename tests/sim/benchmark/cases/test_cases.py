@@ -57,7 +57,7 @@ def test_the_quick_benchmark_has_every_case_of_the_full_one_and_fewer_trials() -
         assert few.name.startswith(many.name)
     assert [few.name for few in quick if few.name not in {many.name for many in whole}] == [
         "random robots, x5-uncalibrated, the smallest of 10",
-        "a2085_06, wear, by all joints at once",
+        "a2085_06, link change, by all joints at once",
     ]
     assert len({case.name for case in whole}) == len(whole)
     assert all(few.trials for few in quick)
@@ -70,8 +70,8 @@ def test_the_full_benchmark_has_the_trials_that_the_bars_are_about() -> None:
     assert len(joints) == len(ALIGNMENTS) * len(LENGTHS_MM) * len(SETTINGS) == 24
     assert {len(case.trials) for case in joints} == {KINEMATIC_TRIALS} == {13}
     assert len(case_named(cases, "random robots").trials) == 200
-    wear = case_named(cases, "wear").trials
-    assert [sum(len(trial.arguments[which]) for trial in wear) for which in (0, 1)] == [13, 100]
+    checks = case_named(cases, "link change").trials
+    assert [sum(len(trial.arguments[which]) for trial in checks) for which in (0, 1)] == [13, 100]
     for arm in ARMS:
         assert len(chosen(cases, f"{arm}*joint by joint")) == 2
 
@@ -231,7 +231,7 @@ def test_a_run_without_an_end_or_with_another_topology_misses_a_bar() -> None:
     assert rows(case.summarise([ended]))["tip position, rms [mm]"].holds is False
 
 
-# ---------------------------------------------------------------------- topology, networks, wear
+# ---------------------------------------------------------------------- topology, networks, link change
 
 
 def test_one_wrong_robot_of_two_hundred_misses_the_bar() -> None:
@@ -309,7 +309,7 @@ def test_over_a_bad_network_intervals_must_cover() -> None:
 
 def check(**changed: Any) -> LinkChangeTrial:
     done = LinkChangeTrial(
-        found=True,
+        detected=True,
         located=True,
         size_error_m=2e-4,
         false_alarm=False,
@@ -326,14 +326,14 @@ def test_a_change_must_be_found_located_and_sized_in_time() -> None:
     lost = check(located=False, size_error_m=None, vector_error_m=None)
     checks = [Checks((check(), check(size_error_m=6e-4)), ()), Checks((lost,), ())]
     found = rows(case.summarise(checks))
-    assert found["2 mm not found, or not located, of 3"].ours == 1.0
+    assert found["2 mm not detected, or not located, of 3"].ours == 1.0
     assert found["size of the 2 mm, largest error [mm]"].holds is False
     assert found["robot time of a check, longest [s]"].holds
 
 
 def test_a_false_alarm_misses_its_bar() -> None:
     (case,) = link_change_cases(3, 3, 0)
-    quiet = check(found=False, located=False, size_error_m=None, child=None)
+    quiet = check(detected=False, located=False, size_error_m=None, child=None)
     alarm = "false alarms without a change, of 3"
     assert rows(case.summarise([Checks((), (quiet,) * 3)]))[alarm].holds
     assert rows(case.summarise([Checks((), (quiet, quiet, check(false_alarm=True)))]))[alarm].holds is False

@@ -8,7 +8,7 @@ import pytest
 from sim.benchmark.case import Case, Summary
 from sim.benchmark.cases.gravity_compensation import CompensationTrial
 from sim.benchmark.cases.inertia import InertiaTrial
-from sim.benchmark.cases.monitoring import Alarms, MonitoringTrial, Watches
+from sim.benchmark.cases.monitoring import Alarms, MonitoredSegments, MonitoringTrial
 from sim.benchmark.cases.payload import PayloadTrial
 from sim.benchmark.cases.reassembly import Reassembly
 from sim.benchmark.cases.regressor import RegressorTrial
@@ -37,23 +37,23 @@ def test_the_quick_benchmark_has_every_case_and_says_where_it_does_less() -> Non
     left = [name for name in CASES if not any(one.startswith(name) for one in quick)]
     # That nothing is taken for something is tried where there is time for it.
     assert left == ["a2085_06, no payload"]
-    assert all(name in CASES or name.endswith(", known without error") for name in quick)
+    assert all(name in CASES or name.endswith(", true model") for name in quick)
 
 
-def test_the_full_benchmark_watches_for_an_hour_and_tries_everything_several_times() -> None:
-    (watched,) = (case for case in CASES.values() if case.name.endswith("watched"))
-    drawn = [one for trial in watched.trials for one in trial.arguments[0]]
-    quiet = [day for trial in watched.trials for day in trial.arguments[1]]
-    stretch_s = {trial.arguments[3] for trial in watched.trials}
+def test_the_full_benchmark_monitors_for_an_hour_and_tries_everything_several_times() -> None:
+    (monitored,) = (case for case in CASES.values() if case.name.endswith("monitored"))
+    drawn = [one for trial in monitored.trials for one in trial.arguments[0]]
+    unchanged = [day for trial in monitored.trials for day in trial.arguments[1]]
+    segment_s = {trial.arguments[3] for trial in monitored.trials}
     assert len(set(drawn)) == len(drawn) == 4 * 2 * DYNAMIC_TRIALS
-    assert len(set(quiet)) * stretch_s.pop() == 3600.0
+    assert len(set(unchanged)) * segment_s.pop() == 3600.0
     assert len(CASES["a2085_06, x5, inertia"].trials) == DYNAMIC_TRIALS
 
 
 def inertia(**changed: Any) -> InertiaTrial:
     good: dict[str, Any] = {
         "rank": 36,
-        "most_rank": 36,
+        "max_rank": 36,
         "known": 12,
         "sigmas_off": (0.5, -1.0, 2.0),
         "largest": (0.001, 0.002, 0.04),
@@ -160,32 +160,36 @@ def test_calculated_torque_must_help_where_it_is_stable() -> None:
     )
 
 
-def test_floating_that_is_as_stiff_as_holding_misses() -> None:
-    name = "a2085_04, x5, floating, known without error"
+def test_compensation_that_is_as_stiff_as_holding_misses() -> None:
+    name = "a2085_04, x5, gravity compensation, true model"
     light = CompensationTrial(0.1, 10.0, 5.0, 0.1, 0.7, 8.0)
     assert missed(rows(name, light)) == []
-    assert missed(rows(name, light._replace(drift_deg=3.0))) == ["drift left alone, most [deg]"]
+    assert missed(rows(name, light._replace(drift_deg=3.0))) == ["drift without a hand, largest [deg]"]
     assert missed(rows(name, light._replace(guiding_n=4.0))) == [
         "the same over that of an arm held in position"
     ]
 
 
-def watched(**changed: Any) -> MonitoringTrial:
+def monitored(**changed: Any) -> MonitoringTrial:
     good = MonitoringTrial("payload", "payload", True, 0.5, 1.5, 0.2, 0.01, 0, 20.0, ())
     return good._replace(**changed)
 
 
 def test_what_is_missed_misplaced_or_imagined_is_counted() -> None:
-    (name,) = (name for name in CASES if name.endswith("watched"))
+    (name,) = (name for name in CASES if name.endswith("monitored"))
     quiet = (Alarms(0, 3600.0),)
-    assert missed(rows(name, Watches((watched(),) * 13, quiet))) == []
-    wrong = (watched(found="wear"), watched(located=False), watched(found="nothing")) + (watched(),) * 10
-    assert missed(rows(name, Watches(wrong, quiet))) == []
-    more = (watched(found="collision"),) * 7
-    assert missed(rows(name, Watches(wrong + more, quiet))) == ["payload: missed or misplaced, of 20"]
-    lavish = rows(name, Watches((watched(false_alarms=2),) * 13, quiet))
-    assert lavish["something else said beside it, in 13 trials"].ours == 26.0
-    assert missed(rows(name, Watches((watched(),) * 13, (Alarms(3, 3600.0),)))) == [
+    assert missed(rows(name, MonitoredSegments((monitored(),) * 13, quiet))) == []
+    wrong = (monitored(found="wear"), monitored(located=False), monitored(found="nothing")) + (
+        monitored(),
+    ) * 10
+    assert missed(rows(name, MonitoredSegments(wrong, quiet))) == []
+    more = (monitored(found="collision"),) * 7
+    assert missed(rows(name, MonitoredSegments(wrong + more, quiet))) == [
+        "payload: missed or misplaced, of 20"
+    ]
+    lavish = rows(name, MonitoredSegments((monitored(false_alarms=2),) * 13, quiet))
+    assert lavish["additional findings, in 13 trials"].ours == 26.0
+    assert missed(rows(name, MonitoredSegments((monitored(),) * 13, (Alarms(3, 3600.0),)))) == [
         "false alarms, 95 % sure to be above [1/h]"
     ]
 

@@ -8,12 +8,12 @@ import pytest
 
 from coordinator.excitation.plan import Plan
 from module_agent.signals.clock_map import ClockMap
-from sim.benchmark.cases.network import OFFSET_S, apart, clock_error_s, network_trial
+from sim.benchmark.cases.network import OFFSET_S, clock_error_s, network_trial, with_clock_errors
 from sim.imperfections.noise_profile import noise_profile
 from sim.sensors.module_clock import ModuleClock
 
 ARM = "thesis_171_horizontal"
-NOISE = apart(noise_profile("x5"))
+NOISE = with_clock_errors(noise_profile("x5"))
 
 
 @pytest.fixture(scope="module")

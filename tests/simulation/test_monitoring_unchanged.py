@@ -1,9 +1,9 @@
-"""A robot to which nothing happens is left alone, whatever the network does to its feedback."""
+"""An unchanged robot raises no alarm, whatever the network does to its feedback."""
 
 import pytest
 
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from sim.benchmark.cases.monitored_robot import Happening, watched
+from sim.benchmark.cases.monitored_robot import WorldEvent, monitor_robot
 from sim.benchmark.cases.monitoring import (
     Alarms,
     MonitoringTrial,
@@ -13,10 +13,13 @@ from sim.benchmark.cases.monitoring import (
     settings_of,
 )
 
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("monitoring")
+
 ARM = Subject(robot="a2085_03", seed=3, brief=True)
 
 
-def notes_of(subject: Subject, for_s: float, *happenings: Happening) -> tuple[Monitor, list[str]]:
+def notes_of(subject: Subject, for_s: float, *events: WorldEvent) -> tuple[Monitor, list[str]]:
     known = known_subject(ARM)
     monitor = Monitor(known.reference)
     notes: list[str] = []
@@ -24,7 +27,7 @@ def notes_of(subject: Subject, for_s: float, *happenings: Happening) -> tuple[Mo
     def report(update: MonitorUpdate, now_ns: int) -> None:
         notes.extend(update.notes)
 
-    watched(settings_of(known.robot, subject, 9), known.motions, for_s, monitor, report, happenings)
+    monitor_robot(settings_of(known.robot, subject, 9), known.motions, for_s, monitor, report, events)
     return monitor, notes
 
 

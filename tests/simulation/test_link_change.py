@@ -1,4 +1,4 @@
-"""A known robot is checked on another day: a link that has slipped is found, a sound robot is left in peace.
+"""A known robot is checked on another day: a displaced link is found, an unchanged robot raises no alarm.
 
 Modules are as delivered, with uncalibrated IMUs, on links that give.
 """
@@ -18,22 +18,25 @@ from coordinator.excitation.plan import Plan
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
 from module_agent.model.errors import EXIT_FINDING
-from sim.benchmark.cases.link_change import Wear, draw_link_change, worn
+from sim.benchmark.cases.link_change import LinkChange, draw_link_change, with_link_change
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
 from sim.virtual_time.run import VirtualConfig, run_virtual
+
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("check")
 
 ARM = "a2085_03"
 SLIPPED_M = 4e-3
 
 
 class Days(NamedTuple):
-    """The same robot: as it was known, another day, and worn yet another day."""
+    """The same robot: as it is known, unchanged on another day, and with a displaced link."""
 
     known: BaselineRobot
     sound: BaselineRobot
-    worn: BaselineRobot
-    wear: Wear
+    changed: BaselineRobot
+    change: LinkChange
 
 
 def _lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:
@@ -52,16 +55,16 @@ def days(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     folder, robot = tmp_path_factory.mktemp("days"), load_robot(ARM)
     known = _lived(robot, folder / "known", 0, KNOWN_BY[request.param])
     plan = check_plan(known, Plan())
-    wear = Wear(robot.serials[2], np.array([SLIPPED_M, 0.0, 0.0]))
+    change = LinkChange(robot.serials[2], np.array([SLIPPED_M, 0.0, 0.0]))
     return Days(
         known,
         _lived(robot, folder / "sound", 1, plan),
-        _lived(worn(robot, wear), folder / "worn", 2, plan),
-        wear,
+        _lived(with_link_change(robot, change), folder / "changed", 2, plan),
+        change,
     )
 
 
-def test_a_sound_robot_is_left_in_peace(days: Days) -> None:
+def test_an_unchanged_robot_raises_no_alarm(days: Days) -> None:
     report = check(days.known, days.sound)
     assert not report.changed
     assert report.words[0].startswith("no link has changed")
@@ -87,26 +90,26 @@ def test_a_check_runs_the_motions_that_the_robot_is_known_from(days: Days) -> No
 
 
 def test_a_link_that_slipped_is_found_located_and_sized(days: Days) -> None:
-    report = check(days.known, days.worn)
+    report = check(days.known, days.changed)
     named = [link for link in report.links if link.changed]
-    assert [link.child for link in named] == [days.wear.child]
+    assert [link.child for link in named] == [days.change.child]
     # The bar of a 2 mm change.
-    assert np.linalg.norm(np.array(named[0].displacement_mm) - 1e3 * days.wear.displacement_m) < 0.5
+    assert np.linalg.norm(np.array(named[0].displacement_mm) - 1e3 * days.change.displacement_m) < 0.5
     assert abs(named[0].length_mm - 1e3 * SLIPPED_M) < 3.0 * named[0].length_sigma_mm
     assert named[0].sigmas > 4.0
-    assert days.wear.child in report.words[0]
+    assert days.change.child in report.words[0]
 
 
 def test_the_command_says_so_and_exits_with_4(days: Days) -> None:
     arguments = ["check", str(days.known.folder), "--measured"]
     sound = CliRunner().invoke(app, [*arguments, str(days.sound.folder)])
     assert sound.exit_code == 0, sound.output
-    slipped = CliRunner().invoke(app, [*arguments, str(days.worn.folder), "--json"])
+    slipped = CliRunner().invoke(app, [*arguments, str(days.changed.folder), "--json"])
     assert slipped.exit_code == EXIT_FINDING
-    written = json.loads((days.worn.folder / CHECK).read_text())
+    written = json.loads((days.changed.folder / CHECK).read_text())
     assert written["changed"] is True
-    assert [link["child"] for link in written["links"] if link["changed"]] == [days.wear.child]
-    assert not list(days.worn.folder.glob("*.part"))
+    assert [link["child"] for link in written["links"] if link["changed"]] == [days.change.child]
+    assert not list(days.changed.folder.glob("*.part"))
 
 
 def test_modules_that_are_not_the_known_ones_are_named(days: Days) -> None:
@@ -130,13 +133,13 @@ def test_a_check_needs_a_robot_or_a_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["arm6", "a2085_06", "tree_y"])
-def test_worn_robots_are_displaced_where_they_say_and_only_there(name: str) -> None:
+def test_a_link_change_displaces_its_module_and_what_is_beyond_it_only(name: str) -> None:
     robot = load_robot(name)
     sound = true_chain(robot)
     for seed in range(5):
-        wear = draw_link_change(robot, seed, 2e-3)
-        assert np.linalg.norm(wear.displacement_m) == pytest.approx(2e-3)
-        k = robot.serials.index(wear.child)
-        moved = true_chain(worn(robot, wear)).imu_home[:, :3, 3] - sound.imu_home[:, :3, 3]
-        assert moved[k] == pytest.approx(sound.imu_home[k, :3, :3] @ wear.displacement_m, abs=1e-12)
+        change = draw_link_change(robot, seed, 2e-3)
+        assert np.linalg.norm(change.displacement_m) == pytest.approx(2e-3)
+        k = robot.serials.index(change.child)
+        moved = true_chain(with_link_change(robot, change)).imu_home[:, :3, 3] - sound.imu_home[:, :3, 3]
+        assert moved[k] == pytest.approx(sound.imu_home[k, :3, :3] @ change.displacement_m, abs=1e-12)
         assert np.allclose(moved[:k], 0.0, atol=1e-12)

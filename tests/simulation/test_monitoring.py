@@ -1,10 +1,10 @@
-"""Things happen to a known arm while it moves, and the watch says what, where and how large; else nothing."""
+"""Events on a known arm that moves are named, located and sized by the monitor; there is nothing else."""
 
 import pytest
 
 from coordinator.monitoring.findings import Finding
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from sim.benchmark.cases.monitored_robot import Happening, watched
+from sim.benchmark.cases.monitored_robot import WorldEvent, monitor_robot
 from sim.benchmark.cases.monitoring import (
     Happens,
     MonitoringTrial,
@@ -14,6 +14,9 @@ from sim.benchmark.cases.monitoring import (
     settings_of,
 )
 from sim.world.external_force import Push
+
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("monitoring")
 
 # One robot for all tests of the file, recorded once.
 ARM = Subject(robot="a2085_03", seed=3, brief=True)
@@ -62,13 +65,13 @@ def test_a_hand_that_holds_the_arm_for_seconds_is_not_weighed() -> None:
     known = known_subject(ARM)
     monitor = Monitor(known.reference)
     hand = Push(serial="elbow", force_n=(6.0, 8.0, -4.0), at_m=(0.1, 0.0, 0.0), from_s=5.0, for_s=3.0)
-    happening = Happening(4.0, lambda world: world.push(hand))
+    event = WorldEvent(4.0, lambda world: world.push(hand))
     findings: list[Finding] = []
 
     def report(update: MonitorUpdate, now_ns: int) -> None:
         findings.extend(update.findings)
 
-    watched(settings_of(known.robot, ARM, 5), known.motions, 9.0, monitor, report, (happening,))
+    monitor_robot(settings_of(known.robot, ARM, 5), known.motions, 9.0, monitor, report, (event,))
     # At first it is a blow like any other.
     assert findings[0].kind == "collision"
     assert findings[0].since_ns == pytest.approx(5.0e9, abs=0.1e9)

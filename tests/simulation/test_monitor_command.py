@@ -15,6 +15,9 @@ from sim.robot.variants import loaded
 from sim.virtual_time.robot import VirtualRobot
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
+# Tests of this group share recorded runs: they stay in one process.
+pytestmark = pytest.mark.xdist_group("monitoring")
+
 ARM = load_robot("a2085_03")
 HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
 GRASPED_S = 20.0
