@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from coordinator.batch_estimation.imu_prediction import imu_readings
     from coordinator.description.urdf_reader import read_urdf
     from coordinator.identification.identify import identify
+    from coordinator.kinematics.imu_links import link_from_imus, link_from_joint
     from coordinator.library import (
         connect,
         denavit_hartenberg,
@@ -32,6 +33,8 @@ _HOMES = {
     "identify": "coordinator.identification.identify",
     "imu_readings": "coordinator.batch_estimation.imu_prediction",
     "inverse_dynamics": "module_agent.model.regressor",
+    "link_from_imus": "coordinator.kinematics.imu_links",
+    "link_from_joint": "coordinator.kinematics.imu_links",
     "load_recording": "coordinator.library",
     "load_run": "coordinator.library",
     "read_log": "coordinator.arm_fit.data_file",
@@ -48,6 +51,8 @@ __all__ = [
     "identify",
     "imu_readings",
     "inverse_dynamics",
+    "link_from_imus",
+    "link_from_joint",
     "load_recording",
     "load_run",
     "read_log",
