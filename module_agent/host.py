@@ -283,9 +283,9 @@ class AgentHost:
         for module, pwm in zip(modules, self._hardware.send(commands), strict=True):
             for outgoing in module.publish(pwm):
                 self._send(module, outgoing)
-        if self._neighbours.restless:
+        if self._neighbours.has_work:
             self._attend_to_motions()
-        if self._shared.collection.restless:
+        if self._shared.collection.has_work:
             for wish in self._shared.collection.poll(self.modules[0].now_ns):
                 self._ask_history(wish)
         self._worker.check()
@@ -340,7 +340,7 @@ class AgentHost:
             # An answer too; anything else is malformed.
             refused = _of(asked.serial, decode(Ack, payload))
             if refused.reason in (Refusal.GONE.value, Refusal.WRONG_BOOT.value):
-                self._shared.collection.on_gone(asked)
+                self._shared.collection.on_lost(asked)
             return
         self._neighbours.on_feedback(feedback, clocks, live=False)
         self._shared.collection.on_feedback(feedback)

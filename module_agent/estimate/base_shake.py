@@ -1,11 +1,11 @@
-"""How whatever carries a joint shakes, by the IMU of the joint's own module, and whether that is worth using.
+"""The shake of a joint's base, measured by the IMU of the joint's own module, and whether it is significant.
 
-The module that turns the joint sits on the base or on other links; what these do, its IMU feels and so does
-the child's. It samples on the encoder's clock, so what is felt is turned by the joint's angle first, into
-axes that turn with the child, and goes through the low-pass afterwards.
+The module that turns the joint sits on the base or on other links, whose motion both its IMU and the child's
+IMU measure. It samples on the encoder's clock, so its readings are first turned by the joint's angle, into
+axes that turn with the child, and then low-passed.
 
-The IMU of a joint that turns also feels its gears. So its readings are used only where they hold more than
-that noise: where the joint's rate and acceleration show in them.
+The IMU of a turning joint also measures the vibration of its gears. So its readings are used only if they
+exceed that noise: if they correlate with the joint's rate and acceleration.
 """
 
 from copy import copy
@@ -24,21 +24,21 @@ SLOPE, CURVE = slice(9, 12), slice(12, 15)
 _LOADING = [0, 1, 8]
 # Chi^2 of 12 coefficients, all of them noise, is above this once in 10,000.
 SHAKE_CHI2 = 39.0
-# An IMU that reads this much of the joint's rate about the axis sits on the moving side: its module is
-# mounted reversed, and knows nothing of what carries the joint.
+# An IMU that reads this much of the joint's rate about the axis is on the moving side: its module is mounted
+# reversed and does not measure the joint's base.
 CARRIED_ABOVE = 0.5
 
 
 class BaseMotion:
     """The shake under a joint during one motion, at any time since the joint's first sample.
 
-    gravity: (2,) the specific force across the axis in the joint's housing that `still` has.
-    shakes: whether more than the IMU's own noise is to be seen.
-    push_m: how far out the shake across the axis goes with the joint's acceleration, as a distance.
+    gravity: (2,) the specific force across the axis in the joint's housing, from `still`.
+    shakes: whether the readings exceed the IMU's own noise.
+    push_m: force across the axis per angular acceleration of the joint, a distance.
 
     Args:
         joint, imu: what the joint's module sampled, on one clock.
-        still: (6,) what its IMU reads at rest, gyro first; a constant error of it passes for gravity.
+        still: (6,) its IMU's readings at rest, gyro first; a constant error counts as gravity.
 
     Raises:
         ValueError: too few samples for the low-pass, or unevenly spaced ones.
@@ -71,7 +71,7 @@ class BaseMotion:
         return np.asarray(self._spline(np.clip(t_s, self.start_s, self.end_s)) * self._known)
 
     def about_the_axis(self) -> "BaseMotion":
-        """Return only what needs no direction across the axis: the swing about it, and the push along it."""
+        """Return the parts without a direction across the axis: the swing about it and the push along it."""
         reduced = copy(self)
         reduced._known = np.zeros(15)
         reduced._known[[2, 5, 8, 11, 14]] = 1.0
@@ -79,14 +79,14 @@ class BaseMotion:
 
 
 def _turned_back(vectors: Array, angle: Array) -> Array:
-    """Return vectors (n, 3) of the housing as seen from axes that turn by (n,) about its third."""
+    """Return vectors (n, 3) of the housing in axes that turn by angles (n,) about its third axis."""
     cosine, sine = np.cos(angle), np.sin(angle)
     x, y, z = vectors.T
     return np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1)
 
 
 def _shakes(t_ns: Times, readings: Array, angle: Array, smooth_s: float) -> tuple[bool, float]:
-    """Return whether rate and acceleration of the joint show in an IMU's readings (n, 6), force first.
+    """Return whether an IMU's readings (n, 6), force first, correlate with the joint's rate and acceleration.
 
     Also the size of the acceleration's coefficient in the force across the axis.
     """
@@ -99,12 +99,12 @@ def _shakes(t_ns: Times, readings: Array, angle: Array, smooth_s: float) -> tupl
     coefficients = np.linalg.solve(normal, columns.T @ smooth)
     if abs(coefficients[0, 5]) > CARRIED_ABOVE:
         return False, 0.0
-    # The noise is what the low-pass takes, as shake is slow and the gears' noise is white; it grows with the
+    # The low-pass removes the noise, as shake is slow and the gears' noise is white. The noise grows with the
     # speed, and so weighs most where the columns are largest.
     reach = (len(readings) - len(smooth)) // 2
     fast = readings[reach : len(readings) - reach] - smooth
     if not np.any(fast, axis=0).all():
-        return False, 0.0  # readings that never change are those of no IMU
+        return False, 0.0  # constant readings: the IMU does not work
     white = fast**2 / (1.0 - 1.0 / white_ratio(t_ns, smooth_s))
     scatter = np.einsum("ni,nj,nk->kij", columns, columns, white)
     inverse = np.linalg.inv(normal)

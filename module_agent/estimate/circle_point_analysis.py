@@ -1,7 +1,7 @@
 """The thesis' circle point analysis of one joint in one IMU's frame (chapters 4.3.2 to 4.3.5 and 6.2.1).
 
-The estimator is the thesis' as written, with its known biases (only alpha is filtered, so that d comes out
-0.77 % long at 2 Hz and 250 Hz), but with one sign convention throughout:
+The estimator is that of the thesis, with its known biases (only alpha is filtered, so that d comes out 0.77 %
+long at 2 Hz and 250 Hz), but with one sign convention throughout:
 
     j   direction about which the IMU's body turns when the joint's position grows
     r   points from the joint's axis to the IMU (the thesis' points back to the joint)
@@ -28,13 +28,12 @@ Mask = NDArray[np.bool_]
 MIN_SAMPLES = 3 * TAPS
 MIN_RATE_RAD_S = 0.02  # 15 times the gyro's noise; slower motions say nothing about an axis
 MIN_ACCELERATION_RAD_S2 = 0.1  # 100 mm give 0.01 m/s^2, below the noise of one sample
-REST_S = (
-    0.1  # the window of 5.6 s leaves 2 % of the amplitude in its first 0.1 s, 0.4 mrad of angle at 0.2 rad
-)
+# The window of 5.6 s leaves 2 % of the amplitude in its first 0.1 s, 0.4 mrad of angle at 0.2 rad.
+REST_S = 0.1
 
 
 class RestReading(NamedTuple):
-    """What an IMU reads at rest: means (3,) in frame u, and the scatter of one sample (rms over the axes)."""
+    """An IMU's readings at rest: means (3,) in frame u, and the scatter of one sample (rms over the axes)."""
 
     gyro_offset_rad_s: Array
     specific_force_m_s2: Array
@@ -55,7 +54,7 @@ class CircleFit(NamedTuple):
     """A circle point analysis; vectors (3,) in the IMU frame u, conventions as in the module's docstring.
 
     sigma_distance_m: from the residual of eq. 23, widened for its autocorrelation, and from what the initial
-        gravity and the axis leave uncertain in eq. 16. It knows nothing of scale errors of the sensors.
+        gravity and the axis leave uncertain in eq. 16. Scale errors of the sensors are not included.
     residual_rms_m_s2: of the tangential acceleration about alpha d.
     singular_values: of eq. 20 divided by sqrt(samples): rms accelerations [m/s^2], largest first.
     """
@@ -91,7 +90,7 @@ def rest_reading(rest: ImuWindow) -> RestReading:
 def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
     """Find the joint's axis in frame u from the constant motion: eq. 15 on the gyro less its offset (eq. 30).
 
-    Samples of less than half the top speed are left out. Every sample counts with the sign of the encoder's
+    Samples of less than half the top speed are dropped. Every sample counts with the sign of the encoder's
     rate, so that j does not depend on the direction of the motion; a motion forth and back cancels the gyro
     offset.
 
@@ -143,11 +142,11 @@ def circle_point_analysis(
             short.
 
     Returns:
-        The fit. An IMU on the axis comes out with a distance near zero and a sigma no smaller than its noise
-        warrants; its radial direction then means nothing.
+        The fit. An IMU on the axis has a distance near zero and a sigma no smaller than its noise
+        warrants; its radial direction is then undefined.
 
     Raises:
-        DataError: too few samples or too little motion, with what would be enough.
+        DataError: too few samples or too little motion; the message says how much is needed.
     """
     _enough(sine.t_s.size, "windowed sine motion")
     at_rest = rest_reading(rest)
@@ -214,7 +213,7 @@ def circle_estimate(fit: CircleFit, delay_s: float) -> CircleEstimate:
 
 
 def _turns(axis: Array, sine: AlignedMotion, quiet: Mask) -> Array:
-    """Return (n, 3, 3): what turns a vector fixed in the world, seen from u at the beginning, to sample n.
+    """Return (n, 3, 3): the rotations in frame u of a vector fixed in the world, from the start to sample n.
 
     The body turns by +phi about j, so the world turns by -phi as seen from it: eq. 16 with this sign.
     """

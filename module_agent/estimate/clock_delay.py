@@ -1,7 +1,7 @@
-"""Find the offset between two modules' clocks from a motion that both saw: gyro against encoder rate.
+"""Estimate the offset between two modules' clocks from one motion: gyro against encoder rate.
 
 Round trips bound the offset to tens of milliseconds; the motion itself gives it to tens of microseconds. The
-gyro of whoever is carried reads gyro(t) = b + c v(t - delay) with v the joint's rate and c, b constant
+gyro of a carried module reads gyro(t) = b + c v(t - delay) with v the joint's rate and c, b constant
 3-vectors, so no axis has to be known. A grid finds the basin, Gauss-Newton on (b, c, delay) the minimum.
 """
 
@@ -17,9 +17,8 @@ from module_agent.model.errors import DataError
 SEARCH_S = 0.08  # round trips are off by up to 60 ms, and the optimum must lie inside the grid
 GRID_S = 0.004
 STEPS = 8
-# Below this the gyro does not follow the joint, and the best of many poor delays would mean nothing. Reaction
-# motion of a held joint follows it well and is kept: motion_detection tells it from being carried by its
-# size.
+# Below this the gyro does not follow the joint, and the best delay is meaningless. The reaction motion of a
+# held joint follows it well and is accepted here: `motion_detection` rejects it by its size.
 MIN_EXPLAINED = 0.25
 
 
@@ -27,16 +26,16 @@ class ClockDelay(NamedTuple):
     """How the joint's clock maps to the IMU's: t_imu = t_joint + offset_ns.
 
     delay_s: offset minus the rough offset it was started from.
-    sigma_s: one standard deviation; infinite if not found.
+    sigma_s: one standard deviation; infinite if undetermined.
     explained: fraction of the gyro's variance that the joint's rate explains, 0..1.
-    found: whether the motion was seen; if not, the offset is the rough one.
+    determined: whether the gyro follows the joint; if not, the offset is the rough one.
     """
 
     offset_ns: int
     delay_s: float
     sigma_s: float
     explained: float
-    found: bool
+    determined: bool
 
 
 def clock_delay(
@@ -45,7 +44,7 @@ def clock_delay(
     """Refine the offset between the joint's clock and the IMU's from one motion.
 
     Both windows should hold the whole motion and a little rest about it. The offset is taken as constant: 100
-    ppm over 5 s are 0.5 ms from end to end, and what is found is the mean.
+    ppm over 5 s are 0.5 ms from end to end, and the estimate is the mean.
 
     Raises:
         DataError: fewer than 3 filter lengths of samples, or windows that do not overlap by as much.
@@ -66,8 +65,8 @@ def clock_delay(
     delay = min(max(delay, -search_s), search_s)
     explained = _explained(gyro, rate.spline(at - delay))
     if explained < MIN_EXPLAINED:
-        return ClockDelay(rough_offset_ns, 0.0, float("inf"), explained, found=False)
-    return ClockDelay(rough_offset_ns + round(1e9 * delay), delay, sigma, explained, found=True)
+        return ClockDelay(rough_offset_ns, 0.0, float("inf"), explained, determined=False)
+    return ClockDelay(rough_offset_ns + round(1e9 * delay), delay, sigma, explained, determined=True)
 
 
 class _RateSpline:
@@ -107,7 +106,7 @@ def _refine(gyro: Array, at_s: Array, spline: CubicSpline, delay_s: float) -> tu
             return delay_s, float("inf")
         g = gyro - gyro.mean(axis=0)
         c = v @ g / power
-        free = dv - v * (v @ dv) / power  # what of the slope is not an amplitude
+        free = dv - v * (v @ dv) / power  # the slope without its share of the amplitude
         information = float(c @ c) * float(free @ free)
         if information <= 0.0:
             return delay_s, float("inf")

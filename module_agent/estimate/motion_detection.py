@@ -1,8 +1,8 @@
-"""Did this IMU move with the joint? The size of the gyro's answer to the joint's rate says so.
+"""Decide whether an IMU moves with a joint, by the regression of its gyro on the joint's rate.
 
 An IMU that is rigidly carried reads gyro = j v, with |j| = 1; one that is not reads its own noise, the
-shaking of the structure, and the give of held joints (20-30 % of the rate). The energy of the gyro would
-count all shaking; the regression coefficient on the joint's rate counts only what follows the joint.
+shaking of the structure, and the compliance of held joints (20-30 % of the rate). The energy of the gyro
+would count all shaking; the regression coefficient on the joint's rate counts only what follows the joint.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from module_agent.estimate.windows import AlignedMotion, Array
 from module_agent.model.errors import DataError
+from module_agent.model.read_only import read_only
 
 MOVED_ABOVE = 0.5
 
@@ -35,11 +36,10 @@ class MotionDetection(NamedTuple):
 def detect_motion(motions: Sequence[AlignedMotion], gyro_offset_rad_s: ArrayLike) -> MotionDetection:
     """Regress the gyro, less its offset, on the joint's rate over all motions of one joint.
 
-    The offset comes from rest and not from the motions: over a constant motion it could not be told from the
-    motion itself.
+    The offset comes from rest, not from the motions: over a constant motion the two are indistinguishable.
 
     Args:
-        motions: the CM and WSM of one joint as one IMU saw them, on one time axis.
+        motions: constant motion and windowed sine of one joint, with one IMU's readings on one time axis.
         gyro_offset_rad_s: (3,) gyro offset at rest (thesis eq. 30).
 
     Raises:
@@ -57,5 +57,5 @@ def detect_motion(motions: Sequence[AlignedMotion], gyro_offset_rad_s: ArrayLike
     coefficient = rate @ gyro / power
     scatter = float(((gyro - np.outer(rate, coefficient)) ** 2).mean())
     ratio = float(np.linalg.norm(coefficient))
-    coefficient.flags.writeable = False
-    return MotionDetection(ratio > MOVED_ABOVE, ratio, coefficient, float(np.sqrt(scatter / power)))
+    sigma = float(np.sqrt(scatter / power))
+    return MotionDetection(ratio > MOVED_ABOVE, ratio, read_only(coefficient), sigma)

@@ -1,4 +1,4 @@
-"""A motion of a joint as one observer saw it: as it was sampled, and behind the low-pass."""
+"""One joint motion as one IMU measured it: as sampled, and low-passed."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from module_agent.estimate.windows import ImuWindow, JointWindow
 
 
 class ObservedMotion(NamedTuple):
-    """A joint's motion and what an IMU saw of it: t_imu = t_joint + `offset_ns` and a delay to be found.
+    """A joint's motion and an IMU's readings of it: t_imu = t_joint + `offset_ns` + a delay to be estimated.
 
-    base: how what carries the joint shook meanwhile, None where nobody saw it.
-    instrument: the same motion without the encoder's noise, if the equations are to be weighed with it (the
-        method of instrumental variables); None weighs them with the encoder's own.
+    base: the shake of the joint's base, None if it was not measured.
+    instrument: the motion without the encoder's noise, for the method of instrumental variables; None for
+        ordinary least squares.
     """
 
     imu: SmoothImu
@@ -28,7 +28,7 @@ class ObservedMotion(NamedTuple):
 class MotionWindows(NamedTuple):
     """One motion as it was sampled: the observer's IMU, the joint, and the IMU of the joint's own module.
 
-    t_imu = t_joint + `offset_ns` and a delay to be found; the two last share a clock.
+    t_imu = t_joint + `offset_ns` + a delay to be estimated; `joint` and `carrier` share a clock.
     """
 
     imu: ImuWindow
@@ -38,14 +38,14 @@ class MotionWindows(NamedTuple):
 
 
 def observed_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_S) -> list[ObservedMotion]:
-    """Put the motions of one joint behind the low-pass.
+    """Low-pass the motions of one joint.
 
     Raises:
         ValueError: too few samples for the low-pass, or unevenly spaced ones.
     """
     if not windows:
         return []
-    # One rest for all, as the joint swings about it; of the longest, where the mean is best.
+    # One mean reading for all motions, as the joint swings about rest: that of the longest motion.
     longest = max((window.carrier for window in windows), key=lambda imu: imu.t_ns.size)
     still = np.hstack([longest.gyro_rad_s, longest.accel_m_s2]).mean(axis=0)
     return [

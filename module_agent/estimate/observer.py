@@ -1,7 +1,7 @@
-"""What one module makes of the motions of all joints, its own included: the local estimate.
+"""One module's local estimates from the motions of all joints, its own included.
 
-`job` copies the samples that an estimate needs and returns the work as a function, so that it can run beside
-the firmware's tick.
+`job` copies the samples that an estimate needs and returns the work as a function, so that it can run in
+parallel to the firmware's ticks.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ MARGIN_NS = 150_000_000
 
 
 class Finding(NamedTuple):
-    """What a module makes of a joint: whether it moves with it, and the circle that it describes then."""
+    """A module's estimate of a joint: whether it moves with it, and the circle that its IMU describes."""
 
     joint: str
     motion_ids: tuple[int, ...]
@@ -45,7 +45,7 @@ class Finding(NamedTuple):
 
 
 class _Local(NamedTuple):
-    """Both estimates of one joint, and why there is no regression where there is none."""
+    """Both estimates of one joint, and the reason if there is no regression."""
 
     circle: CircleEstimate | None
     regression: RegressionEstimate | None
@@ -53,7 +53,7 @@ class _Local(NamedTuple):
 
 
 class _Constant(NamedTuple):
-    """The constant motion of a joint as this module saw it, and whether it moved with it."""
+    """The constant motion of a joint as this module measured it, and whether the module moved with it."""
 
     boot: int
     motion_id: int
@@ -63,9 +63,9 @@ class _Constant(NamedTuple):
 
 
 class Observer:
-    """Keeps, per joint, the constant motion until the windowed sine comes, and the findings.
+    """Holds, per joint, the constant motion until the windowed sine follows, and the findings.
 
-    `knowledge` is how well the module's own IMU is known.
+    `knowledge` is the prior of the module's own IMU.
     """
 
     def __init__(self, serial: str, boot: int, knowledge: ImuPrior = UNCALIBRATED):
@@ -77,7 +77,7 @@ class Observer:
         self._rest: tuple[int, Rows] | None = None
 
     def job(self, motion: JointMotion, history: History, rest: MotionRecord | None) -> Callable[[], Finding]:
-        """Copy what is needed of the own history; return the estimate as work to be done."""
+        """Copy the needed rows of the own history; return the estimate as work to be done."""
         own = _own_rows(history, motion, motion.rough_offset_ns.get(self.serial, 0))
         still = self._rest_rows(history, rest)
         return lambda: self._analyse(motion, imu_window(own), imu_window(still))
@@ -112,7 +112,7 @@ class Observer:
                 )
             else:
                 # Slow motion decides: near a resonance of the held joints the windowed sine shakes modules
-                # that it does not carry, and holds others still that it does.
+                # that the joint does not carry, and keeps others still that it does carry.
                 constant = self._constant_of(motion)
                 numbers, moved = (constant.motion_id, *numbers), constant.moved
                 if moved:
@@ -121,7 +121,7 @@ class Observer:
                     local = self._regress(circle, [constant.windows, windows], still)
             note = "" if local is None else local.note
         except (DataError, np.linalg.LinAlgError) as error:
-            # Said to whoever listens: an estimate that cannot be had is a finding too.
+            # Published as a finding: it explains why there is no estimate.
             note = str(error)
         if local is None:
             local = _Local(None, None, note)

@@ -1,4 +1,4 @@
-"""A motion and its time derivatives behind one Gaussian low-pass, the same for everything that is compared.
+"""Motions and their time derivatives through one Gaussian low-pass, the same for all compared signals.
 
 The low-pass h of a signal x commutes with its derivatives, so that (d/dt)^m (h * x) is x convolved with the
 m-th derivative of the kernel: nothing is ever differentiated by differences. What is not linear in the
@@ -18,7 +18,7 @@ from module_agent.model.errors import DataError
 # Passes 2 Hz with 0.969 and 4 Hz with 0.88. Encoder counts of 2 pi / 2^16 at 250 Hz become 0.014 rad/s^2 of
 # noise in the acceleration, which shortens d by 5e-5 where the joint's is 2 rad/s^2 rms.
 SMOOTH_S = 0.028
-# Behind this much of a low-pass the rate is formed that is squared.
+# The low-pass of the rate that is then squared.
 BRIEF_S = 0.008
 REACH = 5.0  # half the kernel's length, in its own deviations
 # Beyond this much of the time step the samples do not count as evenly spaced.
@@ -31,7 +31,7 @@ COSINE, SINE, SQUARED = 6, 7, 8
 
 
 class SmoothImu(NamedTuple):
-    """IMU samples behind the low-pass of `smooth_s`: `t_ns` (n,), gyro and accelerometer (n, 3)."""
+    """IMU samples through the low-pass of `smooth_s`: `t_ns` (n,), gyro and accelerometer (n, 3)."""
 
     t_ns: Times
     gyro_rad_s: Array
@@ -40,7 +40,7 @@ class SmoothImu(NamedTuple):
 
 
 class SmoothMotion:
-    """A joint's motion behind the low-pass, at any time within it.
+    """A joint's motion through the low-pass, at any time within it.
 
     Raises:
         DataError: too few samples for the filter, or unevenly spaced ones.
@@ -49,7 +49,7 @@ class SmoothMotion:
     def __init__(self, joint: JointWindow, smooth_s: float = SMOOTH_S):
         step_s = _step_s(joint.t_ns, "joint", smooth_s)
         q = joint.position_rad
-        # What the brief low-pass takes of a rate is s^2 / 2 q''' to second order; a square would show it.
+        # The brief low-pass attenuates a rate by s^2 / 2 q''' to second order, which would bias its square.
         rate = _filtered(q, step_s, BRIEF_S, 1) - 0.5 * BRIEF_S**2 * _filtered(q, step_s, BRIEF_S, 3)
         squared = _filtered(rate**2, step_s, smooth_s, 0)
         # Two filters reach farther than one: all columns end where the shortest does.
@@ -74,7 +74,7 @@ class SmoothMotion:
 
 
 def smooth_imu(imu: ImuWindow, smooth_s: float = SMOOTH_S) -> SmoothImu:
-    """Filter an IMU's samples; those whose filter would reach beyond the window are left out.
+    """Filter an IMU's samples; those whose kernel would reach beyond the window are dropped.
 
     Raises:
         DataError: as `SmoothMotion`.
@@ -105,13 +105,13 @@ def low_passed(t_ns: Times, signal: Array, smooth_s: float, order: int = 0) -> t
 def derivative_kernel(step_s: float, smooth_s: float, order: int) -> Array:
     """Return the weights (taps,) of the `order`-th derivative of a Gaussian low-pass, latest sample last.
 
-    What sampling and truncation lose is made up for: t^order / order! comes out as one, lower powers as zero.
+    Corrected for sampling and truncation: t^order / order! comes out as one, lower powers as zero.
     """
     reach = _reach(step_s, smooth_s)
     t = step_s / smooth_s * np.arange(-reach, reach + 1)
     window = np.exp(-0.5 * t**2)
-    # That derivative is the window times a Hermite polynomial: the one that passes t^order and, as far as
-    # samples go, nothing below it.
+    # That derivative is the window times a Hermite polynomial: the one that passes t^order and, on these
+    # samples, no lower power.
     powers = t[:, None] ** np.arange(order % 2, order + 1, 2)
     wanted = np.zeros(powers.shape[1])
     wanted[-1] = factorial(order) / smooth_s**order

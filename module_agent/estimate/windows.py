@@ -1,4 +1,4 @@
-"""Windows of samples that the local estimate works on, and how they are brought onto one time axis."""
+"""Windows of samples for the local estimates, and their alignment onto one time axis."""
 
 from typing import NamedTuple
 
@@ -42,7 +42,7 @@ class AlignedMotion(NamedTuple):
 def imu_window(rows: Rows) -> ImuWindow:
     """Take the IMU's samples out of feedback rows (`feedback_rows.ROW`).
 
-    Rows may come faster than the IMU samples, or twice after a gap was filled: every IMU time counts once.
+    Rows may be more frequent than IMU samples, or repeated after a gap: every IMU time counts once.
     """
     t_ns, first = np.unique(rows["imu_t_ns"].astype(np.int64), return_index=True)
     return ImuWindow(
@@ -61,7 +61,7 @@ def joint_window(rows: Rows) -> JointWindow:
 def align(imu: ImuWindow, joint: JointWindow, offset_ns: int) -> AlignedMotion:
     """Interpolate the joint to the times of the IMU samples: t of the joint is t + offset_ns of the IMU.
 
-    IMU samples outside the joint's window are left out: nothing is extrapolated.
+    IMU samples outside the joint's window are dropped: nothing is extrapolated.
 
     Raises:
         DataError: the windows do not overlap, or hold too few samples to interpolate.

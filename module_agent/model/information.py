@@ -1,4 +1,4 @@
-"""Square-root information: what the samples of a joint say of the inertial parameters, in a few rows.
+"""Square-root information: the samples of a joint reduced to a few rows about the inertial parameters.
 
 A QR of [Y | tau] keeps everything that least squares needs of any number of samples (Golub and Van Loan,
 Matrix Computations, section 5.3). Two such pieces merge by a QR of their stacked rows: exactly, in any order,
@@ -89,7 +89,7 @@ def gather_joint(
     """Return the information of one joint: what `gather` returns for it, from its torques (m,) alone.
 
     The motion is (m, n). That of joints which neither carry it nor are carried by it has no effect. `further`
-    are columns (m, k) of this joint beside the bodies'.
+    are columns (m, k) of this joint in addition to the bodies'.
 
     Raises:
         ValueError: shapes that do not fit.
@@ -101,12 +101,12 @@ def gather_joint(
         raise ValueError(f"torques {tau.shape} do not fit a motion {signals[0].shape}")
     if not tau.size or not np.isfinite(tau).all():
         raise DataError(f"{tau.size} torques: at least one is needed, and all finite")
-    beside = np.zeros((tau.size, 0)) if further is None else np.asarray(further, dtype=float)
+    extra = np.zeros((tau.size, 0)) if further is None else np.asarray(further, dtype=float)
     total: JointInformation | None = None
     for begin in range(0, tau.size, _BLOCK):
         part = slice(begin, begin + _BLOCK)
         bodies = _own_rows(chain, joint, [signal[part] for signal in signals])
-        own = np.column_stack([bodies, beside[part]])
+        own = np.column_stack([bodies, extra[part]])
         block = _triangular(own, tau[part], 0.0, len(own))
         total = block if total is None else merge_joint(total, block)
     assert total is not None
@@ -150,11 +150,11 @@ def merge_joint(one: JointInformation, other: JointInformation) -> JointInformat
 
 
 def _triangular(y: Array, tau: NDArray[np.float64], rest: float, samples: int) -> JointInformation:
-    felt = np.flatnonzero(y.any(axis=0))
-    rows = qr(np.column_stack([y[:, felt], tau]), mode="r", check_finite=False)[0][: felt.size + 1]
-    kept = min(felt.size, rows.shape[0])
+    nonzero = np.flatnonzero(y.any(axis=0))
+    rows = qr(np.column_stack([y[:, nonzero], tau]), mode="r", check_finite=False)[0][: nonzero.size + 1]
+    kept = min(nonzero.size, rows.shape[0])
     r = np.zeros((kept, y.shape[1]))
-    r[:, felt] = rows[:kept, :-1]
+    r[:, nonzero] = rows[:kept, :-1]
     z = rows[:kept, -1].copy()
     make_read_only((r, z))
     return JointInformation(r, z, rest + float(rows[kept:, -1] @ rows[kept:, -1]), samples)

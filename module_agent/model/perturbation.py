@@ -4,8 +4,6 @@ An increment is (6 n,): for every module [rotation (3), translation (3)], the ex
 displacement of its housing in the root frame at q = 0, applied from the left. Housing, IMU and axis of the
 module move together, since the catalogue ties them. Moving everything beyond a joint about or along that
 joint's axis is the same twist for all of it, for finite amounts too.
-
-The cross product of many vectors at once, samples in the last axis.
 """
 
 import numpy as np

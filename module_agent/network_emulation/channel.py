@@ -1,6 +1,6 @@
-"""What one direction of a network does to each message: random draws and recorded traces made into fates.
+"""One direction of a network: random draws and recorded traces determine the fate of each message.
 
-Messages in order: each waits for its own time and for those before it, as on a TCP link.
+Messages of one key stay in order: each waits for its own time and for those before it, as on a TCP link.
 """
 
 from collections import deque

@@ -1,9 +1,8 @@
-"""A transport whose network misbehaves, around any other: late, lost, stalled, cut off, out of order, twice.
+"""A wrapper of any transport that delays, loses, stalls, cuts off, reorders and duplicates messages.
 
 Every message crosses exactly one wrapper, that of the endpoint that receives it: samples, requests, and the
-replies to this endpoint's queries. What this endpoint sends goes out untouched, unless it is cut off.
-
-A network profile put between a program and its transport, in real time.
+replies to this endpoint's queries. Messages that this endpoint sends pass unchanged, unless it is cut off.
+`inject` puts a network profile between a program and its transport, in real time.
 """
 
 import threading
@@ -31,13 +30,13 @@ from module_agent.transport.transport import (
     Undeclare,
 )
 
-# A lost request stays referenced this long: a transport may tell the asker at once that nobody answers when
-# the request is garbage collected, and the loss would not look like one. Longer than any time-out in use.
+# A lost request stays referenced this long, longer than any time-out in use: when a request is garbage
+# collected, a transport may report at once that there is no answer, which does not look like a loss.
 _LOST_REQUEST_S = 30.0
 
 
 class DropCounts(NamedTuple):
-    """What an endpoint lost so far, by kind; `sent` is what it tried to send while it was cut off."""
+    """Messages that an endpoint lost so far, by kind; `sent` are those that it sent while cut off."""
 
     samples: int
     requests: int
@@ -71,7 +70,7 @@ class _Declaration:
 
 
 class _Question:
-    """A query under way; whatever comes first, answer or time-out, is its one reply."""
+    """A query under way; its one reply is the answer or the time-out, whichever comes first."""
 
     def __init__(self, tag: int, key: str, sink: Sink):
         self.tag = tag
@@ -108,19 +107,18 @@ class _Once:
 
 
 class ImpairedTransport:
-    """Wraps a transport and impairs what its endpoint receives, as the profile's way to it says.
+    """Wraps a transport and impairs the messages that its endpoint receives by one path of a profile.
 
     Order is kept per key and kind of message but for the fraction `reorder`. A stall holds up all messages of
     the endpoint together. Lost requests and replies end as a `Reply` with error "Timeout" when the query's
     time is up. A reply is never duplicated, and a duplicated request is answered once. Liveliness is delayed,
-    in order, never lost; so are errors of queries, which no message carries, delivered as they come. A
-    perfect way delivers from inside the call of the inner transport.
+    in order, never lost; errors of queries, which
+    no message carries, are delivered at once. A perfect path delivers within the call of the inner transport.
 
     Partition: from `partition` to `heal`, and at a coordinator at the profile's times, the endpoint is cut
-    off: what it sends and what comes for it is lost, what is under way to it already arrives. Liveliness then
-    goes as with a session of which nothing is heard: changes are told at the end; if the partition lasts
-    longer than the lease (`LEASE_S`), both sides see the other's tokens vanish after it, and appear again at
-    the end.
+    off: what it sends and what comes for it is lost, what is under way to it already arrives. Liveliness
+    changes are then reported at the end; if the partition lasts longer than the lease (`LEASE_S`), both sides
+    see the other's tokens vanish after it and reappear at the end.
 
     Thread-safe; the scheduler must run its calls one at a time.
     """
@@ -156,7 +154,7 @@ class ImpairedTransport:
 
     @property
     def drops(self) -> DropCounts:
-        """What was lost so far at this endpoint."""
+        """Messages lost so far at this endpoint."""
         with self._lock:
             return DropCounts(*self._dropped.values())
 
@@ -184,7 +182,7 @@ class ImpairedTransport:
             request = event._replace(reply=_Once(event.reply, self._answer))
             arrives = self._impair("request", event.key, lambda: declaration.deliver(request))
             if not arrives:
-                self._scheduler.call_later(_LOST_REQUEST_S, lambda: _let_go(event.reply))
+                self._scheduler.call_later(_LOST_REQUEST_S, lambda: _release(event.reply))
 
         return declaration.hold(self._inner.serve(key_expr, on_request))
 
@@ -200,7 +198,7 @@ class ImpairedTransport:
                 self._inner.query(key, payload, timeout_s, lambda event: self._on_reply(question, event), tag)
         except TransportError:
             self._forget(question)
-            # Closing meanwhile has answered it.
+            # A concurrent close has answered it.
             if question.withdraw() is not None:
                 raise
         self._scheduler.call_later(timeout_s, lambda: self._finish(question, Reply(tag, key, None, TIMEOUT)))
@@ -219,22 +217,22 @@ class ImpairedTransport:
         """Deliver changes of matching tokens late, in order, never lost."""
         declaration = _Declaration(sink, self._forget_watch)
 
-        def tell(event: Liveness) -> None:
+        def report(event: Liveness) -> None:
             self._delay("liveness", event.key, lambda: declaration.deliver(event))
 
-        watched = WatchedTokens(tell)
+        watched = WatchedTokens(report)
 
         def on_liveness(event: Event) -> None:
             assert isinstance(event, Liveness)
             with self._parting:
-                watched.hear(event, self._parted)
+                watched.on_change(event, self._parted)
 
         with self._parting:
             self._watched[declaration] = watched
         return declaration.hold(self._inner.watch_alive(key_expr, on_liveness))
 
     def close(self) -> None:
-        """Close the inner transport; messages under way are gone, queries under way get their `Reply`."""
+        """Close the inner transport; messages under way are dropped, queries under way get their `Reply`."""
         with self._lock:
             if self._closed:
                 return
@@ -258,7 +256,7 @@ class ImpairedTransport:
         self._scheduler.call_later(LEASE_S, lambda: self._lapse(number))
 
     def heal(self) -> None:
-        """End the partition, whoever began it."""
+        """End the partition, also one that the profile began."""
         with self._parting:
             if not self._parted:
                 return
@@ -282,7 +280,7 @@ class ImpairedTransport:
             token.hide()
 
     def _is_cut_off(self) -> bool:
-        """Return whether what is to be sent is lost, and count it."""
+        """Return whether a message to be sent is lost, and count it."""
         if not self._parted or self._closed:
             return False
         with self._lock:
@@ -291,7 +289,7 @@ class ImpairedTransport:
 
     def _answer(self, reply: Callable[[bytes], None], payload: bytes) -> None:
         if self._is_cut_off():
-            self._scheduler.call_later(_LOST_REQUEST_S, lambda: _let_go(reply))
+            self._scheduler.call_later(_LOST_REQUEST_S, lambda: _release(reply))
         else:
             reply(payload)
 
@@ -334,7 +332,7 @@ class ImpairedTransport:
             self._scheduler.call_later(delay_s, deliver)
 
     def _impair(self, kind: str, key: str, deliver: Callable[[], None]) -> bool:
-        """Deliver as fate has it; return False when the message is lost."""
+        """Deliver a message by its fate; return False if it is lost."""
         with self._lock:
             if self._closed:
                 return False
@@ -352,7 +350,7 @@ class ImpairedTransport:
     def _calls(
         self, kind: str, key: str, deliver: Callable[[], None]
     ) -> list[tuple[float, Callable[[], None]]] | None:
-        """Return what to call when for a message; nothing if it is lost, None if the way is perfect."""
+        """Return the delays and calls that deliver a message; empty if it is lost, None on a perfect path."""
         if self._channel is None:
             return None
         fate = self._channel.fate(self._scheduler.now_s - self._start_s)
@@ -391,8 +389,8 @@ class ImpairedTransport:
         return call
 
 
-def _let_go(reply: Callable[[bytes], None]) -> None:
-    """Hold the last reference to what would have answered a lost request until here."""
+def _release(reply: Callable[[bytes], None]) -> None:
+    """Hold the last reference to the reply function of a lost request until now."""
 
 
 def inject(transport: Transport, network: NetworkProfile, seed: int, receiver: Receiver) -> Transport:

@@ -1,8 +1,8 @@
-"""Liveliness across a partition: what an endpoint that is cut off sees, and what the others see of it.
+"""Liveliness across a partition, as seen by the endpoint that is cut off and by the others.
 
-As with a session whose peers fall silent: a partition shorter than the session's lease is not seen at all,
-and what happened meanwhile is told at its end. After the lease either side takes the other for gone; when the
-partition is over, who is still there comes back.
+A partition shorter than the session's lease is not noticed; changes during it are reported at its end. After
+the lease each side's tokens vanish for the other; when the partition ends, the tokens that still exist
+reappear.
 """
 
 import threading
@@ -12,7 +12,7 @@ from module_agent.transport.transport import Liveness, Undeclare
 
 
 class OwnToken:
-    """A token of this endpoint, withdrawn while the endpoint is taken for gone."""
+    """A token of this endpoint, withdrawn while the endpoint counts as lost."""
 
     def __init__(self, declare: Callable[[], Undeclare], forget: Callable[["OwnToken"], None]):
         self._declare: Callable[[], Undeclare] | None = declare
@@ -42,46 +42,46 @@ class OwnToken:
 
 
 class WatchedTokens:
-    """The tokens of others as one watch of this endpoint sees them."""
+    """The tokens of others as one watch of this endpoint reports them."""
 
-    def __init__(self, tell: Callable[[Liveness], None]):
-        self._tell = tell
-        self._told: dict[str, None] = {}
+    def __init__(self, report: Callable[[Liveness], None]):
+        self._report = report
+        self._present: dict[str, None] = {}
         self._held: list[Liveness] = []
-        self._gone = False
+        self._lapsed = False
 
-    def hear(self, event: Liveness, parted: bool) -> None:
-        """Take in a change; it is told at once, or when the partition is over."""
+    def on_change(self, event: Liveness, parted: bool) -> None:
+        """Report a change at once, or at the end of the partition."""
         if parted:
             self._held.append(event)
         else:
-            self._tell_of(event)
+            self._report_change(event)
 
     def lapse(self) -> None:
-        """Take everybody for gone: the partition has lasted longer than the lease."""
-        self._gone = True
-        for key in self._told:
-            self._tell(Liveness(key, False))
+        """Report all tokens as vanished: the partition has lasted longer than the lease."""
+        self._lapsed = True
+        for key in self._present:
+            self._report(Liveness(key, False))
 
     def heal(self) -> None:
-        """Tell what has changed meanwhile; after a lapse, who is there."""
+        """Report the changes meanwhile, after a lapse all tokens that exist."""
         held, self._held = self._held, []
-        gone, self._gone = self._gone, False
-        if not gone:
+        lapsed, self._lapsed = self._lapsed, False
+        if not lapsed:
             for event in held:
-                self._tell_of(event)
+                self._report_change(event)
             return
         for event in held:
             self._note(event)
-        for key in self._told:
-            self._tell(Liveness(key, True))
+        for key in self._present:
+            self._report(Liveness(key, True))
 
-    def _tell_of(self, event: Liveness) -> None:
+    def _report_change(self, event: Liveness) -> None:
         self._note(event)
-        self._tell(event)
+        self._report(event)
 
     def _note(self, event: Liveness) -> None:
         if event.alive:
-            self._told[event.key] = None
+            self._present[event.key] = None
         else:
-            self._told.pop(event.key, None)
+            self._present.pop(event.key, None)

@@ -1,4 +1,4 @@
-"""Network files: a profile as TOML, with the fields of `NetworkProfile`, and its traces beside it.
+"""Network files: a profile as TOML, with the fields of `NetworkProfile`, and its traces in files next to it.
 
 name = "workshop"        # the file's own name if not given
 delay_ms = 1.0
@@ -8,8 +8,8 @@ jitter_ms = 2.0
 apart_s = 5.0
 mean_ms = 30.0
 
-[to_coordinator]         # what differs on the way there
-trace = "uplink.csv"     # beside this file; see network_trace
+[to_coordinator]         # where this direction differs
+trace = "uplink.csv"     # in this file's folder; see `trace`
 """
 
 import tomllib

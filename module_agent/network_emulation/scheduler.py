@@ -1,7 +1,4 @@
-"""Something that tells the time and calls a function later; `impaired_transport` delays messages with it.
-
-A `Scheduler` in real time: one daemon thread and a heap.
-"""
+"""The time, and functions called later: the contract, and its implementation in real time."""
 
 import heapq
 import itertools
@@ -62,7 +59,7 @@ class TimerThread:
                 self._wake.notify()
 
     def close(self) -> None:
-        """Stop; what has not been called yet is forgotten. May be called twice, also from a call."""
+        """Stop; pending calls are dropped. May be called twice, also from a call."""
         with self._wake:
             self._closed = True
             self._heap.clear()

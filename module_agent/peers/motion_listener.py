@@ -1,8 +1,8 @@
-"""What the modules of one agent process hear of whichever joint moves, so that each can estimate from it.
+"""The motions of all joints, collected for the modules of one agent process, which estimate from them.
 
-A joint that moves is noticed by its status; its feedback is then listened to, and whatever the network
-dropped is asked for from its history. When the motion is complete it is handed to every module of the
-process. Pure: what is to be sent or subscribed comes back as wishes.
+The status of a module announces its motion. Its feedback is then subscribed to, and rows that the network
+dropped are requested from its history. A complete motion goes to every module of the process. No I/O:
+subscriptions and requests are returned as actions.
 """
 
 from collections.abc import Mapping
@@ -34,14 +34,13 @@ class AskHistory(NamedTuple):
     end_row: int
 
 
-Wish = Listen | AskHistory
+Action = Listen | AskHistory
 
 
 class JointMotion(NamedTuple):
     """A complete motion of one joint: its record and all its rows, and a rough mapping of its clock.
 
-    `rough_offset_ns` per own module: own clock minus the joint's clock, too large by the delay of the
-    network.
+    `rough_offset_ns` per own module: own clock minus the joint's clock, too large by the network's delay.
     """
 
     serial: str
@@ -64,7 +63,7 @@ class _Track:
         self.give_up_ns = now_ns + GIVE_UP_NS
 
     def note_arrival(self, t_ns: int, own_ns: Mapping[str, int]) -> None:
-        # The smallest difference is that of the message that was least delayed.
+        # The smallest difference belongs to the message with the smallest delay.
         for own, now_ns in own_ns.items():
             offset = now_ns - t_ns
             self.offset_ns[own] = min(self.offset_ns.get(own, offset), offset)
@@ -73,19 +72,19 @@ class _Track:
 class MotionListener:
     """Collects exploration motions of all joints; `own_ns` maps own serials to their clocks now.
 
-    `restless` says whether `poll` may have anything to say: something was heard since, or rows are missing.
+    `has_work` says whether `poll` may return anything: a message arrived since, or rows are missing.
     """
 
     def __init__(self) -> None:
-        self.restless = False
+        self.has_work = False
         self._tracks: dict[str, _Track] = {}
         self._finished: dict[str, tuple[int, int]] = {}
-        self._wishes: list[Wish] = []
+        self._actions: list[Action] = []
         self._boot: dict[str, int] = {}
         self._newest: dict[tuple[str, int], int] = {}
 
-    def _late(self, status: Status) -> bool:
-        """Return whether something newer of this module was heard: a later status, or a later boot."""
+    def _is_outdated(self, status: Status) -> bool:
+        """Return whether a later status or a later boot of this module has arrived."""
         newest = self._newest.get((status.serial, status.boot))
         if newest is not None and (self._boot[status.serial] != status.boot or status.seq <= newest):
             return True
@@ -95,9 +94,9 @@ class MotionListener:
 
     def on_status(self, status: Status, now_ns: int, own_ns: Mapping[str, int]) -> None:
         """Take notice of a status; `now_ns` is any one steady clock of this process."""
-        if self._late(status):
+        if self._is_outdated(status):
             return
-        self.restless = True
+        self.has_work = True
         record = status.motion
         if record is None or record.pattern.kind not in EXPLORATION_KINDS:
             self._drop(status.serial)
@@ -110,22 +109,22 @@ class MotionListener:
             if record.outcome not in ("running", "done"):
                 return
             track = self._tracks[status.serial] = _Track(status, record, now_ns)
-            self._wishes.append(Listen(status.serial, True))
+            self._actions.append(Listen(status.serial, True))
         if record.outcome not in ("running", "done"):
             self._drop(status.serial)
             return
         if track.record.end_row is None:
-            # Counted from when the end is known: rows that are gone are not to be asked for for ever.
+            # Counted from when the end is known, so that lost rows are not requested for ever.
             track.give_up_ns = now_ns + GIVE_UP_NS
         track.record = record
         track.note_arrival(status.t_ns, own_ns)
 
     def on_feedback(self, feedback: Feedback, own_ns: Mapping[str, int], live: bool = True) -> None:
-        """Keep rows; `live` says that they come as published, so that their age tells the clocks apart."""
+        """Keep rows; `live` says that they were published, so that their arrival bounds the clock offset."""
         track = self._tracks.get(feedback.serial)
         if track is None or track.boot != feedback.boot:
             return
-        self.restless = True
+        self.has_work = True
         rows = track.log.add(feedback)
         if live and len(rows):
             track.note_arrival(int(rows["t_ns"][-1]), own_ns)
@@ -134,10 +133,10 @@ class MotionListener:
 
     def _drop(self, serial: str) -> None:
         if self._tracks.pop(serial, None) is not None:
-            self._wishes.append(Listen(serial, False))
+            self._actions.append(Listen(serial, False))
 
-    def poll(self, now_ns: int) -> tuple[list[Wish], list[JointMotion]]:
-        """Return what to send or subscribe now, and the motions that have become complete."""
+    def poll(self, now_ns: int) -> tuple[list[Action], list[JointMotion]]:
+        """Return the actions due now, and the motions that have become complete."""
         complete: list[JointMotion] = []
         for track in list(self._tracks.values()):
             end = track.record.end_row
@@ -157,9 +156,9 @@ class MotionListener:
             elif now_ns >= track.asked_until_ns:
                 first, stop = missing[0]
                 track.asked_until_ns = now_ns + ANSWER_TIMEOUT_NS
-                self._wishes.append(
+                self._actions.append(
                     AskHistory(track.serial, track.boot, first, min(stop, first + ROWS_PER_QUESTION))
                 )
-        self.restless = any(track.record.end_row is not None for track in self._tracks.values())
-        wishes, self._wishes = self._wishes, []
-        return wishes, complete
+        self.has_work = any(track.record.end_row is not None for track in self._tracks.values())
+        actions, self._actions = self._actions, []
+        return actions, complete

@@ -1,7 +1,7 @@
-"""The rows of motions that an agent process keeps, to say later what its torques tell: its own, and others'.
+"""The rows of motions that an agent process keeps for its torque information, its own and other modules'.
 
-A network drops feedback, so the rows of other modules are asked for from their histories, which keep them for
-a minute; what is kept here stays longer. Pure: what is to be asked comes back as wishes.
+A network drops feedback, so the rows of other modules are requested from their histories, which hold a
+minute; rows kept here stay longer. No I/O: the requests to send are returned.
 """
 
 from collections.abc import Mapping
@@ -50,11 +50,11 @@ class _Part:
         self.asked: AskHistory | None = None
         self.asked_until_ns = now_ns
         self.give_up_ns = now_ns + GIVE_UP_NS
-        self.gone = False
+        self.lost = False
 
     @property
     def is_open(self) -> bool:
-        return self.track is None and not self.gone
+        return self.track is None and not self.lost
 
     def keep(self, rows: Rows) -> None:
         self.track = Track(*(rows[name].copy() for name in ("t_ns", "position_rad", "effort_nm")))
@@ -65,47 +65,47 @@ class _Part:
 
 
 class MotionCollection:
-    """Keeps motions by their number, which no two motions of a boot share, whoever has asked for them.
+    """Keeps motions by their number, which no two motions of a boot share, for all requesters alike.
 
-    `restless` says whether rows are still to be fetched, so that `poll` may have something to ask.
+    `has_work` says whether rows are still to be fetched, so that `poll` may return requests.
     """
 
     def __init__(self) -> None:
-        self.restless = False
+        self.has_work = False
         self._motions: dict[int, dict[str, _Part]] = {}
         self._open: list[_Part] = []
 
     def collect(self, request: CollectRequest, own: Mapping[str, OwnRows], now_ns: int) -> None:
         """Begin to keep a motion; rows of the process's `own` modules are copied from their histories.
 
-        What is kept of it already stays, of a module that has not booted since: the histories may have
-        forgotten it. `now_ns` is any one steady clock of this process. What is refused changes nothing.
+        Rows of it that are kept already stay, unless their module has booted since: the histories may have
+        dropped them. `now_ns` is any one steady clock of this process. A refused request changes nothing.
 
         Raises:
             WireError: GONE for own rows that are not kept, WRONG_BOOT for those of another boot.
         """
         known = self._motions.get(request.motion_id, {})
-        # All of them before any is stored: a refusal of one leaves no motion behind that lacks it.
+        # All parts first, so that a refusal leaves no incomplete motion behind.
         parts = {
             wanted.serial: _begun(wanted, own.get(wanted.serial), now_ns)
             for wanted in request.rows
             if not _is_kept(known.get(wanted.serial), wanted)
         }
         for serial in parts.keys() & known.keys():
-            known[serial].gone = True
+            known[serial].lost = True
         self._motions.setdefault(request.motion_id, {}).update(parts)
         self._open += parts.values()
         self._forget()
-        self.restless = True
+        self.has_work = True
 
     def _forget(self) -> None:
-        """Drop the oldest motions while there are more, or more rows, than are kept."""
+        """Drop the oldest motions beyond the limits of motions and rows."""
         rows = sum(map(_rows, self._motions.values()))
         while len(self._motions) > MAX_MOTIONS or (len(self._motions) > 1 and rows > MAX_ROWS):
             oldest = self._motions.pop(next(iter(self._motions)))
             rows -= _rows(oldest)
             for part in oldest.values():
-                part.gone = True
+                part.lost = True
 
     def on_feedback(self, feedback: Feedback) -> None:
         """Take rows that some motion waits for."""
@@ -121,30 +121,30 @@ class MotionCollection:
             if not part.missing():
                 part.keep(part.log.rows(wanted.first_row, wanted.end_row))
 
-    def on_gone(self, asked: AskHistory) -> None:
-        """Take notice that a module has rows no longer, by the question that it refused.
+    def on_lost(self, asked: AskHistory) -> None:
+        """Mark the rows of a refused request as lost: the module no longer has them.
 
-        Motions whose rows were not in that question wait on: they are told by their own.
+        Motions whose rows were not in that request keep waiting for their own.
         """
         for part in self._open:
             if part.is_open and part.asked == asked:
-                part.gone = True
+                part.lost = True
 
     def poll(self, now_ns: int) -> list[AskHistory]:
-        """Return what to ask now."""
+        """Return the requests due now."""
         self._open = [part for part in self._open if part.is_open]
-        self.restless = bool(self._open)
-        wishes = []
+        self.has_work = bool(self._open)
+        requests = []
         for part in self._open[:QUESTIONS_AT_ONCE]:
             if now_ns >= part.give_up_ns:
-                part.gone = True
+                part.lost = True
             elif now_ns >= part.asked_until_ns:
                 first, end = part.missing()[0]
                 part.asked_until_ns = now_ns + ANSWER_TIMEOUT_NS
                 end = min(end, first + ROWS_PER_QUESTION)
                 part.asked = AskHistory(part.wanted.serial, part.wanted.boot, first, end)
-                wishes.append(part.asked)
-        return wishes
+                requests.append(part.asked)
+        return requests
 
     def tracks(self, motion_id: int) -> dict[str, Track]:
         """Return the rows of a motion by serial.
@@ -155,9 +155,9 @@ class MotionCollection:
         parts = self._motions.get(motion_id)
         if parts is None:
             raise WireError(Refusal.GONE, f"motion {motion_id} was not collected here")
-        gone = [serial for serial, part in parts.items() if part.gone]
-        if gone:
-            raise WireError(Refusal.GONE, f"motion {motion_id}: rows of {', '.join(gone)[:200]} are gone")
+        lost = [serial for serial, part in parts.items() if part.lost]
+        if lost:
+            raise WireError(Refusal.GONE, f"motion {motion_id}: rows of {', '.join(lost)[:200]} are gone")
         waiting = [serial for serial, part in parts.items() if part.track is None]
         if waiting:
             raise WireError(
@@ -167,7 +167,7 @@ class MotionCollection:
 
 
 def _is_kept(known: _Part | None, wanted: RowRange) -> bool:
-    return known is not None and known.wanted.boot == wanted.boot and not known.gone
+    return known is not None and known.wanted.boot == wanted.boot and not known.lost
 
 
 def _begun(wanted: RowRange, own: OwnRows | None, now_ns: int) -> _Part:

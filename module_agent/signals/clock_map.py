@@ -1,4 +1,4 @@
-"""How a module's clock maps to the time of a session."""
+"""The map from a module's clock to the time of a session."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ class ClockMap(NamedTuple):
 
     def to_session(self, module_ns: Times) -> Times:
         """Map module times (n,) to session times (n,), both integer nanoseconds."""
-        # The offset can be years of uptime, which a float does not tell to the nanosecond.
+        # The offset can be years of uptime, which a float does not resolve to the nanosecond.
         whole, rest = self._split()
         since = module_ns - self.origin_ns
         mapped: Times = module_ns + whole + np.rint(rest + self.drift * since).astype(np.int64)

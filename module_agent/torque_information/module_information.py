@@ -1,7 +1,7 @@
-"""What a module's own torques say of the inertial parameters, from the rows that it has kept of the motions.
+"""The information in a module's own torques about the inertial parameters, from its kept rows of motions.
 
-It computes with the chain, the clocks and the times that it is told, by the same resampling, low-pass and
-regressor as whoever has the rows of all modules: both get the same to rounding.
+It uses the chain, clocks and times of the request, and the same resampling, low-pass and regressor as a
+coordinator with the rows of all modules: both results agree to rounding.
 """
 
 from collections.abc import Mapping
@@ -67,7 +67,7 @@ def _motion(
     span: SpanPart,
     tracks: Mapping[str, Track],
 ) -> JointMotion:
-    """Return one motion, filtered; joints that do not matter stand still in it."""
+    """Return one filtered motion; joints without influence stand still in it."""
     common = span.first_ns + request.step_ns * np.arange(span.samples, dtype=np.int64)
     signals = np.zeros((span.samples, len(chain.serials), 2))
     for k in coupled(chain, joint):

@@ -1,10 +1,8 @@
-"""Chains and clock maps as parts of messages, and back: doubles as they are, so that nothing is rounded.
+"""Chains, clock maps and a joint's information as parts of messages, and back, without rounding.
 
-The information of a joint as bytes, for the wire: doubles as they are, so that nothing is rounded.
-
-Little-endian: the number of columns, of rows k and of columns f that are not zero ("<3I"), how many samples
-went in ("<Q"), and `rest` ("<d"); the f columns ("<u2" each); of every row i the values from its diagonal on,
-f - i of them; the k targets.
+The bytes of a joint's information are little-endian: the numbers of columns, of rows k and of columns f that
+are not zero ("<3I"), the number of samples ("<Q"), and `rest` ("<d"); the indices of the f columns ("<u2"
+each); of every row i the f - i values from its diagonal on; the k targets.
 """
 
 import struct
@@ -21,7 +19,7 @@ from module_agent.wire.information_messages import GEOMETRY_BYTES, ChainPart, Cl
 
 
 def chain_part(chain: Chain) -> ChainPart:
-    """Return a chain as it goes over the wire.
+    """Return a chain as part of a message.
 
     Raises:
         DataError: more modules than a message carries.
@@ -61,7 +59,7 @@ def chain_of(part: ChainPart) -> Chain:
 
 
 def clock_part(clock: ClockMap) -> ClockPart:
-    """Return a clock map as it goes over the wire, without how well it is known."""
+    """Return a clock map as part of a message, without its sigmas."""
     return ClockPart(
         origin_ns=int(clock.origin_ns), offset_ns=float(clock.offset_ns), drift=float(clock.drift)
     )
@@ -79,51 +77,51 @@ MAX_BYTES = _HEAD.size + 2 * MAX_COLUMNS + 8 * (MAX_COLUMNS * (MAX_COLUMNS + 1) 
 
 
 def pack(information: JointInformation) -> bytes:
-    """Return the bytes of what `information.gather_joint` or `merge_joint` has returned.
+    """Return the bytes of a result of `information.gather_joint` or `merge_joint`.
 
     Raises:
         DataError: more than `MAX_COLUMNS` columns, or rows that are not triangular.
     """
     rows, columns = information.r.shape
-    felt = np.flatnonzero(information.r.any(axis=0))
-    kept = information.r[:, felt]
-    if columns > MAX_COLUMNS or rows > felt.size or np.tril(kept, -1).any():
+    nonzero = np.flatnonzero(information.r.any(axis=0))
+    triangle = information.r[:, nonzero]
+    if columns > MAX_COLUMNS or rows > nonzero.size or np.tril(triangle, -1).any():
         raise DataError(
             f"{rows} rows of {columns} columns: triangular ones of at most {MAX_COLUMNS} columns are packed"
         )
-    upper = kept[np.triu_indices(rows, 0, felt.size)]
-    head = _HEAD.pack(columns, rows, felt.size, information.samples, information.rest)
+    upper = triangle[np.triu_indices(rows, 0, nonzero.size)]
+    head = _HEAD.pack(columns, rows, nonzero.size, information.samples, information.rest)
     values = np.concatenate([upper, information.z]).astype("<f8")
-    return head + felt.astype("<u2").tobytes() + values.tobytes()
+    return head + nonzero.astype("<u2").tobytes() + values.tobytes()
 
 
 def unpack(block: bytes) -> JointInformation:
-    """Return the information that `pack` has made bytes of; its arrays are read-only.
+    """Return the information from the bytes of `pack`; its arrays are read-only.
 
     Raises:
         DataError: the bytes are not what they announce, or hold a value that is not finite.
     """
     if len(block) < _HEAD.size:
         raise DataError(f"{len(block)} bytes of information, the head alone has {_HEAD.size}")
-    columns, rows, felt_count, samples, rest = _HEAD.unpack_from(block)
-    if not rows <= felt_count <= columns <= MAX_COLUMNS:
+    columns, rows, nonzero_count, samples, rest = _HEAD.unpack_from(block)
+    if not rows <= nonzero_count <= columns <= MAX_COLUMNS:
         raise DataError(
-            f"{rows} rows in {felt_count} of {columns} columns: at most {MAX_COLUMNS}, and rows in as many"
+            f"{rows} rows in {nonzero_count} of {columns} columns: at most {MAX_COLUMNS}, and rows in as many"
         )
-    upper = felt_count * rows - rows * (rows - 1) // 2
-    due = _HEAD.size + 2 * felt_count + 8 * (upper + rows)
+    upper = nonzero_count * rows - rows * (rows - 1) // 2
+    due = _HEAD.size + 2 * nonzero_count + 8 * (upper + rows)
     if len(block) != due:
         raise DataError(f"{len(block)} bytes of information, {due} are announced")
-    felt = np.frombuffer(block, "<u2", felt_count, _HEAD.size).astype(np.int64)
-    values = np.frombuffer(block, "<f8", upper + rows, _HEAD.size + 2 * felt_count).astype(np.float64)
-    if not (np.diff(felt, prepend=-1) > 0).all() or (felt >= columns).any():
+    nonzero = np.frombuffer(block, "<u2", nonzero_count, _HEAD.size).astype(np.int64)
+    values = np.frombuffer(block, "<f8", upper + rows, _HEAD.size + 2 * nonzero_count).astype(np.float64)
+    if not (np.diff(nonzero, prepend=-1) > 0).all() or (nonzero >= columns).any():
         raise DataError("the columns of the information are out of order, or out of range")
     if not (np.isfinite(values).all() and np.isfinite(rest) and rest >= 0.0):
         raise DataError("the information holds a value that is not finite, or a negative square")
-    kept = np.zeros((rows, felt_count))
-    kept[np.triu_indices(rows, 0, felt_count)] = values[:upper]
+    triangle = np.zeros((rows, nonzero_count))
+    triangle[np.triu_indices(rows, 0, nonzero_count)] = values[:upper]
     r = np.zeros((rows, columns))
-    r[:, felt] = kept
+    r[:, nonzero] = triangle
     z = values[upper:].copy()
     make_read_only((r, z))
     return JointInformation(r, z, rest, samples)

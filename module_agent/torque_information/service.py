@@ -1,4 +1,4 @@
-"""How a module answers what its torques say: it keeps the rows of motions, and computes beside the ticks."""
+"""A module's service of torque information: it keeps rows of motions and computes in the background."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, Protocol, TypeVar
@@ -12,14 +12,14 @@ T = TypeVar("T")
 
 
 class Worker(Protocol):
-    """Runs work beside the ticks: a thread in real time, at once in virtual time."""
+    """Runs work in the background: on a thread in real time, at once in virtual time."""
 
     def submit(self, job: Callable[[], T], done: Callable[[T], None]) -> None:
         """Run a job and hand its result to `done`, from any thread."""
         ...
 
     def check(self) -> None:
-        """Raise what a job raised."""
+        """Raise the exception of a failed job."""
         ...
 
 
@@ -34,14 +34,14 @@ class Answer(NamedTuple):
 
 
 class _Result(NamedTuple):
-    """What has been computed for a request: the packed information, or why there is none."""
+    """The result for a request: the packed information, or the reason why there is none."""
 
     block: bytes
     why: str
 
 
 class InformationService:
-    """Of one module. The latest answer is kept, so that all its parts are those of one computation."""
+    """Answers for one module. The latest result is kept, so that all its parts are from one computation."""
 
     def __init__(self, serial: str, collection: MotionCollection, worker: Worker):
         self._serial = serial
@@ -54,7 +54,7 @@ class InformationService:
         """Begin to keep the rows of a motion.
 
         Raises:
-            WireError: they cannot be kept.
+            WireError: the rows cannot be kept.
         """
         if self._serial not in (wanted.serial for wanted in request.rows):
             raise WireError(Refusal.RANGE, f"own rows of {self._serial} are not among those to be kept")
@@ -65,7 +65,7 @@ class InformationService:
 
         Raises:
             WireError: BUSY while it is not ready, GONE for a motion that is not kept, UNFIT for a request
-                that nothing can be computed of, RANGE for a part that there is not.
+                that cannot be computed, RANGE for a part beyond the end.
         """
         digest = request.digest()
         if digest != self._asked:
@@ -94,7 +94,7 @@ class InformationService:
 
 
 def _compute(serial: str, request: InformationRequest, tracks: Mapping[int, Mapping[str, Track]]) -> _Result:
-    # Only here: what it takes to load, half a second, would otherwise hold up the start of every agent.
+    # Imported here because loading takes half a second, which would delay the start of every agent.
     from module_agent.torque_information.module_information import own_information
     from module_agent.torque_information.serialisation import pack
 
@@ -103,8 +103,8 @@ def _compute(serial: str, request: InformationRequest, tracks: Mapping[int, Mapp
     except KeyError as error:
         return _Result(b"", f"no rows of {error.args[0]} were kept for a motion")
     except RobotError as error:
-        # A finding too, to be told to whoever asks.
+        # The reason is the answer to the request.
         return _Result(b"", str(error))
     except Exception as error:
-        # A defect here, but one that a message has brought about: it must not end the modules of the process.
+        # A defect, but caused by a message: it must not end the modules of the process.
         return _Result(b"", f"{serial} cannot compute this, {type(error).__name__}: {error}")

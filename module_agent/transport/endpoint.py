@@ -1,4 +1,4 @@
-"""Endpoints of the network: where one listens and the others connect to."""
+"""Endpoints of the network: the hub listens on one, the others connect to it."""
 
 import re
 
@@ -13,10 +13,10 @@ _FORM = re.compile(r"(?P<protocol>[a-z-]+)/(?P<address>[^?#]+)([?#].*)?\Z")
 def check_endpoint(text: str) -> str:
     """Return an endpoint that can be listened on or connected to, such as `tcp/127.0.0.1:7447`.
 
-    Zenoh itself takes an unknown protocol or a missing port for a hub that does not answer yet.
+    Zenoh itself treats an unknown protocol or a missing port as a hub that does not answer yet.
 
     Raises:
-        UsageError: it cannot, whatever the network does; the message says what would be right.
+        UsageError: it can never be used; the message says what would be right.
     """
     match = _FORM.match(text)
     if match is None:

@@ -8,7 +8,7 @@ from module_agent.transport.transport import Event
 class Inbox:
     """Events in order of arrival. When it is full, what arrives is dropped and counted.
 
-    `waiting` is true while there are events: the queue itself, as asking it costs a tick the least.
+    `waiting` is the queue itself, true while there are events: the cheapest test in a tick.
     """
 
     __slots__ = ("_capacity", "dropped", "waiting")

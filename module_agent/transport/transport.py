@@ -4,7 +4,7 @@ A transport delivers every event by calling a `Sink`, from any thread: a sink mu
 never blocks for long and may drop; a query is answered by exactly one `Reply`. Implementations: Zenoh
 (`zenoh_transport`), the simulator's virtual network, and `impaired_transport`, which wraps either.
 
-The errors that a `Reply` without payload carries, the same whatever the transport.
+A `Reply` without payload carries one of the errors at the end of this file, the same for every transport.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 from module_agent.model.errors import RobotError
 
-# A session of which nothing is heard for so long is gone, for the others: its liveliness tokens vanish.
+# A session that is silent for longer is lost to the others: its liveliness tokens vanish.
 LEASE_S = 1.0
 
 
@@ -32,7 +32,7 @@ class Request(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """The end of a query: `payload` is None when nobody answered, and `error` says why."""
+    """The end of a query: `payload` is None without an answer, and `error` says why."""
 
     tag: int
     key: str
@@ -56,15 +56,15 @@ class TransportError(RobotError):
 
 
 class NoHub(TransportError):
-    """Nobody answers where the hub should be; there may be one later."""
+    """The hub does not answer; it may start later."""
 
 
 class EndpointInUse(TransportError):
-    """Somebody else listens on the endpoint."""
+    """Another program listens on the endpoint."""
 
 
 class Undeclare(Protocol):
-    """What a declaration returns; keep it as long as the declaration shall hold."""
+    """The handle of a declaration; keep it as long as the declaration shall hold."""
 
     def undeclare(self) -> None:
         """End the declaration. May be called twice."""
@@ -104,5 +104,5 @@ class Transport(Protocol):
 
 
 TIMEOUT = "Timeout"
-NO_ANSWER = "nobody answers on this key"
+NO_ANSWER = "no answer on this key"
 CLOSED = "the transport is closed"

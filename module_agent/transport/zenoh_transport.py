@@ -177,8 +177,8 @@ class ZenohTransport:
     def subscribe(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver a `Sample` for everything published on a matching key from now on.
 
-        A foreign client may publish on an expression such as `x5/**`: that is heard by whoever subscribed to
-        one key, and by nobody who subscribed to many, as it names none of them.
+        A foreign client may publish on an expression such as `x5/**`. Subscribers to one key receive that as
+        their key; subscribers to many do not receive it, as it names none of them.
         """
         declaration = _Declaration(sink, self._forget_declaration)
 
@@ -314,7 +314,7 @@ class ZenohTransport:
 
 
 def _one_key(said: str, declared: str) -> str | None:
-    """Return the key that a message on `said` means to whoever declared `declared`, None if it means many."""
+    """Return the key that a message on `said` means for a declaration on `declared`, None for many."""
     if "*" not in said:
         return said
     return None if "*" in declared else declared
@@ -325,7 +325,7 @@ def open_zenoh(config: ZenohConfig) -> ZenohTransport:
 
     Raises:
         NoHub: a client found no hub within `connect_timeout_s`.
-        EndpointInUse: somebody else listens there, most often another coordinator.
+        EndpointInUse: another program listens there, most often another coordinator.
         TransportError: an endpoint is malformed or cannot be listened on.
     """
     try:

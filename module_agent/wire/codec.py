@@ -19,7 +19,7 @@ MAX_DEPTH = 6
 
 M = TypeVar("M", bound=Message)
 
-# What `unpackb` makes of maps and arrays.
+# The types of maps and arrays from `unpackb`.
 _CONTAINERS = (dict, tuple)
 _RANGE_ERRORS = frozenset({"greater_than", "greater_than_equal", "less_than", "less_than_equal"})
 

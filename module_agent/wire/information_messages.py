@@ -1,5 +1,5 @@
-"""What is said of the information in torques (`dynamics.information`): which rows a module is to keep for it,
-what it is to be computed with, and the answer. Sizes are bounded for 64 modules.
+"""Messages about the information in torques (`model.information`): the rows that a module is to keep, the
+request with everything to compute with, and the answer. Sizes are bounded for 64 modules.
 """
 
 import hashlib
@@ -28,7 +28,7 @@ Instant = Annotated[int, Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)]
 
 
 def out_of_range(detail: str) -> PydanticCustomError:
-    """Return the error of fields that do not fit each other, which `codec` takes for one of range."""
+    """Return the error of fields that contradict each other, which `codec` reports as one of range."""
     return PydanticCustomError("less_than_equal", "{detail}", {"detail": detail})
 
 
@@ -70,7 +70,7 @@ class CollectRequest(Message):
 
 
 class ChainPart(Part):
-    """A `dynamics.chain.Chain` of n modules; `geometry` is one block of little-endian doubles, (n, 22)."""
+    """A `model.chain.Chain` of n modules; `geometry` is one block of little-endian doubles, (n, 22)."""
 
     serials: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MAX_MODULES)]
     parent: tuple[Annotated[int, Field(ge=-1, lt=MAX_MODULES)], ...]
@@ -80,7 +80,7 @@ class ChainPart(Part):
 
 
 class ClockPart(Part):
-    """How a module's clock maps to the session's (`dynamics.clock_map.ClockMap`)."""
+    """How a module's clock maps to the session's (`signals.clock_map.ClockMap`)."""
 
     origin_ns: Annotated[int, Field(ge=0, le=MAX_TIME_NS)]
     offset_ns: Annotated[float, Field(ge=-MAX_OFFSET_NS, le=MAX_OFFSET_NS)]
@@ -98,7 +98,7 @@ class SpanPart(Part):
 
 
 class InformationRequest(Message):
-    """Ask what a module's own torques say in some motions, computed with this chain and these clocks.
+    """Ask for the information in a module's own torques in some motions, with this chain and these clocks.
 
     `clocks` in the order of the chain's serials. Samples are `step_ns` apart and low-passed at `cutoff_hz`.
     The answer comes in parts; `offset` is where in the block it is to begin.
@@ -122,7 +122,7 @@ class InformationRequest(Message):
         return self
 
     def digest(self) -> bytes:
-        """Return a SHA-256 of what is to be computed, whoever is asked and however often."""
+        """Return a SHA-256 of the computation asked for: the same for every module, sender and part."""
         question = {"serial": "", "boot": 0, "seq": 0, "sender": "", "offset": 0}
         return hashlib.sha256(encode(self.model_copy(update=question))).digest()
 

@@ -131,7 +131,7 @@ class EffortProfile(Part):
 
 
 class PidGains(Part):
-    """One loop's parameters, with the manufacturer's meanings (see `firmware.pid`)."""
+    """One loop's parameters, with the manufacturer's meanings (see `control.pid`)."""
 
     kp: Finite
     ki: Finite = 0.0
@@ -183,7 +183,7 @@ class Limits(Part):
 
 
 class Info(Message):
-    """Who a module is. Answer to an `Ask` on `info`."""
+    """Type, limits, gains and rates of a module. Answer to an `Ask` on `info`."""
 
     module_type: Name
     firmware: Name
@@ -211,7 +211,7 @@ class Feedback(Message):
 
 
 class Status(Message):
-    """How a module is. Published on `status` at every change and at least twice a second; also on an `Ask`.
+    """The state of a module. Published on `status` at every change and twice a second at least, and on `Ask`.
 
     `re` is the sequence number of the question that this answers, 0 when published.
     """
@@ -256,8 +256,8 @@ class RegressionEstimate(Part):
     triangle, row by row, of that of axis and radial vector (6 x 6, in the IMU's frame). `gravity_m_s2` is the
     specific force of rest with the joint at zero. A motion of frequency f turns the IMU by
     `compliance_s2` (2 pi f)^2 more than the encoder says. `delay_s` is that of the IMU's samples beyond the
-    rough mapping of the clocks, in the last motion. `base_shakes`: the shake of what carries the joint was
-    seen by the joint's own module, and taken off.
+    rough mapping of the clocks, in the last motion. `base_shakes`: the shake of the joint's base was measured
+    by the joint's own module, and subtracted.
     """
 
     axis: Vector3
@@ -276,7 +276,7 @@ class RegressionEstimate(Part):
 
 
 class Estimate(Message):
-    """What this module (`serial`) makes of the motion of one joint (`joint`). Published on `estimate`.
+    """The estimate of this module (`serial`) from the motion of one joint (`joint`). Published on `estimate`.
 
     `circle` is the thesis' estimator, `regression` the one that reaches the sensors' limit.
     """
@@ -314,7 +314,7 @@ class Ask(Message):
 
 
 class EstimateRequest(Message):
-    """Ask for what this module made of the latest motion of `joint`."""
+    """Ask for this module's estimate from the latest motion of `joint`."""
 
     sender: Name
     joint: Name
@@ -364,7 +364,7 @@ class Setpoint(Message):
 
 
 class Stop(Message):
-    """Stop at once. Needs no lease; holds until somebody acquires the lease again."""
+    """Stop at once. Needs no lease; holds until the lease is acquired again."""
 
     sender: Name
     why: Text = ""

@@ -1,6 +1,6 @@
 """The feedback rows of one module as they arrive: in any order, with gaps, some of them twice.
 
-Rows are numbered since the module's boot, so whoever listens knows what is missing and can ask for it.
+Rows are numbered since the module's boot, so that a listener knows which are missing and can request them.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from module_agent.wire.messages import Feedback
 from module_agent.wire.refusal import Refusal, WireError
 
 _GROWTH = 4096
-# Four hours at 250 Hz, or one at 1 kHz: what is farther off is no row of this session.
+# Four hours at 250 Hz, or one at 1 kHz: a row number farther off is not of this session.
 MAX_ROWS = 4_000_000
 
 
@@ -26,7 +26,7 @@ class RowLog:
 
     @property
     def first_row(self) -> int:
-        """The oldest row number that is known of, 0 before any."""
+        """The oldest row number so far, 0 before any."""
         return self._base or 0
 
     @property

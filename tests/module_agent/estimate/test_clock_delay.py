@@ -24,7 +24,7 @@ def test_a_windowed_sine_gives_the_offset_to_a_tenth_of_a_millisecond(
     imu, joint = shifted(horizontal_link).sine(0.1, seed)
     found = clock_delay(imu, joint, OFFSET_NS + round(1e6 * rough_error_ms))
     # Noise of 1.2 mrad/s and 5 mrad/s on a rate of 0.5 rad/s rms and 1400 samples: about 10 us; bound 100 us.
-    assert found.found
+    assert found.determined
     assert abs(found.offset_ns - OFFSET_NS) < 100_000
     assert found.delay_s == pytest.approx(-1e-3 * rough_error_ms, abs=1e-4)
 
@@ -63,7 +63,7 @@ def test_the_sign_and_size_of_the_gain_do_not_matter(horizontal_link: Any) -> No
 
 def test_an_imu_that_does_not_move_leaves_the_rough_offset_as_it_is(horizontal_link: Any) -> None:
     found = clock_delay(*shifted(horizontal_link, carried=0.0).sine(0.1, 6), OFFSET_NS + 30_000_000)
-    assert not found.found
+    assert not found.determined
     assert found.offset_ns == OFFSET_NS + 30_000_000
     assert found.sigma_s == float("inf")
 
@@ -88,7 +88,7 @@ def test_windows_that_do_not_overlap_are_refused(horizontal_link: Any) -> None:
 
 def test_a_joint_at_rest_has_no_delay_to_find(horizontal_link: Any) -> None:
     quiet = horizontal_link._replace(noise=0.0)
-    assert not clock_delay(*quiet.sine(0.0, 9), 0).found
+    assert not clock_delay(*quiet.sine(0.0, 9), 0).determined
 
 
 def test_aligned_positions_are_those_of_the_same_instant(horizontal_link: Any) -> None:

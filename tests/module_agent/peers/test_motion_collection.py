@@ -51,7 +51,7 @@ def test_own_rows_are_copied_and_others_are_asked_for_until_they_have_come() -> 
     collection.collect(request(), kept(J1=history(700)), 0)
     asked = 0
     assert refused(collection) is Refusal.BUSY
-    while collection.restless:
+    while collection.has_work:
         for wish in collection.poll(0):
             asked += 1
             assert wish.serial == OTHER
@@ -119,12 +119,12 @@ def test_rows_that_never_come_are_said_to_be_gone(end: str) -> None:
     collection.collect(request(), kept(J1=history(700)), 0)
     (asked,) = collection.poll(0)
     if end == "refused":
-        collection.on_gone(asked)
+        collection.on_lost(asked)
     else:
         collection.poll(GIVE_UP_NS)
     assert refused(collection) is Refusal.GONE
     assert collection.poll(GIVE_UP_NS) == []
-    assert not collection.restless
+    assert not collection.has_work
 
 
 def test_a_motion_of_another_number_is_not_known() -> None:
@@ -140,7 +140,7 @@ def test_own_rows_that_are_gone_or_of_another_boot_are_refused_and_leave_nothing
         with pytest.raises(WireError) as caught:
             collection.collect(wrong, own, 0)
         assert caught.value.reason is reason
-        assert not collection.restless
+        assert not collection.has_work
         with pytest.raises(WireError, match="motion 1 was not collected here"):
             collection.tracks(1)
 
@@ -166,7 +166,7 @@ def test_a_refusal_of_one_range_leaves_the_other_motions_of_the_module_open() ->
     for number, first in ((1, 10), (2, 300)):
         collection.collect(request(number, first, first + 200), kept(J1=history(700)), 0)
     one, other = collection.poll(0)
-    collection.on_gone(one)
+    collection.on_lost(one)
     assert (refused(collection, 1), refused(collection, 2)) == (Refusal.GONE, Refusal.BUSY)
     collection.on_feedback(served(other, history(700)))
     assert len(collection.tracks(2)[OTHER].t_ns) == 200

@@ -10,11 +10,11 @@ from module_agent.peers.motion_listener import (
     ANSWER_TIMEOUT_NS,
     GIVE_UP_NS,
     ROWS_PER_QUESTION,
+    Action,
     AskHistory,
     JointMotion,
     Listen,
     MotionListener,
-    Wish,
 )
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.messages import ConstantMotion, Feedback, GoTo, MotionRecord, Pattern, Status
@@ -77,16 +77,16 @@ def _feedback(first: int, count: int = BATCH, boot: int = 1, serial: str = "J") 
 
 
 class Checked(MotionListener):
-    """Neighbours that have nothing to say unless they are restless."""
+    """Neighbours that have nothing to say unless they are has_work."""
 
-    def poll(self, now_ns: int) -> tuple[list[Wish], list[JointMotion]]:
-        restless = self.restless
+    def poll(self, now_ns: int) -> tuple[list[Action], list[JointMotion]]:
+        has_work = self.has_work
         said = super().poll(now_ns)
-        assert restless or said == ([], [])
+        assert has_work or said == ([], [])
         return said
 
 
-def _questions(wishes: list[Wish]) -> list[AskHistory]:
+def _questions(wishes: list[Action]) -> list[AskHistory]:
     return [w for w in wishes if isinstance(w, AskHistory)]
 
 
@@ -128,16 +128,16 @@ def test_rows_that_were_dropped_are_asked_for_in_pieces_that_a_message_can_carry
 
 def test_who_only_listens_rests_until_something_is_heard_and_who_misses_rows_does_not() -> None:
     neighbours = Checked()
-    assert not neighbours.restless
+    assert not neighbours.has_work
     neighbours.on_status(_status(_running()), 0, OWN)
-    assert neighbours.restless
+    assert neighbours.has_work
     neighbours.poll(0)
-    assert not neighbours.restless
+    assert not neighbours.has_work
     neighbours.on_feedback(_feedback(100), OWN)
-    assert neighbours.restless
+    assert neighbours.has_work
     neighbours.on_status(_status(_record(), 2), 0, OWN)
     neighbours.poll(0)
-    assert neighbours.restless
+    assert neighbours.has_work
 
 
 def test_an_unanswered_question_is_asked_again_but_not_at_every_tick() -> None:
