@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coordinator.arm_fit.data_file import read_log
+    from coordinator.arm_fit.fit_dynamics import fit_dynamics
     from coordinator.batch_estimation.imu_prediction import imu_readings
     from coordinator.description.urdf_reader import read_urdf
     from coordinator.identification.identify import identify
@@ -29,6 +30,7 @@ _HOMES = {
     "denavit_hartenberg": "coordinator.library",
     "export_hrdf": "coordinator.library",
     "export_urdf": "coordinator.library",
+    "fit_dynamics": "coordinator.arm_fit.fit_dynamics",
     "forward_kinematics": "coordinator.library",
     "identify": "coordinator.identification.identify",
     "imu_readings": "coordinator.batch_estimation.imu_prediction",
@@ -47,6 +49,7 @@ __all__ = [
     "denavit_hartenberg",
     "export_hrdf",
     "export_urdf",
+    "fit_dynamics",
     "forward_kinematics",
     "identify",
     "imu_readings",

@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.arm_fit.consistent_bodies import consistent_bodies
 from coordinator.arm_fit.problem import Problem
 from coordinator.dynamics.torque_prediction import TorqueError, torque_error
 from coordinator.parameter_fit.robust_least_squares import WeightedFit, fit_weighted
@@ -87,8 +88,19 @@ def fitted(problem: Problem) -> Predictor:
     return lambda seen, tried: problem.regressor[tried] @ fit_part(problem, seen).parameters
 
 
-def claimed(problem: Problem, phi: Array) -> Predictor:
-    """Return the predictor that knows the bodies' parameters beforehand, and nothing of the drives."""
+def by_consistent_bodies(problem: Problem, prior: Array, trust: float) -> Predictor:
+    """Return the predictor that fits physically consistent bodies and drives (`consistent_bodies`)."""
+
+    def predict(seen: slice, tried: slice) -> Array:
+        fit = consistent_bodies(problem, fit_part(problem, seen), prior, trust)
+        predicted: Array = problem.regressor[tried] @ np.concatenate([fit.phi, fit.drives])
+        return predicted
+
+    return predict
+
+
+def by_given_bodies(problem: Problem, phi: Array) -> Predictor:
+    """Return the predictor of given bodies (10 n,) without drives."""
     return lambda _, tried: problem.regressor[tried][..., : problem.inertial] @ phi
 
 
@@ -163,8 +175,8 @@ def _without(problem: Problem, term: Term) -> Problem:
 
 def overall(errors: tuple[HeldOutError, ...]) -> tuple[float, float]:
     """Return the errors of both halves and all joints together, filtered: of all samples, and masked."""
-    found = {e.masked: e.error.overall for e in errors if e.tried_on == "both" and not e.raw}
-    return found[False], found[True]
+    by_mask = {e.masked: e.error.overall for e in errors if e.tried_on == "both" and not e.raw}
+    return by_mask[False], by_mask[True]
 
 
 def _predictions(problem: Problem, predictor: Predictor) -> Iterator[tuple[Tried, Index, Array]]:

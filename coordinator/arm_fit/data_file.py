@@ -1,10 +1,10 @@
-"""Recorded joint positions and torques of anybody's robot, from CSV or npz, on one uniform time base.
+"""Read recordings of joint positions and torques from CSV or npz onto a uniform time base.
 
-CSV, one line of names and one line a sample: `t_s`, and per joint `q_<joint>_rad`, `tau_<joint>_nm` and, for
+CSV, a line of names and a line per sample: `t_s`, and per joint `q_<joint>_rad`, `tau_<joint>_nm` and, for
 all joints or none, `qd_<joint>_rad_s`; <joint> as in the URDF, columns in any order, others are ignored.
 
-npz: `position_rad` (m, n); `torque` or `torque_nm` (m, n); `sample_rate_hz` () or `t_s` (m,). They may be
-joined by `velocity_rad_s` (m, n) and by `joint_names` (n,), without which the joints are in the URDF's order.
+npz: `position_rad` (m, n); `torque` or `torque_nm` (m, n); `sample_rate_hz` () or `t_s` (m,); optionally
+`velocity_rad_s` (m, n) and `joint_names` (n,), without which the joints are in the URDF's order.
 """
 
 import csv
@@ -23,7 +23,7 @@ from module_agent.signals.filtering import NS_PER_S, resample
 
 # Of a sampling interval; a fiftieth at 0.1 of the sampling rate is 1.3 % of the amplitude, between samples.
 _JITTER = 0.02
-# Longer holes than this, in usual intervals, are not bridged: nobody knows what the robot did.
+# Longer gaps than this, in usual intervals, are not interpolated: the motion in between is unknown.
 _BRIDGED = 5.0
 
 
@@ -32,25 +32,27 @@ class DataFileError(UsageError):
 
 
 class JointLog(NamedTuple):
-    """A recording of n joints in the robot's order at uniform times, read-only.
+    """A recording of n joints in the order of the robot's chain at m uniform times, read-only.
 
-    q_rad, tau_nm: (m, n); qd_rad_s: (m, n) or None. resampled: whether the file's own times were uneven.
+    rate_hz: sampling rate. q_rad: (m, n) joint positions. qd_rad_s: (m, n) joint velocities, None if they
+    were not measured. tau_nm: (m, n) joint torques. resampled: whether the times of the file were not
+    uniform.
     """
 
     rate_hz: float
     q_rad: Array
     qd_rad_s: Array | None
     tau_nm: Array
-    resampled: bool
+    resampled: bool = False
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the last."""
+        """The time from the first sample to the last [s]."""
         return (len(self.q_rad) - 1) / self.rate_hz
 
 
 class _Table(NamedTuple):
-    """What a file holds: times (m,) [s], signals by name (m, n), and how one of its rows is called."""
+    """The contents of a file: times (m,) [s], signals by name (m, n), and what one of its rows is called."""
 
     t_s: Array
     signals: dict[str, Array]
@@ -58,10 +60,10 @@ class _Table(NamedTuple):
 
 
 def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
-    """Return the recording by every other sample, and the same motion at the same times by the others.
+    """Return two recordings of the same motion at the same times with independent noise.
 
-    White noise of an encoder in the one is independent of that in the other. The others are interpolated to
-    the times of the first, which at their rate is exact for what a low-pass well below it leaves.
+    One is every other sample. The other is interpolated from the rest to the times of the first, which is
+    accurate for frequencies well below the sampling rate.
     """
     count = (len(log.q_rad) - 1) // 2
     step_ns = NS_PER_S / log.rate_hz
@@ -82,15 +84,25 @@ def _half(log: JointLog, signals: Sequence[Array]) -> JointLog:
     return JointLog(0.5 * log.rate_hz, signals[0], velocity, signals[1], log.resampled)
 
 
-def read_log(path: Path, joints: Sequence[str]) -> JointLog:
-    """Return the recording in a file, its columns in the order of `joints`.
+def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
+    """Return the recording in a CSV or npz file, positions and torques (m, n) at uniform times.
+
+    CSV: a line of names and a line per sample; `t_s` [s], and per joint `q_<joint>_rad`, `tau_<joint>_nm` and
+    optionally `qd_<joint>_rad_s`. npz: `position_rad` (m, n), `torque_nm` (m, n), `t_s` (m,) or
+    `sample_rate_hz` (), and optionally `velocity_rad_s` (m, n) and `joint_names` (n,).
+
+    Args:
+        path: of the file; its name ends on .csv or .npz.
+        joints: (n,) names of the joints in the order that the columns shall have, `robot.chain.serials` of
+            `read_urdf`.
 
     Raises:
         DataFileError: neither CSV nor npz, columns or arrays that are missing or do not fit the joints, a
-            value that is not a finite number, or times that do not grow or have a hole; with file, column
-            and row.
+            value that is not a finite number, or times that do not increase or have a gap; the message
+            names file, column and row.
         OSError: the file cannot be read.
     """
+    path = Path(path)
     readers = {".csv": _read_csv, ".npz": _read_npz}
     if path.suffix.lower() not in readers:
         raise DataFileError(f"{path}: its name ends on {path.suffix!r}; .csv and .npz are read")
@@ -130,7 +142,7 @@ def _csv_columns(header: Sequence[str], joints: Sequence[str]) -> dict[str, list
         _refuse(f"line 1: no column {', '.join(missing)}; the columns are {', '.join(header) or 'none'}")
     twice = [name for names in wanted.values() for name in names if header.count(name) > 1]
     if twice:
-        _refuse(f"line 1: column {twice[0]} is there twice")
+        _refuse(f"line 1: column {twice[0]} appears twice")
     return wanted
 
 
@@ -230,7 +242,7 @@ def _log(table: _Table) -> JointLog:
     times = table.t_s
     # An identification needs thousands; four are what a spline needs.
     if times.size < 4:
-        _refuse(f"{times.size} samples are no recording")
+        _refuse(f"{times.size} samples are no recording; at least 4 are needed")
     steps = np.diff(times)
     if (steps <= 0.0).any():
         row = int(np.argmax(steps <= 0.0)) + 1
@@ -239,7 +251,7 @@ def _log(table: _Table) -> JointLog:
     if steps.max() > _BRIDGED * usual:
         row = int(np.argmax(steps)) + 1
         _refuse(
-            f"{table.row(row)}: a hole of {steps.max():.4g} s before it; samples come every {usual:.4g} s "
+            f"{table.row(row)}: a gap of {steps.max():.4g} s before it; samples come every {usual:.4g} s "
             f"and at most {_BRIDGED:.0f} intervals are bridged"
         )
     rate_hz = (times.size - 1) / float(times[-1] - times[0])

@@ -7,7 +7,7 @@ from scipy.signal import welch
 
 from coordinator.arm_fit.data_file import JointLog
 from module_agent.model.chain import Array
-from module_agent.model.errors import DataError
+from module_agent.model.errors import UsageError
 from module_agent.signals.filtering import NS_PER_S, filtered_motion, settling_samples, zero_phase_low_pass
 
 # Of the speed's power in what counts as the motion, and how many times its highest frequency passes. Friction
@@ -75,25 +75,32 @@ def usual_cutoff_hz(log: JointLog) -> float:
     return float(min(_HARMONICS * max(highest, frequencies[1]), 0.2 * log.rate_hz))
 
 
-def most_samples(joints: int) -> int:
-    """Return how many samples of n joints a fit takes, so that their columns fit into memory."""
+def max_samples(joints: int) -> int:
+    """Return how many samples of n joints a fit uses at most, so that their regressor fits into memory."""
     return int(_MAX_ENTRIES / (_COLUMNS_PER_JOINT * joints**2))
 
 
-def filtered_log(log: JointLog, cutoff_hz: float, most: int | None = None) -> FilteredLog:
-    """Return a recording through one low-pass (`filtered_motion`), with at most `most` samples.
+def filtered_log(log: JointLog, cutoff_hz: float, max_count: int | None = None) -> FilteredLog:
+    """Return a recording through one low-pass (`filtered_motion`), with at most `max_count` samples.
 
     Raises:
-        DataError: a cut-off out of range, or too few samples for it.
+        UsageError: a cut-off out of range, or too few samples for it.
     """
+    if not 0.0 < cutoff_hz < 0.5 * log.rate_hz:
+        raise UsageError(f"cutoff_hz {cutoff_hz} is outside 0 to {0.5 * log.rate_hz}, half the sampling rate")
+    edge = settling_samples(log.rate_hz, cutoff_hz)
+    if len(log.q_rad) <= 4 * edge:
+        raise UsageError(
+            f"{len(log.q_rad)} samples, of which the low-pass unsettles {4 * edge}; a longer recording or a "
+            "higher cut-off is needed"
+        )
     t_ns = np.round(np.arange(len(log.q_rad)) * (NS_PER_S / log.rate_hz)).astype(np.int64)
     motion = filtered_motion(t_ns, log.q_rad, log.qd_rad_s, log.tau_nm, log.rate_hz, cutoff_hz)
-    edge = settling_samples(log.rate_hz, cutoff_hz)
     raw = log.tau_nm[edge : len(log.tau_nm) - edge]
     size = float(np.linalg.norm(raw))
     step = max(1, int(log.rate_hz / (_KEPT_PER_CUTOFF * cutoff_hz)))
-    if most is not None:
-        step = max(step, -(-len(raw) // most))
+    if max_count is not None:
+        step = max(step, -(-len(raw) // max_count))
     q, qd, qdd, tau, tau_raw = (
         _thinned(signal, edge, step)
         for signal in (motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm, raw)
@@ -116,9 +123,4 @@ def filtered_log(log: JointLog, cutoff_hz: float, most: int | None = None) -> Fi
 
 def _thinned(fine: Array, edge: int, step: int) -> Array:
     """Return some of the samples, without the ends, where what is filtered once more has not settled."""
-    if len(fine) <= 2 * edge:
-        raise DataError(
-            f"{len(fine) + 2 * edge} samples, of which the low-pass unsettles {4 * edge}; a longer recording "
-            "or a higher cut-off is needed"
-        )
     return fine[edge : len(fine) - edge : step]

@@ -1,15 +1,22 @@
-"""From a recording and a URDF to the report: fit, held-out errors, baselines, and what each term is worth."""
+"""Fit a recording, test the fit on held-out samples and put everything into the report."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.arm_fit.consistent_bodies import (
+    USUAL_TRUST,
+    ConsistentBodies,
+    NoPriorError,
+    consistent_bodies,
+    urdf_prior,
+)
 from coordinator.arm_fit.cross_validation import (
     HeldOutError,
     Predictor,
-    claimed,
+    by_consistent_bodies,
+    by_given_bodies,
     errors_elsewhere,
     fit_part,
     fitted,
@@ -19,13 +26,6 @@ from coordinator.arm_fit.cross_validation import (
     mean_torque,
 )
 from coordinator.arm_fit.data_file import JointLog
-from coordinator.arm_fit.physically_consistent import (
-    USUAL_TRUST,
-    RealBodies,
-    by_real_bodies,
-    claimed_bodies,
-    real_bodies,
-)
 from coordinator.arm_fit.problem import Problem, joined
 from coordinator.arm_fit.report import (
     ArmParameterPart,
@@ -52,57 +52,59 @@ from coordinator.parameter_fit.report_parts import base_parameter_parts, body_pa
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
 from coordinator.parameter_fit.significance import SIGNIFICANT_CHANCE, chance_of, f_statistic
 from module_agent.model.chain import Array
-from module_agent.model.errors import DataError
 from module_agent.model.regressor import PER_BODY
 
 _ROUNDING = 1e-9
 
 Step = Callable[[str], None]
-STEPS = 4
+# Of `fit_dynamics`: reading, filtering and the four of `fit_and_test`.
+STEPS = 6
 
 
-class Identified(NamedTuple):
-    """The report, and the real bodies with the drives beside them; None where there are none."""
+class FitResult(NamedTuple):
+    """The report, and the physically consistent bodies with the drives; None where there are none."""
 
     report: FitReport
-    real: RealBodies | None
+    consistent: ConsistentBodies | None
 
 
 class Elsewhere(NamedTuple):
-    """Another recording of the same robot, which is only predicted."""
+    """Another recording of the same robot, by its name, which is only predicted."""
 
-    data: Path
+    data: str
     problem: Problem
 
 
-def identified(
-    urdf: Path,
-    data: Path,
-    log: JointLog,
+def fit_and_test(
     problem: Problem,
+    log: JointLog,
+    *,
+    urdf_name: str,
+    data_name: str,
     step: Step,
     trust: float = USUAL_TRUST,
     elsewhere: Elsewhere | None = None,
-) -> Identified:
-    """Return what a recording tells.
+) -> FitResult:
+    """Fit a recording, and test the fit on samples that were held out.
 
     Args:
-        urdf, data: the files' names. log, problem: the recording, as read and as posed.
-        step: told of each of the `STEPS` before it begins.
-        trust: how much the URDF's own inertias count where real bodies are fitted (`physical_fit`).
+        problem: the recording as a least-squares problem. log: the same as recorded.
+        urdf_name, data_name: names of the files for the report.
+        step: is called with a sentence before each of the steps.
+        trust: weight of the URDF's inertias for the consistent bodies (`consistent_bodies`).
         elsewhere: another recording to predict, posed with the top speeds of this one.
 
     Raises:
-        ValueError: too few samples for the parameters.
+        DataError: too few samples for the parameters.
     """
     step("fit to the whole recording")
     fit = fit_part(problem, slice(0, len(problem.log.tau_nm)))
-    real, note = _real(problem, fit, trust)
+    bodies, note = _consistent(problem, fit, trust)
     step("fit to each half, tried on the other")
     try:
-        held_out = _held_out(problem, elsewhere, None if real is None else trust)
+        held_out = _held_out(problem, elsewhere, None if bodies is None else trust)
     except NotSolvedError as error:
-        real, note = None, str(error)
+        bodies, note = None, str(error)
         held_out = _held_out(problem, elsewhere, None)
     step("fit to ever longer parts")
     lengths = [
@@ -113,16 +115,16 @@ def identified(
         TermGainPart(without=g.without, all=g.all_samples, masked=g.masked) for g in gain_of_terms(problem)
     ]
     report = FitReport(
-        urdf=str(urdf),
-        data=str(data),
-        held_out_data=None if elsewhere is None else str(elsewhere.data),
+        urdf=urdf_name,
+        data=data_name,
+        held_out_data=None if elsewhere is None else elsewhere.data,
         recording=_data_part(log, problem),
         held_out=held_out,
         lengths=lengths,
         gains=gains,
-        fit=_fit_part(problem, fit, real, note),
+        fit=_fit_part(problem, fit, bodies, note),
     )
-    return Identified(report, real)
+    return FitResult(report, bodies)
 
 
 def named(problem: Problem, fit: WeightedFit) -> BaseParameters:
@@ -138,20 +140,20 @@ def named(problem: Problem, fit: WeightedFit) -> BaseParameters:
     return found._replace(covariance=covariance)
 
 
-def _real(problem: Problem, fit: WeightedFit, trust: float) -> tuple[RealBodies | None, str]:
+def _consistent(problem: Problem, fit: WeightedFit, trust: float) -> tuple[ConsistentBodies | None, str]:
     try:
-        return real_bodies(problem, fit, claimed_bodies(problem.robot), trust), ""
-    except DataError as error:
+        return consistent_bodies(problem, fit, urdf_prior(problem.robot), trust), ""
+    except (NoPriorError, NotSolvedError) as error:
         return None, str(error)
 
 
 def _predictors(problem: Problem, trust: float | None) -> list[tuple[Model, tuple[Problem, Predictor]]]:
     tried: list[tuple[Model, tuple[Problem, Predictor]]] = [("fitted", (problem, fitted(problem)))]
     if trust is not None:
-        prior = claimed_bodies(problem.robot)
-        tried.append(("bodies", (problem, by_real_bodies(problem, prior, trust))))
+        prior = urdf_prior(problem.robot)
+        tried.append(("bodies", (problem, by_consistent_bodies(problem, prior, trust))))
     if problem.robot.phi is not None:
-        tried.append(("urdf", (problem, claimed(problem, problem.robot.phi))))
+        tried.append(("urdf", (problem, by_given_bodies(problem, problem.robot.phi))))
     if problem.drives:
         alone = problem.with_drives(lambda _: True, bodies=False)
         tried.append(("drives_only", (alone, fitted(alone))))
@@ -191,8 +193,8 @@ def _data_part(log: JointLog, problem: Problem) -> DataPart:
     )
 
 
-def _fit_part(problem: Problem, fit: WeightedFit, real: RealBodies | None, note: str) -> FitPart:
-    found = named(problem, fit)
+def _fit_part(problem: Problem, fit: WeightedFit, bodies: ConsistentBodies | None, note: str) -> FitPart:
+    base = named(problem, fit)
     names = problem.robot.chain.serials
     return FitPart(
         parameters=len(problem.columns.names),
@@ -203,10 +205,10 @@ def _fit_part(problem: Problem, fit: WeightedFit, real: RealBodies | None, note:
         terms=list(problem.choice.terms),
         coupled=[[names[i], names[j]] for i, j in problem.choice.coupled],
         independent_samples=fit.independent_samples,
-        base_parameters=_base_parts(problem, found),
-        bodies=_bodies(problem, found, real),
+        base_parameters=_base_parts(problem, base),
+        bodies=_bodies(problem, base, bodies),
         bodies_note=note,
-        drives=[_term_part(problem, fit, found, k) for k in range(len(problem.drives))],
+        drives=[_term_part(problem, fit, base, k) for k in range(len(problem.drives))],
         residuals=[
             JointNoisePart(
                 joint=name,
@@ -220,7 +222,7 @@ def _fit_part(problem: Problem, fit: WeightedFit, real: RealBodies | None, note:
     )
 
 
-def _bodies(problem: Problem, base: BaseParameters, real: RealBodies | None) -> list[LinkBodyPart]:
+def _bodies(problem: Problem, base: BaseParameters, bodies: ConsistentBodies | None) -> list[LinkBodyPart]:
     robot = problem.robot
     units = (*inertial_units(len(robot.bodies)), *(drive.unit for drive in problem.drives))
     results = identifiabilities(base, units)
@@ -229,7 +231,7 @@ def _bodies(problem: Problem, base: BaseParameters, real: RealBodies | None) -> 
             link=link,
             joint=joint,
             summary=body_summary(results[PER_BODY * i : PER_BODY * (i + 1)]),
-            body=None if real is None else body_part(real.bodies[i]),
+            rigid_body=None if bodies is None else body_part(bodies.bodies[i]),
             urdf_mass_kg=None if robot.phi is None else float(robot.phi[PER_BODY * i]),
         )
         for i, (link, joint) in enumerate(zip(robot.bodies, robot.chain.serials, strict=True))
@@ -264,14 +266,14 @@ def _claims(problem: Problem, base: BaseParameters) -> Array | None:
     return np.where(np.abs(claims) > _ROUNDING * size, claims, 0.0)
 
 
-def _term_part(problem: Problem, fit: WeightedFit, found: BaseParameters, k: int) -> TermPart:
+def _term_part(problem: Problem, fit: WeightedFit, base: BaseParameters, k: int) -> TermPart:
     """Test a parameter of a drive: the F of the model without it is (value / sigma)^2 for a single one."""
     drive, column = problem.drives[k], problem.inertial + k
     # A drive's columns are tried first, so in most cases one begins its own group; else it is within others.
-    groups = [i for i in range(found.rank) if column in found.lumped(i)]
-    own = min(groups, key=lambda i: found.independent[i] != column)
-    others = [found.columns.names[j] for j in found.lumped(own) if j != column]
-    value, sigma = float(found.value[own]), float(found.sigma[own])
+    groups = [i for i in range(base.rank) if column in base.lumped(i)]
+    own = min(groups, key=lambda i: base.independent[i] != column)
+    others = [base.columns.names[j] for j in base.lumped(own) if j != column]
+    value, sigma = float(base.value[own]), float(base.sigma[own])
     f = float(f_statistic(value, sigma))
     chance = chance_of(f, fit.independent_samples - fit.rank)
     return TermPart(

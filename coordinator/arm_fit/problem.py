@@ -1,4 +1,4 @@
-"""The least-squares problem of a recording: every column that the model has, for every kept sample."""
+"""The least-squares problem of a recording: the columns of the model for every sample that is used."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from coordinator.dynamics.drive_model import (
 )
 from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
 from module_agent.model.chain import Array
-from module_agent.model.errors import DataError, UsageError
+from module_agent.model.errors import UsageError
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, torque_regressor
 from module_agent.signals.torque_terms import TERM_KINDS, Term
@@ -95,15 +95,18 @@ def problem(
         top_rad_s: (n,) top speeds that count, of another recording that this one is compared with.
 
     Raises:
-        ValueError: terms or pairs that do not exist, parts of speed out of range, or a joint that never
-            moves.
+        UsageError: parts of speed out of range, or a joint that never moves.
+        ValueError: terms or pairs that do not exist (`drive_columns`).
     """
     for name, part in (("slow", choice.slow_part), ("mask", choice.mask_part)):
         if not 0.0 < part < 1.0:
             raise UsageError(f"the {name} part of the top speed is {part}; it must be between 0 and 1")
     top_rad_s = log.top_rad_s if top_rad_s is None else top_rad_s
     if (still := np.flatnonzero(top_rad_s < 1e-6)).size:
-        raise DataError(f"joint {robot.chain.serials[still[0]]!r} never moves; nothing shows its friction")
+        raise UsageError(
+            f"joint {robot.chain.serials[still[0]]!r} never moves in the recording; its friction is not "
+            "determined: record a motion of all joints"
+        )
     drives = drive_columns(len(robot.bodies), choice.terms, choice.coupled)
     slow_rad_s = choice.slow_part * top_rad_s
     moving = np.abs(log.qd_rad_s) > choice.mask_part * top_rad_s
@@ -127,7 +130,7 @@ def joined(one: Problem, other: Problem) -> Problem:
         ValueError: the two have different columns.
     """
     if one.columns.names != other.columns.names:
-        raise DataError("two recordings with different columns cannot be joined")
+        raise ValueError("two recordings with different columns cannot be joined")
     log, more = one.log, other.log
     return one._replace(
         log=log._replace(

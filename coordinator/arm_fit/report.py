@@ -34,9 +34,9 @@ class DataPart(Part):
 class ErrorPart(Part):
     """A relative torque error |e| / |tau| on samples that were not fitted to; null where |tau| is zero.
 
-    model: `fitted` (least squares), `bodies` (real bodies near the URDF's, and drives), `urdf` (the inertias
-    that the URDF claims, no friction), `drives_only` (friction, offset and motors without bodies), `mean`
-    (the constant mean of the other half).
+    model: `fitted` (least squares), `bodies` (physically consistent bodies near the URDF's, and drives),
+    `urdf` (the inertias of the URDF, no friction), `drives_only` (friction, offset and motors without
+    bodies), `mean` (the constant mean of the other half).
     """
 
     model: Model
@@ -100,14 +100,14 @@ class LinkBodyPart(Part):
     """A body: the link right behind a joint and all links that are fixed to it, in the link's frame.
 
     summary: which of its parameters are identified, weak, known only in combinations, or without effect.
-    body: the physically consistent body that explains the torques, as in the URDF where these do not
+    rigid_body: the physically consistent body that explains the torques, as in the URDF where these do not
     determine it; null if none were fitted. urdf_mass_kg: the mass by the URDF.
     """
 
     link: str
     joint: str
     summary: str
-    body: BodyPart | None
+    rigid_body: BodyPart | None
     urdf_mass_kg: float | None
 
 
@@ -127,8 +127,8 @@ class JointNoisePart(Part):
 class FitPart(Part):
     """The fit to the whole recording: rank and condition of the weighted regressor, parameters, residuals.
 
-    bodies_note: why there are no real bodies, if there are none. robust: by Huber's weights. instruments: by
-    instrumental variables (`fit_weighted`).
+    bodies_note: why there are no physically consistent bodies, if there are none. robust: by Huber's
+    weights. instruments: by instrumental variables (`fit_weighted`).
     """
 
     parameters: int
@@ -149,8 +149,8 @@ class FitPart(Part):
 class FitReport(Part):
     """Everything that `x5-coordinator fit-dynamics` reports; errors are fractions, SI units.
 
-    Schema 2 names `summary`, `identifiability` and `body` (in schema 1 `words`, `verdict`, and the body's
-    fields by themselves).
+    Schema 2 names `summary`, `identifiability` and `rigid_body` (in schema 1 `words`, `verdict`, and the
+    body's fields by themselves).
     """
 
     schema_version: int = SCHEMA

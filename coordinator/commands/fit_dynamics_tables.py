@@ -8,7 +8,7 @@ from coordinator.arm_fit.report import ArmParameterPart, ErrorPart, FitReport, M
 
 _MODEL_WORDS: dict[Model, str] = {
     "fitted": "least squares",
-    "bodies": "real bodies near the URDF's",
+    "bodies": "consistent bodies near the URDF's",
     "urdf": "the URDF's inertias, no friction",
     "drives_only": "friction and motors only",
     "mean": "constant mean",
@@ -44,7 +44,7 @@ def notes(report: FitReport) -> Iterator[str]:
         f"{fit.independent_samples:.0f} independent samples"
     )
     if fit.bodies_note:
-        yield f"no real bodies: {fit.bodies_note}"
+        yield f"no physically consistent bodies: {fit.bodies_note}"
 
 
 def _held_out(report: FitReport) -> Table:
@@ -142,7 +142,7 @@ def _base(report: FitReport) -> Table:
 def _bodies(report: FitReport) -> Table:
     table = _table("Body by body", ("body", "turned by", "its parameters"), ("mass [kg]", "URDF"))
     for i, part in enumerate(report.fit.bodies, start=1):
-        masses = (_mass(part.body.mass_kg if part.body else None), _mass(part.urdf_mass_kg))
+        masses = (_mass(part.rigid_body.mass_kg if part.rigid_body else None), _mass(part.urdf_mass_kg))
         table.add_row(f"{i}: {part.link}", part.joint, part.summary, *masses)
     return table
 

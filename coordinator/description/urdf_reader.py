@@ -36,6 +36,7 @@ class UrdfRobot(NamedTuple):
     carried: all links that move with some joint.
     phi: (10 n,) the inertias of the file, as in `torque_regressor`: in the root frame at q = 0, of all
         links of a body together. None if no moving link has one.
+    path: of the file.
     """
 
     chain: Chain
@@ -43,6 +44,7 @@ class UrdfRobot(NamedTuple):
     homes: Array
     carried: frozenset[str]
     phi: Array | None
+    path: Path = Path()
 
 
 class _Joint(NamedTuple):
@@ -61,8 +63,12 @@ class _Placed(NamedTuple):
     body: int
 
 
-def read_urdf(path: Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRobot:
-    """Return the robot of a file; `gravity` (3,) is the specific force of rest, up in the root link's frame.
+def read_urdf(path: str | Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRobot:
+    """Return the robot that a URDF file describes: its chain of n moving joints and its inertias.
+
+    Args:
+        path: of the file. Joints are revolute, continuous or fixed and form a tree.
+        gravity: (3,) specific force at rest in the root link's frame [m/s^2]; it points upwards.
 
     Raises:
         UrdfError: no XML, no robot, no tree, or a joint that is neither revolute, continuous nor fixed; the
@@ -76,7 +82,7 @@ def read_urdf(path: Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRobot:
     if root.tag != "robot":
         raise UrdfError(f"{path}: its element is <{root.tag}>; a URDF begins with <robot>")
     try:
-        return _robot(root, np.array(gravity, dtype=float))
+        return _robot(root, np.array(gravity, dtype=float))._replace(path=Path(path))
     except UrdfError as error:
         raise UrdfError(f"{path}: {error}") from None
 

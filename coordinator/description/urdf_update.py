@@ -1,4 +1,4 @@
-"""The URDF that was given, with the bodies that explain the torques instead of those that it claimed."""
+"""Put fitted bodies and friction into a robot's own URDF, whose other contents stay."""
 
 import os
 from collections.abc import Sequence
@@ -6,43 +6,36 @@ from pathlib import Path
 from xml.etree.ElementTree import (
     Comment,
     Element,
-    ElementTree,
     SubElement,
     TreeBuilder,
     XMLParser,
     indent,
     parse,
+    tostring,
 )
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.dynamics.drive_model import DriveColumn
 from coordinator.dynamics.pseudo_inertia import Body
+from module_agent.model.chain import Array
 
 
-def write_fitted_urdf(
-    path: Path,
-    given: Path,
-    robot: UrdfRobot,
-    bodies: Sequence[Body],
-    friction: Sequence[tuple[float, float]],
-) -> None:
-    """Write a copy of the file `given`; the file is the complete old or the complete new one.
+def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLike) -> str:
+    """Return the text of a robot's URDF with other bodies and friction.
 
-    The inertia of a body stands in the link right behind its joint; links fixed to that have none of their
-    own any more, because it is within. Joints get viscous and Coulomb friction.
+    The inertia of a body is in the link right behind its joint; links fixed to that lose their own, which is
+    contained in it. Joints get viscous and Coulomb friction.
 
     Args:
-        path: the file. given: what `robot` was read from.
-        bodies: (n,) in the frames of the links. friction: (n,) per joint damping and friction.
-
-    Raises:
-        OSError: a file cannot be read or written.
+        robot: of `read_urdf`, whose file is read again. bodies: (n,) in the frames of the links
+        `robot.bodies`.
+        friction: (n, 2) viscous [Nm s/rad] and Coulomb [Nm] of every joint.
     """
     # Comments are the owner's too.
-    tree = parse(given, XMLParser(target=TreeBuilder(insert_comments=True)))
-    root = tree.getroot()
+    root = parse(robot.path, XMLParser(target=TreeBuilder(insert_comments=True))).getroot()
     heads = dict(zip(robot.bodies, bodies, strict=True))
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -51,27 +44,37 @@ def write_fitted_urdf(
                 link.remove(old)
         if name in heads:
             link.insert(0, _inertial(heads[name]))
-    rubbing = dict(zip(robot.chain.serials, friction, strict=True))
+    drives = dict(zip(robot.chain.serials, np.asarray(friction).tolist(), strict=True))
     for joint in root.findall("joint"):
-        if joint.get("name", "") in rubbing:
-            _rub(joint, *rubbing[joint.get("name", "")])
+        if joint.get("name", "") in drives:
+            _set_friction(joint, *drives[joint.get("name", "")])
     indent(root)
     root.insert(0, Comment(" Inertias and friction were identified from torques. "))
-    _write(tree, path)
+    return str(tostring(root, encoding="utf-8", xml_declaration=True), "utf-8")
 
 
-def friction_of(
-    drives: Sequence[DriveColumn], values: Sequence[float], joints: int
-) -> list[tuple[float, float]]:
-    """Return what a URDF can say of the drives: damping and friction of each joint, none below zero.
+def write_fitted_urdf(path: Path, text: str) -> None:
+    """Write the text of a URDF; the file is the complete old or the complete new one.
 
-    What coupled joints share has no place in a URDF.
+    Raises:
+        OSError: the file cannot be written.
     """
-    found = np.zeros((joints, 2))
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def friction_of(drives: Sequence[DriveColumn], values: Sequence[float], joints: int) -> Array:
+    """Return damping and friction of each joint as a URDF has them, (n, 2), none below zero, read-only.
+
+    A URDF has no element for what coupled joints share.
+    """
+    friction = np.zeros((joints, 2))
     for drive, value in zip(drives, values, strict=True):
         if len(drive.joints) == 1 and drive.term in ("viscous", "coulomb"):
-            found[drive.joints[0], ("viscous", "coulomb").index(drive.term)] = max(0.0, float(value))
-    return [(float(damping), float(friction)) for damping, friction in found]
+            friction[drive.joints[0], ("viscous", "coulomb").index(drive.term)] = max(0.0, float(value))
+    friction.flags.writeable = False
+    return friction
 
 
 def _inertial(body: Body) -> Element:
@@ -84,16 +87,10 @@ def _inertial(body: Body) -> Element:
     return element
 
 
-def _rub(joint: Element, damping: float, friction: float) -> None:
+def _set_friction(joint: Element, damping: float, friction: float) -> None:
     for old in joint.findall("dynamics"):
         joint.remove(old)
     SubElement(joint, "dynamics", damping=_text(damping), friction=_text(friction))
-
-
-def _write(tree: "ElementTree[Element]", path: Path) -> None:
-    temporary = path.with_name(path.name + ".part")
-    tree.write(temporary, encoding="utf-8", xml_declaration=True)
-    os.replace(temporary, path)
 
 
 def _text(value: float) -> str:

@@ -100,6 +100,17 @@ def body(pseudo: ArrayLike) -> Body:
     return Body(mass, centre, inertia)
 
 
+def bodies_in_frames(pseudo: Array, homes: Array) -> tuple[Body, ...]:
+    """Return bodies in frames of their own.
+
+    Args:
+        pseudo: (n, 4, 4) consistent pseudo-inertias in the root frame. homes: (n, 4, 4) poses of the frames
+            in the root frame.
+    """
+    into = np.linalg.inv(homes)
+    return tuple(body(own @ matrix @ own.T) for own, matrix in zip(into, pseudo, strict=True))
+
+
 def _symmetric(upper: Array) -> Array:
     found = np.zeros((3, 3))
     found[_UPPER] = upper

@@ -53,7 +53,8 @@ def torque_error(
         mask: (m, n) or (m, 1), True where to compare; None compares all. State both when you mask.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, or nothing to compare.
+        DataError: the mask leaves nothing to compare.
+        ValueError: shapes that do not fit, or values that are not finite.
     """
     tau, predicted, mean = (np.asarray(a, dtype=float) for a in (tau_nm, tau_predicted_nm, tau_mean_nm))
     if tau.ndim != 2 or predicted.shape != tau.shape or mean.shape != tau.shape[1:]:

@@ -15,7 +15,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.excitation.joint_limits import JointLimits, NoExcitation
 from coordinator.excitation.segment import SampledMotion, Segment, draw_segment, sampled, smaller, way
 from coordinator.excitation.self_collision import CLEARANCE_M, clearance_m
-from coordinator.parameter_fit.least_squares import MAX_SIGMA_KG
+from coordinator.parameter_fit.spectrum import MAX_SIGMA_KG
 from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
 

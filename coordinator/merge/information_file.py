@@ -43,7 +43,7 @@ class RunInformation(NamedTuple):
 
 
 class InformationFileError(RobotError):
-    """The file is not there, or does not hold what it should; the message names it."""
+    """The information of a run is missing or damaged; the message names the file."""
 
 
 def write_information(path: Path, run: RunInformation) -> None:

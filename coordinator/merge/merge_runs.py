@@ -18,14 +18,18 @@ from scipy.linalg import qr
 
 from coordinator.merge.information_file import RunInformation
 from coordinator.parameter_fit.base_parameters import BaseParameters, Columns, base_parameters, whitened
-from coordinator.parameter_fit.least_squares import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG
 from coordinator.parameter_fit.module_parts import Part, bodies_from_parts, part_columns, parts_of
+from coordinator.parameter_fit.spectrum import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG, spectrum
 from coordinator.parameter_fit.systematic_errors import body_shifts, whitened_effects
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 
 # Torques without noise, as a simulation may have them, would weigh infinitely.
 _MIN_SIGMA_NM = 1e-9
+
+
+class MergeError(DataError):
+    """Runs that cannot be merged, or together determine no more than each by itself."""
 
 
 class RunShare(NamedTuple):
@@ -47,14 +51,6 @@ class RunShare(NamedTuple):
     def gain(self) -> float:
         """The median over its combinations of sigma merged over sigma alone."""
         return float(np.median(self.sigma_merged / self.sigma_alone))
-
-
-class _Spectrum(NamedTuple):
-    """All rows: singular values (k,), right singular vectors (k, p), the target along the left ones (k,)."""
-
-    values: Array
-    directions: Array
-    along: Array
 
 
 class MergedInformation(NamedTuple):
@@ -81,8 +77,7 @@ def merge_runs(
             for chains that were themselves estimated.
 
     Raises:
-        DataError: no runs, the same run twice, or runs with no module in common: together they say no more
-            than each by itself.
+        MergeError: no runs, the same run twice, or runs with no module in common.
     """
     _check(runs)
     parts = parts_of(run.chain for run in runs)
@@ -90,27 +85,26 @@ def merge_runs(
     scales = _scale_sigmas(runs)
     rows = [_rows(run, parts, scales) for run in runs]
     merged = _without_scales(rows, len(scales))
-    whole, spectrum = _base(*merged, columns, tolerance), _spectrum(*merged, columns)
     shares = []
     for run, one in zip(runs, rows, strict=True):
         own = _without_scales([one], len(scales))
-        shares.append(_share(run, _base(*own, columns, tolerance), _spectrum(*own, columns), spectrum))
-    return MergedInformation(parts, whole, tuple(shares))
+        shares.append(_share(run, _base(*own, columns, tolerance), own, merged))
+    return MergedInformation(parts, _base(*merged, columns, tolerance), tuple(shares))
 
 
 def _check(runs: Sequence[RunInformation]) -> None:
     if not runs:
-        raise DataError("no runs to merge")
+        raise MergeError("no runs to merge")
     known: dict[str, str] = {}
     for run in runs:
         if run.session in known:
-            raise DataError(
-                f"the runs {known[run.session]} and {run.name} are of the same recording, which says no more "
-                "when it is counted twice: give each once"
+            raise MergeError(
+                f"the runs {known[run.session]} and {run.name} are of the same recording, which counts once: "
+                "give each run once"
             )
         known[run.session] = run.name
     if not set.intersection(*(set(run.chain.serials) for run in runs)):
-        raise DataError(f"the runs {', '.join(run.name for run in runs)} have no module in common")
+        raise MergeError(f"the runs {', '.join(run.name for run in runs)} have no module in common")
 
 
 def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:
@@ -171,27 +165,25 @@ def _base(rows: Array, target: Array, columns: Columns, tolerance: float) -> Bas
     return base_parameters(rows, target, columns, max_sigma=MAX_SIGMA_KG, tolerance=tolerance)
 
 
-def _spectrum(rows: Array, target: Array, columns: Columns) -> _Spectrum:
-    left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
-    return _Spectrum(values, directions, left.T @ target)
-
-
-def _share(run: RunInformation, own: BaseParameters, alone: _Spectrum, whole: _Spectrum) -> RunShare:
-    sums = own.grouping * own.columns.scale
-    _, sigma_alone = _of(sums, alone)
-    value, sigma_merged = _of(sums, whole)
+def _share(
+    run: RunInformation, own: BaseParameters, alone: tuple[Array, Array], merged: tuple[Array, Array]
+) -> RunShare:
+    """Compare a run's base parameters by its own rows and target with those of all runs."""
+    _, sigma_alone = _combinations(own, *alone)
+    value, sigma_merged = _combinations(own, *merged)
     inconsistency_sigma = float(np.sqrt(np.mean(((value - own.value) / own.sigma) ** 2)))
     return RunShare(run.name, run.chain.serials, own, sigma_alone, sigma_merged, inconsistency_sigma)
 
 
-def _of(sums: Array, told: _Spectrum) -> tuple[Array, Array]:
-    """Return values and standard deviations of sums (r, p) of parameters in kg.
+def _combinations(base: BaseParameters, rows: Array, target: Array) -> tuple[Array, Array]:
+    """Return values and standard deviations (r,) of the combinations in base parameters by other rows.
 
-    Every parameter is zero to `MAX_SIGMA_KG` beforehand. Sums that two runs have in common, but for errors of
-    their chains, would otherwise be told apart by those.
+    The prior of every parameter is 0 +- `MAX_SIGMA_KG`. Without it, combinations that two runs share up to
+    the errors of their chains would be told apart by these errors.
     """
-    along = sums @ told.directions.T
+    told = spectrum(rows * base.columns.scale)
+    along = (base.grouping * base.columns.scale) @ told.directions.T
     square = told.values**2 + MAX_SIGMA_KG**-2
     sigma = np.linalg.norm(along / np.sqrt(square), axis=1)
     sigma.flags.writeable = False
-    return along @ (told.values / square * told.along), sigma
+    return along @ (told.values / square * (told.left.T @ target)), sigma

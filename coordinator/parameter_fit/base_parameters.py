@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, qr, solve_triangular
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_transform
-from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
+from coordinator.parameter_fit.spectrum import RANK_TOLERANCE, spectrum
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
@@ -198,21 +198,20 @@ def base_parameters(
         tolerance: singular values that are smaller shares of the largest count as zero.
 
     Raises:
-        ValueError: shapes that do not fit, values that are not finite, or rows of zeros.
+        DataError: rows of zeros, or values that are not finite.
+        ValueError: shapes that do not fit.
     """
     rows, seen, common = _rows(triangle, target, len(columns.names), sigma, common_errors)
-    left, values, directions = np.linalg.svd(rows * columns.scale, full_matrices=False)
-    kept = (values > tolerance * values[0]) & (values > sigma / max_sigma)
-    if not values.any():
-        raise DataError("the rows show no parameter: without gravity or motion the torques say nothing")
-    space = directions[kept]
+    whole = spectrum(rows * columns.scale)
+    kept = whole.determined(tolerance) & (whole.values > sigma / max_sigma)
+    values, space = whole.values[kept], whole.directions[kept]
     chosen = _independent(space, columns.preferred)
     # x = scale * y and y = space^T (space y): beta in units of scale is (space[:, chosen])^-1 space y.
     triangular = qr(space[:, chosen])
     back = solve_triangular(triangular[1], triangular[0].T)
-    inverse = back / values[kept] @ left[:, kept].T
+    inverse = back / values @ whole.left[:, kept].T
     # Both kinds of error side by side: their squares add.
-    spread = np.hstack([back / values[kept] * sigma, inverse @ common])
+    spread = np.hstack([back / values * sigma, inverse @ common])
     own = columns.scale[chosen]
     grouping = own[:, None] * (back @ space) / columns.scale
     grouping[:, chosen] = np.eye(len(chosen))
@@ -223,7 +222,7 @@ def base_parameters(
         value=own * (inverse @ seen),
         covariance=own[:, None] * (spread @ spread.T) * own,
         share=np.sum(space**2, axis=0),
-        condition=float(values[0] / values[kept][-1]) if kept.any() else float("inf"),
+        condition=whole.condition(kept),
     )
     make_read_only(found)
     return found

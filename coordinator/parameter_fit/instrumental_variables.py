@@ -20,14 +20,9 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
-from coordinator.parameter_fit.least_squares import (
-    ESTIMATED_CHAIN_TOLERANCE,
-    RANK_TOLERANCE,
-    InertialFit,
-    solve_information,
-    solve_weighted,
-)
+from coordinator.parameter_fit.least_squares import InertialFit, solve_information, solve_weighted
 from coordinator.parameter_fit.significance import SIGNIFICANT_F, f_statistic
+from coordinator.parameter_fit.spectrum import ESTIMATED_CHAIN_TOLERANCE, RANK_TOLERANCE, without_range
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, known_scale, refine_scale, scaled
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
@@ -140,13 +135,11 @@ def _without_departure(piece: JointInformation, size: int, phi: Array) -> JointI
 def _earned(piece: JointInformation, size: int, independent_fraction: float) -> _Earned:
     """Drop the weakest term until all that are left earn their place; bodies explain what they can."""
     bodies = piece.r[:, :size] * parameter_scale(size // PER_BODY)
-    left, values, _ = np.linalg.svd(bodies, full_matrices=False)
-    space = left[:, values > RANK_TOLERANCE * values[0]]
     terms = piece.r[:, size:]
-    columns, target = (part - space @ (space.T @ part) for part in (terms, piece.z))
+    (columns, target), rank = without_range(bodies, RANK_TOLERANCE, (terms, piece.z))
     gain, spread = np.zeros(len(READING_TERMS)), np.full(len(READING_TERMS), np.inf)
     used = np.linalg.norm(columns, axis=0) > _ALIKE * np.linalg.norm(terms, axis=0)
-    freedom = max(piece.samples - space.shape[1] - len(READING_TERMS), 1)
+    freedom = max(piece.samples - rank - len(READING_TERMS), 1)
     while used.any():
         inverse = np.linalg.pinv(columns[:, used])
         value = inverse @ target

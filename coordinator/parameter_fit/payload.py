@@ -20,8 +20,8 @@ from scipy.linalg import qr
 
 from coordinator.dynamics.pseudo_inertia import Body, body, parameter_scale, pseudo_inertia
 from coordinator.parameter_fit.base_parameters import whitened
-from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
 from coordinator.parameter_fit.physically_consistent import physically_consistent
+from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation

@@ -25,6 +25,7 @@ from scipy.optimize import brentq
 from coordinator.dynamics.pseudo_inertia import parameter_transform, pseudo_inertia
 from coordinator.parameter_fit.base_parameters import whitened
 from coordinator.parameter_fit.least_squares import InertialFit
+from coordinator.parameter_fit.spectrum import UndeterminedError
 from coordinator.parameter_fit.systematic_errors import whitened_effects
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
@@ -58,7 +59,7 @@ _TRACE = np.trace(_UNITS, axis1=1, axis2=2)
 
 
 class NotSolvedError(DataError):
-    """Newton's method did not come to an end; the message says how far it came."""
+    """Newton's method did not converge; the message says how far it came."""
 
 
 class PhysicalFit(NamedTuple):
@@ -123,13 +124,14 @@ def fit_physical(
             covariance.
 
     Raises:
-        ValueError: shapes that do not fit, a prior that is no body's, or torques that are all zero.
+        UndeterminedError: torques that are all zero.
+        ValueError: shapes that do not fit, or a prior that is no body's.
         NotSolvedError: numerical trouble.
     """
     bodies = np.asarray(prior, dtype=float)
     size = float(np.sqrt(sum(piece.z @ piece.z + piece.rest for piece in information)))
     if not size > 0.0:
-        raise DataError("all torques are zero: no bodies explain them")
+        raise UndeterminedError("all torques are zero: no bodies explain them")
     best = _relative_error(information, least_squares.phi, size)
     # Least squares fits its own noise too: by so much the true bodies themselves would be worse.
     sigma = _common_sigma(information, least_squares, size)

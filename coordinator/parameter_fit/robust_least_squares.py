@@ -17,7 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
-from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
+from coordinator.parameter_fit.spectrum import (
+    RANK_TOLERANCE,
+    UndeterminedError,
+    degrees_of_freedom,
+    spectrum,
+    spread,
+)
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only
@@ -110,8 +116,8 @@ def fit_weighted(
             least squares.
 
     Raises:
+        DataError: torques that say nothing, a joint with too few samples, or values that are not finite.
         ValueError: shapes that do not fit.
-        DataError: values that are not finite, or a joint with too few samples.
     """
     y, tau = np.asarray(regressor, dtype=float), np.asarray(tau_nm, dtype=float)
     counted, size = np.ones(tau.shape, bool) if used is None else np.asarray(used, bool), np.asarray(scale)
@@ -142,10 +148,7 @@ def _fit(
     solution: _Solution, used: NDArray[np.bool_], weights: Array, sigma: Array, correlation: Array
 ) -> WeightedFit:
     # The rows' noise is 1, but so many of them count as one.
-    along = sum(
-        (time * rows.T @ rows for time, rows in zip(correlation, solution.spread, strict=True)),
-        start=np.zeros((solution.inverse.shape[1],) * 2),
-    )
+    along = spread(solution.spread, correlation)
     samples = used.sum(axis=0, dtype=np.int64)
     fit = WeightedFit(
         parameters=solution.parameters,
@@ -200,12 +203,9 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool
     stacked = [np.column_stack([joint.y, joint.tau]) / own for joint, own in zip(joints, sigma, strict=True)]
     whole = qr(np.vstack(stacked), mode="r", check_finite=False)[0][: len(scale)]
     rows, target = whole[:, :-1], whole[:, -1]
-    _, values, right = np.linalg.svd(rows * scale, full_matrices=False)
-    if not values[0] > 0.0:
-        raise DataError("the regressor is zero: without gravity or motion the torques say nothing")
-    kept = values > RANK_TOLERANCE * values[0]
-    inverse = scale[:, None] * right[kept].T / values[kept]
-    condition = float(values[0] / values[kept][-1])
+    within = spectrum(rows * scale)
+    kept = within.determined(RANK_TOLERANCE)
+    inverse, condition = scale[:, None] * within.inverse(kept), within.condition(kept)
     hat = [joint.y @ inverse / own for joint, own in zip(joints, sigma, strict=True)]
     if not tooled:
         parameters = inverse @ ((rows @ inverse).T @ target)
@@ -213,10 +213,10 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool
     # Along the regressor's own directions, so that what it does not show stays zero: Z^T U c = Z^T tau.
     tools = np.vstack([joint.z @ inverse / own for joint, own in zip(joints, sigma, strict=True)])
     torques = np.concatenate([joint.tau / own for joint, own in zip(joints, sigma, strict=True)])
-    spread = np.linalg.solve(tools.T @ np.vstack(hat), tools.T).T
-    parameters = inverse @ (spread.T @ torques)
+    through = np.linalg.solve(tools.T @ np.vstack(hat), tools.T).T
+    parameters = inverse @ (through.T @ torques)
     ends = np.cumsum([len(joint.tau) for joint in joints])[:-1]
-    return _Solution(parameters, inverse, hat, np.split(spread, ends), rows, rows @ parameters, condition)
+    return _Solution(parameters, inverse, hat, np.split(through, ends), rows, rows @ parameters, condition)
 
 
 def _huber(off: Array) -> Array:
@@ -241,19 +241,10 @@ def _robust_noise(residual: Array, used: NDArray[np.bool_]) -> Array:
 
 
 def _freedom(solution: _Solution, used: NDArray[np.bool_]) -> Array:
-    """Return per joint what makes the standard deviation of the rms: the fit has taken degrees of freedom.
-
-    Those are the trace of the joint's part of the hat matrix U U^T.
-    """
+    """Return per joint the factor from the rms to the standard deviation, by the degrees of freedom."""
     count = used.sum(axis=0)
-    taken = np.array([float(np.sum(rows**2)) for rows in solution.hat])
-    if (short := np.flatnonzero(count - taken < 1.0)).size:
-        raise DataError(
-            f"joint {short[0] + 1} has {count[short[0]]} samples for {taken[short[0]]:.0f} parameters; "
-            "nothing is left to tell the noise from"
-        )
-    found: Array = np.sqrt(count / (count - taken))
-    return found
+    left = [degrees_of_freedom(i, int(count[i]), hat) for i, hat in enumerate(solution.hat)]
+    return np.asarray(np.sqrt(count / np.array(left)))
 
 
 def _check(y: Array, tau: Array, scale: Array, used: NDArray[np.bool_]) -> None:
@@ -265,4 +256,4 @@ def _check(y: Array, tau: Array, scale: Array, used: NDArray[np.bool_]) -> None:
     if not (np.isfinite(y).all() and np.isfinite(tau).all()):
         raise DataError("the regressor or a torque holds a value that is not finite")
     if (idle := np.flatnonzero(~used.any(axis=0))).size:
-        raise DataError(f"joint {idle[0] + 1} has no samples to fit to: it never moves fast enough")
+        raise UndeterminedError(f"joint {idle[0] + 1} has no samples to fit: it never moves fast enough")

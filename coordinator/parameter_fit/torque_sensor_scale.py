@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
+from coordinator.parameter_fit.spectrum import without_range
 from module_agent.model.catalogue import TorqueKind
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
@@ -87,12 +88,10 @@ def refine_scale(
         end = begin + len(piece.z)
         columns[begin:end, i] = weights[i] * (piece.r @ phi)
         begin = end
-    left, values, _ = np.linalg.svd(rows, full_matrices=False)
-    space = left[:, values > tolerance * values[0]]
-    seen, target = (part - space @ (space.T @ part) for part in (columns, readings))
-    curvature = seen.T @ seen + np.eye(joints) / prior_sigma**2
-    covariance = np.linalg.inv(curvature)
-    change = -covariance @ (seen.T @ target + so_far.value / prior_sigma**2)
+    (slopes, target), _ = without_range(rows, tolerance, (columns, readings))
+    curvature = slopes.T @ slopes + np.eye(joints) / prior_sigma**2
+    covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
+    change = -covariance @ (slopes.T @ target + so_far.value / prior_sigma**2)
     value = so_far.value + change
     make_read_only((value, covariance))
     return TorqueScale(value, covariance)

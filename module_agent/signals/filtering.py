@@ -198,7 +198,7 @@ def filtered_motion(
 
     Returns:
         The signals without the unsettled samples at both ends. The bandwidth left has about
-        `2 * cutoff_hz / rate_hz` independent samples per sample (see `solve_pseudo_inverse`).
+        `2 * cutoff_hz / rate_hz` independent samples per sample (see `solve_information`).
 
     Raises:
         DataError: shapes that differ, times that are not uniform, too few samples, or a bad cut-off.

@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 
 from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.inertia_prior import module_prior
-from coordinator.dynamics.pseudo_inertia import Body, body, parameter_transform
+from coordinator.dynamics.pseudo_inertia import Body, bodies_in_frames, parameter_transform
 from coordinator.parameter_fit.base_parameters import (
     BaseParameters,
     base_parameters,
@@ -29,8 +29,9 @@ from coordinator.parameter_fit.identifiability import (
     body_summary,
     identifiabilities,
 )
-from coordinator.parameter_fit.least_squares import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG, InertialFit
+from coordinator.parameter_fit.least_squares import InertialFit
 from coordinator.parameter_fit.physically_consistent import NotSolvedError, PhysicalFit, fit_physical
+from coordinator.parameter_fit.spectrum import ESTIMATED_CHAIN_TOLERANCE, MAX_SIGMA_KG
 from coordinator.parameter_fit.systematic_errors import whitened_effects
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
@@ -119,10 +120,5 @@ def robot_bodies(
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
     informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
     judged = identifiabilities(base, inertial_units(joints), into @ fit.phi, informed_sigma)
-    bodies = _in_links(fit.pseudo, link_homes(chain))
+    bodies = bodies_in_frames(fit.pseudo, link_homes(chain))
     return RobotBodies(chain.serials, frames, base, judged, fit, bodies, note)
-
-
-def _in_links(pseudo: Array, homes: Array) -> tuple[Body, ...]:
-    into = np.linalg.inv(homes)
-    return tuple(body(one @ matrix @ one.T) for one, matrix in zip(into, pseudo, strict=True))

@@ -4,12 +4,9 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from coordinator.arm_fit.data_file import read_log
-from coordinator.arm_fit.filtered_log import filtered_log, usual_cutoff_hz
-from coordinator.arm_fit.fit import identified
-from coordinator.arm_fit.problem import ModelChoice, problem
+from coordinator.arm_fit.fit_dynamics import fit_dynamics
+from coordinator.arm_fit.problem import ModelChoice
 from coordinator.arm_fit.report import FitReport
-from coordinator.description.urdf_reader import read_urdf
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, scaled
 
@@ -28,10 +25,7 @@ def recorded_cases(folder: Path) -> list[Case]:
 
 def fitted(folder: Path) -> FitReport:
     """Fit one half and try the other, both ways."""
-    robot = read_urdf(folder / URDF)
-    log = read_log(folder / MOTION, robot.chain.serials)
-    posed = problem(robot, filtered_log(log, usual_cutoff_hz(log)), ModelChoice(coupled=_COUPLED))
-    return identified(folder / URDF, folder / MOTION, log, posed, lambda _: None).report
+    return fit_dynamics(folder / URDF, folder / MOTION, choice=ModelChoice(coupled=_COUPLED)).report
 
 
 def _summary(case: str, reports: Sequence[FitReport]) -> Summary:

@@ -96,13 +96,13 @@ def test_every_other_sample_shows_the_same_motion_with_noise_of_its_own(rng: Gen
     ("old", "new", "words"),
     [
         ("q_elbow_rad", "q_wrist_rad", r"line 1: no column q_elbow_rad; the columns are t_s, q_wrist_rad"),
-        ("note", "q_elbow_rad", r"line 1: column q_elbow_rad is there twice"),
+        ("note", "q_elbow_rad", r"line 1: column q_elbow_rad appears twice"),
         ("note", "qd_elbow_rad_s", r"line 1: no column qd_shoulder_rad_s"),
         ("fine", "fine,7", r"line 2: 7 cells; the first line names 6 columns"),
         ("\n0.02,", "\n0.02,nan,", r"line 4: 7 cells"),
         ("\n0.02,", "\nsoon,", r"line 4, column t_s: 'soon'; a finite number is needed"),
         ("\n0.02,", "\n0.01,", r"line 4: its time 0.01 s is not after that of the sample before it"),
-        ("\n0.39,", "\n0.99,", r"line 41: a hole of 0.61 s before it; samples come every 0.01 s"),
+        ("\n0.39,", "\n0.99,", r"line 41: a gap of 0.61 s before it; samples come every 0.01 s"),
         ("\n0.05,", "\n\n\n0.02,", r"line 9: its time 0.02 s is not after"),
     ],
 )

@@ -5,8 +5,8 @@ import pytest
 from numpy.random import default_rng
 
 from coordinator.arm_fit.data_file import JointLog
-from coordinator.arm_fit.filtered_log import filtered_log, most_samples, usual_cutoff_hz
-from module_agent.model.errors import DataError
+from coordinator.arm_fit.filtered_log import filtered_log, max_samples, usual_cutoff_hz
+from module_agent.model.errors import UsageError
 
 RATE_HZ = 1000.0
 
@@ -70,9 +70,9 @@ def test_a_long_recording_is_thinned_until_it_fits() -> None:
     assert np.abs(speed).max() == pytest.approx(np.abs(some.qd_rad_s[:, 0]).max(), rel=0.2)
     square = np.sign(some.fine_qd_rad_s)
     assert len(some.low_passed(square)) == len(some.q_rad)
-    assert most_samples(7) > 10_000
+    assert max_samples(7) > 10_000
 
 
 def test_a_recording_too_short_for_its_cut_off_is_refused() -> None:
-    with pytest.raises(DataError, match="more than 2000"):
+    with pytest.raises(UsageError, match="the low-pass unsettles 8000"):
         filtered_log(waving(1.0, seconds=1.0), 1.0)

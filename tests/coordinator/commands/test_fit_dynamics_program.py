@@ -142,7 +142,10 @@ def test_a_urdf_without_masses_is_fitted_in_sums_and_not_written(tmp_path: Path)
     done = called(*files, "--fitted-urdf", str(out))
     assert done.exit_code == 1, done.output
     said = " ".join(done.output.split())
-    assert "no real bodies: the URDF gives no mass to 'lower'; only sums of parameters are fitted" in said
+    assert (
+        "no physically consistent bodies: the URDF gives no mass to 'lower'; only base parameters are fitted"
+        in said
+    )
     assert "m2 c2z" in said
     assert not out.exists()
 
@@ -198,4 +201,4 @@ def test_a_file_that_is_broken_is_named_with_the_line(tmp_path: Path) -> None:
 def test_a_recording_too_short_for_its_parameters_is_a_failure(tmp_path: Path) -> None:
     done = called(*write_files(tmp_path, seconds=1.9), "--cutoff", "6")
     assert done.exit_code == 1, done.output
-    assert "nothing is left to tell the noise from" in done.output
+    assert "nothing is left to estimate the noise from" in done.output

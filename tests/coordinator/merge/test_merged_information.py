@@ -19,13 +19,12 @@ from coordinator.merge.information_file import (
     read_information,
     write_information,
 )
-from coordinator.merge.merge_runs import MergedInformation, merge_runs
-from coordinator.parameter_fit.least_squares import RANK_TOLERANCE
+from coordinator.merge.merge_runs import MergedInformation, MergeError, merge_runs
 from coordinator.parameter_fit.module_parts import bodies_from_parts, parts_of
+from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
 from coordinator.parameter_fit.systematic_errors import chain_effects, error_directions
 from coordinator.recording.run_folder import INFORMATION
 from module_agent.model.chain import Array, Chain
-from module_agent.model.errors import DataError
 from module_agent.model.information import compress, merge
 from module_agent.model.perturbation import apply_perturbation
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
@@ -273,7 +272,7 @@ def test_every_sum_is_as_uncertain_as_claimed_where_only_chains_err() -> None:
 def test_a_run_is_not_counted_twice() -> None:
     rng = default_rng(18)
     one, two = (measured(rng, assembled(rng), name=name) for name in ("one", "two"))
-    with pytest.raises(DataError, match="the runs one and copy are of the same recording"):
+    with pytest.raises(MergeError, match="the runs one and copy are of the same recording"):
         merge_runs([one, two, one._replace(name="copy")])
     assert len(merge_runs([one, two]).runs) == 2
 
@@ -282,9 +281,9 @@ def test_runs_of_other_modules_are_not_merged() -> None:
     rng = default_rng(11)
     run = measured(rng, assembled(rng))
     other = run._replace(name="other", session="another", chain=run.chain._replace(serials=("X", "Y", "Z")))
-    with pytest.raises(DataError, match="the runs run, other have no module in common"):
+    with pytest.raises(MergeError, match="the runs run, other have no module in common"):
         merge_runs([run, other])
-    with pytest.raises(DataError, match="no runs"):
+    with pytest.raises(MergeError, match="no runs"):
         merge_runs([])
 
 

@@ -16,6 +16,7 @@ from coordinator.parameter_fit.base_parameters import (
     whitened,
 )
 from coordinator.parameter_fit.least_squares import solve_information
+from coordinator.parameter_fit.spectrum import UndeterminedError
 from coordinator.parameter_fit.systematic_errors import scale_effects, whitened_effects
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale
 from module_agent.model.chain import Array, Chain
@@ -239,7 +240,7 @@ def test_what_does_not_fit_is_named_and_results_cannot_be_written_to(rng: Genera
     columns = inertial_columns(1)
     with pytest.raises(ValueError, match=r"rows \(5, 9\) and target \(5,\) do not fit 10 named columns"):
         base_parameters(np.ones((5, 9)), np.ones(5), columns)
-    with pytest.raises(DataError, match="the torques say nothing"):
+    with pytest.raises(UndeterminedError, match="the torques say nothing"):
         base_parameters(np.zeros((5, 10)), np.ones(5), columns)
     with pytest.raises(DataError, match="not finite"):
         base_parameters(np.full((5, 10), np.nan), np.ones(5), columns)

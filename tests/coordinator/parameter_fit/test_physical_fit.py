@@ -22,6 +22,7 @@ from coordinator.parameter_fit.physically_consistent import (
     fit_physical,
     physically_consistent,
 )
+from coordinator.parameter_fit.spectrum import UndeterminedError
 from coordinator.parameter_fit.systematic_errors import scale_effects
 from coordinator.parameter_fit.torque_sensor_scale import TorqueScale
 from module_agent.model.chain import Array
@@ -282,6 +283,6 @@ def test_what_does_not_fit_is_named(arm: Case) -> None:
     with pytest.raises(NotSolvedError, match="the rows do not determine them"):
         physically_consistent(np.zeros((3, 41)), np.zeros(3), arm.prior, 1.0)
     still = tuple(JointInformation(p.r, np.zeros_like(p.z), 0.0, p.samples) for p in arm.information)
-    with pytest.raises(DataError, match="all torques are zero"):
+    with pytest.raises(UndeterminedError, match="all torques are zero"):
         fit_physical(still, arm.prior, arm.least_squares)
     assert not any(array.flags.writeable for array in arm.fit if isinstance(array, np.ndarray))

@@ -6,6 +6,7 @@ from numpy.random import Generator, default_rng
 from scipy.signal import lfilter
 
 from coordinator.parameter_fit.robust_least_squares import correlation_times, fit_weighted
+from coordinator.parameter_fit.spectrum import UndeterminedError
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 
@@ -133,7 +134,9 @@ def test_too_little_to_fit_is_said_joint_by_joint(rng: Generator) -> None:
     y = smooth_columns(rng, 50)
     used = np.ones((50, 2), bool)
     used[:, 1] = False
-    with pytest.raises(DataError, match="joint 2 has no samples to fit to: it never moves fast enough"):
+    with pytest.raises(UndeterminedError, match="joint 2 has no samples to fit: it never moves fast enough"):
         fit_weighted(y, y @ TRUTH, np.ones(3), used)
-    with pytest.raises(DataError, match=r"joint 1 has 1 samples for \d parameters; nothing is left"):
+    with pytest.raises(
+        UndeterminedError, match=r"joint 1 has 1 samples for \d.\d parameters; nothing is left"
+    ):
         fit_weighted(y[:1], y[:1] @ TRUTH, np.ones(3))

@@ -10,12 +10,13 @@ from numpy.random import default_rng
 from coordinator.arm_fit.cross_validation import fit_part, fitted, halves, held_out_errors
 from coordinator.arm_fit.data_file import JointLog, in_two, read_log
 from coordinator.arm_fit.filtered_log import filtered_log, usual_cutoff_hz
-from coordinator.arm_fit.fit import Elsewhere, identified, named
+from coordinator.arm_fit.fit import named
+from coordinator.arm_fit.fit_dynamics import fit_dynamics
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.report import ErrorPart, FitReport
 from coordinator.description.urdf_reader import read_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
-from module_agent.model.errors import DataError
+from module_agent.model.errors import DataError, UsageError
 
 TX40 = Path(__file__).resolve().parents[3] / ".." / "shared" / "data" / "tx40"
 # Of the robot in conftest.py.
@@ -46,8 +47,7 @@ def posed(urdf: Path, data: Path, choice: ModelChoice) -> tuple[JointLog, Proble
 
 
 def report(urdf: Path, data: Path, choice: ModelChoice) -> FitReport:
-    log, found = posed(urdf, data, choice)
-    return identified(urdf, data, log, found, lambda _: None).report
+    return fit_dynamics(urdf, data, choice=choice).report
 
 
 def error(
@@ -199,13 +199,11 @@ def test_a_fit_to_more_predicts_better(three: FitReport) -> None:
 
 
 def test_another_recording_is_predicted_by_what_the_first_one_told(recording: Any, another: Any) -> None:
-    log, first = posed(recording.urdf, recording.npz, SHARED)
+    _, first = posed(recording.urdf, recording.npz, SHARED)
     robot = read_urdf(another.urdf)
     more = filtered_log(read_log(another.npz, robot.chain.serials), first.log.cutoff_hz)
     second = problem(robot, more, SHARED, top_rad_s=first.log.top_rad_s)
-    found = identified(
-        recording.urdf, recording.npz, log, first, lambda _: None, elsewhere=Elsewhere(another.npz, second)
-    ).report
+    found = fit_dynamics(recording.urdf, recording.npz, held_out=another.npz, choice=SHARED).report
     # As for the halves: 0.2 % of noise, and a little for reversals.
     assert overall(found, tried_on="other recording") < 0.006
     assert overall(found, tried_on="other recording", model="bodies") < 0.006
@@ -232,7 +230,7 @@ def test_a_joint_that_never_moves_is_named(recording: Any) -> None:
     still = recording.q_rad.copy()
     still[:, 1] = 0.3
     log = JointLog(RATE_HZ, still, None, recording.tau_nm, False)
-    with pytest.raises(DataError, match="joint 'elbow' never moves"):
+    with pytest.raises(UsageError, match="joint 'elbow' never moves"):
         problem(robot, filtered_log(log, 10.0), SHARED)
 
 

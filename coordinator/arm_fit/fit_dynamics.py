@@ -1,0 +1,157 @@
+"""The library's `fit_dynamics`: inertia, friction and motors of an arm from its URDF and a log of torques."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
+from coordinator.arm_fit.data_file import JointLog, in_two, read_log
+from coordinator.arm_fit.filtered_log import filtered_log, max_samples, usual_cutoff_hz
+from coordinator.arm_fit.fit import Elsewhere, fit_and_test
+from coordinator.arm_fit.problem import ModelChoice, Problem, problem
+from coordinator.arm_fit.report import FitReport
+from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
+from coordinator.description.urdf_update import fitted_urdf_text, friction_of, write_fitted_urdf
+from coordinator.dynamics.pseudo_inertia import Body
+from module_agent.model.chain import Array
+from module_agent.model.errors import DataError, UsageError
+
+_USUAL = ModelChoice()
+
+
+class ArmFit(NamedTuple):
+    """The dynamics of an arm with n joints as `fit_dynamics` returns them; SI units, arrays are read-only.
+
+    robot: the arm by its URDF. report: everything with its uncertainty: base parameters, drives, residuals,
+        and torque errors on samples that were not fitted to.
+    bodies: (n,) physically consistent bodies in the frames of the links `robot.bodies`, centre of mass and
+        the inertia about it. phi: (10 n,) the same in the root frame at q = 0, as `torque_regressor` takes
+        them. friction: (n, 2) viscous [Nm s/rad] and Coulomb [Nm], none below zero. urdf: the text of the
+        URDF with bodies and friction. The four are None if the URDF gives a link no mass, so that there is no
+        prior for what the torques do not determine; `report.fit.bodies_note` says so.
+    """
+
+    robot: UrdfRobot
+    report: FitReport
+    bodies: tuple[Body, ...] | None
+    phi: Array | None
+    friction: Array | None
+    urdf: str | None
+
+    def write_urdf(self, path: str | Path) -> None:
+        """Write the URDF with the fitted bodies and friction, whole or not at all.
+
+        Raises:
+            DataError: there are no bodies to write.
+            OSError: the file cannot be written.
+        """
+        if self.urdf is None:
+            raise DataError(
+                f"{path}: not written, there are no physically consistent bodies: "
+                f"{self.report.fit.bodies_note}"
+            )
+        write_fitted_urdf(Path(path), self.urdf)
+
+
+def fit_dynamics(
+    urdf: str | Path | UrdfRobot,
+    data: str | Path | JointLog,
+    *,
+    held_out: str | Path | JointLog | None = None,
+    choice: ModelChoice = _USUAL,
+    instruments: bool = False,
+    cutoff_hz: float | None = None,
+    gravity: ArrayLike = STANDARD_GRAVITY,
+    trust: float = USUAL_TRUST,
+    progress: Callable[[str], None] = lambda _: None,
+) -> ArmFit:
+    """Identify inertia, friction and motors of an arm, and test the result on held-out samples.
+
+    The torques are a linear function of the parameters, tau = Y(q, qd, qdd) x; every joint's equations are
+    weighted by its residual, and the covariance takes the correlation of the residuals into account
+    (`fit_weighted`). The bodies are those nearest to the URDF's that explain the torques
+    (`consistent_bodies`).
+
+    Args:
+        urdf: file of the arm, or what `read_urdf` returned for it; revolute, continuous and fixed joints.
+        data: CSV or npz file of the recording (see `read_log`), or the recording itself.
+        held_out: another recording of the same arm, predicted by the fit to the whole of `data`.
+        choice: terms of the drives, joints that share a drive, robust weights, and the speeds below which
+            friction fades and samples are masked.
+        instruments: fit by instrumental variables, every other sample against the rest, so that the noise of
+            the encoders does not bias the inertias; needs twice as many samples.
+        cutoff_hz: low-pass over motion and torque; by default five times the highest frequency of the motion.
+        gravity: (3,) specific force at rest in the root link's frame [m/s^2], upwards. Ignored if `urdf` is a
+            robot, whose chain has its own.
+        trust: weight of the URDF's inertias for the bodies.
+        progress: is called with a sentence before every step (`STEPS`).
+
+    Raises:
+        UsageError: a file that is not what it should be, or an option out of range.
+        DataError: the recording does not determine the parameters.
+        OSError: a file cannot be read.
+    """
+    if not 0.0 < trust < np.inf:
+        raise UsageError(f"trust {trust}: it must be a number above 0")
+    progress(f"read {_name(urdf)} and {_name(data)}")
+    robot = urdf if isinstance(urdf, UrdfRobot) else read_urdf(urdf, gravity)
+    log = _log(data, robot)
+    progress("low-pass, and the regressor of every sample")
+    posed = _posed(robot, log, choice, cutoff_hz, instruments)
+    elsewhere = None if held_out is None else Elsewhere(_name(held_out), _posed_like(posed, held_out))
+    result = fit_and_test(
+        posed,
+        log,
+        urdf_name=_name(urdf),
+        data_name=_name(data),
+        step=progress,
+        trust=trust,
+        elsewhere=elsewhere,
+    )
+    if result.consistent is None:
+        return ArmFit(robot, result.report, None, None, None, None)
+    found = result.consistent
+    friction = friction_of(posed.drives, found.drives.tolist(), len(robot.bodies))
+    text = fitted_urdf_text(robot, found.bodies, friction)
+    return ArmFit(robot, result.report, found.bodies, found.phi, friction, text)
+
+
+def _name(source: str | Path | UrdfRobot | JointLog) -> str:
+    if isinstance(source, UrdfRobot):
+        return str(source.path)
+    return "a recording in memory" if isinstance(source, JointLog) else str(source)
+
+
+def _log(data: str | Path | JointLog, robot: UrdfRobot) -> JointLog:
+    if not isinstance(data, JointLog):
+        return read_log(data, robot.chain.serials)
+    if data.q_rad.shape != data.tau_nm.shape or data.q_rad.shape[1:] != (len(robot.bodies),):
+        raise UsageError(
+            f"positions {data.q_rad.shape} and torques {data.tau_nm.shape} of the recording do not fit the "
+            f"joints {', '.join(robot.chain.serials)}"
+        )
+    return data
+
+
+def _posed(
+    robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff_hz: float | None, instruments: bool
+) -> Problem:
+    cutoff = usual_cutoff_hz(log) if cutoff_hz is None else cutoff_hz
+    count = max_samples(len(robot.bodies))
+    if not instruments:
+        return problem(robot, filtered_log(log, cutoff, count), choice)
+    one, again = (filtered_log(half, cutoff, count) for half in in_two(log))
+    return problem(robot, one, choice, again)
+
+
+def _posed_like(posed: Problem, data: str | Path | JointLog) -> Problem:
+    """Pose another recording with the cut-off and the top speeds of the first one."""
+    try:
+        log = filtered_log(_log(data, posed.robot), posed.log.cutoff_hz, max_samples(len(posed.robot.bodies)))
+    except UsageError as error:
+        text = str(error)
+        raise UsageError(text if text.startswith(_name(data)) else f"{_name(data)}: {text}") from None
+    return problem(posed.robot, log, posed.choice, top_rad_s=posed.log.top_rad_s)
