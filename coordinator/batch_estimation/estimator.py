@@ -38,9 +38,9 @@ CONVERGED = 1e-7
 # What the data knows worse than this (in rad, or in m) it does not know: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
 # A step (rad, m) along what only the motion of the base tells.
-FARTHEST = 0.3
+MAX_STEP = 0.3
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
-FINEST = 1e-6
+MIN_RMS = 1e-6
 # Samples, 50 a second.
 MAX_LAG = 100
 
@@ -167,7 +167,7 @@ def _residuals(state: _State, data: SensorData, expected: _Expected) -> tuple[Ar
 
 def _rms(residual: Array) -> Array:
     """Return the rms (n,) per axis of residuals (m, n, 3), no smaller than any sensor's resolution."""
-    return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), FINEST))
+    return np.asarray(np.maximum(np.sqrt(np.mean(residual**2, axis=(0, 2))), MIN_RMS))
 
 
 def _spread(data: SensorData, residual: Array) -> Array:
@@ -178,7 +178,7 @@ def _spread(data: SensorData, residual: Array) -> Array:
 def _believed(data: SensorData, residual: Array) -> Array:
     """Return the spread of every motion, (motions, n), widened for the correlation of its samples."""
     parts = [residual[samples] for samples in data.motions]
-    return np.stack([_rms(part) * np.sqrt(samples_per_independent(part, MAX_LAG, FINEST)) for part in parts])
+    return np.stack([_rms(part) * np.sqrt(samples_per_independent(part, MAX_LAG, MIN_RMS)) for part in parts])
 
 
 def _normal_equations(
@@ -279,8 +279,8 @@ def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
     information, rhs, _ = _reduced(normal)
     unknown = spectrum.vectors[:, ~spectrum.known]
     information, rhs = unknown.T @ information @ unknown, unknown.T @ rhs
-    step = np.linalg.solve(information + np.eye(len(rhs)) * FARTHEST**-2.0, rhs)
-    return np.concatenate([np.zeros(6), unknown @ np.clip(step, -FARTHEST, FARTHEST)])
+    step = np.linalg.solve(information + np.eye(len(rhs)) * MAX_STEP**-2.0, rhs)
+    return np.concatenate([np.zeros(6), unknown @ np.clip(step, -MAX_STEP, MAX_STEP)])
 
 
 def _moved(state: _State, step: Array, nuisance: Array, prior: ImuPrior) -> _State:

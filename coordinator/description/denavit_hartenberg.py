@@ -52,7 +52,7 @@ def dh_path(chain: Chain, leaf: int, parallel_below_rad: float = PARALLEL_BELOW_
     """
     path = chain.ancestors(leaf)
     first = path[0]
-    frame = _frame(chain.axis[first], _beside(chain.axis[first]), chain.point[first])
+    frame = _frame(chain.axis[first], _x_axis_across(chain.axis[first]), chain.point[first])
     base, rows = frozen(frame), []
     for joint, following in pairwise(path):
         row, frame = _step(
@@ -130,7 +130,7 @@ def _angle(start: Array, end: Array, about: Array) -> float:
     return float(np.arctan2(np.cross(start, end) @ about, start @ end))
 
 
-def _beside(axis: Array) -> Array:
+def _x_axis_across(axis: Array) -> Array:
     """Return the unit vector across `axis` that is nearest to the root frame's x, or to its y."""
     for candidate in np.eye(3)[:2]:
         across = candidate - axis * (axis @ candidate)

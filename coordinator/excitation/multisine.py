@@ -21,7 +21,7 @@ SLOW_RAD = 0.25
 FAST_RAD = 0.12
 # Half of speed and acceleration is left to the fast motion.
 SLOW_SHARE = 0.5
-SHORTEST_S = 11.0
+MIN_DURATION_S = 11.0
 # Periods of the difference of neighbouring frequencies within the flat part of the window.
 BEATS = 0.5
 FLAT_SHARE = 0.7
@@ -37,7 +37,7 @@ class JointSetting(NamedTuple):
 def simultaneous_duration_s(joints: int) -> float:
     """Return how long all joints must turn for their frequencies to be told apart."""
     spacing_hz = (FAST_HZ[1] - FAST_HZ[0]) / max(joints - 1, 1)
-    return max(SHORTEST_S, BEATS / spacing_hz / FLAT_SHARE)
+    return max(MIN_DURATION_S, BEATS / spacing_hz / FLAT_SHARE)
 
 
 def simultaneous_patterns(

@@ -117,9 +117,9 @@ class Plan(BaseModel):
         return factory.model_copy(update={"position": position})
 
 
-def _amplitude(kind: ModuleType, frequency_hz: float, most_rad: float) -> float:
+def _amplitude(kind: ModuleType, frequency_hz: float, max_rad: float) -> float:
     """Return an amplitude whose peak speed is 70 % of the type's: back-EMF then leaves torque to spare."""
-    return min(most_rad, 0.7 * kind.max_speed_rad_s / (6.2832 * frequency_hz))
+    return min(max_rad, 0.7 * kind.max_speed_rad_s / (6.2832 * frequency_hz))
 
 
 def load_plan(path: Path) -> Plan:

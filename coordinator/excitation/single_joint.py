@@ -30,11 +30,11 @@ SINE_RAD = 0.25
 SWEEP_SPEED_RAD_S = 1.0
 # Ramps that begin slowly do not ring links and bases: a cycle of 0.8 Hz.
 RAMP_S = 0.6
-SHORTEST_LEVEL_S = 0.1
+MIN_LEVEL_S = 0.1
 # The thesis' window: 2.8 s to its middle with 1 s of spread.
 SIGMA_SHARE = 1.0 / 2.8
-SHORTEST_PERIODS = 2.0
-LONGEST_SINE_S = 8.0
+MIN_PERIODS = 2.0
+MAX_SINE_S = 8.0
 # Samples that a prediction is made of; the noise of the sensors' 250 is averaged over as many.
 RATE_HZ = 50.0
 SENSOR_RATE_HZ = 250.0
@@ -140,8 +140,8 @@ def _sweeps(task: JointTask) -> list[ConstantMotion]:
 
 
 def _sines(task: JointTask, lasting_s: float) -> list[WindowedSine]:
-    most_s = min(lasting_s, LONGEST_SINE_S)
-    return [one for f in FREQUENCIES_HZ if (one := _sine(task, f, most_s)) is not None]
+    max_s = min(lasting_s, MAX_SINE_S)
+    return [one for f in FREQUENCIES_HZ if (one := _sine(task, f, max_s)) is not None]
 
 
 def _sweep(task: JointTask, sweep_rad: float) -> ConstantMotion | None:
@@ -151,7 +151,7 @@ def _sweep(task: JointTask, sweep_rad: float) -> ConstantMotion | None:
         SWEEP_SPEED_RAD_S,
         task.limits.speed_rad_s,
         task.limits.accel_rad_s2 * RAMP_S,
-        2.0 * sweep_rad / (RAMP_S + SHORTEST_LEVEL_S),
+        2.0 * sweep_rad / (RAMP_S + MIN_LEVEL_S),
     )
     if speed <= 0.0:
         return None
@@ -168,7 +168,7 @@ def _other_s(task: JointTask, constant: ConstantMotion) -> float:
 
 def _sine(task: JointTask, frequency_hz: float, lasting_s: float) -> WindowedSine | None:
     room = task.limits.room_rad(task.home_rad)
-    if lasting_s < SHORTEST_PERIODS / frequency_hz or room <= 0.0:
+    if lasting_s < MIN_PERIODS / frequency_hz or room <= 0.0:
         return None
     full = WindowedSine(
         amplitude=min(SINE_RAD, room),

@@ -26,7 +26,7 @@ from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
-from coordinator.kinematics.simultaneous_motion import circles_of_all
+from coordinator.kinematics.simultaneous_motion import circle_observations
 from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
@@ -198,7 +198,7 @@ def _pairs(
     """Return the circles as observations."""
     whole = simultaneous_motion(recording, serials)
     if whole is not None:
-        return circles_of_all(serials, respond(recording, clocks, serials, whole))
+        return circle_observations(serials, respond(recording, clocks, serials, whole))
     sines = {
         e.serial: i
         for i, e in enumerate(_exploration_motions(recording, serials))

@@ -24,7 +24,7 @@ from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, window
 from coordinator.synchronisation.round_trips import map_clocks
-from coordinator.topology.topology import MotionSeen, Topology, likely_topology
+from coordinator.topology.topology import MotionObservation, Topology, likely_topology
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import DataError
@@ -94,7 +94,7 @@ def beside(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
 # ---------------------------------------------------------------------- what was seen
 
 
-def _seen(recording: Recording, joint: str, observer: str) -> MotionSeen | None:
+def _seen(recording: Recording, joint: str, observer: str) -> MotionObservation | None:
     """Return who moved with whom, by the slow motion where there is one (see `estimate.observer`)."""
     found = list(recording.estimates.get((joint, observer), {}).values())
     if not found:
@@ -105,7 +105,7 @@ def _seen(recording: Recording, joint: str, observer: str) -> MotionSeen | None:
     slow = [e for e in found if e.motion_ids[-1] in slow_ids]
     estimate, turned = (slow or found)[-1], _circle(found)
     axis = np.array(turned.circle.axis) if turned is not None and turned.circle is not None else None
-    return MotionSeen(estimate.moved, estimate.rate_ratio, axis)
+    return MotionObservation(estimate.moved, estimate.rate_ratio, axis)
 
 
 def _circle(found: Sequence[Estimate]) -> Estimate | None:

@@ -16,7 +16,12 @@ from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, window
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.motion_evidence import MotionEvidence, NotMoved, motion_evidence
-from coordinator.topology.topology import DOUBTFUL_BELOW, MotionSeen, Observations, seen_again
+from coordinator.topology.topology import (
+    DOUBTFUL_BELOW,
+    MotionObservation,
+    Observations,
+    combined_observation,
+)
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
@@ -34,7 +39,7 @@ OWN_SIGMA = 0.2
 class Seen(NamedTuple):
     """What a recording says of who moved with whom.
 
-    observations: {(joint, observer): MotionSeen}, of what was seen.
+    observations: {(joint, observer): MotionObservation}, of what was seen.
     unmoved: joints that were told to move and did not, with the reason in words.
     blind: modules that saw no motion at all: no feedback, no clock, no findings.
     """
@@ -71,7 +76,7 @@ def _usual_pose(heard_of: Mapping[str, Sequence["Heard"]]) -> dict[str, float]:
     return {serial: float(np.median(found)) for serial, found in places.items()}
 
 
-def _axis(seen: MotionSeen) -> Array | None:
+def _axis(seen: MotionObservation) -> Array | None:
     """Return the axis of a joint in the frame of an IMU, zero if it does not carry it."""
     return seen.axis if seen.moved else np.zeros(3)
 
@@ -152,13 +157,13 @@ class Axes(NamedTuple):
 
 def _look(
     recording: Recording, serials: Sequence[str], heard_of: Mapping[str, list[Heard]], axes: Axes | None
-) -> tuple[dict[tuple[str, str], MotionSeen], dict[str, str]]:
+) -> tuple[dict[tuple[str, str], MotionObservation], dict[str, str]]:
     """Return what was seen of all joints, and of those of which nothing was, why not."""
-    observations: dict[tuple[str, str], MotionSeen] = {}
+    observations: dict[tuple[str, str], MotionObservation] = {}
     unmoved: dict[str, str] = {}
     for joint in serials:
         found, why = _of_joint(recording, serials, heard_of[joint], axes)
-        observations |= {(joint, observer): seen_again(many) for observer, many in found.items()}
+        observations |= {(joint, observer): combined_observation(many) for observer, many in found.items()}
         if not found:
             unmoved[joint] = why
     return observations, unmoved
@@ -166,9 +171,9 @@ def _look(
 
 def _of_joint(
     recording: Recording, serials: Sequence[str], motions: Sequence[Heard], axes: Axes | None
-) -> tuple[dict[str, list[MotionSeen]], str]:
+) -> tuple[dict[str, list[MotionObservation]], str]:
     """Return what everyone saw of all motions of a joint; without any, why not."""
-    found: dict[str, list[MotionSeen]] = {}
+    found: dict[str, list[MotionObservation]] = {}
     why = "it was never told to move, or never came to the end of its motion"
     for heard in motions:
         assert heard.event.motion is not None
@@ -186,7 +191,7 @@ def _of_joint(
     return found, why
 
 
-def by_feedback(heard: Heard, axes: Axes | None) -> dict[str, MotionSeen]:
+def by_feedback(heard: Heard, axes: Axes | None) -> dict[str, MotionObservation]:
     """Return what the feedback of all modules says of one motion; nothing without that of the joint.
 
     Raises:
@@ -220,11 +225,11 @@ def _covered(ear: _Ear, serials: Sequence[str], event: JournalEvent) -> bool:
     return len(found.t_ns) > 0.9 * len(whole.t_ns)
 
 
-def _motion_seen(seen: MotionEvidence, k: int) -> MotionSeen:
+def _motion_seen(seen: MotionEvidence, k: int) -> MotionObservation:
     ratio = float(seen.rate_ratio[k])
     moved = ratio > 0.5
     axis = seen.coefficient[k] / ratio if moved else None
-    return MotionSeen(moved, ratio, axis, float(seen.ratio_sigma[k]), float(seen.give[k]))
+    return MotionObservation(moved, ratio, axis, float(seen.ratio_sigma[k]), float(seen.give[k]))
 
 
 def _finding(recording: Recording, motion: MotionRecord, joint: str, observer: str) -> Estimate | None:
@@ -233,12 +238,12 @@ def _finding(recording: Recording, motion: MotionRecord, joint: str, observer: s
     return found if found is not None and not found.note else None
 
 
-def _checked(seen: MotionSeen | None, finding: Estimate | None) -> MotionSeen | None:
+def _checked(seen: MotionObservation | None, finding: Estimate | None) -> MotionObservation | None:
     """Return what the feedback says, less certain if the module itself found otherwise."""
     if finding is None:
         return seen
     if seen is None:
-        return MotionSeen(finding.moved, finding.rate_ratio, None, OWN_SIGMA)
+        return MotionObservation(finding.moved, finding.rate_ratio, None, OWN_SIGMA)
     apart = abs(seen.rate_ratio - finding.rate_ratio)
     return seen._replace(sigma=float(np.hypot(seen.sigma, max(0.0, apart - seen.sigma))))
 

@@ -5,18 +5,18 @@ from typing import NamedTuple
 
 from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
 from coordinator.identification.topology_observations import Seen, observe, slow_motions
-from coordinator.kinematics.simultaneous_motion import seen_by_all
+from coordinator.kinematics.simultaneous_motion import motion_observations
 from coordinator.recording.journal import excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.next_motion import NextMotion, next_motions
 from coordinator.topology.topology import (
-    MotionSeen,
+    MotionObservation,
     Topology,
     TopologyError,
+    combined_observation,
     find_topology,
     likely_topology,
-    seen_again,
 )
 from module_agent.model.errors import DataError
 
@@ -68,13 +68,13 @@ def _seen(recording: Recording, serials: Sequence[str]) -> Seen:
     if whole is None:
         return slow
     clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
-    found = dict(seen_by_all(serials, respond(recording, clocks, serials, whole)))
+    found = dict(motion_observations(serials, respond(recording, clocks, serials, whole)))
     for pair, seen in slow.observations.items():
-        found[pair] = seen_again([found[pair], seen])
+        found[pair] = combined_observation([found[pair], seen])
     return Seen(found, {}, ())
 
 
-def _usable(seen: Seen) -> tuple[dict[tuple[str, str], MotionSeen], list[str]]:
+def _usable(seen: Seen) -> tuple[dict[tuple[str, str], MotionObservation], list[str]]:
     """Return the observations among modules that saw something, and the joints that did not move."""
     left = {p: o for p, o in seen.observations.items() if p[0] not in seen.blind}
     return left, [s for s in seen.unmoved if s not in seen.blind]

@@ -71,11 +71,11 @@ def assemble(
     types: Sequence[ModuleType],
     pairs: Sequence[PairObservation],
     rests: Sequence[RestObservation],
-    least_gain: float = 0.0,
+    min_gain: float = 0.0,
 ) -> ChainFit:
     """Fit the chain; `types` are those of the modules in the order of the topology.
 
-    A step that lowers the weighted squares by less than `least_gain` of them ends it: a look at a robot in
+    A step that lowers the weighted squares by less than `min_gain` of them ends it: a look at a robot in
     between need not be worked out to the last digit.
 
     The steps are those of Gauss and Newton in the resolved directions only (least squares of least norm by a
@@ -88,11 +88,11 @@ def assemble(
     """
     if len(types) != len(topology.serials):
         raise ValueError(f"{len(types)} module types for {len(topology.serials)} modules")
-    seen = pack(topology.serials, pairs, rests)
+    observations = pack(topology.serials, pairs, rests)
     size = float(np.mean([np.linalg.norm(r.specific_force_m_s2, axis=1).mean() for r in rests]))
-    chain = _refine(initial_chain(topology, types, seen, size), seen, least_gain)
-    _check_directions(chain, seen)
-    return _describe(chain, seen, pairs)
+    chain = _refine(initial_chain(topology, types, observations, size), observations, min_gain)
+    _check_directions(chain, observations)
+    return _describe(chain, observations, pairs)
 
 
 class _Solved(NamedTuple):
@@ -104,15 +104,15 @@ class _Solved(NamedTuple):
     rank: int
 
 
-def _solve(chain: Chain, seen: ChainObservations) -> _Solved:
-    slopes = jacobian(chain, seen)
+def _solve(chain: Chain, observations: ChainObservations) -> _Solved:
+    slopes = jacobian(chain, observations)
     width = 6 * len(chain.serials)
     # The first root is the frame, and turning gravity about itself does nothing: neither is an unknown.
     slopes = np.concatenate([slopes[:, 6:width], slopes[:, width:] @ _level(chain)], axis=1)
     if slopes.shape[0] < slopes.shape[1]:
         slopes = np.concatenate([slopes, np.zeros((slopes.shape[1] - slopes.shape[0], slopes.shape[1]))])
     u, s, vt = np.linalg.svd(slopes, full_matrices=False)
-    return _Solved(u[: seen.rows], s, vt, int(np.count_nonzero(s > 1.0 / RESOLVED_BELOW)))
+    return _Solved(u[: observations.rows], s, vt, int(np.count_nonzero(s > 1.0 / RESOLVED_BELOW)))
 
 
 def _level(chain: Chain) -> Array:
@@ -121,28 +121,30 @@ def _level(chain: Chain) -> Array:
     return np.asarray(vt[1:].T)
 
 
-def _refine(chain: Chain, seen: ChainObservations, least_gain: float) -> Chain:
-    rest = residuals(chain, seen)
+def _refine(chain: Chain, observations: ChainObservations, min_gain: float) -> Chain:
+    rest = residuals(chain, observations)
     for _ in range(STEPS):
-        parts = _solve(chain, seen)
+        parts = _solve(chain, observations)
         keep = slice(parts.rank)
         step = -parts.vt[keep].T @ ((parts.u[:, keep].T @ rest) / parts.s[keep])
         before = float(rest @ rest)
-        better = _shortened(chain, seen, step, before)
+        better = _shortened(chain, observations, step, before)
         if better is None:
             return chain
         chain, rest = better
         gain = 1.0 - float(rest @ rest) / before
-        if np.abs(step).max() < STILL or gain < least_gain:
+        if np.abs(step).max() < STILL or gain < min_gain:
             return chain
     return chain
 
 
-def _shortened(chain: Chain, seen: ChainObservations, step: Array, cost: float) -> tuple[Chain, Array] | None:
+def _shortened(
+    chain: Chain, observations: ChainObservations, step: Array, cost: float
+) -> tuple[Chain, Array] | None:
     """Return the chain after the longest of the halved steps that makes the cost smaller, or nothing."""
     for halving in range(HALVINGS):
         moved = _stepped(chain, 0.5**halving * step)
-        rest = residuals(moved, seen)
+        rest = residuals(moved, observations)
         if float(rest @ rest) < cost:
             return moved, rest
     return None
@@ -156,12 +158,15 @@ def _stepped(chain: Chain, step: Array) -> Chain:
     return moved._replace(gravity=frozen(gravity))
 
 
-def _check_directions(chain: Chain, seen: ChainObservations) -> None:
+def _check_directions(chain: Chain, observations: ChainObservations) -> None:
     """Raise an AssemblyError if an axis points the other way; the residuals, being sines, do not show it."""
-    along = np.sum(predict(chain, seen).axis * seen.axis, axis=1)
+    along = np.sum(predict(chain, observations).axis * observations.axis, axis=1)
     if along.size and along.min() <= 0.0:
         worst = int(np.argmin(along))
-        joint, observer = chain.serials[seen.joint[worst]], chain.serials[seen.observer[worst]]
+        joint, observer = (
+            chain.serials[observations.joint[worst]],
+            chain.serials[observations.observer[worst]],
+        )
         raise AssemblyError(
             f"{observer} saw the axis of joint {joint} {np.degrees(np.arccos(along[worst])):.0f} degrees "
             f"away from where the fit puts it: what {observer} saw of the joints further up does not fit one "
@@ -169,15 +174,15 @@ def _check_directions(chain: Chain, seen: ChainObservations) -> None:
         )
 
 
-def _describe(chain: Chain, seen: ChainObservations, pairs: Sequence[PairObservation]) -> ChainFit:
-    parts = _solve(chain, seen)
-    rest = residuals(chain, seen)
+def _describe(chain: Chain, observations: ChainObservations, pairs: Sequence[PairObservation]) -> ChainFit:
+    parts = _solve(chain, observations)
+    rest = residuals(chain, observations)
     poses = 6 * (len(chain.serials) - 1)
     resolved = parts.vt[: parts.rank, :poses] / parts.s[: parts.rank, None]
     covariance = np.zeros((poses + 6, poses + 6))
     covariance[6:, 6:] = resolved.T @ resolved
     null_basis = _null_basis(parts.vt[parts.rank :, :poses])
-    freedom = seen.rows - parts.rank
+    freedom = observations.rows - parts.rank
     condition = float(parts.s[0] / parts.s[parts.rank - 1]) if parts.rank else float("nan")
     return ChainFit(
         estimate=ChainEstimate(chain, frozen(covariance), null_basis, parts.rank, condition),

@@ -131,41 +131,43 @@ class Prediction(NamedTuple):
     gravity: Array
 
 
-def predict(chain: Chain, seen: ChainObservations) -> Prediction:
+def predict(chain: Chain, observations: ChainObservations) -> Prediction:
     """Return what the chain would have shown."""
-    return _Geometry(chain, seen).prediction()
+    return _Geometry(chain, observations).prediction()
 
 
-def residuals(chain: Chain, seen: ChainObservations) -> Array:
+def residuals(chain: Chain, observations: ChainObservations) -> Array:
     """Return the weighted residuals (rows,), of unit variance: axes, then radial vectors, then gravity."""
-    return _weigh(predict(chain, seen), seen)
+    return _weigh(predict(chain, observations), observations)
 
 
-def jacobian(chain: Chain, seen: ChainObservations) -> Array:
+def jacobian(chain: Chain, observations: ChainObservations) -> Array:
     """Return d residuals / d [increment (6 n), tilt of gravity (3)], (rows, 6 n + 3), at the chain as it is.
 
     The tilt turns the gravity vector about the root frame's axes; about itself that does nothing.
     """
-    return _Geometry(chain, seen).jacobian()
+    return _Geometry(chain, observations).jacobian()
 
 
 class _Geometry:
     """The chain at every observed position: displacements of bodies, poses of observers, lines of joints."""
 
-    def __init__(self, chain: Chain, seen: ChainObservations):
-        self.chain, self.seen = chain, seen
+    def __init__(self, chain: Chain, observations: ChainObservations):
+        self.chain, self.observations = chain, observations
         count = len(chain.serials)
         self.parent = np.array(chain.parent)
         self.carrier = np.array([chain.carrier(k) for k in range(count)])
         # The base in the last place is body -1 and never moves.
-        self.body = np.tile(np.eye(4), (len(seen.positions), count + 1, 1, 1))
-        self.body[:, :-1] = body_displacements(chain, seen.positions)
+        self.body = np.tile(np.eye(4), (len(observations.positions), count + 1, 1, 1))
+        self.body[:, :-1] = body_displacements(chain, observations.positions)
         self.up = chain.gravity / np.linalg.norm(chain.gravity)
-        above = self.body[seen.pair_pose, self.parent[seen.joint]]
-        self.axis = np.einsum("pij,pj->pi", above[:, :3, :3], chain.axis[seen.joint])
-        self.point = np.einsum("pij,pj->pi", above[:, :3, :3], chain.point[seen.joint]) + above[:, :3, 3]
-        self.observer = self._imu(seen.pair_pose, seen.observer)
-        self.rest = self._imu(seen.rest_pose, seen.rest_module)
+        above = self.body[observations.pair_pose, self.parent[observations.joint]]
+        self.axis = np.einsum("pij,pj->pi", above[:, :3, :3], chain.axis[observations.joint])
+        self.point = (
+            np.einsum("pij,pj->pi", above[:, :3, :3], chain.point[observations.joint]) + above[:, :3, 3]
+        )
+        self.observer = self._imu(observations.pair_pose, observations.observer)
+        self.rest = self._imu(observations.rest_pose, observations.rest_module)
 
     def prediction(self) -> Prediction:
         turn, place = self.observer[:, :3, :3], self.observer[:, :3, 3]
@@ -176,22 +178,26 @@ class _Geometry:
         )
 
     def jacobian(self) -> Array:
-        seen, width = self.seen, 6 * len(self.chain.serials)
+        observations, width = self.observations, 6 * len(self.chain.serials)
         bodies = self._body_twists()
-        line = bodies[seen.pair_pose, self.parent[seen.joint]]
-        self._add(line, seen.pair_pose, self.parent[seen.joint], seen.joint)
-        imu = self._imu_twists(bodies, seen.pair_pose, seen.observer)
+        line = bodies[observations.pair_pose, self.parent[observations.joint]]
+        self._add(line, observations.pair_pose, self.parent[observations.joint], observations.joint)
+        imu = self._imu_twists(bodies, observations.pair_pose, observations.observer)
         axis, radial = self._pair_slopes(line - imu)
-        rest = self._imu_twists(bodies, seen.rest_pose, seen.rest_module)
+        rest = self._imu_twists(bodies, observations.rest_pose, observations.rest_module)
         # u sees g turn backwards when u turns: d(R^T g) = R^T (g x omega).
         home = np.swapaxes(self.rest[:, :3, :3], 1, 2)
         gravity = home @ skew(self.up) @ rest[:, :3]
         tilt = -home @ skew(self.up)
-        pieces = _weigh_slopes(axis, radial, gravity, seen)
-        found = np.zeros((seen.rows, width + 3))
+        pieces = _weigh_slopes(axis, radial, gravity, observations)
+        found = np.zeros((observations.rows, width + 3))
         found[:, :width] = pieces
-        tilts = np.swapaxes(seen.gravity_across, 1, 2) @ tilt / seen.sigma_gravity_rad[:, None, None]
-        found[4 * seen.joint.size :, width:] = tilts.reshape(-1, 3)
+        tilts = (
+            np.swapaxes(observations.gravity_across, 1, 2)
+            @ tilt
+            / observations.sigma_gravity_rad[:, None, None]
+        )
+        found[4 * observations.joint.size :, width:] = tilts.reshape(-1, 3)
         return found
 
     def _imu(self, pose: Index, module: Index) -> Array:
@@ -234,19 +240,24 @@ class _Geometry:
         return home @ d_axis, home @ d_radial
 
 
-def _weigh(predicted: Prediction, seen: ChainObservations) -> Array:
-    axis = _into(seen.pair_across, predicted.axis) / seen.sigma_axis_rad[:, None]
-    place = _into(seen.pair_across, predicted.radial_m - seen.radial_m) / seen.sigma_radial_m[:, None]
-    gravity = _into(seen.gravity_across, predicted.gravity) / seen.sigma_gravity_rad[:, None]
+def _weigh(predicted: Prediction, observations: ChainObservations) -> Array:
+    axis = _into(observations.pair_across, predicted.axis) / observations.sigma_axis_rad[:, None]
+    place = (
+        _into(observations.pair_across, predicted.radial_m - observations.radial_m)
+        / observations.sigma_radial_m[:, None]
+    )
+    gravity = _into(observations.gravity_across, predicted.gravity) / observations.sigma_gravity_rad[:, None]
     return np.concatenate([axis.ravel(), place.ravel(), gravity.ravel()])
 
 
-def _weigh_slopes(axis: Array, radial: Array, gravity: Array, seen: ChainObservations) -> Array:
-    pair = np.swapaxes(seen.pair_across, 1, 2)
+def _weigh_slopes(axis: Array, radial: Array, gravity: Array, observations: ChainObservations) -> Array:
+    pair = np.swapaxes(observations.pair_across, 1, 2)
     blocks = (
-        pair @ axis / seen.sigma_axis_rad[:, None, None],
-        pair @ radial / seen.sigma_radial_m[:, None, None],
-        np.swapaxes(seen.gravity_across, 1, 2) @ gravity / seen.sigma_gravity_rad[:, None, None],
+        pair @ axis / observations.sigma_axis_rad[:, None, None],
+        pair @ radial / observations.sigma_radial_m[:, None, None],
+        np.swapaxes(observations.gravity_across, 1, 2)
+        @ gravity
+        / observations.sigma_gravity_rad[:, None, None],
     )
     return np.concatenate([block.reshape(-1, axis.shape[2]) for block in blocks])
 

@@ -28,7 +28,7 @@ NEUTRAL_SHARE = 1e-3
 
 
 def initial_chain(
-    topology: Topology, types: Sequence[ModuleType], seen: ChainObservations, gravity_m_s2: float
+    topology: Topology, types: Sequence[ModuleType], observations: ChainObservations, gravity_m_s2: float
 ) -> Chain:
     """Return a chain near the observations; `types` in the order of the topology, gravity's size [m/s^2]."""
     count = len(topology.serials)
@@ -43,9 +43,9 @@ def initial_chain(
         gravity=np.array([0.0, 0.0, gravity_m_s2]),
     )
     chain = _placed(chain, 0, types[0], np.eye(3), np.array(types[0].imu_xyz))
-    chain = chain._replace(gravity=frozen(gravity_m_s2 * _root_gravity(chain, seen)))
+    chain = chain._replace(gravity=frozen(gravity_m_s2 * _root_gravity(chain, observations)))
     for k in range(1, count):
-        evidence = _evidence(chain, k, seen)
+        evidence = _evidence(chain, k, observations)
         turn, place = _neutral(chain, k, types)
         turn = _align(evidence, turn)
         place = _locate(evidence, turn, place)
@@ -88,11 +88,11 @@ def own_line(kind: ModuleType, mounted_reversed: bool) -> tuple[Array, Array]:
     return direction, np.array(kind.output_xyz) - np.array(kind.imu_xyz)
 
 
-def _root_gravity(chain: Chain, seen: ChainObservations) -> Array:
+def _root_gravity(chain: Chain, observations: ChainObservations) -> Array:
     """Return the unit specific force of rest in the root frame, by the first module's IMU."""
-    rows = seen.rest_module == 0
-    own = _own_motion(chain, 0, seen.positions[seen.rest_pose[rows]])
-    total = np.einsum("vij,vj->i", own[:, :3, :3], seen.gravity[rows])
+    rows = observations.rest_module == 0
+    own = _own_motion(chain, 0, observations.positions[observations.rest_pose[rows]])
+    total = np.einsum("vij,vj->i", own[:, :3, :3], observations.gravity[rows])
     return np.asarray(total / np.linalg.norm(total))
 
 
@@ -105,28 +105,32 @@ def _own_motion(chain: Chain, k: int, positions: Array) -> Array:
     return screw_motion(axis, inverse[:3, :3] @ chain.point[k] + inverse[:3, 3], positions[:, k])
 
 
-def _evidence(chain: Chain, k: int, seen: ChainObservations) -> _Evidence:
-    pairs = np.flatnonzero(seen.observer == k)
-    rests = np.flatnonzero(seen.rest_module == k)
-    positions = seen.positions[np.concatenate([seen.pair_pose[pairs], seen.rest_pose[rests]])]
+def _evidence(chain: Chain, k: int, observations: ChainObservations) -> _Evidence:
+    pairs = np.flatnonzero(observations.observer == k)
+    rests = np.flatnonzero(observations.rest_module == k)
+    positions = observations.positions[
+        np.concatenate([observations.pair_pose[pairs], observations.rest_pose[rests]])
+    ]
     body = np.tile(np.eye(4), (len(positions), len(chain.serials) + 1, 1, 1))
     body[:, :-1] = body_displacements(chain, positions)  # of the ancestors; the others are not placed yet
     back = np.linalg.inv(body[:, chain.parent[k]])
-    joints = seen.joint[pairs]
+    joints = observations.joint[pairs]
     line = back[: pairs.size] @ body[np.arange(pairs.size), np.array(chain.parent)[joints]]
     axes = np.einsum("pij,pj->pi", line[:, :3, :3], chain.axis[joints])
     up = back[pairs.size :, :3, :3] @ (chain.gravity / np.linalg.norm(chain.gravity))
     own = _own_motion(chain, k, positions)
-    here = np.einsum("vij,vj->vi", own[:, :3, :3], np.concatenate([seen.axis[pairs], seen.gravity[rests]]))
-    sigma = np.concatenate([seen.sigma_axis_rad[pairs], seen.sigma_gravity_rad[rests]])
+    here = np.einsum(
+        "vij,vj->vi", own[:, :3, :3], np.concatenate([observations.axis[pairs], observations.gravity[rests]])
+    )
+    sigma = np.concatenate([observations.sigma_axis_rad[pairs], observations.sigma_gravity_rad[rests]])
     return _Evidence(
         own=own,
         there=np.concatenate([axes, up]),
         here=here,
         weight=sigma**-2,
         points=np.einsum("pij,pj->pi", line[:, :3, :3], chain.point[joints]) + line[:, :3, 3],
-        radial_m=seen.radial_m[pairs],
-        radial_weight=1.0 / seen.sigma_radial_m[pairs],
+        radial_m=observations.radial_m[pairs],
+        radial_weight=1.0 / observations.sigma_radial_m[pairs],
     )
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coordinator.kinematics.chain_observations import PairObservation
-from coordinator.topology.topology import MotionSeen
+from coordinator.topology.topology import MotionObservation
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.model.read_only import frozen
@@ -112,18 +112,22 @@ def simultaneous_response(
     )
 
 
-def seen_by_all(serials: Sequence[str], response: SimultaneousResponse) -> dict[tuple[str, str], MotionSeen]:
-    """Return who moved with whom, {(joint, observer): MotionSeen}, the columns named by `serials`."""
-    seen: dict[tuple[str, str], MotionSeen] = {}
+def motion_observations(
+    serials: Sequence[str], response: SimultaneousResponse
+) -> dict[tuple[str, str], MotionObservation]:
+    """Return who moved with whom, {(joint, observer): MotionObservation}, the columns named by `serials`."""
+    seen: dict[tuple[str, str], MotionObservation] = {}
     for i, joint in enumerate(serials):
         for k, observer in enumerate(serials):
             size = float(np.linalg.norm(response.axis[i, k]))
             moved = response.moved(i, k)
-            seen[joint, observer] = MotionSeen(moved, size, response.axis[i, k] / size if moved else None)
+            seen[joint, observer] = MotionObservation(
+                moved, size, response.axis[i, k] / size if moved else None
+            )
     return seen
 
 
-def circles_of_all(serials: Sequence[str], response: SimultaneousResponse) -> list[PairObservation]:
+def circle_observations(serials: Sequence[str], response: SimultaneousResponse) -> list[PairObservation]:
     """Return the circle of every joint in every other IMU that it carries; `serials` name the columns."""
     tilt = TILT_PER_SWING2 * float(response.swing2_rad2.sum())
     return [

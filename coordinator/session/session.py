@@ -321,7 +321,7 @@ class Session:
             motions = await self._reporter.doubts()
             self._total += len(motions)
             for motion in motions:
-                self._reporter.note(motion.words)
+                self._reporter.note(motion.summary)
                 await self._step(
                     f"settle/{turn}/{motion.joint}",
                     f"moving joint {motion.joint} again",

@@ -24,7 +24,7 @@ RATIO_FLOOR = 0.05
 # Less than this over a motion is no motion: encoders and springs of a joint that is stuck still jitter.
 MIN_RATE_RAD_S = 0.02
 # Six blocks of four samples are the least that tells how much they differ.
-FEWEST_SAMPLES = 4 * BLOCKS
+MIN_SAMPLES = 4 * BLOCKS
 # What is left of a held joint's motion after it is taken off: its axis in the IMU's frame turns with the
 # joints between, by some tenths of a radian.
 GIVE_LEFT = 0.3
@@ -90,11 +90,11 @@ def motion_evidence(
 
     Raises:
         NotMoved: the joint's rate is below `MIN_RATE_RAD_S` rms.
-        DataError: fewer than `FEWEST_SAMPLES` samples.
+        DataError: fewer than `MIN_SAMPLES` samples.
     """
     rate = qd_rad_s[:, joint]
-    if rate.size < FEWEST_SAMPLES:
-        raise DataError(f"{rate.size} samples of the motion; at least {FEWEST_SAMPLES} are needed")
+    if rate.size < MIN_SAMPLES:
+        raise DataError(f"{rate.size} samples of the motion; at least {MIN_SAMPLES} are needed")
     size = float(np.sqrt(np.mean(rate**2)))
     if size < MIN_RATE_RAD_S:
         raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {MIN_RATE_RAD_S} is needed")

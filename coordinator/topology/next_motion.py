@@ -1,4 +1,4 @@
-"""When in doubt about the topology: the next motion that settles it, as data and in words."""
+"""When in doubt about the topology: the next motion that settles it, as data and as a sentence."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -22,7 +22,7 @@ class NextMotion(NamedTuple):
     speed: float
     travel: float
     others_rad: float
-    words: str
+    summary: str
 
     def pattern(self, slow: ConstantMotion) -> ConstantMotion:
         """Return the motion, `slow` being the one that every joint is explored with."""
@@ -61,15 +61,15 @@ def _next(doubt: Doubt, observations: Observations, done: int) -> NextMotion:
     seen = observations.get((doubt.joint, doubt.observer))
     if done == MAX_REPEATS - 1:
         how = 0.7, 1.0, OTHERS_TURNED_RAD
-        words = f"joint {doubt.joint} moves again with all other joints turned by {OTHERS_TURNED_RAD} rad"
+        summary = f"joint {doubt.joint} moves again with all other joints turned by {OTHERS_TURNED_RAD} rad"
     elif seen is None:
         how = 1.0, 1.0, 0.0
-        words = f"joint {doubt.joint} moves again, for {doubt.observer} has missed it"
+        summary = f"joint {doubt.joint} moves again, for {doubt.observer} has missed it"
     elif seen.give > 0.7 * seen.sigma:
         # Half the speed over the same way takes a quarter of the acceleration.
         how = 0.5 ** (done + 1), 1.0, 0.0
-        words = f"joint {doubt.joint} moves more slowly, for other joints gave way when it moved"
+        summary = f"joint {doubt.joint} moves more slowly, for other joints gave way when it moved"
     else:
         how = 1.0, 1.5, 0.0
-        words = f"joint {doubt.joint} moves farther, for {doubt.observer} saw it through noise or shaking"
-    return NextMotion(doubt.joint, *how, f"{words}: {doubt.text}")
+        summary = f"joint {doubt.joint} moves farther, for {doubt.observer} saw it through noise or shaking"
+    return NextMotion(doubt.joint, *how, f"{summary}: {doubt.text}")

@@ -26,7 +26,7 @@ UNBELIEVABLE_BELOW = float(np.log(3.0))
 CONTRADICTS_ABOVE = float(np.log(19.0))
 
 
-class MotionSeen(NamedTuple):
+class MotionObservation(NamedTuple):
     """What one module saw of one joint's motion.
 
     moved: whether its IMU was carried along.
@@ -34,7 +34,7 @@ class MotionSeen(NamedTuple):
     axis: (3,) direction in the IMU's frame about which it turned when the joint's position grew, if it did.
     sigma: one standard deviation of the ratio, systematic errors included. give: how much other joints moved
         along (see `motion_evidence`).
-    summed_log_odds: of several motions together, of which this is the clearest; see `seen_again`.
+    summed_log_odds: of several motions together, of which this is the clearest; see `combined_observation`.
     """
 
     moved: bool
@@ -53,7 +53,7 @@ class MotionSeen(NamedTuple):
         return size if self.moved else -size
 
 
-def seen_again(motions: Sequence[MotionSeen]) -> MotionSeen:
+def combined_observation(motions: Sequence[MotionObservation]) -> MotionObservation:
     """Put together what one module saw of several motions of one joint: the log-odds add up.
 
     One that went wrong is outvoted by two that did not, where an average would fit nothing.
@@ -128,11 +128,11 @@ class TopologyError(DataError):
         self.serials = serials
 
 
-Observations = Mapping[tuple[str, str], MotionSeen]
+Observations = Mapping[tuple[str, str], MotionObservation]
 
 
 def find_topology(observations: Observations, unmoved: Collection[str] = ()) -> Topology:
-    """Derive the tree from what every module saw of every joint: {(joint, observer): MotionSeen}.
+    """Derive the tree from what every module saw of every joint: {(joint, observer): MotionObservation}.
 
     Args:
         observations: of all pairs; a few may be missing where the others make up for them.

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 # the duration at either end carries it to exactly zero: a step there would put a spike into the
 # acceleration.
 TAPER_SHARE = 0.15
-SHORTEST_GOTO_S = 0.2
+MIN_GOTO_S = 0.2
 # Peak speed over mean speed of a minimum-jerk path: 15/8.
 MINIMUM_JERK_PEAK = 1.875
 
@@ -74,7 +74,7 @@ def waveform(pattern: Pattern, origin_rad: float, t_s: Array) -> Waveform:
 
 def minimum_jerk_duration_s(travel_rad: float, max_speed_rad_s: float) -> float:
     """Return how long a minimum-jerk path of |travel_rad| takes whose peak speed is `max_speed_rad_s`."""
-    return max(MINIMUM_JERK_PEAK * travel_rad / max_speed_rad_s, SHORTEST_GOTO_S)
+    return max(MINIMUM_JERK_PEAK * travel_rad / max_speed_rad_s, MIN_GOTO_S)
 
 
 def minimum_jerk(travel_rad: float, total_s: float, t_s: ArrayLike) -> Waveform:

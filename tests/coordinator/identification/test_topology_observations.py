@@ -5,7 +5,7 @@ import pytest
 
 from coordinator.identification.topology_observations import TURNED_RAD, Axes, Heard, by_feedback
 from coordinator.recording.journal import JournalEvent
-from coordinator.topology.topology import MotionSeen
+from coordinator.topology.topology import MotionObservation
 
 NAMES = ("held", "moving", "watching")
 SAMPLES = 60
@@ -24,7 +24,7 @@ def heard(held_rad: float, turned_rad: float) -> Heard:
     return Heard(event, NAMES, np.array([held_rad, 0.0, 0.0]), rate, gyro, np.zeros((3, 3)))
 
 
-def seen(turned_rad: float, held_rad: float) -> MotionSeen:
+def seen(turned_rad: float, held_rad: float) -> MotionObservation:
     axes = Axes({("held", "watching"): np.array([1.0, 0.0, 0.0])}, dict.fromkeys(NAMES, 0.0))
     return by_feedback(heard(held_rad, turned_rad), axes)["watching"]
 

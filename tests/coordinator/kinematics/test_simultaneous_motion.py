@@ -12,8 +12,8 @@ from coordinator.kinematics.simultaneous_motion import (
     SimultaneousMotion,
     SimultaneousResponse,
     StillReading,
-    circles_of_all,
-    seen_by_all,
+    circle_observations,
+    motion_observations,
     simultaneous_response,
 )
 from coordinator.topology.topology import find_topology
@@ -63,7 +63,7 @@ def test_the_tree_is_found_with_reversed_modules_and_several_roots(
     robots: SimpleNamespace, seed: int
 ) -> None:
     chain, _ = robots.random(seed, joints=7, roots=1 + seed % 2)
-    found = find_topology(seen_by_all(chain.serials, answered(chain, seed)))
+    found = find_topology(motion_observations(chain.serials, answered(chain, seed)))
     parents = {
         s: None if p < 0 else found.serials[p] for s, p in zip(found.serials, found.parent, strict=True)
     }
@@ -81,7 +81,7 @@ def test_circles_are_near_the_true_ones_and_within_what_is_claimed_of_them(
 ) -> None:
     chain, _ = robots.random(10 + seed, joints=6, serial=True)
     response = answered(chain, seed)
-    found = circles_of_all(chain.serials, response)
+    found = circle_observations(chain.serials, response)
     index = {serial: k for k, serial in enumerate(chain.serials)}
     carried = [(i, k) for k in range(6) for i in chain.ancestors(chain.carrier(k)) if i != k]
     assert sorted((index[p.joint], index[p.observer]) for p in found) == sorted(carried)
@@ -103,9 +103,9 @@ def test_the_refinement_ends_where_it_would_have_ended_from_the_true_robot(
     chain, types = robots.random(20 + seed, joints=6, serial=True)
     data, still = moved(chain, seed)
     response = simultaneous_response(data, still, RATE_HZ, 15.0)
-    topology = find_topology(seen_by_all(chain.serials, response))
+    topology = find_topology(motion_observations(chain.serials, response))
     rest = robots.rest(chain, np.zeros(6))
-    first = assemble(topology, types, circles_of_all(chain.serials, response), [rest])
+    first = assemble(topology, types, circle_observations(chain.serials, response), [rest])
     sparse = SensorData(*(signal[::5] for signal in data))
     rng = np.random.default_rng(seed)
     motion = [rng.normal(0.0, size, (50, 6)) for size in (0.3, 1.0, 3.0)]

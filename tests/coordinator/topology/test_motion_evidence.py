@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from coordinator.topology.motion_evidence import (
-    FEWEST_SAMPLES,
     GIVE_LEFT,
     MIN_RATE_RAD_S,
+    MIN_SAMPLES,
     RATIO_FLOOR,
     NotMoved,
     carried_log_odds,
@@ -121,7 +121,7 @@ def test_a_joint_that_is_stuck_has_not_moved_whatever_its_encoder_jitters() -> N
 
 
 def test_too_short_a_motion_is_refused() -> None:
-    few = FEWEST_SAMPLES - 1
+    few = MIN_SAMPLES - 1
     with pytest.raises(DataError, match=f"{few} samples"):
         motion_evidence(0, rates()[:few], np.zeros((few, 3, 3)), np.zeros((3, 3)))
 

@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.topology.topology import MotionSeen, Topology, TopologyError, find_topology, likely_topology
+from coordinator.topology.topology import (
+    MotionObservation,
+    Topology,
+    TopologyError,
+    find_topology,
+    likely_topology,
+)
 
 MINUS_Z = np.array([0.0, 0.0, -1.0])
 
@@ -21,14 +27,18 @@ def movers(name: str | None, parent: dict[str, str | None]) -> list[str]:
     return [] if name is None else [*movers(parent[name], parent), name]
 
 
-def watch(parent: dict[str, str | None], reverse: dict[str, bool]) -> dict[tuple[str, str], MotionSeen]:
+def watch(
+    parent: dict[str, str | None], reverse: dict[str, bool]
+) -> dict[tuple[str, str], MotionObservation]:
     """Every IMU is carried by the joints between it and the base, and by its own if mounted by the output."""
     seen = {}
     for k in parent:
         carried = movers(parent[k], parent) + [k] * reverse[k]
         for i in parent:
             axis = MINUS_Z if i == k else np.array([1.0, 0.0, 0.0])
-            seen[i, k] = MotionSeen(True, 0.98, axis) if i in carried else MotionSeen(False, 0.03)
+            seen[i, k] = (
+                MotionObservation(True, 0.98, axis) if i in carried else MotionObservation(False, 0.03)
+            )
     return seen
 
 
@@ -70,7 +80,7 @@ def test_noise_within_its_own_sigma_leaves_every_forest_certain(
     assert found.confidence > 0.99
 
 
-def topology_or_error(seen: dict[tuple[str, str], MotionSeen]) -> Topology | TopologyError:
+def topology_or_error(seen: dict[tuple[str, str], MotionObservation]) -> Topology | TopologyError:
     try:
         return find_topology(seen)
     except TopologyError as error:
@@ -92,7 +102,7 @@ def test_one_wrong_observation_that_looks_sure_gives_another_forest_or_an_error_
     seen = watch(*forest)
     pair = data.draw(st.sampled_from(sorted(seen)))
     moved = not seen[pair].moved
-    seen[pair] = MotionSeen(moved, float(moved), MINUS_Z if pair[0] == pair[1] else None)
+    seen[pair] = MotionObservation(moved, float(moved), MINUS_Z if pair[0] == pair[1] else None)
     found = topology_or_error(seen)
     if isinstance(found, TopologyError):
         assert set(pair) <= set(found.serials)
@@ -107,7 +117,7 @@ def test_one_unclear_observation_is_a_doubt_or_an_error_that_names_it_and_never_
 ) -> None:
     seen = watch(*forest)
     pair = data.draw(st.sampled_from(sorted(seen)))
-    seen[pair] = MotionSeen(ratio > 0.5, ratio, MINUS_Z if pair[0] == pair[1] else None)
+    seen[pair] = MotionObservation(ratio > 0.5, ratio, MINUS_Z if pair[0] == pair[1] else None)
     found = topology_or_error(seen)
     if isinstance(found, TopologyError):
         assert f"{pair[1]} saw joint {pair[0]} with a rate ratio of {ratio:.2f}" in str(found)
@@ -129,7 +139,7 @@ def test_the_confidence_is_the_probability_of_the_least_certain_answer() -> None
     seen = watch(CHAIN, FORWARD)
     assert find_topology(seen).confidence > 0.999
     # Whether C is on B or beside it, what C saw of joint B alone tells.
-    seen["B", "C"] = MotionSeen(True, 0.6, sigma=0.15)
+    seen["B", "C"] = MotionObservation(True, 0.6, sigma=0.15)
     found = find_topology(seen)
     expected = 1.0 / (1.0 + np.exp(-seen["B", "C"].log_odds))
     assert found.confidence == pytest.approx(expected, abs=2e-3)
@@ -141,19 +151,19 @@ def test_the_confidence_is_the_probability_of_the_least_certain_answer() -> None
 
 @given(st.floats(0.0, 1.0), st.floats(0.02, 0.5))
 def test_a_ratio_as_far_from_being_carried_as_from_not_is_a_toss_up(off: float, sigma: float) -> None:
-    above, below = (MotionSeen(r > 0.5, r, sigma=sigma).log_odds for r in (0.5 + off, 0.5 - off))
+    above, below = (MotionObservation(r > 0.5, r, sigma=sigma).log_odds for r in (0.5 + off, 0.5 - off))
     assert above == pytest.approx(-below, abs=1e-9)
     assert abs(above) < 12.0
 
 
 def test_a_larger_sigma_makes_less_certain_of_the_same_ratio() -> None:
-    odds = [MotionSeen(True, 1.0, sigma=sigma).log_odds for sigma in (0.05, 0.15, 0.25, 0.5)]
+    odds = [MotionObservation(True, 1.0, sigma=sigma).log_odds for sigma in (0.05, 0.15, 0.25, 0.5)]
     assert odds == sorted(odds, reverse=True)
 
 
 def test_two_observations_that_agree_are_surer_than_one() -> None:
     """Whether B is on A, both IMUs beyond it tell as well; whether C is on B, C alone."""
-    unclear = MotionSeen(True, 0.75, sigma=0.25)
+    unclear = MotionObservation(True, 0.75, sigma=0.25)
     seen = {pair: unclear if o.moved else o for pair, o in watch(CHAIN, FORWARD).items()}
     found = likely_topology(seen)
     assert found.parent_log_odds[1] > found.parent_log_odds[2] + 0.5
@@ -161,14 +171,14 @@ def test_two_observations_that_agree_are_surer_than_one() -> None:
 
 def test_a_ring_that_looks_sure_is_named() -> None:
     seen = watch(CHAIN, FORWARD)
-    seen["B", "A"] = MotionSeen(True, 1.0)
+    seen["B", "A"] = MotionObservation(True, 1.0)
     with pytest.raises(TopologyError, match=r"A moves B and B moves A|B moves A and A moves B"):
         find_topology(seen)
 
 
 def test_an_unclear_observation_that_no_tree_allows_is_outvoted_and_named() -> None:
     seen = watch(CHAIN, FORWARD)
-    seen["B", "A"] = MotionSeen(True, 0.55)
+    seen["B", "A"] = MotionObservation(True, 0.55)
     found = find_topology(seen)
     assert found.parent == (-1, 0, 1)
     assert [(d.kind, d.joint, d.observer) for d in found.doubts] == [("contradiction", "B", "A")]
@@ -176,7 +186,7 @@ def test_an_unclear_observation_that_no_tree_allows_is_outvoted_and_named() -> N
 
 def test_two_movers_of_which_neither_moves_the_other_are_named() -> None:
     seen = watch({"A": None, "B": None, "C": "A"}, FORWARD)
-    seen["B", "C"] = MotionSeen(True, 1.0)
+    seen["B", "C"] = MotionObservation(True, 1.0)
     with pytest.raises(TopologyError, match="A and B both move C, but neither moves the other") as caught:
         find_topology(seen)
     assert set(caught.value.serials) == {"A", "B", "C"}
@@ -184,7 +194,7 @@ def test_two_movers_of_which_neither_moves_the_other_are_named() -> None:
 
 def test_a_joint_that_skips_a_generation_is_named() -> None:
     seen = watch(CHAIN, FORWARD)
-    seen["A", "C"] = MotionSeen(False, 0.0)
+    seen["A", "C"] = MotionObservation(False, 0.0)
     with pytest.raises(TopologyError, match="A moves B and B moves C, but A does not move C") as caught:
         find_topology(seen)
     assert set(caught.value.serials) == {"A", "B", "C"}
@@ -232,7 +242,7 @@ def test_what_a_joint_that_is_stuck_carries_stands_on_what_carries_it_and_all_el
 
 
 def test_what_is_not_certain_of_a_module_is_said_in_words() -> None:
-    seen = watch(CHAIN, FORWARD) | {("B", "C"): MotionSeen(True, 0.6, sigma=0.15)}
+    seen = watch(CHAIN, FORWARD) | {("B", "C"): MotionObservation(True, 0.6, sigma=0.15)}
     found = likely_topology({pair: o for pair, o in seen.items() if pair[0] != "A"}, ["A"])
     words = dict(zip(found.serials, (found.caveat(k) for k in range(3)), strict=True))
     assert words["A"] == ", its joint did not move: mounting and what it carries unknown"
@@ -243,6 +253,6 @@ def test_what_is_not_certain_of_a_module_is_said_in_words() -> None:
 def test_a_housing_that_turns_the_wrong_way_about_its_own_axis_is_named() -> None:
     seen = watch(CHAIN, {"A": False, "B": True, "C": False})
     assert find_topology(seen).reversed == (False, True, False)
-    seen["B", "B"] = MotionSeen(True, 1.0, -MINUS_Z)
+    seen["B", "B"] = MotionObservation(True, 1.0, -MINUS_Z)
     with pytest.raises(TopologyError, match="encoder's sign"):
         find_topology(seen)
