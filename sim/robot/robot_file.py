@@ -5,6 +5,7 @@ to the proximal frame of the child (its housing; its output if the child is moun
 """
 
 import tomllib
+from functools import partial
 from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -172,7 +173,7 @@ class Module(_Strict):
     def _fits_a_key(cls, serial: str) -> str:
         if serial == BASE:
             raise ValueError(f"{BASE!r} is the base's own name; call the module otherwise")
-        return check_chunk("serial", serial)
+        return _known(serial, partial(check_chunk, "serial"))
 
     @field_validator("type")
     @classmethod
@@ -195,14 +196,13 @@ class Robot(_Strict):
     @field_validator("name")
     @classmethod
     def _fits_a_key(cls, name: str) -> str:
-        return check_chunk("robot", name)
+        return _known(name, partial(check_chunk, "robot"))
 
     @field_validator("network")
     @classmethod
     def _known_network(cls, name: str, info: ValidationInfo) -> str:
         found = network_beside(name, (info.context or {}).get("folder", Path()))
-        network(found)
-        return found
+        return _known(found, network)
 
     @field_validator("noise")
     @classmethod
