@@ -94,14 +94,14 @@ def print_result(result: Result, terminal: Terminal) -> None:
         )
     terminal.console.print(table)
     for item in result.unresolved:
-        terminal.note(f"not identifiable: {item.words}")
+        terminal.note(f"not identifiable: {item.summary}")
     if result.dynamics is not None:
         _print_inertia(result.dynamics, terminal)
     terminal.note(f"trace hash {result.trace_hash}")
 
 
 def _print_inertia(dynamics: DynamicsPart, terminal: Terminal) -> None:
-    for line in dynamics.words:
+    for line in dynamics.summary:
         terminal.note(line)
     if dynamics.held_out is None:
         return

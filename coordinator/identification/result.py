@@ -1,19 +1,20 @@
 """`result.json`: what a session found, in a versioned schema; written whole or not at all."""
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from coordinator.parameter_fit.report_parts import BodyPart
+from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart
 from module_agent.model.chain import Chain
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 class Part(BaseModel):
-    """A piece of the result."""
+    """A part of the result: immutable, and without fields that the schema does not name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,12 +62,12 @@ class UnknownPart(Part):
 
 
 class UnresolvedPart(Part):
-    """What the data does not tell: in words, as parameters of links, and what would tell it."""
+    """What the data do not determine: as a sentence, as parameters of links, and what would resolve it."""
 
     kind: str
     joint: str
     modules: list[str]
-    words: str
+    summary: str
     resolved_by: str = ""
     links: list[UnknownPart] = []
 
@@ -191,46 +192,34 @@ class BodiesPart(Part):
     held_out_relative_error: float | None
 
 
-class BaseParameterPart(Part):
-    """A sum of parameters that torques show, "m2 c2x + 0.225 (m3 + m4)", in SI units.
-
-    m, m c and I are of the bodies in the order of the chain, counted from 1, each in its own of
-    `DynamicsPart.frames` and about that frame's origin. relative_sigma is None of a value of zero.
-    """
-
-    words: str
-    value: float
-    sigma: float
-    relative_sigma: float | None
-
-
 class IdentifiabilityPart(Part):
-    """Whether one parameter is known: `identified` by torques alone, within 10 %; `weak` if worse, or by the
-    modules' make; `not identifiable` else.
+    """Whether one parameter is known.
 
-    sums are the places in `base_parameters` of those that it is in: none, if torques do not depend on it.
+    identifiability: `identified` (by torques alone, within 10 %), `weak` (worse, or only with the prior of
+    the module type) or `not identifiable`. base_parameters: the indices of the base parameters that it is
+    part of; none if torques do not depend on it.
     """
 
     parameter: str
     serial: str
-    verdict: str
+    identifiability: str
     value: float | None
     sigma: float | None
-    sums: list[int]
+    base_parameters: list[int]
 
 
 class TorqueTermPart(Part):
-    """What one joint's torque reading holds beside the bodies' torque (`dynamics.torque_terms`).
+    """A term of one joint's torque reading besides the rigid bodies' torque (`signals.torque_terms`).
 
-    used: it earns its place; else value and sigma are zero. gain: by how many variances of the torque's noise
-    it makes the joint's misfit smaller; None of the scale of the sensor, which the joints together tell
-    (`dynamics.torque_scale`).
+    significant: it is part of the model; else value and sigma are zero. gain: by how many variances of the
+    torque's noise it reduces the joint's sum of squared residuals; None for the sensor's scale, which is
+    estimated from all joints together (`parameter_fit.torque_sensor_scale`).
     """
 
     serial: str
     term: str
     unit: str
-    used: bool
+    significant: bool
     value: float
     sigma: float
     gain: float | None = None
@@ -239,14 +228,15 @@ class TorqueTermPart(Part):
 class DynamicsPart(Part):
     """The inertial parameters; see `dynamics.regressor` for the order and frame of `phi`.
 
-    `phi` predicts torques but need not be of real bodies: those are `bodies`. words say what is known, body
-    by body. frames are the poses (4, 4) at q = 0 in the root frame in which base parameters and verdicts are
-    worded: z along the joint's axis, x towards the next joint (`dynamics.joint_frames`). seen_by: by what the
-    bodies' motion was seen (`inertia`); noise_nm: what each way of seeing it leaves in the torques.
+    `phi` predicts torques but need not be of real bodies: those are `bodies`. summary: what is known, body
+    by body. frames are the poses (4, 4) at q = 0 in the root frame in which base parameters and
+    identifiability are stated: z along the joint's axis, x towards the next joint; m, m c and I of body k
+    (counted from 1 along the chain) are in frame k, about its origin. motion_source: the sensors from which
+    the bodies' motion is known; noise_nm: the torque residual with each motion source.
 
-    gathered_by: whose the rows from encoders are, from which what IMUs saw beyond is taken off; by_agents are
-    the modules that gathered their own. gathered_difference: how far those and the coordinator's are apart at
-    most, relative.
+    gathered_by: who projected the encoders' rows, from which what only IMUs measure is subtracted; by_agents
+    are the modules that projected their own. gathered_difference: the largest relative difference between
+    those and the coordinator's.
     """
 
     phi: list[float]
@@ -259,10 +249,10 @@ class DynamicsPart(Part):
     held_out: HeldOutPart | None
     bodies: BodiesPart | None = None
     base_parameters: list[BaseParameterPart] = []
-    identifiabilities: list[IdentifiabilityPart] = []
-    words: list[str] = []
+    identifiability: list[IdentifiabilityPart] = []
+    summary: list[str] = []
     frames: list[list[list[float]]] = []
-    seen_by: str = "encoders"
+    motion_source: str = "encoders"
     noise_nm: dict[str, dict[str, float]] = {}
     torque_terms: list[TorqueTermPart] = []
     gathered_by: Literal["agents", "coordinator", "both"] = "coordinator"
@@ -300,6 +290,42 @@ class Result(Part):
     wall_time_s: float | None
     trace_hash: str
     schema_version: int = Field(default=SCHEMA, alias="schema")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_any_schema(cls, document: Any) -> Any:
+        return migrate(document)
+
+
+# Fields of schema 1 that were renamed, by the path of the part that holds them; [] stands for a list.
+_RENAMED: dict[tuple[str, ...], dict[str, str]] = {
+    ("unresolved", "[]"): {"words": "summary"},
+    ("dynamics", "base_parameters", "[]"): {"words": "summary"},
+    ("dynamics", "verdicts", "[]"): {"verdict": "identifiability", "sums": "base_parameters"},
+    ("dynamics", "torque_terms", "[]"): {"used": "significant"},
+    ("dynamics",): {"verdicts": "identifiability", "words": "summary", "seen_by": "motion_source"},
+}
+
+
+def migrate(document: Any) -> Any:
+    """Return a `result.json` of schema 1, as parsed, in this schema; any other document unchanged."""
+    if not isinstance(document, dict) or document.get("schema") != 1:
+        return document
+    migrated: dict[str, Any] = {**document, "schema": SCHEMA}
+    for path, names in _RENAMED.items():
+        migrated = _renamed(migrated, path, names)
+    return migrated
+
+
+def _renamed(value: Any, path: Sequence[str], names: Mapping[str, str]) -> Any:
+    """Return a copy with the keys of the parts at a path renamed; a part that is missing is left out."""
+    if path and path[0] == "[]":
+        return [_renamed(item, path[1:], names) for item in value] if isinstance(value, list) else value
+    if not isinstance(value, dict):
+        return value
+    if path:
+        return value | {path[0]: _renamed(value[path[0]], path[1:], names)} if path[0] in value else value
+    return {names.get(key, key): item for key, item in value.items()}
 
 
 def write_result(path: Path, result: Result) -> None:

@@ -8,7 +8,6 @@ from coordinator.description.denavit_hartenberg import dh_paths
 from coordinator.description.link_transforms import PARAMETERS, LinkTransform, link_transforms
 from coordinator.description.product_of_exponentials import screw_model
 from coordinator.identification.result import (
-    BaseParameterPart,
     BodiesPart,
     ChainPart,
     DhPart,
@@ -29,7 +28,7 @@ from coordinator.identification.result import (
     UnknownPart,
     UnresolvedPart,
 )
-from coordinator.parameter_fit.report_parts import body_part
+from coordinator.parameter_fit.report_parts import base_parameter_parts, body_part
 from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array
@@ -147,13 +146,13 @@ def _unresolved(fit: "ChainEstimate", types: list[ModuleType], item: "Unresolved
         kind=item.kind,
         joint=item.joint,
         modules=list(item.modules),
-        words=_words(item, links),
+        summary=_summary(item, links),
         resolved_by=item.resolved_by,
         links=links,
     )
 
 
-def _words(item: "Unresolved", links: list[UnknownPart]) -> str:
+def _summary(item: "Unresolved", links: list[UnknownPart]) -> str:
     """Say which parameters of which links are not known, why, and what would tell them."""
     short = [", ".join(name.split("_")[0] for name in link.parameters) for link in links]
     of = [
@@ -259,11 +258,11 @@ def _dynamics(
         residual_rms_nm=dict(zip(serials, inertia.residual_rms_nm.tolist(), strict=True)),
         held_out=_held_out(serials, held_out) if held_out is not None else None,
         bodies=_bodies(bodies) if bodies is not None else None,
-        base_parameters=_base_parameters(bodies) if bodies is not None else [],
-        identifiabilities=_verdicts(bodies) if bodies is not None else [],
-        words=bodies.summary() if bodies is not None else [],
+        base_parameters=base_parameter_parts(bodies.base) if bodies is not None else [],
+        identifiability=_identifiability(bodies) if bodies is not None else [],
+        summary=bodies.summary() if bodies is not None else [],
         frames=bodies.frames.tolist() if bodies is not None else [],
-        seen_by=found.eyes,
+        motion_source=found.eyes,
         gathered_by=_gathered_by(found.gathered, len(serials)),
         by_agents=list(found.gathered.by_agents) if found.gathered is not None else [],
         gathered_difference=found.gathered.difference if found.gathered is not None else None,
@@ -287,7 +286,7 @@ def _torque_terms(serials: tuple[str, ...], seen: "InstrumentalFit") -> list[Tor
             serial=serial,
             term=term,
             unit=TERM_KINDS[term].unit,
-            used=bool(terms.used[i, k]),
+            significant=bool(terms.used[i, k]),
             value=float(terms.value[i, k]),
             sigma=float(terms.sigma[i, k]),
             gain=float(terms.gain[i, k]),
@@ -299,7 +298,7 @@ def _torque_terms(serials: tuple[str, ...], seen: "InstrumentalFit") -> list[Tor
             serial=serial,
             term="scale",
             unit="",
-            used=bool(scale.sigma[i] > 0.0),
+            significant=bool(scale.sigma[i] > 0.0),
             value=float(scale.value[i]),
             sigma=float(scale.sigma[i]),
         )
@@ -322,29 +321,15 @@ def _bodies(found: "RobotBodies") -> BodiesPart | None:
     )
 
 
-def _base_parameters(found: "RobotBodies") -> list[BaseParameterPart]:
-    base = found.base
-    columns = zip(base.value.tolist(), base.sigma.tolist(), base.relative_sigma.tolist(), strict=True)
-    return [
-        BaseParameterPart(
-            words=base.summary(i),
-            value=value,
-            sigma=sigma,
-            relative_sigma=ratio if np.isfinite(ratio) else None,
-        )
-        for i, (value, sigma, ratio) in enumerate(columns)
-    ]
-
-
-def _verdicts(found: "RobotBodies") -> list[IdentifiabilityPart]:
+def _identifiability(found: "RobotBodies") -> list[IdentifiabilityPart]:
     return [
         IdentifiabilityPart(
             parameter=one.name,
             serial=found.serials[k // PER_BODY],
-            verdict=one.kind,
+            identifiability=one.kind,
             value=one.value,
             sigma=one.sigma,
-            sums=list(one.base_parameters),
+            base_parameters=list(one.base_parameters),
         )
         for k, one in enumerate(found.identifiabilities)
     ]

@@ -1,8 +1,9 @@
 """`session.mcap`: every message as it was sent or received, crash-safe, readable by any MCAP tool.
 
 Topics are the keys; the kind (publication, request, reply) is in the channel's metadata. Message encoding is
-msgpack with a JSON schema for each message type; the journal is JSON. Chunks are small and handed over five
-times a second, because a chunk is what a crash loses: the library's default of 1 MiB lost 11.8 s.
+msgpack with a JSON schema for each message type; the journal is JSON. Chunks are handed over five times a
+second, because a chunk is what a crash loses: the library's default of 1 MiB lost 11.8 s. They are compressed
+with zstd (measured: 6.9 MB instead of 15.4 MB for 97 s of four modules, 0.27 s of CPU time).
 """
 
 import json
@@ -13,6 +14,7 @@ from pathlib import Path
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import NonSeekingReader
 from mcap.writer import CompressionType, Writer
+from zstandard import ZstdError
 
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Entry, Kind
@@ -21,7 +23,7 @@ from module_agent.wire.keys import parse
 from module_agent.wire.messages import Ack, Message
 from module_agent.wire.topics import TOPICS
 
-CHUNK_BYTES = 16 * 1024
+CHUNK_BYTES = 64 * 1024
 FLUSH_NS = 200_000_000
 MCAP0_MAGIC = b"\x89MCAP0\r\n"
 KINDS: tuple[Kind, ...] = ("publication", "request", "reply", "journal")
@@ -44,7 +46,7 @@ class SessionWriter:
         self.path = path
         self._file = path.open("wb")
         self._flushed_ns = 0
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="x5", library="x5-coordinator")
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[Kind, str], int] = {}
@@ -113,5 +115,5 @@ def read_session(path: Path) -> Iterator[Entry]:
         except (EndOfFile, struct.error):
             # A recording that a crash cut short is read up to the cut: that is what it is for.
             return
-        except McapError as error:
+        except (McapError, ZstdError) as error:
             raise SessionFileError(f"{path}: damaged: {error}") from error

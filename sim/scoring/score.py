@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from coordinator.identification.identified import Identified
-from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart
+from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart, migrate
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.errors import DataError, RobotError
 from module_agent.signals.filtering import resample
@@ -153,7 +153,7 @@ def _compared(
         links=_links(estimated, truth, result.links),
         tip_position_rms_mm=tip[0],
         tip_orientation_rms_deg=tip[1],
-        unidentifiable=[item.words for item in result.unresolved],
+        unidentifiable=[item.summary for item in result.unresolved],
         torque_relative_error=torque.overall,
         torque_relative_error_per_joint=torque.per_joint,
         torque_rms_error_nm_per_joint=torque.rms_error_nm,
@@ -247,7 +247,7 @@ def _existing(path: Path) -> Path:
 def _read_result(path: Path) -> _ResultFile:
     try:
         document = json.loads(_existing(path).read_text(encoding="utf-8"))
-        found = _ResultFile.model_validate(document)
+        found = _ResultFile.model_validate(migrate(document))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])

@@ -101,21 +101,23 @@ def test_the_result_says_what_is_known_of_every_parameter(run: list[Entry]) -> N
     dynamics = identify(_recorded(run)).result.dynamics
     assert dynamics is not None
     assert len(dynamics.base_parameters) == dynamics.rank
-    assert len(dynamics.identifiabilities) == dynamics.parameters == 20
+    assert len(dynamics.identifiability) == dynamics.parameters == 20
     sums = dynamics.base_parameters
     alone = [
-        v for v in dynamics.identifiabilities if any(sums[place].words == v.parameter for place in v.sums)
+        v
+        for v in dynamics.identifiability
+        if any(sums[place].summary == v.parameter for place in v.base_parameters)
     ]
     assert alone
     for verdict in alone:
         # Known by itself: the one sum that it is in is it.
-        (place,) = verdict.sums
+        (place,) = verdict.base_parameters
         assert (sums[place].value, sums[place].sigma) == (verdict.value, verdict.sigma)
         relative = sums[place].relative_sigma
         assert relative is not None
-        assert verdict.verdict == ("identified" if relative <= 0.1 else "weak")
-    assert {v.serial for v in dynamics.identifiabilities} == {BASE, TIP}
-    assert len(dynamics.words) == 3
+        assert verdict.identifiability == ("identified" if relative <= 0.1 else "weak")
+    assert {v.serial for v in dynamics.identifiability} == {BASE, TIP}
+    assert len(dynamics.summary) == 3
 
 
 def test_the_axis_of_the_joint_and_gravity_stand_as_in_the_robot(run: list[Entry]) -> None:

@@ -94,3 +94,22 @@ def test_a_result_does_not_take_what_its_schema_lacks() -> None:
     fields = _result().model_dump(by_alias=True)
     with pytest.raises(ValidationError, match="extra"):
         Result.model_validate({**fields, "colour": "red"})
+
+
+def test_a_result_of_schema_1_is_read() -> None:
+    text = (Path(__file__).parent / "data" / "result_schema_1.json").read_text()
+    old, result = json.loads(text), Result.model_validate_json(text)
+    assert old["schema"] == 1
+    assert result.schema_version == SCHEMA
+    assert [item.summary for item in result.unresolved] == [item["words"] for item in old["unresolved"]]
+    dynamics, before = result.dynamics, old["dynamics"]
+    assert dynamics is not None
+    assert dynamics.summary == before["words"]
+    assert dynamics.motion_source == before["seen_by"]
+    assert [p.summary for p in dynamics.base_parameters] == [p["words"] for p in before["base_parameters"]]
+    kinds = [(p.identifiability, p.base_parameters) for p in dynamics.identifiability]
+    assert kinds == [(p["verdict"], p["sums"]) for p in before["verdicts"]]
+    assert [t.significant for t in dynamics.torque_terms] == [t["used"] for t in before["torque_terms"]]
+    again = json.loads(result.model_dump_json(by_alias=True))
+    assert again["schema"] == SCHEMA
+    assert Result.model_validate(again) == result

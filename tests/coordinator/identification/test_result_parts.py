@@ -93,10 +93,10 @@ def test_what_a_vertical_axis_hides_is_said_as_parameters_of_a_link_and_as_what_
     assert set(by_kind) == {"offset_along_axis", "rotation_about_axis"}
     offset = by_kind["offset_along_axis"]
     assert [(link.parent, link.child, link.parameters) for link in offset.links] == [(base, tip, ["z_mm"])]
-    assert offset.words.startswith(f"z of the link {base} - {tip}: offset of {tip} along {base}'s axis")
-    assert "tilting the base" in by_kind["rotation_about_axis"].words
+    assert offset.summary.startswith(f"z of the link {base} - {tip}: offset of {tip} along {base}'s axis")
+    assert "tilting the base" in by_kind["rotation_about_axis"].summary
     assert result.transforms[0].sigma[2] is None
-    assert score(out).unidentifiable == [item.words for item in result.unresolved]
+    assert score(out).unidentifiable == [item.summary for item in result.unresolved]
 
 
 def test_the_covariance_of_the_chain_is_that_of_its_links(run: tuple[Result, Path]) -> None:

@@ -86,11 +86,11 @@ def make_run(
     if set(chain.serials) == set(SERIALS):
         write_held_out(folder, chain.serials, predicted, measured)
     document = {
-        "schema": 1,
+        "schema": 2,
         "serials": list(chain.serials),
         "chain": chain.to_dict(),
         "unresolved": [
-            {"kind": "rotation_about_axis", "joint": "root", "modules": [], "words": "yaw beyond root"}
+            {"kind": "rotation_about_axis", "joint": "root", "modules": [], "summary": "yaw beyond root"}
         ],
         "null_basis": [[]] * (6 * len(chain.serials)) if basis is None else basis.tolist(),
         "links": links(chain),
@@ -271,7 +271,7 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path, name: str) -> None:
 
 def test_what_is_wrong_within_a_file_is_named(tmp_path: Path) -> None:
     cases: list[tuple[dict[str, Any], str]] = [
-        ({"schema": 2}, "schema 2; this program scores schema 1"),
+        ({"schema": 3}, "schema 3; this program scores schema 2"),
         ({"robot_time_s": "long"}, "robot_time_s: Input should be a valid number"),
         ({"null_basis": [[1.0]]}, "null_basis must have 36 rows"),
         ({"serials": ["root"]}, r"serials and chain\.serials differ"),
