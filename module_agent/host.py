@@ -61,7 +61,7 @@ class InlineWorker:
 
 
 class HostedModule:
-    """One module of this process: its firmware, its observer, and what waits for them."""
+    """One module of this process: its firmware, its observer, and their inboxes."""
 
     def __init__(self, robot: str, config: FirmwareConfig, modules: Modules, index: int, shared: "Shared"):
         self.robot = robot
@@ -87,11 +87,11 @@ class HostedModule:
         return self._keys[leaf]
 
     def sink(self, leaf: Leaf) -> Sink:
-        """Return where what arrives on a leaf is put."""
+        """Return the inbox of a leaf."""
         return self.stops.put if leaf is Leaf.STOP else self.inbox.put
 
     def collect(self) -> None:
-        """Take what has arrived by now, to be judged by the next sample."""
+        """Take what has arrived by now; its age is judged by the time of the next sample."""
         if self.stops.waiting or self.inbox.waiting:
             self._arrived = self.stops.drain() + self.inbox.drain()
             self.firmware.dropped_events = self.inbox.dropped
@@ -132,7 +132,7 @@ class HostedModule:
         try:
             return encode(self._answer_message(self.firmware.admission.read(leaf, payload)))
         except WireError as error:
-            # What is not ready yet is asked for again; nobody has done anything wrong.
+            # A result that is not ready yet is requested again; that is no fault of the sender's.
             if error.reason is not Refusal.BUSY:
                 self.firmware.admission.count(error.reason)
             return encode(self._ack(False, 0, error.reason.value, error.detail[:512]))
@@ -203,7 +203,7 @@ class HostedModule:
 
 
 class Shared:
-    """What the modules of one process have in common."""
+    """State that the modules of one process share."""
 
     def __init__(self, worker: Worker) -> None:
         self.worker = worker
@@ -244,8 +244,8 @@ class AgentHost:
         self._transport = transport
         self._worker = worker
         self._neighbours = MotionListener()
-        self._heard = Inbox(capacity=4096)
-        self._found: list[tuple[HostedModule, Finding]] = []
+        self._from_others = Inbox(capacity=4096)
+        self._findings: list[tuple[HostedModule, Finding]] = []
         self._listening: dict[str, Undeclare] = {}
         self._declared: list[Undeclare] = []
         self._asked: dict[int, AskHistory] = {}
@@ -260,8 +260,8 @@ class AgentHost:
                 self._declared.append(transport.serve(module.key(leaf), module.sink(leaf)))
             for leaf in PUBLISHED_TO_MODULE:
                 self._declared.append(transport.subscribe(module.key(leaf), module.sink(leaf)))
-        self._declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._heard.put))
-        # Last, so that whoever sees the token finds everything else in place.
+        self._declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._from_others.put))
+        # Last, so that everything else is in place when the token is seen.
         for module in self.modules:
             self._declared.append(transport.declare_alive(module.key(Leaf.ALIVE)))
 
@@ -271,13 +271,13 @@ class AgentHost:
         Raises:
             HardwareLost: no further tick will come.
         """
-        # Before the sample: a process that freezes in it finds the sample of long ago when it thaws, and by
-        # that sample's time all that was sent to it meanwhile would be fresh.
+        # Before the sample: a process that freezes while it waits gets an old sample when it thaws; by the
+        # time of that sample all commands that arrived meanwhile would be fresh.
         for module in self.modules:
             module.collect()
         samples = self._hardware.receive()
-        if self._heard.waiting:
-            self._hear()
+        if self._from_others.waiting:
+            self._read_others()
         modules = self.modules
         commands = [module.step(sample) for module, sample in zip(modules, samples, strict=True)]
         for module, pwm in zip(modules, self._hardware.send(commands), strict=True):
@@ -286,10 +286,10 @@ class AgentHost:
         if self._neighbours.has_work:
             self._attend_to_motions()
         if self._shared.collection.has_work:
-            for wish in self._shared.collection.poll(self.modules[0].now_ns):
-                self._ask_history(wish)
+            for wanted in self._shared.collection.poll(self.modules[0].now_ns):
+                self._ask_history(wanted)
         self._worker.check()
-        if self._found:
+        if self._findings:
             self._publish_findings()
 
     def _send(self, module: HostedModule, outgoing: Outgoing) -> None:
@@ -303,23 +303,23 @@ class AgentHost:
     def _clocks(self) -> dict[str, int]:
         return {module.serial: module.now_ns for module in self.modules}
 
-    def _hear(self) -> None:
+    def _read_others(self) -> None:
         clocks = self._clocks()
         now_ns = self.modules[0].now_ns
-        for event in self._heard.drain(limit=512):
+        for event in self._from_others.drain(limit=512):
             try:
-                self._hear_one(event, now_ns, clocks)
+                self._on_event(event, now_ns, clocks)
             except WireError as error:
                 for module in self.modules:
                     module.firmware.admission.count(error.reason)
 
-    def _hear_one(self, event: Event, now_ns: int, clocks: dict[str, int]) -> None:
+    def _on_event(self, event: Event, now_ns: int, clocks: dict[str, int]) -> None:
         if isinstance(event, Liveness | Request):
             return
         if isinstance(event, Reply):
             asked = self._asked.pop(event.tag, None)
             if event.payload is not None and asked is not None:
-                self._hear_history(asked, event.payload, clocks)
+                self._on_history(asked, event.payload, clocks)
             return
         parts = parse(event.key)
         if parts.leaf is Leaf.STATUS:
@@ -333,7 +333,7 @@ class AgentHost:
             )
             self._neighbours.on_feedback(feedback, clocks)
 
-    def _hear_history(self, asked: AskHistory, payload: bytes, clocks: dict[str, int]) -> None:
+    def _on_history(self, asked: AskHistory, payload: bytes, clocks: dict[str, int]) -> None:
         try:
             feedback = decode(Feedback, payload, TOPICS[Leaf.HISTORY].max_bytes_from_module)
         except WireError:
@@ -347,54 +347,54 @@ class AgentHost:
 
     def _attend_to_motions(self) -> None:
         now_ns = self.modules[0].now_ns
-        wishes, motions = self._neighbours.poll(now_ns)
-        for wish in wishes:
-            if isinstance(wish, Listen):
-                self._listen(wish)
+        requests, motions = self._neighbours.poll(now_ns)
+        for wanted in requests:
+            if isinstance(wanted, Listen):
+                self._listen(wanted)
             else:
-                self._ask_history(wish)
+                self._ask_history(wanted)
         for motion in motions:
             for module in self.modules:
                 self._submit(module, motion)
 
     def _publish_findings(self) -> None:
-        while self._found:
-            module, finding = self._found.pop(0)
+        while self._findings:
+            module, finding = self._findings.pop(0)
             module.observer.findings[finding.joint] = finding
             self._transport.publish(module.key(Leaf.ESTIMATE), encode(module.estimate(finding)))
 
     def _submit(self, module: HostedModule, motion: JointMotion) -> None:
         job = module.observer.job(motion, module.firmware.history, module.firmware.last_rest)
-        self._worker.submit(job, lambda finding: self._found.append((module, finding)))
+        self._worker.submit(job, lambda finding: self._findings.append((module, finding)))
 
-    def _listen(self, wish: Listen) -> None:
-        held = self._listening.pop(wish.serial, None)
-        if held is not None:
-            held.undeclare()
-        if wish.on:
-            self._listening[wish.serial] = self._transport.subscribe(
-                key(self._robot, wish.serial, Leaf.FEEDBACK), self._heard.put
+    def _listen(self, wanted: Listen) -> None:
+        subscription = self._listening.pop(wanted.serial, None)
+        if subscription is not None:
+            subscription.undeclare()
+        if wanted.on:
+            self._listening[wanted.serial] = self._transport.subscribe(
+                key(self._robot, wanted.serial, Leaf.FEEDBACK), self._from_others.put
             )
 
-    def _ask_history(self, wish: AskHistory) -> None:
+    def _ask_history(self, wanted: AskHistory) -> None:
         self._tag += 1
         self._seq += 1
-        self._asked[self._tag] = wish
+        self._asked[self._tag] = wanted
         if len(self._asked) > MAX_ASKED:
             del self._asked[next(iter(self._asked))]
         question = HistoryRequest(
-            serial=wish.serial,
-            boot=wish.boot,
+            serial=wanted.serial,
+            boot=wanted.boot,
             seq=self._seq,
             sender=self.modules[0].serial,
-            first_row=wish.first_row,
-            end_row=wish.end_row,
+            first_row=wanted.first_row,
+            end_row=wanted.end_row,
         )
         self._transport.query(
-            key(self._robot, wish.serial, Leaf.HISTORY),
+            key(self._robot, wanted.serial, Leaf.HISTORY),
             encode(question),
             HISTORY_TIMEOUT_S,
-            self._heard.put,
+            self._from_others.put,
             self._tag,
         )
 

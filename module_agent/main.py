@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 CONNECT_ATTEMPT_S = 1.0
-# What an agent says when it is up; the launcher waits for it.
+# An agent prints this when it is up; the launcher waits for it.
 ATTACHED = "attached to the bus and the network"
 
 
@@ -73,13 +73,13 @@ def _transport(connect: list[str], listen: list[str], network: NetworkProfile, s
         mode="client", connect=tuple(connect), listen=tuple(listen), connect_timeout_s=CONNECT_ATTEMPT_S
     )
     transport: Transport | None = None
-    said = False
+    reported = False
     while transport is None:
         try:
             transport = open_zenoh(config)
         except NoHub as error:
-            if not said:
-                said = True
+            if not reported:
+                reported = True
                 typer.echo(f"x5-agent: waiting for the network: {error}", err=True)
     return inject(transport, network, seed, "module")
 
@@ -148,7 +148,7 @@ def _serve(host: "AgentHost", worker: ThreadWorker) -> None:
         typer.echo(f"x5-agent: {names}: the world is gone: {error}", err=True)
         raise typer.Exit(EXIT_LOST) from error
     finally:
-        # When the world is gone, whoever ended it most likely ends the agents too: a signal in the middle of
+        # The end of the world is mostly followed by a signal that ends the agents too: one in the middle of
         # closing would leave the session half open, and its threads would keep the process for ever.
         _ignore_signals()
         host.close()

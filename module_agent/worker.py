@@ -1,4 +1,4 @@
-"""Runs local estimates beside the ticks, on one background thread."""
+"""Runs local estimates on one background thread, while the ticks go on."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +21,7 @@ class ThreadWorker:
     def _run(self, job: Callable[[], T], done: Callable[[T], None]) -> None:
         try:
             done(job())
-        except BaseException as error:  # kept for `check`: the pool would only log it
+        except BaseException as error:  # stored for `check`: the pool would only log it
             self._failure = error
 
     def check(self) -> None:

@@ -43,12 +43,12 @@ Law = Callable[[Command, float, float, float], float]
 
 
 def pwm_per_rad_s(kind: ModuleType) -> float:
-    """Return what the velocity loop takes to hold a speed: the PWM of its back-EMF, by the motor's Kv."""
+    """Return the PWM per output speed that balances the back-EMF, by the motor's Kv."""
     return kind.gear_ratio * 30.0 / (math.pi * kind.motor.velocity_constant_rpm_v * NOMINAL_VOLTAGE_V)
 
 
 def torque_at_full_pwm_nm(kind: ModuleType) -> float:
-    """Return what the effort loop takes full PWM to exert at rest, behind a gear of constant efficiency."""
+    """Return the output torque at full PWM and rest, behind a gear of constant efficiency."""
     motor = kind.motor
     stalled_a = NOMINAL_VOLTAGE_V / motor.resistance_ohm
     return stalled_a * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency

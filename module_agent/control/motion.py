@@ -22,14 +22,14 @@ USUAL_PERIOD_NS = 10_000_000
 
 
 def profile_period_ns(total_s: float) -> int:
-    """Return how far apart the samples of a motion are: 10 ms, more for a motion over 8 s."""
+    """Return the sample period of a motion's effort profile: 10 ms, more for a motion over 8 s."""
     fitting_ns = -(-round(total_s * 1e9) // (MAX_SAMPLES - 1))
     # Whole milliseconds, which are a module's ticks.
     return max(USUAL_PERIOD_NS, -(-fitting_ns // MIN_PERIOD_NS) * MIN_PERIOD_NS)
 
 
 def effort_profile(effort_nm: ArrayLike, period_ns: int) -> EffortProfile:
-    """Return the efforts (k,) at 0, 1, 2 ... periods of a motion as a module takes them.
+    """Return the message with the efforts (k,) [Nm] at 0, 1, 2 ... periods of a motion.
 
     Raises:
         ValueError: not 2 to 800 finite numbers in a row, or a period outside 1 ms to 1 s.
@@ -57,13 +57,13 @@ def effort_at(profile: EffortProfile, t_s: NDArray[np.float64]) -> NDArray[np.fl
     if not np.isfinite(values).all():
         place = int(np.argmin(np.isfinite(values)))
         raise WireError(Refusal.NOT_FINITE, f"sample {place} of the effort profile is {values[place]}")
-    found: NDArray[np.float64] = np.interp(t_s, np.arange(values.size) * (profile.period_ns * 1e-9), values)
-    return found
+    efforts: NDArray[np.float64] = np.interp(t_s, np.arange(values.size) * (profile.period_ns * 1e-9), values)
+    return efforts
 
 
 # A motion is sampled when it starts; a minute takes 3 ms.
-LONGEST_S = 60.0
-# The thesis asks for up to 9 times what the module can do, to show how it saturates.
+MAX_MOTION_S = 60.0
+# The thesis commands up to 9 times the maximum speed, to show how the module saturates.
 ABSURD_SPEED = 10.0
 
 
@@ -140,14 +140,16 @@ def check_duration(pattern: Pattern, origin_rad: float) -> None:
         WireError: LIMIT, with the duration.
     """
     total_s = duration_s(pattern, origin_rad)
-    if total_s > LONGEST_S:
+    if total_s > MAX_MOTION_S:
         raise WireError(
-            Refusal.LIMIT, f"the motion would take {total_s:.0f} s, at most {LONGEST_S:.0f} s are taken"
+            Refusal.LIMIT, f"the motion would take {total_s:.0f} s, at most {MAX_MOTION_S:.0f} s are taken"
         )
 
 
 def check_speed(speed_rad_s: float, limits: Limits) -> None:
-    """Check that a speed is one that somebody may mean. The loops clamp what the motor cannot follow.
+    """Reject speeds above ABSURD_SPEED times the module's maximum: probably a unit error.
+
+    The loops clamp slower ones to what the motor can follow.
 
     Raises:
         WireError: LIMIT, with the speed.

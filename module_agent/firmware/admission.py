@@ -1,7 +1,7 @@
-"""Whether a command may act: checked in one fixed order, the first failure is the reason.
+"""Admission of commands: the checks run in one fixed order, and the first failure is the reason.
 
 Length, msgpack limits, version, types, finiteness, range (all in `codec`), then serial, boot, lease, sequence
-and age. Age is the time since the newest module time that the sender had seen, so late, replayed and thawed
+and age. Age is the time since the newest feedback that the sender had received, so late, replayed and thawed
 commands are refused without any clock in common.
 """
 
@@ -16,7 +16,7 @@ Command = LeaseRequest | MotionCommand | Setpoint | GainsCommand
 
 
 class Admission:
-    """Decodes and checks what arrives at one module, and counts what it refuses by reason."""
+    """Decodes and checks the messages to one module, and counts refusals by reason."""
 
     def __init__(self, serial: str, boot: int, lifetime_ns: int):
         self._serial = serial

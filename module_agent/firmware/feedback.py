@@ -1,6 +1,6 @@
-"""The last minute of feedback rows, so that nothing that a network drops is lost.
+"""Feedback rows: when one is due, its contents, when a batch is published, and the last minute of them.
 
-When feedback rows are due, what they hold, and when a batch of them is to be published.
+The history lets a receiver ask again for rows that the network has dropped.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ class History:
 
     @property
     def first_row(self) -> int:
-        """The oldest row still kept."""
+        """The number of the oldest row in the ring."""
         return max(0, self.next_row - self.capacity)
 
     def append(self, values: tuple[float, ...]) -> None:
@@ -41,7 +41,7 @@ class History:
         """Return a copy of rows `first` up to and without `end`, shape (end - first,).
 
         Raises:
-            WireError: GONE (overwritten or not yet there), saying which rows are kept.
+            WireError: GONE, a row is overwritten or not yet there; the message has the range available.
         """
         return np.frombuffer(self.block(first, end), dtype=ROW)
 
@@ -49,7 +49,7 @@ class History:
         """Return the bytes of rows `first` up to and without `end`.
 
         Raises:
-            WireError: GONE (overwritten or not yet there), saying which rows are kept.
+            WireError: GONE, a row is overwritten or not yet there; the message has the range available.
         """
         if first > end or first < self.first_row or end > self.next_row:
             raise WireError(
@@ -64,12 +64,12 @@ class History:
         return bytes(ring[start:]) + bytes(ring[: stop - len(ring)])
 
     def between(self, start_ns: int, end_ns: int) -> Rows:
-        """Return a copy of the rows kept whose module time is within a span, both ends included."""
+        """Return a copy of the available rows whose module time is within a span, both ends included."""
         first, end = self._row_from(start_ns), self._row_from(end_ns + 1)
         return self.rows(first, max(first, end))
 
     def _row_from(self, t_ns: int) -> int:
-        """Return the first row kept at or after a module time; rows are in the order of their time."""
+        """Return the first available row at or after a module time; rows are in the order of their time."""
         low, high = self.first_row, self.next_row
         stamps = self._ring["t_ns"]
         while low < high:

@@ -224,8 +224,8 @@ class Firmware:
         self._record = self._record.model_copy(update={"outcome": outcome, "end_row": self.history.next_row})
         if outcome == "done" and self._record.pattern.kind == "rest":
             self.last_rest = self._record
-        # A motion that is broken off holds where it was then, not where it would have ended; and the effort
-        # that moved it there is not the one that holds it.
+        # An interrupted motion holds its last commanded position and not its end; the effort that was fed
+        # forward to move the joint is not the one that holds it.
         if outcome == "done":
             self._command = Command(self._motion.last_position_rad, 0.0, self._motion.last_effort_nm)
         else:
@@ -298,8 +298,9 @@ class Firmware:
         self._refresh(request.echo_ns)
 
     def _refresh(self, echo_ns: int) -> None:
-        """Count the lifetime from what the sender had seen of this module, not from when its command came:
-        a command that was long on the way must not let a motor outlive its commander.
+        """Count the lifetime from the newest feedback that the sender had, not from the command's arrival.
+
+        A command that was long on the way must not keep a motor running after its sender has died.
         """
         self._fresh_ns = max(self._fresh_ns, echo_ns)
 

@@ -1,4 +1,4 @@
-"""Who may command a joint: one holder at a time, with a token that grows with every grant."""
+"""The lease of a joint: one sender may command it at a time, under a token that grows with every grant."""
 
 from module_agent.wire.messages import LeaseRequest
 from module_agent.wire.refusal import Refusal, WireError
@@ -19,11 +19,11 @@ class Lease:
         self._granted: dict[str, tuple[int, int]] = {}
 
     def left_ns(self, now_ns: int) -> int:
-        """Return the time until the lease lapses, 0 when nobody holds it."""
+        """Return the time until the lease lapses, 0 when it has no holder."""
         return max(0, self._until_ns - now_ns) if self.holder is not None else 0
 
     def lapsed(self, now_ns: int) -> bool:
-        """Return whether a holder has let its lease run out."""
+        """Return whether the lease has a holder and has run out."""
         return self.holder is not None and now_ns >= self._until_ns
 
     def acquire(self, request: LeaseRequest, now_ns: int) -> bool:
@@ -59,7 +59,7 @@ class Lease:
         self._until_ns = max(self._until_ns, now_ns + duration_ns)
 
     def release(self) -> None:
-        """Let go; the token stays, so that old commands stay refused."""
+        """End the lease; the token stays, so that old commands stay refused."""
         self.holder = None
         self._until_ns = 0
 
@@ -67,7 +67,7 @@ class Lease:
         """Check that a command comes from the present holder under the present token.
 
         Raises:
-            WireError: HELD by somebody else, or NO_LEASE.
+            WireError: HELD, the lease has another holder; NO_LEASE, it has none or another token.
         """
         if self.holder is None:
             raise WireError(Refusal.NO_LEASE, f"{sender} holds no lease: acquire it first")

@@ -1,14 +1,14 @@
 """The states of a module and their transitions, as a table.
 
-    idle       nobody holds the lease; motor off
+    idle       no lease; motor off
     armed      leased; holds the last set position
     moving     leased; a motion pattern runs on the module
     streaming  leased; follows setpoints from the network
-    expired    no fresh command within the lifetime; the expiry action runs until somebody acquires again
-    stopped    somebody said stop; motor holds still by damping until somebody acquires again
-    fault      the module protects itself (over-temperature); motor off until the cause is gone and re-armed
+    expired    no fresh command within the lifetime; the expiry action runs until the lease is acquired again
+    stopped    a stop or the M-stop; the motor is damped until the lease is acquired again
+    fault      the module protects itself (over-temperature); motor off until it has cooled and is acquired
 
-What is not in the table cannot happen; a command that would need it is refused.
+A transition that is not in the table does not exist; a command that needs it is refused.
 """
 
 from typing import Literal
@@ -54,5 +54,5 @@ TRANSITIONS: dict[tuple[State, Trigger], State] = {
     ("fault", "stop"): "fault",
 }
 
-# States in which the motor follows commands, so that it must hear from their sender within the lifetime.
+# States in which the motor follows commands, whose sender must renew them within the lifetime.
 COMMANDED: frozenset[State] = frozenset({"armed", "moving", "streaming"})

@@ -32,7 +32,7 @@ class BusClient:
 
     Raises:
         HardwareLost: no world listens in time, or it speaks another version.
-        BusRefused: the world knows no such serial, or an agent has it already.
+        BusRefused: the world has no such serial, or another agent serves it.
     """
 
     def __init__(self, path: str, serials: Sequence[str], connect_timeout_s: float = 10.0):

@@ -4,7 +4,7 @@ The line runs where every kind of module has one: the firmware hands over target
 closes its loops inside. Real modules do so behind an Ethernet port, at a rate that a network could not keep;
 a simulated one does so in `loop_inside`. On this side of the line is what hangs on the lease, on how fresh
 commands are and on motions: who may command, the command lifetime of the firmware and its expiry action,
-states, motions. On the other side is what a module does by itself, whatever it is told: loops and gains,
+states, motions. On the other side is what a module does by itself, whatever it is commanded: loops and gains,
 limits of position and temperature, the brake, and a watchdog that turns the motor off when no commands come.
 """
 
@@ -70,7 +70,7 @@ class ModuleSample(NamedTuple):
 
 
 class ModuleInformation(NamedTuple):
-    """What a module says of itself; periods in its own clock, gains as they are in force.
+    """The description of one module; periods in its own clock, gains as they are in force.
 
     serial is unique and never changes; its user gives it a name, and the same family to all of one robot.
     """
@@ -93,7 +93,7 @@ class Modules(Protocol):
     """The modules of one agent process. A tick is one `receive` and then one `send`.
 
     `LoopInside` implements it for simulated modules; `tests/module_agent/hardware` has what every
-    implementation must fulfil. What a driver of HEBI's modules does for each method is said there.
+    implementation must fulfil. Each method below says what it means for a real HEBI module.
     """
 
     @property
@@ -141,10 +141,10 @@ class Modules(Protocol):
     def set_lifetime(self, index: int, lifetime_ns: int) -> None:
         """Set how long a module follows a command when no other comes: then its motor is off.
 
-        It guards against an agent that has died; whose commander has died, the firmware sees itself, and runs
-        its expiry action.
+        It guards against an agent that has died. Against a coordinator that has died the firmware has a
+        lifetime of its own, with an expiry action.
 
-        HEBI: `command_lifetime`. While it runs a module refuses other senders.
+        HEBI: `command_lifetime`. While a command lives the module refuses other senders.
 
         Raises:
             ValueError: a lifetime that is not positive.

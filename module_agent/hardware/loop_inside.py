@@ -1,8 +1,9 @@
 """Simulated modules behind the contract of real ones: the loops that a real module closes inside.
 
-What is inside a module lives here: the loops and their gains, the guard of the motor, and the watchdog that
-turns the motor off when no commands come. Every reason for this to act is in the module itself. What hangs on
-the lease, on how fresh commands are and on motions is the firmware's, which says it in commands.
+The loops and their gains, the motor guard (limits of position and temperature), the brake and the watchdog
+that turns the motor off when no commands come are here, because they depend on nothing but the module. What
+depends on the lease, on the freshness of commands and on motions stays in the firmware: it decides between
+motor off, hold and brake on expiry, and expresses the decision as a command.
 """
 
 from collections.abc import Sequence
@@ -90,7 +91,7 @@ class LoopInside:
 
     @property
     def identified(self) -> tuple[str, ...]:
-        """The serials of the modules that show which one they are."""
+        """The serials of the marked modules."""
         return tuple(drive.module.serial for drive in self._drives if drive.identified)
 
     def receive(self) -> list[ModuleSample]:
@@ -153,7 +154,7 @@ class LoopInside:
         self._drives[index].lifetime_ns = lifetime_ns
 
     def identify(self, index: int, on: bool) -> None:
-        """Remember which modules are to show which one they are; nothing can be seen of it."""
+        """Set or clear the mark of a module, see `identified`; a simulated module has no LED."""
         self._drives[index].identified = on
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""What a module keeps its motor from, whatever commands it: heat, the ends of its range, its own momentum."""
+"""The output stage of a module: limits of temperature and position, and the brake."""
 
 from module_agent.control.controller import NOMINAL_VOLTAGE_V
 from module_agent.hardware.hardware import LimitState, SensorSample

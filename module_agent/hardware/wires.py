@@ -7,7 +7,7 @@ from module_agent.hardware.hardware import SensorSample
 
 
 class WiredModule(NamedTuple):
-    """What the wires say of one module before its first tick. Periods in the module's own clock."""
+    """The description of one simulated module before its first tick. Periods in the module's own clock."""
 
     serial: str
     module_type: str

@@ -21,24 +21,24 @@ STOP_TIMEOUT_S = 5.0
 WATCH_S = 0.1
 LOGS = "logs"
 # The file systems' limit is 255 bytes.
-_LONGEST_NAME = 100
+_MAX_NAME = 100
 _PR_SET_PDEATHSIG = 1
 
 
 class LaunchError(RobotError):
-    """A process did not come up or died; the message says which and what it printed last."""
+    """A process did not start or ended early; the message has its name and its last output."""
 
 
-def _nowhere_else(process: str) -> tuple[str, ...]:
+def _directly(process: str) -> tuple[str, ...]:
     return ()
 
 
 class LaunchConfig(NamedTuple):
-    """What is started; `processes` is how many agent processes share the modules (None: one each).
+    """The settings of a launch; `processes` is how many agent processes share the modules (None: one each).
 
     `pushes` are on the world, as its option `--push` takes them.
-    `within` is told the name of a process ("world", "coordinator", or "agent" and its serials) and returns
-    the words that go before its command, such as `nsenter` and a network namespace.
+    `within` maps the name of a process ("world", "coordinator", or "agent" and its serials) to the command
+    that it is run by, such as `nsenter` with a network namespace.
     """
 
     robot_file: str
@@ -53,12 +53,12 @@ class LaunchConfig(NamedTuple):
     processes: int | None = None
     coordinator_options: tuple[str, ...] = ()
     agent_options: tuple[str, ...] = ()
-    within: Callable[[str], tuple[str, ...]] = _nowhere_else
+    within: Callable[[str], tuple[str, ...]] = _directly
     pushes: tuple[str, ...] = ()
 
 
 class Child(NamedTuple):
-    """A started process, where its output goes, and what it prints there when it is up."""
+    """A started process, its log, and the text `up` that it prints there when it is ready."""
 
     name: str
     process: "subprocess.Popen[bytes]"
@@ -74,12 +74,13 @@ def _die_with_parent() -> None:
 class Launcher:
     """Starts, watches and stops the processes of one robot. Use as a context manager.
 
-    What a process prints is kept in `logs/` of the run's folder; `say` is told who is up and who has ended.
+    The output of the processes goes to `logs/` of the run's folder; `report` is called with one line whenever
+    a process is ready or has ended.
     """
 
-    def __init__(self, config: LaunchConfig, say: Callable[[str], None]):
+    def __init__(self, config: LaunchConfig, report: Callable[[str], None]):
         self.config = config
-        self._say = say
+        self._report = report
         self._folder = tempfile.TemporaryDirectory(prefix="x5-")
         self.bus = str(Path(self._folder.name) / "bus")
         self.children: list[Child] = []
@@ -104,7 +105,7 @@ class Launcher:
             arguments += ["--push", push]
         world = self._start("world", arguments)
         self._wait(lambda: os.path.exists(self.bus), world, "its bus")
-        self._say("world: bus open")
+        self._report("world: bus open")
         return world
 
     def start_agents(self) -> list[Child]:
@@ -138,7 +139,7 @@ class Launcher:
     def _log(self, name: str) -> Path:
         folder = self.config.out / LOGS
         folder.mkdir(parents=True, exist_ok=True)
-        stem = name.replace(" ", "-").replace("/", "-")[:_LONGEST_NAME]
+        stem = name.replace(" ", "-").replace("/", "-")[:_MAX_NAME]
         taken = [child.log for child in self.children]
         paths = [folder / f"{stem}.log", *(folder / f"{stem}-{k}.log" for k in range(2, len(taken) + 3))]
         return next(path for path in paths if path not in taken)
@@ -158,14 +159,14 @@ class Launcher:
             )
         child = Child(name, process, log, up)
         self.children.append(child)
-        self._say(f"{name}: process {process.pid}")
+        self._report(f"{name}: process {process.pid}")
         return child
 
     def _wait(self, ready: Callable[[], bool], child: Child, what: str) -> None:
         end = time.monotonic() + START_TIMEOUT_S
         while not ready():
             if child.process.poll() is not None:
-                raise LaunchError(_obituary(child))
+                raise LaunchError(_ending(child))
             if time.monotonic() > end:
                 raise LaunchError(f"{child.name} did not open {what} within {START_TIMEOUT_S:.0f} s")
             time.sleep(0.02)
@@ -179,8 +180,7 @@ class Launcher:
     def watch(self, coordinator: Child) -> int:
         """Watch until the coordinator ends, and return its exit code (128 + n if signal n ended it).
 
-        An agent that ends early is named with its last words, and how the run ends is the coordinator's to
-        say.
+        An agent that ends early is reported with its last output; the coordinator decides how to go on.
 
         Raises:
             LaunchError: the world ended early, so that there is no robot any more.
@@ -191,15 +191,15 @@ class Launcher:
         return code if code >= 0 else 128 - code
 
     def look(self, coordinator: Child) -> None:
-        """Say once of every process that it has come up, and that it has ended; see `watch`."""
+        """Report once for every process that it is ready and that it has ended; see `watch`."""
         for child in [each for each in self._waited_for if each.up in whole_log(each)]:
             self._waited_for.remove(child)
-            self._say(f"{child.name}: {child.up}")
+            self._report(f"{child.name}: {child.up}")
         for child in [each for each in self.dead() if each not in self._ended and each != coordinator]:
             self._ended.append(child)
             if child.name == "world":
-                raise LaunchError(_obituary(child))
-            self._say(_obituary(child))
+                raise LaunchError(_ending(child))
+            self._report(_ending(child))
 
     def stop(self) -> None:
         """Stop everything, coordinator first and world last, and remove the bus. May be called twice."""
@@ -228,10 +228,10 @@ def whole_log(child: Child) -> str:
     return child.log.read_text(errors="replace")
 
 
-def last_words(child: Child) -> str:
+def last_output(child: Child) -> str:
     """Return the last lines that a process printed."""
     return " / ".join(whole_log(child).strip().splitlines()[-3:])
 
 
-def _obituary(child: Child) -> str:
-    return f"{child.name} ended with {child.process.returncode}: {last_words(child) or 'without a word'}"
+def _ending(child: Child) -> str:
+    return f"{child.name} ended with {child.process.returncode}: {last_output(child) or 'no output'}"

@@ -1,8 +1,8 @@
 """`python -m sim.processes.link_emulator`: a network in user space between network namespaces.
 
-Every host is a namespace with a TUN interface; what it sends is read here and written to the host that it is
-for, at the time and if the profile has it so. So TCP itself meets delay, loss and reordering, and no queueing
-discipline of the kernel is needed.
+Every host is a namespace with a TUN interface. Its packets are read here and written to their destination
+with the delay, loss and reordering of the profile. So TCP itself is impaired, and no queueing discipline of
+the kernel is needed.
 """
 
 import argparse
@@ -24,11 +24,11 @@ from module_agent.network_emulation.profile_file import network as network_named
 from sim.processes.network_namespace import open_tun
 from sim.processes.packet_switch import LinkCounts, PacketSwitch
 
-# What it says when packets pass.
+# Printed when packets pass.
 UP = "the links are up"
-_LONGEST_PACKET_BYTES = 65_535
-# How long it may take to notice that it is to end.
-_LOOK_S = 0.1
+_MAX_PACKET_BYTES = 65_535
+# How often the loop checks whether it has been ended.
+_POLL_S = 0.1
 
 
 class Host(NamedTuple):
@@ -42,7 +42,7 @@ def host(text: str) -> Host:
     """Read a host as it is given on the command line, such as `/proc/4711/ns/net=10.77.0.1/24`.
 
     Raises:
-        UsageError: it is of another form; the message says what would be right.
+        UsageError: the text has another form; the message shows an example.
     """
     namespace, _, address = text.rpartition("=")
     try:
@@ -58,7 +58,7 @@ def forward(tuns: Sequence[int], switch: PacketSwitch, ended: Callable[[], bool]
     """Pass packets between the hosts' descriptors until it is ended.
 
     Raises:
-        OSError: a host's interface is gone.
+        OSError: the interface of a host has been closed.
     """
     index_of = {tun: index for index, tun in enumerate(tuns)}
     start_s = time.monotonic()
@@ -67,12 +67,12 @@ def forward(tuns: Sequence[int], switch: PacketSwitch, ended: Callable[[], bool]
         for destination, packet in switch.due(now_s):
             with suppress(BlockingIOError):  # a full queue drops, as any link's does
                 os.write(tuns[destination], packet)
-        wait_s = _LOOK_S if switch.next_s is None else min(_LOOK_S, max(0.0, switch.next_s - now_s))
+        wait_s = _POLL_S if switch.next_s is None else min(_POLL_S, max(0.0, switch.next_s - now_s))
         readable, _, _ = select.select(tuns, (), (), wait_s)
         now_s = time.monotonic() - start_s
         for tun in readable:
             with suppress(BlockingIOError):
-                switch.take(now_s, index_of[tun], os.read(tun, _LONGEST_PACKET_BYTES))
+                switch.take(now_s, index_of[tun], os.read(tun, _MAX_PACKET_BYTES))
 
 
 def counts_by_address(
@@ -111,7 +111,7 @@ def main() -> int:
     try:
         forward(tuns, switch, lambda: bool(ended))
     except OSError as error:
-        print(f"link emulator: the interface of a host is gone: {error}", file=sys.stderr)
+        print(f"link emulator: the interface of a host has been closed: {error}", file=sys.stderr)
         return EXIT_LOST
     finally:
         if asked.counts is not None:

@@ -28,7 +28,7 @@ _IFF_NO_PI = 0x1000
 
 
 class NamespaceError(RobotError):
-    """The machine does not allow it; the message says what is missing."""
+    """The machine cannot make network namespaces or interfaces; the message names what is missing."""
 
 
 class NetworkNamespace:
@@ -64,7 +64,7 @@ class NetworkNamespace:
 
     @property
     def prefix(self) -> tuple[str, ...]:
-        """The words that, before a command, run it in the namespace."""
+        """The command that runs the command after it in the namespace."""
         return ("nsenter", f"--net={self.path}")
 
     def close(self) -> None:
@@ -91,15 +91,17 @@ class NetworkNamespace:
             time.sleep(0.005)
         if self._holder.poll() is None:
             self._holder.kill()
-        said = self._holder.communicate()[1].decode(errors="replace").strip()
-        raise NamespaceError(f"no network namespace: {said or 'unshare does not get there'}")
+        reason = self._holder.communicate()[1].decode(errors="replace").strip()
+        raise NamespaceError(
+            f"no network namespace: {reason or f'unshare is not ready after {OPEN_TIMEOUT_S:.0f} s'}"
+        )
 
 
 def open_tun(namespace: Path, address: IPv4Interface) -> int:
     """Give a namespace an interface with this address; return the descriptor of its packets, not blocking.
 
-    What is sent there to the address' network can be read, one IP packet at a time, and what is written
-    arrives. The interface is gone when the descriptor is closed.
+    A read returns one IP packet that was sent in the namespace to the address' network; a written packet
+    arrives there. The interface ends when the descriptor is closed.
 
     Raises:
         NamespaceError: the machine does not allow it.
@@ -109,17 +111,17 @@ def open_tun(namespace: Path, address: IPv4Interface) -> int:
     thread = threading.Thread(target=lambda: opened.append(_tun_within(namespace)))
     thread.start()
     thread.join()
-    (found,) = opened
-    if isinstance(found, OSError):
-        raise NamespaceError(f"no TUN interface: {found}") from found
-    for words in (("addr", "add", str(address), "dev", INTERFACE), ("link", "set", INTERFACE, "up")):
+    (tun,) = opened
+    if isinstance(tun, OSError):
+        raise NamespaceError(f"no TUN interface: {tun}") from tun
+    for arguments in (("addr", "add", str(address), "dev", INTERFACE), ("link", "set", INTERFACE, "up")):
         done = subprocess.run(
-            ["nsenter", f"--net={namespace}", "ip", *words], capture_output=True, text=True, check=False
+            ["nsenter", f"--net={namespace}", "ip", *arguments], capture_output=True, text=True, check=False
         )
         if done.returncode:
-            os.close(found)
-            raise NamespaceError(f"ip {' '.join(words)}: {done.stderr.strip()}")
-    return found
+            os.close(tun)
+            raise NamespaceError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
+    return tun
 
 
 def _tun_within(namespace: Path) -> int | OSError:

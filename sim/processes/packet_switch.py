@@ -1,4 +1,4 @@
-"""IP packets between hosts, late, lost, stalled, out of order or twice: a network profile on real packets."""
+"""IP packets between hosts under a network profile: delayed, lost, stalled, reordered or duplicated."""
 
 import heapq
 import itertools
@@ -18,7 +18,7 @@ _MIN_HEADER_BYTES = 20
 
 
 class LinkCounts(NamedTuple):
-    """What became of the packets of one direction; `delay_s` is the sum over those that were sent on."""
+    """The counts of packets of one direction; `delay_s` is the sum over those that were forwarded."""
 
     taken: int = 0
     lost: int = 0
@@ -37,13 +37,13 @@ class _Link:
 
 
 class PacketSwitch:
-    """Takes packets from hosts and gives them to others at the times of their fates.
+    """Takes packets from hosts and forwards them at the times that the profile gives.
 
     The first host is the coordinator's, the others are modules'. Every direction between two hosts is a link
     of its own, with the profile's path to its receiver and draws of its own: a radio of every module. Packets
     of a link keep their order but for the fraction `reorder`. In the profile's partitions nothing passes to
     or from the coordinator.
-    Packets for nobody here are dropped without a count, as are those that are not IPv4.
+    Packets with another destination are dropped without a count, as are those that are not IPv4.
     """
 
     def __init__(self, hosts: Sequence[IPv4Address], profile: NetworkProfile, seed: int):
@@ -65,7 +65,7 @@ class PacketSwitch:
 
     @property
     def counts(self) -> dict[tuple[int, int], LinkCounts]:
-        """What became of the packets so far, by the indices of the sending and the receiving host."""
+        """The counts of packets so far, by the indices of the sending and the receiving host."""
         return {pair: link.counts for pair, link in self._links.items()}
 
     def take(self, t_s: float, source: int, packet: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Pushes: what somebody's hand, or an obstacle, does to a simulated robot from outside for a while."""
+"""Pushes: external wrenches on a simulated robot, as of a hand or an obstacle, for a limited time."""
 
 import re
 import tomllib
@@ -12,8 +12,8 @@ from sim.geometry.link_parts import Xyz
 
 _NOTHING = (0.0, 0.0, 0.0)
 _EXAMPLE = "serial=X-00011,force_n=[0,0,-10],from_s=2,for_s=0.5"
-# A bare serial is no TOML; on a command line its quotation marks would have to be protected from the shell.
-_BARE_SERIAL = re.compile(r"(?<![\w-])serial\s*=\s*(?![\s\"'])([^,\s]+)")
+# Serials may be given without quotation marks, which a command line would have to protect from the shell.
+_UNQUOTED_SERIAL = re.compile(r"(?<![\w-])serial\s*=\s*(?![\s\"'])([^,\s]+)")
 
 Newton = Annotated[float, Field(ge=-1e4, le=1e4)]
 NewtonMetre = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -21,7 +21,7 @@ Second = Annotated[float, Field(ge=0.0, le=1e6)]
 
 
 class Push(BaseModel):
-    """A wrench on what the joint of module `serial` turns, from `from_s` on for `for_s` of world time [s].
+    """A wrench on the body that the joint of module `serial` turns, from `from_s` on for `for_s` [s, world].
 
     `force_n` and `torque_nm` are in world axes (z up) and keep their directions while the robot moves. The
     force acts at `at_m`: a point that moves with the body, in the body's frame of `sim.robot.robot_tree` (the
@@ -44,24 +44,24 @@ class Push(BaseModel):
         return self
 
     def acts(self, t_ns: int) -> bool:
-        """Whether it pushes at a world time [ns]."""
+        """Return whether the wrench acts at a world time [ns]."""
         return round(self.from_s * 1e9) <= t_ns and not self.is_over(t_ns)
 
     def is_over(self, t_ns: int) -> bool:
-        """Whether it has pushed for its time at a world time [ns]."""
+        """Return whether the wrench has ended at a world time [ns]."""
         return t_ns >= round((self.from_s + self.for_s) * 1e9)
 
 
 def parse_push(text: str) -> Push:
-    """Parse keys and values as of a TOML table in one line, such as the example in every error's message.
+    """Parse a push from `key=value` pairs as in an inline TOML table; every error shows an example.
 
     Raises:
-        ValueError: the text describes no push; the message says which key is wrong.
+        UsageError: the text is no push; the message names the key that is wrong.
     """
-    quoted = _BARE_SERIAL.sub(r'serial="\1"', text)
+    quoted = _UNQUOTED_SERIAL.sub(r'serial="\1"', text)
     try:
-        found: object = tomllib.loads(f"push = {{{quoted}}}")["push"]
-        return Push.model_validate(found)
+        table: object = tomllib.loads(f"push = {{{quoted}}}")["push"]
+        return Push.model_validate(table)
     except tomllib.TOMLDecodeError as error:
         raise UsageError(f"{text!r} is no push: {error}; one is {_EXAMPLE}") from error
     except ValidationError as error:
@@ -79,10 +79,10 @@ def _fault(error: dict[str, object]) -> str:
 
 
 def check_pushed(push: Push, serials: Sequence[str]) -> None:
-    """Make sure that a push is on one of the modules.
+    """Check that a push is on one of the modules.
 
     Raises:
-        ValueError: it is not; the message lists them.
+        UsageError: it is not; the message lists them.
     """
     if push.serial not in serials:
         raise UsageError(

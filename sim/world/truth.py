@@ -1,8 +1,7 @@
-"""What the simulator knows and the coordinator must find out, in files for whoever scores a run.
+"""The true parameters and motion of a simulated robot, in files against which a run is scored.
 
-`truth.json` holds the robot's constants, `truth.npz` the true motion. A file is the complete old or new one.
-
-A world that takes down its own truth with every step, to be served on the bus.
+`truth.json` holds the robot's constants, `truth.npz` the true motion, as a `TruthLog` records it. Files are
+replaced atomically.
 """
 
 import io
@@ -100,7 +99,7 @@ def read_truth(path: Path) -> Truth:
     document = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(document, dict) or document.get("version") != VERSION:
         raise DataError(f"{path}: not a truth file of version {VERSION}")
-    # Files of runs before sensors had more than biases lack the rest of their errors.
+    # Older files have the sensors' biases only.
     clocks, bias, errors = document["clocks"], document["imu_bias"], document.get("sensor_errors")
     return Truth(
         robot=document["robot"],
@@ -128,7 +127,7 @@ class TruthLog:
         self._rows: list[tuple[Array, Array, Array]] = []
 
     def record(self) -> None:
-        """Take down the instant of the last samples if it is due."""
+        """Record the instant of the last samples if it is due."""
         if self._ticks % self._every == 0:
             plant = self._world.plant
             self._t_ns.append(plant.t_ns)
@@ -182,7 +181,7 @@ def _replace(path: Path, content: bytes) -> None:
 
 
 class LoggedWorld:
-    """Steps a world and records it in a `TruthLog`."""
+    """Steps a world and records its truth in `log`; to be served on the bus."""
 
     def __init__(self, world: World):
         self._world = world

@@ -57,9 +57,9 @@ class World:
     that instant on the module's clock, and so is `imu_t_ns` in the ticks in which the IMU is read. In between
     the last IMU values are repeated with their own time.
 
-    The world begins at rest, the modules' joints where the robot file has them and everything that gives
-    sagged under its weight. `noise_seed` draws the sensors' noise and drift anew for the same modules, as on
-    another day; what the modules are hangs on `seed` alone. `pushes` act from outside, each in its time.
+    The world begins at rest, the modules' joints where the robot file has them and all compliant joints at
+    their static deflection. `noise_seed` draws the sensors' noise and drift anew for the same modules, as on
+    another day; the modules' parameters depend on `seed` alone. `pushes` are external wrenches.
 
     Raises:
         ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number, a push is on no module, or the
@@ -140,10 +140,10 @@ class World:
         self._windings.above_k[:] = above_ambient_k
 
     def push(self, push: Push) -> None:
-        """Push from outside, in its time; may be called between any two steps.
+        """Add an external wrench; may be called between any two steps.
 
         Raises:
-            ValueError: on no module of this robot.
+            UsageError: the robot has no such module.
         """
         check_pushed(push, self.robot.serials)
         self._pushes.append(push)
@@ -151,7 +151,7 @@ class World:
     def become(self, robot: Robot) -> None:
         """Go on as a robot with the same modules and joints but other links or payloads, moving as before.
 
-        Whatever is added is taken to move along already: it comes on without a blow.
+        Added mass moves with its body from the first instant on: there is no impact.
 
         Raises:
             ValueError: other modules, or another number of joints that give.
@@ -190,8 +190,8 @@ class World:
         actuators, q, qd = self._actuators, self._q, self._qd
         motor = actuators.motor_rad
         # The integrator is a leapfrog: its velocities live half a tick before its positions, but it takes
-        # velocity forces as if they were of the same instant. So it is handed what they lack of those at the
-        # velocity that the last acceleration predicts for this instant.
+        # velocity forces as if they were of the same instant. The difference to the velocity forces at the
+        # velocity that the last acceleration predicts for this instant is added.
         self._rates[0], self._rates[1] = qd + self._ahead, qd
         mass, biases = self._tree.mass_and_biases(q, self._rates)
         if self._pushes:
@@ -227,7 +227,7 @@ class World:
         return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
 
     def _pushed(self, q: Array) -> Array:
-        """Return what the pushes of this instant do to all joints (m,), and forget those that are over."""
+        """Return the generalised forces (m,) of the pushes at this instant; drop those that have ended."""
         self._pushes = [push for push in self._pushes if not push.is_over(self.t_ns)]
         load = np.zeros_like(q)
         for push in (one for one in self._pushes if one.acts(self.t_ns)):
@@ -237,9 +237,9 @@ class World:
         return load
 
     def _rehearse(self, sensors: Sensors) -> None:
-        """Call all that is compiled at its first call, which would take seconds out of real time."""
+        """Call every function that is compiled at its first call, which would stop real time for seconds."""
         still, idle = np.zeros_like(self._q), np.zeros(len(self._joints))
-        self._felt = self._tree.feel(self._q, still, still)
+        self._imu_readings = self._tree.feel(self._q, still, still)
         mass, biases = self._tree.mass_and_biases(self._q, self._rates)
         self._tree.reach(self._q, 0, *np.zeros((3, 3)))
         actuators = copy(self._actuators)
@@ -249,7 +249,7 @@ class World:
 
     def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:
         if self._sensors.imu_due(self._tick):
-            self._felt = self._tree.feel(q, rate, change)
+            self._imu_readings = self._tree.feel(q, rate, change)
         return self._sensors.read(self._tick, self._instant(q, rate))
 
     def _instant(self, q: Array, rate: Array) -> Instant:
@@ -263,8 +263,8 @@ class World:
             current_a=actuators.current_a,
             winding_c=self._windings.winding_c,
             voltage_v=actuators.voltage_v,
-            gyro_rad_s=self._felt[0],
-            specific_force_m_s2=self._felt[1],
+            gyro_rad_s=self._imu_readings[0],
+            specific_force_m_s2=self._imu_readings[1],
         )
 
 

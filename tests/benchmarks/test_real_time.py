@@ -18,7 +18,7 @@ from module_agent.wire.codec import MAX_MESSAGE_BYTES, decode
 from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf, every
 from module_agent.wire.messages import Feedback
-from sim.processes.launcher import Child, LaunchConfig, Launcher, last_words, stop_child
+from sim.processes.launcher import Child, LaunchConfig, Launcher, last_output, stop_child
 from sim.robot.robot_file import load_robot
 
 pytestmark = pytest.mark.benchmark
@@ -67,7 +67,7 @@ class Ear:
     def wait_for(self, serials: tuple[str, ...], world: Child) -> None:
         end = time.monotonic() + STARTUP_S
         while set(serials) - set(self.newest_ns):
-            assert world.process.poll() is None, last_words(world)
+            assert world.process.poll() is None, last_output(world)
             assert time.monotonic() < end, f"only {sorted(self.newest_ns)} were heard"
             time.sleep(0.1)
 
@@ -129,7 +129,7 @@ def test_sixteen_modules_in_real_time(tmp_path: Path, endpoint: str, processes: 
         _measure(ear, {**children, "listener": [os.getpid()]}, robot.serials)
         for child in (world, *agents):
             stop_child(child)
-        print(f"  the world, start included: {last_words(world)}")
+        print(f"  the world, start included: {last_output(world)}")
     ear.close()
 
 
@@ -161,5 +161,5 @@ def test_sixteen_modules_in_real_time_while_they_move(tmp_path: Path, endpoint: 
         if coordinator.process.poll() is None:
             _measure(ear, children, robot.serials)
         else:
-            print(f"  too fast for this machine: {last_words(coordinator)}")
+            print(f"  too fast for this machine: {last_output(coordinator)}")
         ear.close()

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from module_agent import main as agent_program
 from module_agent.hardware.hardware import HardwareLost
 from module_agent.main import app
+from module_agent.model.errors import UsageError
 from module_agent.network_emulation.impaired_transport import ImpairedTransport, inject
 from module_agent.network_emulation.profile import NetworkProfile, PathProfile, profile
 from module_agent.transport.endpoint import check_endpoint
@@ -83,8 +84,8 @@ def test_what_zenoh_can_listen_on_is_an_endpoint(good: str) -> None:
     "bad",
     ["", "tcp", "tcp/", "tcp/:7447", "tcp/host:", "tcp/host:0", "tcp/host:65536", "tcp/host:x", "a/b:1"],
 )
-def test_what_no_network_can_mend_is_no_endpoint(bad: str) -> None:
-    with pytest.raises(ValueError, match="endpoint"):
+def test_an_endpoint_that_can_never_be_used_is_refused(bad: str) -> None:
+    with pytest.raises(UsageError, match="endpoint"):
         check_endpoint(bad)
 
 

@@ -220,7 +220,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     made.launcher.stop()
 
 
-def test_an_agent_that_ends_early_is_named_with_its_last_words_and_the_coordinator_decides(
+def test_an_agent_that_ends_early_is_named_with_its_last_output_and_the_coordinator_decides(
     bench: Bench,
 ) -> None:
     bench.start("world", SLEEP)
