@@ -73,13 +73,13 @@ def fit_part(problem: Problem, some: slice) -> WeightedFit:
         DataError: a joint with too few samples.
     """
     return fit_weighted(
-        problem.regressor[some],
-        problem.log.tau_nm[some],
-        problem.columns.scale,
-        problem.moving[some],
-        problem.choice.robust,
-        problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
-        None if problem.instruments is None else problem.instruments[some],
+        regressor=problem.regressor[some],
+        tau_nm=problem.log.tau_nm[some],
+        scale=problem.columns.scale,
+        used=problem.moving[some],
+        robust=problem.choice.robust,
+        least_correlation=problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
+        instruments=None if problem.instruments is None else problem.instruments[some],
     )
 
 

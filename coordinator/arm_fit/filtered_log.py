@@ -95,7 +95,14 @@ def filtered_log(log: JointLog, cutoff_hz: float, max_count: int | None = None) 
             "higher cut-off is needed"
         )
     t_ns = np.round(np.arange(len(log.q_rad)) * (NS_PER_S / log.rate_hz)).astype(np.int64)
-    motion = filtered_motion(t_ns, log.q_rad, log.qd_rad_s, log.tau_nm, log.rate_hz, cutoff_hz)
+    motion = filtered_motion(
+        t_ns=t_ns,
+        q_rad=log.q_rad,
+        qd_rad_s=log.qd_rad_s,
+        tau_nm=log.tau_nm,
+        rate_hz=log.rate_hz,
+        cutoff_hz=cutoff_hz,
+    )
     raw = log.tau_nm[edge : len(log.tau_nm) - edge]
     size = float(np.linalg.norm(raw))
     step = max(1, int(log.rate_hz / (_KEPT_PER_CUTOFF * cutoff_hz)))

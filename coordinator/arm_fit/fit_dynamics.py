@@ -112,11 +112,13 @@ def fit_dynamics(
         elsewhere=elsewhere,
     )
     if result.consistent is None:
-        return ArmFit(robot, result.report, None, None, None, None)
+        return ArmFit(robot=robot, report=result.report, bodies=None, phi=None, friction=None, urdf=None)
     found = result.consistent
     friction = friction_of(posed.drives, found.drives.tolist(), len(robot.bodies))
     text = fitted_urdf_text(robot, found.bodies, friction)
-    return ArmFit(robot, result.report, found.bodies, found.phi, friction, text)
+    return ArmFit(
+        robot=robot, report=result.report, bodies=found.bodies, phi=found.phi, friction=friction, urdf=text
+    )
 
 
 def _name(source: str | Path | UrdfRobot | JointLog) -> str:

@@ -172,7 +172,14 @@ def _share(
     _, sigma_alone = _combinations(own, *alone)
     value, sigma_merged = _combinations(own, *merged)
     inconsistency_sigma = float(np.sqrt(np.mean(((value - own.value) / own.sigma) ** 2)))
-    return RunShare(run.name, run.chain.serials, own, sigma_alone, sigma_merged, inconsistency_sigma)
+    return RunShare(
+        name=run.name,
+        serials=run.chain.serials,
+        base=own,
+        sigma_alone=sigma_alone,
+        sigma_merged=sigma_merged,
+        inconsistency_sigma=inconsistency_sigma,
+    )
 
 
 def _combinations(base: BaseParameters, rows: Array, target: Array) -> tuple[Array, Array]:

@@ -122,7 +122,15 @@ def base_summary(base: BaseParameters) -> str:
 def _known_alone(name: str, unit: str, place: int, value: float, sigma: float) -> Identifiability:
     ratio = sigma / abs(value) if value else np.inf
     kind: Kind = "identified" if ratio <= WEAK_ABOVE else "weak"
-    return Identifiability(name, kind, value, sigma, (place,), (), f"{kind}: {_figures(value, sigma, unit)}")
+    return Identifiability(
+        name=name,
+        kind=kind,
+        value=value,
+        sigma=sigma,
+        base_parameters=(place,),
+        lumped_with=(),
+        summary=f"{kind}: {_figures(value, sigma, unit)}",
+    )
 
 
 def _in_combination(
@@ -130,14 +138,36 @@ def _in_combination(
 ) -> Identifiability:
     if not places:
         summary = "not identifiable: without effect on torques"
-        return Identifiability(name, "not identifiable", None, None, (), (), summary)
+        return Identifiability(
+            name=name,
+            kind="not identifiable",
+            value=None,
+            sigma=None,
+            base_parameters=(),
+            lumped_with=(),
+            summary=summary,
+        )
     more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
     where = f"in combination with {', '.join(others[:_NAMED])}{more}"
     if sigma <= WEAK_ABOVE * abs(value):
         summary = f"weak: {_figures(value, sigma, unit)} by the prior, only {where}"
-        return Identifiability(name, "weak", value, sigma, places, others, summary)
+        return Identifiability(
+            name=name,
+            kind="weak",
+            value=value,
+            sigma=sigma,
+            base_parameters=places,
+            lumped_with=others,
+            summary=summary,
+        )
     return Identifiability(
-        name, "not identifiable", None, None, places, others, f"not identifiable: only {where}"
+        name=name,
+        kind="not identifiable",
+        value=None,
+        sigma=None,
+        base_parameters=places,
+        lumped_with=others,
+        summary=f"not identifiable: only {where}",
     )
 
 

@@ -109,7 +109,13 @@ def solve_instrumental_variables(
         phi, before = informed.phi, scale
         if scale_sigma:
             scale = refine_scale(
-                left, fit.phi, sigma, scale_sigma, scale, independent_fraction, ESTIMATED_CHAIN_TOLERANCE
+                information=left,
+                phi=fit.phi,
+                noise_nm=sigma,
+                prior_sigma=scale_sigma,
+                so_far=scale,
+                independent_fraction=independent_fraction,
+                tolerance=ESTIMATED_CHAIN_TOLERANCE,
             )
         if max(moved, np.abs(scale.value - before.value).max()) < _SETTLED:
             break

@@ -108,7 +108,14 @@ def solve_information(
     sigma = _residual(information, system, inverse @ along[kept], left)[1]
     variance = np.diagonal(spread(left, (sigma * system.weights) ** 2)) / independent_fraction
     kept[kept] = variance < (max_sigma_kg * whole.values[kept]) ** 2
-    return _fit(information, system, whole, along, kept, independent_fraction)
+    return _fit(
+        information=information,
+        system=system,
+        whole=whole,
+        along=along,
+        kept=kept,
+        independent_fraction=independent_fraction,
+    )
 
 
 def solve_weighted(

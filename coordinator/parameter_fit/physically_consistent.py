@@ -142,14 +142,24 @@ def fit_physical(
     def error_of(phi: Array) -> float:
         return _relative_error(information, phi, size)
 
-    found, weight, error = _strongest_prior(rows, target, bodies, error_of, allowed, most_cost)
+    found, weight, error = _strongest_prior(
+        rows=rows, target=target, prior=bodies, error_of=error_of, allowed=allowed, most_cost=most_cost
+    )
     covariance = found.covariance
     if effects is not None:
         shifts = covariance @ (rows.T @ whitened_effects(effects, sigma, independent_fraction))
         covariance = covariance + shifts @ shifts.T
     pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
     make_read_only((pseudo, found.x, covariance, found.divergence))
-    return PhysicalFit(found.x, covariance, pseudo, found.divergence, weight, error, best)
+    return PhysicalFit(
+        phi=found.x,
+        covariance=covariance,
+        pseudo=pseudo,
+        divergence=found.divergence,
+        weight=weight,
+        error=error,
+        least_squares_error=best,
+    )
 
 
 def _strongest_prior(
@@ -324,7 +334,14 @@ def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float
     square = qr(np.column_stack([matrix @ scale, seen]), mode="r", check_finite=False)[0]
     # The last row is what no parameters explain: dropped, so that small gains are not lost beside it.
     square = square[: matrix.shape[1]]
-    return _Problem(square[:, :-1], square[:, -1], scale, len(bodies), weight, weight)
+    return _Problem(
+        triangle=square[:, :-1],
+        target=square[:, -1],
+        scale=scale,
+        bodies=len(bodies),
+        weight=weight,
+        barrier=weight,
+    )
 
 
 def _common_sigma(information: Sequence[JointInformation], fit: InertialFit, size: float) -> Array:

@@ -209,14 +209,30 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool
     hat = [joint.y @ inverse / own for joint, own in zip(joints, sigma, strict=True)]
     if not tooled:
         parameters = inverse @ ((rows @ inverse).T @ target)
-        return _Solution(parameters, inverse, hat, hat, rows, target, condition)
+        return _Solution(
+            parameters=parameters,
+            inverse=inverse,
+            hat=hat,
+            spread=hat,
+            rows=rows,
+            target=target,
+            condition=condition,
+        )
     # Along the regressor's own directions, so that what it does not show stays zero: Z^T U c = Z^T tau.
     tools = np.vstack([joint.z @ inverse / own for joint, own in zip(joints, sigma, strict=True)])
     torques = np.concatenate([joint.tau / own for joint, own in zip(joints, sigma, strict=True)])
     through = np.linalg.solve(tools.T @ np.vstack(hat), tools.T).T
     parameters = inverse @ (through.T @ torques)
     ends = np.cumsum([len(joint.tau) for joint in joints])[:-1]
-    return _Solution(parameters, inverse, hat, np.split(through, ends), rows, rows @ parameters, condition)
+    return _Solution(
+        parameters=parameters,
+        inverse=inverse,
+        hat=hat,
+        spread=np.split(through, ends),
+        rows=rows,
+        target=rows @ parameters,
+        condition=condition,
+    )
 
 
 def _huber(off: Array) -> Array:

@@ -85,7 +85,9 @@ def body_motion_tracks(
     if not imus:
         return tracks
     return [
-        track if (rider := _rider(chain, i)) is None else _corrected(chain, bodies, turns, seen, track, rider)
+        track
+        if (rider := _rider(chain, i)) is None
+        else _corrected(chain=chain, bodies=bodies, turns=turns, seen=seen, track=track, rider=rider)
         for i, track in enumerate(tracks)
     ]
 
@@ -115,7 +117,9 @@ def _turns(
     compliance, hinges = np.split(refined.compliance, [2 * len(links)])
     for _ in range(_ROUNDS):
         bodies = body_motions(chain, *joints, base, turns)
-        loads = link_loads(chain, kinds, bodies, joints[0], RATE_HZ, turns)
+        loads = link_loads(
+            chain=chain, kinds=kinds, bodies=bodies, q_rad=joints[0], rate_hz=RATE_HZ, turns=turns
+        )
         turns = turns_under(with_hinges_moved([loads], links, hinges)[0], links, compliance)
     return turns
 

@@ -228,7 +228,14 @@ def _offsets_nm(robot: Robot, seen: InstrumentalFit) -> Array:
 
 
 def _regressor(robot: Robot, seen: Readings, eyes: MotionSource) -> Array:
-    tracks = body_motion_tracks(robot.chain, robot.kinds, robot.refined, robot.floor, seen, eyes == "imus")
+    tracks = body_motion_tracks(
+        chain=robot.chain,
+        kinds=robot.kinds,
+        refined=robot.refined,
+        floor=robot.floor,
+        seen=seen,
+        imus=eyes == "imus",
+    )
     return track_regressor(tracks)
 
 

@@ -116,9 +116,25 @@ def robot_bodies(
         note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
     if fit is None:
         judged = identifiabilities(base, inertial_units(joints))
-        return RobotBodies(chain.serials, frames, base, judged, None, (), note)
+        return RobotBodies(
+            serials=chain.serials,
+            frames=frames,
+            base=base,
+            identifiabilities=judged,
+            fit=None,
+            bodies=(),
+            note=note,
+        )
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
     informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
     judged = identifiabilities(base, inertial_units(joints), into @ fit.phi, informed_sigma)
     bodies = bodies_in_frames(fit.pseudo, link_homes(chain))
-    return RobotBodies(chain.serials, frames, base, judged, fit, bodies, note)
+    return RobotBodies(
+        serials=chain.serials,
+        frames=frames,
+        base=base,
+        identifiabilities=judged,
+        fit=fit,
+        bodies=bodies,
+        note=note,
+    )

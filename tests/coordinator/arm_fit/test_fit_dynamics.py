@@ -10,7 +10,7 @@ from numpy.random import default_rng
 from coordinator.arm_fit.cross_validation import fit_part, fitted, halves, held_out_errors
 from coordinator.arm_fit.data_file import JointLog, in_two, read_log
 from coordinator.arm_fit.filtered_log import filtered_log, usual_cutoff_hz
-from coordinator.arm_fit.fit import named
+from coordinator.arm_fit.fit import STEPS, named
 from coordinator.arm_fit.fit_dynamics import fit_dynamics
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.report import ErrorPart, FitReport
@@ -255,3 +255,25 @@ def test_the_staubli_tx40_is_predicted_within_the_best_known_errors() -> None:
     reach = sums["m2 c2x + 0.225 (m3 + m4 + m5 + m6)"]
     assert reach.urdf == pytest.approx(2.397, abs=1e-3)
     assert reach.value == pytest.approx(reach.urdf, rel=0.15)
+
+
+def test_the_library_takes_files_or_what_was_read_from_them(recording: Any, tmp_path: Path) -> None:
+    robot = read_urdf(str(recording.urdf))
+    log = read_log(str(recording.npz), robot.chain.serials)
+    steps: list[str] = []
+    fit = fit_dynamics(robot, log, choice=SHARED, progress=steps.append)
+    of_files = fit_dynamics(str(recording.urdf), str(recording.npz), choice=SHARED)
+    assert fit.report.held_out == of_files.report.held_out
+    assert (fit.report.data, of_files.report.data) == ("a recording in memory", str(recording.npz))
+    assert len(steps) == STEPS
+    assert fit.bodies is not None
+    assert fit.friction is not None
+    assert [part.rigid_body.mass_kg for part in fit.report.fit.bodies if part.rigid_body] == [
+        body.mass_kg for body in fit.bodies
+    ]
+    fit.write_urdf(tmp_path / "fitted.urdf")
+    assert (tmp_path / "fitted.urdf").read_text() == fit.urdf
+    again = read_urdf(tmp_path / "fitted.urdf")
+    np.testing.assert_allclose(again.phi, fit.phi, atol=1e-9)
+    with pytest.raises(UsageError, match="do not fit the joints waist, elbow, wrist"):
+        fit_dynamics(robot, log._replace(tau_nm=log.tau_nm[:, :2]))
