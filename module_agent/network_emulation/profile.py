@@ -1,4 +1,4 @@
-"""How a network misbehaves: the parameters of `channel` and `impaired_transport`, and the named profiles."""
+"""The impairments of a network, parameters of `channel` and `impaired_transport`, and the named profiles."""
 
 from typing import Annotated, Literal
 
@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from module_agent.model.errors import UsageError
 from module_agent.network_emulation.trace import NetworkTrace
 
-# Who a message goes to; a path may be another in each direction.
+# The receiver of a message; each direction has its own path.
 Receiver = Literal["module", "coordinator"]
 
 # What the jitter is drawn from; mean and variance are the profile's, the tail is the distribution's.
@@ -27,7 +27,7 @@ class _Strict(BaseModel):
 
 
 class Burst(_Strict):
-    """Bad times of a path, that depend on nothing that is sent.
+    """Bad times of a path, independent of the traffic.
 
     Durations and the times between the end of one and the start of the next are exponential, with the means
     `mean_ms` and `apart_s`.
@@ -56,10 +56,10 @@ class PathProfile(_Strict):
     """One direction: delay = base + jitter; loss, stalls, reordering, duplication; or a recorded trace.
 
     `delay_ms` is the least delay; `spread_ms` lets every endpoint have another: what is added is drawn once,
-    uniform up to it. `jitter_ms` is the mean of what comes on top and `jitter_shape` its (mean / standard
+    uniform up to it. `jitter_ms` is the mean of the added jitter and `jitter_shape` its (mean / standard
     deviation)^2, the shape of a gamma (1 = exponential; smaller has the heavier tail). Messages keep their
     order, as over one TCP link, but for the fraction `reorder`, which is delivered at its own time. `loss`
-    drops, `duplicate` delivers twice. What a `trace` says of delay and loss comes on top.
+    drops, `duplicate` delivers twice. Delay and loss of a `trace` are added.
     """
 
     delay_ms: Milliseconds = 0.0
@@ -84,7 +84,7 @@ class PathProfile(_Strict):
 class NetworkProfile(PathProfile):
     """Both directions of a network, and when the coordinator is cut off.
 
-    What `to_modules` or `to_coordinator` name replaces, for that direction, what is named here. `partitions`
+    Fields of `to_modules` and `to_coordinator` replace those given here for that direction. `partitions`
     are intervals (start, end) [s], in order, in which nothing passes between modules and coordinator, from
     the start of the coordinator's endpoint: it alone is cut off, as clocks of many would not agree on when.
     """
@@ -150,7 +150,7 @@ PROFILES: dict[str, NetworkProfile] = {
             duplicate=0.001,
             to_coordinator=PathProfile(jitter_ms=4.0, loss=0.006),
         ),
-        # At the edge of what the default command lifetime can bear: round trips to 300 ms, 5 % lost in all.
+        # At the edge of what the default command lifetime tolerates: round trips to 300 ms, 5 % lost in all.
         NetworkProfile(
             name="bad",
             delay_ms=10.0,
@@ -177,7 +177,7 @@ PROFILES: dict[str, NetworkProfile] = {
 
 
 def profile(name: str) -> NetworkProfile:
-    """Look up a profile by name; `network_file.network` takes files as well.
+    """Look up a profile by name; `profile_file.network` accepts files as well.
 
     Raises:
         UsageError: unknown profile; the message lists the known ones.

@@ -44,8 +44,8 @@ def network(value: str) -> NetworkProfile:
     return load_network(path)
 
 
-def network_beside(value: str, folder: Path) -> str:
-    """Return a network as `network` takes it, given in a file of this folder: its paths start there."""
+def network_relative_to(value: str, folder: Path) -> str:
+    """Return a name or path for `network` from one that is relative to a folder."""
     return value if value in PROFILES else str(folder / value)
 
 
@@ -74,13 +74,13 @@ def load_network(path: Path) -> NetworkProfile:
 
 
 def _read_traces(data: dict[str, Any], path: Path, text: str) -> None:
-    """Put the traces in the place of their files' names."""
+    """Replace the file names of traces by the traces."""
     for table in ((), ("to_modules",), ("to_coordinator",)):
         path_table = data.get(table[0]) if table else data
         if not isinstance(path_table, dict) or "trace" not in path_table:
             continue
         location: Location = (*table, "trace")
-        where = f"{path}:{line_of(text, location)}: {_words(location)}"
+        where = f"{path}:{line_of(text, location)}: {_dotted(location)}"
         if not isinstance(path_table["trace"], str):
             raise NetworkError(f"{where}: must be the name of a CSV file")
         try:
@@ -91,11 +91,11 @@ def _read_traces(data: dict[str, Any], path: Path, text: str) -> None:
 
 def _fault(path: Path, text: str, error: dict[str, Any]) -> str:
     location: Location = tuple(error["loc"])
-    key = f"{_words(location)}: " if location else ""
+    key = f"{_dotted(location)}: " if location else ""
     return f"{path}:{line_of(text, location)}: {key}{_reason(error)}"
 
 
-def _words(location: Location) -> str:
+def _dotted(location: Location) -> str:
     return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in location).lstrip(".")
 
 

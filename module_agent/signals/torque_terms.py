@@ -1,4 +1,4 @@
-"""The registry of torque terms: what a joint's torque holds besides the torque of the bodies.
+"""The registry of torque terms: the parts of a joint's torque other than that of the bodies.
 
 Every term is a column, linear in one parameter per joint (Khalil and Dombre 2002, Modeling, identification
 and control of robots, section 9.6). A drive adds the torque of its rotor, friction and an offset:
@@ -49,7 +49,7 @@ DRIVE_TERMS: tuple[Term, ...] = ("inertia", "viscous", "coulomb", "curved", "off
 READING_TERMS: tuple[Term, ...] = ("lag", "offset", "viscous", "coulomb")
 
 # Below this speed the sign of a reading's Coulomb friction fades: ten times what an encoder of 14 bits,
-# low-passed, makes of a joint at rest.
+# low-passed, reads of a joint at rest.
 SLOW_RAD_S = 0.01
 
 

@@ -24,7 +24,7 @@ from pydantic import (
 
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import RobotError, UsageError
-from module_agent.network_emulation.profile_file import network, network_beside
+from module_agent.network_emulation.profile_file import network, network_relative_to
 from module_agent.network_emulation.toml_location import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
 from sim.geometry.link_parts import Angle, FreePose, Moment, Part, Xyz, check_inertia
@@ -201,7 +201,7 @@ class Robot(_Strict):
     @field_validator("network")
     @classmethod
     def _known_network(cls, name: str, info: ValidationInfo) -> str:
-        found = network_beside(name, (info.context or {}).get("folder", Path()))
+        found = network_relative_to(name, (info.context or {}).get("folder", Path()))
         return _known(found, network)
 
     @field_validator("noise")

@@ -119,7 +119,7 @@ def test_the_message_says_what_the_fit_says(horizontal_link: Any) -> None:
     assert message.delay_s == 0.0123
 
 
-def test_too_little_to_go_by_is_refused_in_words(horizontal_link: Any) -> None:
+def test_too_little_data_is_refused_with_the_reason(horizontal_link: Any) -> None:
     rest = horizontal_link.rest(np.random.default_rng(0))
     cm, sine = align(*horizontal_link.constant(1.0, 1), 0), align(*horizontal_link.sine(0.1, 2), 0)
     still = align(*horizontal_link._replace(noise=0.0).sine(0.0, 2), 0)

@@ -80,7 +80,7 @@ def test_derivatives_are_those_of_the_readings_on_a_base_that_shakes(motion: Smo
         assert np.allclose(jacobian[:, :, column], expected, atol=1e-5 * scale), column
 
 
-def test_on_a_base_that_turns_the_imu_feels_what_a_rigid_body_does() -> None:
+def test_on_a_base_that_turns_the_imu_reads_the_motion_of_a_rigid_body() -> None:
     """Independent: where the IMU is in the world, differentiated twice; rotations by scipy."""
     t_s = np.arange(0.0, 3.0, 0.001)
     t_ns = (1e9 * t_s).astype(np.int64)
@@ -139,7 +139,7 @@ def test_turning_the_frame_turns_both_sensors(motion: SmoothMotion) -> None:
             assert np.allclose(jacobian[:, sensor, column], np.cross(direction, predicted[:, sensor]))
 
 
-def test_a_point_mass_on_a_bent_link_feels_what_newton_says() -> None:
+def test_a_point_mass_on_a_bent_link_obeys_newton() -> None:
     """Independent: integrate c delta'' + delta = -c q'', and differentiate the true circle of the IMU."""
     c, distance, rate = 2.5e-5, 0.48, 2000.0
     t_s = np.arange(0.0, 4.0, 1.0 / rate)

@@ -52,7 +52,7 @@ def test_axis_and_radial_vector_are_found_to_the_noise(link: Any, seed: int) -> 
     np.testing.assert_allclose(found.gyro_bias_rad_s, link.gyro_offset, atol=2e-3)
 
 
-def test_it_has_not_the_bias_of_the_circle_point_analysis(link: Any) -> None:
+def test_the_bias_of_the_circle_point_analysis_is_absent(link: Any) -> None:
     ours, thesis = [], []
     for seed in range(8):
         ours.append(regressed(link, seed).distance_m - LENGTH_M)
@@ -74,7 +74,7 @@ def test_stated_sigmas_are_those_of_the_errors(link: Any) -> None:
     assert 0.25 < np.sqrt(np.mean(across**2) / 2.0) < 1.45
 
 
-def test_covariance_is_symmetric_and_says_nothing_along_the_axis(link: Any) -> None:
+def test_covariance_is_symmetric_and_singular_along_the_axis(link: Any) -> None:
     found = regressed(link, 0)
     np.testing.assert_allclose(found.covariance, found.covariance.T, atol=1e-15)
     assert np.linalg.eigvalsh(found.covariance).min() > -1e-15
@@ -112,7 +112,7 @@ def test_a_link_that_bends_is_not_taken_for_a_longer_one(link: Any) -> None:
     assert found.distance_m == pytest.approx(LENGTH_M, abs=3e-4)
 
 
-def test_late_readings_of_the_imu_are_told_per_motion(link: Any) -> None:
+def test_the_delay_of_the_imu_is_estimated_per_motion(link: Any) -> None:
     late = link._replace(imu_ahead_s=4e-3)
     rest = rest_reading(late.rest(np.random.default_rng(1)))
     found = regress_joint([seen(late.constant(1.0, 1)), seen(late.sine(0.1, 1), 1_000_000)], rest)
@@ -143,7 +143,7 @@ def test_gravity_calibrates_the_scale_where_the_joint_turns_the_imu_in_it(link: 
     assert found.sigma_distance_m < 1.2e-3
 
 
-def test_an_imu_that_stands_still_is_refused_by_what_it_lacks(link: Any) -> None:
+def test_an_imu_that_stands_still_is_refused_with_the_reason(link: Any) -> None:
     still = link._replace(carried=0.1)
     with pytest.raises(DataError, match=r"turned by 0\.1 of what the joint did"):
         regressed(still, 0)
@@ -158,7 +158,7 @@ def test_gaps_in_the_samples_are_refused(link: Any) -> None:
         seen((ImuWindow(*(column[kept] for column in imu)), joint))
 
 
-def test_the_message_carries_what_was_found(link: Any) -> None:
+def test_the_message_carries_the_estimate(link: Any) -> None:
     found = regressed(link, 0)
     message = regression_estimate(found, 2e-3)
     assert RegressionEstimate.model_validate(message.model_dump()) == message

@@ -13,7 +13,7 @@ def test_the_imu_of_an_x5_sits_inside_its_housing(kind: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("name", ["X5-1", "X5-4", "X5-9"])
-def test_an_older_module_differs_in_the_imus_place_and_in_how_much_it_is_shaken(name: str) -> None:
+def test_an_older_module_differs_in_the_place_and_the_vibration_of_its_imu(name: str) -> None:
     present, older = module_type(name), module_type(f"{name}-old")
     assert older.imu_xyz != present.imu_xyz
     assert older.vibration > present.vibration == 1.0

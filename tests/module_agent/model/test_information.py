@@ -98,7 +98,7 @@ def test_pieces_in_any_order_say_what_the_whole_says(order: list[int], sizes: li
         assert far(one, other) < EXACT
 
 
-def test_further_columns_are_carried_beside_those_of_the_bodies(rng: Generator) -> None:
+def test_further_columns_follow_those_of_the_bodies(rng: Generator) -> None:
     chain = random_tree(rng, 2)
     q, qd, qdd, tau = motion(rng, 100, 2)
     friction = np.zeros((100, 2, 2))
@@ -128,7 +128,7 @@ def test_the_bytes_hold_every_double_as_it_is(joints: int, samples: int, seed: i
 
 @settings(deadline=None, max_examples=100)
 @given(st.binary(max_size=400))
-def test_bytes_of_anybody_are_refused_or_are_information(block: bytes) -> None:
+def test_arbitrary_bytes_are_refused_or_are_information(block: bytes) -> None:
     try:
         found = unpack(block)
     except DataError:
@@ -136,7 +136,7 @@ def test_bytes_of_anybody_are_refused_or_are_information(block: bytes) -> None:
     assert np.isfinite(found.r).all()
 
 
-def test_bytes_that_lie_are_refused_by_what_is_wrong(rng: Generator) -> None:
+def test_wrong_bytes_are_refused_with_the_reason(rng: Generator) -> None:
     block = pack(gather(random_tree(rng, 2), *motion(rng, 50, 2))[0])
     for wrong, why in (
         (block[:-8], "are announced"),

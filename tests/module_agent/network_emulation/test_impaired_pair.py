@@ -283,7 +283,7 @@ def test_after_the_lease_a_partition_takes_tokens_away_and_its_end_gives_them_ba
     assert alive(pair) == [(0.001, True), (1.001 + LEASE_S, False), (3.001, True)]
 
 
-def test_what_happens_to_tokens_in_a_short_partition_is_told_in_order_at_its_end(pairs) -> None:
+def test_changes_of_tokens_in_a_short_partition_are_reported_in_order_at_its_end(pairs) -> None:
     pair = pairs(NetworkProfile(name="t", delay_ms=1.0))
     pair.coordinator.watch_alive("m", pair.note("seen"))
     first = pair.module.declare_alive("m")
@@ -295,7 +295,7 @@ def test_what_happens_to_tokens_in_a_short_partition_is_told_in_order_at_its_end
     assert alive(pair) == [(0.001, True), (1.501, False), (1.501, True)]
 
 
-def test_a_module_that_is_gone_for_good_by_the_end_of_a_long_partition_does_not_come_back(pairs) -> None:
+def test_a_module_that_left_during_a_long_partition_does_not_reappear(pairs) -> None:
     pair = pairs(NetworkProfile(name="t", delay_ms=1.0))
     pair.coordinator.watch_alive("m", pair.note("seen"))
     pair.module.declare_alive("m")
@@ -344,7 +344,7 @@ OPERATIONS = st.lists(
 
 @settings(max_examples=150, deadline=None)
 @given(OPERATIONS, st.integers(0, 2**32), st.sampled_from([0.0, 5.0]))
-def test_whatever_is_cut_and_healed_each_question_has_one_end_and_who_is_there_is_known_in_the_end(
+def test_with_any_partitions_each_query_ends_once_and_the_final_liveliness_is_right(
     operations: list[tuple[float, str]], seed: int, delay_ms: float
 ) -> None:
     pair = Pair(NetworkProfile(name="t", delay_ms=delay_ms, jitter_ms=delay_ms, loss=0.1), seed)
@@ -379,7 +379,7 @@ def test_whatever_is_cut_and_healed_each_question_has_one_end_and_who_is_there_i
     assert sorted(e.tag for e in pair.events("reply")) == list(range(asked))
     view: dict[str, bool] = {}
     for event in pair.events("seen"):
-        # Nobody is told twice of the same: appearing and vanishing alternate.
+        # No change is reported twice: appearing and vanishing alternate.
         assert view.get(event.key, False) is not event.alive
         view[event.key] = event.alive
     assert {key for key, there in view.items() if there} == set(tokens)

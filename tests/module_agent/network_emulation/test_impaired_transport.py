@@ -227,7 +227,7 @@ def test_a_request_is_answered_at_most_once_however_often_it_arrives(found, seed
 
 
 def test_a_lost_request_stays_alive_until_its_asker_has_given_up() -> None:
-    """Zenoh would tell the asker "nobody answers" at once if the request were garbage collected."""
+    """Zenoh would report "no answer" to the asker at once if the request were garbage collected."""
     transport, inner, clock = make(NetworkProfile(name="dead", loss=1.0))
     transport.serve("k", lambda event: None)
     ended: list[float] = []

@@ -26,7 +26,7 @@ from module_agent.wire.refusal import WireError
 from module_agent.worker import ThreadWorker
 
 ROBOT, BOOT, TICK_NS, STEP_NS = "bench", 7, 1_000_000, 4_000_000
-OWN, BESIDE, FAR = "J1", "J2", "J3"
+OWN, NEXT, FAR = "J1", "J2", "J3"
 # Enough for the low-pass and the spline; a row is four ticks.
 ROWS = 300
 
@@ -34,7 +34,7 @@ ROWS = 300
 class Swinging:
     """Two modules that swing."""
 
-    modules = tuple(WiredModule(serial, "X5-4", TICK_NS, STEP_NS) for serial in (OWN, BESIDE))
+    modules = tuple(WiredModule(serial, "X5-4", TICK_NS, STEP_NS) for serial in (OWN, NEXT))
 
     def __init__(self) -> None:
         self.ticks = 0
@@ -134,7 +134,7 @@ def asking(**changes: Any) -> dict[str, Any]:
     return {
         **head(),
         "chain": {
-            "serials": [OWN, BESIDE],
+            "serials": [OWN, NEXT],
             "parent": [-1, 0],
             "reversed": [False, False],
             "geometry": struct.pack("<44d", *geometry, *geometry),
@@ -171,15 +171,15 @@ def plain() -> Bench:
 
 
 def test_a_good_question_is_answered(plain: Bench) -> None:
-    plain.collect(collecting(rows(OWN), rows(BESIDE)))
+    plain.collect(collecting(rows(OWN), rows(NEXT)))
     plain.ask(Leaf.INFORMATION, asking())
     found = decode(Information, plain.ask(Leaf.INFORMATION, asking()), MAX_MESSAGE_BYTES)
     assert found.total_bytes == len(found.part)
 
 
 @pytest.mark.parametrize("end", [5, 3, 100_006])
-def test_a_range_of_no_rows_or_of_too_many_is_refused_whichever_it_is(plain: Bench, end: int) -> None:
-    wrong = plain.refused(Leaf.COLLECT, collecting(rows(OWN), rows(BESIDE), rows(FAR, 5, end)))
+def test_a_range_of_no_rows_or_of_too_many_is_refused_for_every_module(plain: Bench, end: int) -> None:
+    wrong = plain.refused(Leaf.COLLECT, collecting(rows(OWN), rows(NEXT), rows(FAR, 5, end)))
     assert wrong.reason == "range"
     assert f"rows 5 to {end} of J3: 1 to 100000 rows" in wrong.detail
     plain.host.cycle()
@@ -194,8 +194,8 @@ def test_rows_of_a_module_are_asked_for_once_in_a_motion(plain: Bench) -> None:
 
 
 def test_own_rows_of_a_former_boot_are_refused_and_leave_no_motion(plain: Bench) -> None:
-    for serial in (OWN, BESIDE):
-        wanted = [rows(s, boot=BOOT - (s == serial)) for s in (OWN, BESIDE)]
+    for serial in (OWN, NEXT):
+        wanted = [rows(s, boot=BOOT - (s == serial)) for s in (OWN, NEXT)]
         wrong = plain.refused(Leaf.COLLECT, collecting(*wanted))
         assert wrong.reason == "wrong_boot"
         assert serial in wrong.detail
@@ -215,14 +215,14 @@ def test_own_rows_of_a_former_boot_are_refused_and_leave_no_motion(plain: Bench)
     ],
 )
 def test_times_beyond_what_64_bits_add_up_are_refused(bench: Bench, wrong: dict[str, Any]) -> None:
-    bench.collect(collecting(rows(OWN), rows(BESIDE)))
+    bench.collect(collecting(rows(OWN), rows(NEXT)))
     assert bench.refused(Leaf.INFORMATION, wrong).reason == "range"
     for _ in range(5):
         bench.host.cycle()
 
 
 def test_more_work_than_a_module_has_time_for_is_refused_before_it_is_begun(plain: Bench) -> None:
-    plain.collect(collecting(rows(OWN), rows(BESIDE)))
+    plain.collect(collecting(rows(OWN), rows(NEXT)))
     serials = [f"J{number}" for number in range(64)]
     chain = {**asking()["chain"], "serials": serials, "parent": [-1] * 64, "reversed": [False] * 64}
     motions = [{**asking()["motions"][0], "samples": 65_536}] * 2
@@ -231,14 +231,14 @@ def test_more_work_than_a_module_has_time_for_is_refused_before_it_is_begun(plai
     assert "131072 samples of 64 modules: at most 48828" in wrong.detail
 
 
-def test_a_defect_that_a_question_brings_about_is_told_and_counted_and_ends_nothing(
+def test_a_defect_caused_by_a_request_is_reported_and_counted_and_ends_nothing(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: Any) -> None:
         raise OverflowError("cannot convert float infinity to integer")
 
     monkeypatch.setattr(module_information, "own_information", broken)
-    bench.collect(collecting(rows(OWN), rows(BESIDE)))
+    bench.collect(collecting(rows(OWN), rows(NEXT)))
     found = decode(Ack, bench.ask(Leaf.INFORMATION, asking()))
     # A thread takes as long as it takes; its end is what lets the loop go on.
     while found.reason == "busy":
@@ -288,7 +288,7 @@ def test_a_refusal_that_answers_no_question_of_this_process_ends_no_motion(plain
     key_, asked, sink, tag = plain.wires.queries[0]
     plain.wires.queries.append((key_, asked, sink, tag + 1000))
     refuse(plain, 1)
-    refuse(plain, 0, serial=BESIDE)
+    refuse(plain, 0, serial=NEXT)
     assert why(plain, 1) == "busy"
     # The question is over all the same: refused by another module, it is asked anew in its time.
     for _ in range(500):
@@ -344,7 +344,7 @@ def changed(of: dict[str, Any], by: st.SearchStrategy[dict[str, Any]]) -> st.Sea
 GOOD = asking()
 CHAIN = st.fixed_dictionaries(
     {
-        "serials": st.lists(st.sampled_from([OWN, BESIDE, FAR]), min_size=1, max_size=3),
+        "serials": st.lists(st.sampled_from([OWN, NEXT, FAR]), min_size=1, max_size=3),
         "parent": st.lists(st.integers(-1, 3), min_size=1, max_size=3),
         "reversed": st.lists(st.booleans(), min_size=2, max_size=2),
         "geometry": st.lists(FLOATS, min_size=44, max_size=44).map(lambda v: struct.pack("<44d", *v)),
@@ -399,6 +399,6 @@ def test_no_demand_to_keep_rows_stops_the_ticks(lasting: Bench, message: dict[st
 def test_no_question_about_torques_stops_the_ticks(lasting: Bench, message: dict[str, Any]) -> None:
     # Rows that are still kept: the bench has gone on.
     end = lasting.host.modules[0].firmware.history.next_row
-    lasting.ask(Leaf.COLLECT, collecting(rows(OWN, 0, end - 1), rows(BESIDE, 0, end - 1)))
+    lasting.ask(Leaf.COLLECT, collecting(rows(OWN, 0, end - 1), rows(NEXT, 0, end - 1)))
     assert is_answer(lasting.ask(Leaf.INFORMATION, message))
     assert is_answer(lasting.ask(Leaf.INFORMATION, message))

@@ -240,11 +240,11 @@ def test_of_two_servers_the_first_answer_is_the_only_reply(rig: Rig) -> None:
     assert got == [Reply(1, "k", b"quick")]
 
 
-def test_a_query_that_nobody_serves_says_so(rig: Rig) -> None:
+def test_a_query_on_a_key_without_server_says_so(rig: Rig) -> None:
     got: list[Event] = []
-    rig.a.query("nobody", b"", 5.0, got.append, 3)
+    rig.a.query("unserved", b"", 5.0, got.append, 3)
     rig.until(lambda: bool(got))
-    assert got == [Reply(3, "nobody", None, NO_ANSWER)]
+    assert got == [Reply(3, "unserved", None, NO_ANSWER)]
 
 
 def test_an_unanswered_query_times_out_once_and_a_late_answer_is_ignored(rig: Rig) -> None:

@@ -103,7 +103,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 
 def answer(transport: ZenohTransport, key: str) -> bytes:
-    """Ask until somebody answers; every single query must end in one reply."""
+    """Ask until there is an answer; every single query must end in one reply."""
     end_s = time.monotonic() + LIMIT_S
     while time.monotonic() < end_s:
         got: list[Event] = []
@@ -121,7 +121,7 @@ def answer(transport: ZenohTransport, key: str) -> bytes:
         if reply.payload is not None:
             return reply.payload
         time.sleep(0.005)
-    raise AssertionError(f"nobody answers on {key}")
+    raise AssertionError(f"no answer on {key}")
 
 
 def test_agents_started_before_the_hub_hear_each_other_through_it(endpoint, start) -> None:
@@ -177,7 +177,7 @@ def test_a_killed_agent_s_token_vanishes_and_its_successor_takes_over(endpoint, 
     hub.close()
 
 
-def test_a_second_hub_is_told_that_the_port_is_taken_and_may_join_as_a_spoke(endpoint, start) -> None:
+def test_a_second_hub_learns_that_the_port_is_taken_and_may_join_as_a_spoke(endpoint, start) -> None:
     hub = open_zenoh(ZenohConfig.hub(endpoint))
     with pytest.raises(TransportError, match=r"in use.*another coordinator"):
         open_zenoh(ZenohConfig.hub(endpoint))

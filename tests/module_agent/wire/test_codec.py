@@ -253,7 +253,7 @@ def test_the_bytes_of_an_effort_that_is_fed_forward_are_the_committed_ones() -> 
     assert struct.unpack("<3f", plain["samples"]) == (2.25, -0.5, 1.0)
 
 
-def test_a_motion_of_who_knows_no_effort_is_one_without() -> None:
+def test_a_motion_without_the_field_effort_has_no_effort() -> None:
     golden = bytes.fromhex(json.loads(GOLDEN.read_text())["MotionCommand without effort"])
     assert decode(MotionCommand, golden).effort is None
 
@@ -299,7 +299,7 @@ def test_what_is_asked_of_64_modules_and_the_longest_answer_fit_a_message() -> N
         assert decode(type(message), encode(message), MAX_MESSAGE_BYTES) == message
 
 
-def test_what_is_wrong_with_an_element_is_said_of_the_element() -> None:
+def test_the_error_names_the_wrong_element() -> None:
     """Not of the array, which lacks it then."""
     request = next(m for m in EXAMPLES if isinstance(m, InformationRequest)).model_dump()
     request["clocks"][0]["drift"] = 0.2
@@ -311,7 +311,7 @@ def test_what_is_wrong_with_an_element_is_said_of_the_element() -> None:
     assert caught.value.reason is Refusal.TYPES
 
 
-def test_a_question_has_the_same_digest_whoever_is_asked_and_for_whichever_part() -> None:
+def test_a_request_has_the_same_digest_for_every_module_and_part() -> None:
     request = next(m for m in EXAMPLES if isinstance(m, InformationRequest))
     again = request.model_copy(update={"serial": "J2", "boot": 1, "seq": 99, "offset": 0, "sender": "b"})
     assert again.digest() == request.digest()
@@ -319,7 +319,7 @@ def test_a_question_has_the_same_digest_whoever_is_asked_and_for_whichever_part(
 
 
 def test_plain_struct_knowledge_reads_the_rows() -> None:
-    """The block is what the table in the README says: 101 bytes a row, little-endian, packed."""
+    """The block is what `ROW` says: 101 bytes a row, little-endian, packed."""
     data = rows(3).tobytes()
     assert len(data) == 3 * 101
     assert int.from_bytes(data[101:109], "little", signed=True) == 1_004_000_000

@@ -36,7 +36,7 @@ def test_a_packed_row_is_the_record_that_numpy_makes(row: tuple[float, ...], slo
     assert bytes(ring) == expected.tobytes()
 
 
-def test_a_reading_too_large_for_its_field_is_kept_as_infinite_and_refused_by_whoever_reads_it() -> None:
+def test_a_reading_too_large_for_its_field_is_kept_as_infinite_and_refused_by_readers() -> None:
     ring = bytearray(ROW.itemsize)
     pack_row(ring, 0, (1, 1, 0, 0, 0.0, -1e39, *[0.0] * 16))
     rows = np.frombuffer(ring, dtype=ROW)

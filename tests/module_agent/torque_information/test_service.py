@@ -111,7 +111,7 @@ class Robot:
         }
 
     def by_all_rows(self) -> tuple[JointInformation, ...]:
-        """What whoever has the rows of all modules makes of them, all joints at once."""
+        """The information of all joints at once, from the rows of all modules."""
         total: tuple[JointInformation, ...] = ()
         for _, first, samples in SPANS:
             common = self.first_ns + STEP_NS * (first + np.arange(samples))
@@ -169,7 +169,7 @@ def refusal(found: InformationService, request: InformationRequest) -> WireError
 
 
 @pytest.mark.parametrize("parent", [(-1,), (-1, 0, 1), (-1, 0, 0, 2, -1)])
-def test_every_module_gets_from_its_own_torques_what_all_rows_tell_of_its_joint(
+def test_a_modules_own_information_equals_that_from_the_rows_of_all_modules(
     parent: tuple[int, ...],
 ) -> None:
     robot = Robot(parent)
@@ -194,7 +194,7 @@ def test_an_answer_is_not_ready_before_it_is_computed_and_is_computed_once() -> 
     for _ in range(3):
         assert refusal(found, robot.request()).reason is Refusal.BUSY
     assert len(worker.jobs) == 1
-    # Meanwhile nobody else's question is begun.
+    # Meanwhile no other request is begun.
     assert refusal(found, robot.request(cutoff_hz=11.0)).reason is Refusal.BUSY
     worker.jobs[0]()
     assert len(worker.jobs) == 1
@@ -231,7 +231,7 @@ def test_a_motion_that_was_not_collected_is_named() -> None:
     assert worker.jobs == []
 
 
-def test_a_request_that_nothing_can_be_computed_of_is_refused_with_the_reason() -> None:
+def test_a_request_that_cannot_be_computed_is_refused_with_the_reason() -> None:
     robot = Robot((-1, 0))
     late = robot.request().motions[0].model_copy(update={"first_ns": 0})
     for wrong, why in (

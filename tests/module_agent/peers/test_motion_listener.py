@@ -1,4 +1,4 @@
-"""A motion is handed over once and whole, whatever order its messages come in and whichever are lost."""
+"""A motion is handed over once and complete, in any order of its messages and with any of them lost."""
 
 from typing import Any
 
@@ -77,7 +77,7 @@ def _feedback(first: int, count: int = BATCH, boot: int = 1, serial: str = "J") 
 
 
 class Checked(MotionListener):
-    """Neighbours that have nothing to say unless they are has_work."""
+    """A listener that returns nothing unless it has work."""
 
     def poll(self, now_ns: int) -> tuple[list[Action], list[JointMotion]]:
         has_work = self.has_work
@@ -86,8 +86,8 @@ class Checked(MotionListener):
         return said
 
 
-def _questions(wishes: list[Action]) -> list[AskHistory]:
-    return [w for w in wishes if isinstance(w, AskHistory)]
+def _questions(actions: list[Action]) -> list[AskHistory]:
+    return [w for w in actions if isinstance(w, AskHistory)]
 
 
 def _whole(motion: JointMotion, record: MotionRecord) -> bool:
@@ -99,134 +99,134 @@ def _whole(motion: JointMotion, record: MotionRecord) -> bool:
 
 
 def test_a_joint_that_moves_is_listened_to_until_its_motion_is_complete() -> None:
-    neighbours = Checked()
-    neighbours.on_status(_status(_running()), 0, OWN)
-    assert neighbours.poll(0) == ([Listen("J", True)], [])
+    listener = Checked()
+    listener.on_status(_status(_running()), 0, OWN)
+    assert listener.poll(0) == ([Listen("J", True)], [])
     for first in range(100, 400, BATCH):
-        neighbours.on_feedback(_feedback(first), OWN)
-        assert neighbours.poll(0) == ([], [])
-    neighbours.on_status(_status(_record(), 2), 0, OWN)
-    wishes, motions = neighbours.poll(0)
-    assert wishes == [Listen("J", False)]
+        listener.on_feedback(_feedback(first), OWN)
+        assert listener.poll(0) == ([], [])
+    listener.on_status(_status(_record(), 2), 0, OWN)
+    actions, motions = listener.poll(0)
+    assert actions == [Listen("J", False)]
     assert [_whole(m, _record()) for m in motions] == [True]
-    assert neighbours.poll(MS) == ([], [])
+    assert listener.poll(MS) == ([], [])
 
 
 def test_rows_that_were_dropped_are_asked_for_in_pieces_that_a_message_can_carry() -> None:
-    neighbours = Checked()
+    listener = Checked()
     record = _record(end=100 + 600)
-    neighbours.on_status(_status(record), 0, OWN)
+    listener.on_status(_status(record), 0, OWN)
     now, asked = 0, []
     for _ in range(3):
-        (question,) = _questions(neighbours.poll(now)[0])
+        (question,) = _questions(listener.poll(now)[0])
         asked.append(question.end_row - question.first_row)
-        neighbours.on_feedback(_feedback(question.first_row, asked[-1]), OWN, live=False)
-    _, motions = neighbours.poll(now)
+        listener.on_feedback(_feedback(question.first_row, asked[-1]), OWN, live=False)
+    _, motions = listener.poll(now)
     assert asked == [ROWS_PER_QUESTION, ROWS_PER_QUESTION, 600 - 2 * ROWS_PER_QUESTION]
     assert [_whole(m, record) for m in motions] == [True]
 
 
-def test_who_only_listens_rests_until_something_is_heard_and_who_misses_rows_does_not() -> None:
-    neighbours = Checked()
-    assert not neighbours.has_work
-    neighbours.on_status(_status(_running()), 0, OWN)
-    assert neighbours.has_work
-    neighbours.poll(0)
-    assert not neighbours.has_work
-    neighbours.on_feedback(_feedback(100), OWN)
-    assert neighbours.has_work
-    neighbours.on_status(_status(_record(), 2), 0, OWN)
-    neighbours.poll(0)
-    assert neighbours.has_work
+def test_a_listener_has_work_after_a_message_and_while_rows_are_missing() -> None:
+    listener = Checked()
+    assert not listener.has_work
+    listener.on_status(_status(_running()), 0, OWN)
+    assert listener.has_work
+    listener.poll(0)
+    assert not listener.has_work
+    listener.on_feedback(_feedback(100), OWN)
+    assert listener.has_work
+    listener.on_status(_status(_record(), 2), 0, OWN)
+    listener.poll(0)
+    assert listener.has_work
 
 
 def test_an_unanswered_question_is_asked_again_but_not_at_every_tick() -> None:
-    neighbours = Checked()
-    neighbours.on_status(_status(_record()), 0, OWN)
-    questions = [q for now in range(0, 1000 * MS, MS) for q in _questions(neighbours.poll(now)[0])]
+    listener = Checked()
+    listener.on_status(_status(_record()), 0, OWN)
+    questions = [q for now in range(0, 1000 * MS, MS) for q in _questions(listener.poll(now)[0])]
     assert len(questions) == 1000 * MS // ANSWER_TIMEOUT_NS + 1
     assert len(set(questions)) == 1
 
 
-def test_rows_that_never_come_are_given_up_though_the_module_goes_on_telling_of_its_last_motion() -> None:
-    neighbours = Checked()
+def test_rows_that_never_come_are_given_up_although_the_status_still_names_the_motion() -> None:
+    listener = Checked()
     last_question = 0
     for number, now in enumerate(range(0, 4 * GIVE_UP_NS, 100 * MS)):
-        neighbours.on_status(_status(_record(), 1 + number), now, OWN)
-        wishes, motions = neighbours.poll(now)
+        listener.on_status(_status(_record(), 1 + number), now, OWN)
+        actions, motions = listener.poll(now)
         assert motions == []
-        if _questions(wishes):
+        if _questions(actions):
             last_question = now
     assert last_question <= GIVE_UP_NS
 
 
 def test_a_long_motion_is_not_given_up_while_it_runs() -> None:
-    neighbours = Checked()
+    listener = Checked()
     for number, now in enumerate(range(0, 3 * GIVE_UP_NS, 400 * MS)):
-        neighbours.on_status(_status(_running(), 1 + number), now, OWN)
-        neighbours.poll(now)
-    neighbours.on_status(_status(_record(), 1000), now, OWN)
-    assert _questions(neighbours.poll(now)[0])
+        listener.on_status(_status(_running(), 1 + number), now, OWN)
+        listener.poll(now)
+    listener.on_status(_status(_record(), 1000), now, OWN)
+    assert _questions(listener.poll(now)[0])
 
 
 def test_a_motion_that_was_stopped_is_dropped() -> None:
     for outcome in ("stopped", "expired", "superseded"):
-        neighbours = Checked()
-        neighbours.on_status(_status(_running()), 0, OWN)
-        neighbours.on_status(_status(_record(outcome=outcome), 2), 0, OWN)
-        assert neighbours.poll(0) == ([Listen("J", True), Listen("J", False)], [])
+        listener = Checked()
+        listener.on_status(_status(_running()), 0, OWN)
+        listener.on_status(_status(_record(outcome=outcome), 2), 0, OWN)
+        assert listener.poll(0) == ([Listen("J", True), Listen("J", False)], [])
         # One of which nothing but the end was heard is not even listened to.
-        neighbours.on_status(_status(_record(2, outcome=outcome), 3), 0, OWN)
-        assert neighbours.poll(0) == ([], [])
+        listener.on_status(_status(_record(2, outcome=outcome), 3), 0, OWN)
+        assert listener.poll(0) == ([], [])
 
 
-def test_journeys_are_no_exploration() -> None:
-    neighbours = Checked()
+def test_motions_between_poses_are_no_exploration() -> None:
+    listener = Checked()
     journey = GoTo(target_rad=1.0, max_speed_rad_s=1.0)
-    neighbours.on_status(_status(_record(pattern=journey)), 0, OWN)
-    neighbours.on_status(_status(None, 2), 0, OWN)
-    assert neighbours.poll(0) == ([], [])
+    listener.on_status(_status(_record(pattern=journey)), 0, OWN)
+    listener.on_status(_status(None, 2), 0, OWN)
+    assert listener.poll(0) == ([], [])
 
 
 def test_a_joint_that_boots_anew_in_mid_motion_does_not_mix_its_rows() -> None:
-    neighbours = Checked()
-    neighbours.on_status(_status(_running(), 50), 0, OWN)
-    neighbours.on_feedback(_feedback(100, 250), OWN)
-    neighbours.on_status(_status(_record(start=0, end=100), 1, boot=2), 0, OWN)
-    neighbours.on_feedback(_feedback(0, 50, boot=1), OWN)
-    assert neighbours.poll(0)[1] == []
+    listener = Checked()
+    listener.on_status(_status(_running(), 50), 0, OWN)
+    listener.on_feedback(_feedback(100, 250), OWN)
+    listener.on_status(_status(_record(start=0, end=100), 1, boot=2), 0, OWN)
+    listener.on_feedback(_feedback(0, 50, boot=1), OWN)
+    assert listener.poll(0)[1] == []
     # A straggler of the old boot changes nothing.
-    neighbours.on_status(_status(_record(), 51), 0, OWN)
-    neighbours.on_feedback(_feedback(0, 100, boot=2), OWN)
-    motions = neighbours.poll(0)[1]
+    listener.on_status(_status(_record(), 51), 0, OWN)
+    listener.on_feedback(_feedback(0, 100, boot=2), OWN)
+    motions = listener.poll(0)[1]
     assert [(m.boot, len(m.rows)) for m in motions] == [(2, 100)]
 
 
 def test_joints_that_move_at_once_are_kept_apart() -> None:
-    neighbours = Checked()
+    listener = Checked()
     for serial in ("J", "K"):
-        neighbours.on_status(_status(_record(), serial=serial), 0, OWN)
-        neighbours.on_feedback(_feedback(100, 300, serial=serial), OWN)
-    assert [m.serial for m in neighbours.poll(0)[1]] == ["J", "K"]
+        listener.on_status(_status(_record(), serial=serial), 0, OWN)
+        listener.on_feedback(_feedback(100, 300, serial=serial), OWN)
+    assert [m.serial for m in listener.poll(0)[1]] == ["J", "K"]
 
 
-def test_the_clock_is_mapped_by_the_message_that_was_least_delayed() -> None:
-    neighbours = Checked()
-    neighbours.on_status(_status(_record(), t_ns=0), 0, {"ME": 10_000 * MS, "YOU": 20 * MS})
+def test_the_clock_is_mapped_by_the_message_with_the_least_delay() -> None:
+    listener = Checked()
+    listener.on_status(_status(_record(), t_ns=0), 0, {"ME": 10_000 * MS, "YOU": 20 * MS})
     for first, delay in ((100, 9), (200, 2), (300, 30)):
         sent = (first + 99) * 4 * MS
         own = {"ME": sent + 10_000 * MS + delay * MS, "YOU": sent + delay * MS}
-        neighbours.on_feedback(_feedback(first, 100), own)
-    (motion,) = neighbours.poll(0)[1]
+        listener.on_feedback(_feedback(first, 100), own)
+    (motion,) = listener.poll(0)[1]
     # The status came without delay for ME, with 20 ms for YOU.
     assert motion.rough_offset_ns == {"ME": 10_000 * MS, "YOU": 2 * MS}
 
 
-def test_rows_from_history_tell_nothing_of_the_clock() -> None:
-    neighbours = Checked()
-    neighbours.on_status(_status(_record(), t_ns=0), 0, {"ME": 50 * MS})
-    neighbours.on_feedback(_feedback(100, 300), {"ME": 0}, live=False)
-    (motion,) = neighbours.poll(0)[1]
+def test_rows_from_history_do_not_map_the_clock() -> None:
+    listener = Checked()
+    listener.on_status(_status(_record(), t_ns=0), 0, {"ME": 50 * MS})
+    listener.on_feedback(_feedback(100, 300), {"ME": 0}, live=False)
+    (motion,) = listener.poll(0)[1]
     assert motion.rough_offset_ns == {"ME": 50 * MS}
 
 
@@ -273,11 +273,11 @@ def _news(now: int, seq: int) -> Status | None:
     silent=st.booleans(),
     holes=st.integers(0, 9),
 )
-def test_whatever_the_network_does_a_motion_is_handed_over_whole_and_once_or_not_at_all(
+def test_over_any_network_a_motion_is_handed_over_complete_and_once_or_not_at_all(
     seed: int, loss: float, silent: bool, holes: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    neighbours, net = Checked(), _Net(rng, loss)
+    listener, net = Checked(), _Net(rng, loss)
     found: list[JointMotion] = []
     listening = False
     lost_rows = rng.integers(0, 1400 // 50, holes).tolist()
@@ -288,18 +288,18 @@ def test_whatever_the_network_does_a_motion_is_handed_over_whole_and_once_or_not
         if status is not None and tick % 10 == 0:
             net.send(now, status)
         if listening and row < 1400 and row // 50 not in lost_rows:
-            neighbours.on_feedback(_feedback(row, 5), {"ME": now})
+            listener.on_feedback(_feedback(row, 5), {"ME": now})
         for message in net.arrived(now):
             if isinstance(message, Status):
-                neighbours.on_status(message, now, {"ME": now})
+                listener.on_status(message, now, {"ME": now})
             elif isinstance(message, AskHistory):
                 if not silent and message.end_row <= row:
                     count = message.end_row - message.first_row
                     net.send(now, _feedback(message.first_row, count))
             else:
-                neighbours.on_feedback(message, {"ME": now}, live=False)
-        wishes, motions = neighbours.poll(now)
-        for wish in wishes:
+                listener.on_feedback(message, {"ME": now}, live=False)
+        actions, motions = listener.poll(now)
+        for wish in actions:
             if isinstance(wish, Listen):
                 assert wish.on != listening  # never told twice
                 listening = wish.on
@@ -311,7 +311,7 @@ def test_whatever_the_network_does_a_motion_is_handed_over_whole_and_once_or_not
     for motion in found:
         start = 100 if motion.record.motion_id == 11 else 1100
         assert _whole(motion, _record(motion.record.motion_id, start, start + 250))
-    # In the end nothing is left to wait for, and nobody is listened to.
+    # In the end nothing is left to wait for, and no module is subscribed to.
     assert not listening
     if loss == 0.0 and not silent and not lost_rows:
         assert numbers == [11, 12]

@@ -72,7 +72,7 @@ def test_nothing_is_displaced_at_zero() -> None:
     np.testing.assert_allclose(imu_poses(chain, np.zeros((1, 6)))[0], chain.imu_home)
 
 
-def test_a_joint_moves_its_descendants_and_nobody_else() -> None:
+def test_a_joint_moves_its_descendants_and_no_other_body() -> None:
     chain = random_chain(5, joints=8)
     for joint in range(8):
         q = np.zeros((1, 8))

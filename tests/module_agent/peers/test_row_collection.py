@@ -114,7 +114,7 @@ def test_rows_of_another_boot_do_not_count() -> None:
 
 
 @pytest.mark.parametrize("end", ["refused", "silent"])
-def test_rows_that_never_come_are_said_to_be_gone(end: str) -> None:
+def test_rows_that_never_come_are_reported_as_lost(end: str) -> None:
     collection = MotionCollection()
     collection.collect(request(), kept(J1=history(700)), 0)
     (asked,) = collection.poll(0)
@@ -133,7 +133,7 @@ def test_a_motion_of_another_number_is_not_known() -> None:
     assert refused(collection, 2) is Refusal.GONE
 
 
-def test_own_rows_that_are_gone_or_of_another_boot_are_refused_and_leave_nothing_behind() -> None:
+def test_own_rows_that_are_lost_or_of_another_boot_are_refused_and_leave_nothing_behind() -> None:
     collection = MotionCollection()
     own = kept(J2=history(700), J1=history(700))
     for wrong, reason in ((request(end=701), Refusal.GONE), (request(boot=6), Refusal.WRONG_BOOT)):

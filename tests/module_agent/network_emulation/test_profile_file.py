@@ -11,7 +11,12 @@ from coordinator.main import app as coordinator
 from module_agent.main import app as agent
 from module_agent.network_emulation import trace
 from module_agent.network_emulation.profile import PROFILES, LossBurst, NetworkProfile, PathProfile, Stall
-from module_agent.network_emulation.profile_file import NetworkError, load_network, network, network_beside
+from module_agent.network_emulation.profile_file import (
+    NetworkError,
+    load_network,
+    network,
+    network_relative_to,
+)
 from module_agent.network_emulation.trace import NetworkTrace, TraceError, TraceRow, parse_trace
 from sim.main import app as simulator
 from sim.robot.robot_file import RobotFileError, load_robot, shipped_robots
@@ -198,7 +203,7 @@ def test_a_robots_file_names_its_network_from_its_own_folder(file: Path) -> None
         load_robot(robot)
 
 
-def test_a_network_beside_a_file_is_found_from_its_folder() -> None:
-    assert network_beside("lan", Path("robots")) == "lan"
-    assert network_beside("shop.toml", Path("robots")) == "robots/shop.toml"
-    assert network_beside("/etc/shop.toml", Path("robots")) == "/etc/shop.toml"
+def test_a_network_file_is_found_relative_to_the_folder() -> None:
+    assert network_relative_to("lan", Path("robots")) == "lan"
+    assert network_relative_to("shop.toml", Path("robots")) == "robots/shop.toml"
+    assert network_relative_to("/etc/shop.toml", Path("robots")) == "/etc/shop.toml"

@@ -42,16 +42,16 @@ def test_a_swing_of_one_percent_is_seen() -> None:
     assert housing(0.0, swing=0.01).shakes
 
 
-def test_a_module_that_its_own_joint_carries_says_nothing_of_its_base() -> None:
+def test_a_module_on_the_moving_side_does_not_measure_its_base() -> None:
     assert not housing(0.0, swing=1.0).shakes
 
 
-def test_a_dead_imu_shakes_nothing() -> None:
+def test_a_dead_imu_reports_no_shake() -> None:
     dead = ImuWindow(T_NS, np.zeros((T_S.size, 3)), np.zeros((T_S.size, 3)))
     assert not BaseMotion(JointWindow(T_NS, ANGLE, SPEED), dead, np.zeros(6)).shakes
 
 
-def test_what_is_felt_is_seen_from_axes_that_turn_with_the_child() -> None:
+def test_readings_are_in_axes_that_turn_with_the_child() -> None:
     """Independent: rotations by scipy, the derivative of the rate by differences in the housing."""
     rate = np.stack([0.02 * np.sin(8 * T_S), 0.03 * np.cos(7 * T_S), 0.01 * np.sin(6 * T_S)], axis=1)
     force = np.stack([np.sin(5 * T_S), np.cos(4 * T_S), 0.5 * np.sin(3 * T_S)], axis=1)
