@@ -197,14 +197,14 @@ def _normal_equations(
     bodies, ideal, _, _ = expected
     motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
     for k in range(count):
-        found = imu_jacobian(state.chain, bodies, *data.smooth[:2], k)
-        true = mixing(state.imus, k) @ np.concatenate([found.poses, found.gravity, flex.slopes[..., k]])
+        jacobian = imu_jacobian(state.chain, bodies, *data.smooth[:2], k)
+        true = mixing(state.imus, k) @ np.concatenate([jacobian.poses, jacobian.gravity, flex.slopes[..., k]])
         rates = None if data.imu_rates is None else data.imu_rates[:, k]
         own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
         weight = 1.0 / np.repeat([sigma[:, k] for sigma in sigmas], 3, axis=0)[:, motion]
         rows = (np.concatenate([true, own]) * weight).reshape(-1, 6 * samples)
         target = (np.concatenate([part[:, k] for part in residuals], axis=1).T * weight).ravel()
-        at = _places(found.modules, k, count, len(flex.links), int(free.sum()))
+        at = _places(jacobian.modules, k, count, len(flex.links), int(free.sum()))
         information[np.ix_(at, at)] += rows @ rows.T
         rhs[at] += rows @ target
     return _Normal(

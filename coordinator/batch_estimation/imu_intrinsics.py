@@ -82,10 +82,10 @@ def read(intrinsics: ImuIntrinsics, gyro: Array, accel: Array, rates: Array | No
 
 def mixing(intrinsics: ImuIntrinsics, module: int) -> Array:
     """Return the matrix (6, 6) from one IMU's true rates and forces to its readings."""
-    found = np.zeros((6, 6))
-    found[:3, :3], found[3:, 3:] = intrinsics.gyro_matrix[module], intrinsics.accel_matrix[module]
-    found[:3, 3:] = intrinsics.g_sensitivity_s_m[module]
-    return found
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3], matrix[3:, 3:] = intrinsics.gyro_matrix[module], intrinsics.accel_matrix[module]
+    matrix[:3, 3:] = intrinsics.g_sensitivity_s_m[module]
+    return matrix
 
 
 def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool_]) -> Array:
@@ -94,12 +94,12 @@ def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool
     gyro, accel: (m, 3) the truth. rates: (m, 6) or None. free: (34,).
     """
     samples = len(gyro)
-    found = np.zeros((SIZE, 6, samples))
+    derivatives = np.zeros((SIZE, 6, samples))
     for row in range(3):
-        found[3 * row : 3 * row + 3, row] = gyro.T
-        found[9 + 3 * row : 12 + 3 * row, 3 + row] = accel.T
-        found[25 + 3 * row : 28 + 3 * row, row] = accel.T
-    found[18:24] = np.eye(6)[:, :, None]
+        derivatives[3 * row : 3 * row + 3, row] = gyro.T
+        derivatives[9 + 3 * row : 12 + 3 * row, 3 + row] = accel.T
+        derivatives[25 + 3 * row : 28 + 3 * row, row] = accel.T
+    derivatives[18:24] = np.eye(6)[:, :, None]
     if rates is not None:
-        found[DELAY] = -rates.T
-    return found[free]
+        derivatives[DELAY] = -rates.T
+    return derivatives[free]

@@ -90,18 +90,18 @@ def _displaced(body: BodyMotion, seen: _Seen) -> Array:
     turning = _matrix(force) - 2.0 * _product(spin, velocity) - _product(carried, place)
     changes = np.concatenate([spin, turning, carried], axis=1)
     rate, by_turning, by_moving = np.split(np.einsum("jim,jcm->cim", seen.frame, changes), 3)
-    found = np.zeros((6, 6, seen.place.shape[1]))
-    found[:3, :3], found[:3, 3:], found[3:, 3:] = rate, by_turning, by_moving
-    return found
+    slopes = np.zeros((6, 6, seen.place.shape[1]))
+    slopes[:3, :3], slopes[:3, 3:], slopes[3:, 3:] = rate, by_turning, by_moving
+    return slopes
 
 
 def _matrix(vectors: Array) -> Array:
     """Return the matrices (3, 3, m) of the cross products with vectors (3, m)."""
     x, y, z = vectors
-    found = np.zeros((3, *vectors.shape))
-    found[0, 1], found[0, 2], found[1, 2] = -z, y, -x
-    found[1, 0], found[2, 0], found[2, 1] = z, -y, x
-    return found
+    matrices = np.zeros((3, *vectors.shape))
+    matrices[0, 1], matrices[0, 2], matrices[1, 2] = -z, y, -x
+    matrices[1, 0], matrices[2, 0], matrices[2, 1] = z, -y, x
+    return matrices
 
 
 def _product(a: Array, b: Array) -> Array:

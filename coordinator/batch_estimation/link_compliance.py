@@ -134,18 +134,18 @@ def _series(values: Array, rate_hz: float) -> Array:
 
 def joined(parts: Sequence[Sequence[LinkLoad | None]], keep_every: int = 1) -> list[LinkLoad | None]:
     """Join the loads of several stretches of time, link by link, one sample in `keep_every` of each."""
-    found: list[LinkLoad | None] = []
+    loads: list[LinkLoad | None] = []
     for of_link in zip(*parts, strict=True):
         known = [part for part in of_link if part is not None]
         force, moment = (
             [getattr(part, name)[..., ::keep_every] for part in known] for name in ("force", "moment")
         )
-        found.append(
+        loads.append(
             known[0]._replace(force=np.concatenate(force, axis=2), moment=np.concatenate(moment, axis=2))
             if known
             else None
         )
-    return found
+    return loads
 
 
 def link_ends(chain: Chain, kinds: Sequence[ModuleType], module: int) -> tuple[Array, Array]:
@@ -281,12 +281,12 @@ def turns_under(
     loads: Sequence[LinkLoad | None], links: Sequence[int], compliance: Array
 ) -> dict[int, list[LinkTurn]]:
     """Return how links turn under their loads, for compliances (2 l,) in bending and twisting by turns."""
-    found = {}
+    turns = {}
     for module, pair in zip(links, compliance.reshape(-1, 2), strict=True):
         load = loads[module]
         if load is not None:
-            found[module] = load.turns(*(UNIT_RAD_NM * pair))
-    return found
+            turns[module] = load.turns(*(UNIT_RAD_NM * pair))
+    return turns
 
 
 def rigid(count: int, samples: int) -> ComplianceJacobian:
@@ -302,8 +302,8 @@ def loads_of(
     turns: Sequence[LinkTurns] | None = None,
 ) -> list[list[LinkLoad | None]]:
     """Return the loads over each of several stretches of time, as `link_loads` does over one."""
-    found = []
+    loads = []
     for part, turned_links in zip(parts, turns or [{}] * len(parts), strict=True):
         bodies = body_motions(chain, *part.smooth, part.base, turned_links)
-        found.append(link_loads(chain, kinds, bodies, part.smooth[0], rate_hz, turned_links))
-    return found
+        loads.append(link_loads(chain, kinds, bodies, part.smooth[0], rate_hz, turned_links))
+    return loads

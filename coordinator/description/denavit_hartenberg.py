@@ -67,12 +67,12 @@ def dh_transform(theta_rad: ArrayLike, d_m: float, a_m: float, alpha_rad: float)
     """Return eq. 2 for (m,) joint angles: (m, 4, 4) poses of frame i in frame i - 1."""
     theta = np.atleast_1d(np.asarray(theta_rad, dtype=float))
     c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha_rad), np.sin(alpha_rad)
-    found = np.zeros((theta.size, 4, 4))
-    found[:, 0] = np.stack([c, -s * ca, s * sa, a_m * c], axis=1)
-    found[:, 1] = np.stack([s, c * ca, -c * sa, a_m * s], axis=1)
-    found[:, 2] = [0.0, sa, ca, d_m]
-    found[:, 3, 3] = 1.0
-    return found
+    poses = np.zeros((theta.size, 4, 4))
+    poses[:, 0] = np.stack([c, -s * ca, s * sa, a_m * c], axis=1)
+    poses[:, 1] = np.stack([s, c * ca, -c * sa, a_m * s], axis=1)
+    poses[:, 2] = [0.0, sa, ca, d_m]
+    poses[:, 3, 3] = 1.0
+    return poses
 
 
 def dh_poses(path: DhPath, q_rad: ArrayLike) -> Array:
@@ -141,9 +141,9 @@ def _x_axis_across(axis: Array) -> Array:
 
 
 def _frame(z: Array, x: Array, origin: Array) -> Array:
-    found = np.eye(4)
+    frame = np.eye(4)
     # An x that is off by rounding, or by near-parallel axes, is squared up against z.
     x = x - z * (z @ x)
     x = x / np.linalg.norm(x)
-    found[:3, 0], found[:3, 1], found[:3, 2], found[:3, 3] = x, np.cross(z, x), z, origin
-    return found
+    frame[:3, 0], frame[:3, 1], frame[:3, 2], frame[:3, 3] = x, np.cross(z, x), z, origin
+    return frame

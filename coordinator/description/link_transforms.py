@@ -101,14 +101,14 @@ def parameter_slope(pose: Array) -> Array:
     d t = w x t + v; the rotation vector grows by the inverse left Jacobian of SO(3) (Sola et al. 2018, A
     micro Lie theory, eq. 146).
     """
-    found = np.zeros((6, 6))
-    found[:3, :3], found[:3, 3:] = -skew(pose[:3, 3]), np.eye(3)
+    slope = np.zeros((6, 6))
+    slope[:3, :3], slope[:3, 3:] = -skew(pose[:3, 3]), np.eye(3)
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
     angle, matrix = float(np.linalg.norm(turn)), skew(turn)
     # 1 / a^2 - cot(a / 2) / (2 a), whose series begins with 1 / 12.
     factor = 1.0 / 12.0 if angle < 1e-4 else 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
-    found[3:, :3] = np.eye(3) - 0.5 * matrix + factor * matrix @ matrix
-    return np.asarray(_UNITS[:, None] * found)
+    slope[3:, :3] = np.eye(3) - 0.5 * matrix + factor * matrix @ matrix
+    return np.asarray(_UNITS[:, None] * slope)
 
 
 def _null_directions(seen: Array) -> tuple[Array, tuple[bool, ...]]:

@@ -110,7 +110,7 @@ def _tip(chain: Chain, leaf: int, home: Array, covariance: Array) -> Tip:
 
 def _ad(twists: Array) -> Array:
     """Return the (n, 6, 6) matrices of the Lie bracket with twists (n, 6) (Lynch and Park, eq. 8.38)."""
-    found = np.zeros((len(twists), 6, 6))
-    found[:, :3, :3] = found[:, 3:, 3:] = skew(twists[:, :3])
-    found[:, 3:, :3] = skew(twists[:, 3:])
-    return found
+    brackets = np.zeros((len(twists), 6, 6))
+    brackets[:, :3, :3] = brackets[:, 3:, 3:] = skew(twists[:, :3])
+    brackets[:, 3:, :3] = skew(twists[:, 3:])
+    return brackets

@@ -124,8 +124,12 @@ def _joint(element: Element, links: dict[str, Element]) -> _Joint:
     if element.find("mimic") is not None:
         _refuse(f"joint {name!r} mimics another; only joints that move by themselves are known")
     ends = [_end(element, name, end, links) for end in ("parent", "child")]
-    found = element.find("axis")
-    axis = np.array([1.0, 0.0, 0.0]) if found is None else _three(found, "xyz", f"axis of joint {name!r}")
+    axis_element = element.find("axis")
+    axis = (
+        np.array([1.0, 0.0, 0.0])
+        if axis_element is None
+        else _three(axis_element, "xyz", f"axis of joint {name!r}")
+    )
     length = float(np.linalg.norm(axis))
     if kind in _MOVING and not length > 1e-9:
         _refuse(f"axis of joint {name!r} is zero; it must be a direction")
@@ -134,8 +138,8 @@ def _joint(element: Element, links: dict[str, Element]) -> _Joint:
 
 
 def _end(element: Element, name: str, end: str, links: dict[str, Element]) -> str:
-    found = element.find(end)
-    link = None if found is None else found.get("link")
+    end_element = element.find(end)
+    link = None if end_element is None else end_element.get("link")
     if link is None or link not in links:
         _refuse(f"joint {name!r} has {end} {link!r}, and no link has that name")
     return link
@@ -203,8 +207,8 @@ def _link_inertia(inertial: Element, where: str) -> Array:
     about_centre = [_number(inertia, key, where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
     phi = np.array([_number(mass, "value", where), 0.0, 0.0, 0.0, *about_centre])
     pose = _pose(inertial.find("origin"), where)
-    found: Array = pose @ pseudo_inertia(phi) @ pose.T
-    return found
+    in_link: Array = pose @ pseudo_inertia(phi) @ pose.T
+    return in_link
 
 
 def _pose(origin: Element | None, where: str) -> Array:

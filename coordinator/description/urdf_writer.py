@@ -112,8 +112,8 @@ def link_homes(chain: Chain) -> Array:
 
 
 def _shortest_turn(from_direction: Array, to_direction: Array) -> Array:
-    found: Array = Rotation.align_vectors([to_direction], [from_direction])[0].as_matrix()
-    return found
+    rotation: Array = Rotation.align_vectors([to_direction], [from_direction])[0].as_matrix()
+    return rotation
 
 
 def upright_pose(gravity: Array) -> Array:
@@ -130,8 +130,8 @@ def _link_name(chain: Chain, body_index: int) -> str:
 
 
 def _relative(homes: Array, parent: int, pose: Array) -> Array:
-    found: Array = pose if parent == BASE else np.linalg.solve(homes[parent], pose)
-    return found
+    relative: Array = pose if parent == BASE else np.linalg.solve(homes[parent], pose)
+    return relative
 
 
 def _joint(robot: Element, name: str, kind: str, parent: str, child: str, pose: Array) -> Element:

@@ -70,19 +70,19 @@ def circle_slopes(setting: CircleSetting, path: JointPath) -> Array:
     """
     across = radial_directions(setting)
     samples = len(path.q_rad)
-    found = np.zeros((GEOMETRY, 6, samples))
+    derivatives = np.zeros((GEOMETRY, 6, samples))
     axis = setting.axis[:, None]
     for k, direction in enumerate(across):
         at = np.broadcast_to(direction[:, None], (3, samples))
-        found[k, 3:] = cross(axis * path.qdd_rad_s2, at) - at * path.qd_rad_s**2
+        derivatives[k, 3:] = cross(axis * path.qdd_rad_s2, at) - at * path.qd_rad_s**2
         tilt = np.cross(direction, setting.axis)
-        found[2 + k, :3] = tilt[:, None] * path.qd_rad_s
-        found[2 + k, 3:] = _gravity_by_axis(setting, tilt, path.q_rad)
-        found[2 + k, 3:] += np.cross(tilt, setting.radial_m)[:, None] * path.qdd_rad_s2
-        found[2 + k, 3:] += np.outer(setting.axis, tilt @ setting.radial_m * path.qd_rad_s**2)
+        derivatives[2 + k, :3] = tilt[:, None] * path.qd_rad_s
+        derivatives[2 + k, 3:] = _gravity_by_axis(setting, tilt, path.q_rad)
+        derivatives[2 + k, 3:] += np.cross(tilt, setting.radial_m)[:, None] * path.qdd_rad_s2
+        derivatives[2 + k, 3:] += np.outer(setting.axis, tilt @ setting.radial_m * path.qd_rad_s**2)
     for k, unit in enumerate(np.eye(3)):
-        found[4 + k, 3:] = turned(setting.axis, -path.q_rad, np.repeat(unit[:, None], samples, 1))
-    return found
+        derivatives[4 + k, 3:] = turned(setting.axis, -path.q_rad, np.repeat(unit[:, None], samples, 1))
+    return derivatives
 
 
 def radial_directions(setting: CircleSetting) -> Array:

@@ -137,11 +137,11 @@ def measured_load(q_rad: Array, tau_nm: Array, rate_hz: float) -> Load:
     edge = settling_samples(rate_hz, HELD_JOINT_CUTOFF_HZ) // 2
     kept = slice(edge, len(q) - edge)
     terms = np.column_stack([acceleration, rate, q - q.mean(), np.ones(len(q))])[kept]
-    found, *_ = np.linalg.lstsq(terms, tau[kept], rcond=None)
-    residual = tau[kept] - terms @ found
+    solution, *_ = np.linalg.lstsq(terms, tau[kept], rcond=None)
+    residual = tau[kept] - terms @ solution
     # A low-passed sample is not independent of its neighbours.
     independent = len(terms) * min(1.0, 2.0 * HELD_JOINT_CUTOFF_HZ / rate_hz)
     freedom = max(independent - terms.shape[1], 1.0)
     scatter = float(residual @ residual) / len(terms) * independent / freedom
     variance = scatter * np.linalg.pinv(terms.T @ terms)[0, 0] * len(terms) / independent
-    return Load(float(found[0]), float(np.sqrt(variance)))
+    return Load(float(solution[0]), float(np.sqrt(variance)))

@@ -87,12 +87,12 @@ def excitation_task(chain: Chain, modules: Sequence[RobotModule], plan: Plan) ->
 
 def _limits(module: RobotModule, inertia_kg_m2: float) -> JointLimits:
     # What gravity takes is counted with the motion's own torque, in every pose.
-    found, told = joint_limits(module.kind, 0.0, inertia_kg_m2), module.limits
-    low, high = told.min_position_rad, told.max_position_rad
-    return found._replace(
-        speed_rad_s=min(found.speed_rad_s, told.max_speed_rad_s),
-        low_rad=found.low_rad if low is None else max(found.low_rad, low + END_RAD),
-        high_rad=found.high_rad if high is None else min(found.high_rad, high - END_RAD),
+    limits, stated = joint_limits(module.kind, 0.0, inertia_kg_m2), module.limits
+    low, high = stated.min_position_rad, stated.max_position_rad
+    return limits._replace(
+        speed_rad_s=min(limits.speed_rad_s, stated.max_speed_rad_s),
+        low_rad=limits.low_rad if low is None else max(limits.low_rad, low + END_RAD),
+        high_rad=limits.high_rad if high is None else min(limits.high_rad, high - END_RAD),
     )
 
 

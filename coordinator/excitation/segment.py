@@ -108,14 +108,14 @@ def way(from_rad: Array, to_rad: Array, max_speed_rad_s: float, rate_hz: float) 
     goals = [GoTo(target_rad=float(q), max_speed_rad_s=max_speed_rad_s) for q in to_rad]
     lasting = [duration_s(goal, float(q)) for goal, q in zip(goals, from_rad, strict=True)]
     t_s = np.arange(int(max(lasting) * rate_hz) + 2) / rate_hz
-    found = np.stack(
+    positions = np.stack(
         [
             q + waveform(goal, float(q), np.minimum(t_s, end)).offset_rad
             for goal, q, end in zip(goals, from_rad, lasting, strict=True)
         ],
         axis=1,
     )
-    return read_only(found)
+    return read_only(positions)
 
 
 def sampled(segment: Segment, rate_hz: float) -> SampledMotion:

@@ -84,21 +84,21 @@ def design_joint(task: JointTask, constant: ConstantMotion | None = None) -> Joi
         NoExcitation: nothing fits into range, limits and time, with all three.
     """
     slow = [constant] if constant is not None else _sweeps(task)
-    found = [
+    candidates = [
         _judged(task, one, sine) for one in slow for sine in _sines(task, task.budget_s - _other_s(task, one))
     ]
-    if not found:
+    if not candidates:
         raise NoExcitation(
             f"no motion fits: {task.budget_s:.1f} s, {task.limits.room_rad(task.home_rad):.2f} rad to either "
             f"side, at most {task.limits.speed_rad_s:.2f} rad/s and {task.limits.accel_rad_s2:.2f} rad/s^2"
         )
-    return min(found, key=lambda motions: motions.error_m)
+    return min(candidates, key=lambda motions: motions.error_m)
 
 
 def next_sine(task: JointTask, done: Sequence[Pattern], lasting_s: float) -> WindowedSine | None:
     """Return the fast motion that tells most beside those that are done; None if none fits."""
-    found = list(_sines(task, lasting_s))
-    return min(found, key=lambda sine: predicted_sigma_m(task, [*done, sine]), default=None)
+    candidates = list(_sines(task, lasting_s))
+    return min(candidates, key=lambda sine: predicted_sigma_m(task, [*done, sine]), default=None)
 
 
 def predicted_sigma_m(task: JointTask, patterns: Sequence[Pattern]) -> float:
@@ -128,11 +128,11 @@ def _settings(task: JointTask) -> list[CircleSetting]:
 
 def _path(pattern: Pattern) -> JointPath:
     t_s = np.arange(0.0, duration_s(pattern, 0.0), 1.0 / RATE_HZ)
-    found = waveform(pattern, 0.0, t_s)
+    wave = waveform(pattern, 0.0, t_s)
     # A slow motion passes home in its middle.
-    middle = 0.5 * (found.offset_rad[0] + found.offset_rad[-1])
-    acceleration = np.gradient(found.velocity_rad_s, t_s)
-    return JointPath(found.offset_rad - middle, found.velocity_rad_s, acceleration, RATE_HZ)
+    middle = 0.5 * (wave.offset_rad[0] + wave.offset_rad[-1])
+    acceleration = np.gradient(wave.velocity_rad_s, t_s)
+    return JointPath(wave.offset_rad - middle, wave.velocity_rad_s, acceleration, RATE_HZ)
 
 
 def _sweeps(task: JointTask) -> list[ConstantMotion]:

@@ -190,15 +190,15 @@ class _Geometry:
         gravity = home @ skew(self.up) @ rest[:, :3]
         tilt = -home @ skew(self.up)
         pieces = _weigh_slopes(axis, radial, gravity, observations)
-        found = np.zeros((observations.rows, width + 3))
-        found[:, :width] = pieces
+        slopes = np.zeros((observations.rows, width + 3))
+        slopes[:, :width] = pieces
         tilts = (
             np.swapaxes(observations.gravity_across, 1, 2)
             @ tilt
             / observations.sigma_gravity_rad[:, None, None]
         )
-        found[4 * observations.joint.size :, width:] = tilts.reshape(-1, 3)
-        return found
+        slopes[4 * observations.joint.size :, width:] = tilts.reshape(-1, 3)
+        return slopes
 
     def _imu(self, pose: Index, module: Index) -> Array:
         return np.asarray(self.body[pose, self.carrier[module]] @ self.chain.imu_home[module])
@@ -210,12 +210,12 @@ class _Geometry:
         Ad(D_parent) xi - Ad(D_a) xi to the twists of all that a moves.
         """
         count = len(self.chain.serials)
-        found = np.zeros((*self.body.shape[:2], 6, 6 * count))
+        twists = np.zeros((*self.body.shape[:2], 6, 6 * count))
         carry = adjoint(self.body)
         for a, parent in enumerate(self.chain.parent):
-            found[:, a] = found[:, parent]
-            found[:, a, :, 6 * a : 6 * a + 6] += carry[:, parent] - carry[:, a]
-        return found
+            twists[:, a] = twists[:, parent]
+            twists[:, a, :, 6 * a : 6 * a + 6] += carry[:, parent] - carry[:, a]
+        return twists
 
     def _imu_twists(self, bodies: Array, pose: Index, module: Index) -> Array:
         twists: Array = bodies[pose, self.carrier[module]]

@@ -57,17 +57,17 @@ def gauge_freedoms(chain: Chain, unresolved: Sequence[Unresolved]) -> tuple[Gaug
     The chain may be another one of the same modules; what is no motion of it, and what has no name, is left
     out.
     """
-    found: list[GaugeFreedom] = []
+    freedoms: list[GaugeFreedom] = []
     for item in unresolved:
         first = chain.serials.index(item.modules[0])
         path = chain.ancestors(first)
         if item.kind in ("offset_along_axis", "rotation_about_axis"):
             joint = chain.serials.index(item.joint)
             if joint in path[:-1]:
-                found.append(GaugeFreedom(item.kind, joint, path[path.index(joint) + 1]))
+                freedoms.append(GaugeFreedom(item.kind, joint, path[path.index(joint) + 1]))
         elif item.kind in ("position", "rotation_about_gravity") and chain.parent[first] == BASE:
-            found.append(GaugeFreedom(item.kind, BASE, first))
-    return tuple(sorted(dict.fromkeys(found), key=lambda one: one.branch))
+            freedoms.append(GaugeFreedom(item.kind, BASE, first))
+    return tuple(sorted(dict.fromkeys(freedoms), key=lambda one: one.branch))
 
 
 def nearest(chain: Chain, free: Sequence[GaugeFreedom], places: Sequence[int], imu_home: Array) -> Array:
@@ -79,8 +79,8 @@ def nearest(chain: Chain, free: Sequence[GaugeFreedom], places: Sequence[int], i
         off = moved(chain, free, amounts).imu_home[list(places)] - imu_home
         return np.concatenate([off[:, :3, 3].ravel(), REACH_M / np.sqrt(2.0) * off[:, :3, :3].ravel()])
 
-    found = least_squares(misfit, _start(misfit, free), xtol=1e-10, ftol=1e-10)
-    return np.asarray(found.x)
+    fit = least_squares(misfit, _start(misfit, free), xtol=1e-10, ftol=1e-10)
+    return np.asarray(fit.x)
 
 
 def moved(chain: Chain, free: Sequence[GaugeFreedom], amounts: Array) -> Chain:

@@ -316,10 +316,10 @@ def _axes(signals: _Signals) -> list[tuple[Array, Array]]:
         return np.concatenate([across[0] - across[1], np.linalg.norm(x.reshape(2, 3), axis=1) - 1.0])
 
     starts = np.random.default_rng(0).normal(size=(_STARTS, 6))
-    found = [least_squares(residual, axes(start).ravel(), max_nfev=50) for start in starts]
-    found.sort(key=lambda fit: float(fit.cost))
+    fits = [least_squares(residual, axes(start).ravel(), max_nfev=50) for start in starts]
+    fits.sort(key=lambda fit: float(fit.cost))
     pairs: list[tuple[Array, Array]] = []
-    for fit in found:
+    for fit in fits:
         j = axes(fit.x)
         if not any(abs(j[0] @ a) > 0.99 and abs(j[1] @ b) > 0.99 for a, b in pairs):
             pairs.append((j[0], j[1]))
@@ -353,7 +353,7 @@ def _arms(signals: _Signals, frame_1: Array, frame_2: Array) -> tuple[float, _St
 
 
 def _refined(signals: _Signals, state: _State, sigmas: tuple[float, float], priors: Array) -> _State:
-    found = least_squares(
+    fit = least_squares(
         lambda x: _weighted(signals, _State(state.frames, x), sigmas, priors),
         state.values,
         x_scale=np.r_[np.full(_GEOMETRY, 0.1), priors],
@@ -361,7 +361,7 @@ def _refined(signals: _Signals, state: _State, sigmas: tuple[float, float], prio
         max_nfev=40,
     )
     # Turns of the axes go into the frames, which then are the new reference.
-    values = np.asarray(found.x).copy()
+    values = np.asarray(fit.x).copy()
     turns = Rotation.from_rotvec(np.c_[values[:4].reshape(2, 2), np.zeros(2)]).as_matrix()
     values[:4] = 0.0
     return _State(state.frames @ turns, values)

@@ -155,8 +155,8 @@ def _align(evidence: _Evidence, neutral: Array) -> Array:
     here = np.concatenate([evidence.here, np.eye(3)])
     least = evidence.weight.min(initial=NEUTRAL_SIGMA**-2)
     weight = np.concatenate([evidence.weight, np.full(3, NEUTRAL_SHARE * least)])
-    found, _ = Rotation.align_vectors(there, here, weights=weight)
-    return np.asarray(found.as_matrix())
+    rotation, _ = Rotation.align_vectors(there, here, weights=weight)
+    return np.asarray(rotation.as_matrix())
 
 
 def _locate(evidence: _Evidence, turn: Array, neutral: Array) -> Array:
@@ -171,7 +171,7 @@ def _locate(evidence: _Evidence, turn: Array, neutral: Array) -> Array:
     rows = (across * evidence.radial_weight[:, None, None]).reshape(-1, 3)
     goal = (aim * evidence.radial_weight[:, None]).ravel()
     prior = np.eye(3) / NEUTRAL_SIGMA
-    found, *_ = np.linalg.lstsq(
+    place, *_ = np.linalg.lstsq(
         np.concatenate([rows, prior]), np.concatenate([goal, prior @ neutral]), rcond=None
     )
-    return np.asarray(found)
+    return np.asarray(place)

@@ -180,11 +180,11 @@ def _regressed(terms: Array, signals: Array, independent: float) -> tuple[Array,
     """Return coefficients (p, n, 3) of signals (m, n, 3) on terms (m, p), and their sigmas (p, n)."""
     samples, count, _ = signals.shape
     scale = np.maximum(np.sqrt(np.mean(terms**2, axis=0)), np.finfo(float).tiny)
-    found, *_ = np.linalg.lstsq(terms / scale, signals.reshape(samples, -1), rcond=1e-10)
-    residual = signals.reshape(samples, -1) - (terms / scale) @ found
+    solution, *_ = np.linalg.lstsq(terms / scale, signals.reshape(samples, -1), rcond=1e-10)
+    residual = signals.reshape(samples, -1) - (terms / scale) @ solution
     scatter = np.sqrt(np.mean(residual.reshape(samples, count, 3) ** 2, axis=(0, 2)) / independent)
     spread = np.sqrt(np.diag(np.linalg.pinv((terms / scale).T @ (terms / scale))))
-    coefficients = (found / scale[:, None]).reshape(len(scale), count, 3)
+    coefficients = (solution / scale[:, None]).reshape(len(scale), count, 3)
     return coefficients, np.outer(spread / scale, scatter)
 
 
@@ -205,8 +205,8 @@ def _gravity(gyro_rad_s: Array, force_m_s2: Array, rate_hz: float) -> Array:
     samples, count, _ = gyro_rad_s.shape
     between = 0.5 * (gyro_rad_s[1:] + gyro_rad_s[:-1]) / rate_hz
     steps = Rotation.from_rotvec(-between.reshape(-1, 3)).as_matrix().reshape(samples - 1, count, 3, 3)
-    found = np.empty((samples, count, 3))
-    found[0] = force_m_s2
+    gravity = np.empty((samples, count, 3))
+    gravity[0] = force_m_s2
     for row, step in enumerate(steps):
-        found[row + 1] = np.einsum("nij,nj->ni", step, found[row])
-    return found
+        gravity[row + 1] = np.einsum("nij,nj->ni", step, gravity[row])
+    return gravity

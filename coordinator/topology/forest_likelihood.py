@@ -165,14 +165,14 @@ def edge_log_odds(parent: Parents, others: dict[Parents, float]) -> Array:
 
     Infinite for a module that no rival mounts elsewhere.
     """
-    found = np.full(len(parent), np.inf)
+    log_odds = np.full(len(parent), np.inf)
     if not others:
-        return found
+        return log_odds
     moved = np.array(list(others)) != np.array(parent)
     weight = np.array(list(others.values()))
     for k in range(len(parent)):
         wrong = weight[moved[:, k]]
         right = np.append(weight[~moved[:, k]], 0.0)
         if wrong.size:
-            found[k] = np.logaddexp.reduce(right) - np.logaddexp.reduce(wrong)
-    return found
+            log_odds[k] = np.logaddexp.reduce(right) - np.logaddexp.reduce(wrong)
+    return log_odds

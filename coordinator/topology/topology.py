@@ -142,16 +142,16 @@ def find_topology(observations: Observations, unmoved: Collection[str] = ()) -> 
         TopologyError: too many observations are missing, they contradict each other beyond noise, or they
             leave open how a module is mounted; with the serials.
     """
-    found = likely_topology(observations, unmoved)
-    serials = list(found.serials)
+    topology = likely_topology(observations, unmoved)
+    serials = list(topology.serials)
     _check_reversed(serials, observations)
-    wrong = [d for d in found.doubts if d.kind == "contradiction" and d.log_odds < -CONTRADICTS_ABOVE]
+    wrong = [d for d in topology.doubts if d.kind == "contradiction" and d.log_odds < -CONTRADICTS_ABOVE]
     if wrong:
         raise _contradiction_error(wrong[0], serials, observations)
-    open_ = [d for d in found.doubts if d.kind != "contradiction" and d.log_odds < UNBELIEVABLE_BELOW]
+    open_ = [d for d in topology.doubts if d.kind != "contradiction" and d.log_odds < UNBELIEVABLE_BELOW]
     if open_:
         raise TopologyError(open_[0].text, tuple(dict.fromkeys((open_[0].module, open_[0].joint))))
-    return found
+    return topology
 
 
 def likely_topology(observations: Observations, unmoved: Collection[str] = ()) -> Topology:
@@ -253,9 +253,9 @@ def _outvoted(case: _Case, i: int, k: int) -> Iterator[Doubt]:
     joint, observer, odds = case.serials[i], case.serials[k], float(abs(case.odds[i, k]))
     pairs = {(joint, observer): None}
     if odds > CONTRADICTS_ABOVE and (
-        found := _impossible(case.serials, case.observations, (joint, observer))
+        contradiction := _impossible(case.serials, case.observations, (joint, observer))
     ):
-        pairs |= dict.fromkeys(found.pairs)
+        pairs |= dict.fromkeys(contradiction.pairs)
     for pair in pairs:
         text = f"{_saw(case.observations, *pair)}, which does not fit the rest; repeat that motion"
         yield Doubt("contradiction", pair[1], -odds, *pair, text)
@@ -322,16 +322,18 @@ def _impossible(
     serials: list[str], observations: Observations, pair: tuple[str, str]
 ) -> _Contradiction | None:
     movers = {k: [i for i in serials if i != k and _carried(observations, i, k)] for k in serials}
-    return next((found for found in _contradictions(serials, movers) if pair in found.pairs), None)
+    return next((one for one in _contradictions(serials, movers) if pair in one.pairs), None)
 
 
 def _contradiction_error(doubt: Doubt, serials: list[str], observations: Observations) -> TopologyError:
     """Say what no tree allows, with the observation that does not fit the rest."""
     pair = (doubt.joint, doubt.observer)
-    found = _impossible(serials, observations, pair)
-    told, pairs = (f"{found.text}: no tree does that. ", found.pairs) if found is not None else ("", ())
+    contradiction = _impossible(serials, observations, pair)
+    reason, pairs = "", [pair]
+    if contradiction is not None:
+        reason, pairs = f"{contradiction.text}: no tree does that. ", [pair, *contradiction.pairs]
     return TopologyError(
-        f"{told}{doubt.text}", tuple(dict.fromkeys(serial for one in (pair, *pairs) for serial in one))
+        f"{reason}{doubt.text}", tuple(dict.fromkeys(serial for one in pairs for serial in one))
     )
 
 
