@@ -1,12 +1,12 @@
 """The report of fit-dynamics in a versioned schema; written whole or not at all."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
 from coordinator.parameter_fit.identifiability import Precision
 from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part
+from module_agent.model.files import write_json
 
 SCHEMA = 2
 
@@ -178,6 +178,4 @@ def write_report(path: Path, report: FitReport) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, report)

@@ -1,6 +1,5 @@
 """`check.json`: what a check says of every link of a known robot, in figures and in words."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from scipy.stats import norm
 
 from coordinator.baseline.change_detection import Findings, LinkChange
 from module_agent.model.chain import Chain
+from module_agent.model.files import write_json
 
 SCHEMA = 1
 BASE_NAME = "base"
@@ -196,6 +196,4 @@ def _odds(probability: float) -> str:
 
 def write_check(path: Path, report: CheckReport) -> None:
     """Write `check.json`; the file is the complete old or the complete new one."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(report.model_dump_json(indent=1, by_alias=True) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, report)

@@ -1,6 +1,5 @@
 """`payload.json`: what a robot carries that it did not carry when it was identified."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.pseudo_inertia import Body, body
 from coordinator.parameter_fit.payload import Payload
 from module_agent.model.chain import Chain
+from module_agent.model.files import write_json
 
 SCHEMA = 1
 # The next best carrier must explain that much less, in variances of the torques' noise, to be ruled out.
@@ -81,9 +81,7 @@ def payload_report(
 
 def write_payload(path: Path, report: PayloadReport) -> None:
     """Write `payload.json`; the file is the complete old or the complete new one."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, report)
 
 
 def _words(report: PayloadReport) -> list[str]:

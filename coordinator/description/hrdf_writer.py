@@ -9,7 +9,6 @@ uncertainty: those are in `result.json`.
 The base frame has z up; the degrees of freedom are in the order of the file, which a comment in it repeats.
 """
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +22,7 @@ from coordinator.dynamics.pseudo_inertia import body, is_consistent, nearest_con
 from coordinator.kinematics.frames import distal_homes, housing_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.files import replacing
 from module_agent.model.regressor import PER_BODY, check_phi
 
 VERSION = "1.6.0"
@@ -69,9 +69,8 @@ def write_hrdf(
     """
     robot = hrdf_element(chain, types, phi, name)
     indent(robot, space="  ")
-    temporary = path.with_name(path.name + ".part")
-    ElementTree(robot).write(temporary, encoding="utf-8", xml_declaration=True)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        ElementTree(robot).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
 def hrdf_element(

@@ -1,6 +1,5 @@
 """Put fitted bodies and friction into a robot's own URDF, whose other contents stay."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import (
@@ -21,6 +20,7 @@ from coordinator.description.urdf_reader import UrdfRobot
 from coordinator.dynamics.drive_model import DriveColumn
 from coordinator.dynamics.pseudo_inertia import Body
 from module_agent.model.chain import Array
+from module_agent.model.files import write_text
 
 
 def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLike) -> str:
@@ -59,9 +59,7 @@ def write_fitted_urdf(path: Path, text: str) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, text)
 
 
 def friction_of(drives: Sequence[DriveColumn], values: Sequence[float], joints: int) -> Array:

@@ -5,7 +5,6 @@ root frame. Body i is the link `body_<serial>` with z on its joint's axis at q =
 `joint_<serial>`; `imu_<serial>` is a link fixed to the body that carries the IMU.
 """
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, indent
@@ -23,6 +22,7 @@ from coordinator.dynamics.pseudo_inertia import (
 )
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
+from module_agent.model.files import replacing
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, check_phi
 
@@ -51,9 +51,8 @@ def write_urdf(
     """
     robot = robot_element(chain, phi, name, module_types)
     indent(robot, space="  ")
-    temporary = path.with_name(path.name + ".part")
-    ElementTree(robot).write(temporary, encoding="utf-8", xml_declaration=True)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        ElementTree(robot).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
 def robot_element(

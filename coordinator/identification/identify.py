@@ -4,10 +4,10 @@ Topology from who moved, a first chain from the agents' circle point analyses, o
 over all exploration motions, then the inertial parameters, checked on motions that nothing was fitted to.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
+from module_agent.model.files import replacing
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, JointMotion, settling_samples
@@ -283,14 +284,13 @@ def _checked(bodies: RobotBodies, kinematics: Kinematics, motion: JointMotion, m
 
 def write_held_out(path: Path, held_out: HeldOutMotion) -> None:
     """Write the held-out torques as npz, whole or not at all."""
-    temporary = path.with_name("held_out.part.npz")
-    np.savez_compressed(
-        temporary,
-        serials=np.array(held_out.serials),
-        t_ns=held_out.module_ns,
-        session_ns=held_out.session_ns,
-        q_rad=held_out.q_rad,
-        tau_measured_nm=held_out.tau_measured_nm,
-        tau_predicted_nm=held_out.tau_predicted_nm,
-    )
-    os.replace(temporary, path)
+    arrays: dict[str, Any] = {
+        "serials": np.array(held_out.serials),
+        "t_ns": held_out.module_ns,
+        "session_ns": held_out.session_ns,
+        "q_rad": held_out.q_rad,
+        "tau_measured_nm": held_out.tau_measured_nm,
+        "tau_predicted_nm": held_out.tau_predicted_nm,
+    }
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)

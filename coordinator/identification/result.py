@@ -1,6 +1,5 @@
 """`result.json`: what a session found, in a versioned schema; written whole or not at all."""
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -9,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart
 from module_agent.model.chain import Chain
+from module_agent.model.files import write_json
 
 SCHEMA = 2
 
@@ -330,7 +330,4 @@ def _renamed(value: Any, path: Sequence[str], names: Mapping[str, str]) -> Any:
 
 def write_result(path: Path, result: Result) -> None:
     """Write the result; the file is the complete old or the complete new one."""
-    text = result.model_dump_json(indent=1, by_alias=True)
-    temporary = path.with_suffix(".json.part")
-    temporary.write_text(text + "\n")
-    os.replace(temporary, path)
+    write_json(path, result)

@@ -1,6 +1,5 @@
 """`information.npz`: what a run's torques say, with the chain that it was computed with; versioned."""
 
-import os
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +8,7 @@ import numpy as np
 
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError, RobotError
+from module_agent.model.files import replacing
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 
@@ -63,9 +63,8 @@ def write_information(path: Path, run: RunInformation) -> None:
     }
     for k, joint in enumerate(run.joints):
         arrays[f"r{k}"], arrays[f"z{k}"], arrays[f"effects{k}"] = joint.r, joint.z, run.effects[k]
-    temporary = path.with_name("information.part.npz")
-    np.savez_compressed(temporary, **arrays)
-    os.replace(temporary, path)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 def read_information(path: Path) -> RunInformation:

@@ -1,6 +1,5 @@
 """`merged.json`: the base parameters of module parts that several runs determine together."""
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from coordinator.merge.merge_runs import MergedInformation, RunShare
 from coordinator.parameter_fit.identifiability import WEAK_ABOVE
 from coordinator.parameter_fit.report_parts import BaseParameterPart, Part, base_parameter_parts
+from module_agent.model.files import write_json
 
 SCHEMA = 2
 MERGED = "merged.json"
@@ -73,6 +73,4 @@ def _run(run: RunShare) -> RunPart:
 
 def write_report(path: Path, report: MergeReport) -> None:
     """Write the report, whole or not at all."""
-    temporary = path.with_suffix(".part")
-    temporary.write_text(report.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, report)

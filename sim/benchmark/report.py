@@ -4,8 +4,6 @@ The picture has a panel for every figure, with the thesis' value, ours, the boun
 each case. matplotlib is imported where it draws, since everything else here works without it.
 """
 
-import json
-import os
 import platform
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -14,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from module_agent.model.errors import UsageError
+from module_agent.model.files import write_json
 from sim.benchmark.case import CaseResult
 from sim.benchmark.row import Row
 
@@ -79,10 +78,7 @@ def write_results(path: Path, results: Results) -> None:
         "costs": [cost._asdict() for cost in results.costs],
         "wall_time_s": results.wall_time_s,
     }
-    text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, document)
 
 
 _OURS, _MISSED, _THESIS, _BOUND, _BAR = "#1f5fa8", "#c0261c", "#d07a1f", "#606060", "#2f7d32"

@@ -1,6 +1,5 @@
 """`x5-sim monitoring`: the monitor on simulated robots with an event, or without."""
 
-import json
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -12,6 +11,7 @@ from coordinator.monitoring.findings import KINDS, UNITS, Kind
 from coordinator.runtime.command_line import fail
 from coordinator.runtime.terminal import print_table
 from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, UsageError
+from module_agent.model.files import write_json
 from sim.benchmark.case import Trial
 from sim.benchmark.cases.monitoring import (
     AFTER_S,
@@ -80,7 +80,7 @@ def monitoring(
     )
     if json_file is not None:
         try:
-            json_file.write_text(json.dumps(figures(happened, alarms), indent=1) + "\n", encoding="utf-8")
+            write_json(json_file, figures(happened, alarms))
         except OSError as error:
             fail(f"cannot write {json_file}: {error.strerror or error}", EXIT_FAILED)
 

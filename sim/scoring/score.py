@@ -5,7 +5,6 @@ tips are compared, and nothing else is.
 """
 
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ from coordinator.identification.identified import Identified
 from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart, migrate
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.errors import DataError, RobotError
+from module_agent.model.files import write_json
 from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.world.truth import Motion, read_motion, read_truth
@@ -165,9 +165,7 @@ def _compared(
 
 def write_score(path: Path, found: Score) -> None:
     """Write `score.json`; the file is the complete old or the complete new one."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(found.model_dump_json(indent=1) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_json(path, found)
 
 
 def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[LinkScore]:

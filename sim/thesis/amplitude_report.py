@@ -4,8 +4,6 @@ The picture draws the estimated length over the amplitude, as the thesis' figure
 """
 
 import csv
-import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from module_agent.model.errors import UsageError
+from module_agent.model.files import replacing, write_json
 from sim.thesis.amplitude_sweep import AmplitudeTrial
 from sim.thesis.published import ALIGNMENTS, Alignment, ThesisLength, thesis_length
 
@@ -64,13 +63,12 @@ def write_results(folder: Path, settings: dict[str, object], trials: Sequence[Am
         "repeats": [_plain(row) for row in repeats(trials)],
         "repeats_unfiltered": [_plain(row) for row in repeats(trials, filtered=False)],
     }
-    _replace(folder / "amplitudes.json", json.dumps(document, indent=1, allow_nan=False) + "\n")
-    temporary = folder / "amplitudes.csv.part"
-    with temporary.open("w", newline="", encoding="utf-8") as file:
+    write_json(folder / "amplitudes.json", document)
+    csv_file = folder / "amplitudes.csv"
+    with replacing(csv_file) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(AmplitudeTrial._fields)
         writer.writerows(trials)
-    os.replace(temporary, folder / "amplitudes.csv")
 
 
 def _plain(row: Repeats) -> dict[str, object]:
@@ -81,12 +79,6 @@ def _plain(row: Repeats) -> dict[str, object]:
         "error_mm": row.error_mm,
         "scatter_mm": row.scatter_mm,
     }
-
-
-def _replace(path: Path, text: str) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 _FILTERED, _UNFILTERED, _THESIS, _TRUTH, _SATURATED = "#1f5fa8", "#d07a1f", "#b0204a", "#404040", "#e9e4da"

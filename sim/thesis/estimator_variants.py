@@ -15,7 +15,6 @@ whose scale is wrong they take the error. The agents use `encoder`.
 What came of comparing estimators: one row for each arm and estimator, to print and as JSON.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +28,7 @@ from module_agent.estimate.observed_motion import MotionWindows, ObservedMotion,
 from module_agent.estimate.smoothing import SmoothMotion
 from module_agent.estimate.windows import Array, ImuWindow, JointWindow, imu_window
 from module_agent.model.errors import DataError
+from module_agent.model.files import write_json
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
@@ -231,8 +231,7 @@ def write_estimators(path: Path, settings: dict[str, object], rows: Sequence[Est
     Raises:
         OSError: the file cannot be written.
     """
-    text = json.dumps({"settings": settings, "rows": [row._asdict() for row in rows]}, indent=2)
-    path.write_text(text + "\n", encoding="utf-8")
+    write_json(path, {"settings": settings, "rows": [row._asdict() for row in rows]})
 
 
 def _rms(values: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> float:

@@ -3,7 +3,6 @@
 The picture shows how the thesis' arm follows in the three input modes, as its figures 52 to 61 do.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from module_agent.model.errors import UsageError
+from module_agent.model.files import write_json
 from module_agent.model.read_only import read_only
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
@@ -82,7 +82,7 @@ def write_assistance(path: Path, settings: dict[str, object], found: Sequence[Co
         "rows": [_row(each) for each in found],
         "bars": [bar._asdict() | {"holds": bar.holds} for bar in bars(found)],
     }
-    path.write_text(json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_json(path, document)
 
 
 def _row(each: Combination) -> dict[str, object]:

@@ -4,10 +4,7 @@
 replaced atomically.
 """
 
-import io
 import json
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +15,7 @@ from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.wires import WiredModule
 from module_agent.model.chain import Chain
 from module_agent.model.errors import DataError
+from module_agent.model.files import replacing, write_json
 from module_agent.model.read_only import make_read_only, read_only
 from sim.geometry.pose import Array
 from sim.imperfections.module_errors import SensorErrors
@@ -87,7 +85,7 @@ def write_truth(path: Path, robot: Robot, world: World | None = None) -> None:
         "imu_bias": None if truth.imu_bias is None else truth.imu_bias.tolist(),
         "sensor_errors": None if errors is None else {k: v.tolist() for k, v in errors._asdict().items()},
     }
-    _replace(path, json.dumps(document, indent=1).encode())
+    write_json(path, document)
 
 
 def read_truth(path: Path) -> Truth:
@@ -148,10 +146,9 @@ class TruthLog:
 
     def save(self, path: Path) -> None:
         """Write the motion as an npz file, atomically; the fields are those of `Motion`."""
-        buffer = io.BytesIO()
         fields: dict[str, Any] = self.motion()._asdict()
-        np.savez(buffer, **fields)
-        _replace(path, buffer.getvalue())
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, **fields)
 
 
 def read_motion(path: Path) -> Motion:
@@ -161,23 +158,6 @@ def read_motion(path: Path) -> Motion:
     serials = tuple(str(s) for s in arrays.pop("serials"))
     make_read_only(arrays.values())
     return Motion(serials, **arrays)
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Put the content in place in one step: a reader, or a crash, sees the old file or the new one."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        # mkstemp makes the file private; a result is for everyone to read.
-        temporary.chmod(0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 class LoggedWorld:

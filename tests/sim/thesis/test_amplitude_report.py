@@ -8,6 +8,7 @@ import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
+from module_agent.model.errors import UsageError
 from sim.commands.amplitudes import table
 from sim.main import app
 from sim.thesis.amplitude_report import plot, repeats, write_results
@@ -70,7 +71,7 @@ def test_the_picture_has_a_panel_for_every_arm_and_shows_what_is_out_of_range(tm
     # The out-of-range estimate and the in-range one are drawn in the same colour: 0x1f5fa8.
     blue = abs(picture[..., :3] - [0x1F / 255, 0x5F / 255, 0xA8 / 255]).max(axis=2) < 0.01
     assert blue.sum() > 500
-    with pytest.raises(ValueError, match="nothing to draw"):
+    with pytest.raises(UsageError, match="nothing to draw"):
         plot([trial()], tmp_path / "b.png", "title")
 
 

@@ -1,0 +1,50 @@
+"""Files that are written whole or not at all: a reader, or a crash, finds the old file or the new one."""
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydantic import BaseModel
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside `path`; what is written there takes its place if nothing was raised.
+
+    Raises:
+        OSError: the file cannot be put in its place.
+    """
+    temporary = path.with_name(path.name + ".part")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except BaseException:
+        if temporary.is_file():
+            temporary.unlink()
+        raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write a JSON file of a pydantic model (by alias), or of plain data without NaN and infinities.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: a number is not finite.
+    """
+    if isinstance(document, BaseModel):
+        text = document.model_dump_json(indent=1, by_alias=True)
+    else:
+        text = json.dumps(document, indent=1, allow_nan=False)
+    write_text(path, text + "\n")
