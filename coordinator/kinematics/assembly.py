@@ -1,10 +1,9 @@
-"""Assemble the chain from what every module saw of every joint further up, and of gravity.
+"""Assemble the chain from observations of every joint by the modules beyond it, and of gravity.
 
-Unknown are the poses of all housings at q = 0, against the first root's, and the direction of gravity; a
-module's own axis follows from its housing by the catalogue. All observations of all pairs are fitted
-together, so that a distal module that saw a joint far up tells what the modules between did not. What no
-observation tells is named and stays at its neutral value: the fit only ever moves in directions that the
-observations resolve.
+Unknown are the poses of all housings at q = 0, relative to the first root's, and the direction of gravity; a
+module's own axis follows from its housing by the catalogue. The observations of all pairs are fitted
+together, so that a distal module that observes a joint far up adds what the modules between do not resolve.
+Unresolved directions are named and keep their neutral values: the fit steps only along resolved ones.
 """
 
 from collections.abc import Sequence
@@ -75,8 +74,8 @@ def assemble(
 ) -> ChainFit:
     """Fit the chain; `types` are those of the modules in the order of the topology.
 
-    A step that lowers the weighted squares by less than `min_gain` of them ends it: a look at a robot in
-    between need not be worked out to the last digit.
+    The iteration ends with a step that lowers the weighted squares by less than the share `min_gain`: a
+    preview of a robot need not converge to the last digit.
 
     The steps are those of Gauss and Newton in the resolved directions only (least squares of least norm by a
     truncated SVD), so that unresolved directions stay where the neutral first guess has put them.
@@ -141,7 +140,7 @@ def _refine(chain: Chain, observations: ChainObservations, min_gain: float) -> C
 def _shortened(
     chain: Chain, observations: ChainObservations, step: Array, cost: float
 ) -> tuple[Chain, Array] | None:
-    """Return the chain after the longest of the halved steps that makes the cost smaller, or nothing."""
+    """Return the chain after the longest of the halved steps that lowers the cost; None if none does."""
     for halving in range(HALVINGS):
         moved = _stepped(chain, 0.5**halving * step)
         rest = residuals(moved, observations)

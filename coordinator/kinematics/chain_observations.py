@@ -1,9 +1,8 @@
-"""What the modules saw of each other, and what a chain predicts of it: residuals and their Jacobian.
+"""Observations of joints by IMUs, what a chain predicts of them, residuals and their Jacobian.
 
 Everything is vectorised over observations; the base is body -1, kept in the last place of every array of
-bodies.
-
-What a module's local estimate of a joint is worth to the assembly of the chain.
+bodies. `circle_observation` makes an observation of a module's local estimate, with a sigma that counts its
+systematic errors.
 """
 
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.perturbation import adjoint, skew
 from module_agent.wire.messages import Estimate
 
-# Floors of what is believed, added in squares to the stated sigmas, which know nothing of the sensors' own
+# Floors of the sigmas, added in squares to the stated ones, which do not include the sensors' systematic
 # errors: an accelerometer's scale is good to 0.5 %, its place in the housing to 0.3 mm, a gyro's axes to 2
 # mrad against the housing, and an accelerometer's bias of 5 mg tilts gravity by 5 mrad.
 DISTANCE_FLOOR_M = 3e-4
@@ -85,8 +84,9 @@ class ChainObservations(NamedTuple):
 def pack(
     serials: Sequence[str], pairs: Sequence[PairObservation], rests: Sequence[RestObservation]
 ) -> ChainObservations:
-    """Turn observations into arrays. What a module saw of its own joint is left out: the catalogue says it
-    all.
+    """Turn observations into arrays.
+
+    A module's observations of its own joint are left out: the catalogue gives its axis.
 
     Raises:
         DataError: no rest observation.
@@ -132,7 +132,7 @@ class Prediction(NamedTuple):
 
 
 def predict(chain: Chain, observations: ChainObservations) -> Prediction:
-    """Return what the chain would have shown."""
+    """Return the observations that the chain predicts."""
     return _Geometry(chain, observations).prediction()
 
 
@@ -297,11 +297,11 @@ def _across(directions: Array) -> Array:
 def circle_observation(estimate: Estimate, q_rad: Array) -> PairObservation | None:
     """Return the circle of an estimate as an observation; None without one.
 
-    An IMU that turned by more or by less than the joint was moved by something else too: by held joints that
-    give between the two, above all. By that share axis and distance are believed less.
+    An IMU that turned by more or by less than the joint was also moved by something else, mostly by compliant
+    held joints between the two. The sigmas of axis and distance grow by that share.
 
     Args:
-        estimate: what `serial` made of `joint`.
+        estimate: by the module `serial`, of `joint`.
         q_rad: (n,) mean positions of all joints meanwhile.
     """
     circle = estimate.circle

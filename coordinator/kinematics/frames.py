@@ -1,9 +1,8 @@
-"""How joints are turned against each other: the angle between a joint's axis and its parent's.
+"""Frames of a chain's modules at q = 0, and the angles between successive axes.
 
-Where a chain's modules have their two faces at q = 0: the housing's mounting face and the output's.
-
-The catalogue ties both, and the axis, to the IMU. Frames are the geometric ones of the catalogue: z points
-out of the module at its output and into it at its housing, whichever way round the module is mounted.
+A module has two mounting faces, the housing's and the output's. The catalogue ties both, and the axis, to the
+IMU. The frames are those of the catalogue: z points out of the module at its output and into it at its
+housing, for forward and reversed modules alike.
 """
 
 from collections.abc import Sequence
@@ -21,8 +20,8 @@ PARALLEL_BELOW = 1e-6
 def axis_angles(chain: Chain, covariance: Array) -> tuple[Array, Array]:
     """Return the angles (n,) [rad], 0 to pi, between each joint's axis and its parent's, and their sigmas.
 
-    NaN for roots. `covariance`: (6 n, 6 n) of the chain's increments (`increments.apply_perturbation`). How a
-    module is turned about its parent's axis, or placed along it, does not matter.
+    NaN for roots. `covariance`: (6 n, 6 n) of the chain's perturbations (`apply_perturbation`). The angle
+    does not depend on how a module is turned about its parent's axis, or placed along it.
     """
     angle, sigma = np.full((2, len(chain.serials)), np.nan)
     for k in chain.linked:

@@ -1,7 +1,8 @@
-"""Motions of a robot's parts that no observation tells, carried out: how far, is whoever's choice.
+"""Gauge freedoms of a chain as finite motions, and how to fix them near a reference.
 
-Small increments along a null space are straight; a branch that is turned about a joint by half a turn goes
-round. So the motions that have a name are done one after the other, each where the robot stands by then.
+The null space of a fit is a set of small, straight perturbations; a branch that is turned about a joint by
+half a turn moves on a circle. So every named freedom is applied as a finite motion, one after the other, each
+at the pose that the ones before it have led to.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ from module_agent.model.read_only import frozen
 
 # What a wrong orientation counts against a wrong place: the displacement at a usual module's reach.
 REACH_M = 0.3
-# Starts for what may be off by half a turn.
+# Starting angles for rotations, which may be off by half a turn.
 TURNS_RAD = (0.5 * np.pi, np.pi, 1.5 * np.pi)
 
 
@@ -52,10 +53,10 @@ def gauge_fixed(estimate: ChainEstimate, reference: Chain) -> ChainEstimate:
 
 
 def gauge_freedoms(chain: Chain, unresolved: Sequence[Unresolved]) -> tuple[GaugeFreedom, ...]:
-    """Return the unresolved motions as motions of a chain, proximal ones first.
+    """Return the named unresolved directions as motions of a chain, proximal ones first.
 
-    The chain may be another one of the same modules; what is no motion of it, and what has no name, is left
-    out.
+    The chain may be another one of the same modules; directions that are no motion of it, and combinations
+    without a name, are left out.
     """
     freedoms: list[GaugeFreedom] = []
     for item in unresolved:
@@ -96,7 +97,7 @@ def moved(chain: Chain, free: Sequence[GaugeFreedom], amounts: Array) -> Chain:
 
 
 def carried(before: Chain, after: Chain, increments: Array) -> Array:
-    """Return increments (6 n, k) of a chain as those of the chain after free motions: the same changes."""
+    """Return perturbations (6 n, k) of a chain expressed at the chain after free motions."""
     motions = after.imu_home @ np.linalg.inv(before.imu_home)
     blocks = np.asarray(increments).reshape(len(before.serials), 6, -1)
     return frozen((adjoint(np.asarray(motions)) @ blocks).reshape(np.shape(increments)))
@@ -116,7 +117,7 @@ def _twists(chain: Chain, one: GaugeFreedom) -> Array:
 
 
 def _start(misfit: Callable[[Array], Array], free: Sequence[GaugeFreedom]) -> Array:
-    """Choose where Gauss-Newton begins: a free heading may be off by half a turn, out of its reach."""
+    """Choose the start of least squares: a free heading may be off by half a turn, beyond its convergence."""
     sizes = [3 if one.kind == "position" else 1 for one in free]
     start = np.zeros(sum(sizes))
     best = float(np.sum(misfit(start) ** 2))

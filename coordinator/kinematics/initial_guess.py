@@ -1,8 +1,7 @@
-"""A first chain in closed form, down the tree: directions by aligning vectors, places by linear least
-squares.
+"""A first chain in closed form, down the tree: directions by aligning vectors, places by least squares.
 
-Every module is placed against its parent's body from the axes further up and gravity, as its IMU saw them.
-What they leave open stays where a neutral mounting puts it: straight on, in the plane of the parent's output
+Every module is placed against its parent's body by the axes further up and gravity, as its IMU observed them.
+Unresolved directions keep the values of a neutral mounting: straight on, in the plane of the parent's output
 face.
 """
 
@@ -19,8 +18,8 @@ from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.forward_kinematics import body_displacements, screw_motion
 from module_agent.model.read_only import frozen
 
-# How far a mounting may be from neutral, in rad and m. It only fills in what no observation says better than
-# this; the refinement that follows knows nothing of it.
+# Sigma of a mounting about neutral, in rad and m. It only fills in directions that no observation resolves
+# better; the refinement that follows does not use it.
 NEUTRAL_SIGMA = 0.25
 # What a neutral direction counts against the poorest that was seen. Mountings are often half a turn from
 # neutral: even a direction seen through a joint that swung along must outweigh it.
@@ -150,7 +149,7 @@ def _neutral(chain: Chain, k: int, types: Sequence[ModuleType]) -> tuple[Array, 
 
 
 def _align(evidence: _Evidence, neutral: Array) -> Array:
-    """Return the IMU's orientation at home from the directions it saw; where they say nothing, neutral."""
+    """Return the IMU's orientation at home by the observed directions; neutral where unresolved."""
     there = np.concatenate([evidence.there, neutral.T])
     here = np.concatenate([evidence.here, np.eye(3)])
     least = evidence.weight.min(initial=NEUTRAL_SIGMA**-2)
@@ -160,7 +159,7 @@ def _align(evidence: _Evidence, neutral: Array) -> Array:
 
 
 def _locate(evidence: _Evidence, turn: Array, neutral: Array) -> Array:
-    """Return the IMU's place at home: each radial vector fixes what is across its axis, neutral the rest."""
+    """Return the IMU's place at home by the radial vectors; neutral where unresolved."""
     count = len(evidence.points)
     axis, own = evidence.there[:count], evidence.own[:count]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]

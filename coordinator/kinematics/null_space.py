@@ -1,8 +1,7 @@
-"""Name what the observations leave open: which parameter of which module, and what would tell it.
+"""Name the null space of a fit: which parameter of which module is not resolved, and what would resolve it.
 
-The null space of a fit is a set of vectors of numbers. Here it is compared with the motions of the robot's
-parts that are known to be able to hide: a branch along the axis of the joint that carries it or about it, and
-a second tree on the base against the first.
+The null vectors are compared with the motions of the robot's parts that can be unobservable: a branch along
+the axis of the joint that carries it or about it, and a second tree on the base against the first.
 """
 
 from collections.abc import Iterator
@@ -21,12 +20,12 @@ SAME_ABOVE = 0.995
 
 
 class Unresolved(NamedTuple):
-    """One way in which the robot could be different without any observation telling.
+    """An unobservable change of the robot.
 
     joint: serial of the joint about or along whose axis it goes; empty for positions and combinations.
-    modules: serials of the modules that would stand elsewhere, that next to the joint first.
-    directions: (6 n, m) increments (see `increments`), one column each; rotations in rad, offsets in m.
-    resolved_by: what would tell it, or that nothing does.
+    modules: serials of the modules that it displaces, that next to the joint first.
+    directions: (6 n, m) perturbations (`apply_perturbation`), one column each, in rad and m.
+    resolved_by: the motion or measurement that would make it observable, or that nothing does.
     """
 
     kind: Kind
@@ -40,7 +39,7 @@ class Unresolved(NamedTuple):
 def name_null_space(chain: Chain, null_basis: Array) -> tuple[Unresolved, ...]:
     """Name the null space of a fit, `null_basis` (6 n, k) with orthonormal columns, motion by motion.
 
-    What is left when all that have a name are taken out is reported as combinations, so that nothing is lost.
+    The rest of the null space is reported as combinations.
     """
     named = [item for item in _candidates(chain) if _hidden(item, null_basis)]
     left = null_basis
@@ -58,7 +57,7 @@ def _hidden(item: Unresolved, null_basis: Array) -> bool:
 
 
 def _candidates(chain: Chain) -> Iterator[Unresolved]:
-    # Branch by branch: two children of one joint do not see each other, so each can hide on its own.
+    # Branch by branch: no observation ties two children of one joint, so each has its own freedom.
     for child in chain.linked:
         joint = chain.parent[child]
         yield _offset(chain, joint, child)

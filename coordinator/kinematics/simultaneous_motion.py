@@ -1,6 +1,6 @@
-"""Who carries whom, and a first chain, from one motion in which all joints turn at once (thesis 7.2).
+"""Which joint carries which IMU, and circles, from one motion of all joints at once (thesis 7.2).
 
-Joints that turn at frequencies of their own are told apart by regression. The gyro of IMU k reads
+Joints that turn at different frequencies are separated by regression. The gyro of IMU k reads
 
     w_k = sum_i j_ik dq_i/dt + b       over the joints i that carry it, j_ik the axis of joint i in its frame,
 
@@ -10,7 +10,7 @@ and its accelerometer, less gravity as the gyro says that it turned,
 
 so that r_ik = (j_ik x r_ik) x j_ik is the radial vector of the circle that joint i makes it describe (thesis
 eqs 15 to 24 for all joints together). The joints between turn the axes in the IMU's frame by as much as they
-move: that is regressed on to first order; what is of second order stays with the refinement that follows.
+move: the regression includes that to first order; terms of second order are left to the refinement.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ TILT_PER_SWING2 = 0.25
 # and the least of it. On random robots of six joints with links of 0.3 m it is 6 cm rms of up to 1 m.
 CROSSTALK_SHARE = 0.15
 RADIUS_FLOOR_M = 0.01
-# A joint that turns less than this (rms) hardly says who moves with it: gyros err by some mrad/s.
+# The motion of a joint that turns less than this (rms) is lost in the gyros' errors of some mrad/s.
 MIN_RATE_RAD_S = 0.005
 
 
@@ -56,7 +56,7 @@ class StillReading(NamedTuple):
 
 
 class SimultaneousResponse(NamedTuple):
-    """What IMU k answers to joint i: arrays (n joints, n IMUs, ...), in the IMU's frame, read-only.
+    """The response of IMU k to joint i: arrays (n joints, n IMUs, ...), in the IMU's frame, read-only.
 
     axis: (n, n, 3) of the gyro to the joint's rate: the axis if it is carried, else about zero.
     tangential_m: (n, n, 3) of the specific force to the joint's acceleration, j x r.
@@ -115,7 +115,7 @@ def simultaneous_response(
 def motion_observations(
     serials: Sequence[str], response: SimultaneousResponse
 ) -> dict[tuple[str, str], MotionObservation]:
-    """Return who moved with whom, {(joint, observer): MotionObservation}, the columns named by `serials`."""
+    """Return {(joint, observer): MotionObservation}; the columns are named by `serials`."""
     seen: dict[tuple[str, str], MotionObservation] = {}
     for i, joint in enumerate(serials):
         for k, observer in enumerate(serials):

@@ -1,1 +1,1 @@
-"""Which module is mounted on which, and which motion would tell."""
+"""Which module is mounted on which, and which motion settles doubts about it."""

@@ -1,11 +1,11 @@
-"""How surely modules form this forest and no other: log-odds of every edge.
+"""The likelihood of a forest of modules against its rivals: log-odds of every edge.
 
 A forest says of every joint and IMU whether the one carries the other. With independent observations its
 log-likelihood, up to a constant, is the sum of the log-odds of all pairs that it says are carried. Other
 forests are weighed against it that differ by one move: a module mounted elsewhere with all that it carries,
-or taken out alone and put elsewhere, beneath some of what is mounted there. These are what one or a few
-wrong observations would make of it. What lies farther off is not counted: it matters only where less than
-1 % is in doubt, and makes that look like up to seven times less.
+or taken out alone and put elsewhere, beneath some of what is mounted there. One or a few wrong observations
+lead to one of these. Forests more than one move away are not counted: they matter only where less than 1 % is
+in doubt, and leaving them out understates that by up to a factor of seven.
 """
 
 from collections.abc import Collection, Iterator, Sequence

@@ -1,10 +1,10 @@
-"""How strongly one motion of one joint says which IMUs it carried: rate ratios with honest uncertainties.
+"""Rate ratios between a joint and every IMU, with uncertainties: which IMUs does the joint carry?
 
-An IMU that a joint carries reads gyro = j v, with the joint's rate v and |j| = 1; one that it does not carry
-reads none of v. What else moves an IMU in time with the joint makes the ratio uncertain: shaking and noise,
-which differ from one stretch of the motion to the next, and held joints that give, which their own encoders
-see. Where those joints' own motions have shown whom they carry, and about which axis, what they gave is taken
-off.
+An IMU that a joint carries reads gyro = j v, with the joint's rate v and |j| = 1; the gyro of any other is
+uncorrelated with v. Two disturbances move an IMU in time with the joint and make the ratio uncertain: shaking
+and noise, which differ from one block of the motion to the next, and compliant held joints, whose encoders
+measure by how much they give. Where those joints' own motions have shown which IMUs they carry, and about
+which axis, their contribution is subtracted.
 """
 
 from typing import NamedTuple
@@ -16,8 +16,8 @@ from module_agent.model.errors import DataError
 from module_agent.model.read_only import frozen
 
 BLOCKS = 6
-# Of a thousand observations, one has gone wrong in a way that is in no model: it tells nothing.
-ODD = 1e-3
+# Share of outliers: of a thousand observations one is wrong in a way that no model describes.
+OUTLIER_SHARE = 1e-3
 # The IMU's own scale and axes, links that bend, a base that shakes: seen by no encoder, and repeating with
 # the motion. Clean ratios of uncalibrated modules are within 0.03 of 0 and 1.
 RATIO_FLOOR = 0.05
@@ -25,9 +25,9 @@ RATIO_FLOOR = 0.05
 MIN_RATE_RAD_S = 0.02
 # Six blocks of four samples are the least that tells how much they differ.
 MIN_SAMPLES = 4 * BLOCKS
-# What is left of a held joint's motion after it is taken off: its axis in the IMU's frame turns with the
+# Share of a held joint's motion that remains after subtraction: its axis in the IMU's frame turns with the
 # joints between, by some tenths of a radian.
-GIVE_LEFT = 0.3
+RESIDUAL_GIVE = 0.3
 
 
 class NotMoved(DataError):
@@ -35,12 +35,12 @@ class NotMoved(DataError):
 
 
 class MotionEvidence(NamedTuple):
-    """What n IMUs saw of one joint's motion; arrays read-only.
+    """The response of n IMUs to one joint's motion; arrays read-only.
 
     coefficient: (n, 3) regression of each gyro on the joint's rate, in the frame of that IMU.
-    sigma: (n,) one standard deviation of its size, from how much the stretches of the motion differ.
-    give: (n,) how much the other joints moved along, relative to this one, less what was taken off: that much
-        more or less may an IMU have turned, depending on where it sits.
+    sigma: (n,) one standard deviation of its size, from the scatter between blocks of the motion.
+    give: (n,) by how much the other joints moved along, relative to this one, less what was subtracted: an
+        upper bound of the error of the rate ratio by them, which depends on where the IMU sits.
     """
 
     coefficient: Array
@@ -54,7 +54,7 @@ class MotionEvidence(NamedTuple):
 
     @property
     def ratio_sigma(self) -> Array:
-        """(n,) what the ratios may be wrong by, systematic errors included.
+        """(n,) one standard deviation of the ratios, systematic errors included.
 
         The other joints' motion adds anything between -`give` and `give`: a uniform distribution.
         """
@@ -64,21 +64,21 @@ class MotionEvidence(NamedTuple):
 def carried_log_odds(rate_ratio: float, sigma: float) -> float:
     """Return the log-odds that an IMU with this rate ratio is carried.
 
-    Normal errors about 1 if carried and 0 if not, and in a share `ODD` of all cases anything from 0 to 2: so
-    a ratio that fits neither tells next to nothing, and none tells more than about 9, 1 to 8000.
+    Normal errors about 1 if carried and 0 if not, and outliers from 0 to 2 in a share
+    `OUTLIER_SHARE`: a ratio that fits neither is nearly uninformative, and no log-odds exceed 9, 1 to 8000.
     """
     scale = sigma * np.sqrt(2.0 * np.pi)
     fits = [np.exp(-0.5 * ((rate_ratio - at) / sigma) ** 2) / scale for at in (1.0, 0.0)]
-    return float(np.log((fits[0] + 0.5 * ODD) / (fits[1] + 0.5 * ODD)))
+    return float(np.log((fits[0] + 0.5 * OUTLIER_SHARE) / (fits[1] + 0.5 * OUTLIER_SHARE)))
 
 
 def motion_evidence(
     joint: int, qd_rad_s: Array, gyro_rad_s: Array, offset_rad_s: Array, axes: Array | None = None
 ) -> MotionEvidence:
-    """Regress all gyros, less their offsets and what held joints gave, on one joint's rate.
+    """Regress all gyros, less their offsets and the motion of held joints, on one joint's rate.
 
-    The spread is that of the jackknife over blocks of the motion (Efron, The Jackknife, 1982, eq. 3.13): it
-    needs no model of how shaking and noise hang together in time.
+    The standard deviation is that of the jackknife over blocks of the motion (Efron, The Jackknife, 1982,
+    eq. 3.13), which needs no model of the autocorrelation of shaking and noise.
 
     Args:
         joint: column of the joint that was moved.
@@ -113,8 +113,8 @@ def motion_evidence(
 
 
 def _given(rates: Array, axes: Array | None, imus: int) -> tuple[Array, Array]:
-    """Return what held joints turned every IMU by (m, n, 3), and what share of each is left (joints, n)."""
+    """Return the rates of every IMU by held joints (m, n, 3), and the remaining shares (joints, n)."""
     if axes is None:
         return np.zeros((len(rates), imus, 3)), np.ones((rates.shape[1], imus))
     given = np.tensordot(rates, np.nan_to_num(axes, nan=0.0), axes=1)
-    return np.asarray(given), np.where(np.isnan(axes).any(axis=2), 1.0, GIVE_LEFT)
+    return np.asarray(given), np.where(np.isnan(axes).any(axis=2), 1.0, RESIDUAL_GIVE)

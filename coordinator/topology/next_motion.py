@@ -1,4 +1,4 @@
-"""When in doubt about the topology: the next motion that settles it, as data and as a sentence."""
+"""Choose the next motion that settles a doubt about the topology."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -6,13 +6,14 @@ from typing import NamedTuple
 from coordinator.topology.topology import Doubt, Observations
 from module_agent.wire.messages import ConstantMotion
 
-# A joint is asked again this often; what three motions of different kinds leave open, a fourth does too.
+# A joint is moved again at most this often: doubts that three motions of different kinds leave open, a fourth
+# does not settle either.
 MAX_REPEATS = 3
 OTHERS_TURNED_RAD = 0.5
 
 
 class NextMotion(NamedTuple):
-    """A slow motion of one joint to look at once more.
+    """A slow motion of one joint that is observed once more.
 
     speed, travel: relative to the slow motion that every joint is explored with.
     others_rad: how far all other joints are turned from home first, so that weight and inertia act otherwise.

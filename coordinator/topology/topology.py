@@ -1,11 +1,11 @@
-"""Who carries whom: the tree of modules from which IMU moved with which joint.
+"""The tree of modules from observations of which IMU moved with which joint.
 
 The joints that move a module's IMU are the ones between it and the base. So the joints that move it, its own
 apart, are its ancestors; the parent is the ancestor that itself has the most ancestors. A module that moves
 with its own joint is mounted reversed: by its output, so that the housing turns.
 
-Every observation counts by its own certainty: the forest is the likeliest one, each of its edges comes with
-the odds that it is right, and what contradicts it or leaves it in doubt is named.
+Every observation is weighted by its log-odds: the forest is the one of maximum likelihood, each of its edges
+has the odds of being right, and observations that contradict it or leave it in doubt are named.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -18,16 +18,16 @@ from coordinator.topology.motion_evidence import carried_log_odds
 from module_agent.model.chain import BASE, Array
 from module_agent.model.errors import DataError
 
-# What is less likely than this (log-odds) to be right is worth another motion: 1 in 100 may be wrong.
+# Answers with lower log-odds than this are checked by another motion: 1 in 100 may be wrong.
 DOUBTFUL_BELOW = float(np.log(99.0))
-# What is less likely than this is not believed at all: one in four would be wrong.
+# Answers with lower log-odds than this are rejected: one in four would be wrong.
 UNBELIEVABLE_BELOW = float(np.log(3.0))
-# An observation that is surer than this and does not fit has seen something: it is not outvoted.
+# An observation with higher log-odds than this that does not fit is a contradiction and is not outvoted.
 CONTRADICTS_ABOVE = float(np.log(19.0))
 
 
 class MotionObservation(NamedTuple):
-    """What one module saw of one joint's motion.
+    """What one module measured of one joint's motion.
 
     moved: whether its IMU was carried along.
     rate_ratio: size of the gyro's answer to the joint's rate, 1 if carried, 0 if not.
@@ -54,9 +54,9 @@ class MotionObservation(NamedTuple):
 
 
 def combined_observation(motions: Sequence[MotionObservation]) -> MotionObservation:
-    """Put together what one module saw of several motions of one joint: the log-odds add up.
+    """Combine one module's observations of several motions of one joint: the log-odds add up.
 
-    One that went wrong is outvoted by two that did not, where an average would fit nothing.
+    One outlier is outvoted by two good observations, where an average would fit neither.
 
     Raises:
         DataError: no motion.
@@ -70,7 +70,7 @@ def combined_observation(motions: Sequence[MotionObservation]) -> MotionObservat
 
 
 class Doubt(NamedTuple):
-    """What is not certain, how certain it is, and what was seen least clearly of what would settle it.
+    """An uncertain answer, its log-odds, and the least certain of the observations that would settle it.
 
     log_odds: that the answer in the topology is right; for a contradiction, that the observation is wrong.
     joint, observer: the observation to repeat.
@@ -90,8 +90,8 @@ class Topology(NamedTuple):
     parent: index of the parent module, -1 on the base. reversed: mounted by the output.
     confidence: the probability that the least certain of all these answers is right.
     parent_log_odds, reversed_log_odds: log-odds of every answer, against all that could be instead; 0 is a
-        toss-up, and so is the mounting of a module whose joint did not move. Empty if nobody has weighed
-        them, as of a topology that was known beforehand.
+        toss-up, and so is the mounting of a module whose joint did not move. Empty if they were not
+        computed, as for a topology that was known beforehand.
     unmoved: modules whose joints did not move. What they carry stands in the forest on their parents.
     doubts: what another motion should settle, the least certain first.
     """
@@ -111,7 +111,7 @@ class Topology(NamedTuple):
         return tuple(s for s, p in zip(self.serials, self.parent, strict=True) if p == BASE)
 
     def caveat(self, k: int) -> str:
-        """Return in words what is not certain of the module with this index, nothing if all is."""
+        """Return a phrase about what is uncertain of the module with this index; empty if nothing is."""
         if self.serials[k] in self.unmoved:
             return ", its joint did not move: mounting and what it carries unknown"
         if not self.parent_log_odds:
@@ -132,7 +132,7 @@ Observations = Mapping[tuple[str, str], MotionObservation]
 
 
 def find_topology(observations: Observations, unmoved: Collection[str] = ()) -> Topology:
-    """Derive the tree from what every module saw of every joint: {(joint, observer): MotionObservation}.
+    """Derive the tree from observations {(joint, observer): MotionObservation}.
 
     Args:
         observations: of all pairs; a few may be missing where the others make up for them.
@@ -158,7 +158,7 @@ def likely_topology(observations: Observations, unmoved: Collection[str] = ()) -
     """Derive the likeliest tree, however likely it is; `find_topology` is what to believe.
 
     Raises:
-        TopologyError: a module has seen nothing, or nobody has seen its joint and it is not `unmoved`.
+        TopologyError: a module has no observations, or its joint has none and it is not `unmoved`.
     """
     serials = sorted({serial for pair in observations for serial in pair} | set(unmoved))
     _check_complete(serials, observations, unmoved)
@@ -171,7 +171,7 @@ def likely_topology(observations: Observations, unmoved: Collection[str] = ()) -
 
 
 class _Case(NamedTuple):
-    """A forest in the order of `serials`, what it was made of, and what else it could be."""
+    """A forest in the order of `serials`, the observations that it explains, and its rivals."""
 
     serials: list[str]
     observations: Observations
@@ -284,13 +284,13 @@ def _check_complete(serials: list[str], observations: Observations, unmoved: Col
     """A module that never answered is named as such, rather than with each of its missing pairs.
 
     Raises:
-        TopologyError: a module has seen nothing, or nobody has seen its joint and it is not `unmoved`.
+        TopologyError: a module has no observations, or its joint has none and it is not `unmoved`.
     """
     joints, observers = {i for i, _ in observations}, {k for _, k in observations}
     silent = [k for k in serials if k not in observers]
     unseen = [i for i in serials if i not in joints and i not in unmoved]
     parts = [f"module {k} reported on no joint" for k in silent]
-    parts += [f"nobody reported on joint {i}" for i in unseen]
+    parts += [f"no module reported on joint {i}" for i in unseen]
     if parts:
         raise TopologyError(
             "; ".join(parts) + ". Every module must have watched every joint",

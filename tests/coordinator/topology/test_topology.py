@@ -219,7 +219,7 @@ def test_modules_that_did_not_answer_are_named_once() -> None:
         find_topology(seen)
     assert caught.value.serials == ("B",)
     seen = {pair: o for pair, o in watch(CHAIN, FORWARD).items() if pair[0] != "B"}
-    with pytest.raises(TopologyError, match="nobody reported on joint B"):
+    with pytest.raises(TopologyError, match="no module reported on joint B"):
         find_topology(seen)
 
 
