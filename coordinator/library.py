@@ -35,7 +35,7 @@ from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, RESULT, SESSION
 from coordinator.recording.run_folder import load_recording as read_recording
 from coordinator.synchronisation.round_trips import map_clocks
-from coordinator.torque_control.gravity_model import weight_of
+from coordinator.torque_control.gravity_model import gravity_model_of_result
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import LostError
@@ -113,7 +113,7 @@ class SavedRun:
 
         Per body [m, m c (3), I about the root frame's origin (xx, xy, xz, yy, yz, zz)], root frame at q = 0.
         """
-        return None if self.result.dynamics is None else weight_of(self.result).phi
+        return None if self.result.dynamics is None else gravity_model_of_result(self.result).phi
 
     @cached_property
     def recording(self) -> Recording:

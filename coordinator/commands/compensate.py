@@ -20,7 +20,7 @@ from coordinator.runtime.event_loop import (
 )
 from coordinator.runtime.exit_codes import explain
 from coordinator.runtime.terminal import Terminal
-from coordinator.torque_control.gains import most_damping_nm_s_rad
+from coordinator.torque_control.gains import max_damping_nm_s_rad
 from coordinator.torque_control.gravity_compensation import CompensationSettings
 from coordinator.torque_control.gravity_model import GravityModel, gravity_model
 from coordinator.torque_control.session import CompensationPlan, CompensationSession
@@ -91,7 +91,7 @@ def _check_times(for_s: float | None, hold_s: float) -> None:
 
 
 def _check_damping(damping_nm_s_rad: float, model: GravityModel) -> None:
-    most, name = min((most_damping_nm_s_rad(module_type(name)), name) for name in set(model.types))
+    most, name = min((max_damping_nm_s_rad(module_type(name)), name) for name in set(model.types))
     if not 0.0 <= damping_nm_s_rad <= most:
         raise UsageError(
             f"--damping {damping_nm_s_rad}: it must be 0 to {most:g} Nm s/rad, the most for type {name}"

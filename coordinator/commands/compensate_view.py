@@ -1,4 +1,4 @@
-"""A float in the terminal: a live table, plain lines in a pipe, or lines of JSON for programs."""
+"""Gravity compensation in the terminal: a live table, plain lines in a pipe, or lines of JSON."""
 
 import json
 from collections.abc import Callable
@@ -12,12 +12,12 @@ from coordinator.runtime.terminal import print_table
 from coordinator.torque_control.session import Moment
 from coordinator.torque_control.summary import CompensationSummary
 
-# A live table; a pipe is read later, and by line.
+# Update intervals of the live table and of lines in a pipe.
 LIVE_S, LINE_S = 0.25, 0.5
 
 
 class CompensationView:
-    """Shows moments every so often; `now_s` is the clock of the session.
+    """Shows moments at intervals; `now_s` is the clock of the session.
 
     Use as a context manager. Notes, and what is live, go to standard error; lines of JSON and the summary to
     standard output.
@@ -42,11 +42,11 @@ class CompensationView:
             self._live.stop()
 
     def note(self, text: str) -> None:
-        """Something worth a line."""
+        """Print a line."""
         self._console.print(f"  {text}", markup=False, soft_wrap=True)
 
     def moment(self, now: Moment) -> None:
-        """Set-points have been sent."""
+        """Show a moment, if the interval is over."""
         now_s = self._now_s()
         if now_s < self._due_s:
             return
@@ -59,7 +59,7 @@ class CompensationView:
             self._console.print(moment_line(self._serials, now), markup=False, soft_wrap=True)
 
     def summary(self, found: CompensationSummary) -> None:
-        """It is over."""
+        """Print the summary."""
         if self._as_json:
             print(json.dumps(summary_fields(found)), flush=True)
         elif not self._quiet:
@@ -78,10 +78,10 @@ def moment_fields(serials: tuple[str, ...], now: Moment) -> dict[str, object]:
         reading.age_s.tolist(),
         strict=True,
     )
-    names = "serial", "position_rad", "velocity_rad_s", "asked_nm", "measured_nm", "age_s"
+    names = "serial", "position_rad", "velocity_rad_s", "commanded_nm", "measured_nm", "age_s"
     return {
         "phase": now.phase,
-        "floated_s": round(now.compensated_s, 3),
+        "compensated_s": round(now.compensated_s, 3),
         "missed": now.missed,
         "joints": [dict(zip(names, row, strict=True)) for row in columns],
     }
@@ -98,7 +98,7 @@ def moment_line(serials: tuple[str, ...], now: Moment) -> str:
 
 def moment_table(serials: tuple[str, ...], now: Moment) -> RenderableType:
     """Return a moment as a table."""
-    titles = "joint", "position [deg]", "speed [deg/s]", "asked for [Nm]", "measured [Nm]", "age [ms]"
+    titles = "joint", "position [deg]", "speed [deg/s]", "commanded [Nm]", "measured [Nm]", "age [ms]"
     shown = Table(*titles, title=f"{now.phase}, {now.compensated_s:.1f} s, {now.missed} set-points missed")
     reading = now.reading
     for k, serial in enumerate(serials):
@@ -126,17 +126,17 @@ def summary_table(found: CompensationSummary) -> Table:
         "farthest [deg]",
         "top speed [deg/s]",
         "torque, rms [Nm]",
-        "most [Nm]",
+        "max [Nm]",
     )
-    title = f"floated for {found.compensated_s:.1f} s: {found.why}; {found.missed} set-points missed"
+    title = f"compensated for {found.compensated_s:.1f} s: {found.why}; {found.missed} set-points missed"
     shown = Table(*titles, title=title)
     for joint in found.joints:
         shown.add_row(
             joint.serial,
-            f"{degrees(joint.ended_rad - joint.began_rad):+.1f}",
+            f"{degrees(joint.end_rad - joint.start_rad):+.1f}",
             f"{degrees(joint.farthest_rad):.1f}",
             f"{degrees(joint.top_speed_rad_s):.1f}",
             f"{joint.effort_rms_nm:.2f}",
-            f"{joint.effort_most_nm:.2f}",
+            f"{joint.effort_max_nm:.2f}",
         )
     return shown

@@ -1,8 +1,8 @@
-"""Torque set-points of a motion from what was identified: the thesis' input mode 3 (chapter 6.3.2).
+"""Feed-forward torques of a motion from the identified model: the thesis' input mode 3 (chapter 6.3.2).
 
-The effort of a module is what its spring exerts on its output, and the set-point of its effort loop means the
-same. So it is the torque of the rigid bodies alone, tau = Y(q, qd, qdd) phi (thesis eq. 28): friction, gear
-loss and the rotor's inertia lie before the spring. They are what the module's loops have to make up for.
+The effort of a module, and the set-point of its effort loop, is the torque of its spring on its output. It is
+therefore that of the rigid bodies alone, tau = Y(q, qd, qdd) phi (eq. 28): friction, gear loss and the
+rotor's inertia act before the spring and are compensated by the module's loops.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,12 +23,12 @@ from module_agent.wire.messages import EffortProfile, GoTo, Pattern, Rest
 RATE_HZ = 1000.0
 # Patterns that end within half a tick of one another end together.
 _TOGETHER_S = 5e-4
-# Nearer than this a joint is where it shall be.
-_THERE_RAD, _SLOWEST_RAD_S = 1e-4, 1e-6
+# A joint that is nearer to its target does not move.
+_THERE_RAD, _MIN_RAD_S = 1e-4, 1e-6
 
 
 class Reference(NamedTuple):
-    """The motion that is asked for: `t_s` (m,) from its start, the others (m, n); read-only."""
+    """A desired motion: `t_s` (m,) from its start, the others (m, n); read-only."""
 
     t_s: Array
     q_rad: Array
@@ -37,7 +37,7 @@ class Reference(NamedTuple):
 
 
 class SetPoints(NamedTuple):
-    """A reference and the efforts (m, n) [Nm] of the springs that it takes, read-only."""
+    """A reference and its spring torques (m, n) [Nm], read-only."""
 
     reference: Reference
     effort_nm: Array
@@ -58,7 +58,7 @@ def joint_reference(
     if unknown := [serial for serial in patterns if serial not in serials]:
         raise KeyError(f"a pattern for {unknown[0]}, which is not among the joints {', '.join(serials)}")
     if missing := [serial for serial in serials if serial not in origins_rad]:
-        raise KeyError(f"joint {missing[0]} has no origin: where it stands as the motion begins")
+        raise KeyError(f"joint {missing[0]} has no origin: give its position at the start of the motion")
     total_s = _common_duration_s(patterns, origins_rad)
     t_s = np.arange(round(total_s * rate_hz) + 1) / rate_hz
     q, qd = np.empty((2, t_s.size, len(serials)))
@@ -81,32 +81,32 @@ def paths_together(
         KeyError: a joint has a target and no origin.
     """
     if not targets_rad:
-        raise ValueError("no joint has a target: there is nowhere to go")
+        raise ValueError("no joint has a target")
     ways = {serial: abs(target - origins_rad[serial]) for serial, target in targets_rad.items()}
     longest = max(ways, key=lambda serial: ways[serial])
     last = GoTo(target_rad=targets_rad[longest], max_speed_rad_s=max_speed_rad_s)
     total_s = duration_s(last, origins_rad[longest])
     found: dict[str, Pattern] = {}
     for serial, way in ways.items():
-        speed = max(MINIMUM_JERK_PEAK * way / total_s, _SLOWEST_RAD_S)
+        speed = max(MINIMUM_JERK_PEAK * way / total_s, _MIN_RAD_S)
         own = GoTo(target_rad=targets_rad[serial], max_speed_rad_s=speed)
         found[serial] = own if way >= _THERE_RAD else Rest(duration_s=total_s)
     return found
 
 
 def standing(reference: Reference, row: int, length_s: float, rate_hz: float = RATE_HZ) -> Reference:
-    """Return a reference that stands for a while where another one is at a row (-1: its end)."""
+    """Return a reference that rests at the position of a row of another one (-1: its end)."""
     t_s = np.arange(round(length_s * rate_hz) + 1) / rate_hz
     q = np.tile(reference.q_rad[row], (t_s.size, 1))
     return Reference(*(read_only(array) for array in (t_s, q, np.zeros_like(q), np.zeros_like(q))))
 
 
 def feed_forward(chain: Chain, phi: ArrayLike, reference: Reference) -> SetPoints:
-    """Return what the springs have to exert along a reference whose columns are in the chain's order.
+    """Return the spring torques along a reference whose columns are in the chain's order.
 
     Args:
-        chain: as identified. phi: (10 n,) or (n, 10), its parameters. Only combinations of them that show in
-            torques matter, so that what the identification leaves open has no effect.
+        chain: as identified.
+        phi: (10 n,) or (n, 10), its inertial parameters. Only their identifiable combinations have an effect.
 
     Raises:
         ValueError: another number of joints or parameters, or values that are not finite.
@@ -116,7 +116,7 @@ def feed_forward(chain: Chain, phi: ArrayLike, reference: Reference) -> SetPoint
 
 
 def on_module(points: SetPoints) -> list[EffortProfile]:
-    """Return the efforts as the modules play them beside their motion, one profile a joint, in order.
+    """Return the efforts as profiles that the modules play along with their motion, one per joint, in order.
 
     Raises:
         ValueError: a value that is not finite, or a motion too long for a profile: over 799 s.
@@ -131,12 +131,12 @@ def on_module(points: SetPoints) -> list[EffortProfile]:
 
 def _common_duration_s(patterns: Mapping[str, Pattern], origins_rad: Mapping[str, float]) -> float:
     if not patterns:
-        raise ValueError("no joint has a pattern: there is no motion to compute efforts of")
+        raise ValueError("no joint has a pattern")
     ends = {serial: duration_s(pattern, origins_rad[serial]) for serial, pattern in patterns.items()}
     first, last = min(ends, key=lambda s: ends[s]), max(ends, key=lambda s: ends[s])
     if ends[last] - ends[first] > _TOGETHER_S:
         raise ValueError(
-            f"joint {first} ends after {ends[first]:.3f} s and {last} after {ends[last]:.3f} s: a joint that "
-            "has ended would miss what the others' motion asks of it, so all must end together"
+            f"joint {first} ends after {ends[first]:.3f} s and {last} after {ends[last]:.3f} s: all "
+            "patterns must end together, since a joint needs torque as long as the others move"
         )
     return ends[last]

@@ -1,4 +1,4 @@
-"""The gains of a module that floats, and of one that holds what it bears."""
+"""Gains of gravity compensation, and of holding under it."""
 
 from module_agent.control.gains import default_gains
 from module_agent.model.catalogue import ModuleType
@@ -8,26 +8,26 @@ from module_agent.wire.messages import GainSet
 # Under this strategy all three loops speak newton metres, so that a position or a velocity loop that is off
 # leaves pure torque control, and the velocity loop is a damper, on the module and at its rate.
 STRATEGY = 2
-# The factory's position control gives under this strategy: it has the weight to bear by itself. Where the
-# weight is borne already it can be so much stiffer. At 16 times arms of four and six joints ring.
+# Stiffness relative to the factory's position loop, which is soft under this strategy, since it has to exert
+# the weight too. Measured: at 16 times, arms of four and six joints ring.
 HOLDING_TIMES = 6.0
-# The largest damping of a joint, of the factory's in the velocity loop of this strategy: as much as it holds
-# with. At 10 times an X5-1 in the wrist of an arm of six joints rings.
+# Largest damping relative to the factory's velocity loop of this strategy. Measured: at 10 times, an X5-1 in
+# the wrist of an arm of six joints rings.
 MAX_DAMPING_TIMES = HOLDING_TIMES
 
 
-def most_damping_nm_s_rad(kind: ModuleType) -> float:
-    """Return the largest damping under which a module floats."""
+def max_damping_nm_s_rad(kind: ModuleType) -> float:
+    """Return the largest damping of a module type."""
     return MAX_DAMPING_TIMES * default_gains(kind, STRATEGY).velocity.kp
 
 
 def compensation_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
-    """Return the gains under which a module floats: the factory's effort loop, and a damper.
+    """Return the gains of gravity compensation: the factory's effort loop, and a damper.
 
     Raises:
         UsageError: the damping is negative, not finite, or more than a module of this type takes.
     """
-    most = most_damping_nm_s_rad(kind)
+    most = max_damping_nm_s_rad(kind)
     if not 0.0 <= damping_nm_s_rad <= most:
         raise UsageError(
             f"damping of {damping_nm_s_rad} Nm s/rad: module type {kind.name} takes 0 to {most:g} Nm s/rad"
@@ -36,7 +36,7 @@ def compensation_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
 
 
 def holding_gains(kind: ModuleType) -> GainSet:
-    """Return the gains under which a module holds still what it bears."""
+    """Return the gains of holding while gravity is compensated."""
     return _torque_gains(kind, HOLDING_TIMES * default_gains(kind, STRATEGY).velocity.kp)
 
 

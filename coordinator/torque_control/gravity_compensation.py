@@ -1,22 +1,24 @@
-"""Floating: the motors of a robot bear its own weight and nothing else, so that a hand can lead it.
+"""Gravity compensation: the motors exert the robot's own weight, so that it can be led by hand.
 
-Under torque control every spring is asked for what the bodies beyond it weigh, tau = C(q, qd) qd + g(q)
-(thesis eq. 28 without acceleration). Friction and gear loss lie before the spring, inside the effort loop,
-which makes up for them: what is left of them holds the arm where the model errs by less.
+Under torque control the commanded spring torque of every joint is that of the bodies beyond it,
+tau = C(q, qd) qd + g(q) (eq. 28 without acceleration). Friction and gear loss act before the spring, inside
+the effort loop, which compensates them. The residual friction holds the arm where the model's error is
+smaller.
 
-    loading   factory gains; holds where it is, and goes over from the torque that it bears to the calculated
-    loaded    holds; waits for the gains of torque control
-    freeing   the position loop lets go, little by little
-    floating  the weight is borne, nothing else
-    holding   the position loop takes hold again, where the robot is; if it had not let go yet, where it held
-    held      holds
-    returning goes to where it is told, held all the way
+    loading       factory gains; holds the position; the torque fades from the measured to the modelled one
+    loaded        holds; waits for the gains of torque control
+    releasing     the stiffness of the position loop fades to zero
+    compensating  the modelled weight is exerted, nothing else
+    holding       the position loop regains its stiffness, at the measured position; if it had not been
+                  released yet, at the held position
+    held          holds
+    returning     moves to a given position under position control
 
-A robot floats until it is told to hold, or a joint goes too fast, nears the end of its range or would have to
-bear more than it can. Before it is taken, and again before it is set free, its torque sensors are compared
-with the weight: what they read beside it counts as their offset, and it is not set free if that is more than
-an offset and the errors of scales. Whoever sinks while it is being set free is held too. Pure: time is an
-argument, and nothing is sent from here.
+Compensation lasts until `hold` is called, or a joint exceeds the speed limit, comes near the end of its range
+or needs more torque than it has. Before the start, and again before the release, the torque sensors are
+compared with the model: the difference counts as the sensors' offset, and the release is refused if it is
+larger than offsets and scale errors explain. A joint that sinks during the release is held too. Pure: time is
+an argument, and nothing is sent from here.
 """
 
 from typing import Literal, NamedTuple
@@ -29,48 +31,47 @@ from module_agent.model.chain import Array
 from module_agent.model.errors import LostError, RobotError
 from module_agent.wire.messages import Limits
 
-Phase = Literal["loading", "loaded", "freeing", "floating", "holding", "held", "returning"]
+Phase = Literal["loading", "loaded", "releasing", "compensating", "holding", "held", "returning"]
 
-# What a torque sensor reads beside the weight while the joint holds still, from this share of the ramp on, is
-# its offset: it is borne with the weight from then on, or the effort loop would push by it.
-TARED_FROM = 0.7
-# How far from the calculated torque a joint may be that holds still: a share of its weight, four deviations
-# of the scale of a torque sensor as delivered, and one of its type's largest torque, four of its offset.
-# Springs lie beyond the motors' friction, so that friction hides nothing from them.
-UNKNOWN_OF_WEIGHT = 0.08
-UNKNOWN_OF_LARGEST = 0.02
-# How far a joint may go while it is being loaded, and while it is being set free: nobody leads it yet. Heavy
-# arms whose motors were off sink by 9 degrees as they are taken, into the soft gains of the factory, and by 1
-# as they are set free.
-MAX_SUNK_RAD, MAX_GIVEN_RAD = float(np.radians(15.0)), float(np.radians(5.0))
-# How far a joint may lag on the way back: it is stopped by something then.
+# From this share of the ramp on, the difference between measured and modelled torque of the resting joint is
+# averaged as the sensor's offset. It is added to the commanded torque; else the effort loop would push by it.
+OFFSET_FROM = 0.7
+# Largest accepted difference between measured and modelled torque at rest: a share of the modelled torque
+# (four sigma of a torque sensor's scale as delivered) and a share of the type's maximum torque (four sigma of
+# its offset). The springs measure beyond the motors' friction, so friction does not contribute.
+MAX_OFFSET_OF_WEIGHT = 0.08
+MAX_OFFSET_OF_EFFORT = 0.02
+# How far a joint may move while loading and while releasing. Measured: heavy arms whose motors were off sink
+# by 9 degrees into the soft factory gains, and by 1 degree on release.
+MAX_LOADING_MOTION_RAD, MAX_RELEASE_MOTION_RAD = float(np.radians(15.0)), float(np.radians(5.0))
+# Largest lag on the way back; more means that something blocks the joint.
 MAX_LAG_RAD = 0.08
-# How fast the way back is gone at most, and as a share of the speed at which a joint is held.
+# Top speed of the way back, and the same as a share of the speed limit.
 BACK_RAD_S, BACK_SHARE = 0.5, 0.5
 
 
 class CompensationRefused(RobotError):
-    """The robot is not set free; the message names the joint, what is wrong and what would be right."""
+    """The robot is not released; the message names the joint, the measured and the accepted value."""
 
 
 class StaleFeedback(LostError):
-    """A module has not been heard of for too long to say what its joints bear."""
+    """The newest feedback of a module is too old to compensate by."""
 
     def __init__(self, serial: str, age_s: float, most_s: float):
         super().__init__(
-            f"module {serial} was last heard {1e3 * age_s:.0f} ms ago, at most {1e3 * most_s:.0f} ms are "
-            "taken: check the network"
+            f"module {serial}: newest feedback is {1e3 * age_s:.0f} ms old, at most {1e3 * most_s:.0f} ms "
+            "are accepted; check the network"
         )
         self.serial = serial
 
 
 class CompensationSettings(NamedTuple):
-    """How a robot floats.
+    """Settings of gravity compensation.
 
-    damping_nm_s_rad: of every joint against its motion. max_speed_rad_s: a joint that goes faster is held.
-    ramp_s: from holding to floating, in each of the two ramps. hold_s: the ramp back. stale_s: the oldest
-    feedback to act on. margin_rad: how near a joint may come to the ends of its range.
-    velocity_forces: whether C(q, qd) qd is borne too.
+    damping_nm_s_rad: viscous damping of every joint. max_speed_rad_s: the robot is held if a joint moves
+    faster. ramp_s: duration of loading and of releasing. hold_s: duration of holding. stale_s: the oldest
+    feedback to act on. margin_rad: the smallest distance of a joint from the ends of its range.
+    velocity_forces: whether C(q, qd) qd is compensated too.
     """
 
     damping_nm_s_rad: float = 0.0
@@ -83,9 +84,9 @@ class CompensationSettings(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """The newest that is known of n joints, (n,) each.
+    """The newest feedback of n joints, (n,) each.
 
-    age_s: for how long nothing newer has come; how long it was on the way is not in it.
+    age_s: time since it arrived, without its transit time.
     """
 
     age_s: Array
@@ -95,7 +96,7 @@ class Reading(NamedTuple):
 
 
 class Targets(NamedTuple):
-    """Set-points of n joints, (n,) each; without positions the position loops are off."""
+    """Set-points of n joints, (n,) each; position_rad None: the position loops are off."""
 
     position_rad: Array | None
     velocity_rad_s: Array
@@ -103,132 +104,131 @@ class Targets(NamedTuple):
 
 
 class GravityCompensator:
-    """The course of one float; `step` is called at the rate of the set-points.
+    """The state machine of gravity compensation; `step` is called at the rate of the set-points.
 
-    phase: as above. why: why it holds or is held, empty before.
+    phase: as above. why: the reason for holding, empty before.
     """
 
-    def __init__(self, weight: GravityModel, limits: tuple[Limits, ...], settings: CompensationSettings):
+    def __init__(self, model: GravityModel, limits: tuple[Limits, ...], settings: CompensationSettings):
         self.phase: Phase = "loading"
         self.why = ""
         self.is_fault = False
-        self._weight = weight
-        self._serials = weight.chain.serials
+        self._model = model
+        self._serials = model.chain.serials
         self._settings = settings
-        self._most_nm = np.array([one.max_effort_nm for one in limits])
+        self._max_effort_nm = np.array([one.max_effort_nm for one in limits])
         self._low = _ends([one.min_position_rad for one in limits], -np.inf) + settings.margin_rad
         self._high = _ends([one.max_position_rad for one in limits], np.inf) - settings.margin_rad
         self._since_s = 0.0
         self._place: Array | None = None
         self._way: Way | None = None
-        # What the position loops still pull with as it takes hold: all if they had not let go.
-        self._grip = 1.0
-        self._pull: float | None = None
-        # What was asked of it when it was held before it could be set free.
-        self._left_nm: Array | None = None
-        self._borne, self._asked, self._tare = np.zeros((3, len(limits)))
-        self._strangers: list[Array] = []
+        # The stiffness share at the beginning of holding: 1 if the position loops were not released.
+        self._stiffness_share = 1.0
+        self._held_share: float | None = None
+        # The torque commanded when loading was aborted.
+        self._aborted_nm: Array | None = None
+        self._initial_nm, self._asked, self._offset = np.zeros((3, len(limits)))
+        self._offsets: list[Array] = []
 
     @property
     def place_rad(self) -> Array:
-        """Where it holds the joints, or last held them (n,).
+        """The held, or last held, joint positions (n,).
 
         Raises:
-            ValueError: it has not been stepped yet.
+            ValueError: before the first step.
         """
         if self._place is None:
-            raise ValueError("it holds nothing before its first step")
+            raise ValueError("no position is held before the first step")
         return self._place
 
     def check_start(self, reading: Reading) -> None:
-        """Check that the robot may be set free where it is; to be called before it is taken.
+        """Check that the robot can be compensated in its pose, before leases are taken.
 
-        `reading` is best the mean of some rows: its efforts are compared with the weight.
+        `reading` should be the mean of some rows, since its torques are compared with the model.
 
         Raises:
-            FloatRefused: its weight is too much for a joint, or a joint stands at the end of its range or
-            bears another load than the known one.
+            CompensationRefused: a joint needs more torque than it has, is at the end of its range, or carries
+                another load than the modelled one.
         """
-        weight = self._weight.effort_nm(reading.q_rad, np.zeros_like(reading.q_rad))
+        weight_nm = self._model.effort_nm(reading.q_rad, np.zeros_like(reading.q_rad))
         reason = (
-            self._overload(weight)
+            self._overload(weight_nm)
             or self._at_an_end(reading.q_rad)
-            or self._strange(reading.effort_nm, reading.effort_nm - weight)
+            or self._unexplained_offset(reading.effort_nm, reading.effort_nm - weight_nm)
         )
         if reason:
             raise CompensationRefused(reason)
 
     def step(self, t_s: float, reading: Reading) -> Targets:
-        """Return the set-points of this moment.
+        """Return the set-points at a time.
 
         Raises:
-            StaleFeedback: what is known of a joint is too old.
+            StaleFeedback: the feedback of a joint is too old.
         """
         self._check_age(reading.age_s)
         rate = reading.qd_rad_s if self._settings.velocity_forces else np.zeros_like(reading.q_rad)
-        weight = self._weight.effort_nm(reading.q_rad, rate)
+        weight_nm = self._model.effort_nm(reading.q_rad, rate)
         if self._place is None:
-            self._begin(t_s, reading, weight)
-        self._guard(t_s, reading, weight)
-        if self.phase == "loading" and self._share(t_s, self._settings.ramp_s) >= TARED_FROM:
-            self._strangers.append(reading.effort_nm - weight)
+            self._begin(t_s, reading, weight_nm)
+        self._guard(t_s, reading, weight_nm)
+        if self.phase == "loading" and self._share(t_s, self._settings.ramp_s) >= OFFSET_FROM:
+            self._offsets.append(reading.effort_nm - weight_nm)
         self._go_on(t_s, reading)
-        # What is too much is held by the position loop as far as the motor can.
-        most = self._most_nm
-        self._asked = np.clip(self._effort(t_s, weight + self._tare), -most, most)
+        most = self._max_effort_nm
+        self._asked = np.clip(self._effort(t_s, weight_nm + self._offset), -most, most)
         if self._way is not None:
             return Targets(*self._way.at(t_s - self._since_s), self._asked)
         return Targets(self._held(t_s, reading.q_rad), np.zeros_like(self._asked), self._asked)
 
     def _begin(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
         self._since_s, self._place = t_s, reading.q_rad.copy()
-        self._borne = self._asked = reading.effort_nm.copy()
-        if self._left_nm is not None:
-            self._left_nm = self._borne
-        elif strange := self._strange(reading.effort_nm, reading.effort_nm - weight_nm):
-            self._fault(t_s, reading, strange)
+        self._initial_nm = self._asked = reading.effort_nm.copy()
+        if self._aborted_nm is not None:
+            self._aborted_nm = self._initial_nm
+        elif unknown := self._unexplained_offset(reading.effort_nm, reading.effort_nm - weight_nm):
+            self._fault(t_s, reading, unknown)
 
     def _effort(self, t_s: float, weight_nm: Array) -> Array:
-        """Return what the springs are asked for: the weight, once the robot is known to weigh that."""
+        """Return the commanded spring torques: the weight, faded in by loading and out by an abort."""
         if self.phase == "loading":
-            return self._borne + self._share(t_s, self._settings.ramp_s) * (weight_nm - self._borne)
-        if self._left_nm is None:
+            return self._initial_nm + self._share(t_s, self._settings.ramp_s) * (weight_nm - self._initial_nm)
+        if self._aborted_nm is None:
             return weight_nm
-        # It was not set free: from what was asked last to what it bore by itself, without a step.
+        # Aborted: from the last commanded torque to the initially measured one, without a step.
         gone = self._share(t_s, self._settings.hold_s) if self.phase == "holding" else 1.0
-        return self._left_nm + gone * (self._borne - self._left_nm)
+        return self._aborted_nm + gone * (self._initial_nm - self._aborted_nm)
 
     def is_in(self, *phases: Phase) -> bool:
-        """Whether it is in one of these phases."""
+        """Return whether the phase is one of these."""
         return self.phase in phases
 
     def release(self, t_s: float) -> None:
-        """Set the robot free: the gains of torque control are in force. Only from `loaded`."""
+        """Begin the release; the gains of torque control must be in force. Only from `loaded`."""
         if self.phase == "loaded":
-            self._enter("freeing", t_s)
+            self._enter("releasing", t_s)
 
     def hold(self, t_s: float, why: str) -> None:
-        """Take hold of the robot at the next step, if it is not held already.
+        """Hold the robot from the next step on.
 
-        Where it is held, or is on its way, it stays there with full grip; where it is being set free the pull
-        goes on as it is; where it is free it is taken hold of where it is.
+        If loading or returning: keep the set-point at full stiffness. If releasing: keep the current
+        stiffness. If compensating: hold at the measured position. If holding or held: nothing changes.
         """
         if self.phase in ("holding", "held"):
             return
         self.why = self.why or why
         if self.phase == "loading":
-            self._left_nm = self._asked
-        elif self.phase == "freeing":
-            self._pull = 1.0 - self._share(t_s, self._settings.ramp_s)
-        elif self.phase == "floating":
-            self._grip = self._pull = 0.0
+            self._aborted_nm = self._asked
+        elif self.phase == "releasing":
+            self._held_share = 1.0 - self._share(t_s, self._settings.ramp_s)
+        elif self.phase == "compensating":
+            self._stiffness_share = self._held_share = 0.0
         elif self._way is not None:
             self._place, self._way = self._way.at(t_s - self._since_s)[0], None
-            self._grip = 1.0
+            self._stiffness_share = 1.0
         self._enter("holding", t_s)
 
-    def lead_back(self, t_s: float, target_rad: Array) -> None:
-        """Go to (n,) positions from where it holds. Only from `held`."""
+    def return_to(self, t_s: float, target_rad: Array) -> None:
+        """Move to positions (n,). Only from `held`."""
         if self.phase == "held":
             speed = min(BACK_RAD_S, BACK_SHARE * self._settings.max_speed_rad_s)
             self._way = Way(self.place_rad, target_rad, speed)
@@ -241,23 +241,23 @@ class GravityCompensator:
         return min(max((t_s - self._since_s) / length_s, 0.0), 1.0)
 
     def _held(self, t_s: float, q_rad: Array) -> Array | None:
-        """Return where the position loops are to pull to, None when they are off.
+        """Return the position set-points, None when the position loops are off.
 
-        They pull with a share of their stiffness: to a place so much nearer than the one that they hold.
+        A share of the stiffness is a set-point at that share of the way from the measured to the held one.
         """
         assert self._place is not None
-        if self.phase == "floating":
+        if self.phase == "compensating":
             return None
-        if self._pull is not None and self.phase == "holding":
-            self._place, self._pull = q_rad + self._pull * (self._place - q_rad), None
-        grip = 1.0
-        if self.phase == "freeing":
-            grip = 1.0 - self._share(t_s, self._settings.ramp_s)
+        if self._held_share is not None and self.phase == "holding":
+            self._place, self._held_share = q_rad + self._held_share * (self._place - q_rad), None
+        share = 1.0
+        if self.phase == "releasing":
+            share = 1.0 - self._share(t_s, self._settings.ramp_s)
         elif self.phase == "holding":
-            grip = max(self._grip, self._share(t_s, self._settings.hold_s))
-        return q_rad + grip * (self._place - q_rad)
+            share = max(self._stiffness_share, self._share(t_s, self._settings.hold_s))
+        return q_rad + share * (self._place - q_rad)
 
-    # ------------------------------------------------------------------ what ends it
+    # ------------------------------------------------------------------ transitions
 
     def _go_on(self, t_s: float, reading: Reading) -> None:
         self._arrive(t_s)
@@ -266,16 +266,16 @@ class GravityCompensator:
         if self._share(t_s, length_s) < 1.0:
             return
         if self.phase == "loading":
-            tare = np.mean(self._strangers, axis=0)
-            strange = self._strange(reading.effort_nm, tare)
-            if strange:
-                self._fault(t_s, reading, strange)
+            offset = np.mean(self._offsets, axis=0)
+            unknown = self._unexplained_offset(reading.effort_nm, offset)
+            if unknown:
+                self._fault(t_s, reading, unknown)
             else:
-                # It has given meanwhile, and stiffer gains are to come: they shall not snatch it back.
-                self._place, self._tare = reading.q_rad.copy(), tare
+                # Stiffer gains follow, and must not pull back a joint that has yielded meanwhile.
+                self._place, self._offset = reading.q_rad.copy(), offset
                 self._enter("loaded", t_s)
-        elif self.phase == "freeing":
-            self._enter("floating", t_s)
+        elif self.phase == "releasing":
+            self._enter("compensating", t_s)
         elif self.phase == "holding":
             self._enter("held", t_s)
 
@@ -287,29 +287,29 @@ class GravityCompensator:
     def _guard(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
         if self._way is not None:
             wanted = self._way.at(t_s - self._since_s)[0]
-            reason = self._astray(reading.q_rad - wanted, MAX_LAG_RAD, "behind on its way back")
+            reason = self._astray(reading.q_rad - wanted, MAX_LAG_RAD, "behind on the way back")
             reason = reason or self._too_fast(reading.qd_rad_s) or self._overload(weight_nm)
-        elif self.phase in ("freeing", "floating"):
+        elif self.phase in ("releasing", "compensating"):
             reason = self._too_fast(reading.qd_rad_s) or self._at_an_end(reading.q_rad)
             reason = reason or self._overload(weight_nm)
         else:
             reason = ""
-        if self.phase in ("loading", "freeing"):
+        if self.phase in ("loading", "releasing"):
             given = reading.q_rad - self.place_rad
-            most_rad = MAX_SUNK_RAD if self.phase == "loading" else MAX_GIVEN_RAD
-            reason = reason or self._astray(given, most_rad, "away before it was free")
+            max_rad = MAX_LOADING_MOTION_RAD if self.phase == "loading" else MAX_RELEASE_MOTION_RAD
+            reason = reason or self._astray(given, max_rad, "from its held position before the release")
         if reason:
             self._fault(t_s, reading, reason)
 
     def _fault(self, t_s: float, reading: Reading, why: str) -> None:
         was_on_its_way = self._way is not None
         if was_on_its_way:
-            # The end had another reason; what has come between is the one to tell.
+            # This fault, not the end of the session, is the reason now.
             self.why = ""
         self.is_fault = True
         self.hold(t_s, why)
         if was_on_its_way:
-            # It does not push on against what has stopped it.
+            # Do not push on against an obstacle.
             self._place = reading.q_rad.copy()
 
     def _check_age(self, age_s: Array) -> None:
@@ -318,34 +318,38 @@ class GravityCompensator:
             raise StaleFeedback(self._serials[worst], float(age_s[worst]), self._settings.stale_s)
 
     def _overload(self, weight_nm: Array) -> str:
-        over = np.abs(weight_nm) - self._most_nm
+        over = np.abs(weight_nm) - self._max_effort_nm
         worst = int(np.argmax(over))
         if over[worst] <= 0.0:
             return ""
         return (
-            f"joint {self._serials[worst]} would have to bear {weight_nm[worst]:.2f} Nm here, it can bear "
-            f"{self._most_nm[worst]:.2f} Nm; bring the arm to a lighter pose"
+            f"joint {self._serials[worst]}: this pose needs {weight_nm[worst]:.2f} Nm, the limit is "
+            f"{self._max_effort_nm[worst]:.2f} Nm. Move the arm to a pose with less load."
         )
 
-    def _strange(self, effort_nm: Array, tare_nm: Array) -> str:
-        weight = effort_nm - tare_nm
-        over = np.abs(tare_nm) - UNKNOWN_OF_WEIGHT * np.abs(weight) - UNKNOWN_OF_LARGEST * self._most_nm
+    def _unexplained_offset(self, effort_nm: Array, offset_nm: Array) -> str:
+        weight_nm = effort_nm - offset_nm
+        over = (
+            np.abs(offset_nm)
+            - MAX_OFFSET_OF_WEIGHT * np.abs(weight_nm)
+            - MAX_OFFSET_OF_EFFORT * self._max_effort_nm
+        )
         worst = int(np.argmax(over))
         if over[worst] <= 0.0:
             return ""
         return (
-            f"joint {self._serials[worst]} bears {effort_nm[worst]:.2f} Nm, {tare_nm[worst]:+.2f} Nm beside "
-            "what the robot that is known weighs there: it carries something, leans on something, is being "
-            "moved, or stands otherwise than when it was identified; identify it again as it is"
+            f"joint {self._serials[worst]}: measured {effort_nm[worst]:.2f} Nm, model predicts "
+            f"{weight_nm[worst]:.2f} Nm. Remove any payload or contact, or identify the robot again (base "
+            "orientation changed?)."
         )
 
-    def _astray(self, away_rad: Array, most_rad: float, how: str) -> str:
+    def _astray(self, away_rad: Array, max_rad: float, how: str) -> str:
         worst = int(np.argmax(np.abs(away_rad)))
-        if abs(away_rad[worst]) <= most_rad:
+        if abs(away_rad[worst]) <= max_rad:
             return ""
         return (
-            f"joint {self._serials[worst]} was {np.degrees(abs(away_rad[worst])):.1f} degrees {how}, at most "
-            f"{np.degrees(most_rad):.1f} are allowed: something pushes or stops it, or its load is another"
+            f"joint {self._serials[worst]}: {np.degrees(abs(away_rad[worst])):.1f} degrees {how}, at most "
+            f"{np.degrees(max_rad):.1f} are allowed. Remove obstacles; identify again if the load changed."
         )
 
     def _too_fast(self, rate_rad_s: Array) -> str:
@@ -353,8 +357,8 @@ class GravityCompensator:
         if abs(rate_rad_s[worst]) <= self._settings.max_speed_rad_s:
             return ""
         return (
-            f"joint {self._serials[worst]} went {abs(rate_rad_s[worst]):.2f} rad/s, at most "
-            f"{self._settings.max_speed_rad_s:.2f} rad/s are allowed"
+            f"joint {self._serials[worst]}: moved at {abs(rate_rad_s[worst]):.2f} rad/s, at most "
+            f"{self._settings.max_speed_rad_s:.2f} rad/s are allowed (--max-speed)"
         )
 
     def _at_an_end(self, q_rad: Array) -> str:
@@ -363,9 +367,10 @@ class GravityCompensator:
         if beyond[worst] <= 0.0:
             return ""
         margin = self._settings.margin_rad
+        low, high = self._low[worst] - margin, self._high[worst] + margin
         return (
-            f"joint {self._serials[worst]} is at {q_rad[worst]:.2f} rad, within {margin:.2f} rad of the end "
-            f"of its range, {self._low[worst] - margin:.2f} to {self._high[worst] + margin:.2f} rad"
+            f"joint {self._serials[worst]}: position {q_rad[worst]:.2f} rad is within {margin:.2f} rad of "
+            f"the end of its range, {low:.2f} to {high:.2f} rad"
         )
 
 

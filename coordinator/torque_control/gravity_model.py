@@ -1,4 +1,4 @@
-"""What the joints of a known robot have to bear, from the result of the run that it is known from."""
+"""The gravity torques of a robot, from the result of its identification."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -25,9 +25,9 @@ class GravityModel(NamedTuple):
     phi: Array
 
     def effort_nm(self, q_rad: ArrayLike, qd_rad_s: ArrayLike) -> Array:
-        """Return what the springs have to exert (n,) [Nm] at positions and velocities (n,), unaccelerated.
+        """Return the spring torques (n,) [Nm] at positions and velocities (n,) without acceleration.
 
-        That is the weight of the bodies, C(q, qd) qd + g(q): thesis eq. 28 with qdd = 0.
+        These are C(q, qd) qd + g(q): eq. 28 with qdd = 0.
         """
         q = np.asarray(q_rad, dtype=float)[None]
         rate = np.asarray(qd_rad_s, dtype=float)[None]
@@ -36,13 +36,13 @@ class GravityModel(NamedTuple):
 
 
 def gravity_model(folder: Path) -> GravityModel:
-    """Read what a robot weighs from the folder of a run.
+    """Read the gravity model of a robot from the folder of a run.
 
-    The parameters are those of real bodies where any were found: in poses that were never measured they stay
-    those of something that could exist.
+    The parameters are the physically consistent ones where the result has them: they stay plausible in poses
+    that were never measured.
 
     Raises:
-        KnownRobotError: the folder holds no result, or one without inertia.
+        BaselineError: the folder holds no result, or one without dynamics.
     """
     path = folder / RESULT
     if not path.is_file():
@@ -55,20 +55,20 @@ def gravity_model(folder: Path) -> GravityModel:
         raise BaselineError(f"{path} is no result of a run: {place}: {first['msg']}") from error
     if result.dynamics is None:
         raise BaselineError(
-            f"{path} does not tell what the robot weighs: it was run with --no-dynamics; identify it again"
+            f"{path} has no inertial parameters, since the run had --no-dynamics; identify the robot again"
         )
-    return weight_of(result)
+    return gravity_model_of_result(result)
 
 
-def weight_of(result: Result) -> GravityModel:
-    """Return what the robot of a result weighs.
+def gravity_model_of_result(result: Result) -> GravityModel:
+    """Return the gravity model of the robot of a result.
 
     Raises:
-        ValueError: the result is without inertia.
+        ValueError: the result has no dynamics.
     """
     dynamics = result.dynamics
     if dynamics is None:
-        raise ValueError("a result without dynamics does not tell what the robot weighs")
+        raise ValueError("a result without dynamics has no inertial parameters")
     chain = result.chain.chain()
     phi = np.array(dynamics.phi) if dynamics.bodies is None else _phi(chain, dynamics.bodies)
     phi.flags.writeable = False
@@ -76,7 +76,7 @@ def weight_of(result: Result) -> GravityModel:
 
 
 def _phi(chain: Chain, part: BodiesPart) -> Array:
-    """Return the parameters (10 n,) in the root frame of bodies that are told in their links' frames."""
+    """Return the parameters (10 n,) in the root frame of bodies given in their links' frames."""
     by_serial = {one.serial: one for one in part.bodies}
     pairs = zip(chain.serials, link_homes(chain), strict=True)
     return np.concatenate([parameter_transform(home) @ _about_origin(by_serial[s]) for s, home in pairs])

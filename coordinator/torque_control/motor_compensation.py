@@ -1,23 +1,21 @@
-"""How warm a motor's winding gets from the current that it is going to carry.
+"""Motor compensation: the torque that a motor needs beyond the torque of its spring.
 
-Winding, housing and body are three heat capacities in a row; in the seconds of a motion the winding follows
-its losses, the housing warms a little, and the body does not. Constants are the manufacturer's.
-
-What a motor takes beside the torque of its spring, put into the torque's set-point.
-
-The effort of a module is its spring's. To exert it while it turns, the motor overcomes friction, the gear's
-loss and its own rotor's inertia, which all lie before the spring; the module's feed-forward knows of a
-constant efficiency and of the back-EMF. What it lacks is left to the loops, and shows as tracking error: of
-position control (strategy 3) as PWM / P. So the PWM that the motor will need is worked out from the
-catalogue,
+The effort of a module is its spring's torque. To exert it while turning, the motor overcomes friction, gear
+loss and its own rotor's inertia, which all act before the spring. The module's feed-forward models a constant
+efficiency and the back-EMF; the loops compensate the rest, which shows as tracking error: in position control
+(strategy 3) as PWM / P. Therefore the PWM that the motor needs is predicted from the catalogue,
 
     X = tau + Jr thdd + b thd + Tc s(thd)        th = q + tau / k, s: the sign, smoothed about rest
     K N i = X / eff where the motor drives, X where it is driven
-    u = (R i + K N thd) / 48 V                   R: as warm as the winding gets (`winding`)
+    u = (R i + K N thd) / 48 V                   R at the winding's temperature
 
-and the set-point is raised until the effort loop puts out what is missing: its answer to a target is E + F,
-its gain and its feed-forward. Friction is a catalogue's figure that single modules miss by a tenth or more;
-the loops have what is left.
+and the torque set-point is raised until the effort loop, whose response to a target is E + F (gain and
+feed-forward), adds the missing PWM. Single modules deviate from the catalogue's friction by a tenth or more;
+the loops compensate that.
+
+Thermal model of R: winding, housing and body are three heat capacities in a row. Within the seconds of a
+motion the winding follows its losses, the housing warms a little, and the body does not. Constants are the
+manufacturer's.
 """
 
 from collections.abc import Sequence
@@ -66,7 +64,7 @@ def _growth(temperature_c: float) -> float:
     return 1.0 + COPPER_PER_K * (temperature_c - AMBIENT_C)
 
 
-# Friction comes up within this speed: at rest nobody knows which way it points.
+# The sign of friction is smoothed within this speed, since it is undefined at rest.
 _SLOW_RAD_S = 0.02
 _WARMING_TICKS = 10
 
@@ -77,11 +75,10 @@ def with_motor_compensation(
     gains: Sequence[GainSet],
     winding_start_c: Sequence[float] | None = None,
 ) -> SetPoints:
-    """Return set-points at 1 kHz whose efforts make up for what the motors take, one kind and gains a column.
+    """Return set-points at 1 kHz whose efforts include the motors' losses, one type and gains per column.
 
-    `winding_start_c` are the windings' temperatures as the reference begins, the ambient's if not given.
-    A joint with a loop that integrates is left as it is: that finds out by itself, and what is added would
-    wind it up.
+    `winding_start_c` are the windings' temperatures at the start of the reference, by default the ambient's.
+    A joint with an integrating loop is left unchanged: the loop compensates by itself, and would wind up.
 
     Raises:
         ValueError: another number of kinds or gains than columns.

@@ -1,7 +1,7 @@
-"""A known robot floats: it is taken, set free, held again, led back to where it stood, and let go.
+"""A session of gravity compensation: lease, release, hold, return, end of the leases.
 
-Set-points and the renewals of the leases come from one loop: if it stalls both end, and the modules' motors
-are off when their commands' life is over.
+Set-points and the renewals of the leases come from one loop: if it stalls, both end, and the modules switch
+their motors off when the lifetime of their commands is over.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from coordinator.torque_control.gravity_compensation import (
     Targets,
 )
 from coordinator.torque_control.gravity_model import GravityModel
-from coordinator.torque_control.preconditions import Felt, check_mounting, find_baseline_robot
+from coordinator.torque_control.preconditions import RestReading, check_gravity, find_robot
 from coordinator.torque_control.summary import CompensationSummary, CompensationTally
 from module_agent.model.chain import Array
 from module_agent.transport.transport import Transport
@@ -32,33 +32,33 @@ from module_agent.wire.feedback_rows import STATE_NAMES, Rows
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
 
-# The feedback that is acted on is at most so much of a command's life old; a little later the modules would
-# refuse what follows from it.
+# The oldest feedback to act on, as a share of the command lifetime: modules refuse commands that echo older
+# feedback.
 STALE_SHARE = 0.8
-# Gravity and the load are felt for a tenth of a second.
-_FELT_ROWS = 25
-# Rows that are kept; older ones are dropped every so often.
-_KEPT_ROWS, _FORGET_EVERY_S = 250, 2.0
-_LET_GO = ("idle", "expired", "stopped", "fault")
+# Gravity and load at rest are averaged over a tenth of a second.
+_REST_ROWS = 25
+# Retained rows; older ones are dropped at this interval.
+_RETAINED_ROWS, _FORGET_EVERY_S = 250, 2.0
+_RELEASED_STATES = ("idle", "expired", "stopped", "fault")
 _READ = ("position_rad", "velocity_rad_s", "effort_nm")
 
 
 class CompensationPlan(NamedTuple):
-    """What a float is told. rate_hz: of the set-points. for_s: None until it is asked to end.
+    """The course of a session. rate_hz: of the set-points. for_s: duration, None until `end` is called.
 
-    then_hold_s: how long it is held still before it is led back to where it stood; is_led_back: whether it
-    is, or let go where it is. After a limit was met it is let go where it is.
+    final_hold_s: how long the position is held at the end. returns: whether the robot then returns to its
+    start position; after an exceeded limit it is released where it is.
     """
 
     settings: CompensationSettings = CompensationSettings()
     rate_hz: float = 200.0
     for_s: float | None = None
-    then_hold_s: float = 1.0
-    is_led_back: bool = True
+    final_hold_s: float = 1.0
+    returns: bool = True
 
 
 class Moment(NamedTuple):
-    """What is to be seen of a float at one moment."""
+    """The state of a session at one moment, for display."""
 
     phase: Phase
     compensated_s: float
@@ -67,20 +67,20 @@ class Moment(NamedTuple):
     effort_nm: Array
 
 
-class Watcher(Protocol):
-    """Hears how a float goes; a terminal implements it."""
+class CompensationScreen(Protocol):
+    """Shows the course of a session; a terminal implements it."""
 
     def note(self, text: str) -> None:
-        """Something worth a line."""
+        """Show a line of text."""
         ...
 
     def moment(self, now: Moment) -> None:
-        """Set-points have been sent; called at their rate."""
+        """Show a moment; called at the rate of the set-points."""
         ...
 
 
 class CompensationSession:
-    """One float of the robot `name`, whose modules nobody holds yet, by `sender`; on any transport and clock.
+    """Gravity compensation of the robot `name` by `sender`, on any transport and clock.
 
     `post` runs a function on the event loop from any thread.
     """
@@ -89,43 +89,43 @@ class CompensationSession:
         self,
         transport: Transport,
         name: str,
-        weight: GravityModel,
+        model: GravityModel,
         plan: CompensationPlan,
         clock: Clock,
         post: Post,
-        watcher: Watcher,
+        screen: CompensationScreen,
         sender: str,
     ):
         self._recording = Recording()
         self._radio = Messenger(transport, name, clock, post, self._record)
         self._link = ModuleGroup(self._radio, self._recording, clock, sender)
-        self._weight, self._plan, self._clock, self._watcher = weight, plan, clock, watcher
-        self._serials = weight.chain.serials
+        self._model, self._plan, self._clock, self._screen = model, plan, clock, screen
+        self._serials = model.chain.serials
         self._tally = CompensationTally(self._serials)
         self._asked = ""
-        # How often the end was asked for, and how often as the robot was taken hold of.
-        self._asks = self._asks_heard = 0
+        # The number of calls of `end`, and that number when the robot was held.
+        self._end_requests = self._end_requests_seen = 0
         self._held_all = False
         self._is_under_torque = False
 
     @property
     def is_asked_to_end(self) -> bool:
-        """Whether somebody has asked for the end."""
+        """Whether `end` was called."""
         return bool(self._asked)
 
     def end(self, why: str = "asked to end") -> None:
-        """Ask for the end: the robot is held, led back and let go. To be called from the loop's thread.
+        """Ask for the end: the robot is held, returns and is released. To be called from the loop's thread.
 
-        Asked when it is held already, it does not set out any more; asked on its way back, it stops there.
+        When it is held already, it does not return any more; on its way back, it stops there.
         """
         self._asked = self._asked or why
-        self._asks += 1
+        self._end_requests += 1
 
     async def run(self) -> CompensationSummary:
-        """Float until the plan's time is over, the end is asked for, or a limit is met; say how it went.
+        """Compensate until the plan's time is over, `end` is called, or a limit is exceeded.
 
         Raises:
-            NotTheKnownRobot, FloatRefused: nothing has moved.
+            RobotMismatch, CompensationRefused: nothing has moved.
             StaleFeedback, ModuleLost, RobotStopped, NoAnswer, Refused: the robot has been told to stop.
         """
         self._radio.start()
@@ -142,66 +142,66 @@ class CompensationSession:
         return message if isinstance(message, Message) else None
 
     async def _run(self) -> CompensationSummary:
-        await find_baseline_robot(self._link, self._radio, self._weight, self._clock)
-        told = [self._link.info(serial) for serial in self._serials]
-        stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in told)
+        await find_robot(self._link, self._radio, self._model, self._clock)
+        reported = [self._link.info(serial) for serial in self._serials]
+        stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in reported)
         settings = self._plan.settings._replace(stale_s=min(stale_s, self._plan.settings.stale_s))
-        floater = GravityCompensator(self._weight, tuple(info.limits for info in told), settings)
-        stood = self._reading(_FELT_ROWS)
+        compensator = GravityCompensator(self._model, tuple(info.limits for info in reported), settings)
+        stood = self._reading(_REST_ROWS)
         try:
-            floater.check_start(stood)
+            compensator.check_start(stood)
         except CompensationRefused:
-            # A base that stands otherwise changes the weight too, and says more.
-            check_mounting(self._weight.chain, self._felt())
+            # Another orientation of the base changes the weight too, and explains more.
+            check_gravity(self._model.chain, self._rest_reading())
             raise
         if self._asked:
             return self._tally.summary(self._asked, is_fault=False)
         streaming: asyncio.Task[None] | None = None
         try:
             await gather_all(self._link.acquire(serial) for serial in self._serials)
-            streaming = asyncio.create_task(self._stream(floater))
-            await self._float(floater, streaming)
-            await self._return(floater, stood.q_rad, streaming)
+            streaming = asyncio.create_task(self._stream(compensator))
+            await self._compensate(compensator, streaming)
+            await self._return(compensator, stood.q_rad, streaming)
             await _cancelled(streaming)
-            await self._let_go()
+            await self._release_all()
         except BaseException as error:
             if streaming is not None:
                 await _cancelled(streaming)
             await self._abandon(error)
             raise
-        return self._tally.summary(floater.why, floater.is_fault)
+        return self._tally.summary(compensator.why, compensator.is_fault)
 
-    # ------------------------------------------------------------------ floating
+    # ------------------------------------------------------------------ compensating
 
-    async def _float(self, floater: GravityCompensator, streaming: "asyncio.Task[None]") -> None:
-        """Set the robot free once its motors bear it, and take hold of it in the end."""
-        await self._until(lambda: not floater.is_in("loading") or bool(self._asked), streaming)
-        if floater.is_in("loaded") and not self._asked:
-            # Not before it is held: what falls feels no gravity.
-            check_mounting(self._weight.chain, self._felt())
+    async def _compensate(self, compensator: GravityCompensator, streaming: "asyncio.Task[None]") -> None:
+        """Release the robot once its motors exert its weight, and hold it at the end."""
+        await self._until(lambda: not compensator.is_in("loading") or bool(self._asked), streaming)
+        if compensator.is_in("loaded") and not self._asked:
+            # Only while it is held: an IMU in free fall measures no gravity.
+            check_gravity(self._model.chain, self._rest_reading())
             damping = self._plan.settings.damping_nm_s_rad
             await gather_all(
                 self._link.set_gains(s, compensation_gains(self._link.kind(s), damping))
                 for s in self._serials
             )
             self._is_under_torque = True
-            floater.release(self._now_s())
-            await self._until(lambda: not floater.is_in("freeing") or bool(self._asked), streaming)
-            if floater.is_in("floating"):
-                self._watcher.note("it floats: lead it by hand")
-            await self._until(lambda: self._is_over(floater), streaming)
-        self._asks_heard = self._asks
-        floater.hold(self._now_s(), self._asked or "its time is over")
-        self._watcher.note(f"it is held: {floater.why}")
-        await self._until(lambda: floater.is_in("held"), streaming)
+            compensator.release(self._now_s())
+            await self._until(lambda: not compensator.is_in("releasing") or bool(self._asked), streaming)
+            if compensator.is_in("compensating"):
+                self._screen.note("gravity is compensated: lead the robot by hand")
+            await self._until(lambda: self._is_over(compensator), streaming)
+        self._end_requests_seen = self._end_requests
+        compensator.hold(self._now_s(), self._asked or "the time is over")
+        self._screen.note(f"holding: {compensator.why}")
+        await self._until(lambda: compensator.is_in("held"), streaming)
         if self._is_under_torque:
             await gather_all(
                 self._link.set_gains(s, holding_gains(self._link.kind(s))) for s in self._serials
             )
 
-    def _is_over(self, floater: GravityCompensator) -> bool:
+    def _is_over(self, compensator: GravityCompensator) -> bool:
         over = self._plan.for_s is not None and self._tally.compensated_s >= self._plan.for_s
-        return over or bool(self._asked) or not floater.is_in("floating")
+        return over or bool(self._asked) or not compensator.is_in("compensating")
 
     async def _until(self, condition: Callable[[], bool], streaming: "asyncio.Task[None]") -> None:
         while not condition():
@@ -210,15 +210,15 @@ class CompensationSession:
             self._link.check()
             await asyncio.sleep(POLL_S)
 
-    async def _stream(self, floater: GravityCompensator) -> None:
-        """Send set-points at their rate, renew the leases, and keep no more of the past than it takes."""
+    async def _stream(self, compensator: GravityCompensator) -> None:
+        """Send set-points at their rate, renew the leases, and drop old rows."""
         period_s = 1.0 / self._plan.rate_hz
         due_s = forgot_s = self._now_s()
         renewed_s = due_s - KEEP_ALIVE_S
         while True:
             now_s = self._now_s()
             self._check_states()
-            self._step(floater, now_s)
+            self._step(compensator, now_s)
             if now_s - renewed_s >= KEEP_ALIVE_S:
                 self._link.renew()
                 renewed_s = now_s
@@ -231,15 +231,15 @@ class CompensationSession:
                 due_s += late_s
             await asyncio.sleep(max(0.0, due_s - self._now_s()))
 
-    def _step(self, floater: GravityCompensator, now_s: float) -> None:
+    def _step(self, compensator: GravityCompensator, now_s: float) -> None:
         reading = self._reading()
-        targets = floater.step(now_s, reading)
+        targets = compensator.step(now_s, reading)
         self._send(targets)
-        if floater.phase == "floating":
+        if compensator.phase == "compensating":
             self._tally.add(now_s, reading.q_rad, reading.qd_rad_s, targets.effort_nm)
         tally = self._tally
-        self._watcher.moment(
-            Moment(floater.phase, tally.compensated_s, tally.missed, reading, targets.effort_nm)
+        self._screen.moment(
+            Moment(compensator.phase, tally.compensated_s, tally.missed, reading, targets.effort_nm)
         )
 
     def _send(self, targets: Targets) -> None:
@@ -250,15 +250,15 @@ class CompensationSession:
         self._tally.sent += 1
 
     def _check_states(self) -> None:
-        """Check that no module has let go of its joint, once all have taken set-points.
+        """Check that every module executes set-points, once all have begun to.
 
         Raises:
-            RobotStopped, ModuleLost: one has.
+            RobotStopped, ModuleLost: one does not any more.
         """
         states = {s: STATE_NAMES[int(self._newest(s)["state"][0])] for s in self._serials}
         self._held_all = self._held_all or set(states.values()) == {"streaming"}
         for serial, state in states.items():
-            if self._held_all and state in _LET_GO:
+            if self._held_all and state in _RELEASED_STATES:
                 status = self._link.module(serial).status
                 note = status.note if status is not None and status.state == state else ""
                 if state == "stopped":
@@ -268,36 +268,37 @@ class CompensationSession:
     # ------------------------------------------------------------------ the end
 
     async def _return(
-        self, floater: GravityCompensator, stood_rad: Array, streaming: "asyncio.Task[None]"
+        self, compensator: GravityCompensator, stood_rad: Array, streaming: "asyncio.Task[None]"
     ) -> None:
-        """Hold the robot still, and lead it back to where it stood, where its motors were off before.
+        """Hold the robot still, then return to its start position, where it stood with its motors off.
 
-        A robot that met a limit met perhaps somebody, and what lies on its way back is not known: it stays.
+        After an exceeded limit it stays: it may have hit a person, and the way back may be blocked.
         """
-        await self._stand(streaming)
-        if not (self._plan.is_led_back and self._is_under_torque):
+        await self._hold_still(streaming)
+        if not (self._plan.returns and self._is_under_torque):
             return
-        if not floater.is_fault and self._asks == self._asks_heard:
-            self._watcher.note("it goes back to where it stood")
-            floater.lead_back(self._now_s(), stood_rad)
+        if not compensator.is_fault and self._end_requests == self._end_requests_seen:
+            self._screen.note("returning to the start position")
+            compensator.return_to(self._now_s(), stood_rad)
             await self._until(
-                lambda: not floater.is_in("returning") or self._asks > self._asks_heard, streaming
+                lambda: not compensator.is_in("returning") or self._end_requests > self._end_requests_seen,
+                streaming,
             )
-            if floater.is_in("held"):
+            if compensator.is_in("held"):
                 return
-            floater.hold(self._now_s(), self._asked)
-            self._watcher.note(
-                f"it is held on its way back: {floater.why if floater.is_fault else self._asked}"
+            compensator.hold(self._now_s(), self._asked)
+            self._screen.note(
+                f"holding on the way back: {compensator.why if compensator.is_fault else self._asked}"
             )
-            await self._until(lambda: floater.is_in("held"), streaming)
-            await self._stand(streaming)
-        self._watcher.note("it does not go back, and is let go where it is: support it")
+            await self._until(lambda: compensator.is_in("held"), streaming)
+            await self._hold_still(streaming)
+        self._screen.note("released at its position without returning: support the arm")
 
-    async def _stand(self, streaming: "asyncio.Task[None]") -> None:
-        end_s = self._now_s() + self._plan.then_hold_s
+    async def _hold_still(self, streaming: "asyncio.Task[None]") -> None:
+        end_s = self._now_s() + self._plan.final_hold_s
         await self._until(lambda: self._now_s() >= end_s, streaming)
 
-    async def _let_go(self) -> None:
+    async def _release_all(self) -> None:
         keeper = asyncio.create_task(self._link.keep_alive())
         try:
             await self._link.release_all()
@@ -306,10 +307,12 @@ class CompensationSession:
 
     async def _abandon(self, error: BaseException) -> None:
         why = str(error) or type(error).__name__
-        deaf = await self._link.stop_all(why[:200])
-        self._watcher.note(f"stopped: {why}" + (f"; no confirmation from {', '.join(deaf)}" if deaf else ""))
+        unconfirmed = await self._link.stop_all(why[:200])
+        self._screen.note(
+            f"stopped: {why}" + (f"; no confirmation from {', '.join(unconfirmed)}" if unconfirmed else "")
+        )
 
-    # ------------------------------------------------------------------ what is known of the robot
+    # ------------------------------------------------------------------ feedback
 
     def _now_s(self) -> float:
         return 1e-9 * self._clock()
@@ -319,35 +322,37 @@ class CompensationSession:
         return log.rows(log.end_row - count, log.end_row)
 
     def _reading(self, count: int = 1) -> Reading:
-        """Return what the newest rows say, the mean of `count` of each module."""
+        """Return the mean of the newest `count` rows of each module."""
         now_ns = self._clock()
-        ages = [1e-9 * (now_ns - self._heard_ns(serial)) for serial in self._serials]
+        ages = [1e-9 * (now_ns - self._received_ns(serial)) for serial in self._serials]
         rows = [self._newest(serial, count) for serial in self._serials]
         means = ([row[name].mean(dtype=float) for row in rows] for name in _READ)
         return Reading(np.array(ages), *(np.array(values) for values in means))
 
-    def _heard_ns(self, serial: str) -> int:
-        """Return when the newest row of a module came; what is known of later arrivals is dropped."""
+    def _received_ns(self, serial: str) -> int:
+        """Return when the newest row of a module first arrived; later arrivals are dropped."""
         arrivals = self._link.module(serial).arrivals
         arrivals[:] = [first_of_newest(arrivals)]
         return arrivals[0][0]
 
-    def _felt(self) -> Felt:
-        rows = [self._newest(serial, _FELT_ROWS) for serial in self._serials]
+    def _rest_reading(self) -> RestReading:
+        rows = [self._newest(serial, _REST_ROWS) for serial in self._serials]
         q = [float(row["position_rad"].mean()) for row in rows]
-        return Felt(np.array(q), np.array([row["accel_m_s2"].astype(float).mean(axis=0) for row in rows]))
+        return RestReading(
+            np.array(q), np.array([row["accel_m_s2"].astype(float).mean(axis=0) for row in rows])
+        )
 
     def _forget(self) -> None:
         for serial in self._serials:
             record = self._link.module(serial)
-            record.rows.forget_before(record.rows.end_row - _KEPT_ROWS)
+            record.rows.forget_before(record.rows.end_row - _RETAINED_ROWS)
             record.round_trips.clear()
 
 
 def first_of_newest(arrivals: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    """Return the arrival, (session time, newest module time) [ns], that first brought the newest of all.
+    """Return the first arrival, (session time, newest module time) [ns], of the newest module time.
 
-    Messages that overtake one another, or come twice, bring nothing newer.
+    Messages that overtake one another, or arrive twice, do not count.
     """
     return min(arrivals, key=lambda one: (-one[1], one[0]))
 

@@ -1,4 +1,4 @@
-"""What a float came to: how far, how fast, and under which torques every joint went; kept in running sums."""
+"""Summary of a session of gravity compensation: range, speed and torque of every joint, in running sums."""
 
 from typing import NamedTuple
 
@@ -8,21 +8,22 @@ from module_agent.model.chain import Array
 
 
 class JointSummary(NamedTuple):
-    """What a joint did while it floated: from where to where, how fast at most, and what it bore."""
+    """A joint during compensation: start and end position, largest deviation, top speed and torques."""
 
     serial: str
-    began_rad: float
-    ended_rad: float
+    start_rad: float
+    end_rad: float
     farthest_rad: float
     top_speed_rad_s: float
     effort_rms_nm: float
-    effort_most_nm: float
+    effort_max_nm: float
 
 
 class CompensationSummary(NamedTuple):
-    """How a float went: why it ended, and whether by a limit. missed: of `sent`, so many more were due.
+    """How a session ended: why, and whether by an exceeded limit.
 
-    joints is empty if the robot was not set free.
+    sent: set-points sent; missed: set-points that were due beyond those. joints is empty if the robot was not
+    released.
     """
 
     why: str
@@ -34,7 +35,7 @@ class CompensationSummary(NamedTuple):
 
 
 class CompensationTally:
-    """Adds up a float of n joints, moment by moment."""
+    """Accumulates the summary of n joints, moment by moment."""
 
     def __init__(self, serials: tuple[str, ...]):
         self._serials = serials
@@ -46,11 +47,11 @@ class CompensationTally:
 
     @property
     def compensated_s(self) -> float:
-        """For how long it has floated so far."""
+        """How long gravity has been compensated so far."""
         return 0.0 if self._began is None else self._last[0] - self._began[0]
 
     def add(self, t_s: float, q_rad: Array, qd_rad_s: Array, effort_nm: Array) -> None:
-        """Add a moment at which the robot floated, (n,) each."""
+        """Add a moment of compensation, (n,) each."""
         if self._began is None:
             self._began = t_s, q_rad
         self._last = t_s, q_rad
@@ -61,7 +62,7 @@ class CompensationTally:
         self._count += 1
 
     def summary(self, why: str, is_fault: bool) -> CompensationSummary:
-        """Return what it came to."""
+        """Return the summary."""
         if self._began is None:
             return CompensationSummary(why, is_fault, 0.0, self.sent, self.missed, ())
         columns = (

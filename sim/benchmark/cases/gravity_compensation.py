@@ -14,7 +14,7 @@ import numpy as np
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify
 from coordinator.runtime.event_loop import run_to_end
-from coordinator.torque_control.gravity_model import GravityModel, weight_of
+from coordinator.torque_control.gravity_model import GravityModel, gravity_model_of_result
 from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
 from coordinator.torque_control.summary import CompensationSummary
 from module_agent.model.chain import Array, Chain
@@ -88,8 +88,8 @@ class CompensationRun(NamedTuple):
 
     def released(self) -> "CompensationRun":
         """Return the part in which the robot was released."""
-        free = np.array([phase == "floating" for phase in self.phases])
-        phases = tuple(phase for phase in self.phases if phase == "floating")
+        free = np.array([phase == "compensating" for phase in self.phases])
+        phases = tuple(phase for phase in self.phases if phase == "compensating")
         return CompensationRun(self.summary, phases, self.t_s[free], self.q_rad[free])
 
 
@@ -106,7 +106,7 @@ def compensation_trial(
     Raises:
         what `CompensationSession.run` raises.
     """
-    free = CompensationPlan(for_s=drift_s, then_hold_s=0.0, is_led_back=False)
+    free = CompensationPlan(for_s=drift_s, final_hold_s=0.0, returns=False)
     drifts = []
     for pose in poses:
         alone = compensate_robot(posed(robot, pose.start_rad), weight, free, seed, noise).released()
@@ -119,7 +119,7 @@ def compensation_trial(
     long = free._replace(for_s=FREE_S + GROWING_S)
     guided = compensate_robot(here, weight, long, seed, noise, pushes=_growing(tip, FREE_MAX_N))
     # Held from the moment at which it would be released.
-    still = free._replace(for_s=0.0, then_hold_s=FREE_S + GROWING_S)
+    still = free._replace(for_s=0.0, final_hold_s=FREE_S + GROWING_S)
     held = compensate_robot(here, weight, still, seed, noise, pushes=_growing(tip, HELD_MAX_N))
     return CompensationTrial(
         drift_deg=max(drifts),
@@ -174,7 +174,9 @@ def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan |
         ValueError: the plan leaves out the dynamics.
     """
     settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
-    return weight_of(identify(record_session(settings, plan or Plan(imu=imu_kind(noise)))).result)
+    return gravity_model_of_result(
+        identify(record_session(settings, plan or Plan(imu=imu_kind(noise)))).result
+    )
 
 
 def posed(robot: Robot, start_rad: Mapping[str, float]) -> Robot:

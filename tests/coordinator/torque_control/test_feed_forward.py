@@ -128,5 +128,5 @@ def test_paths_to_another_pose_end_together_there_and_the_longest_is_as_fast_as_
 def test_a_pose_that_is_there_already_is_stood_in_for_a_moment() -> None:
     paths = paths_together({"J0": 0.3}, {"J0": 0.3}, 0.5)
     assert [path.kind for path in paths.values()] == ["rest"]
-    with pytest.raises(ValueError, match="nowhere to go"):
+    with pytest.raises(ValueError, match="no joint has a target"):
         paths_together({"J0": 0.3}, {}, 0.5)

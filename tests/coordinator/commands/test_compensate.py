@@ -27,7 +27,7 @@ SERIALS = ("A", "B")
 
 def moment(t_s: float = 1.0, q: tuple[float, float] = (0.5, -1.0)) -> Moment:
     reading = Reading(np.array([0.012, 0.02]), np.array(q), np.array([0.1, 0.0]), np.array([1.25, -0.5]))
-    return Moment("floating", t_s, 3, reading, np.array([1.2, -0.4]))
+    return Moment("compensating", t_s, 3, reading, np.array([1.2, -0.4]))
 
 
 # --------------------------------------------------------------------------- wrong usage
@@ -63,7 +63,7 @@ def test_a_folder_that_does_not_tell_the_weight_is_wrong_usage(
 ) -> None:
     for folder, words in (
         (tmp_path / "nowhere", "holds no result.json: give the folder of a run that has finished"),
-        (known_folder("a2085_03", dynamics=None), "it was run with --no-dynamics"),
+        (known_folder("a2085_03", dynamics=None), "the run had --no-dynamics"),
     ):
         done = CliRunner().invoke(app, ["compensate", str(folder)])
         assert done.exit_code == 2, done.output
@@ -74,11 +74,11 @@ def test_a_folder_that_does_not_tell_the_weight_is_wrong_usage(
 
 
 def test_a_moment_is_a_line_in_a_pipe_and_a_row_a_joint_in_a_terminal() -> None:
-    assert moment_line(SERIALS, moment()) == "floating 1.0 s: A 28.6 deg 1.20 Nm, B -57.3 deg -0.40 Nm"
+    assert moment_line(SERIALS, moment()) == "compensating 1.0 s: A 28.6 deg 1.20 Nm, B -57.3 deg -0.40 Nm"
     shown = Console(file=io.StringIO(), width=120)
     shown.print(moment_table(SERIALS, moment()))
     text = shown.file.getvalue()  # type: ignore[attr-defined]
-    assert "floating, 1.0 s, 3 set-points missed" in text
+    assert "compensating, 1.0 s, 3 set-points missed" in text
     for words in ("28.6", "5.7", "1.20", "1.25", "12", "-57.3"):
         assert words in text
 
@@ -91,18 +91,18 @@ def test_lines_of_json_come_twice_a_second_and_hold_si_units(capsys: pytest.Capt
             view.moment(moment(0.005 * k))
         view.note("nobody hears it")
         tally = CompensationTally(SERIALS)
-        view.summary(tally.summary("its time is over", False))
+        view.summary(tally.summary("the time is over", False))
     *lines, summary = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [line["floated_s"] for line in lines] == [0.0, 0.5, 1.0]
+    assert [line["compensated_s"] for line in lines] == [0.0, 0.5, 1.0]
     assert lines[0]["joints"][1] == {
         "serial": "B",
         "position_rad": -1.0,
         "velocity_rad_s": 0.0,
-        "asked_nm": -0.4,
+        "commanded_nm": -0.4,
         "measured_nm": -0.5,
         "age_s": 0.02,
     }
-    assert (summary["why"], summary["joints"]) == ("its time is over", [])
+    assert (summary["why"], summary["joints"]) == ("the time is over", [])
 
 
 def test_a_summary_tells_how_far_how_fast_and_under_what_load_every_joint_went() -> None:
@@ -116,16 +116,16 @@ def test_a_summary_tells_how_far_how_fast_and_under_what_load_every_joint_went()
     found = tally.summary("asked to end", False)
     assert (found.compensated_s, found.sent, found.missed) == (pytest.approx(1.0), 101, 2)
     first, second = found.joints
-    assert (first.began_rad, first.ended_rad) == (0.0, pytest.approx(0.16))
+    assert (first.start_rad, first.end_rad) == (0.0, pytest.approx(0.16))
     assert first.farthest_rad == pytest.approx(0.32)
-    assert (first.top_speed_rad_s, first.effort_most_nm) == (0.4, 5.0)
+    assert (first.top_speed_rad_s, first.effort_max_nm) == (0.4, 5.0)
     assert first.effort_rms_nm == pytest.approx(np.sqrt((100 * 9.0 + 25.0) / 101))
     assert (second.farthest_rad, second.effort_rms_nm) == (0.0, pytest.approx(2.0))
     assert json.loads(json.dumps(summary_fields(found)))["joints"][0]["serial"] == "A"
     shown = Console(file=io.StringIO(), width=120)
     shown.print(summary_table(found))
     text = shown.file.getvalue()  # type: ignore[attr-defined]
-    assert "floated for 1.0 s: asked to end; 2 set-points missed" in text
+    assert "compensated for 1.0 s: asked to end; 2 set-points missed" in text
     assert "+9.2" in text
 
 

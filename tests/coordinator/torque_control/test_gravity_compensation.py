@@ -7,13 +7,13 @@ from coordinator.torque_control.gains import (
     HOLDING_TIMES,
     compensation_gains,
     holding_gains,
-    most_damping_nm_s_rad,
+    max_damping_nm_s_rad,
 )
 from coordinator.torque_control.gravity_compensation import (
-    MAX_GIVEN_RAD,
-    MAX_SUNK_RAD,
-    UNKNOWN_OF_LARGEST,
-    UNKNOWN_OF_WEIGHT,
+    MAX_LOADING_MOTION_RAD,
+    MAX_OFFSET_OF_EFFORT,
+    MAX_OFFSET_OF_WEIGHT,
+    MAX_RELEASE_MOTION_RAD,
     CompensationRefused,
     CompensationSettings,
     GravityCompensator,
@@ -61,12 +61,12 @@ def reading(q: float = 0.0, rate: float = 0.0, effort: float = LEVEL_NM, age_s: 
     return Reading(*(np.array([value]) for value in (age_s, q, rate, effort)))
 
 
-def floater(of: Limits | None = None, settings: CompensationSettings = SETTINGS) -> GravityCompensator:
+def compensator(of: Limits | None = None, settings: CompensationSettings = SETTINGS) -> GravityCompensator:
     return GravityCompensator(pendulum(), (of or limits(),), settings)
 
 
 def loaded() -> GravityCompensator:
-    found = floater()
+    found = compensator()
     for t_s in (10.0, 10.8):
         found.step(t_s, reading())
     assert found.phase == "loaded"
@@ -77,7 +77,7 @@ def free() -> GravityCompensator:
     found = loaded()
     found.release(11.0)
     found.step(11.8, reading())
-    assert found.phase == "floating"
+    assert found.phase == "compensating"
     return found
 
 
@@ -90,7 +90,7 @@ def place(targets: Targets) -> float:
 
 
 def test_before_it_is_set_free_the_joint_goes_over_from_the_torque_that_it_bears_to_its_weight() -> None:
-    it = floater()
+    it = compensator()
     borne = LEVEL_NM + 0.32
     first, middle = it.step(10.0, reading(effort=borne)), it.step(10.4, reading(effort=borne))
     assert first.effort_nm[0] == pytest.approx(borne)
@@ -102,7 +102,7 @@ def test_before_it_is_set_free_the_joint_goes_over_from_the_torque_that_it_bears
 
 
 def test_what_a_sensor_reads_beside_the_weight_before_it_is_free_is_borne_with_the_weight() -> None:
-    it = floater()
+    it = compensator()
     rng = np.random.default_rng(1)
     for t_s in np.arange(10.0, 10.81, 0.005):
         # 0.3 Nm of offset and some noise.
@@ -115,7 +115,7 @@ def test_what_a_sensor_reads_beside_the_weight_before_it_is_free_is_borne_with_t
 
 
 def test_where_it_has_given_while_it_was_held_softly_it_is_not_snatched_back() -> None:
-    it = floater()
+    it = compensator()
     it.step(10.0, reading())
     it.step(10.8, reading(q=0.05))
     assert it.phase == "loaded"
@@ -129,7 +129,7 @@ def test_the_position_loop_lets_go_little_by_little_and_pulls_to_where_it_held()
     assert place(it.step(11.0, reading(q=0.06))) == pytest.approx(0.0)
     assert place(it.step(11.4, reading(q=0.06))) == pytest.approx(0.03)
     assert it.step(11.8, reading(q=0.06)).position_rad is None
-    assert it.phase == "floating"
+    assert it.phase == "compensating"
 
 
 def test_free_it_is_asked_for_its_weight_wherever_it_is_led() -> None:
@@ -159,7 +159,7 @@ def test_velocity_forces_are_borne_if_asked_for(velocity_forces: bool) -> None:
 
 
 def test_only_what_has_the_gains_of_torque_control_is_set_free() -> None:
-    it = floater()
+    it = compensator()
     it.release(10.0)
     assert it.phase == "loading"
 
@@ -190,9 +190,12 @@ def test_the_first_reason_to_hold_is_the_one_that_is_told() -> None:
 @pytest.mark.parametrize(
     ("now", "words"),
     [
-        (reading(rate=-1.6), "joint J went 1.60 rad/s, at most 1.50 rad/s are allowed"),
-        (reading(q=1.95), "joint J is at 1.95 rad, within 0.10 rad of the end of its range, -2.00 to 2.00"),
-        (reading(q=-1.95), "joint J is at -1.95 rad, within 0.10 rad of the end"),
+        (reading(rate=-1.6), "joint J: moved at 1.60 rad/s, at most 1.50 rad/s are allowed"),
+        (
+            reading(q=1.95),
+            "joint J: position 1.95 rad is within 0.10 rad of the end of its range, -2.00 to 2.00",
+        ),
+        (reading(q=-1.95), "joint J: position -1.95 rad is within 0.10 rad of the end"),
     ],
 )
 def test_a_joint_beyond_a_limit_is_held_where_it_is_and_named(now: Reading, words: str) -> None:
@@ -217,16 +220,16 @@ def test_a_pose_that_is_too_heavy_for_the_joint_is_held_at_what_it_can_bear() ->
         it.step(t_s, down)
     it.release(11.0)
     it.step(11.8, down)
-    assert it.phase == "floating"
+    assert it.phase == "compensating"
     found = it.step(12.0, reading(q=0.2, effort=-7.0))
-    assert "joint J would have to bear -8.65 Nm here, it can bear 7.00 Nm" in it.why
+    assert "joint J: this pose needs -8.65 Nm, the limit is 7.00 Nm" in it.why
     assert found.effort_nm[0] == -7.0
 
 
 def test_held_before_it_is_free_it_keeps_its_full_grip_and_bears_what_it_bore() -> None:
     # What it bears is 0.3 Nm more than what is known, of which half is let go half way.
     borne = LEVEL_NM - 0.3
-    it = floater()
+    it = compensator()
     it.step(10.0, reading(effort=borne))
     before = it.step(10.4, reading(effort=borne))
     assert before.effort_nm[0] == pytest.approx(borne + 0.15)
@@ -244,7 +247,7 @@ def test_held_before_it_is_free_it_keeps_its_full_grip_and_bears_what_it_bore() 
 def test_an_unknown_load_is_found_at_the_first_step_and_borne_from_then_on() -> None:
     # A tool as heavy as the arm: by the weight that is known it would sink.
     borne = 2.0 * LEVEL_NM
-    it = floater()
+    it = compensator()
     for t_s in (10.0, 10.02, 10.3, 10.5, 10.9):
         now = it.step(t_s, reading(q=0.02 * (t_s - 10.0), effort=borne))
         assert it.is_fault
@@ -253,20 +256,20 @@ def test_an_unknown_load_is_found_at_the_first_step_and_borne_from_then_on() -> 
 
 
 def test_held_before_its_first_step_it_bears_what_it_bore() -> None:
-    it = floater()
+    it = compensator()
     it.hold(10.0, "asked")
     first = it.step(10.0, reading(effort=2.0 * LEVEL_NM))
     assert (place(first), first.effort_nm[0]) == (0.0, pytest.approx(2.0 * LEVEL_NM))
 
 
 def test_an_unknown_load_that_shows_in_the_end_of_loading_is_borne_and_held_where_it_was() -> None:
-    it = floater()
+    it = compensator()
     it.step(10.0, reading(q=0.05))
     for t_s in np.arange(10.05, 10.8, 0.05):
         last = it.step(float(t_s), reading(q=0.05, effort=LEVEL_NM - 1.0))
     first = it.step(10.8, reading(q=0.06, effort=LEVEL_NM - 1.0))
     assert it.is_fault
-    assert "it carries something" in it.why
+    assert "Remove any payload or contact" in it.why
     assert place(first) == place(last) == pytest.approx(0.05)
     assert first.effort_nm[0] == pytest.approx(last.effort_nm[0], abs=0.05)
 
@@ -282,19 +285,23 @@ def test_taken_hold_of_while_it_is_being_set_free_the_pull_goes_on_as_it_is() ->
     assert place(it.step(11.41, reading(q=0.08))) == pytest.approx(0.03)
 
 
-@pytest.mark.parametrize("is_freeing", [False, True])
-def test_a_joint_that_sinks_before_it_is_free_is_held(is_freeing: bool) -> None:
-    it = loaded() if is_freeing else floater()
-    if is_freeing:
+@pytest.mark.parametrize("is_releasing", [False, True])
+def test_a_joint_that_sinks_before_it_is_free_is_held(is_releasing: bool) -> None:
+    it = loaded() if is_releasing else compensator()
+    if is_releasing:
         it.release(11.0)
-    most = MAX_GIVEN_RAD if is_freeing else MAX_SUNK_RAD
+    most = MAX_RELEASE_MOTION_RAD if is_releasing else MAX_LOADING_MOTION_RAD
     it.step(11.0, reading())
     it.step(11.2, reading(q=0.9 * most))
     assert not it.is_fault
     it.step(11.3, reading(q=1.1 * most))
     assert (it.phase, it.is_fault) == ("holding", True)
-    told = "5.5 degrees away before it was free, at most 5.0" if is_freeing else "16.5 degrees away before"
-    assert f"joint J was {told}" in it.why
+    reported = (
+        "5.5 degrees from its held position before the release, at most 5.0"
+        if is_releasing
+        else "16.5 degrees from"
+    )
+    assert f"joint J: {reported}" in it.why
 
 
 # --------------------------------------------------------------------------- led back
@@ -306,7 +313,7 @@ def returning() -> GravityCompensator:
     it.hold(20.0, "asked")
     for t_s in (20.0, 20.5):
         it.step(t_s, reading(q=0.8))
-    it.lead_back(30.0, np.zeros(1))
+    it.return_to(30.0, np.zeros(1))
     return it
 
 
@@ -331,7 +338,7 @@ def test_a_float_with_a_low_speed_limit_is_led_back_below_it() -> None:
     it.hold(10.0, "asked")
     for t_s in (10.1, 10.5):
         it.step(t_s, reading(q=0.5))
-    it.lead_back(11.0, np.zeros(1))
+    it.return_to(11.0, np.zeros(1))
     # Half way it is the fastest: 15/8 of 0.5 rad in 4.7 s.
     half_s = 11.0 + 0.5 * 1.875 * 0.5 / 0.2
     assert it.step(half_s, reading(q=0.25)).velocity_rad_s[0] == pytest.approx(-0.2)
@@ -356,7 +363,7 @@ def test_what_stops_it_on_its_way_back_is_not_pushed_against() -> None:
     assert it.phase == "returning"
     stopped = it.step(31.0, reading(q=0.76))
     assert (it.phase, it.is_fault) == ("holding", True)
-    assert "degrees behind on its way back, at most 4.6 are allowed" in it.why
+    assert "degrees behind on the way back, at most 4.6 are allowed" in it.why
     assert place(stopped) == pytest.approx(0.76)
 
 
@@ -364,13 +371,13 @@ def test_what_stops_it_on_its_way_back_is_not_pushed_against() -> None:
 
 
 def test_a_robot_too_heavy_where_it_stands_or_at_its_end_is_refused_before_it_is_taken() -> None:
-    with pytest.raises(
-        CompensationRefused, match=r"joint J would have to bear -8.83 Nm here, it can bear 7.00 Nm"
-    ):
+    with pytest.raises(CompensationRefused, match=r"joint J: this pose needs -8.83 Nm, the limit is 7.00 Nm"):
         GravityCompensator(pendulum(mass_kg=3.0), (limits(),), SETTINGS).check_start(reading())
-    with pytest.raises(CompensationRefused, match=r"joint J is at 0.95 rad, within 0.10 rad of the end"):
-        floater(limits(-1.0, 1.0)).check_start(reading(q=0.95))
-    floater(limits(-1.0, 1.0)).check_start(reading(q=0.85, effort=LEVEL_NM * np.cos(0.85)))
+    with pytest.raises(
+        CompensationRefused, match=r"joint J: position 0.95 rad is within 0.10 rad of the end"
+    ):
+        compensator(limits(-1.0, 1.0)).check_start(reading(q=0.95))
+    compensator(limits(-1.0, 1.0)).check_start(reading(q=0.85, effort=LEVEL_NM * np.cos(0.85)))
 
 
 @pytest.mark.parametrize(("share", "is_free"), [(0.9, True), (1.1, False)])
@@ -378,27 +385,27 @@ def test_a_robot_too_heavy_where_it_stands_or_at_its_end_is_refused_before_it_is
 def test_a_robot_that_bears_another_load_than_the_known_one_is_not_set_free(
     share: float, is_free: bool, q: float
 ) -> None:
-    weight = LEVEL_NM * np.cos(q)
-    most = UNKNOWN_OF_WEIGHT * abs(weight) + UNKNOWN_OF_LARGEST * X5_4.max_effort_nm
+    model = LEVEL_NM * np.cos(q)
+    most = MAX_OFFSET_OF_WEIGHT * abs(model) + MAX_OFFSET_OF_EFFORT * X5_4.max_effort_nm
     # 0.33 Nm level, 0.14 Nm hanging: a third of a kilogram at the end of the one of 0.8 kg is 1 Nm.
     assert most < 0.35
-    strange = reading(q=q, effort=weight - share * most)
-    it = floater()
+    unknown = reading(q=q, effort=model - share * most)
+    it = compensator()
     for t_s in (10.0, 10.8, 10.9):
-        it.step(t_s, strange)
+        it.step(t_s, unknown)
     assert it.is_fault != is_free
     assert it.phase == ("loaded" if is_free else "held")
-    assert is_free or "it carries something, leans on something" in it.why
+    assert is_free or "Remove any payload or contact" in it.why
     if is_free:
-        floater().check_start(strange)
+        compensator().check_start(unknown)
     else:
-        with pytest.raises(CompensationRefused, match="beside what the robot that is known weighs there"):
-            floater().check_start(strange)
+        with pytest.raises(CompensationRefused, match=r"measured .* Nm, model predicts .* Nm"):
+            compensator().check_start(unknown)
 
 
 def test_feedback_that_is_too_old_ends_it_in_any_phase_and_names_the_module() -> None:
-    for it in (floater(), loaded(), free()):
-        with pytest.raises(StaleFeedback, match="module J was last heard 130 ms ago, at most 120 ms"):
+    for it in (compensator(), loaded(), free()):
+        with pytest.raises(StaleFeedback, match="module J: newest feedback is 130 ms old, at most 120 ms"):
             it.step(20.0, reading(age_s=0.13))
         it.step(20.0, reading(age_s=0.11))
 
@@ -421,7 +428,7 @@ def test_under_the_gains_of_floating_nothing_but_the_damper_answers_a_velocity()
 def test_a_damping_that_no_module_can_give_makes_no_gains(damping: float) -> None:
     with pytest.raises(UsageError, match=r"module type X5-4 takes 0 to 1\.2 Nm s/rad"):
         compensation_gains(X5_4, damping)
-    assert compensation_gains(X5_4, most_damping_nm_s_rad(X5_4)).velocity.kp == pytest.approx(1.2)
+    assert compensation_gains(X5_4, max_damping_nm_s_rad(X5_4)).velocity.kp == pytest.approx(1.2)
 
 
 # --------------------------------------------------------------------------- what is newest

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coordinator.torque_control.gravity_model import GravityModel
-from coordinator.torque_control.preconditions import Felt, RobotMismatch, check_mounting, find_baseline_robot
+from coordinator.torque_control.preconditions import RestReading, RobotMismatch, check_gravity, find_robot
 from module_agent.model.chain import Chain
 from module_agent.model.forward_kinematics import imu_poses
 from sim.benchmark.cases.gravity_compensation import true_weight
@@ -18,13 +18,13 @@ from sim.robot.robot_tree import true_chain
 ARM = "thesis_171_horizontal"
 
 
-def felt(chain: Chain, q: np.ndarray, tilt_rad: float = 0.0, lost_zero_rad: float = 0.0) -> Felt:
+def rest(chain: Chain, q: np.ndarray, tilt_rad: float = 0.0, lost_zero_rad: float = 0.0) -> RestReading:
     """What IMUs feel at rest if the base is tilted about x, or the last joint counts from another zero."""
     turned = Rotation.from_rotvec([tilt_rad, 0.0, 0.0]).as_matrix() @ chain.gravity
     poses = imu_poses(chain, q[None])[0]
-    told = q.copy()
-    told[-1] += lost_zero_rad
-    return Felt(told, np.swapaxes(poses[:, :3, :3], 1, 2) @ turned)
+    reported = q.copy()
+    reported[-1] += lost_zero_rad
+    return RestReading(reported, np.swapaxes(poses[:, :3, :3], 1, 2) @ turned)
 
 
 def test_a_robot_that_stands_as_it_stood_is_known_by_where_its_imus_feel_gravity() -> None:
@@ -32,27 +32,27 @@ def test_a_robot_that_stands_as_it_stood_is_known_by_where_its_imus_feel_gravity
     rng = np.random.default_rng(1)
     for _ in range(20):
         q = rng.uniform(-3.0, 3.0, 6)
-        check_mounting(chain, felt(chain, q))
+        check_gravity(chain, rest(chain, q))
         # Errors of IMUs as delivered: 3 % of scale, 0.3 m/s^2 of offset.
-        at = felt(chain, q)
-        check_mounting(chain, at._replace(accel_m_s2=1.03 * at.accel_m_s2 + rng.normal(0.0, 0.3, (6, 3))))
+        at = rest(chain, q)
+        check_gravity(chain, at._replace(accel_m_s2=1.03 * at.accel_m_s2 + rng.normal(0.0, 0.3, (6, 3))))
 
 
 @pytest.mark.parametrize("change", [{"tilt_rad": 0.35}, {"tilt_rad": -np.pi}])
 def test_a_base_that_stands_otherwise_is_noticed_and_the_module_is_named(change: dict[str, float]) -> None:
     chain = true_chain(load_robot("arm6"))
-    with pytest.raises(RobotMismatch, match=r"the IMU of module A-\d feels gravity \d+ degrees from"):
-        check_mounting(chain, felt(chain, np.full(6, 0.2), **change))
+    with pytest.raises(RobotMismatch, match=r"the IMU of module A-\d measures gravity \d+ deg from"):
+        check_gravity(chain, rest(chain, np.full(6, 0.2), **change))
 
 
 def test_a_joint_that_has_lost_its_zero_is_noticed_where_its_imu_turns_with_it() -> None:
     chain = true_chain(load_robot("arm6"))
     q = np.array([0.0, 0.3, -0.4, 0.2, 0.0, 0.0])
-    at = felt(chain, q)
+    at = rest(chain, q)
     wrong = at.q_rad.copy()
     wrong[1] += 0.5
-    with pytest.raises(RobotMismatch, match="feels gravity 29 degrees"):
-        check_mounting(chain, at._replace(q_rad=wrong))
+    with pytest.raises(RobotMismatch, match="measures gravity 29 deg"):
+        check_gravity(chain, at._replace(q_rad=wrong))
 
 
 # --------------------------------------------------------------------------- on a network
@@ -65,7 +65,7 @@ def known(**changes: object) -> GravityModel:
 def test_the_known_robot_is_found_and_met(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     radio, recording, link = rig.link()
-    rig.run(find_baseline_robot(link, radio, known(), lambda: rig.loop.now_ns))
+    rig.run(find_robot(link, radio, known(), lambda: rig.loop.now_ns))
     assert link.serials == ("X-00009", "X-00010")
     assert all(recording.modules[serial].arrivals for serial in link.serials)
 
@@ -78,10 +78,10 @@ def test_a_module_that_is_missing_of_another_type_or_no_part_of_it_is_named(
     whole = known()
     rename = whole.chain._replace(serials=("X-00009", "gone"))
     less = whole.chain._replace(serials=("X-00009",))
-    for weight, words in (
-        (known(chain=rename), "module gone is not there, 1 of 2 are missing; there are X-00009, X-00010"),
-        (known(chain=less), "module X-00010 is no part of the robot that is known, X-00009"),
-        (known(types=("X5-9", "X5-1")), "module X-00009 is an X5-"),
+    for model, words in (
+        (known(chain=rename), r"module gone is missing \(1 of 2 are\); present: X-00009, X-00010"),
+        (known(chain=less), "module X-00010 is not in the model, which has X-00009"),
+        (known(types=("X5-9", "X5-1")), "module X-00009 is of type X5-"),
     ):
         with pytest.raises(RobotMismatch, match=words):
-            rig.run(find_baseline_robot(link, radio, weight, lambda: rig.loop.now_ns))
+            rig.run(find_robot(link, radio, model, lambda: rig.loop.now_ns))
