@@ -48,7 +48,7 @@ class Readings(NamedTuple):
 
 
 def readings(one: Window, refined: Refinement, cutoff_hz: float) -> Readings:
-    """Filter a window as `differentiation.filtered_motion` does, and correct its IMUs by what they err."""
+    """Filter a window as `filtering.filtered_motion` does, and correct its IMUs by what they err."""
     others = [one.gyro_rad_s, one.accel_m_s2]
     q, qd, qdd, (gyro, accel), kept = filtered_signals(one.q_rad, others, RATE_HZ, cutoff_hz)
     imus = refined.intrinsics
