@@ -30,7 +30,7 @@ from module_agent.wire.messages import Estimate, MotionRecord
 
 KEEP_EVERY = 5
 # An axis that joints between have turned by less is still where it was seen: what is left of it is some
-# tenths (`motion_evidence.GIVE_LEFT`).
+# tenths (`motion_evidence.RESIDUAL_GIVE`).
 TURNED_RAD = 0.3
 # Of a module's own finding nobody knows how far it may be wrong: held joints give by 20 to 30 %.
 OWN_SIGMA = 0.2

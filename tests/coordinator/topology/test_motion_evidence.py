@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from coordinator.topology.motion_evidence import (
-    GIVE_LEFT,
     MIN_RATE_RAD_S,
     MIN_SAMPLES,
     RATIO_FLOOR,
+    RESIDUAL_GIVE,
     NotMoved,
     carried_log_odds,
     motion_evidence,
@@ -99,7 +99,7 @@ def test_what_a_held_joint_gave_is_taken_off_where_it_is_known_whom_it_carries(t
     without = motion_evidence(0, rate, gyro, np.zeros((3, 3)))
     assert np.abs(without.rate_ratio - own).max() > 0.25
     assert (np.abs(seen.rate_ratio - own) <= np.sqrt(3.0) * seen.ratio_sigma).all()
-    np.testing.assert_allclose(seen.give, GIVE_LEFT * give)
+    np.testing.assert_allclose(seen.give, RESIDUAL_GIVE * give)
     if turned_rad == 0.0:
         np.testing.assert_allclose(seen.rate_ratio, own, atol=1e-12)
 
