@@ -1,8 +1,8 @@
 """Motion patterns as position and velocity over time, relative to where the motion begins.
 
 All functions are vectorised over the time samples. Sources: thesis eq. 13 (constant motion), eq. 14 (windowed
-sine), table 6 and figure 44 (dynamic pattern); sums
-of sines as excitation: Swevers et al., Optimal robot excitation and identification, 1997.
+sine), table 6 and figure 44 (dynamic pattern); sums of sines as excitation: Swevers et al., Optimal robot
+excitation and identification, 1997.
 """
 
 from typing import NamedTuple

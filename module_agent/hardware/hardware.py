@@ -1,11 +1,11 @@
 """The contract between the firmware and the modules whose motors it commands and whose sensors it reads.
 
-The line runs where every kind of module has one: the firmware hands over targets (`Command`), and the module
-closes its loops inside. Real modules do so behind an Ethernet port, at a rate that a network could not keep;
-a simulated one does so in `loop_inside`. On this side of the line is what hangs on the lease, on how fresh
-commands are and on motions: who may command, the command lifetime of the firmware and its expiry action,
-states, motions. On the other side is what a module does by itself, whatever it is commanded: loops and gains,
-limits of position and temperature, the brake, and a watchdog that turns the motor off when no commands come.
+The firmware hands over targets (`Command`), and the module closes its loops inside. Real modules close them
+behind an Ethernet port, at a rate that no network round trip could keep; for simulated modules `loop_inside`
+does it. In the firmware is what depends on the lease, on the freshness of commands and on motions: the sender
+that may command, the command lifetime and its expiry action, states, motions. In the module is what depends
+on nothing else: loops and gains, limits of position and temperature, the brake, and a watchdog that turns the
+motor off when no commands come.
 """
 
 from collections.abc import Sequence

@@ -123,10 +123,7 @@ class LoopInside:
                 "read: receive a sample first, then send one command per module"
             )
         self._commands, self._answered = commands, sensors
-        self.pwm = [
-            drive.run(command, one)
-            for drive, command, one in zip(self._drives, commands, sensors, strict=True)
-        ]
+        self.pwm = list(map(_Drive.run, self._drives, commands, sensors))
         return self.pwm
 
     def _go_on(self) -> None:

@@ -23,7 +23,7 @@ from module_agent.worker import ThreadWorker
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         (("--network", "pigeons"), "known are none, lan, lossy, wifi, bad, asymmetric"),
         (("--robot", "a/b"), "robot 'a/b' cannot be part of a key"),
@@ -37,10 +37,10 @@ from module_agent.worker import ThreadWorker
         (("--listen", "tcp/127.0.0.1:99999"), "with a port of 1 to 65535"),
     ],
 )
-def test_wrong_usage_is_answered_at_once_with_what_is_right(arguments: tuple[str, ...], words: str) -> None:
+def test_wrong_usage_is_answered_at_once_with_what_is_right(arguments: tuple[str, ...], message: str) -> None:
     done = CliRunner().invoke(app, ["--serial", "A-1", "--bus", "no-bus", *arguments])
     assert done.exit_code == 2, done.output
-    assert words in done.output
+    assert message in done.output
 
 
 def test_a_port_that_somebody_else_has_is_named_and_not_waited_for() -> None:
@@ -56,11 +56,11 @@ def test_a_port_that_somebody_else_has_is_named_and_not_waited_for() -> None:
 def test_an_agent_waits_for_its_hub_until_it_is_told_to_stop(tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        nobody = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        unused = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     command = [sys.executable, "-m", "module_agent.main", "--serial", "A-1", "--bus", str(tmp_path / "bus")]
-    with subprocess.Popen([*command, "--connect", nobody], stderr=subprocess.PIPE, text=True) as agent:
+    with subprocess.Popen([*command, "--connect", unused], stderr=subprocess.PIPE, text=True) as agent:
         assert agent.stderr is not None
-        assert f"waiting for the network: no hub answers on {nobody}" in agent.stderr.readline()
+        assert f"waiting for the network: no hub answers on {unused}" in agent.stderr.readline()
         agent.send_signal(signal.SIGTERM)
         assert agent.wait(30.0) == 0
         assert agent.stderr.read() == ""

@@ -59,19 +59,19 @@ def test_a_module_finds_the_circle_of_another_joint_through_a_network_that_loses
     rigs: Callable[..., Any], network: str, seed: int
 ) -> None:
     rig = rigs(ARM, network, seed, lifetime_ns=500_000_000)
-    heard: dict[str, list[Estimate]] = {BASE: [], TIP: []}
+    estimates_of: dict[str, list[Estimate]] = {BASE: [], TIP: []}
     listener = rig.network.endpoint("listener")
 
     def on_estimate(event: Any) -> None:
         found = decode(Estimate, event.payload)
-        heard[found.serial].append(found)
+        estimates_of[found.serial].append(found)
 
     listener.subscribe(key(rig.robot.name, TIP, Leaf.ESTIMATE), on_estimate)
     listener.subscribe(key(rig.robot.name, BASE, Leaf.ESTIMATE), on_estimate)
     rig.run(_explore(rig.link()[2], BASE))
     # Each module says once what it makes of each of the two motions.
-    assert [len(found) for found in heard.values()] == [2, 2]
-    constant, sine = heard[TIP]
+    assert [len(found) for found in estimates_of.values()] == [2, 2]
+    constant, sine = estimates_of[TIP]
     assert (constant.moved, sine.moved) == (True, True)
     assert len(sine.motion_ids) == 2
     assert sine.circle is not None
@@ -82,8 +82,8 @@ def test_a_module_finds_the_circle_of_another_joint_through_a_network_that_loses
     assert 0.95 * 0.171 < sine.circle.distance_m < 1.15 * 0.171
     assert np.degrees(np.arccos(min(1.0, sine.circle.axis @ (turn.T @ chain.axis[0])))) < 0.5
     # The housing of the module that moves stands on the base: it was not carried, and says so too.
-    assert [found.moved for found in heard[BASE]] == [False, False]
-    assert heard[BASE][1].circle is None
+    assert [found.moved for found in estimates_of[BASE]] == [False, False]
+    assert estimates_of[BASE][1].circle is None
 
 
 def test_a_motion_of_a_single_tick_does_not_end_the_agents(rigs: Callable[..., Any]) -> None:

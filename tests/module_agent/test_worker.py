@@ -15,7 +15,7 @@ def _finding(joint: str) -> Finding:
 
 
 def test_jobs_run_beside_the_caller_in_the_order_of_submission() -> None:
-    worker, go, found = ThreadWorker(), threading.Event(), list[tuple[str, str]]()
+    worker, go, findings = ThreadWorker(), threading.Event(), list[tuple[str, str]]()
 
     def job(joint: str) -> Finding:
         assert go.wait(5.0)
@@ -24,17 +24,17 @@ def test_jobs_run_beside_the_caller_in_the_order_of_submission() -> None:
     for joint in ("A", "B", "C"):
         worker.submit(
             lambda joint=joint: job(joint),
-            lambda f: found.append((f.joint, threading.current_thread().name)),
+            lambda f: findings.append((f.joint, threading.current_thread().name)),
         )
     # The caller has not been held up by jobs that cannot have begun.
-    assert found == []
+    assert findings == []
     go.set()
     last = threading.Event()
     worker.submit(lambda: _finding("end"), lambda _: last.set())
     assert last.wait(5.0)
     worker.close()
-    assert [joint for joint, _ in found] == ["A", "B", "C"]
-    assert all(name.startswith("estimate") for _, name in found)
+    assert [joint for joint, _ in findings] == ["A", "B", "C"]
+    assert all(name.startswith("estimate") for _, name in findings)
     worker.check()
 
 
@@ -67,32 +67,32 @@ def test_a_receiver_that_crashes_is_raised_where_it_is_checked() -> None:
 
 
 def test_closing_ends_the_running_job_and_drops_the_waiting_ones() -> None:
-    worker, started, found = ThreadWorker(), threading.Event(), list[str]()
+    worker, started, findings = ThreadWorker(), threading.Event(), list[str]()
 
     def slow() -> Finding:
         started.set()
         time.sleep(0.05)
         return _finding("running")
 
-    worker.submit(slow, lambda f: found.append(f.joint))
-    worker.submit(lambda: _finding("waiting"), lambda f: found.append(f.joint))
+    worker.submit(slow, lambda f: findings.append(f.joint))
+    worker.submit(lambda: _finding("waiting"), lambda f: findings.append(f.joint))
     assert started.wait(5.0)
     worker.close()
-    assert found == ["running"]
+    assert findings == ["running"]
     # What was dropped has not failed.
     worker.check()
 
 
 def test_inline_work_is_done_at_once_and_its_crash_comes_at_once() -> None:
-    worker, found = InlineWorker(), list[Finding]()
-    worker.submit(lambda: _finding("A"), found.append)
-    assert [f.joint for f in found] == ["A"]
+    worker, findings = InlineWorker(), list[Finding]()
+    worker.submit(lambda: _finding("A"), findings.append)
+    assert [f.joint for f in findings] == ["A"]
 
     def crash() -> Finding:
         raise ZeroDivisionError("a defect")
 
     with pytest.raises(ZeroDivisionError):
-        worker.submit(crash, found.append)
+        worker.submit(crash, findings.append)
 
 
 def test_closing_with_jobs_waiting_logs_no_error(caplog: pytest.LogCaptureFixture) -> None:

@@ -49,9 +49,9 @@ class Bench:
     """One module on a bench: its position is what the test sets, its clock what the test lets pass."""
 
     def __init__(self, kind: str = "X5-9", **settings: Any) -> None:
-        found = CATALOGUE[kind]  # type: ignore[index]
-        limits = settings.pop("limits", catalogue_limits(found))
-        self._wired = WiredFirmware(FirmwareConfig("A", found, BOOT, limits, **settings))
+        module = CATALOGUE[kind]  # type: ignore[index]
+        limits = settings.pop("limits", catalogue_limits(module))
+        self._wired = WiredFirmware(FirmwareConfig("A", module, BOOT, limits, **settings))
         self.firmware = self._wired.firmware
         self.m_stop = False
         self.now = 5_000 * MS
@@ -121,7 +121,7 @@ def refused(ack: Ack, reason: Refusal) -> bool:
     return not ack.accepted and ack.reason == reason.value
 
 
-def test_a_module_that_nobody_holds_has_its_motor_off() -> None:
+def test_without_a_lease_the_motor_is_off() -> None:
     bench = Bench()
     bench.ticks(500)
     assert bench.pwm == 0.0
@@ -275,7 +275,7 @@ def test_a_command_for_another_boot_or_module_is_refused() -> None:
     assert refused(bench.acquire(serial="B"), Refusal.WRONG_SERIAL)
 
 
-def test_stop_needs_no_lease_and_holds_until_somebody_acquires() -> None:
+def test_stop_needs_no_lease_and_holds_until_the_lease_is_acquired() -> None:
     bench = Bench()
     bench.acquire()
     bench.move()
@@ -459,19 +459,19 @@ def test_an_acquire_that_was_sent_before_a_stop_does_not_undo_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("pattern", "said"),
+    ("pattern", "detail"),
     [
         (GoTo(target_rad=1e6, max_speed_rad_s=1e-6), "would take"),
         (GoTo(target_rad=6.0, max_speed_rad_s=0.01), "would take"),
         (ConstantMotion(velocity_rad_s=1e5, duration_s=1.0), "times"),
     ],
 )
-def test_an_absurd_motion_is_refused_before_it_is_sampled(pattern: Any, said: str) -> None:
+def test_an_absurd_motion_is_refused_before_it_is_sampled(pattern: Any, detail: str) -> None:
     bench = Bench()
     bench.acquire()
     answer = bench.move(pattern=pattern)
     assert refused(answer, Refusal.LIMIT)
-    assert said in answer.detail
+    assert detail in answer.detail
 
 
 def test_a_joint_beyond_its_range_is_not_driven_further_out() -> None:
@@ -518,7 +518,7 @@ def test_an_m_stop_ends_the_motion_and_keeps_the_module_from_being_armed() -> No
     assert bench.acquire().accepted
 
 
-def test_gains_end_with_the_lease_of_who_set_them() -> None:
+def test_gains_end_with_the_lease_of_their_sender() -> None:
     bench = Bench()
     bench.acquire()
     factory = bench.gains

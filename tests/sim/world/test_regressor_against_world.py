@@ -29,7 +29,7 @@ def test_true_parameters_give_the_true_torque(name: str) -> None:
     filtered = filtered_motion(
         motion.t_ns, motion.q_rad, motion.qd_rad_s, motion.spring_torque_nm, 1000.0, 30.0
     )
-    found = check_held_out(true_chain(robot), true_inertia(robot), filtered, np.zeros(joints)).error
+    error = check_held_out(true_chain(robot), true_inertia(robot), filtered, np.zeros(joints)).error
     # What is left is the world's integration step of 1 ms (measured: 1e-4 to 4e-4).
-    assert found.overall < 2e-3
-    assert found.per_joint.max() < 2e-3
+    assert error.overall < 2e-3
+    assert error.per_joint.max() < 2e-3

@@ -26,26 +26,26 @@ def test_truth_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
     robot = load_robot("tree_y")
     world = World(robot, seed=3)
     write_truth(tmp_path / "truth.json", robot, world)
-    found = read_truth(tmp_path / "truth.json")
-    _assert_same(found, truth_of(robot, world))
-    assert found.imu_bias is not None
-    np.testing.assert_array_equal(found.imu_bias, world.imu_bias)
-    assert found.sensor_errors is not None
-    for read, drawn in zip(found.sensor_errors, world.sensor_errors, strict=True):
+    truth = read_truth(tmp_path / "truth.json")
+    _assert_same(truth, truth_of(robot, world))
+    assert truth.imu_bias is not None
+    np.testing.assert_array_equal(truth.imu_bias, world.imu_bias)
+    assert truth.sensor_errors is not None
+    for read, drawn in zip(truth.sensor_errors, world.sensor_errors, strict=True):
         np.testing.assert_array_equal(read, drawn)
         assert not read.flags.writeable
-    assert found.sensor_errors.misalignment.shape == (6, 2, 3, 3)
-    assert not found.inertia.flags.writeable
+    assert truth.sensor_errors.misalignment.shape == (6, 2, 3, 3)
+    assert not truth.inertia.flags.writeable
 
 
 def test_truth_of_a_robot_alone_has_no_clocks(tmp_path: Path) -> None:
     robot = load_robot("arm6")
     write_truth(tmp_path / "truth.json", robot)
-    found = read_truth(tmp_path / "truth.json")
-    _assert_same(found, truth_of(robot))
-    assert found.clocks is None
-    assert found.sensor_errors is None
-    assert found.chain.reversed == (False, False, True, False, False, False)
+    truth = read_truth(tmp_path / "truth.json")
+    _assert_same(truth, truth_of(robot))
+    assert truth.clocks is None
+    assert truth.sensor_errors is None
+    assert truth.chain.reversed == (False, False, True, False, False, False)
 
 
 def test_truth_written_before_sensors_had_more_errors_than_biases_is_read(tmp_path: Path) -> None:

@@ -120,7 +120,7 @@ def test_a_push_is_read_from_one_line_with_or_without_quotation_marks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("serial=A,force_n=[0,0,1]", "for_s: is missing"),
         ("serial=A,for_s=1", "nothing pushes: give force_n, torque_nm or both"),
@@ -129,8 +129,8 @@ def test_a_push_is_read_from_one_line_with_or_without_quotation_marks() -> None:
         ("hard", "is no push"),
     ],
 )
-def test_a_text_that_is_no_push_is_refused_with_the_key_and_an_example(text: str, words: str) -> None:
-    with pytest.raises(UsageError, match=re.escape(words)) as refused:
+def test_a_text_that_is_no_push_is_refused_with_the_key_and_an_example(text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(message)) as refused:
         parse_push(text)
     assert "one is serial=X-00011" in str(refused.value)
 

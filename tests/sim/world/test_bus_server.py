@@ -276,10 +276,10 @@ def test_the_end_of_the_world_is_hardware_lost(path) -> None:
 @pytest.mark.parametrize("pwm", [1.5, -1.0000001, float("nan"), float("inf")])
 def test_an_agent_with_a_pwm_out_of_range_is_dropped_and_nothing_of_it_applied(path, pwm) -> None:
     world = EchoWorld(["A"])
-    seen: list[float] = []
+    applied: list[float] = []
     events: list[str] = []
     step = world.step
-    world.step = lambda pwm: (seen.extend(pwm), step(pwm))[1]  # type: ignore[method-assign]
+    world.step = lambda pwm: (applied.extend(pwm), step(pwm))[1]  # type: ignore[method-assign]
     with running(BusServer(path, world, report=events.append)):
         client = BusClient(path, ["A"], LIMIT_S)
         client.exchange([0.25])
@@ -287,7 +287,7 @@ def test_an_agent_with_a_pwm_out_of_range_is_dropped_and_nothing_of_it_applied(p
         with pytest.raises(HardwareLost):
             exchange_often(client, pwm)
         client.close()
-    assert set(seen) == {0.0, 0.25}
+    assert set(applied) == {0.0, 0.25}
     assert any("a PWM is within [-1, 1]" in line for line in events)
 
 

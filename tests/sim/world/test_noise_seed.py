@@ -11,9 +11,9 @@ from sim.world.world import World
 def _trace(noise_seed: int | None, ticks: int = 80) -> np.ndarray:
     world = World(load_robot("a2085_03"), 7, "poor", noise_seed=noise_seed)
     waves = (0.2 * np.sin(2.0 * math.pi * k * 1e-3 + np.arange(3)) for k in range(ticks))
-    found = np.array([[tuple(sample) for sample in world.step(pwm.tolist())] for pwm in waves])
+    samples = np.array([[tuple(sample) for sample in world.step(pwm.tolist())] for pwm in waves])
     world.close()
-    return found
+    return samples
 
 
 def test_another_day_the_modules_have_the_same_errors_and_clocks() -> None:

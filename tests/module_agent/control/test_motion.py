@@ -59,11 +59,11 @@ class HeldModule:
         imu = self.now // (4 * MS) * 4 * MS
         sample = SensorSample(self.now, imu, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 25.0, 24.0, 0, 0, 0, 0, 0, 9.8)
         _, out = self._wired.tick(sample, incoming)
-        for said in out:
-            if isinstance(said, Publication) and said.leaf is Leaf.FEEDBACK:
-                feedback = decode(Feedback, said.payload, MAX_MESSAGE_BYTES)
+        for outgoing in out:
+            if isinstance(outgoing, Publication) and outgoing.leaf is Leaf.FEEDBACK:
+                feedback = decode(Feedback, outgoing.payload, MAX_MESSAGE_BYTES)
                 self.commands += unpack(feedback)["effort_command_nm"].tolist()
-        return [said.payload for said in out if isinstance(said, Answer)]
+        return [outgoing.payload for outgoing in out if isinstance(outgoing, Answer)]
 
     def played(self, ticks: int) -> list[float]:
         """Return the effort commands of the next ticks."""
@@ -102,7 +102,7 @@ def test_a_motion_without_efforts_leaves_the_effort_loop_off() -> None:
 
 
 @pytest.mark.parametrize(
-    ("samples", "reason", "words"),
+    ("samples", "reason", "detail"),
     [
         (b"123456789", Refusal.TYPES, "an effort profile of 9 bytes; a sample is 4 bytes long"),
         (
@@ -118,11 +118,11 @@ def test_a_motion_without_efforts_leaves_the_effort_loop_off() -> None:
     ],
 )
 def test_efforts_that_are_no_numbers_are_refused_and_nothing_moves(
-    samples: bytes, reason: Refusal, words: str
+    samples: bytes, reason: Refusal, detail: str
 ) -> None:
     module = HeldModule()
     ack = module.move(EffortProfile(period_ns=10 * MS, samples=samples))
-    assert (ack.accepted, ack.reason, ack.detail) == (False, reason.value, words)
+    assert (ack.accepted, ack.reason, ack.detail) == (False, reason.value, detail)
     assert module.firmware.state == "armed"
 
 

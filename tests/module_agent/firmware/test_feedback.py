@@ -35,9 +35,9 @@ def test_rows_between_two_times_are_those_that_a_comparison_of_all_finds(
     steps: list[int], start_ns: int, end_ns: int
 ) -> None:
     stamps = np.cumsum([0, *steps]).tolist()
-    kept = stamps[-CAPACITY:]
-    found = filled(stamps).between(start_ns, end_ns)
-    assert found["t_ns"].tolist() == [t for t in kept if start_ns <= t <= end_ns]
+    available = stamps[-CAPACITY:]
+    rows = filled(stamps).between(start_ns, end_ns)
+    assert rows["t_ns"].tolist() == [t for t in available if start_ns <= t <= end_ns]
 
 
 def test_rows_that_were_read_stay_as_they_were_when_the_ring_goes_on() -> None:

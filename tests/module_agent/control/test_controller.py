@@ -367,17 +367,17 @@ def control(
 ) -> tuple[Array, Array]:
     """Run a controller around the plant; return measurements (k, 3) and PWM (k,)."""
     p, x = plant(), np.zeros(4)
-    seen, driven = np.empty((len(targets), 3)), np.empty(len(targets))
+    measured, driven = np.empty((len(targets), 3)), np.empty(len(targets))
     for k, target in enumerate(targets.tolist()):
-        seen[k] = p.c @ x
-        driven[k] = pwm_of(target, seen[k].tolist())
+        measured[k] = p.c @ x
+        driven[k] = pwm_of(target, measured[k].tolist())
         x = p.a @ x + p.b[:, 0] * driven[k]
-    return seen, driven
+    return measured, driven
 
 
 def of_controller(gains: GainSet) -> Callable[[Sequence[float], Sequence[float]], float]:
     controller = Controller(KIND, gains, DT)
-    return lambda target, seen: controller.update(Command(*target), *seen)
+    return lambda target, measured: controller.update(Command(*target), *measured)
 
 
 class Wired:
@@ -393,24 +393,24 @@ class Wired:
         )
         self._gains = gains
 
-    def __call__(self, target: Sequence[float], seen: Sequence[float]) -> float:
+    def __call__(self, target: Sequence[float], measured: Sequence[float]) -> float:
         position, velocity, effort = target
         aims = {"position_rad": position, "velocity_rad_s": velocity, "effort_nm": effort}
         messages: list[tuple[Leaf, type[Message], dict[str, object]]] = [(Leaf.SETPOINT, Setpoint, aims)]
         if self._wired.firmware.state == "armed":
             # Gains first: they begin without a past, as the model does.
             messages.insert(0, (Leaf.GAINS, GainsCommand, {"gains": self._gains}))
-        return self._tick(seen, messages)
+        return self._tick(measured, messages)
 
     def _tick(
-        self, seen: Sequence[float], messages: list[tuple[Leaf, type[Message], dict[str, object]]]
+        self, measured: Sequence[float], messages: list[tuple[Leaf, type[Message], dict[str, object]]]
     ) -> float:
         echo_ns, self._now_ns = self._now_ns, self._now_ns + 1_000_000
         inbox = [
             Incoming(leaf, encode(kind(**self._head(echo_ns), **rest)), 1) for leaf, kind, rest in messages
         ]
         still = (0.0, 0.0, 0.0, 30.0, 24.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.8)
-        sample = SensorSample(self._now_ns, self._now_ns, *seen, *still)
+        sample = SensorSample(self._now_ns, self._now_ns, *measured, *still)
         out, sent = self._wired.tick(sample, inbox)
         answers = [decode(Ack, o.payload) for o in sent if isinstance(o, Answer)]
         assert all(a.accepted for a in answers), answers
@@ -446,13 +446,13 @@ def test_the_closed_loop_s_step_responses_are_the_linear_model_s(
     for k, target in enumerate(targets):
         expected[k] = c @ x
         x = a @ x + b @ target
-    seen, driven = control(driver(gains), targets)
+    measured, driven = control(driver(gains), targets)
     # Within what 24 V give, or the firmware would limit what the linear model does not.
     assert np.abs(driven).max() < 0.49
-    assert np.ptp(seen[:, 0]) > 0.01
+    assert np.ptp(measured[:, 0]) > 0.01
     # A stable loop does not let roundings grow; the model's integrals of target and measurement, told apart,
     # reach 0.1 and cost a few digits.
-    np.testing.assert_allclose(seen, expected, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(measured, expected, rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
@@ -475,7 +475,7 @@ def test_the_closed_loop_s_gain_and_phase_are_the_model_s(strategy: int, which: 
     targets = np.zeros((SETTLING_TICKS, 3))
     t = np.arange(SETTLING_TICKS) * DT
     targets[:, which] = 0.01 * np.sin(2.0 * np.pi * np.outer(hz, t)).sum(axis=0)
-    seen, driven = control(of_controller(gains), targets)
+    measured, driven = control(of_controller(gains), targets)
     assert np.abs(driven).max() < 1.0
-    response = np.fft.rfft(seen[-1000:], axis=0)[hz].T / np.fft.rfft(targets[-1000:, which])[hz]
+    response = np.fft.rfft(measured[-1000:], axis=0)[hz].T / np.fft.rfft(targets[-1000:, which])[hz]
     np.testing.assert_allclose(response, expected, rtol=1e-6, atol=1e-7)
