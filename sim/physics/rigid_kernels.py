@@ -3,6 +3,9 @@
 All vectors are in world axes, and wrenches and inertia are about the world's origin, so that those of several
 bodies simply add up (Featherstone, Rigid Body Dynamics Algorithms, 2008, sections 5.3 and 6.2). Joints turn
 about, or slide along, z of their frame.
+
+Arrays are assigned element by element: assigning one to a slice takes five seconds more to compile, for the
+message of the error that it might raise.
 """
 
 from typing import Any
@@ -168,7 +171,9 @@ def mass_and_biases(
     biases, still = np.empty(rates.shape), np.zeros(len(q))
     for k in range(len(rates)):
         motion = _move(parent, prismatic, sign, where, arm, rates[k], still, up_m_s2)
-        biases[k] = _loads(parent, spin, travel, mass, place, lever, central, motion)
+        loads = _loads(parent, spin, travel, mass, place, lever, central, motion)
+        for i in range(len(q)):
+            biases[k, i] = loads[i]
     return matrix, biases
 
 
@@ -217,7 +222,8 @@ def _twists(
             place[i, k] = arm[i, k] + (place[parent[i], k] if parent[i] >= 0 else 0.0)
             travel[i, k] = sign[i] * where[i, k, 2]
         if not prismatic[i]:
-            spin[i] = travel[i]
+            for k in range(3):
+                spin[i, k] = travel[i, k]
             _cross(place[i], spin[i], travel[i])
     return spin, travel, place
 
