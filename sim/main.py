@@ -9,6 +9,9 @@ COMMANDS = {
         f"{_FOLDER}.run", "launch", "Run world, agents and coordinator with the live viewer."
     ),
     "world": LazyCommand(f"{_FOLDER}.world", "world", "Run the world of one robot for agents to attach to."),
+    "compile": LazyCommand(
+        f"{_FOLDER}.compile", "compile_kernels", "Compile all kernels, so that the first run does not."
+    ),
     "robots": LazyCommand(f"{_FOLDER}.robots", "robots", "List the robots that are shipped."),
     "show": LazyCommand(f"{_FOLDER}.robots", "show", "Draw a robot at its zero position."),
     "effects": LazyCommand(

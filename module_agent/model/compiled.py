@@ -1,7 +1,7 @@
 """Kernels: functions on plain arrays, compiled to machine code.
 
-The code is kept on disk and reused until the kernel's own file changes. That check knows nothing of other
-files, so kernels call each other within one file only.
+The code is kept on disk and reused until the kernel's own file changes. That check does not cover other files,
+so kernels call each other within one file only. `x5-sim compile` compiles all of them in advance.
 """
 
 from collections.abc import Callable
@@ -20,6 +20,6 @@ def compiled(function: Function) -> Function:
     try:
         kernel = numba.njit(cache=True, nogil=True)(function)
     except RuntimeError:
-        # No folder to keep the code in (a read-only installation without a home): compiled in each process.
+        # No folder for the code (a read-only installation without a home): compiled in each process.
         kernel = numba.njit(nogil=True)(function)
     return cast(Function, kernel)

@@ -1,0 +1,48 @@
+"""What `x5-sim compile` compiles is what runs need."""
+
+import gc
+from pathlib import Path
+from typing import Any
+
+from numba.core.dispatcher import Dispatcher
+
+import sim
+from sim.commands.compile import GROUPS, call_kernels
+from sim.robot.robot_file import load_robot
+from sim.world.external_force import Push
+from sim.world.world import World
+
+
+def signatures() -> dict[str, list[Any]]:
+    """Return the compiled signatures of every kernel of the package."""
+    kernels = [o for o in gc.get_objects() if isinstance(o, Dispatcher)]
+    return {
+        f"{k.py_func.__module__}.{k.py_func.__name__}": list(k.signatures)
+        for k in kernels
+        if k.py_func.__module__.partition(".")[0] in ("module_agent", "coordinator", "sim")
+    }
+
+
+def test_every_module_with_kernels_is_compiled() -> None:
+    root = Path(sim.__file__ or "").parents[1]
+    with_kernels = {
+        ".".join(path.relative_to(root).with_suffix("").parts)
+        for package in ("module_agent", "coordinator", "sim")
+        for path in (root / package).rglob("*.py")
+        if "\n@compiled\n" in path.read_text()
+    }
+    assert {module for group in GROUPS.values() for module in group} == with_kernels
+
+
+def test_a_run_needs_no_other_signatures() -> None:
+    call_kernels()
+    before = signatures()
+    compiled = {name.rpartition(".")[0] for name, types in before.items() if types}
+    assert compiled == {module for group in GROUPS.values() for module in group}
+    robot = load_robot("arm6")
+    push = Push(serial=robot.modules[-1].serial, force_n=(0.0, 0.0, -1.0), for_s=1.0)
+    world = World(robot, seed=2, pushes=(push,))
+    for _ in range(20):
+        world.step([0.1] * len(robot.modules))
+    world.close()
+    assert signatures() == before
