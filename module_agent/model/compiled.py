@@ -1,7 +1,7 @@
 """Kernels: functions on plain arrays, compiled to machine code.
 
-The code is kept on disk and reused until the kernel's own file changes. That check does not cover other files,
-so kernels call each other within one file only. `x5-sim compile` compiles all of them in advance.
+The code is kept on disk and reused until the kernel's own file changes. That check does not cover other
+files, so kernels call each other within one file only. `x5-sim compile` compiles all of them in advance.
 """
 
 from collections.abc import Callable
