@@ -78,7 +78,7 @@ def fit_part(problem: Problem, some: slice) -> WeightedFit:
         scale=problem.columns.scale,
         used=problem.moving[some],
         robust=problem.choice.robust,
-        least_correlation=problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
+        min_correlation=problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
         instruments=None if problem.instruments is None else problem.instruments[some],
     )
 
@@ -188,11 +188,11 @@ def _predictions(problem: Problem, predictor: Predictor) -> Iterator[tuple[Tried
 
 def _shortened(problem: Problem, part: float) -> Predictor:
     def predict(seen: slice, tried: slice) -> Array:
-        kept = max(1, round(part * (seen.stop - seen.start)))
+        count = max(1, round(part * (seen.stop - seen.start)))
         near = (
-            slice(seen.stop - kept, seen.stop)
+            slice(seen.stop - count, seen.stop)
             if seen.stop <= tried.start
-            else slice(seen.start, seen.start + kept)
+            else slice(seen.start, seen.start + count)
         )
         return fitted(problem)(near, tried)
 

@@ -193,23 +193,23 @@ def _read_npz(path: Path, joints: Sequence[str]) -> _Table:
 def _array(arrays: dict[str, NDArray[np.generic]], key: str, joints: Sequence[str], rows: int = -1) -> Array:
     if key not in arrays:
         _refuse(f"no array {key}; its arrays are {', '.join(arrays) or 'none'}")
-    found = arrays[key]
-    if found.ndim != 2 or found.shape[1] != len(joints) or (rows >= 0 and found.shape[0] != rows):
+    array = arrays[key]
+    if array.ndim != 2 or array.shape[1] != len(joints) or (rows >= 0 and array.shape[0] != rows):
         _refuse(
-            f"{key} has shape {found.shape}; ({rows if rows >= 0 else 'samples'}, {len(joints)}) is needed: "
+            f"{key} has shape {array.shape}; ({rows if rows >= 0 else 'samples'}, {len(joints)}) is needed: "
             f"the joints are {', '.join(joints)}"
         )
-    values = _floats(found, key)
+    values = _floats(array, key)
     if not np.isfinite(values).all():
         row, column = np.argwhere(~np.isfinite(values))[0]
         _refuse(f"{key}, row {row}, column {column}: {values[row, column]}; a finite number is needed")
     return values
 
 
-def _floats(found: NDArray[np.generic], key: str) -> Array:
-    if found.dtype.kind not in "fiu":
-        _refuse(f"{key} holds {found.dtype}; real numbers are needed")
-    return found.astype(float)
+def _floats(array: NDArray[np.generic], key: str) -> Array:
+    if array.dtype.kind not in "fiu":
+        _refuse(f"{key} holds {array.dtype}; real numbers are needed")
+    return array.astype(float)
 
 
 def _npz_times(arrays: dict[str, NDArray[np.generic]], rows: int) -> Array:
@@ -257,9 +257,11 @@ def _log(table: _Table) -> JointLog:
     rate_hz = (times.size - 1) / float(times[-1] - times[0])
     even = np.arange(times.size) / rate_hz
     uneven = bool(np.abs(times - times[0] - even).max() > _JITTER / rate_hz)
-    found = {key: _even(times, values, even) if uneven else values for key, values in table.signals.items()}
-    make_read_only(found.values())
-    return JointLog(rate_hz, found["q"], found.get("qd"), found["tau"], uneven)
+    even_signals = {
+        key: _even(times, values, even) if uneven else values for key, values in table.signals.items()
+    }
+    make_read_only(even_signals.values())
+    return JointLog(rate_hz, even_signals["q"], even_signals.get("qd"), even_signals["tau"], uneven)
 
 
 def _even(times: Array, values: Array, even: Array) -> Array:

@@ -133,11 +133,11 @@ def named(problem: Problem, fit: WeightedFit) -> BaseParameters:
     Their covariance counts how alike the residuals are (`WeightedFit.covariance`).
     """
     homes = problem.robot.homes
-    found = base_parameters(into_frames(fit.rows, homes), fit.target, problem.columns)
-    in_root = into_frames(found.grouping, np.linalg.inv(homes))
+    base = base_parameters(into_frames(fit.rows, homes), fit.target, problem.columns)
+    in_root = into_frames(base.grouping, np.linalg.inv(homes))
     covariance = in_root @ fit.covariance @ in_root.T
     covariance.flags.writeable = False
-    return found._replace(covariance=covariance)
+    return base._replace(covariance=covariance)
 
 
 def _consistent(problem: Problem, fit: WeightedFit, trust: float) -> tuple[ConsistentBodies | None, str]:
@@ -161,21 +161,21 @@ def _predictors(problem: Problem, trust: float | None) -> list[tuple[Model, tupl
 
 
 def _held_out(problem: Problem, elsewhere: Elsewhere | None, trust: float | None) -> list[ErrorPart]:
-    found = [(name, held_out_errors(*tried)) for name, tried in _predictors(problem, trust)]
+    tests = [(name, held_out_errors(*tried)) for name, tried in _predictors(problem, trust)]
     if elsewhere is not None:
         both, seen = joined(problem, elsewhere.problem), len(problem.log.tau_nm)
-        found += [(name, errors_elsewhere(*tried, seen)) for name, tried in _predictors(both, trust)]
-    return [_error_part(name, error) for name, errors in found for error in errors]
+        tests += [(name, errors_elsewhere(*tried, seen)) for name, tried in _predictors(both, trust)]
+    return [_error_part(name, error) for name, errors in tests for error in errors]
 
 
-def _error_part(model: Model, found: HeldOutError) -> ErrorPart:
+def _error_part(model: Model, tested: HeldOutError) -> ErrorPart:
     return ErrorPart(
         model=model,
-        tried_on=found.tried_on,
-        torque="raw" if found.raw else "filtered",
-        samples="masked" if found.masked else "all",
-        overall=finite(found.error.overall),
-        per_joint=[finite(float(e)) for e in found.error.per_joint],
+        tried_on=tested.tried_on,
+        torque="raw" if tested.raw else "filtered",
+        samples="masked" if tested.masked else "all",
+        overall=finite(tested.error.overall),
+        per_joint=[finite(float(e)) for e in tested.error.per_joint],
     )
 
 

@@ -113,11 +113,11 @@ def fit_dynamics(
     )
     if result.consistent is None:
         return ArmFit(robot=robot, report=result.report, bodies=None, phi=None, friction=None, urdf=None)
-    found = result.consistent
-    friction = friction_of(posed.drives, found.drives.tolist(), len(robot.bodies))
-    text = fitted_urdf_text(robot, found.bodies, friction)
+    fitted = result.consistent
+    friction = friction_of(posed.drives, fitted.drives.tolist(), len(robot.bodies))
+    text = fitted_urdf_text(robot, fitted.bodies, friction)
     return ArmFit(
-        robot=robot, report=result.report, bodies=found.bodies, phi=found.phi, friction=friction, urdf=text
+        robot=robot, report=result.report, bodies=fitted.bodies, phi=fitted.phi, friction=friction, urdf=text
     )
 
 

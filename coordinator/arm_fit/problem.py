@@ -59,17 +59,17 @@ class Problem(NamedTuple):
         """How many of the columns are the bodies'."""
         return PER_BODY * len(self.robot.bodies)
 
-    def with_drives(self, kept: Callable[[DriveColumn], bool], bodies: bool = True) -> "Problem":
+    def with_drives(self, keep: Callable[[DriveColumn], bool], bodies: bool = True) -> "Problem":
         """Return the problem with some of the drives' columns, and with or without the bodies'."""
         some = np.array(
-            [bodies] * self.inertial + [kept(drive) for drive in self.drives],
+            [bodies] * self.inertial + [keep(drive) for drive in self.drives],
             dtype=bool,
         )
         at = np.flatnonzero(some)
         order = {int(column): i for i, column in enumerate(at)}
         preferred = [order[int(c)] for c in self.columns.preferred if some[c]]
         return self._replace(
-            drives=tuple(drive for drive in self.drives if kept(drive)),
+            drives=tuple(drive for drive in self.drives if keep(drive)),
             columns=Columns(
                 tuple(self.columns.names[i] for i in at),
                 self.columns.scale[at],
@@ -152,15 +152,15 @@ def joined(one: Problem, other: Problem) -> Problem:
 def _regressor(robot: UrdfRobot, drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
     inertial = torque_regressor(robot.chain, log.q_rad, log.qd_rad_s, log.qdd_rad_s2)
     further = drive_regressor(drives, _signals(drives, log, slow_rad_s), len(robot.bodies))
-    found = np.concatenate([inertial, further], axis=2)
-    return read_only(found)
+    regressor = np.concatenate([inertial, further], axis=2)
+    return read_only(regressor)
 
 
 def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
     """Return the drives' signals (m, k) as they are behind the torque's low-pass."""
-    found = drive_signals(drives, log.qd_rad_s, log.qdd_rad_s2, slow_rad_s).copy()
+    signals = drive_signals(drives, log.qd_rad_s, log.qdd_rad_s2, slow_rad_s).copy()
     at = [k for k, drive in enumerate(drives) if not TERM_KINDS[drive.term].linear]
     fine = drive_signals([drives[k] for k in at], log.fine_qd_rad_s, log.fine_qdd_rad_s2, slow_rad_s)
     if at:
-        found[:, at] = log.low_passed(fine)
-    return found
+        signals[:, at] = log.low_passed(fine)
+    return signals

@@ -46,7 +46,7 @@ def body_tracks(
         turns: how links turn, by the module that each carries.
     """
     near: list[dict[int, Screw]] = []
-    found = []
+    tracks = []
     for i, parent in enumerate(chain.parent):
         own = chain.axis[i], np.cross(chain.point[i], chain.axis[i])
         screws = {i: Screw(*(np.repeat(part[:, None], len(q_rad), axis=1) for part in own))}
@@ -55,21 +55,21 @@ def body_tracks(
                 screws[joint] = _carried(chain, i, q_rad[:, i], _beyond(screw, turns.get(i, ())))
         near.append(screws)
         link = turns.get(next(iter(chain.children(i)), BASE), ())
-        found.append(
+        tracks.append(
             BodyTrack(given(bodies[i], link), {joint: _beyond(s, link) for joint, s in screws.items()})
         )
-    return found
+    return tracks
 
 
 def track_regressor(tracks: Sequence[BodyTrack]) -> Array:
     """Return the regressor (m, n, 10 n) of n bodies, as `torque_regressor` has it."""
     joints = len(tracks)
     samples = tracks[0].motion.omega.shape[1]
-    found = np.zeros((samples, joints, PER_BODY * joints))
+    regressor = np.zeros((samples, joints, PER_BODY * joints))
     for i, track in enumerate(tracks):
         for joint, screw in track.screws.items():
-            found[:, joint, PER_BODY * i : PER_BODY * (i + 1)] = _row(track.motion, screw).T
-    return found
+            regressor[:, joint, PER_BODY * i : PER_BODY * (i + 1)] = _row(track.motion, screw).T
+    return regressor
 
 
 def _beyond(screw: Screw, link: Sequence[LinkTurn]) -> Screw:

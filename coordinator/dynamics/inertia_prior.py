@@ -33,11 +33,11 @@ def module_prior(chain: Chain, types: Sequence[ModuleType]) -> Array:
         ValueError: there is not one type per module.
     """
     turned, held = sides_prior(chain, types)
-    found = turned.copy()
+    prior = turned.copy()
     for i, parent in enumerate(chain.parent):
         if parent != BASE:
-            found[parent] += held[i]
-    return read_only(found)
+            prior[parent] += held[i]
+    return read_only(prior)
 
 
 def sides_prior(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array]:
@@ -88,6 +88,6 @@ def _link(begin: Array, end: Array) -> Array:
 
 def _lump(mass_kg: float, centre: Array, spread: Array) -> Array:
     """Return the pseudo-inertia of a mass about a centre (4,), its second moments `spread` (3, 3) smeared."""
-    found = mass_kg * np.outer(centre, centre)
-    found[:3, :3] += spread + mass_kg * SMEAR_M**2 * np.eye(3)
-    return np.asarray(found)
+    pseudo = mass_kg * np.outer(centre, centre)
+    pseudo[:3, :3] += spread + mass_kg * SMEAR_M**2 * np.eye(3)
+    return np.asarray(pseudo)

@@ -40,11 +40,11 @@ def pseudo_inertia(phi: ArrayLike) -> Array:
     """Return the (4, 4) integral of [r; 1] [r; 1]^T dm of ten parameters (order of thesis eq. 25)."""
     values = np.asarray(phi, dtype=float)
     inertia = _symmetric(values[4:])
-    found = np.empty((4, 4))
-    found[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
-    found[:3, 3] = found[3, :3] = values[1:4]
-    found[3, 3] = values[0]
-    return found
+    pseudo = np.empty((4, 4))
+    pseudo[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    pseudo[:3, 3] = pseudo[3, :3] = values[1:4]
+    pseudo[3, 3] = values[0]
+    return pseudo
 
 
 def parameters(pseudo: ArrayLike) -> Array:
@@ -86,8 +86,8 @@ def nearest_consistent(pseudo: ArrayLike) -> Array:
     """
     values, vectors = np.linalg.eigh(_in_kg(pseudo))
     raised = vectors * np.maximum(values, SMALLEST_KG) @ vectors.T
-    found: Array = raised * _reach()
-    return found
+    nearest: Array = raised * _reach()
+    return nearest
 
 
 def body(pseudo: ArrayLike) -> Body:
@@ -112,9 +112,9 @@ def bodies_in_frames(pseudo: Array, homes: Array) -> tuple[Body, ...]:
 
 
 def _symmetric(upper: Array) -> Array:
-    found = np.zeros((3, 3))
-    found[_UPPER] = upper
-    return found + np.triu(found, 1).T
+    matrix = np.zeros((3, 3))
+    matrix[_UPPER] = upper
+    return matrix + np.triu(matrix, 1).T
 
 
 def _reach() -> Array:
@@ -123,8 +123,8 @@ def _reach() -> Array:
 
 
 def _in_kg(pseudo: ArrayLike) -> Array:
-    found: Array = np.asarray(pseudo, dtype=float) / _reach()
-    return found
+    scaled: Array = np.asarray(pseudo, dtype=float) / _reach()
+    return scaled
 
 
 def parameter_scale(bodies: int) -> Array:

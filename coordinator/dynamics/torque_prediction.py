@@ -86,10 +86,10 @@ def check_held_out(chain: Chain, phi: ArrayLike, motion: JointMotion, tau_mean_n
 
 
 def _norm(signal: Array, axis: int | None) -> Array:
-    found: Array = np.sqrt(np.sum(signal**2, axis=axis))
-    return found
+    norm: Array = np.sqrt(np.sum(signal**2, axis=axis))
+    return norm
 
 
 def _ratio(error: Array, size: Array) -> Array:
-    found: Array = np.divide(error, size, out=np.full(np.shape(size), np.nan), where=size > 0.0)
-    return found
+    ratio: Array = np.divide(error, size, out=np.full(np.shape(size), np.nan), where=size > 0.0)
+    return ratio

@@ -81,4 +81,4 @@ class Identified(NamedTuple):
         """The inertial parameters for files that other programs read: of real bodies, if any were found."""
         if self.bodies is not None and self.bodies.fit is not None:
             return self.bodies.fit.phi
-        return self.inertia.seen.fit.phi if self.inertia is not None else None
+        return self.inertia.instrumental.fit.phi if self.inertia is not None else None

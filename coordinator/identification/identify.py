@@ -79,7 +79,7 @@ def identify(
         windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
         clocks = kinematics.clocks
         inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
-        seen = inertia.seen
+        seen = inertia.instrumental
         bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION, inertia.effects)
         if _motions(recording, "held_out"):
             means = joined_motions([without_terms(one, seen) for one in windows]).tau_nm.mean(axis=0)

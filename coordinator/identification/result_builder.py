@@ -247,7 +247,7 @@ def _dynamics(
 ) -> DynamicsPart | None:
     if found is None:
         return None
-    serials, inertia = kinematics.topology.serials, found.seen.fit
+    serials, inertia = kinematics.topology.serials, found.instrumental.fit
     return DynamicsPart(
         phi=inertia.phi.tolist(),
         rank=inertia.rank,
@@ -262,14 +262,14 @@ def _dynamics(
         identifiability=_identifiability(bodies) if bodies is not None else [],
         summary=bodies.summary() if bodies is not None else [],
         frames=bodies.frames.tolist() if bodies is not None else [],
-        motion_source=found.eyes,
+        motion_source=found.motion_source,
         gathered_by=_gathered_by(found.gathered, len(serials)),
         by_agents=list(found.gathered.by_agents) if found.gathered is not None else [],
         gathered_difference=found.gathered.difference if found.gathered is not None else None,
         noise_nm={
             eyes: dict(zip(serials, noise.tolist(), strict=True)) for eyes, noise in found.noise_nm.items()
         },
-        torque_terms=_torque_terms(serials, found.seen),
+        torque_terms=_torque_terms(serials, found.instrumental),
     )
 
 

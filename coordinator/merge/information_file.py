@@ -93,7 +93,7 @@ def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
     make_read_only(arrays.values())
     joints = len(arrays["serials"])
     rest, samples = _checked(arrays["rest_nm2"], (joints,)), arrays["samples"]
-    found = tuple(
+    information = tuple(
         JointInformation(
             _checked(arrays[f"r{k}"], (len(arrays[f"z{k}"]), 10 * joints)),
             _checked(arrays[f"z{k}"], (len(arrays[f"z{k}"]),)),
@@ -107,7 +107,7 @@ def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
         name=name,
         session=str(arrays["session"]),
         chain=Chain.from_dict(arrays),
-        joints=found,
+        joints=information,
         sigma_nm=_checked(arrays["sigma_nm"], (joints,)),
         independent_fraction=float(arrays["independent_fraction"]),
         phi_parts=_checked(arrays["phi_parts"], (20 * joints,)),

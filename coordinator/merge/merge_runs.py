@@ -109,11 +109,11 @@ def _check(runs: Sequence[RunInformation]) -> None:
 
 def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:
     """Return what is known beforehand of every module's torque sensor, by the best that any run was told."""
-    found: dict[str, float] = {}
+    sigmas: dict[str, float] = {}
     for run in runs:
         for serial in run.chain.serials:
-            found[serial] = min(found.get(serial, np.inf), run.scale_sigma)
-    return dict(sorted(found.items()))
+            sigmas[serial] = min(sigmas.get(serial, np.inf), run.scale_sigma)
+    return dict(sorted(sigmas.items()))
 
 
 def _of_rows(run: RunInformation, of_joints: Array) -> Array:
@@ -146,8 +146,8 @@ def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float
 
 def _without_scales(rows: Sequence[Array], scales: int) -> tuple[Array, Array]:
     """Return rows over the parts and their target of runs whose sensors' scales are the same."""
-    found = _without(np.vstack(rows), scales)
-    return found[:, :-1], found[:, -1]
+    reduced = _without(np.vstack(rows), scales)
+    return reduced[:, :-1], reduced[:, -1]
 
 
 def _without(rows: Array, count: int) -> Array:
@@ -188,9 +188,9 @@ def _combinations(base: BaseParameters, rows: Array, target: Array) -> tuple[Arr
     The prior of every parameter is 0 +- `MAX_SIGMA_KG`. Without it, combinations that two runs share up to
     the errors of their chains would be told apart by these errors.
     """
-    told = spectrum(rows * base.columns.scale)
-    along = (base.grouping * base.columns.scale) @ told.directions.T
-    square = told.values**2 + MAX_SIGMA_KG**-2
+    whole = spectrum(rows * base.columns.scale)
+    along = (base.grouping * base.columns.scale) @ whole.directions.T
+    square = whole.values**2 + MAX_SIGMA_KG**-2
     sigma = np.linalg.norm(along / np.sqrt(square), axis=1)
     sigma.flags.writeable = False
-    return along @ (told.values / square * (told.left.T @ target)), sigma
+    return along @ (whole.values / square * (whole.left.T @ target)), sigma

@@ -201,7 +201,7 @@ def base_parameters(
         DataError: rows of zeros, or values that are not finite.
         ValueError: shapes that do not fit.
     """
-    rows, seen, common = _rows(triangle, target, len(columns.names), sigma, common_errors)
+    rows, measured, common = _rows(triangle, target, len(columns.names), sigma, common_errors)
     whole = spectrum(rows * columns.scale)
     kept = whole.determined(tolerance) & (whole.values > sigma / max_sigma)
     values, space = whole.values[kept], whole.directions[kept]
@@ -215,31 +215,31 @@ def base_parameters(
     own = columns.scale[chosen]
     grouping = own[:, None] * (back @ space) / columns.scale
     grouping[:, chosen] = np.eye(len(chosen))
-    found = BaseParameters(
+    base = BaseParameters(
         columns=columns,
         independent=chosen,
         grouping=grouping,
-        value=own * (inverse @ seen),
+        value=own * (inverse @ measured),
         covariance=own[:, None] * (spread @ spread.T) * own,
         share=np.sum(space**2, axis=0),
         condition=whole.condition(kept),
     )
-    make_read_only(found)
-    return found
+    make_read_only(base)
+    return base
 
 
 def _rows(
     triangle: ArrayLike, target: ArrayLike, size: int, sigma: float, common_errors: ArrayLike | None
 ) -> tuple[Array, Array, Array]:
-    rows, seen = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
+    rows, measured = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
     common = np.zeros((len(rows), 0)) if common_errors is None else np.asarray(common_errors, dtype=float)
-    if rows.ndim != 2 or rows.shape[1] != size or seen.shape != rows.shape[:1]:
-        raise ValueError(f"rows {rows.shape} and target {seen.shape} do not fit {size} named columns")
+    if rows.ndim != 2 or rows.shape[1] != size or measured.shape != rows.shape[:1]:
+        raise ValueError(f"rows {rows.shape} and target {measured.shape} do not fit {size} named columns")
     if common.ndim != 2 or len(common) != len(rows) or not np.isfinite(common).all():
         raise ValueError(f"common errors {common.shape} must be finite, {len(rows)} rows of them")
-    if not (np.isfinite(rows).all() and np.isfinite(seen).all() and sigma > 0.0):
+    if not (np.isfinite(rows).all() and np.isfinite(measured).all() and sigma > 0.0):
         raise DataError("the rows or the target hold a value that is not finite, or sigma is not positive")
-    return rows, seen, common
+    return rows, measured, common
 
 
 def _independent(space: Array, preferred: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -285,10 +285,10 @@ def joint_frames(chain: Chain) -> Array:
     for i, frame in enumerate(frames):
         axis, point = chain.axis[i], chain.point[i]
         child = next(iter(chain.children(i)), None)
-        found = None if child is None else _towards(axis, point, chain.axis[child], chain.point[child])
-        if found is None:
-            found = _beside(axis, point, chain.imu_home[i, :3, 3]) or (_any_normal(axis), point)
-        x, origin = found
+        normal = None if child is None else _towards(axis, point, chain.axis[child], chain.point[child])
+        if normal is None:
+            normal = _beside(axis, point, chain.imu_home[i, :3, 3]) or (_any_normal(axis), point)
+        x, origin = normal
         frame[:3, :3] = np.column_stack([x, np.cross(axis, x), axis])
         frame[:3, 3] = origin
     return read_only(frames)

@@ -1,15 +1,15 @@
-"""Inertial parameters where bodies were seen to move, and readings hold more than the bodies' torque.
+"""Inertial parameters by instrumental variables: encoders as instruments for motion measured by IMUs.
 
 The rows of a joint have the columns [Z | T | Y - Z]: Z the regressor from encoders alone, on a rigid chain;
-T what its reading holds beside the bodies' torque (`torque_terms`); Y the regressor of the motion as it was
-seen (`body_tracks`). The parameters solve
+T the further terms of its torque reading (`torque_terms`); Y the regressor of the motion with base,
+compliance and IMUs (`body_tracks`). The parameters solve
 
     Z^T (tau - Y phi - T theta) = 0,
 
-instrumental variables with Z for instruments (Young 2011, Recursive estimation and time-series analysis,
-section 6.2): the noise of IMUs in Y does not make inertias come out small, and parameters that a rigid robot
-does not show are not taken from noise. They come from what is known of modules beforehand: a base that shakes
-makes a little torque of them. It is solved by turns: with phi known, the torque of Y - Z is taken off.
+instrumental variables with the instruments Z (Young 2011, Recursive estimation and time-series analysis,
+section 6.2): the noise of IMUs in Y does not bias the inertias towards zero, and parameters that a rigid
+robot does not determine are not fitted to noise. These come from the prior; a shaking base makes a little
+torque of them. The solver alternates: with phi known, the torque of Y - Z is subtracted.
 """
 
 from collections.abc import Sequence
@@ -30,19 +30,19 @@ from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 from module_agent.signals.torque_terms import READING_TERMS
 
-# The torque of Y - Z is a few percent: every round leaves as much of the error.
+# The torque of Y - Z is a few percent, and every round reduces the error to as much of it.
 _ROUNDS, _SETTLED = 8, 1e-9
-# A column that keeps less of its length beside the bodies' is one of theirs.
+# A column with a smaller share outside the range of the bodies' columns is one of theirs.
 _ALIKE = 1e-6
 _MIN_NM = 1e-9
 
 
 class TermsFit(NamedTuple):
-    """The parameters of `READING_TERMS` of n joints, (n, 4) each; zero where a term does not earn its place.
+    """The parameters of `READING_TERMS` of n joints, (n, 4) each; zero where a term is not significant.
 
-    sigma: one standard deviation. gain: by how many variances of the torque's noise a term makes the misfit
-    of its joint smaller, whether it is used or not. spread: the standard deviation to which the joint by
-    itself tells a term, infinite if it does not: one that is not used may be there, but not by much more.
+    sigma: one standard deviation. gain: the F statistic of a term, whether it is used or not. used: the
+    significant terms. spread: the standard deviation of a term by its joint alone, infinite if the joint does
+    not determine it; a term that is not used may exist within it.
     """
 
     value: Array
@@ -53,11 +53,11 @@ class TermsFit(NamedTuple):
 
 
 class InstrumentalFit(NamedTuple):
-    """Inertial parameters, and what else was in the readings.
+    """Inertial parameters, and the further terms of the torque readings.
 
-    information: what is left of every joint when terms and the torque of Y - Z are taken off, in the 10 n
-    columns of the bodies, its torques in their true scale as far as it is known. scale: of the sensors.
-    informed_phi: (10 n,) the parameters where torques tell them, and else those that are likely.
+    information: of every joint without terms and the torque of Y - Z, in the 10 n columns of the bodies, its
+    torques corrected by the estimated scale. scale: of the sensors. informed_phi: (10 n,) the parameters with
+    the prior where torques do not determine them.
     """
 
     fit: InertialFit
@@ -77,25 +77,25 @@ def solve_instrumental_variables(
 
     Args:
         information: per joint, in the columns [Z | T], or [Z | T | Y - Z].
-        prior_phi: (10 n,) bodies as they are likely to be; they count where Z shows nothing.
+        prior_phi: (10 n,) the prior, which counts where Z determines nothing.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
-        scale_sigma: how well the torque sensors' scales are known beforehand; zero means exactly.
+        scale_sigma: standard deviation of the prior of the torque sensors' scales; zero if calibrated.
 
     Raises:
         ValueError: columns that are neither, or as `solve_information`.
     """
     size = PER_BODY * len(information)
     widths = {piece.r.shape[1] for piece in information}
-    seen = widths == {2 * size + len(READING_TERMS)}
-    if not seen and widths != {size + len(READING_TERMS)}:
+    with_departure = widths == {2 * size + len(READING_TERMS)}
+    if not with_departure and widths != {size + len(READING_TERMS)}:
         raise ValueError(f"rows of {sorted(widths)} columns are no rows of {len(information)} joints")
     phi = np.asarray(prior_phi, dtype=float)
     scale = known_scale(len(information))
-    for _ in range(_ROUNDS if seen or scale_sigma else 1):
+    for _ in range(_ROUNDS if with_departure or scale_sigma else 1):
         true = [scaled(piece, one) for piece, one in zip(information, scale.value, strict=True)]
         rigid = [_without_departure(piece, size, phi) for piece in true]
-        earned = [_earned(piece, size, independent_fraction) for piece in rigid]
-        left = tuple(without_used(piece, size, one.used) for piece, one in zip(rigid, earned, strict=True))
+        tests = [_significance(piece, size, independent_fraction) for piece in rigid]
+        left = tuple(without_used(piece, size, one.used) for piece, one in zip(rigid, tests, strict=True))
         fit = solve_weighted(left, independent_fraction, ESTIMATED_CHAIN_TOLERANCE)
         sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _MIN_NM))
         informed = solve_information(
@@ -119,10 +119,10 @@ def solve_instrumental_variables(
             )
         if max(moved, np.abs(scale.value - before.value).max()) < _SETTLED:
             break
-    return InstrumentalFit(fit, _terms(rigid, earned, fit, independent_fraction), scale, phi, left)
+    return InstrumentalFit(fit, _terms(rigid, tests, fit, independent_fraction), scale, phi, left)
 
 
-class _Earned(NamedTuple):
+class _Significance(NamedTuple):
     """Of each term of a joint, (4,) each: see `TermsFit`."""
 
     gain: Array
@@ -132,14 +132,14 @@ class _Earned(NamedTuple):
 
 def _without_departure(piece: JointInformation, size: int, phi: Array) -> JointInformation:
     """Return the rows in [Z | T], with the torque of Y - Z taken off."""
-    kept = size + len(READING_TERMS)
-    if piece.r.shape[1] == kept:
+    count = size + len(READING_TERMS)
+    if piece.r.shape[1] == count:
         return piece
-    return piece._replace(r=piece.r[:, :kept], z=piece.z - piece.r[:, kept:] @ phi)
+    return piece._replace(r=piece.r[:, :count], z=piece.z - piece.r[:, count:] @ phi)
 
 
-def _earned(piece: JointInformation, size: int, independent_fraction: float) -> _Earned:
-    """Drop the weakest term until all that are left earn their place; bodies explain what they can."""
+def _significance(piece: JointInformation, size: int, independent_fraction: float) -> _Significance:
+    """Remove the weakest term until all are significant, with the bodies fitted as well as possible."""
     bodies = piece.r[:, :size] * parameter_scale(size // PER_BODY)
     terms = piece.r[:, size:]
     (columns, target), rank = without_range(bodies, RANK_TOLERANCE, (terms, piece.z))
@@ -157,40 +157,40 @@ def _earned(piece: JointInformation, size: int, independent_fraction: float) -> 
         if gain[weakest] > SIGNIFICANT_F:
             break
         used[weakest] = False
-    return _Earned(gain, used, spread)
+    return _Significance(gain, used, spread)
 
 
 def without_used(piece: JointInformation, size: int, used: NDArray[np.bool_]) -> JointInformation:
-    """Return rows in [Z | T | any others] without T: what they say whatever the terms in use are.
+    """Return rows in [Z | T | any others] without T: the information that does not depend on the used terms.
 
     Args:
         size: of Z, 10 n. used: (4,) which of `READING_TERMS` are; the others are left out.
     """
-    kept = np.delete(piece.r, np.s_[size : size + len(READING_TERMS)], axis=1)
+    others = np.delete(piece.r, np.s_[size : size + len(READING_TERMS)], axis=1)
     terms = piece.r[:, size : size + len(READING_TERMS)][:, used]
     count = terms.shape[1]
     if not count:
-        return piece._replace(r=kept)
-    rows = qr(np.column_stack([terms, kept, piece.z]), mode="r", check_finite=False)[0]
+        return piece._replace(r=others)
+    rows = qr(np.column_stack([terms, others, piece.z]), mode="r", check_finite=False)[0]
     return piece._replace(r=rows[count:, count:-1], z=rows[count:, -1], samples=piece.samples - count)
 
 
 def _terms(
     rigid: Sequence[JointInformation],
-    earned: Sequence[_Earned],
+    tests: Sequence[_Significance],
     fit: InertialFit,
     independent_fraction: float,
 ) -> TermsFit:
-    """Return the terms that the rows of every joint leave once the bodies are known."""
+    """Return the terms of every joint with the fitted bodies subtracted."""
     size = len(fit.phi)
     value, sigma = np.zeros((len(rigid), len(READING_TERMS))), np.zeros((len(rigid), len(READING_TERMS)))
-    for i, (piece, one) in enumerate(zip(rigid, earned, strict=True)):
+    for i, (piece, one) in enumerate(zip(rigid, tests, strict=True)):
         inverse = np.linalg.pinv(piece.r[:, size:][:, one.used])
         bodies = piece.r[:, :size]
         value[i, one.used] = inverse @ (piece.z - bodies @ fit.phi)
         through = inverse @ bodies
         noise = fit.torque_sigma_nm[i] ** 2 / independent_fraction * (inverse @ inverse.T)
         sigma[i, one.used] = np.sqrt(np.diagonal(noise + through @ fit.covariance @ through.T))
-    gain, used, spread = (np.array([one[k] for one in earned]) for k in range(3))
+    gain, used, spread = (np.array([one[k] for one in tests]) for k in range(3))
     make_read_only((value, sigma, gain, used, spread))
     return TermsFit(value, sigma, gain, used, spread)

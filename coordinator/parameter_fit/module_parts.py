@@ -43,13 +43,13 @@ class Part(NamedTuple):
 def parts_of(chains: Iterable[Chain]) -> tuple[Part, ...]:
     """Return the parts of all these robots, each once, in whatever order the robots come."""
     roles: tuple[Role, ...] = get_args(Role)
-    found = {
+    parts = {
         Part(serial, role, bool(turned))
         for chain in chains
         for serial, turned in zip(chain.serials, chain.reversed, strict=True)
         for role in roles
     }
-    return tuple(sorted(found))
+    return tuple(sorted(parts))
 
 
 def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
@@ -62,7 +62,7 @@ def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
         ValueError: a part of the chain is not among them.
     """
     place = {part: k for k, part in enumerate(parts)}
-    found = np.zeros((PER_BODY * len(chain.serials), PER_BODY * len(parts)))
+    transform = np.zeros((PER_BODY * len(chain.serials), PER_BODY * len(parts)))
     for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
         into_root = parameter_transform(chain.imu_home[k])
         roles: tuple[tuple[Role, int], ...] = (("turned", k), ("held", parent))
@@ -71,8 +71,8 @@ def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
             if part not in place:
                 raise ValueError(f"{part.name} is not among the {len(parts)} parts")
             if body >= 0:
-                found[_ten(body), _ten(place[part])] = into_root
-    return read_only(found)
+                transform[_ten(body), _ten(place[part])] = into_root
+    return read_only(transform)
 
 
 def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> Array:
@@ -93,14 +93,14 @@ def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> A
             expected[parent] += held[k]
     surplus = (bodies - expected) / expected[:, :1]
     place = {part: k for k, part in enumerate(parts_of([chain]))}
-    found = np.zeros((len(place), PER_BODY))
+    phi_parts = np.zeros((len(place), PER_BODY))
     for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
         into_imu = parameter_transform(np.linalg.inv(chain.imu_home[k]))
         own: tuple[tuple[Role, Array, int], ...] = (("turned", turned[k], k), ("held", held[k], parent))
         for role, part, body in own:
             whole = part + part[0] * surplus[body] if body >= 0 else part
-            found[place[Part(serial, role, bool(chain.reversed[k]))]] = into_imu @ whole
-    flat = found.ravel()
+            phi_parts[place[Part(serial, role, bool(chain.reversed[k]))]] = into_imu @ whole
+    flat = phi_parts.ravel()
     return read_only(flat)
 
 

@@ -141,14 +141,14 @@ def find_payload(
         raise DataError("no body may carry the payload")
     stacked = np.vstack([known, rows])
     none, beyond = _complement(stacked, np.concatenate([known_target, target]))
-    found: dict[int, PayloadOn] = {}
+    fits: dict[int, PayloadOn] = {}
     for b in candidates:
         added = np.vstack([np.zeros((len(known), PER_BODY)), rows[:, PER_BODY * b : PER_BODY * (b + 1)]])
-        found[b] = _on(beyond.T @ added, none, likely[b])
-    gains = {b: float(none @ none) - one.misfit for b, one in found.items()}
+        fits[b] = _on(beyond.T @ added, none, likely[b])
+    gains = {b: float(none @ none) - one.misfit for b, one in fits.items()}
     best = max(gains, key=lambda b: gains[b])
     rival = max((b for b in gains if b != best), key=lambda b: gains[b], default=None)
-    one, pseudo = found[best], pseudo_inertia(found[best].phi)
+    one, pseudo = fits[best], pseudo_inertia(fits[best].phi)
     make_read_only((one.phi, one.covariance, pseudo))
     return Payload(
         carrier=best,
@@ -184,6 +184,6 @@ def _on(columns: Array, none: Array, place_m: Array) -> PayloadOn:
 def _likely(place_m: Array) -> Array:
     """Return the pseudo-inertia (4, 4) of a payload as it is likely."""
     centre = np.append(place_m, 1.0)
-    found = LIKELY_KG * np.outer(centre, centre)
-    found[:3, :3] += LIKELY_KG * LIKELY_SIZE_M**2 * np.eye(3)
-    return np.asarray(found)
+    pseudo = LIKELY_KG * np.outer(centre, centre)
+    pseudo[:3, :3] += LIKELY_KG * LIKELY_SIZE_M**2 * np.eye(3)
+    return np.asarray(pseudo)

@@ -103,14 +103,14 @@ def fit_physical(
     prior: ArrayLike,
     least_squares: InertialFit,
     independent_fraction: float = 1.0,
-    most_cost: float = MAX_COST,
+    max_cost: float = MAX_COST,
     effects: Sequence[Array] | None = None,
 ) -> PhysicalFit:
     """Fit real bodies to the torques of all joints.
 
     The prior has the largest of `WEIGHTS` with which the torques are explained worse than by least squares by
-    at most `most_cost`, or by no more than the noise that least squares fits; if none is, because friction is
-    missing in the model for example, then worse than by the best real bodies by at most `most_cost`.
+    at most `max_cost`, or by no more than the noise that least squares fits; if none is, because friction is
+    missing in the model for example, then worse than by the best real bodies by at most `max_cost`.
 
     Args:
         information: per joint of n.
@@ -119,7 +119,7 @@ def fit_physical(
             outweigh the prior; all joints count alike, as in unweighted least squares, so that the errors of
             the two compare.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
-        most_cost: see above; a share of |tau|.
+        max_cost: see above; a share of |tau|.
         effects: (k_i, j) of every joint, of errors that come as a whole (`common_errors`); they widen the
             covariance.
 
@@ -137,25 +137,25 @@ def fit_physical(
     sigma = _common_sigma(information, least_squares, size)
     rows, target = whitened(information, sigma, independent_fraction)
     own = least_squares.rank * float(sigma[0]) ** 2 / independent_fraction
-    allowed = max(best + most_cost, float(np.hypot(best, np.sqrt(own) / size)))
+    allowed = max(best + max_cost, float(np.hypot(best, np.sqrt(own) / size)))
 
     def error_of(phi: Array) -> float:
         return _relative_error(information, phi, size)
 
-    found, weight, error = _strongest_prior(
-        rows=rows, target=target, prior=bodies, error_of=error_of, allowed=allowed, most_cost=most_cost
+    solution, weight, error = _strongest_prior(
+        rows=rows, target=target, prior=bodies, error_of=error_of, allowed=allowed, max_cost=max_cost
     )
-    covariance = found.covariance
+    covariance = solution.covariance
     if effects is not None:
         shifts = covariance @ (rows.T @ whitened_effects(effects, sigma, independent_fraction))
         covariance = covariance + shifts @ shifts.T
-    pseudo = np.stack([pseudo_inertia(phi) for phi in found.x.reshape(-1, PER_BODY)])
-    make_read_only((pseudo, found.x, covariance, found.divergence))
+    pseudo = np.stack([pseudo_inertia(phi) for phi in solution.x.reshape(-1, PER_BODY)])
+    make_read_only((pseudo, solution.x, covariance, solution.divergence))
     return PhysicalFit(
-        phi=found.x,
+        phi=solution.x,
         covariance=covariance,
         pseudo=pseudo,
-        divergence=found.divergence,
+        divergence=solution.divergence,
         weight=weight,
         error=error,
         least_squares_error=best,
@@ -168,19 +168,19 @@ def _strongest_prior(
     prior: Array,
     error_of: Callable[[Array], float],
     allowed: float,
-    most_cost: float,
+    max_cost: float,
 ) -> tuple[Solution, float, float]:
     """Return the solution with the largest weight whose error is allowed, the weight, and the error."""
     tried: list[tuple[Solution, float, float]] = []
     for weight in WEIGHTS:
-        found = physically_consistent(rows, target, prior, weight)
-        tried.append((found, weight, error_of(found.x)))
+        solution = physically_consistent(rows, target, prior, weight)
+        tried.append((solution, weight, error_of(solution.x)))
         if tried[-1][2] <= allowed:
             return tried[-1]
     # No real bodies do as well as least squares: the model lacks something. What the prior adds to their
     # price is kept small instead.
     cheapest = min(error for _, _, error in tried)
-    return next(one for one in tried if one[2] - cheapest <= most_cost)
+    return next(one for one in tried if one[2] - cheapest <= max_cost)
 
 
 def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:
@@ -281,9 +281,9 @@ class _Problem(NamedTuple):
         lower = np.linalg.inv(np.linalg.cholesky(self.matrices(y)))
         along = self.matrices(down)
         rates = np.linalg.eigvalsh(lower @ along @ lower.transpose(0, 2, 1)).ravel()
-        seen = self.triangle @ down
-        curvature = float(seen @ seen)
-        pull = float(seen @ (self.triangle @ y - self.target))
+        change = self.triangle @ down
+        curvature = float(change @ change)
+        pull = float(change @ (self.triangle @ y - self.target))
         pull += self.weight * float(np.trace(along, axis1=1, axis2=2).sum())
 
         def grows(t: float) -> float:
@@ -305,11 +305,11 @@ class _Problem(NamedTuple):
         L^-1 F L^-T for Y = L L^T.
         """
         lower = np.linalg.inv(np.linalg.cholesky(self.matrices(y)))
-        seen = lower[:, None] @ _UNITS @ lower[:, None].transpose(0, 1, 3, 2)
+        whitened_units = lower[:, None] @ _UNITS @ lower[:, None].transpose(0, 1, 3, 2)
         gradient = self.triangle.T @ (self.triangle @ y - self.target)
-        pull = self.weight * _TRACE - self.barrier * np.trace(seen, axis1=2, axis2=3)
+        pull = self.weight * _TRACE - self.barrier * np.trace(whitened_units, axis1=2, axis2=3)
         gradient[: pull.size] += pull.ravel()
-        roots = np.sqrt(self.barrier) * block_diag(*(one.reshape(PER_BODY, 16).T for one in seen))
+        roots = np.sqrt(self.barrier) * block_diag(*(one.reshape(PER_BODY, 16).T for one in whitened_units))
         stacked = np.zeros((len(self.triangle) + len(roots), len(y)))
         stacked[: len(self.triangle)] = self.triangle
         stacked[len(self.triangle) :, : roots.shape[1]] = roots
@@ -317,10 +317,10 @@ class _Problem(NamedTuple):
 
 
 def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> _Problem:
-    matrix, seen = np.asarray(rows, dtype=float), np.asarray(target, dtype=float)
+    matrix, measured = np.asarray(rows, dtype=float), np.asarray(target, dtype=float)
     bodies = np.asarray(prior, dtype=float)
-    if matrix.ndim != 2 or seen.shape != matrix.shape[:1] or bodies.shape != (len(bodies), 4, 4):
-        raise ValueError(f"rows {matrix.shape}, target {seen.shape} and prior {bodies.shape} do not fit")
+    if matrix.ndim != 2 or measured.shape != matrix.shape[:1] or bodies.shape != (len(bodies), 4, 4):
+        raise ValueError(f"rows {matrix.shape}, target {measured.shape} and prior {bodies.shape} do not fit")
     free = matrix.shape[1] - PER_BODY * len(bodies)
     if free < 0:
         raise ValueError(f"rows of {matrix.shape[1]} columns for {len(bodies)} bodies of ten parameters")
@@ -331,7 +331,7 @@ def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float
     except np.linalg.LinAlgError as error:
         raise DataError("a body of the prior cannot exist: its pseudo-inertia is not positive") from error
     scale = block_diag(*(parameter_transform(root) for root in roots), np.eye(free))
-    square = qr(np.column_stack([matrix @ scale, seen]), mode="r", check_finite=False)[0]
+    square = qr(np.column_stack([matrix @ scale, measured]), mode="r", check_finite=False)[0]
     # The last row is what no parameters explain: dropped, so that small gains are not lost beside it.
     square = square[: matrix.shape[1]]
     return _Problem(

@@ -100,7 +100,7 @@ def fit_weighted(
     scale: ArrayLike,
     used: ArrayLike | None = None,
     robust: bool = False,
-    least_correlation: float = 1.0,
+    min_correlation: float = 1.0,
     instruments: ArrayLike | None = None,
 ) -> WeightedFit:
     """Fit the parameters of a regressor.
@@ -110,7 +110,7 @@ def fit_weighted(
         tau_nm: (m, n).
         scale: (p,) by which parameters are counted (`base_parameters.Columns`).
         used: (m, n) samples to fit to, None for all. robust: Huber's weights instead of plain squares.
-        least_correlation: samples that count as one at least, rate / (2 cut-off) behind a low-pass; a fit to
+        min_correlation: samples that count as one at least, rate / (2 cut-off) behind a low-pass; a fit to
             few samples leaves residuals that look more independent than they are.
         instruments: (m, n, p) the same regressor from measurements whose noise is independent; None for
             least squares.
@@ -140,7 +140,7 @@ def fit_weighted(
         if np.abs(sigma / before - 1.0).max() < _SETTLED:
             break
     residual = np.where(counted, tau - y @ solution.parameters, np.nan)
-    correlation = np.maximum(correlation_times(residual), least_correlation)
+    correlation = np.maximum(correlation_times(residual), min_correlation)
     return _fit(solution, counted, weights, sigma, correlation)
 
 
@@ -189,17 +189,17 @@ def _correlation_time(residual: Array) -> float:
 def _joint_rows(y: Array, tau: Array, other: Array | None, weights: Array) -> list[_JointRows]:
     """Compress each joint's samples into the triangle of their QR, which keeps all products of columns."""
     size = y.shape[2]
-    found = []
+    joints = []
     for i in range(y.shape[1]):
-        kept = weights[:, i] > 0.0
-        blocks = [y[kept, i], tau[kept, i, None], *([] if other is None else [other[kept, i]])]
-        rows = qr(np.hstack(blocks) * weights[kept, i, None], mode="r", check_finite=False)[0]
+        used = weights[:, i] > 0.0
+        blocks = [y[used, i], tau[used, i, None], *([] if other is None else [other[used, i]])]
+        rows = qr(np.hstack(blocks) * weights[used, i, None], mode="r", check_finite=False)[0]
         rows = rows[: rows.shape[1]]
-        found.append(_JointRows(rows[:, :size], rows[:, size], rows[:, size + 1 :]))
-    return found
+        joints.append(_JointRows(rows[:, :size], rows[:, size], rows[:, size + 1 :]))
+    return joints
 
 
-def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool) -> _Solution:
+def _solution(joints: list[_JointRows], sigma: Array, scale: Array, with_instruments: bool) -> _Solution:
     stacked = [np.column_stack([joint.y, joint.tau]) / own for joint, own in zip(joints, sigma, strict=True)]
     whole = qr(np.vstack(stacked), mode="r", check_finite=False)[0][: len(scale)]
     rows, target = whole[:, :-1], whole[:, -1]
@@ -207,7 +207,7 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool
     kept = within.determined(RANK_TOLERANCE)
     inverse, condition = scale[:, None] * within.inverse(kept), within.condition(kept)
     hat = [joint.y @ inverse / own for joint, own in zip(joints, sigma, strict=True)]
-    if not tooled:
+    if not with_instruments:
         parameters = inverse @ ((rows @ inverse).T @ target)
         return _Solution(
             parameters=parameters,
@@ -237,23 +237,23 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, tooled: bool
 
 def _huber(off: Array) -> Array:
     """Return the square roots of Huber's weights of residuals in standard deviations."""
-    found: Array = np.sqrt(HUBER_LIMIT / np.maximum(np.abs(off), HUBER_LIMIT))
-    return found
+    roots: Array = np.sqrt(HUBER_LIMIT / np.maximum(np.abs(off), HUBER_LIMIT))
+    return roots
 
 
 def _noise(joints: list[_JointRows], solution: _Solution, used: NDArray[np.bool_]) -> Array:
     """Return the rms of each joint's residual (n,)."""
     left = [float(np.sum((joint.tau - joint.y @ solution.parameters) ** 2)) for joint in joints]
     # Torques without noise leave rounding; weights must stay finite.
-    found: Array = np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _MIN_NM)
-    return found
+    rms: Array = np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _MIN_NM)
+    return rms
 
 
 def _robust_noise(residual: Array, used: NDArray[np.bool_]) -> Array:
     """Return each joint's noise (n,) by the median of its residuals."""
     middle = np.nanmedian(np.where(used, np.abs(residual), np.nan), axis=0)
-    found: Array = np.maximum(_MAD_TO_SIGMA * middle, _MIN_NM)
-    return found
+    sigma: Array = np.maximum(_MAD_TO_SIGMA * middle, _MIN_NM)
+    return sigma
 
 
 def _freedom(solution: _Solution, used: NDArray[np.bool_]) -> Array:

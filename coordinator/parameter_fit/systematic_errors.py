@@ -32,8 +32,8 @@ def error_directions(covariance: Array) -> Array:
     """
     values, vectors = np.linalg.eigh(covariance)
     kept = np.flatnonzero(values > _NEGLIGIBLE * max(values[-1], 0.0))[-_MAX_DIRECTIONS:]
-    found = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
-    return read_only(found)
+    directions = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+    return read_only(directions)
 
 
 def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: JointMotion) -> Array:
@@ -50,11 +50,11 @@ def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: Joint
     """
     joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
     here = inverse_dynamics(chain, phi, *joints)
-    found = [
+    effects = [
         inverse_dynamics(apply_perturbation(chain, one), phi, *joints) - here
         for one in error_directions(covariance).T
     ]
-    return np.stack(found, axis=2) if found else np.zeros((*here.shape, 0))
+    return np.stack(effects, axis=2) if effects else np.zeros((*here.shape, 0))
 
 
 def body_shifts(chain: Chain, directions: ArrayLike, phi_parts: ArrayLike) -> Array:
@@ -71,11 +71,11 @@ def body_shifts(chain: Chain, directions: ArrayLike, phi_parts: ArrayLike) -> Ar
     """
     parts = parts_of([chain])
     here = bodies_from_parts(chain, parts)
-    found = [
+    shifts = [
         (bodies_from_parts(apply_perturbation(chain, one), parts) - here) @ np.asarray(phi_parts, dtype=float)
         for one in np.asarray(directions, dtype=float).T
     ]
-    return np.stack(found, axis=1) if found else np.zeros((len(here), 0))
+    return np.stack(shifts, axis=1) if shifts else np.zeros((len(here), 0))
 
 
 def scale_effects(information: Sequence[JointInformation], scale: TorqueScale) -> tuple[Array, ...]:

@@ -362,7 +362,7 @@ def write_outputs(out: Path, found: Identified) -> None:
 def _information(
     name: str, found: Identified, inertia: Inertia, types: Sequence[ModuleType]
 ) -> RunInformation:
-    seen, fit = inertia.seen, found.kinematics.fit
+    seen, fit = inertia.instrumental, found.kinematics.fit
     # Of the scales' effects what is known beforehand is kept, which several runs share.
     effects = tuple(one[:, len(types) :] for one in inertia.effects)
     directions = error_directions(fit.covariance)

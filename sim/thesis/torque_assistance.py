@@ -131,7 +131,7 @@ def identified_model(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | 
         raise ValueError(
             f"the plan leaves out the dynamics of {robot.name}: there is nothing to calculate from"
         )
-    return Model(found.kinematics.fit.chain, found.inertia.seen.fit.phi)
+    return Model(found.kinematics.fit.chain, found.inertia.instrumental.fit.phi)
 
 
 def standing_robot(name: str, seed: int) -> Robot:

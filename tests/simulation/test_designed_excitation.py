@@ -59,7 +59,7 @@ def test_every_parameter_that_any_motion_could_tell_is_identified(found: Identif
     assert found.inertia is not None
     # Of the true chain: the first axis, which is upright, comes out askew by some 0.2 mrad, and what gravity
     # does about it then is far below the noise. Joint after joint leaves some of them open.
-    assert found.inertia.seen.fit.rank == base_parameter_count(true_chain(load_robot(ARM)))
+    assert found.inertia.instrumental.fit.rank == base_parameter_count(true_chain(load_robot(ARM)))
 
 
 def test_the_held_out_motion_of_all_joints_is_predicted(found: Identified) -> None:
@@ -72,7 +72,7 @@ def test_the_held_out_motion_of_all_joints_is_predicted(found: Identified) -> No
 
 def test_imus_explain_the_torques_better_than_encoders(found: Identified) -> None:
     assert found.inertia is not None
-    assert found.inertia.eyes == "imus"
+    assert found.inertia.motion_source == "imus"
     # White noise of 0.2 % of the largest torque is the limit: what the low-pass leaves of it.
     limit = 0.002 * np.array([t.max_effort_nm for t in build_tree(load_robot(ARM)).types])
     limit *= np.sqrt(INDEPENDENT_FRACTION)
@@ -83,7 +83,7 @@ def test_imus_explain_the_torques_better_than_encoders(found: Identified) -> Non
 
 def test_readings_lag_by_the_damping_of_the_springs_and_hold_nothing_else(found: Identified) -> None:
     assert found.inertia is not None
-    terms = found.inertia.seen.terms
+    terms = found.inertia.instrumental.terms
     lag = READING_TERMS.index("lag")
     # The last joint turns a bare output against next to nothing.
     np.testing.assert_array_equal(terms.used[:, lag], [True, True, False])

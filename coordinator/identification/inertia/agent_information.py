@@ -1,7 +1,7 @@
-"""What the agents say of their own torques, out of a recording: asked for, put together, and checked.
+"""The information that agents gathered from their own torques: request, collect and check it.
 
-A module's answer stands for the rows of its joint if it is whole, of the boot that made the rows, and
-computed with the chain and the clocks that all else is computed with. Otherwise the coordinator's rows do.
+A module's answer replaces the coordinator's rows of its joint if it is complete, of the boot that measured
+the rows, and computed with the same chain and clocks. Otherwise the coordinator's rows are used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,21 +21,21 @@ from module_agent.signals.filtering import DYNAMIC_CUTOFF_HZ, settling_samples
 from module_agent.torque_information.serialisation import chain_of, chain_part, clock_part, clocks_of, unpack
 from module_agent.wire.information_messages import MAX_MODULES, InformationRequest, RowRange, SpanPart
 
-# Of a chain and of clocks that are worked out again, on another machine for example.
+# Differences of a chain and of clocks that are computed again, for example on another machine.
 SAME_CHAIN, SAME_CLOCK_NS = 1e-9, 2.0
-# Some hundred thousand additions of doubles, and the bar. More is another computation.
+# The rounding of some hundred thousand additions of doubles. More is another computation.
 AGREES_BELOW = 1e-10
-# Beyond the rows that count by the clocks as they are mapped so far: those may turn out otherwise.
+# Rows around the motion that are kept too: the clock maps are not final yet.
 _SPARE_NS = 100_000_000
 _MARGIN_S = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
 
 
 class AgentInformation(NamedTuple):
-    """The information of n joints, and whose it is.
+    """The information of n joints, and who gathered it.
 
-    by_agents: of which serials it is the module's own. difference: the largest between what an agent and what
-    the coordinator has of a joint, relative; None without any answer. note: why some are not the agents', and
-    empty if all are or nobody was asked.
+    by_agents: serials whose information is the module's own. difference: the largest relative difference
+    between an agent's and the coordinator's information of a joint; None without any answer. note: why some
+    are not the agents'; empty if all are or no agent was asked.
     """
 
     joints: tuple[JointInformation, ...]
@@ -45,33 +45,35 @@ class AgentInformation(NamedTuple):
 
 
 def dynamic_steps(recording: Recording) -> list[JournalEvent]:
-    """Return the motions that inertia is found from: of every step the latest, as in `dynamic_motion`."""
+    """Return the motions that inertia is identified from: of every step the latest, as in
+    `dynamic_motion`.
+    """
     return list({event.step: event for event in recording.motions("dynamic")}.values())
 
 
 def rows_to_keep(recording: Recording, serials: Sequence[str], event: JournalEvent) -> tuple[RowRange, ...]:
-    """Return which rows of every module are to be kept of a motion.
+    """Return the rows of every module that agents have to keep of a motion.
 
     Raises:
         DataError: a module has no rows of it, or no round trip by which to tell when it was.
     """
     clocks = map_clocks({s: recording.modules[s].trips for s in serials})
     start_ns, end_ns = span(recording, clocks, event, _MARGIN_S)
-    found = []
+    ranges = []
     for serial in serials:
         record = recording.modules[serial]
         around = clocks[serial].module_span(start_ns - _SPARE_NS, end_ns + _SPARE_NS, STEP_NS)
         first, end = record.rows.range_between(*around)
         if first == end or record.rows.missing(first, end):
             raise DataError(f"rows of {serial} in the motion of {event.step} are missing")
-        found.append(RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end))
-    return tuple(found)
+        ranges.append(RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end))
+    return tuple(ranges)
 
 
 def question(
     recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap], sender: str
 ) -> InformationRequest:
-    """Return what every module is asked; whom, by which sequence number, and from where on is to be put in.
+    """Return the request to every module; serial, boot, sequence number and offset are to be filled in.
 
     Raises:
         DataError: there is no dynamic motion, a hole in its rows, or more than a message carries.
@@ -115,8 +117,8 @@ def gathered(
 ) -> AgentInformation:
     """Return the agents' information where they have answered, else the coordinator's `own`, joint by joint.
 
-    Own rows may have further columns than the agents', which then have nothing to say of those: they are
-    compared in the columns that both have, and the own ones are used.
+    If the coordinator's own rows have further columns than the agents', the two are compared in the columns
+    that both have, and the own rows are used.
     """
     digest, why = _asked(recording, chain, clocks)
     if digest is None:
@@ -142,25 +144,25 @@ def gathered(
 
 
 def difference(one: JointInformation, other: JointInformation) -> float:
-    """Return how different two are in the columns that both have, relative to the size of what they say.
+    """Return the relative difference of two pieces of information in the columns that both have.
 
-    What they say is R^T R, R^T z and |tau|^2; the rows themselves are up to their signs.
+    R^T R, R^T z and |tau|^2 are compared; the rows themselves are unique up to their signs only.
     """
     if one.samples != other.samples:
         return float("inf")
     both = min(one.r.shape[1], other.r.shape[1])
-    said = [
+    products = [
         (i.r[:, :both].T @ i.r[:, :both], i.r[:, :both].T @ i.z, np.array([i.z @ i.z + i.rest]))
         for i in (one, other)
     ]
     return max(
         float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), 1e-300)
-        for a, b in zip(*said, strict=True)
+        for a, b in zip(*products, strict=True)
     )
 
 
 def _asked(recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap]) -> tuple[bytes | None, str]:
-    """Return the latest question that was asked with this chain, these clocks and these motions."""
+    """Return the latest request with this chain, these clocks and these motions, or why there is none."""
     if not recording.questions:
         return None, ""
     for digest, asked in reversed(recording.questions.items()):
@@ -174,14 +176,14 @@ def _is_of(asked: InformationRequest, steps: Sequence[JournalEvent]) -> bool:
 
 
 def _is_same(asked: InformationRequest, chain: Chain, clocks: Mapping[str, ClockMap]) -> bool:
-    told = chain_of(asked.chain)
-    if told[:3] != chain[:3] or asked.cutoff_hz != DYNAMIC_CUTOFF_HZ or asked.step_ns != STEP_NS:
+    chain_asked = chain_of(asked.chain)
+    if chain_asked[:3] != chain[:3] or asked.cutoff_hz != DYNAMIC_CUTOFF_HZ or asked.step_ns != STEP_NS:
         return False
-    off = max(float(np.abs(a - b).max()) for a, b in zip(told[3:], chain[3:], strict=True))
+    off = max(float(np.abs(a - b).max()) for a, b in zip(chain_asked[3:], chain[3:], strict=True))
     ends = np.array([t for motion in asked.motions for t in (motion.start_ns, motion.end_ns)])
     late = [
         np.abs(there.to_module(ends) - clocks[serial].to_module(ends)).max()
-        for serial, there in zip(told.serials, clocks_of(asked.clocks), strict=True)
+        for serial, there in zip(chain_asked.serials, clocks_of(asked.clocks), strict=True)
     ]
     return off <= SAME_CHAIN and float(max(late)) <= SAME_CLOCK_NS
 

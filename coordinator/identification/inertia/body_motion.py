@@ -1,8 +1,8 @@
-"""What the bodies of a robot do while joints move, as far as IMUs and the structure's springs tell.
+"""The motion of a robot's bodies from encoders, link compliance and IMUs.
 
-Encoders see the joints alone, and their second derivative is noise for the most part where links are long.
-The IMU of the first module sees the base; the links turn under what they carry as the refinement has found;
-and what every other IMU reads beyond that is its body's own.
+Encoders measure the joints alone, and where links are long their second derivative is mostly noise. The IMU
+of the first module measures the base; the links turn under their load by the refined compliance; and the
+residual of every other IMU is a motion of its own body.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,14 @@ from module_agent.signals.filtering import differentiate, filtered_signals
 
 MotionSource = Literal["encoders", "structure", "imus"]
 
-# What gives is a load itself: the second round changes the turns by a percent.
+# A link that gives changes the loads itself: the second round changes the turns by a percent.
 _ROUNDS = 2
 
 
 class Readings(NamedTuple):
-    """One stretch of time, all through the same low-pass; joints (m, n), and IMUs (m, n, 3).
+    """One stretch of time through a single low-pass: joints (m, n), and IMUs (m, n, 3).
 
-    The IMUs' known errors and delays are taken off.
+    The IMUs are corrected for their estimated errors and delays.
     """
 
     q_rad: Array
@@ -48,15 +48,15 @@ class Readings(NamedTuple):
 
 
 def readings(one: Window, refined: Refinement, cutoff_hz: float) -> Readings:
-    """Filter a window as `filtering.filtered_motion` does, and correct its IMUs by what they err."""
+    """Filter a window as `filtered_motion` does, and correct its IMUs for their estimated errors."""
     others = [one.gyro_rad_s, one.accel_m_s2]
     q, qd, qdd, (gyro, accel), kept = filtered_signals(one.q_rad, others, RATE_HZ, cutoff_hz)
     imus = refined.intrinsics
     late_s = (refined.late_s + imus.errors[:, DELAY])[:, None]
     gyro, accel = (signal + late_s * differentiate(signal, RATE_HZ) for signal in (gyro, accel))
     force = _undone(imus.accel_matrix, accel - imus.accel_bias_m_s2)
-    felt = np.einsum("nij,mnj->mni", imus.g_sensitivity_s_m, force)
-    rate = _undone(imus.gyro_matrix, gyro - imus.gyro_bias_rad_s - felt)
+    from_acceleration = np.einsum("nij,mnj->mni", imus.g_sensitivity_s_m, force)
+    rate = _undone(imus.gyro_matrix, gyro - imus.gyro_bias_rad_s - from_acceleration)
     return Readings(*(signal[kept] for signal in (q, qd, qdd, rate, force)))
 
 
@@ -65,29 +65,29 @@ def body_motion_tracks(
     kinds: Sequence[ModuleType],
     refined: Refinement,
     floor: NoiseFloor | None,
-    seen: Readings,
+    measured: Readings,
     imus: bool,
 ) -> list[BodyTrack]:
-    """Return how all bodies moved.
+    """Return the motion of all bodies.
 
     Args:
         chain: n joints. kinds: their modules' types.
-        refined: what the refinement of this robot has found of links, hinges and IMUs.
-        floor: noise of the IMU that rides on the base; None if none does.
-        seen: one stretch of time without a gap.
-        imus: whether what the IMUs read beyond base and links is taken too.
+        refined: the refinement of this robot: links, hinges and IMUs.
+        floor: noise of the IMU on the base; None without one.
+        measured: one stretch of time without a gap.
+        imus: whether the residuals of the IMUs are used too.
     """
-    joints = seen.q_rad, seen.qd_rad_s, seen.qdd_rad_s2
-    base = None if floor is None else _base(seen, floor)
+    joints = measured.q_rad, measured.qd_rad_s, measured.qdd_rad_s2
+    base = None if floor is None else _base(measured, floor)
     turns = _turns(chain, kinds, refined, joints, base)
     bodies = body_motions(chain, *joints, base, turns)
-    tracks = body_tracks(chain, seen.q_rad, bodies, turns)
+    tracks = body_tracks(chain, measured.q_rad, bodies, turns)
     if not imus:
         return tracks
     return [
         track
         if (rider := _rider(chain, i)) is None
-        else _corrected(chain=chain, bodies=bodies, turns=turns, seen=seen, track=track, rider=rider)
+        else _corrected(chain=chain, bodies=bodies, turns=turns, measured=measured, track=track, rider=rider)
         for i, track in enumerate(tracks)
     ]
 
@@ -96,9 +96,9 @@ def _undone(matrix: Array, read: Array) -> Array:
     return np.asarray(np.einsum("nij,mnj->mni", np.linalg.inv(matrix), read))
 
 
-def _base(seen: Readings, floor: NoiseFloor) -> BaseMotion:
-    omega = outstanding(seen.gyro_rad_s[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
-    force = outstanding(seen.accel_m_s2[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
+def _base(measured: Readings, floor: NoiseFloor) -> BaseMotion:
+    omega = outstanding(measured.gyro_rad_s[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
+    force = outstanding(measured.accel_m_s2[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
     return BaseMotion(omega, differentiate(omega, RATE_HZ), force)
 
 
@@ -109,7 +109,7 @@ def _turns(
     joints: tuple[Array, Array, Array],
     base: BaseMotion | None,
 ) -> LinkTurns:
-    """Return how links turn; without any if the refinement has not looked for what gives."""
+    """Return how links turn; none if the refinement did not estimate compliance."""
     links = list(chain.linked)
     turns: LinkTurns = {}
     if len(refined.compliance) != 5 * len(links):
@@ -125,7 +125,7 @@ def _turns(
 
 
 def _rider(chain: Chain, body: int) -> int | None:
-    """Return the module whose IMU rides on a body, None if none does."""
+    """Return the module whose IMU is on a body, None if there is none."""
     return next((k for k in range(len(chain.serials)) if chain.carrier(k) == body), None)
 
 
@@ -133,17 +133,17 @@ def _corrected(
     chain: Chain,
     bodies: Sequence[BodyMotion],
     turns: LinkTurns,
-    seen: Readings,
+    measured: Readings,
     track: BodyTrack,
     rider: int,
 ) -> BodyTrack:
-    """Return a track with what an IMU on the body reads beyond it; means are the IMU's, not the body's."""
+    """Return a track corrected by the residual of an IMU on the body; its mean is a bias of the IMU."""
     expected = bodies[chain.carrier(rider)]
     if not chain.reversed[rider]:
         expected = given(expected, turns.get(rider, ()))
     turn, place = chain.imu_home[rider, :3, :3], chain.imu_home[rider, :3, 3, None]
-    rate = seen.gyro_rad_s[:, rider] - expected.omega.T @ turn
-    force = seen.accel_m_s2[:, rider] - acceleration_at(expected, place).T @ turn
+    rate = measured.gyro_rad_s[:, rider] - expected.omega.T @ turn
+    force = measured.accel_m_s2[:, rider] - acceleration_at(expected, place).T @ turn
     rate, force = rate - rate.mean(axis=0), force - force.mean(axis=0)
     motion = track.motion
     omega = motion.omega + turn @ rate.T

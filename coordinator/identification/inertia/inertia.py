@@ -1,7 +1,8 @@
-"""The inertial parameters from a recording, with as much of the robot's motion as anybody has seen.
+"""Identify the inertial parameters from a recording, with the motion source that explains the torques best.
 
-Three ways to see the motion are tried: by encoders on a rigid chain at rest, with the base and the links that
-give, and with what every IMU reads beyond that. Whichever leaves the least in the torques is used.
+There are three motion sources: encoders with a rigid chain on a fixed base; additionally the motion of the
+base and the compliance of the links; additionally the residual of every IMU. The one with the smallest torque
+residual is used.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -46,10 +47,10 @@ MOTION_SOURCES: tuple[MotionSource, ...] = get_args(MotionSource)
 # Of the torques' noise, in the mean over the joints: less is chance.
 BETTER_BY = 0.01
 
-_SEEN_BY: dict[MotionSource, str] = {
-    "encoders": "encoders",
-    "structure": "encoders, base and springs of the links",
-    "imus": "IMUs",
+_SOURCE_NAMES: dict[MotionSource, str] = {
+    "encoders": "the encoders",
+    "structure": "encoders, base motion and link compliance",
+    "imus": "encoders, base motion, link compliance and IMUs",
 }
 _NAMES: dict[Term, str] = {
     "lag": "a lag",
@@ -68,11 +69,11 @@ Agents = Callable[[tuple[JointInformation, ...]], AgentInformation]
 
 
 class Robot(NamedTuple):
-    """What is known of a robot when its inertia is asked for.
+    """The robot whose inertia is to be identified.
 
-    chain: n joints. kinds: (n,) their modules' types. refined: what the refinement has found of links and
-    IMUs. covariance: (6 n, 6 n) of the chain's increments. floor: noise of the IMU that rides on the base at
-    rest, None if none does. torque: how well the torque sensors are known.
+    chain: n joints. kinds: (n,) their modules' types. refined: the refinement of links and IMUs. covariance:
+    (6 n, 6 n) of the chain's perturbation. floor: noise at rest of the IMU on the base, None without one.
+    torque: whether the torque sensors are calibrated.
     """
 
     chain: Chain
@@ -86,79 +87,82 @@ class Robot(NamedTuple):
 class Inertia(NamedTuple):
     """Inertial parameters of n bodies.
 
-    seen: parameters, terms and information, of the way of seeing that was best, `eyes`.
-    noise_nm: (n,) of every way, what it leaves in the torques. effects: (k_i, j) of every joint: what errors
-    of the torques' scale, of the chain, and of offsets do to its rows of `seen.information`. gathered: whose
-    the information from encoders is, None if no agent can have been asked.
+    instrumental: parameters, terms and information with the best motion source, `motion_source`.
+    noise_nm: (n,) torque residual with every motion source. effects: (k_i, j) of every joint: the effects of
+    errors of the torques' scale, of the chain, and of offsets on its rows of `instrumental.information`.
+    gathered: by whom the information from encoders was gathered, None if no agent can have been asked.
     """
 
-    seen: InstrumentalFit
-    eyes: MotionSource
+    instrumental: InstrumentalFit
+    motion_source: MotionSource
     noise_nm: Mapping[MotionSource, Array]
     effects: tuple[Array, ...]
     gathered: AgentInformation | None = None
 
     def summary(self) -> list[str]:
-        """Return in lines to read what the motion was seen by, and what torque readings hold besides."""
-        fit, terms = self.seen.fit, self.seen.terms
+        """Return lines about the torque residual, the motion source and the terms of the torque readings."""
+        fit, terms = self.instrumental.fit, self.instrumental.terms
         noise = ", ".join(f"{1e3 * value:.1f}" for value in fit.torque_sigma_nm)
-        lines = [f"torques are explained to {noise} mNm, with motion as seen by {_SEEN_BY[self.eyes]}"]
-        if self.eyes != "encoders":
-            lines[0] += f"; encoders alone leave {self.gain:.2f} times as much"
+        lines = [f"torque residual {noise} mNm, motion measured by {_SOURCE_NAMES[self.motion_source]}"]
+        if self.motion_source != "encoders":
+            lines[0] += f"; with encoders alone it is {self.gain:.2f} times as large"
         for k, term in enumerate(READING_TERMS):
             used = terms.used[:, k]
             if used.any():
                 unit, size = _SHOWN[term]
                 values = ", ".join(f"{size * value:.3g}" for value in terms.value[used, k])
                 lines.append(
-                    f"torque readings of {int(used.sum())} joints hold {_NAMES[term]}: {values} {unit}"
+                    f"torque readings of {int(used.sum())} joints have {_NAMES[term]}: {values} {unit}"
                 )
         return lines
 
     @property
     def gain(self) -> float:
-        """By how much the torques' noise is smaller than with encoders alone, in the mean over the joints."""
-        return float(np.exp(_level(self.noise_nm["encoders"]) - _level(self.noise_nm[self.eyes])))
+        """The torque residual with encoders alone over that with the best source, mean over the joints."""
+        return float(np.exp(_level(self.noise_nm["encoders"]) - _level(self.noise_nm[self.motion_source])))
 
 
 def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None = None) -> Inertia:
-    """Find the inertial parameters from windows of motion.
+    """Identify the inertial parameters from windows of motion.
 
-    `agents` puts what the modules have gathered in the place of the coordinator's rows from encoders; what
-    was seen beyond those the coordinator takes off.
+    Args:
+        robot: chain, types and refinement.
+        windows: stretches of motion without a gap.
+        agents: replaces the coordinator's rows from encoders by those that the modules have gathered; the
+            effects of the other motion sources are subtracted by the coordinator.
 
     Raises:
-        ValueError: too few samples, or motions that say nothing of inertia.
+        DataError: too few samples, or motions that do not determine any inertia.
     """
     pieces = [_information(robot, one) for one in windows]
     prior = np.concatenate([parameters(one) for one in module_prior(robot.chain, robot.kinds)])
-    found: dict[MotionSource, InstrumentalFit] = {}
+    fits: dict[MotionSource, InstrumentalFit] = {}
     shared: AgentInformation | None = None
     gathered: tuple[JointInformation, ...] = ()
-    for eyes in MOTION_SOURCES:
-        total = pieces[0][eyes]
+    for source in MOTION_SOURCES:
+        total = pieces[0][source]
         for piece in pieces[1:]:
-            total = merge(total, piece[eyes])
-        if eyes == "encoders":
+            total = merge(total, piece[source])
+        if source == "encoders":
             shared = agents(total) if agents is not None else None
             gathered = total = shared.joints if shared is not None else total
-        found[eyes] = solve_instrumental_variables(
+        fits[source] = solve_instrumental_variables(
             total, prior, INDEPENDENT_FRACTION, SCALE_SIGMA[robot.torque]
         )
-    noise = {eyes: fit.fit.torque_sigma_nm for eyes, fit in found.items()}
+    noise = {source: fit.fit.torque_sigma_nm for source, fit in fits.items()}
     best: MotionSource = "encoders"
-    for eyes in MOTION_SOURCES[1:]:
-        if _level(noise[eyes]) < _level(noise[best]) - BETTER_BY:
-            best = eyes
-    seen, effects = _considered(robot, windows, gathered, found[best], best)
-    return Inertia(seen, best, noise, effects, shared)
+    for source in MOTION_SOURCES[1:]:
+        if _level(noise[source]) < _level(noise[best]) - BETTER_BY:
+            best = source
+    chosen, effects = _considered(robot, windows, gathered, fits[best], best)
+    return Inertia(chosen, best, noise, effects, shared)
 
 
-def without_terms(one: Window, seen: InstrumentalFit) -> JointMotion:
-    """Return the motion of a window as encoders see it, with the torque of the bodies alone."""
+def without_terms(one: Window, fit: InstrumentalFit) -> JointMotion:
+    """Return the motion of a window by encoders, with the terms of the readings taken off the torques."""
     motion = filtered_window(one)
     columns = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
-    torque = (1.0 + seen.scale.value) * motion.tau_nm - np.einsum("mnk,nk->mn", columns, seen.terms.value)
+    torque = (1.0 + fit.scale.value) * motion.tau_nm - np.einsum("mnk,nk->mn", columns, fit.terms.value)
     torque.flags.writeable = False
     return motion._replace(tau_nm=torque)
 
@@ -167,74 +171,73 @@ def _information(robot: Robot, one: Window) -> dict[MotionSource, tuple[JointInf
     motion = filtered_window(one)
     rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     terms = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
-    found: dict[MotionSource, tuple[JointInformation, ...]] = {
+    information: dict[MotionSource, tuple[JointInformation, ...]] = {
         "encoders": compress(np.concatenate([rigid, terms], axis=2), motion.tau_nm)
     }
-    seen = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
-    for eyes in MOTION_SOURCES[1:]:
-        apart = _regressor(robot, seen, eyes) - rigid
-        found[eyes] = compress(np.concatenate([rigid, terms, apart], axis=2), motion.tau_nm)
-    return found
+    read = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
+    for source in MOTION_SOURCES[1:]:
+        apart = _regressor(robot, read, source) - rigid
+        information[source] = compress(np.concatenate([rigid, terms, apart], axis=2), motion.tau_nm)
+    return information
 
 
 def _considered(
     robot: Robot,
     windows: Sequence[Window],
     gathered: Sequence[JointInformation],
-    seen: InstrumentalFit,
-    eyes: MotionSource,
+    fit: InstrumentalFit,
+    source: MotionSource,
 ) -> tuple[InstrumentalFit, tuple[Array, ...]]:
-    """Return the fit with the rows gathered from encoders, and what errors of chain and scale do to them.
+    """Return the fit with the rows gathered from encoders, and the effects of errors of chain and scale.
 
-    What was seen beyond encoders is taken off the torques: of the rows, its projection onto them.
+    The torque of the motion that encoders do not measure is subtracted from the torques, as far as it is in
+    the range of the rows.
     """
-    size = seen.informed_phi.size
-    offsets_nm = _offsets_nm(robot, seen)
-    beside = [
-        ProjectedRows(scaled(piece, one)) for piece, one in zip(gathered, seen.scale.value, strict=True)
-    ]
+    size = fit.informed_phi.size
+    offsets_nm = _offsets_nm(robot, fit)
+    joints = [ProjectedRows(scaled(piece, one)) for piece, one in zip(gathered, fit.scale.value, strict=True)]
     for one in windows:
         motion = filtered_window(one)
         rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
         rows = np.concatenate([rigid, term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)], axis=2)
-        effects = chain_effects(robot.chain, robot.covariance, seen.informed_phi, motion)
+        effects = chain_effects(robot.chain, robot.covariance, fit.informed_phi, motion)
         omitted = np.broadcast_to(np.diag(offsets_nm), (len(motion.t_ns), *np.diag(offsets_nm).shape))
         effects = np.concatenate([effects, omitted], axis=2)
         departure = np.zeros_like(motion.tau_nm)
-        if eyes != "encoders":
-            apart = _regressor(robot, readings(one, robot.refined, DYNAMIC_CUTOFF_HZ), eyes) - rigid
-            departure = apart @ seen.informed_phi
-        torque = (1.0 + seen.scale.value) * motion.tau_nm
-        for i, joint in enumerate(beside):
+        if source != "encoders":
+            apart = _regressor(robot, readings(one, robot.refined, DYNAMIC_CUTOFF_HZ), source) - rigid
+            departure = apart @ fit.informed_phi
+        torque = (1.0 + fit.scale.value) * motion.tau_nm
+        for i, joint in enumerate(joints):
             joint.add(rows[:, i], torque[:, i], departure[:, i], effects[:, i])
     left = [
-        without_used(joint.rows(), size, used) for joint, used in zip(beside, seen.terms.used, strict=True)
+        without_used(joint.rows(), size, used) for joint, used in zip(joints, fit.terms.used, strict=True)
     ]
     bodies = tuple(piece._replace(r=piece.r[:, :size]) for piece in left)
-    scale = scale_effects(bodies, seen.scale)
+    scale = scale_effects(bodies, fit.scale)
     chain = [piece.r[:, size:] for piece in left]
-    return seen._replace(information=bodies), tuple(map(np.hstack, zip(scale, chain, strict=True)))
+    return fit._replace(information=bodies), tuple(map(np.hstack, zip(scale, chain, strict=True)))
 
 
-def _offsets_nm(robot: Robot, seen: InstrumentalFit) -> Array:
-    """Return by how much (n,) the offsets may be off that are taken for none [Nm]."""
+def _offsets_nm(robot: Robot, fit: InstrumentalFit) -> Array:
+    """Return the standard deviation (n,) of the offsets that are not among the used terms [Nm]."""
     offset = READING_TERMS.index("offset")
     largest = np.array([kind.max_effort_nm for kind in robot.kinds])
     likely = OFFSET_SHARE[robot.torque] * largest
-    told = seen.terms.spread[:, offset]
+    by_torques = fit.terms.spread[:, offset]
     with np.errstate(divide="ignore"):
-        either = 1.0 / np.sqrt(likely**-2.0 + told**-2.0)
-    return np.where(seen.terms.used[:, offset] | (likely == 0.0), 0.0, either)
+        either = 1.0 / np.sqrt(likely**-2.0 + by_torques**-2.0)
+    return np.where(fit.terms.used[:, offset] | (likely == 0.0), 0.0, either)
 
 
-def _regressor(robot: Robot, seen: Readings, eyes: MotionSource) -> Array:
+def _regressor(robot: Robot, seen: Readings, source: MotionSource) -> Array:
     tracks = body_motion_tracks(
         chain=robot.chain,
         kinds=robot.kinds,
         refined=robot.refined,
         floor=robot.floor,
-        seen=seen,
-        imus=eyes == "imus",
+        measured=seen,
+        imus=source == "imus",
     )
     return track_regressor(tracks)
 

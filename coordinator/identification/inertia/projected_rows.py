@@ -1,7 +1,7 @@
-"""Signals put beside rows that somebody else has gathered: as if they had been columns from the first.
+"""Append signals as columns to rows that an agent has already gathered.
 
-Of the rows A of a joint and its torques only the factor R of A = Q R is known, and z = Q^T tau. What another
-signal c of the same samples is in those rows, Q^T c, solves R^T x = A^T c.
+Of the rows A of a joint and its torques only the factor R of A = Q R and z = Q^T tau are known. The
+projection Q^T c of another signal c of the same samples solves R^T x = A^T c.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
 
-# Directions that the rows hold no more of than that are rounding; no fit uses them.
+# Directions with a smaller share of the rows are rounding; no fit uses them.
 _ROUNDING = 1e-10
 
 
@@ -28,16 +28,16 @@ class ProjectedRows:
         Args:
             rows: (m, p), those of which `gathered` is the factor.
             torque_nm: (m,) gathered with them.
-            departure_nm: (m,) what is to be taken off the torques.
-            effects_nm: (m, k) what is to stand beside the rows.
+            departure_nm: (m,) to be subtracted from the torques.
+            effects_nm: (m, k) to be appended to the rows.
         """
         self._departure = self._departure + rows.T @ departure_nm
-        found = rows.T @ effects_nm
-        self._effects = found if self._effects is None else self._effects + found
+        products = rows.T @ effects_nm
+        self._effects = products if self._effects is None else self._effects + products
         self._shared += float(departure_nm @ (departure_nm - 2.0 * torque_nm))
 
     def rows(self) -> JointInformation:
-        """Return the information in p + k columns, of the torques without what was to be taken off."""
+        """Return the information in p + k columns, of the torques less the departures."""
         r, z = self._gathered.r, self._gathered.z
         effects = np.zeros((r.shape[1], 0)) if self._effects is None else self._effects
         beside = self._projected(np.column_stack([self._departure, effects]))
@@ -49,10 +49,10 @@ class ProjectedRows:
 
     def _projected(self, products: Array) -> Array:
         """Return the smallest x with R^T x = products."""
-        # Columns of one size, so that what is small is small.
+        # Columns of one size, so that the singular values compare.
         size = np.linalg.norm(self._gathered.r, axis=0)
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
         left, values, right = np.linalg.svd(self._gathered.r * scale, full_matrices=False)
         kept = values > _ROUNDING * values[0]
-        told = right[kept] @ (scale[:, None] * products) / values[kept, None]
-        return np.asarray(left[:, kept] @ told)
+        solution = right[kept] @ (scale[:, None] * products) / values[kept, None]
+        return np.asarray(left[:, kept] @ solution)

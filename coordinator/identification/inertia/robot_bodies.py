@@ -1,8 +1,8 @@
-"""What torques and modules' make say together of a robot's bodies: real ones, and what is known of each.
+"""A robot's bodies from torques and the catalogue: physically consistent, with their identifiability.
 
-Base parameters and verdicts are from torques alone; the bodies explain the torques as well, and have the
-modules' known make where torques are silent. Parameters are worded in `joint_frames`, where they lump least;
-the bodies are in the links' frames of `urdf`.
+Base parameters and identifiability come from the torques alone. The bodies explain the torques too, and are
+those of the catalogue where torques do not determine them. Parameters are those of `joint_frames`, in which
+combinations are short; the bodies are in the frames of the URDF's links.
 """
 
 from collections.abc import Sequence
@@ -45,9 +45,9 @@ _MIN_SIGMA_NM = 1e-9
 class RobotBodies(NamedTuple):
     """The bodies of a robot of n joints.
 
-    frames: (n, 4, 4) of the words, in the root frame at q = 0. base: the base parameters. verdicts: (10 n,)
-    of every parameter. fit: the real bodies, None if none were found. bodies: (n,) the same as masses, in the
-    links' frames; empty if none were found. note: why.
+    frames: (n, 4, 4) frames of the parameters, in the root frame at q = 0. base: the base parameters.
+    identifiabilities: (10 n,) of every parameter. fit: the physically consistent bodies, None if the solver
+    did not converge. bodies: (n,) the same in the links' frames; empty without. note: why.
     held_out_error: relative torque error of `fit` on motions that were not fitted, None without any.
     """
 
@@ -61,7 +61,7 @@ class RobotBodies(NamedTuple):
     held_out_error: float | None = None
 
     def summary(self) -> list[str]:
-        """Return what is known in lines to read: the sums, then body by body."""
+        """Return lines about the base parameters and the identifiability of each body's parameters."""
         lines = [base_summary(self.base)]
         for i, serial in enumerate(self.serials):
             own = self.identifiabilities[PER_BODY * i : PER_BODY * (i + 1)]
@@ -77,14 +77,14 @@ def robot_bodies(
     independent_fraction: float,
     effects: Sequence[Array] | None = None,
 ) -> RobotBodies:
-    """Return the bodies that a robot's joints turn.
+    """Return the bodies that a robot's joints move.
 
     Args:
         information: per joint of n.
         chain, types: of the same n.
         least_squares: its noise weighs the joints.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
-        effects: (k_i, j) of every joint: what errors that come as a whole do to its rows (`common_errors`).
+        effects: (k_i, j) of every joint: effects of systematic errors on its rows (`systematic_errors`).
 
     Raises:
         ValueError: shapes that do not fit, or torques that say nothing.
@@ -113,27 +113,27 @@ def robot_bodies(
             effects=effects,
         )
     except NotSolvedError as error:
-        note = f"{error}; the bodies in the files are the nearest real ones to least squares' parameters"
+        note = f"{error}; the files have the consistent bodies nearest to the least-squares parameters"
     if fit is None:
-        judged = identifiabilities(base, inertial_units(joints))
+        results = identifiabilities(base, inertial_units(joints))
         return RobotBodies(
             serials=chain.serials,
             frames=frames,
             base=base,
-            identifiabilities=judged,
+            identifiabilities=results,
             fit=None,
             bodies=(),
             note=note,
         )
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
     informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
-    judged = identifiabilities(base, inertial_units(joints), into @ fit.phi, informed_sigma)
+    results = identifiabilities(base, inertial_units(joints), into @ fit.phi, informed_sigma)
     bodies = bodies_in_frames(fit.pseudo, link_homes(chain))
     return RobotBodies(
         serials=chain.serials,
         frames=frames,
         base=base,
-        identifiabilities=judged,
+        identifiabilities=results,
         fit=fit,
         bodies=bodies,
         note=note,

@@ -147,7 +147,7 @@ def _compared(
     torque = _true_torque(motion, found, recorded.truth)
     joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
     estimated = kinematics.fit.chain
-    seen = inertia.seen
+    seen = inertia.instrumental
     real = bodies.fit.phi if bodies.fit is not None else np.full_like(seen.fit.phi, np.nan)
     return trial._replace(
         rank=base.rank,
@@ -162,7 +162,7 @@ def _compared(
         bodies=_relative(inverse_dynamics(estimated, real, *joints), torque),
         poses=poses,
         not_definite=_not_definite(estimated, real, poses, trial.seed),
-        motion_source=inertia.eyes,
+        motion_source=inertia.motion_source,
         gain=inertia.gain,
         robot_time_s=found.result.robot_time_s,
     )
@@ -193,7 +193,7 @@ def _by_true_chain(
         recording.torque,
     )
     inertia = find_inertia(robot, dynamic_windows(recording, kinematics.clocks, serials, "dynamic"))
-    return inverse_dynamics(chain, inertia.seen.fit.phi, *joints)
+    return inverse_dynamics(chain, inertia.instrumental.fit.phi, *joints)
 
 
 def _thesis(found: Identified, recorded: _Recorded, joints: tuple[Array, Array, Array]) -> Array:

@@ -208,7 +208,7 @@ def test_a_prior_is_weakened_until_it_costs_little() -> None:
     # It takes the robot for one of paper: every gram more is dear.
     arm = Case(robot_named("arm6"), 0.1, 2)
     light = 1e-3 * np.asarray(arm.prior)
-    free = fit_physical(arm.information, light, arm.least_squares, most_cost=1.0)
+    free = fit_physical(arm.information, light, arm.least_squares, max_cost=1.0)
     held = fit_physical(arm.information, light, arm.least_squares)
     assert free.weight == WEIGHTS[0]
     assert free.cost > 5e-4

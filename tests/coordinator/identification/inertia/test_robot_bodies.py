@@ -86,7 +86,7 @@ def test_without_real_bodies_the_rest_is_said_all_the_same(monkeypatch: pytest.M
     one = made()
     assert one.fit is None
     assert one.bodies == ()
-    assert one.note.startswith("no real bodies were found; the bodies in the files are the nearest real ones")
+    assert one.note.startswith("no real bodies were found; the files have the consistent bodies nearest")
     assert one.base.rank == 22
     # Nothing is settled by a prior that was not used.
     assert all(
