@@ -1,4 +1,4 @@
-"""Network namespaces of Linux: a network of its own for some processes, and the way into it for packets."""
+"""Linux network namespaces: a separate network for some processes, and an interface to its packets."""
 
 import ctypes
 import fcntl
@@ -59,7 +59,7 @@ class NetworkNamespace:
 
     @property
     def path(self) -> Path:
-        """The file that stands for the namespace."""
+        """The path of the namespace, as `nsenter` takes it."""
         return Path(f"/proc/{self._holder.pid}/ns/net")
 
     @property
@@ -106,7 +106,7 @@ def open_tun(namespace: Path, address: IPv4Interface) -> int:
     Raises:
         NamespaceError: the machine does not allow it.
     """
-    # A thread of its own, as a thread that has entered a namespace would have to find its way back.
+    # In another thread, because a thread that has entered a namespace would have to return from it.
     opened: list[int | OSError] = []
     thread = threading.Thread(target=lambda: opened.append(_tun_within(namespace)))
     thread.start()

@@ -39,10 +39,10 @@ class _Link:
 class PacketSwitch:
     """Takes packets from hosts and forwards them at the times that the profile gives.
 
-    The first host is the coordinator's, the others are modules'. Every direction between two hosts is a link
-    of its own, with the profile's path to its receiver and draws of its own: a radio of every module. Packets
-    of a link keep their order but for the fraction `reorder`. In the profile's partitions nothing passes to
-    or from the coordinator.
+    The first host is the coordinator's, the others are modules'. Every direction between two hosts is a
+    separate link, with the profile's path to its receiver and separate draws, as if every module had a radio.
+    Packets of a link keep their order but for the fraction `reorder`. In the profile's partitions nothing
+    passes to or from the coordinator.
     Packets with another destination are dropped without a count, as are those that are not IPv4.
     """
 

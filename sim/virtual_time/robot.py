@@ -59,7 +59,7 @@ class _Wires:
 class VirtualRobot:
     """Ticks the world and all agents once a virtual millisecond.
 
-    Every agent has its own endpoint on the network, impaired by its own draws, as a process of its own has.
+    Every agent has its own endpoint on the network, impaired by separate draws, like an agent process.
     `pwm` is what the motors get in the next tick; `watchers` are called at the end of every tick.
 
     Args:
@@ -119,7 +119,7 @@ class VirtualRobot:
         )
 
     def boot(self, serial: str, **firmware: Any) -> None:
-        """Start the agent of a module, under a boot id of its own; `firmware` are settings of it alone."""
+        """Start the agent of a module under a new boot id; `firmware` are settings of this module alone."""
         modules = self._loops[serial] = LoopInside(_Wires(self, self.serials.index(serial)))
         config = config_of(modules.information[0], next(self._boot_ids), **self._firmware)
         self.hosts[serial] = AgentHost(

@@ -1,4 +1,4 @@
-"""A motion may bring the efforts that it is fed forward; the module plays them by its own clock."""
+"""A motion follows the module's clock, whatever the ticks; it may bring efforts that are fed forward."""
 
 from typing import Any
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from module_agent.control.gains import catalogue_limits
-from module_agent.control.motion import MAX_SAMPLES, effort_at, effort_profile, profile_period_ns
+from module_agent.control.motion import MAX_SAMPLES, Motion, effort_at, effort_profile, profile_period_ns
+from module_agent.control.waveform import waveform
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Incoming, Publication
 from module_agent.hardware.hardware import SensorSample
@@ -16,6 +17,7 @@ from module_agent.wire.feedback_rows import unpack
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
     Ack,
+    ConstantMotion,
     EffortProfile,
     Feedback,
     LeaseRequest,
@@ -124,6 +126,21 @@ def test_efforts_that_are_no_numbers_are_refused_and_nothing_moves(
     ack = module.move(EffortProfile(period_ns=10 * MS, samples=samples))
     assert (ack.accepted, ack.reason, ack.detail) == (False, reason.value, detail)
     assert module.firmware.state == "armed"
+
+
+@pytest.mark.parametrize("tick_ns", [1 * MS, 4 * MS, 2_700_001])
+def test_a_motion_follows_time_and_not_a_count_of_ticks(tick_ns: int) -> None:
+    pattern, start_ns = ConstantMotion(velocity_rad_s=1.5, duration_s=0.4, ramp_s=0.1), 123
+    motion = Motion(pattern, 0.3, start_ns)
+    end_ns = start_ns + 600 * MS
+    for now_ns in range(start_ns, end_ns, tick_ns):
+        command = motion.command(now_ns)
+        assert command is not None
+        exact = 0.3 + waveform(pattern, 0.3, np.array([1e-9 * (now_ns - start_ns)])).offset_rad[0]
+        # Samples are 1 ms apart, each of which holds until the next.
+        assert 0.0 <= exact - command.position_rad < 1.5e-3 + 1e-12
+        assert np.isnan(command.effort_nm)
+    assert motion.command(end_ns) is None
 
 
 @pytest.mark.parametrize("total_s", [0.2, 5.6, 7.99, 8.0, 60.0])
