@@ -24,9 +24,10 @@ from coordinator.identification.robot_refinement import refine_robot
 from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import assemble
-from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
+from coordinator.kinematics.chain_observations import PairObservation, circle_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circle_observations
+from coordinator.recording.at_rest import rest_observation
 from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
@@ -41,7 +42,6 @@ from coordinator.synchronisation.motion_windows import (
 )
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import Topology
-from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.files import replacing
@@ -52,6 +52,7 @@ from module_agent.wire.messages import Estimate
 
 # Of some 30 errors an IMU the largest is below this in 99 of 100.
 STRANGE_ABOVE = 3.5
+MIN_REST_ROWS = 10
 
 
 def identify(
@@ -70,9 +71,9 @@ def identify(
         kinematics = identify_kinematics(recording)
         kinematics = revise(kinematics) if revise is not None else kinematics
     inertia, bodies, held_out = None, None, None
-    if _motions(recording, "dynamic"):
+    if recording.latest_motions("dynamic"):
         chain, serials = kinematics.fit.chain, kinematics.topology.serials
-        types = [recorded_type(recording, s) for s in serials]
+        types = [recording.module_type(s) for s in serials]
         floor = base_floor(recording, kinematics.clocks, kinematics.topology)
         covariance = kinematics.fit.covariance
         robot = Robot(chain, types, kinematics.refinement, covariance, floor, recording.torque)
@@ -81,7 +82,7 @@ def identify(
         inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
         seen = inertia.instrumental
         bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION, inertia.effects)
-        if _motions(recording, "held_out"):
+        if recording.latest_motions("held_out"):
             means = joined_motions([without_terms(one, seen) for one in windows]).tau_nm.mean(axis=0)
             windows = dynamic_windows(recording, kinematics.clocks, serials, "held_out")
             motion = joined_motions([without_terms(one, seen) for one in windows])
@@ -105,13 +106,13 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         clocks = map_clocks({s: recording.modules[s].trips for s in serials})
         found = search_topology(recording, serials)
         topology = found.topology
-        types = [recorded_type(recording, s) for s in topology.serials]
+        types = [recording.module_type(s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
         first = assemble(
             topology,
             types,
             _pairs(recording, clocks, topology.serials, windows),
-            [_rest(recording, topology.serials)],
+            [rest_observation(recording, topology.serials, MIN_REST_ROWS)],
         )
         clocks |= refine_clocks(first.chain, clocks, windows).clocks
         windows = _exploration(recording, clocks, topology.serials)
@@ -152,17 +153,9 @@ def _settled(refined: Refinement, reference: Chain) -> Refinement:
     )
 
 
-def _motions(recording: Recording, *purposes: Purpose) -> list[JournalEvent]:
-    """Return the last motion of every purpose of every joint, in the order of the journal."""
-    latest: dict[tuple[str, str], JournalEvent] = {}
-    for event in recording.motions(*purposes):
-        latest[event.serial, event.purpose] = event
-    return list(latest.values())
-
-
 def _explored(recording: Recording) -> list[str]:
-    rested = sorted({e.serial for e in _motions(recording, "rest")})
-    explored = {e.serial for e in _motions(recording, "windowed_sine", "whole")}
+    rested = sorted({e.serial for e in recording.latest_motions("rest")})
+    explored = {e.serial for e in recording.latest_motions("windowed_sine", "whole")}
     missing = [s for s in rested if s not in explored and s not in excluded_modules(recording.journal)]
     if not rested or missing:
         raise IdentificationError(
@@ -171,21 +164,9 @@ def _explored(recording: Recording) -> list[str]:
     return rested
 
 
-def recorded_type(recording: Recording, serial: str) -> ModuleType:
-    """Return a module's type, as it has told it.
-
-    Raises:
-        IdentificationError: it has not.
-    """
-    info = recording.modules[serial].info
-    if info is None:
-        raise IdentificationError(f"module {serial} has not told its type")
-    return module_type(info.module_type)
-
-
 def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose) -> Estimate | None:
     """Return what `observer` made of the latest motion of this purpose of `joint`."""
-    found = [e for e in _motions(recording, purpose) if e.serial == joint]
+    found = [e for e in recording.latest_motions(purpose) if e.serial == joint]
     number = found[-1].motion.motion_id if found and found[-1].motion is not None else -1
     for ids, estimate in list(recording.estimates.get((joint, observer), {}).items()):
         if ids[-1] == number:
@@ -217,36 +198,18 @@ def _pairs(
     return pairs
 
 
-def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
-    """Average every IMU and encoder over its rest."""
-    force, scatter, position = [], [], []
-    events = {e.serial: e for e in _motions(recording, "rest")}
-    for serial in serials:
-        motion = events[serial].motion
-        assert motion is not None
-        assert motion.end_row is not None
-        rows = recording.rows(serial, motion.start_row, motion.end_row)
-        if len(rows) < 10:
-            raise IdentificationError(f"module {serial} has {len(rows)} rows at rest, 10 are needed")
-        accel = rows["accel_m_s2"].astype(float)
-        force.append(accel.mean(axis=0))
-        scatter.append(float(accel.std(axis=0).max()) / np.sqrt(len(rows)))
-        position.append(float(rows["position_rad"].mean()))
-    return RestObservation(np.array(force), max(scatter), np.array(position))
-
-
 def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topology) -> NoiseFloor | None:
     """Return the noise of the IMU that rides on the base, if the first module's does."""
     if topology.reversed[0]:
         return None
-    still = [e for e in _motions(recording, "rest") if e.serial == topology.serials[0]]
+    still = [e for e in recording.latest_motions("rest") if e.serial == topology.serials[0]]
     return noise_floor(window(recording, clocks, topology.serials, still[0]), REFINEMENT_CUTOFF_HZ, 0)
 
 
 def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
     """Return the motions that the chain is fitted to, of modules that take part in it."""
-    alone = _motions(recording, "constant", "windowed_sine")
-    whole, repeats = _motions(recording, "whole"), recording.motions("repeat")
+    alone = recording.latest_motions("constant", "windowed_sine")
+    whole, repeats = recording.latest_motions("whole"), recording.motions("repeat")
     alone, whole, repeats = ([e for e in some if e.serial in serials] for some in (alone, whole, repeats))
     # All joints at once are in the window of any of them.
     return [*alone, *whole[:1], *repeats]

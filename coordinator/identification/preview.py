@@ -19,13 +19,14 @@ from coordinator.batch_estimation.link_compliance import compliance_jacobian, jo
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
-from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
+from coordinator.kinematics.chain_observations import PairObservation, circle_observation
+from coordinator.recording.at_rest import rest_observation
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, window
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import MotionObservation, Topology, likely_topology
-from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
@@ -54,8 +55,7 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     Raises:
         DataError: the estimates contradict each other, or modules were not seen at rest.
     """
-    rests = _rests(recording)
-    serials = sorted(rests)
+    serials = sorted({e.serial for e in recording.latest_motions("rest")})
     moved = sorted(set(explored) & set(serials))
     seen = {(i, k): e for i in moved for k in serials if (e := _seen(recording, i, k)) is not None}
     if not seen:
@@ -65,7 +65,7 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     if not kept:
         return None
     topology = _part(found, kept)
-    rest = _rest(recording, rests, topology.serials)
+    rest = rest_observation(recording, topology.serials)
     pairs = [
         pair
         for joint in moved
@@ -74,7 +74,7 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
         and joint != observer
         and (pair := _pair(recording, joint, observer, topology, rest.q_rad)) is not None
     ]
-    types = [module_type(_type(recording, s)) for s in topology.serials]
+    types = [recording.module_type(s) for s in topology.serials]
     fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
     return Preview(fit, tuple(moved), beside(fit.chain, moved))
 
@@ -143,36 +143,6 @@ def _mean_position(recording: Recording, joint: str, motion_ids: Sequence[int]) 
     return float(rows[-1].mean())
 
 
-def _rests(recording: Recording) -> dict[str, tuple[int, int]]:
-    """Return the rows (first, end) of every module's last rest."""
-    serials = sorted({e.serial for e in recording.journal if e.purpose == "rest"})
-    found = {s: [e.motion for e in _motions(recording, s) if e.purpose == "rest"][-1:] for s in serials}
-    return {
-        s: (motion.start_row, motion.end_row)
-        for s, motions in found.items()
-        for motion in motions
-        if motion is not None and motion.end_row is not None
-    }
-
-
-def _rest(recording: Recording, rests: dict[str, tuple[int, int]], serials: Sequence[str]) -> RestObservation:
-    rows = [recording.rows(s, *rests[s]) for s in serials]
-    bare = [s for s, one in zip(serials, rows, strict=True) if not len(one)]
-    if bare:
-        raise DataError(f"no rows at rest of {', '.join(bare)}")
-    force = np.array([one["accel_m_s2"].astype(float).mean(axis=0) for one in rows])
-    scatter = [float(one["accel_m_s2"].std(axis=0).max()) / np.sqrt(len(one)) for one in rows]
-    position = np.array([float(one["position_rad"].mean()) for one in rows])
-    return RestObservation(force, max(scatter), position)
-
-
-def _type(recording: Recording, serial: str) -> str:
-    info = recording.modules[serial].info
-    if info is None:
-        raise DataError(f"module {serial} has not told its type")
-    return info.module_type
-
-
 # ---------------------------------------------------------------------- what hangs together
 
 
@@ -238,8 +208,7 @@ class Previewer:
         return IMU_PRIORS[self._recording.imu]
 
     def _kinds(self, found: Preview) -> list[ModuleType]:
-        infos = [self._recording.modules[s].info for s in found.fit.chain.serials]
-        return [module_type(info.module_type) for info in infos if info is not None]
+        return [self._recording.module_type(s) for s in found.fit.chain.serials]
 
     def _parts_of(self, found: Preview) -> list[SensorData]:
         """Return the samples of every slow and fast motion so far, modules as in the chain."""

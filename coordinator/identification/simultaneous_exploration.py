@@ -47,18 +47,13 @@ def respond(
 
 
 def _still(recording: Recording, serials: Sequence[str]) -> StillReading:
-    events = {
-        e.serial: e.motion
-        for e in recording.journal
-        if e.what == "motion" and e.purpose == "rest" and e.motion is not None and e.motion.end_row
-    }
-    missing = [s for s in serials if s not in events]
+    rows = {serial: recording.rest_rows(serial) for serial in serials}
+    missing = [serial for serial in serials if not len(rows[serial])]
     if missing:
         raise DataError(
             f"no rest of {', '.join(missing)} was recorded: the offsets of its gyro are not known"
         )
-    rows = [recording.rows(s, events[s].start_row, events[s].end_row or 0) for s in serials]
     return StillReading(
-        np.array([one["gyro_rad_s"].astype(float).mean(axis=0) for one in rows]),
-        np.array([one["accel_m_s2"].astype(float).mean(axis=0) for one in rows]),
+        np.array([rows[serial]["gyro_rad_s"].astype(float).mean(axis=0) for serial in serials]),
+        np.array([rows[serial]["accel_m_s2"].astype(float).mean(axis=0) for serial in serials]),
     )

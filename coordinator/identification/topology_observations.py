@@ -250,12 +250,5 @@ def _checked(seen: MotionObservation | None, finding: Estimate | None) -> Motion
 
 def _gyro_offset(recording: Recording, serial: str) -> Array:
     """Average the gyro over the module's last rest; zero if it was never seen at rest."""
-    rests = [
-        e.motion
-        for e in recording.journal
-        if e.what == "motion" and e.purpose == "rest" and e.serial == serial and e.motion is not None
-    ]
-    if not rests or rests[-1].end_row is None:
-        return np.zeros(3)
-    rows = recording.rows(serial, rests[-1].start_row, rests[-1].end_row)
+    rows = recording.rest_rows(serial)
     return np.asarray(rows["gyro_rad_s"].astype(float).mean(axis=0)) if len(rows) else np.zeros(3)

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from coordinator.baseline.known_robot import BaselineRobot
-from coordinator.identification.identify import recorded_type
 from coordinator.monitoring.contact import ContactModel, contact_model, fast_part
 from coordinator.monitoring.likelihood_ratio import ChangeTest, WhitenedRows, find_change, joined, without_own
 from coordinator.monitoring.momentum_observer import MomentumObserver
@@ -108,7 +107,7 @@ def build_reference(known: BaselineRobot) -> Reference:
     chain, recording = known.chain, known.recording
     if not recording.motions("dynamic"):
         raise UnsuitableBaseline(f"{known.folder} has no motions for inertia: it was run with --no-dynamics")
-    types = tuple(recorded_type(recording, serial) for serial in chain.serials)
+    types = tuple(recording.module_type(serial) for serial in chain.serials)
     try:
         motion = dynamic_motion(recording, known.kinematics.clocks, chain.serials, "dynamic")
     except DataError as error:

@@ -8,10 +8,13 @@ import hashlib
 import struct
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 from coordinator.recording.journal import JournalEvent, Purpose
-from module_agent.model.catalogue import ImuKind, TorqueKind
+from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind, module_type
+from module_agent.model.errors import DataError
 from module_agent.wire.codec import decode
-from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.feedback_rows import ROW, Rows
 from module_agent.wire.information_messages import Information, InformationRequest
 from module_agent.wire.keys import Leaf, parse
 from module_agent.wire.messages import Ack, Estimate, Feedback, Info, Message, Status
@@ -188,9 +191,35 @@ class Recording:
             and event.boot in (0, boots.get(event.serial, event.boot))
         ]
 
+    def latest_motions(self, *purposes: Purpose) -> list[JournalEvent]:
+        """Return the last of `motions` of every module and purpose, in the order of the journal."""
+        latest: dict[tuple[str, str], JournalEvent] = {}
+        for event in self.motions(*purposes):
+            latest[event.serial, event.purpose] = event
+        return list(latest.values())
+
     def rows(self, serial: str, first: int, end: int) -> Rows:
         """Return the rows of a range of the latest boot of a module that have arrived."""
         return self.modules[serial].rows.rows(first, end)
+
+    def rest_rows(self, serial: str) -> Rows:
+        """Return the rows of a module's last rest; none if it did not rest."""
+        rests = [e.motion for e in self.motions("rest") if e.serial == serial and e.motion is not None]
+        if not rests or rests[-1].end_row is None:
+            return np.zeros(0, ROW)
+        return self.rows(serial, rests[-1].start_row, rests[-1].end_row)
+
+    def module_type(self, serial: str) -> ModuleType:
+        """Return a module's type, as it reported it.
+
+        Raises:
+            DataError: it has not reported its type.
+            UnknownModuleType: the catalogue does not have it.
+        """
+        info = self.modules[serial].info
+        if info is None:
+            raise DataError(f"module {serial} has not reported its type")
+        return module_type(info.module_type)
 
 
 def _decode(exchange: Exchange, leaf: Leaf, payload: bytes) -> Message:

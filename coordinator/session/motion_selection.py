@@ -25,7 +25,6 @@ from coordinator.excitation.single_joint import (
 from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.imu_prior import IMU_PRIORS
-from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import ConstantMotion, MotionRecord, MultiSine, Pattern, WindowedSine
 
 # A session of designed motions: 10 s a joint and a little to spare, less what it takes to find and check the
@@ -107,7 +106,7 @@ class MotionChoice:
             return None
 
     def _task(self, serial: str, limits: JointLimits) -> JointTask:
-        force = self._rest_rows(serial)["accel_m_s2"].astype(float).mean(axis=0)
+        force = self._recording.rest_rows(serial)["accel_m_s2"].astype(float).mean(axis=0)
         return JointTask(
             limits,
             float(force[2] / np.linalg.norm(force)),
@@ -150,12 +149,4 @@ class MotionChoice:
 
     def _rest_torque_nm(self, serial: str) -> float:
         """Return what a joint holds at home, as it did at rest."""
-        return float(self._rest_rows(serial)["effort_nm"].astype(float).mean())
-
-    def _rest_rows(self, serial: str) -> Rows:
-        rests = [
-            e.motion
-            for e in self._recording.journal
-            if e.purpose == "rest" and e.serial == serial and e.motion
-        ]
-        return self._recording.rows(serial, rests[-1].start_row, rests[-1].end_row or rests[-1].start_row)
+        return float(self._recording.rest_rows(serial)["effort_nm"].astype(float).mean())

@@ -6,15 +6,13 @@ as the IMUs felt it at rest. As the thesis has it (chapter 4.3), all other joint
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from coordinator.kinematics.assembly import AssemblyError, assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
-from coordinator.kinematics.chain_observations import PairObservation, RestObservation, circle_observation
+from coordinator.kinematics.chain_observations import PairObservation, circle_observation
+from coordinator.recording.at_rest import rest_observation
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from coordinator.topology.topology import Topology
-from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.wire.feedback_rows import Rows
@@ -29,8 +27,8 @@ def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | No
     Raises:
         DataError: a module has not told its type, or was not recorded at rest.
     """
-    types = [_type(recording, serial) for serial in topology.serials]
-    rest = _rest(recording, topology.serials)
+    types = [recording.module_type(serial) for serial in topology.serials]
+    rest = rest_observation(recording, topology.serials)
     pairs = _pairs(recording, topology.serials, rest.q_rad)
     if not pairs:
         return None
@@ -63,20 +61,6 @@ def _estimate(recording: Recording, joint: str, observer: str, motion_id: int) -
     return next((estimate for ids, estimate in found.items() if ids[-1] == motion_id), None)
 
 
-def _rest(recording: Recording, serials: Sequence[str]) -> RestObservation:
-    force, scatter, position = [], [], []
-    for serial in serials:
-        event = _last(recording, "rest", serial)
-        if event is None:
-            raise DataError(f"module {serial} was not recorded at rest")
-        rows = _rows(recording, event)
-        accel = rows["accel_m_s2"].astype(float)
-        force.append(accel.mean(axis=0))
-        scatter.append(float(accel.std(axis=0).max()) / np.sqrt(len(rows)))
-        position.append(float(rows["position_rad"].mean()))
-    return RestObservation(np.array(force), max(scatter), np.array(position))
-
-
 def _last(recording: Recording, purpose: Purpose, serial: str) -> JournalEvent | None:
     motions = [event for event in recording.journal if event.what == "motion"]
     found = [event for event in motions if (event.purpose, event.serial) == (purpose, serial)]
@@ -88,10 +72,3 @@ def _rows(recording: Recording, event: JournalEvent) -> Rows:
     if motion is None or motion.end_row is None:
         raise DataError(f"a motion of module {event.serial} has no end")
     return recording.rows(event.serial, motion.start_row, motion.end_row)
-
-
-def _type(recording: Recording, serial: str) -> ModuleType:
-    info = recording.modules[serial].info
-    if info is None:
-        raise DataError(f"module {serial} has not told its type")
-    return module_type(info.module_type)

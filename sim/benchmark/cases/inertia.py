@@ -17,7 +17,7 @@ from scipy.stats import binom, norm
 from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_transform
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Identified
-from coordinator.identification.identify import base_floor, identify, recorded_type
+from coordinator.identification.identify import base_floor, identify
 from coordinator.identification.inertia.body_motion import MotionSource
 from coordinator.identification.inertia.inertia import Robot as MeasuredRobot
 from coordinator.identification.inertia.inertia import find_inertia
@@ -186,7 +186,7 @@ def _by_true_chain(
     serials = kinematics.topology.serials
     robot = MeasuredRobot(
         chain,
-        [recorded_type(recording, serial) for serial in serials],
+        [recording.module_type(serial) for serial in serials],
         kinematics.refinement,
         np.zeros((6 * len(serials),) * 2),
         base_floor(recording, kinematics.clocks, kinematics.topology),

@@ -183,9 +183,9 @@ def test_a_joint_that_was_not_explored_is_named(run: list[Entry]) -> None:
         identify(_recorded(cut))
 
 
-def test_a_module_that_has_not_told_its_type_is_named(run: list[Entry]) -> None:
+def test_a_module_without_reported_type_is_named(run: list[Entry]) -> None:
     cut = [e for e in run if not _on(e, Leaf.INFO, TIP)]
-    with pytest.raises(IdentificationError, match=f"module {TIP} has not told its type"):
+    with pytest.raises(IdentificationError, match=f"module {TIP} has not reported its type"):
         identify(_recorded(cut))
 
 

@@ -37,7 +37,7 @@ def run_of(tmp_path: Path, looks: Any, shown: list[Any], inline: bool = False) -
     run = Run(config, transport, lambda: 0, lambda work: None, screen)  # type: ignore[arg-type]
     run._looks = looks
     run._feed = SimpleNamespace(  # type: ignore[assignment]
-        estimates=lambda *_: None, so_far=lambda t_ns, found: shown.append(found.explored)
+        estimates=lambda *_: None, preview=lambda t_ns, found: shown.append(found.explored)
     )
     return run
 

@@ -10,6 +10,7 @@ import pytest
 
 from coordinator.identification.preview import beside, preview
 from coordinator.kinematics.chain_estimate import link_lengths
+from coordinator.recording.recording import Recording
 from module_agent.model.chain import Chain
 from module_agent.model.errors import DataError
 from module_agent.wire.feedback_rows import ROW
@@ -17,14 +18,15 @@ from module_agent.wire.feedback_rows import ROW
 RESTED, MOVED = 100, 200
 
 
-class Seen:
+class Seen(Recording):
     """A recording of a robot at rest and of perfect circles, of those joints that have moved."""
 
     def __init__(self, robots: Any, chain: Chain, types: Any, explored: Sequence[str]):
+        super().__init__()
         self._chain = chain
         self._rest = robots.rest(chain, np.zeros(len(chain.serials)))
         self.modules = {
-            s: SimpleNamespace(info=SimpleNamespace(module_type=kind.name))
+            s: SimpleNamespace(boot=0, info=SimpleNamespace(module_type=kind.name))
             for s, kind in zip(chain.serials, types, strict=True)
         }
         self.journal = [self._motion(s, "rest", 1, 0, RESTED) for s in chain.serials]
@@ -37,7 +39,7 @@ class Seen:
 
     def _motion(self, serial: str, purpose: str, number: int, first: int, end: int) -> Any:
         motion = SimpleNamespace(motion_id=number, start_row=first, end_row=end)
-        return SimpleNamespace(what="motion", serial=serial, purpose=purpose, motion=motion)
+        return SimpleNamespace(what="motion", serial=serial, boot=0, purpose=purpose, motion=motion)
 
     def _estimate(self, robots: Any, joint: str, observer: str) -> Any:
         chain = self._chain
@@ -151,5 +153,5 @@ def test_a_module_that_has_not_told_its_type_is_named(robots: Any) -> None:
     chain, types = robots.random(1, joints=3)
     recording: Any = Seen(robots, chain, types, chain.serials)
     recording.modules[chain.serials[1]].info = None
-    with pytest.raises(DataError, match=f"module {chain.serials[1]} has not told its type"):
+    with pytest.raises(DataError, match=f"module {chain.serials[1]} has not reported its type"):
         preview(recording, chain.serials)

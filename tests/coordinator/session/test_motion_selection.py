@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from coordinator.excitation.plan import Plan
+from coordinator.recording.recording import Recording
 from coordinator.session.motion_selection import MotionChoice
 from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.catalogue import CATALOGUE
@@ -29,13 +30,15 @@ def record(pattern: Pattern, rows: tuple[int, int]) -> MotionRecord:
     )
 
 
-class Told:
+class Told(Recording):
     """A recording of joints that hold `rest_nm` at rest and move `inertia`, with level axes."""
 
     def __init__(self, inertia: float, slow: ConstantMotion | None = None, rest_nm: float = 0.5):
-        self.estimates: dict[Any, Any] = {}
+        super().__init__()
         rest = record(Rest(duration_s=1.0), REST)
-        self.journal = [SimpleNamespace(purpose="rest", serial=s, motion=rest) for s in SERIALS]
+        self.journal = [
+            SimpleNamespace(what="motion", purpose="rest", serial=s, boot=0, motion=rest) for s in SERIALS
+        ]
         self._inertia, self._slow, self._rest_nm = inertia, slow, rest_nm
 
     def rows(self, serial: str, first: int, end: int) -> "np.ndarray[Any, Any]":
@@ -85,7 +88,10 @@ def test_a_robot_of_any_size_has_the_time_for_designed_motions(joints: int) -> N
     serials = [chr(ord("A") + k) for k in range(joints)]
     told = Told(0.1)
     told.journal = [
-        SimpleNamespace(purpose="rest", serial=s, motion=record(Rest(duration_s=1.0), REST)) for s in serials
+        SimpleNamespace(
+            what="motion", purpose="rest", serial=s, boot=0, motion=record(Rest(duration_s=1.0), REST)
+        )
+        for s in serials
     ]
     recording: Any = told
     plan = Plan(motions="optimised")
