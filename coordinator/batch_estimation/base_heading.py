@@ -1,8 +1,9 @@
-"""Turn a robot about a vertical axis until what its base does fits what its IMUs see of it.
+"""Turn a robot about a vertical axis until the measured motion of its base fits its other IMUs.
 
-Where no motion tells the heading of what lies beyond an axis that is parallel to gravity, a base that shakes
-tells it all the same: the IMU on the base sees in which direction, and so do the others. The heading is
-needed to subtract the shake; how well it is known is not claimed.
+No motion of joints resolves the heading of a branch beyond an axis that is parallel to gravity. A shaking
+base
+does: the IMU on the base measures the direction of the shake, and so do the others. The heading is needed to
+subtract the shake; no uncertainty of it is claimed.
 """
 
 import numpy as np
@@ -15,10 +16,10 @@ from module_agent.model.perturbation import apply_perturbation
 
 
 def faced(chain: Chain, data: SensorData, null_basis: Array) -> Chain:
-    """Return the chain with every unknown heading as the base's motion in `data` shows it.
+    """Return the chain with every unresolved heading estimated from the base's motion in `data`.
 
-    What the gyros see correlates with what they should of the base's rates as c0 + c1 cos + c2 sin of the
-    heading, whose maximum is known from three headings.
+    The correlation of the gyros' readings with the predicted rates of the base is c0 + c1 cos + c2 sin of the
+    heading; three headings give its maximum.
     """
     if data.base_motion is None or not data.base_motion.any():
         return chain
@@ -36,7 +37,7 @@ def faced(chain: Chain, data: SensorData, null_basis: Array) -> Chain:
 
 
 def _agreement(chain: Chain, data: SensorData) -> float:
-    """Return the product of the gyros' readings beyond those on a resting base, and the base's share."""
+    """Return the sum of products of the gyros' measured and predicted rates by the base's motion."""
     resting = readings_on(chain, body_motions(chain, *data.joints)).gyro_rad_s
     shaken = readings_on(chain, body_motions(chain, *data.joints, data.base)).gyro_rad_s
     seen = data.gyro_rad_s - resting

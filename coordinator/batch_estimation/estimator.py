@@ -1,10 +1,11 @@
 """One batch refinement of a chain over all motions at once, from all IMUs and all encoders.
 
-The circle point analysis takes it that only one joint moves. In a real arm the springs of the held joints
+The circle point analysis assumes that only one joint moves. In a real arm the springs of the held joints
 give, so that distal IMUs turn by more than the moving joint does (up to 50 % more near a resonance), and
-the circles come out wrong. Here every IMU sample is predicted from the measured motion of all joints
-(`inertial_prediction`), so what the held joints do is part of the model. Solved by Gauss-Newton on the
-normal equations; gravity and the IMUs' own errors (`imu_intrinsics`) are estimated along.
+the circles are biased. Here every IMU sample is predicted from the measured motion of all joints
+(`imu_prediction`), so the motion of held joints is part of the model. The weighted least squares are solved
+by Gauss-Newton on the normal equations; gravity, the IMUs' own errors (`imu_intrinsics`) and the links'
+compliance (`link_compliance`) are estimated along.
 """
 
 from collections.abc import Sequence
@@ -35,9 +36,9 @@ from module_agent.signals.autocorrelation import samples_per_independent
 
 ITERATIONS = 20
 CONVERGED = 1e-7
-# What the data knows worse than this (in rad, or in m) it does not know: a turn of 6 deg, a tenth of a metre.
+# Directions with a larger sigma (rad or m) count as unresolved: a turn of 6 deg, a tenth of a metre.
 UNKNOWN_ABOVE = 0.1
-# A step (rad, m) along what only the motion of the base tells.
+# Largest step (rad, m) along directions that only the motion of the base resolves.
 MAX_STEP = 0.3
 # Finer than any sensor resolves (rad/s, m/s^2). Smaller weights would drown the biases' prior in rounding.
 MIN_RMS = 1e-6
@@ -80,7 +81,7 @@ class _State(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """What a chain makes of the joints' motion: its bodies' motions, and what perfect IMUs would read."""
+    """Predictions of a chain for the joints' motion: its bodies' motions, and the readings of ideal IMUs."""
 
     bodies: list[BodyMotion]
     ideal: ImuReadings
@@ -105,8 +106,9 @@ def refine_chain(
 
     Args:
         chain: where to start.
-        data: what the sensors read.
-        prior: how well the IMUs are known beforehand.
+        data: m samples of all sensors.
+        prior: of the IMUs' errors.
+        flex: how the readings change with the links' compliances; None for rigid links.
 
     Raises:
         DataError: fewer samples than parameters.
@@ -138,7 +140,7 @@ def refine_chain(
             break
     expected = _expected(state, data, flex)
     gyro, accel = _residuals(state, data, expected)
-    # What the model leaves out repeats with the motion.
+    # Systematic errors repeat with the motion: their samples are not independent.
     believed = _believed(data, gyro), _believed(data, accel)
     normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), believed)
     _, _, spectrum = _solve(normal)
@@ -171,7 +173,7 @@ def _rms(residual: Array) -> Array:
 
 
 def _spread(data: SensorData, residual: Array) -> Array:
-    """Return the rms of every motion, (motions, n): gears that turn shake an IMU more than those at rest."""
+    """Return the rms of every motion, (motions, n): turning gears shake an IMU more than gears at rest."""
     return np.stack([_rms(residual[samples]) for samples in data.motions])
 
 
@@ -219,8 +221,8 @@ def _normal_equations(
 def _before(state: _State, prior: ImuPrior, flex: ComplianceJacobian) -> tuple[Array, Array]:
     """Return the information on [increments (6 n), gravity (3), free IMU errors], and its right-hand side.
 
-    Before any sample the IMUs' errors are known: they are small; and so is gravity's size, which is what
-    tells an accelerometer's scale. What `chain` would change of gravity's size is all that is held.
+    These are the priors of the IMUs' errors, of the links' compliances, and of the magnitude of gravity,
+    which makes the accelerometers' scales observable.
     """
     count, free = len(state.chain.serials), prior.sigmas > 0.0
     nothing = np.zeros(6 * count + 3)
@@ -235,7 +237,7 @@ def _before(state: _State, prior: ImuPrior, flex: ComplianceJacobian) -> tuple[A
 
 
 def _places(modules: Sequence[int], imu: int, count: int, links: int, size: int) -> Index:
-    """Return where the parameters that one IMU feels stand among all of them, in the order of its slopes."""
+    """Return the indices of the parameters that one IMU depends on, in the order of its slopes."""
     increments = [6 * module + np.arange(6) for module in modules]
     shared = 6 * count + np.arange(3 + links)
     own = 6 * count + 3 + links + size * imu + np.arange(size)
@@ -254,7 +256,7 @@ class _Spectrum(NamedTuple):
 
 
 def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
-    """Return information and right-hand side of the poses with the nuisance taken out, and what took it."""
+    """Eliminate the nuisance: return information and right-hand side of the poses, and the elimination."""
     sides = np.column_stack([normal.cross.T, normal.nuisance_rhs])
     through: Array = np.linalg.solve(normal.nuisance, sides).astype(np.float64)
     information = normal.pose - normal.cross @ through[:, :-1]
@@ -262,7 +264,7 @@ def _reduced(normal: _Normal) -> tuple[Array, Array, Array]:
 
 
 def _solve(normal: _Normal) -> tuple[Array, Array, _Spectrum]:
-    """Return the step of all modules (6 n,), that of the nuisance, the spectrum; unknown directions stay."""
+    """Return the steps of all modules (6 n,), zero where unresolved, and of the nuisance; the spectrum."""
     information, rhs, through = _reduced(normal)
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
     with np.errstate(divide="ignore"):
@@ -275,7 +277,7 @@ def _solve(normal: _Normal) -> tuple[Array, Array, _Spectrum]:
 
 
 def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
-    """Return the step (6 n,) along what the joints' motions leave unknown, by the base's motion."""
+    """Return the step (6 n,) by the base's motion, along what the joints' motions do not resolve."""
     information, rhs, _ = _reduced(normal)
     unknown = spectrum.vectors[:, ~spectrum.known]
     information, rhs = unknown.T @ information @ unknown, unknown.T @ rhs

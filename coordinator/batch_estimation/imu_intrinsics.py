@@ -1,9 +1,9 @@
-"""What an IMU makes of the truth: scale, misalignment, bias and delay, as nuisance of the batch refinement.
+"""Errors of IMUs: scale, misalignment, bias and delay, nuisance parameters of the batch estimator.
 
 A sensor of three axes reads y = (I + E) x + b, late by a delay (Titterton & Weston, Strapdown Inertial
 Navigation Technology, 8.3): the diagonal of E holds the scale errors, the rest the axes' misalignments.
-Gravity and the joints' own rates are the references that tell them, as far as the joints turn the IMU; what
-they do not reach stays as uncertain as it was before.
+Gravity and the joints' own rates make them observable as far as the joints turn the IMU; the others keep
+their prior.
 """
 
 from typing import NamedTuple
@@ -56,18 +56,18 @@ class ImuIntrinsics(NamedTuple):
 
 
 def beyond(intrinsics: ImuIntrinsics, prior: ImuPrior) -> Array:
-    """Return the largest error of every IMU (n,) in standard deviations of what was expected of it."""
+    """Return the largest error of every IMU (n,) in standard deviations of the prior."""
     free = prior.sigmas > 0.0
     return np.asarray(np.abs(intrinsics.errors[:, free] / prior.sigmas[free]).max(axis=1))
 
 
 def perfect(count: int) -> ImuIntrinsics:
-    """Return the errors of IMUs that have none."""
+    """Return zero errors for ideal IMUs."""
     return ImuIntrinsics(np.zeros((count, SIZE)))
 
 
 def read(intrinsics: ImuIntrinsics, gyro: Array, accel: Array, rates: Array | None) -> tuple[Array, Array]:
-    """Return what IMUs with these errors read of true rates and specific forces, (m, n, 3) each.
+    """Return the readings of IMUs with these errors for true rates and specific forces, (m, n, 3) each.
 
     rates: (m, n, 6) how fast gyro and accelerometer readings change [rad/s^2, m/s^3]; None without delays.
     """
@@ -91,7 +91,7 @@ def mixing(intrinsics: ImuIntrinsics, module: int) -> Array:
 def slopes(gyro: Array, accel: Array, rates: Array | None, free: NDArray[np.bool_]) -> Array:
     """Return the derivatives of one IMU's readings by those of its errors that are free, (k, 6, m).
 
-    gyro, accel: (m, 3) the truth. rates: (m, 6) or None. free: (34,).
+    gyro, accel: (m, 3) true values. rates: (m, 6) or None. free: (34,).
     """
     samples = len(gyro)
     derivatives = np.zeros((SIZE, 6, samples))

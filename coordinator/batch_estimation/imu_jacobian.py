@@ -1,10 +1,10 @@
-"""How the readings of an IMU change with the chain: the derivatives of `inertial_prediction`.
+"""How the readings of an IMU change with the chain: the derivatives of `imu_prediction`.
 
-An increment xi of module a makes the turn exp(S q) of its joint into exp(xi) exp(S q) exp(-xi). So whatever
-lies beyond the joint is displaced by xi as the body below sees it, and by -xi as the body beyond sees it; the
-module's own IMU is displaced by xi as its carrier sees it. All that is needed is the change of one IMU's
-readings when it is displaced, together with everything between, by a constant twist in the frame of some body
-that carries it.
+A perturbation xi of module a makes the turn exp(S q) of its joint into exp(xi) exp(S q) exp(-xi). So all that
+lies beyond the joint is displaced by xi in the frame of the body below, and by -xi in that of the body
+beyond; the module's own IMU is displaced by xi in the frame of its carrier. All that is needed is the change
+of one IMU's readings when it is displaced, together with everything between, by a constant twist in the
+frame of some body that carries it.
 """
 
 from typing import NamedTuple
@@ -19,8 +19,9 @@ from module_agent.model.perturbation import cross
 class ImuJacobian(NamedTuple):
     """Slopes of one IMU's readings [gyro (3), specific force (3)] in its own frame.
 
-    modules: k modules whose increments it feels, in the order of the chain. poses: (6 k, 6, m) slopes by the
-    increments (see `increments`) of those modules. gravity: (3, 6, m) slopes by `chain.gravity`.
+    modules: k modules on whose perturbations it depends, in the order of the chain. poses: (6 k, 6, m) slopes
+    by the perturbations (`apply_perturbation`) of those modules. gravity: (3, 6, m) slopes by
+    `chain.gravity`.
     """
 
     modules: tuple[int, ...]
@@ -29,7 +30,7 @@ class ImuJacobian(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """An IMU as a body sees it, in the body's frame: frame (3, 3, m), place and velocity (3, m)."""
+    """An IMU relative to a body, in the body's frame: frame (3, 3, m), place and velocity (3, m)."""
 
     frame: Array
     place: Array
@@ -39,13 +40,13 @@ class _Seen(NamedTuple):
 def imu_jacobian(
     chain: Chain, bodies: list[BodyMotion], q_rad: Array, qd_rad_s: Array, module: int
 ) -> ImuJacobian:
-    """Differentiate what the IMU of one module reads.
+    """Differentiate the readings of one module's IMU.
 
     Args:
         chain: n joints.
         bodies: their motion, from `body_motions`.
         q_rad, qd_rad_s: (m, n) joint positions and velocities.
-        module: whose IMU.
+        module: the module that the IMU belongs to.
     """
     body = chain.carrier(module)
     joints = chain.ancestors(body)
@@ -63,13 +64,13 @@ def imu_jacobian(
 
 
 def _at_home(home: Array, samples: int) -> _Seen:
-    """Return an IMU as its carrier sees it, which is at rest there."""
+    """Return an IMU relative to its carrier, at rest."""
     frame = np.broadcast_to(home[:3, :3, None], (3, 3, samples))
     return _Seen(frame, np.broadcast_to(home[:3, 3, None], (3, samples)), np.zeros((3, samples)))
 
 
 def _from_below(chain: Chain, joint: int, q: Array, qd: Array, seen: _Seen) -> _Seen:
-    """Return the IMU as the body below a joint sees it, from how the body beyond sees it."""
+    """Return the IMU relative to the body below a joint, from that relative to the body beyond."""
     axis, point = chain.axis[joint], chain.point[joint][:, None]
     stacked = np.concatenate([seen.frame, (seen.place - point)[:, None], seen.velocity[:, None]], axis=1)
     moved = turned(axis, q, stacked)

@@ -1,4 +1,4 @@
-"""What every IMU of a chain reads during a motion: the forward model of the batch refinement."""
+"""The readings of every IMU of a chain during a motion: the forward model of the batch estimator."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -80,8 +80,8 @@ def body_motions(
 ) -> list[BodyMotion]:
     """Return the motion of every body, the base in the last place, where the index -1 finds it.
 
-    Args as in `imu_readings`. `base_motion` is what the first module's IMU saw of the base; None means rest.
-    `turns` are those of the links that give, by the module that each link carries.
+    Args as in `imu_readings`. `base_motion` is the base's motion measured by the first module's IMU; None
+    means rest. `turns` are those of compliant links, by the module that each link carries.
     """
     q, qd, qdd = (np.asarray(signal, dtype=float).T for signal in (q_rad, qd_rad_s, qdd_rad_s2))
     base = _base(chain, q.shape[1], base_motion)

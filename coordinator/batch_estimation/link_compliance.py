@@ -1,10 +1,10 @@
-"""Links that give under what they carry: quasi-static bending and twisting of each link at one place.
+"""Compliant links: quasi-static bending and twisting of each link under its load, at one hinge.
 
 A tube that is clamped at one end moves its other end like a rigid bar on a hinge (pseudo-rigid-body model,
-Howell, Compliant Mechanisms, 2001, section 5). What turns the hinge is the moment of all that lies beyond:
-the modules' masses, which the catalogue gives, times their specific forces. Links resonate at ten times the
-motions' frequencies and more, so the turn follows the moment at once: theta = C M, with one compliance for
-bending and one for twisting to be estimated. Without it a link that gives by 1 % comes out 0.7 % long.
+Howell, Compliant Mechanisms, 2001, section 5). The load is the moment about the hinge of all modules beyond:
+their masses, by the catalogue, times their specific forces. Links resonate at ten times the motions'
+frequencies and more, so the turn follows the moment at once: theta = C M, with one compliance for bending and
+one for twisting to be estimated. Without it a link that gives by 1 % is estimated 0.7 % too long.
 """
 
 from collections.abc import Sequence
@@ -30,13 +30,13 @@ from module_agent.model.imu_prior import HINGE_SHARE, HINGE_SHARE_SIGMA
 from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate
 
-# How far the hinge may be beside the line from face to face: tubes are centimetres beside the modules' axes.
+# Sigma of the hinge's distance from the line between the faces: tubes are centimetres off the modules' axes.
 HINGE_ASIDE_SIGMA_M = 0.02
 HINGE_SIGMAS = (HINGE_SHARE_SIGMA, HINGE_ASIDE_SIGMA_M, HINGE_ASIDE_SIGMA_M)
 
 
-# A link's own mass: that of the manufacturer's tubes, 0.2 kg of ends and 0.4 kg/m. It need not be exact: what
-# a compliance is multiplied with is not told apart from it.
+# A link's own mass: that of the manufacturer's tubes, 0.2 kg of ends and 0.4 kg/m. It need not be exact: only
+# the product of load and compliance is observable.
 LINK_MASS_KG, LINK_MASS_KG_M = 0.2, 0.4
 
 JointTrack = tuple[Array, Array, Array]  # positions, velocities, accelerations, (m, n) each
@@ -99,8 +99,8 @@ def link_loads(
         bodies: their motion, from `body_motions`, over one stretch of time without holes.
         q_rad: (m, n) joint positions.
         rate_hz: of the samples.
-        turns: how the links turn, as far as it is known, and is counted in `bodies`: near a resonance what
-            gives is a load itself.
+        turns: how the links turn, as far as it is known and contained in `bodies`: near a resonance the
+            motion of compliant links is a load itself.
     """
     samples = len(q_rad)
     carried = [np.zeros((2, 3, samples)) for _ in chain.parent]  # force, and moment about the root's origin
@@ -174,7 +174,7 @@ def _weight(body: BodyMotion, place: Array, mass_kg: float) -> Array:
 
 
 def _seen_from_below(chain: Chain, joint: int, q: Array, load: Array) -> Array:
-    """Return force and moment (2, 3, m) beyond a joint as the body below it sees them."""
+    """Return force and moment (2, 3, m) beyond a joint in the frame of the body below it."""
     axis, point = chain.axis[joint], np.broadcast_to(chain.point[joint][:, None], load[0].shape)
     about_point = np.stack([load[0], load[1] - cross(point, load[0])], axis=1)
     force, moment = np.swapaxes(turned(axis, q, about_point), 0, 1)
@@ -186,7 +186,7 @@ class ComplianceJacobian(NamedTuple):
 
     links: (p,) the module that each compliance's link carries. sigmas: (p,) how well each is known before,
     in `UNIT_RAD_NM`, or for hinges in shares of the length and in metres. slopes: (p, 6, m, n) of [gyro,
-    specific force]. taken: (p,) what is counted in already, which belongs to what is known before.
+    specific force]. taken: (p,) the part that the loads contain already, which the prior is about, too.
     """
 
     links: tuple[int, ...]
@@ -223,7 +223,7 @@ def compliance_jacobian(
 
 
 def _change(chain: Chain, joints: JointTrack, still: ImuReadings, module: int, *turn: LinkTurn) -> Array:
-    """Return what turns of one link make of all IMUs' readings, (6, m, n)."""
+    """Return the change of all IMUs' readings by turns of one link, (6, m, n)."""
     turns = {module: turn}
     moved = readings_on(chain, body_motions(chain, *joints, turns=turns), turns)
     change = [moved.gyro_rad_s - still.gyro_rad_s, moved.accel_m_s2 - still.accel_m_s2]
@@ -238,10 +238,10 @@ def hinge_slopes(
     compliance: Array,
     taken: Array | None = None,
 ) -> ComplianceJacobian:
-    """Return slopes by the places of the hinges (see `LinkLoad.shifts`), beside those known.
+    """Return the slopes `known` and those by the places of the hinges (see `LinkLoad.shifts`).
 
-    Their size follows from the compliances (2 l,) found with the slopes known, of l links. taken: (3 l,) by
-    how much the hinges of the loads have been moved already.
+    Their size follows from the compliances (2 l,) of l links, as estimated with the slopes `known`. taken:
+    (3 l,) by how much the hinges of the loads have been moved already.
     """
     if not known.links:
         return known
@@ -290,7 +290,7 @@ def turns_under(
 
 
 def rigid(count: int, samples: int) -> ComplianceJacobian:
-    """Return the slopes of links that do not give, for so many modules and samples."""
+    """Return the empty Jacobian of rigid links."""
     return ComplianceJacobian((), np.zeros(0), np.zeros((0, 6, samples, count)), np.zeros(0))
 
 

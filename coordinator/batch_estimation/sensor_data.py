@@ -1,11 +1,10 @@
-"""How the base moves while joints do: a bench that gives, a post that rocks, a vehicle.
+"""The data of the batch estimator: joints and IMUs on one time base, and the motion of the base.
 
-The IMU of a module that is bolted to the base by its housing rides on the base, whichever joint turns. What
-it reads beyond its mean is the base's own motion, and everything on the base is carried along: rates, angular
-accelerations and specific forces of a moving frame (Craig, Introduction to Robotics, eqs 6.45-6.48 with a
-base that is not at rest). Its noise is carried along as well, so only what stands out of the noise is taken.
-
-What the batch refinement works on: all joints and IMUs on one time base and through one low-pass.
+The base may move with the joints: a compliant bench, a rocking post, a vehicle. The IMU of a module that is
+bolted to the base by its housing rides on the base. Its readings beyond their mean are the base's own motion,
+which carries everything on the base along: rates, angular accelerations and specific forces of a moving frame
+(Craig, Introduction to Robotics, eqs 6.45-6.48 with a base that is not at rest). Its noise would be carried
+along as well, so only frequencies that exceed the noise are used.
 """
 
 from itertools import pairwise
@@ -22,10 +21,10 @@ SMOOTHED_BINS = 3
 
 
 class BaseMotion(NamedTuple):
-    """Motion of the base about rest, seen by an IMU on it and in that IMU's frame, (m, 3) each.
+    """Motion of the base about rest, measured by an IMU on it and in that IMU's frame, (m, 3) each.
 
-    omega [rad/s], alpha [rad/s^2], acceleration [m/s^2], the latter of the IMU's place, with what tilting
-    makes of gravity.
+    omega [rad/s], alpha [rad/s^2], acceleration [m/s^2], the latter of the IMU's place, including the
+    change of gravity by tilting.
     """
 
     omega: Array
@@ -42,7 +41,7 @@ class NoiseFloor(NamedTuple):
 
 
 def outstanding(signal: Array, variance: Array, cutoff_hz: float, rate_hz: float) -> Array:
-    """Return what of signals (m, k) about their means is not noise, frequency by frequency.
+    """Return signals (m, k) about their means without their noise, by a Wiener filter.
 
     The noise is white up to the cut-off with the given variances (k,). The weights are Wiener's, 1 - N / S
     with S the smoothed periodogram; a frequency whose power could be that of noise is left out.
@@ -85,7 +84,7 @@ class SensorData(NamedTuple):
 
     @property
     def smooth(self) -> tuple[Array, Array, Array]:
-        """What the readings are differentiated by: noise in there would pass for motion, and bias the fit."""
+        """The signals for derivatives: encoder noise in there would act as motion and bias the fit."""
         if self.instrument is None:
             return self.joints
         q, qd, qdd = np.split(self.instrument, 3, axis=1)

@@ -1,8 +1,8 @@
 """Denavit-Hartenberg parameters of a chain: the standard convention of the thesis' eq. 2.
 
 Frame i - 1 has its z along the axis of joint i, so that joint i turns A_i = Rz(theta_i + q_i) Tz(d_i) Tx(a_i)
-Rx(alpha_i). They exist for serial robots only: a tree has one table per path from a root to a leaf. Two axes
-that are all but parallel have a common normal far away, and d then says more of the noise than of the robot
+Rx(alpha_i). They exist for serial chains only: a tree has one table per path from a root to a leaf. Two axes
+that are all but parallel have a common normal far away, and d is then dominated by noise
 (Hayati 1983); `parallel_below_rad` takes such axes for parallel.
 """
 

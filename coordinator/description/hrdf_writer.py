@@ -32,10 +32,11 @@ _INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class _Robot(NamedTuple):
-    """What is written, in the root frame at q = 0.
+    """The robot as it is written, in the root frame at q = 0.
 
     entry, leave: (n, 4, 4) the frames before and after every joint's element. actuator: its type, None for a
-    bare joint. tip: (n, 4, 4) the faces that the joints move. bodies: (n, 10) inertial parameters, or None.
+    joint without actuator. tip: (n, 4, 4) the faces that the joints move. bodies: (n, 10) inertial
+    parameters, or None.
     """
 
     chain: Chain
@@ -113,13 +114,13 @@ def _prepared(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None) 
 def _actuator(chain: Chain, k: int, kind: ModuleType, output: Array) -> str | None:
     """Return the format's type for a module, None if it has none that turns as this one does."""
     off = output[:3, 3] - chain.point[k]
-    beside = off - chain.axis[k] * (chain.axis[k] @ off)
-    apart = max(float(np.abs(output[:3, 2] - chain.axis[k]).max()), float(np.abs(beside).max()))
+    across = off - chain.axis[k] * (chain.axis[k] @ off)
+    apart = max(float(np.abs(output[:3, 2] - chain.axis[k]).max()), float(np.abs(across).max()))
     return kind.hrdf_actuator if kind.hrdf_actuator and not chain.reversed[k] and apart < SAME_BELOW else None
 
 
 def _follow(parent: Element, robot: _Robot, carrier: int, frame: Array) -> None:
-    """Add what the body `carrier` holds; `frame` is where the element before it ended.
+    """Add the elements of the body `carrier`; `frame` is where the element before it ended.
 
     Without recursion over a chain: one of a hundred joints is as deep as it is long.
     """
@@ -168,8 +169,10 @@ def _mass(parent: Element, robot: _Robot, carrier: int, frame: Array) -> dict[st
     into = np.linalg.inv(frame)
     pseudo = into @ pseudo_inertia(robot.bodies[carrier]) @ into.T
     if not is_consistent(pseudo):
-        words = "The identified parameters of the next body are no real body's; this is the nearest real one."
-        _comment(parent, f"{words} For torques use those in result.json.")
+        remark = (
+            "The identified parameters of the next body are no real body's; this is the nearest real one."
+        )
+        _comment(parent, f"{remark} For torques use those in result.json.")
         pseudo = nearest_consistent(pseudo)
     real = body(pseudo)
     values = real.inertia_kg_m2[np.triu_indices(3)]

@@ -1,8 +1,8 @@
-"""What joins two modules: the six parameters of the transform from parent to child, with covariance.
+"""The six parameters of the transform between two modules, from parent to child, with covariance.
 
 X is the pose of the child's mounting face in the parent's moved face at q = 0: translation [mm] and rotation
-vector [deg] in the parent's face. A parameter is unknown if it takes part in any change of the robot that no
-observation tells; the covariance is that of what is known, and zero along the rest.
+vector [deg] in the parent's face. A parameter is unknown if it takes part in any unobservable
+change of the robot; the covariance is zero along these changes.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from module_agent.model.read_only import frozen
 
 Face = Literal["output", "housing"]
 PARAMETERS = ("x_mm", "y_mm", "z_mm", "rx_deg", "ry_deg", "rz_deg")
-# In m and rad, of changes of length 1: a turn that nothing tells displaces a face by a millimetre a radian.
+# In m and rad, of changes of length 1: an unobservable turn may displace a face by a millimetre a radian.
 TAKES_PART_ABOVE = 1e-3
 _UNITS = np.repeat([1e3, 180.0 / np.pi], 3)
 
@@ -29,7 +29,7 @@ class LinkTransform(NamedTuple):
     """One link; arrays read-only.
 
     values: (6,) as in `PARAMETERS`. covariance: (6, 6) in their units. unknown: (6,) which of them take part
-    in what no observation tells. null_directions: (6, k) those changes, orthonormal in their units.
+    in unobservable changes. null_directions: (6, k) those changes, orthonormal in their units.
     """
 
     parent: str
@@ -50,8 +50,8 @@ def link_transforms(
     Args:
         chain: n joints.
         types: per joint.
-        covariance: (6 n, 6 n) of the chain's increments (`increments.apply_perturbation`).
-        null_basis: (6 n, k) increments of length 1 that no observation tells. Exact motions
+        covariance: (6 n, 6 n) of the chain's perturbations (`apply_perturbation`).
+        null_basis: (6 n, k) unobservable perturbations of length 1. Exact motions
             (`null_space.Unresolved`) name parameters sharper than the null vectors of a noisy fit.
 
     Raises:
@@ -112,8 +112,7 @@ def parameter_slope(pose: Array) -> Array:
 
 
 def _null_directions(seen: Array) -> tuple[Array, tuple[bool, ...]]:
-    """Return the changes (6, k) [mm, deg] that null increments, seen in the six parameters, make; and of
-    which."""
+    """Return the changes (6, k) [mm, deg] of the six parameters by null vectors, and which they change."""
     u, size, _ = np.linalg.svd(seen, full_matrices=False)
     moving = u[:, size > TAKES_PART_ABOVE]
     unknown = tuple(bool(part > TAKES_PART_ABOVE) for part in np.linalg.norm(moving, axis=1))

@@ -54,7 +54,7 @@ def screw_model(chain: Chain, types: Sequence[ModuleType], covariance: ArrayLike
     Args:
         chain: n joints.
         types: per joint, which say where the outputs are.
-        covariance: (6 n, 6 n) of the chain's increments (`increments.apply_perturbation`).
+        covariance: (6 n, 6 n) of the chain's perturbations (`apply_perturbation`).
 
     Raises:
         ValueError: types or covariance do not fit the chain.

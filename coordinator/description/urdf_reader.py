@@ -1,7 +1,7 @@
 """A URDF file as a `Chain`, with the inertias that it claims.
 
-The root link's frame is the root frame. Links that a fixed joint joins are one body; what is fixed to the
-root link moves with nothing and says nothing. A body's own frame is that of the link right behind its joint.
+The root link's frame is the root frame. Links that a fixed joint joins are one body; links fixed to the
+root link do not move and are left out. A body's own frame is that of the link right behind its joint.
 """
 
 from collections.abc import Sequence
@@ -221,10 +221,10 @@ def _pose(origin: Element | None, where: str) -> Array:
 
 
 def _three(element: Element, key: str, where: str, default: str = "") -> Array:
-    words = element.get(key, default).split()
-    if len(words) != 3:
+    numbers = element.get(key, default).split()
+    if len(numbers) != 3:
         _refuse(f"{where}: {key}={element.get(key)!r}; three numbers are needed")
-    return np.array([_float(word, key, where) for word in words])
+    return np.array([_float(word, key, where) for word in numbers])
 
 
 def _number(element: Element, key: str, where: str) -> float:

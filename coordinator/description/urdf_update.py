@@ -34,7 +34,7 @@ def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLi
         `robot.bodies`.
         friction: (n, 2) viscous [Nm s/rad] and Coulomb [Nm] of every joint.
     """
-    # Comments are the owner's too.
+    # Comments of the given file are kept.
     root = parse(robot.path, XMLParser(target=TreeBuilder(insert_comments=True))).getroot()
     heads = dict(zip(robot.bodies, bodies, strict=True))
     for link in root.findall("link"):

@@ -138,7 +138,7 @@ def _joint(robot: Element, name: str, kind: str, parent: str, child: str, pose: 
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
     # URDF turns about the fixed x, y and z in this order. At a pitch of 90 degrees roll and yaw are one
-    # angle: any split of it is right, and nobody needs the warning.
+    # angle: any split of it is right, so the warning is suppressed.
     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", suppress_warnings=True)
     SubElement(joint, "origin", xyz=_texts(pose[:3, 3]), rpy=_texts(rpy))
     return joint
