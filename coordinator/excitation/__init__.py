@@ -1,1 +1,1 @@
-"""Motions chosen for what they tell: plan, single joint, multisine, D-optimal."""
+"""Motions chosen by their information: plan, single joint, multisine, D-optimal."""

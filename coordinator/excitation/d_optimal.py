@@ -1,9 +1,8 @@
-"""Which motions tell the inertial parameters best: D-optimal among many that the robot may run.
+"""D-optimal motions for the inertial parameters, chosen among random ones within the robot's limits.
 
-Candidates are drawn within the limits; of each the regressor says how much it would tell of the base
-parameters. Those are chosen, one after another and then in exchange for one another, whose information
-together has the largest determinant (Fedorov 1972; Swevers et al., Optimal robot excitation and
-identification, 1997, for sines as candidates).
+The regressor gives the information of each candidate about the base parameters. Those are chosen, one after
+another and then in exchange for one another, whose information together has the largest determinant (Fedorov
+1972; Swevers et al., Optimal robot excitation and identification, 1997, for sines as candidates).
 """
 
 from collections.abc import Sequence
@@ -22,21 +21,21 @@ from module_agent.model.regressor import inverse_dynamics, torque_regressor
 CANDIDATES = 150
 # Faster than the sines by ten: each period of the fastest is seen in a dozen samples.
 RATE_HZ = 20.0
-# Of the largest eigenvalue: rounding in a sum of squares is 1e-16 of it, the weakest that a motion tells
-# 1e-10.
+# Share of the largest eigenvalue: rounding in a sum of squares is 1e-16 of it, the weakest that a motion
+# excites 1e-10.
 BASE_TOLERANCE = 1e-13
 # Passes of exchanging each chosen motion for a better one; it settles in two or three.
 MAX_PASSES = 6
 # A motion that goes too far is tried again smaller, about a pose nearer to home.
 SHRINK = (1.0, 0.7, 0.5, 0.35)
-# Of the torque that a joint has: inertia that is not known yet may be larger than believed.
+# Share of a joint's maximum torque: the inertia, not identified yet, may be larger than the prior.
 TORQUE_SHARE = 0.6
 
 
 class ExcitationTask(NamedTuple):
-    """What is to be excited, and within which limits; arrays (n,) in the order of the chain.
+    """The robot to be excited, and the limits; arrays (n,) in the order of the chain.
 
-    phi: (10 n,) what is believed of the bodies; it keeps torques within the motors' and is no prior of the
+    phi: (10 n,) likely bodies; they keep the torques within the motors' limits and are no prior of the
         information. reach_rad: how far from home any joint may go. max_effort_nm: of the motors.
     torque_sigma_nm: noise of a torque reading. travel_speed_rad_s: of the ways from home to the poses.
     """
@@ -54,11 +53,12 @@ class ExcitationTask(NamedTuple):
 
 
 class Excitation(NamedTuple):
-    """The chosen motions in the order in which they were chosen, and what they tell.
+    """The chosen motions in the order in which they were chosen, and their information.
 
-    rank: of the base parameters that any candidate tells. log_det: of the information of those, per kg^-2.
+    rank: number of base parameters that any candidate excites. log_det: of the information of those, per
+    kg^-2.
     condition: of the stacked regressor within them. refused: candidates that came too near to the robot
-        itself or asked too much of a motor, however small.
+        itself or exceeded a motor's torque, even when made smaller.
     """
 
     segments: tuple[Segment, ...]
@@ -107,7 +107,7 @@ def design_excitation(
 
 
 def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | str:
-    """Draw one motion that the robot may run, or return what refuses it, however small it is made.
+    """Draw one motion within the limits, made smaller if necessary, or return the limit that refuses it.
 
     Raises:
         NoExcitation: a joint has no room at all.
@@ -124,7 +124,7 @@ def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | s
 
 
 def information(task: ExcitationTask, motion: SampledMotion) -> Array:
-    """Return Y^T W Y (10 n, 10 n) of a motion, parameters in kg (see `identification.parameter_scale`)."""
+    """Return Y^T W Y (10 n, 10 n) of a motion, parameters in kg (see `pseudo_inertia.parameter_scale`)."""
     regressor = torque_regressor(task.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     scale = parameter_scale(len(task.limits))
     rows = (regressor / task.torque_sigma_nm[:, None]).reshape(-1, scale.size) * scale
@@ -145,13 +145,13 @@ def _refused(task: ExcitationTask, segment: Segment) -> str | None:
 
 
 def _base_directions(pieces: Sequence[Array]) -> Array:
-    """Return what all candidates together tell, (10 n, rank), orthonormal."""
+    """Return the directions that all candidates together excite, (10 n, rank), orthonormal."""
     values, vectors = np.linalg.eigh(np.sum(pieces, axis=0))
     return np.asarray(vectors[:, values > BASE_TOLERANCE * values[-1]])
 
 
 def _log_det(total: Array) -> float:
-    """Return the log of the determinant, of what is known to `MAX_SIGMA_KG` beforehand."""
+    """Return the log determinant of the information with a prior of `MAX_SIGMA_KG`."""
     return float(np.linalg.slogdet(total + np.eye(len(total)) / MAX_SIGMA_KG**2)[1])
 
 
@@ -167,7 +167,7 @@ def _greedy(within: Array, count: int) -> list[int]:
 
 
 def _exchanged(within: Array, chosen: Sequence[int]) -> list[int]:
-    """Replace each motion by the one that serves the others best, until none does better."""
+    """Replace each motion by the one that complements the others best, until no exchange improves."""
     order = list(chosen)
     for _ in range(MAX_PASSES):
         before = list(order)

@@ -1,4 +1,4 @@
-"""What one IMU on a circle will tell of it before anything has moved: the Fisher information of a motion.
+"""The Fisher information of a joint's motion about the circle of one IMU, predicted before the motion.
 
 An IMU that a joint carries, with the joint's axis j and the radial vector r in its frame, reads
 
@@ -8,7 +8,7 @@ An IMU that a joint carries, with the joint's axis j and the radial vector r in 
 g the specific force of rest at q = 0 in its frame (thesis eqs 12 to 24, with the sensors' own errors).
 Unknown are r across the axis, the axis, g but for its size, and the errors of the IMU, which a prior knows in
 part. The covariance is the inverse of the information, sum of slopes^T slopes / sigma^2 and the prior: the
-Cramer-Rao bound. Joint angles count as known: encoders are far better than what they are compared with.
+Cramer-Rao bound. Joint angles count as exact: encoders are far more precise than IMUs.
 """
 
 from typing import NamedTuple
@@ -23,12 +23,12 @@ from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.perturbation import cross, skew
 
-# Radius (2), axis (2), gravity (3): what is unknown beside the IMU's own errors.
+# Unknowns besides the IMU's own errors: radius (2), axis (2), gravity (3).
 GEOMETRY = 7
 
 
 class CircleSetting(NamedTuple):
-    """Where an IMU is expected on its circle: vectors (3,) in its frame at q = 0.
+    """The expected place of an IMU on its circle: vectors (3,) in its frame at q = 0.
 
     axis: unit vector. radial_m: across it, from the axis to the IMU. gravity_m_s2: specific force of rest.
     """
@@ -55,7 +55,7 @@ class JointPath(NamedTuple):
 
 
 def circle_readings(setting: CircleSetting, path: JointPath) -> Array:
-    """Return what a perfect IMU reads, gyro and specific force, (6, m)."""
+    """Return the readings of an ideal IMU, gyro and specific force, (6, m)."""
     axis = setting.axis[:, None]
     radial = np.broadcast_to(setting.radial_m[:, None], (3, len(path.q_rad)))
     gravity = turned(setting.axis, -path.q_rad, np.repeat(setting.gravity_m_s2[:, None], len(path.q_rad), 1))
@@ -102,7 +102,7 @@ def circle_covariance(
         DataError: no motion.
     """
     if not paths:
-        raise DataError("no motion: nothing is told of the circle")
+        raise DataError("no motion: at least one is needed for information about the circle")
     free = prior.sigmas > 0.0
     information = np.diag(np.concatenate([np.full(GEOMETRY, 1e-9), prior.sigmas[free] ** -2.0]))
     up = setting.gravity_m_s2 / np.linalg.norm(setting.gravity_m_s2)

@@ -1,6 +1,7 @@
-"""What a joint may be asked for, by its type, what it carries and what it held at rest.
+"""Limits of a joint's motion by its module type, its inertia and its torque at rest.
 
-How much inertia a joint moves, roughly, by its own slow motion: what the next may ask of its torque.
+The inertia is that of a stretched arm before any motion, and estimated from the joint's own slow motion after
+it.
 """
 
 from typing import NamedTuple
@@ -24,12 +25,13 @@ HOT_RESISTANCE = 1.0 + COPPER_PER_K * WINDING_RISE_K
 # which is over before the winding is warm; and so much is never asked for.
 MIN_SHARE = 0.1
 RESERVE_SHARE = 0.2
-# Of the range of a module that does not turn through; the end stops are felt before they are met.
+# Share of the range of a module that does not turn continuously; the rest is kept from the end stops.
 RANGE_SHARE = 0.9
 # Links and brackets weigh about 0.6 of the modules; a module with its link reaches about 0.12 m further.
 LINK_MASS_SHARE = 0.6
 REACH_PER_MODULE_M = 0.12
-# Of the torque that holds an arm level: whoever can carry an arm has so much left to move it.
+# Of the torque that holds an arm level: a module that can carry an arm has at least this share left to move
+# it.
 LEVEL_SHARE = 0.05
 # Of any motion: 100 a period at 4 Hz for 15 s.
 PEAK_SAMPLES = 6001
@@ -40,7 +42,7 @@ class NoExcitation(DataError):
 
 
 class JointLimits(NamedTuple):
-    """The largest speed and acceleration of a motion, and the places it may reach."""
+    """The largest speed and acceleration of a motion, and the range of positions."""
 
     speed_rad_s: float
     accel_rad_s2: float
@@ -61,12 +63,12 @@ def continuous_torque_nm(kind: ModuleType) -> float:
 
 
 def joint_limits(kind: ModuleType, rest_torque_nm: float, inertia_kg_m2: float) -> JointLimits:
-    """Return what a joint may do.
+    """Return the limits of a joint.
 
     Args:
         kind: its type.
-        rest_torque_nm: what it held where the motion takes place.
-        inertia_kg_m2: of what it moves, about its axis; too large rather than too small.
+        rest_torque_nm: its torque at rest where the motion takes place.
+        inertia_kg_m2: of all that it moves, about its axis; an upper bound.
 
     Raises:
         ValueError: an inertia that is not positive.
@@ -105,7 +107,7 @@ def motion_peaks(pattern: Pattern, origin_rad: float = 0.0) -> tuple[float, floa
     return float(np.abs(velocity).max()), float(np.abs(np.gradient(velocity, t_s)).max())
 
 
-# Whatever a joint carries, it has an output and a gear train of its own.
+# A joint moves at least its own output and gear train.
 MIN_KG_M2 = 2e-3
 
 
@@ -117,7 +119,7 @@ class Load(NamedTuple):
 
     @property
     def at_most_kg_m2(self) -> float:
-        """What it hardly exceeds: two standard deviations more, and a fifth for what the fit leaves out."""
+        """An upper bound: two standard deviations more, and a fifth for the model's simplifications."""
         return max(1.2 * (max(self.inertia_kg_m2, 0.0) + 2.0 * self.sigma_kg_m2), MIN_KG_M2)
 
 

@@ -1,4 +1,4 @@
-"""Motions of all joints at once, told apart by their frequencies (thesis 7.2: whole manipulator movements).
+"""Motions of all joints at once, separated by their frequencies (thesis 7.2: whole manipulator movements).
 
 Each joint turns slowly and widely, so that gravity turns in the IMUs, and quickly about that, so that lever
 arms show. No two joints share a frequency; within the window they are nearly orthogonal.
@@ -12,11 +12,11 @@ import numpy as np
 from coordinator.excitation.joint_limits import JointLimits, NoExcitation, motion_peaks
 from module_agent.wire.messages import MultiSine, Sine
 
-# Slow: several turns of gravity within the window. Fast: links and bases that give lengthen what they carry
-# by (f / 13 Hz)^2 or so, whatever the amplitude.
+# Slow: several turns of gravity within the window. Fast: compliant links and bases lengthen the
+# apparent radius by about (f / 13 Hz)^2 at any amplitude.
 SLOW_HZ = (0.15, 0.4)
 FAST_HZ = (0.6, 1.3)
-# Nobody knows yet what a robot may run into: all joints together carry a tip as far as the sum of them.
+# The surroundings are not known yet: all joints together move a tip as far as the sum of their motions.
 SLOW_RAD = 0.25
 FAST_RAD = 0.12
 # Half of speed and acceleration is left to the fast motion.
@@ -28,14 +28,14 @@ FLAT_SHARE = 0.7
 
 
 class JointSetting(NamedTuple):
-    """What a joint may do, and where its motion takes place."""
+    """The limits of a joint, and the centre of its motion."""
 
     limits: JointLimits
     home_rad: float
 
 
 def simultaneous_duration_s(joints: int) -> float:
-    """Return how long all joints must turn for their frequencies to be told apart."""
+    """Return how long all joints must turn for their frequencies to be separable."""
     spacing_hz = (FAST_HZ[1] - FAST_HZ[0]) / max(joints - 1, 1)
     return max(MIN_DURATION_S, BEATS / spacing_hz / FLAT_SHARE)
 
@@ -45,10 +45,10 @@ def simultaneous_patterns(
 ) -> dict[str, MultiSine]:
     """Return a motion for every joint, to be run at the same time.
 
-    Slower joints get the lower frequencies, which ask less of them.
+    Slower joints get the lower frequencies.
 
     Raises:
-        NoExcitation: a joint has no room to move about its home, or nothing left to accelerate with.
+        NoExcitation: a joint has no room to move about its home, or no torque left to accelerate with.
     """
     order = sorted(settings, key=lambda s: (settings[s].limits.speed_rad_s, s))
     slow, fast = np.linspace(*SLOW_HZ, len(order)), np.linspace(*FAST_HZ, len(order))
@@ -79,7 +79,7 @@ def _pattern(serial: str, setting: JointSetting, slow_hz: float, fast_hz: float,
 
 
 def _within(limits: JointLimits, pattern: MultiSine) -> MultiSine:
-    """Return a motion made smaller if the taper, which adds to speed and acceleration, asks for too much."""
+    """Return the motion, made smaller if the taper raises speed or acceleration above the limits."""
     speed, accel = motion_peaks(pattern)
     scale = min(1.0, limits.speed_rad_s / speed, limits.accel_rad_s2 / accel)
     smaller = tuple(s.model_copy(update={"amplitude_rad": scale * s.amplitude_rad}) for s in pattern.sines)

@@ -1,4 +1,4 @@
-"""What a session does with a robot: which motions, how large, how long."""
+"""The settings of a session: which motions, how large, how long."""
 
 import tomllib
 from pathlib import Path
@@ -18,7 +18,7 @@ Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
 
 
 class PlanFileError(UsageError):
-    """The file is no plan; the message names the file, the setting and what would be right."""
+    """The file is not a plan; the message names the file, the setting and the accepted values."""
 
 
 class Plan(BaseModel):
@@ -34,8 +34,8 @@ class Plan(BaseModel):
     # Of designed motions: how long exploring a joint may take, journeys included; by their number if not set,
     # so that all of the session takes 10 s a joint.
     joint_s: Seconds | None = None
-    # Of designed motions: fast ones are repeated until the sensors leave less than this of a radius open, by
-    # the information predicted of them, or until more would not help.
+    # Of designed motions: fast ones are repeated until the predicted sigma of a radius is below this, or
+    # until a further repetition would not lower it.
     precision_mm: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
     # Of the motion of all joints at once; by their number if not set.
     simultaneous_duration_s: Seconds | None = None
@@ -64,11 +64,11 @@ class Plan(BaseModel):
     excitation_s: Annotated[float, Field(ge=3.0, le=60.0)] = 6.0
     excitation_reach_rad: Annotated[float, Field(gt=0.0, le=1.2)] = 0.8
     dynamics: bool = True
-    # Who is mounted on whom takes the slow motions alone; without the fast ones there is no chain.
+    # The topology needs the slow motions only; the chain needs the fast ones, too.
     topology_only: bool = False
-    # How well the modules' IMUs are known beforehand: `kinematics.imu_intrinsics`.
+    # The prior of the modules' IMUs: `module_agent.model.imu_prior`.
     imu: ImuKind = "uncalibrated"
-    # And how well the scales of their torque sensors: `dynamics.torque_scale`.
+    # The prior of the scales of their torque sensors: `parameter_fit.torque_sensor_scale`.
     torque: TorqueKind = "uncalibrated"
     hold_stiffness: Annotated[float, Field(ge=1.0, le=20.0)] = 1.0
     retries: Annotated[int, Field(ge=0, le=5)] = 2

@@ -1,4 +1,4 @@
-"""Excitation of a robot whose chain has just been found, by what its bodies are likely to be."""
+"""Excitation of a robot whose chain is identified and whose bodies have only a prior."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,8 +16,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.wire.messages import Limits
 
-# Of its largest torque, what a module's sensor scatters: its spring turns by that much within an encoder's
-# counts.
+# Noise of a module's torque sensor as a share of its largest torque: an encoder count of the spring's turn.
 SIGMA_SHARE = 2e-3
 # Of a module's own limit of position: held joints give, and a motion is refused that touches it.
 END_RAD = 0.03
@@ -26,7 +25,7 @@ DRAWS = 40
 
 
 class RobotModule(NamedTuple):
-    """What a module is, and what it says that it does not exceed."""
+    """A module's type, and the limits that it reports."""
 
     kind: ModuleType
     limits: Limits
@@ -61,7 +60,7 @@ def _by_serial(chain: Chain, segment: Segment) -> RobotMotion:
 
 
 def excitation_task(chain: Chain, modules: Sequence[RobotModule], plan: Plan) -> ExcitationTask:
-    """Return what a robot may be asked for, by its modules and what is likely to hang on them.
+    """Return the excitation task of a robot by its modules and the prior of its bodies.
 
     Raises:
         ValueError: there is not one module per joint.

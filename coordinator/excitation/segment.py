@@ -1,4 +1,4 @@
-"""One stretch of excitation: all joints about a pose at the same time, each with sines of its own."""
+"""One segment of excitation: all joints move about a pose at once, each by its own sum of sines."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -12,11 +12,11 @@ from module_agent.model.read_only import make_read_only, read_only
 from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import GoTo, MultiSine, Sine
 
-# As many sines a joint, within the band: fast enough for inertia to show beside gravity, slow enough for
-# links that give and for the joints' own bandwidth.
+# Sines per joint, within the band: fast enough for inertia to show against gravity, slow enough for compliant
+# links and for the joints' own bandwidth.
 SINES = 3
 BAND_HZ = (0.2, 1.6)
-# The largest part of a sine's share of speed and acceleration: what the taper adds has room.
+# Share of the limits of speed and acceleration that is used: the taper adds the rest.
 SHARE = 0.8
 
 
@@ -28,7 +28,7 @@ class Segment(NamedTuple):
 
 
 class RobotMotion(NamedTuple):
-    """A segment by serials: where every joint begins [rad], and what it does from there."""
+    """A segment by serials: the pose where every joint begins [rad], and its motion from there."""
 
     pose_rad: Mapping[str, float]
     patterns: Mapping[str, MultiSine]

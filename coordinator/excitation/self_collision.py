@@ -1,9 +1,9 @@
-"""How far a robot stays clear of itself: its links as capsules, of which only the axes are known.
+"""Clearance of a robot from itself: its links as capsules, of which only the axes are known.
 
-A link is the straight way from a joint to the next module's housing, as the chain has it; what hangs on the
-last module nobody knows. Links that are near to each other where the robot stands are built that close, and
-may come only a little nearer. Neighbours meet in the joint between them, and are not watched: it takes a turn
-of more than 2 rad to fold one onto the other.
+A link is the straight line from a joint to the next module's housing, by the chain; a tool on the last module
+is not known. Links that are near to each other at home are built that close, and may come only a little
+nearer. Neighbours meet in the joint between them and are not checked: it takes a turn of more than 2 rad to
+fold one onto the other.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from module_agent.model.forward_kinematics import body_displacements, places_on_
 CLEARANCE_M = 0.10
 # Links that stand nearer than that may come nearer still by so much: cables give.
 NEARER_M = 0.02
-# Nearer than that they meet.
+# Links nearer than that at home are joined.
 TOUCHING_M = 0.01
 # The last module's own output reaches about that far beyond its axis' nearest point to its IMU.
 TIP_M = 0.06
@@ -46,7 +46,7 @@ def link_axes(chain: Chain) -> LinkAxes:
 
 
 def clearance_m(chain: Chain, q_rad: Array, home_rad: Array) -> Array:
-    """Return how near any two links come to each other (m,), inf where there are no two that may meet.
+    """Return how near any two links come to each other (m,), inf without a pair that can collide.
 
     Args:
         chain: n joints.

@@ -1,9 +1,8 @@
-"""Which slow and which fast motion of one joint tell most of the circles that it makes others describe.
+"""The slow and the fast motion of one joint that leave the radius of an IMU's circle least uncertain.
 
-Every candidate within the joint's limits and the time there is gets the variance of the radius that it
-leaves: that of the noise (`circle_information`), and the square of what links and bases that give add, which
-grows with the frequency's square whatever the amplitude. So slow and wide motions win, until the noise takes
-over.
+Every candidate within the joint's limits and the time budget has a predicted variance of the radius: that of
+the noise (`fisher_information`), and the square of the bias by compliant links and bases, which grows with
+the square of the frequency at any amplitude. So slow and wide motions win, until the noise dominates.
 """
 
 from collections.abc import Sequence
@@ -20,12 +19,12 @@ from module_agent.wire.messages import ConstantMotion, Pattern, WindowedSine
 
 # Before anything has moved, a link is taken to be as long as a kit's tube.
 LIKELY_RADIUS_M = 0.3
-# Links and bases that give lengthen what a motion of frequency f shows by (f / f_g)^2: by 0.6 % at 1 Hz on
-# the simulated arms. The refinement leaves a tenth of that, where it has found how they give.
+# Compliant links and bases lengthen the radius that a motion of frequency f shows by (f / f_g)^2: by 0.6 % at
+# 1 Hz on the simulated arms. The refinement, which estimates compliances, leaves a tenth of that.
 GIVE_HZ = 40.0
 SWEEPS_RAD = (0.3, 0.45, 0.7, 1.0)
 FREQUENCIES_HZ = (0.6, 0.8, 1.0, 1.4, 2.0)
-# Nobody knows yet what a joint's motion may run into.
+# The surroundings are not known yet: motions of a joint stay small.
 SINE_RAD = 0.25
 SWEEP_SPEED_RAD_S = 1.0
 # Ramps that begin slowly do not ring links and bases: a cycle of 0.8 Hz.
@@ -41,7 +40,7 @@ SENSOR_RATE_HZ = 250.0
 
 
 class JointTask(NamedTuple):
-    """What is to be explored.
+    """The joint to be explored, and the limits.
 
     along: component of the specific force of rest along the joint's axis, over its size: 1 if the axis is
         upright, 0 if it is level. Seen by the module's own IMU before anything moves.
@@ -60,9 +59,9 @@ class JointTask(NamedTuple):
 
 
 class JointMotions(NamedTuple):
-    """A slow motion through home and a fast one about it, how long all of it takes, what they leave unknown.
+    """A slow motion through home and a fast one about it, their duration and the predicted errors.
 
-    sigma_m: of the radius by the sensors' noise and errors. give_m: what links that give may add to it.
+    sigma_m: of the radius by the sensors' noise and errors. give_m: its bias by compliant links.
     """
 
     constant: ConstantMotion
@@ -96,7 +95,7 @@ def design_joint(task: JointTask, constant: ConstantMotion | None = None) -> Joi
 
 
 def next_sine(task: JointTask, done: Sequence[Pattern], lasting_s: float) -> WindowedSine | None:
-    """Return the fast motion that tells most beside those that are done; None if none fits."""
+    """Return the fast motion that adds most information to those done; None if none fits."""
     candidates = list(_sines(task, lasting_s))
     return min(candidates, key=lambda sine: predicted_sigma_m(task, [*done, sine]), default=None)
 
