@@ -1,4 +1,4 @@
-"""`information.npz`: what a run's torques say, with the chain that it was computed with; versioned."""
+"""`information.npz`: the torque information of a run and the chain that it was computed with; versioned."""
 
 import zipfile
 from pathlib import Path
@@ -18,15 +18,15 @@ VERSION = 2
 class RunInformation(NamedTuple):
     """The information in the torques of one run of a robot of n joints.
 
-    name: of the run. session: the trace hash of its recording, by which a run is known again. joints: (n,)
-    in the columns of `torque_regressor`, whatever else was in the readings taken off. sigma_nm: (n,) noise of
-    the torques. independent_fraction: independent samples per sample.
-    phi_parts: (20 n,) parts that the bodies are likely made of (`dynamics.parts.likely_parts`).
-    directions: (6 n, j) increments that the chain may be off by, one deviation long; zero of errors that are
-    not the chain's. effects: (k_i, j) of every joint: what those do to its rows with the bodies held in the
-    root frame, in Nm (`dynamics.common_errors`).
-    scale: (n,) the torques are 1 + scale times what the sensors showed. scale_sigma: what was known of that
-    before the run; 0 of sensors that show what is.
+    name: of the run. session: the trace hash of its recording, which identifies the run. joints: (n,) in the
+    columns of `torque_regressor`, without the further terms of the readings. sigma_nm: (n,) noise of the
+    torques. independent_fraction: independent samples per sample.
+    phi_parts: (20 n,) likely parts of the bodies (`module_parts.likely_parts`).
+    directions: (6 n, j) perturbations of the chain, one standard deviation long; zero for errors of other
+    kinds. effects: (k_i, j) of every joint: their effects on its rows in Nm, with the bodies fixed in the
+    root frame (`systematic_errors`).
+    scale: (n,) the torques are 1 + scale times the readings. scale_sigma: the prior's standard deviation; 0
+    of calibrated sensors.
     """
 
     name: str

@@ -1,13 +1,12 @@
-"""What several runs with the same modules say together, however the modules were put together for each.
+"""Merge the torque information of several runs with the same modules in different assemblies.
 
-Every run's rows, in standard deviations of what they err by, are taken from its bodies to the parts that
-those are made of (`dynamics.parts`) and stacked: of Gaussian errors that is all that there is to know, in any
-order. An error of a chain is one of its run, and moves the parts with their IMUs. The scale of a torque
-sensor is its module's own in every run, however often that is put together anew: it is one more unknown of
-all runs, of which what is known beforehand counts once. So does every run, which its recording is known by.
+Each run's whitened rows are transformed from bodies to module parts (`module_parts`) and stacked. For
+Gaussian errors this is a sufficient statistic; the order does not matter. The error of a chain belongs to
+its run, and moves the parts with their IMUs. The scale of a torque sensor belongs to its module in all runs:
+it is one more unknown, whose prior counts once. Every run counts once too; it is recognised by its recording.
 
-What a run claims is taken as claimed. An offset of a torque sensor that it took for the first moment of a
-light body is not one of these errors; runs that know that body better show it (`inconsistency_sigma`).
+The covariance of a run is taken as it is. An offset of a torque sensor that a run fitted as the first moment
+of a light body is not in it; the inconsistency with other runs (`inconsistency_sigma`) shows it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +23,7 @@ from coordinator.parameter_fit.systematic_errors import body_shifts, whitened_ef
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 
-# Torques without noise, as a simulation may have them, would weigh infinitely.
+# Simulated torques without noise would have infinite weight.
 _MIN_SIGMA_NM = 1e-9
 
 
@@ -33,11 +32,11 @@ class MergeError(DataError):
 
 
 class RunShare(NamedTuple):
-    """One run by itself and within the whole.
+    """One run by itself, and its share in the merged runs.
 
-    base: what it tells of the parts by itself. sigma_alone, sigma_merged: (rank,) standard deviations of the
-    same combinations by itself and by all runs together. strain: by how many of the run's own standard
-    deviations what all say of them is off from what it says, root mean square. Noise alone makes at most 1.
+    base: the base parameters of the parts by itself. sigma_alone, sigma_merged: (rank,) standard deviations
+    of the same combinations by itself and merged. inconsistency_sigma: difference of the merged values from
+    its own in its own standard deviations, root mean square; at most 1 by noise alone.
     """
 
     name: str
@@ -54,7 +53,7 @@ class RunShare(NamedTuple):
 
 
 class MergedInformation(NamedTuple):
-    """All runs together: base parameters of `parts`, and every run's share."""
+    """All runs merged: the base parameters of `parts`, and every run's share."""
 
     parts: tuple[Part, ...]
     base: BaseParameters
@@ -69,12 +68,12 @@ class MergedInformation(NamedTuple):
 def merge_runs(
     runs: Sequence[RunInformation], tolerance: float = ESTIMATED_CHAIN_TOLERANCE
 ) -> MergedInformation:
-    """Return what runs say together of the parts that their robots were made of.
+    """Return the base parameters of module parts that runs determine together.
 
     Args:
         runs: at least one, each a robot of some of the modules.
-        tolerance: singular values below this share of the largest are not told by the torques; the default is
-            for chains that were themselves estimated.
+        tolerance: singular values below this share of the largest count as zero; the default is for chains
+            that were themselves estimated.
 
     Raises:
         MergeError: no runs, the same run twice, or runs with no module in common.
@@ -108,7 +107,7 @@ def _check(runs: Sequence[RunInformation]) -> None:
 
 
 def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:
-    """Return what is known beforehand of every module's torque sensor, by the best that any run was told."""
+    """Return the prior of every module's torque scale, the smallest sigma that a run was given."""
     sigmas: dict[str, float] = {}
     for run in runs:
         for serial in run.chain.serials:
@@ -117,16 +116,16 @@ def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:
 
 
 def _of_rows(run: RunInformation, of_joints: Array) -> Array:
-    """Return for every row what its joint has."""
+    """Repeat the values of joints (n,) for the rows of each."""
     return np.asarray(np.repeat(of_joints, [len(piece.z) for piece in run.joints]))
 
 
 def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float]) -> Array:
-    """Return a run's rows [scales | parts | target], their errors white; scales are in deviations.
+    """Return a run's whitened rows [scales | parts | target]; scales are in standard deviations.
 
-    A sensor that shows z0 of the torque r phi = (1 + s) z0 was taken to show z0 = z / (1 + v), so that
-    z - v z0 = r phi - s z0. In both places z0 is what the run's own parameters say that it shows: readings
-    would bring their noise along, and all scales come out too small.
+    The reading z0 of the torque r phi = (1 + s) z0 was corrected to z = (1 + v) z0, so that
+    z - v z0 = r phi - s z0. In both places z0 is predicted by the run's own parameters: with measured
+    readings their noise would bias all scales towards zero.
     """
     sigma = np.maximum(run.sigma_nm, _MIN_SIGMA_NM)
     rows, target = whitened(run.joints, sigma, run.independent_fraction)
@@ -145,16 +144,16 @@ def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float
 
 
 def _without_scales(rows: Sequence[Array], scales: int) -> tuple[Array, Array]:
-    """Return rows over the parts and their target of runs whose sensors' scales are the same."""
+    """Return rows over the parts and their target, with the common scales of the runs eliminated."""
     reduced = _without(np.vstack(rows), scales)
     return reduced[:, :-1], reduced[:, -1]
 
 
 def _without(rows: Array, count: int) -> Array:
-    """Return rows without their first columns, unknowns of which one deviation is 1.
+    """Eliminate the first unknowns, whose priors are 0 +- 1, from rows.
 
-    What is known of those beforehand are rows more, and QR leaves below their own rows what is told of all
-    else whatever they are (Bierman 1977, Factorization methods for discrete sequential estimation, ch. 6).
+    The priors are further rows; below the rows of the eliminated unknowns QR leaves the information about all
+    others (Bierman 1977, Factorization methods for discrete sequential estimation, ch. 6).
     """
     known = np.eye(count, rows.shape[1])
     triangle = qr(np.vstack([known, rows]), mode="r", check_finite=False)[0]

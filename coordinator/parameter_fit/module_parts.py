@@ -1,13 +1,12 @@
-"""A robot's bodies as sums of parts that outlive it: what a module's joint turns, and what is held by it.
+"""A robot's bodies as sums of module parts, which stay the same when the modules are assembled differently.
 
-Body i of a robot is the part of module i that turns, and of every module k that it carries the part that is
-held, with the link that leads to it: in whatever order modules are put together, those stay as they are as
-long as every link stays with the module that it leads to. The parameters of a module's parts are counted in
-the frame of its IMU at q = 0, which a robot that has measured itself knows of every module, so that
-phi_bodies = T phi_parts. What rests on the base no torque shows.
+Body i of a robot is the moving side of module i, and of every module k on it the side that is fixed to body i
+("held"), with the link that leads to module k. These parts do not depend on the assembly as long as every
+link stays with the module that it leads to. Their parameters are in the frame of the module's IMU at q = 0,
+whose pose is part of the identified chain, so that phi_bodies = T phi_parts. No torque depends on the part
+that is fixed to the base.
 
-A module that is mounted the other way round holds its output with the link, and turns its housing: those are
-other parts.
+A module that is mounted reversed holds its output with the link and turns its housing: these are other parts.
 """
 
 from collections.abc import Iterable, Sequence
@@ -36,12 +35,12 @@ class Part(NamedTuple):
 
     @property
     def name(self) -> str:
-        """In words: "J1 turned", "J2 held, reversed"."""
+        """Its name: "J1 turned", "J2 held, reversed"."""
         return f"{self.serial} {self.role}" + (", reversed" if self.reversed else "")
 
 
 def parts_of(chains: Iterable[Chain]) -> tuple[Part, ...]:
-    """Return the parts of all these robots, each once, in whatever order the robots come."""
+    """Return the parts of all these robots, each once and sorted."""
     roles: tuple[Role, ...] = get_args(Role)
     parts = {
         Part(serial, role, bool(turned))
@@ -53,7 +52,7 @@ def parts_of(chains: Iterable[Chain]) -> tuple[Part, ...]:
 
 
 def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
-    """Return the matrix T (10 n, 10 p), read-only, by which the bodies of a chain are made of parts.
+    """Return the matrix T (10 n, 10 p), read-only, from parts to the bodies of a chain.
 
     phi_bodies = T phi_parts, the bodies' in the root frame as in `torque_regressor`, a part's in the frame of
     its module's IMU at q = 0.
@@ -76,11 +75,10 @@ def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
 
 
 def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> Array:
-    """Return parameters (20 n,) of the parts of one chain that make up its bodies, read-only.
+    """Return likely parameters (20 n,) of the parts of one chain, in the order of `parts_of([chain])`.
 
-    Torques tell a body as a whole. Its parts are those of modules of the type; by what the body is other than
-    such parts together, each of them is in proportion to its mass: T `likely_parts` = phi. They are in the
-    order of `parts_of([chain])`.
+    Torques determine a body as a whole. Its parts are those of the catalogue, and the difference of the body
+    from their sum is shared out in proportion to their masses, so that T `likely_parts` = phi. Read-only.
 
     Args:
         chain: n joints. types: their modules'. phi: (10 n,) bodies in the root frame.

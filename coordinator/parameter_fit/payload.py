@@ -1,14 +1,14 @@
-"""What was added to a robot whose dynamics are known: mass, centre and inertia, and on which body.
+"""Identify a payload on a robot whose dynamics are known: mass, centre and inertia, and the body it is on.
 
-What is added to a body adds to its ten parameters (Kubus, Kroeger and Wahl 2008, On-line estimation of
-inertial parameters using a recursive total least-squares approach, identify it at the wrist by a sensor; here
-the joints' torques tell it). With information on the robot from before, and rows of later motions,
+A payload adds to the ten parameters of its body (Kubus, Kroeger and Wahl 2008, On-line estimation of inertial
+parameters using a recursive total least-squares approach, identify it by a wrist sensor; here it comes from
+the joints' torques). With the information of motions without it, and rows of later motions,
 
     [ R  0   ] [ phi ]   [ z  ]
     [ S  S_b ] [ psi ] = [ z' ],
 
-S_b the columns of the body b that carries it: the robot's parameters are free as far as neither motion tells
-them, and the payload's covariance holds what is uncertain of the robot. The payload is a body that can exist.
+S_b the columns of the body b that carries it. The robot's parameters are free within the information of both
+motions, so that the payload's covariance contains their uncertainty. The payload is physically consistent.
 """
 
 from collections.abc import Sequence
@@ -28,19 +28,22 @@ from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 
-# Before anything moved: some hundred grams, about as large as a fist, near the module that carries it. It
-# counts as much as one torque reading.
+# Prior: some hundred grams, about as large as a fist, near the module that carries it. It counts as much as
+# one torque reading.
 LIKELY_KG, LIKELY_SIZE_M = 0.2, 0.05
 PRIOR_WEIGHT = 1.0
-# Of the rows' misfit: ten parameters in noise alone take some 10 off, and models err by more than noise.
+# Of the decrease of the misfit: ten parameters fitted to noise take off about 10, and models have errors
+# besides noise.
 FOUND_ABOVE = 50.0
-# What a payload leaves of the misfit is one variance a row, and a little more where springs give; several
-# times that is another change.
+# With a payload the misfit is one variance a row, and a little more where springs give; several times that
+# is another change of the robot.
 EXPLAINED_BELOW = 10.0
 
 
 class PayloadOn(NamedTuple):
-    """The best payload on one body: (10,) its parameters, (10, 10), and the misfit that it leaves."""
+    """The best payload on one body: its parameters (10,), their covariance (10, 10), and the misfit with
+    it.
+    """
 
     misfit: float
     phi: Array
@@ -48,13 +51,12 @@ class PayloadOn(NamedTuple):
 
 
 class Payload(NamedTuple):
-    """What was added; arrays are read-only, in the root frame at q = 0.
+    """A payload; arrays are read-only, in the root frame at q = 0.
 
-    carrier: index of the body that carries it. changed: whether the torques are others at all. phi: (10,) its
-    parameters. covariance: (10, 10). gain: by how much it makes the misfit smaller, in variances of the
-    torques' noise; rival: the same of the next best, `rival_carrier`, None if no other body may carry it.
-    left: the misfit that it leaves, for one degree of freedom: about 1 if it is all that has changed. pseudo:
-    (4, 4).
+    carrier: index of the body that carries it. changed: whether the torques have changed at all. phi: (10,)
+    its parameters. covariance: (10, 10). gain: decrease of the misfit, in variances of the torques' noise;
+    rival: the same of the second best, `rival_carrier`, None if no other body may carry it. left: misfit with
+    the payload per degree of freedom: about 1 if nothing else has changed. pseudo: (4, 4) its pseudo-inertia.
     """
 
     carrier: int
@@ -114,13 +116,13 @@ def find_payload(
     independent_fraction: float = 1.0,
     carriers: Sequence[int] | None = None,
 ) -> Payload:
-    """Find what was added to one body of a robot between two stretches of motion.
+    """Identify the payload that was added to one body of a robot between two motions.
 
     Args:
-        before: what motions without the payload say, per joint of n.
-        later: what motions with it say.
-        places_m: (n, 3) where on each body a payload is likely, in the root frame at q = 0.
-        sigma_nm: (n,) noise of the torques, with what the model leaves out.
+        before: information of motions without the payload, per joint of n.
+        later: information of motions with it.
+        places_m: (n, 3) likely place of a payload on each body, in the root frame at q = 0.
+        sigma_nm: (n,) noise of the torques, including model errors.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         carriers: the bodies that may carry it; all when None.
 
@@ -164,8 +166,10 @@ def find_payload(
 
 
 def _complement(rows: Array, target: Array) -> tuple[Array, Array]:
-    """Return what no parameters of the robot explain: of the target (j,), and of any rows, an orthonormal
-    basis (k, j) of the complement of the rows' range."""
+    """Return an orthonormal basis (k, j) of the complement of the rows' range, and the target (j,) in it.
+
+    It is what no parameters of the robot explain.
+    """
     scale = parameter_scale(rows.shape[1] // PER_BODY)
     left, values, _ = np.linalg.svd(rows * scale)
     rank = int((values > RANK_TOLERANCE * values[0]).sum())
@@ -182,7 +186,7 @@ def _on(columns: Array, none: Array, place_m: Array) -> PayloadOn:
 
 
 def _likely(place_m: Array) -> Array:
-    """Return the pseudo-inertia (4, 4) of a payload as it is likely."""
+    """Return the pseudo-inertia (4, 4) of the prior of a payload."""
     centre = np.append(place_m, 1.0)
     pseudo = LIKELY_KG * np.outer(centre, centre)
     pseudo[:3, :3] += LIKELY_KG * LIKELY_SIZE_M**2 * np.eye(3)

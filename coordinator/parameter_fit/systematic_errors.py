@@ -1,9 +1,9 @@
-"""Errors that come as a whole: of the chain that rows were computed with, and of the torque sensors' scale.
+"""Systematic errors: of the chain that rows were computed with, and of the torque sensors' scale.
 
 Noise averages out over thousands of rows; an error of the chain does not. Each of its directions, one
-standard deviation long, makes other torques of the same motion: columns beside the regressor's, which widen
-what is claimed (errors that are considered, but not estimated: Tapley, Schutz and Born 2004, Statistical
-orbit determination, section 6.2).
+standard deviation long, changes the torques of the same motion. These changes are columns that widen the
+covariance (considered but not estimated parameters: Tapley, Schutz and Born 2004, Statistical orbit
+determination, section 6.2).
 """
 
 from collections.abc import Sequence
@@ -20,15 +20,15 @@ from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import JointMotion
 
-# Of the largest variance of a chain's increments: less makes no difference.
+# Of the largest variance of a chain's perturbation: smaller ones make no difference.
 _NEGLIGIBLE = 1e-8
 _MAX_DIRECTIONS = 128
 
 
 def error_directions(covariance: Array) -> Array:
-    """Return increments (6 n, k), read-only, each one deviation long, whose squares add to a covariance.
+    """Return perturbations D (6 n, k), read-only, one standard deviation long, with D D^T the covariance.
 
-    Those too short to make a difference are left out.
+    Negligible ones are left out.
     """
     values, vectors = np.linalg.eigh(covariance)
     kept = np.flatnonzero(values > _NEGLIGIBLE * max(values[-1], 0.0))[-_MAX_DIRECTIONS:]
@@ -37,14 +37,13 @@ def error_directions(covariance: Array) -> Array:
 
 
 def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: JointMotion) -> Array:
-    """Return what errors of a chain, each of one deviation, do to a motion's torques, (m, n, k) [Nm].
+    """Return the effects of a chain's errors, each one deviation long, on a motion's torques, (m, n, k) [Nm].
 
-    The bodies stay where they are in the root frame, as one run tells them; what is told of the parts that
-    they are made of moves with the chain (`body_shifts`).
+    The bodies are fixed in the root frame, as one run determines them; the parts that they are made of move
+    with the chain (`body_shifts`).
 
     Args:
-        chain: n joints. covariance: (6 n, 6 n) of its increments, k of whose
-            `error_directions` matter.
+        chain: n joints. covariance: (6 n, 6 n) of its perturbation; it has k `error_directions`.
         phi: (10 n,) bodies.
         motion: (m, n).
     """
@@ -58,15 +57,15 @@ def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: Joint
 
 
 def body_shifts(chain: Chain, directions: ArrayLike, phi_parts: ArrayLike) -> Array:
-    """Return what errors of a chain do to bodies that are made of known parts, (10 n, k): (T' - T) phi_parts.
+    """Return the effects of a chain's errors on bodies made of known parts, (10 n, k): (T' - T) phi_parts.
 
-    A part is known in the frame of its module's IMU (`parts`), and goes wherever the chain takes that. With
-    the rows r of `torque_regressor` an error of the chain does to the torque of given parts, to first order,
+    A part is given in the frame of its module's IMU (`module_parts`) and moves with it. With the rows r of
+    `torque_regressor` an error of the chain changes the torques of given parts, to first order, by
 
     ID(chain', T' phi_parts) - ID(chain, T phi_parts) = `chain_effects` + r (T' - T) phi_parts.
 
     Args:
-        chain: n joints. directions: (6 n, k) increments.
+        chain: n joints. directions: (6 n, k) perturbations.
         phi_parts: (20 n,) in the order of `parts_of([chain])`.
     """
     parts = parts_of([chain])
@@ -79,10 +78,10 @@ def body_shifts(chain: Chain, directions: ArrayLike, phi_parts: ArrayLike) -> Ar
 
 
 def scale_effects(information: Sequence[JointInformation], scale: TorqueScale) -> tuple[Array, ...]:
-    """Return what torque sensors of a wrong scale add to the rows of every joint, (k_i, n) each [Nm].
+    """Return the effects of torque sensors' scale errors on the rows of every joint, (k_i, n) each [Nm].
 
-    A sensor that shows (1 + s) of the torque makes all that its joint shows as much too large, which no
-    motion tells from heavier bodies.
+    The readings of a sensor are all too large by the same factor, which no motion can distinguish from
+    heavier bodies.
     """
     return tuple(piece.z[:, None] * own for piece, own in zip(information, scale.root, strict=True))
 
@@ -90,7 +89,7 @@ def scale_effects(information: Sequence[JointInformation], scale: TorqueScale) -
 def whitened_effects(
     effects: Sequence[Array], sigma_nm: ArrayLike, independent_fraction: float = 1.0
 ) -> Array:
-    """Return effects on the rows of all joints, (k, j), in standard deviations of the rows' noise.
+    """Return effects on the rows of all joints, (k, j), whitened as the rows are.
 
     Args as `base_parameters.whitened`; effects: (k_i, j) of every joint.
     """

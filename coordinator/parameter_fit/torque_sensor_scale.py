@@ -1,13 +1,13 @@
-"""By how much each joint's torque sensor is off in scale, as far as the joints that share bodies tell.
+"""Estimate the scale error of each joint's torque sensor from the joints that carry the same bodies.
 
-A sensor that shows tau / (1 + s) makes the bodies beyond its joint as much too light. What a joint carries
-hangs on the joints below it too, so that the scales of a robot's joints are known relative to each other;
-that all are off alike no motion shows. With the rows [r_i | z_i] of joint i and what s is known to be within,
+A sensor that reads tau / (1 + s) makes the bodies beyond its joint too light by that factor. The joints below
+carry these bodies too, so that the scales of a robot's joints are determined relative to each other; a common
+scale of all is not. With the rows [r_i | z_i] of joint i and the prior s = 0 +- sigma,
 
     minimise sum_i |z_i - r_i phi / (1 + s_i)|^2 + sum_i (s_i / sigma)^2,
 
-by Gauss and Newton. It is the prediction that is scaled: scaled readings would bring their noise down with
-them, and all scales come out too small.
+by Gauss-Newton. The prediction is scaled, not the reading: scaling the readings would scale their noise too
+and bias all scales towards zero.
 """
 
 from collections.abc import Sequence
@@ -23,17 +23,17 @@ from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 
-# Of a module's torque sensor, a spring whose stiffness is known to a few percent as delivered. That is a
-# guess: no figure is published.
+# Prior of the scale of a module's torque sensor, a spring whose stiffness is known to a few percent as
+# delivered. That is a guess: no figure is published.
 SCALE_SIGMA: dict[TorqueKind, float] = {"calibrated": 0.0, "uncalibrated": 0.05}
-# Of their largest torque; a real X5-1's log shows 0.4 %.
+# Prior of the offset, as a share of the largest torque; a real X5-1's log shows 0.4 %.
 OFFSET_SHARE: dict[TorqueKind, float] = {"calibrated": 0.0, "uncalibrated": 0.005}
 
 
 class TorqueScale(NamedTuple):
-    """The joints' true torques are (1 + value) times what their sensors show; read-only.
+    """Scale errors of torque sensors: the true torques are (1 + value) times the readings; read-only.
 
-    value: (n,). covariance: (n, n), zero of sensors whose scale is known.
+    value: (n,). covariance: (n, n), zero of calibrated sensors.
     """
 
     value: Array
@@ -52,7 +52,7 @@ class TorqueScale(NamedTuple):
 
 
 def known_scale(joints: int) -> TorqueScale:
-    """Return that of sensors that show what is."""
+    """Return the scales of calibrated sensors: zero, with no uncertainty."""
     return TorqueScale(np.zeros(joints), np.zeros((joints, joints)))
 
 
@@ -70,8 +70,8 @@ def refine_scale(
     Args:
         information: per joint, with torques that were multiplied by 1 + `so_far.value`.
         phi: (10 n,) the bodies that fit them best. noise_nm: (n,) of the torques.
-        prior_sigma: what is known of each scale beforehand; above zero.
-        so_far: from which it goes on.
+        prior_sigma: standard deviation of the prior of each scale; above zero.
+        so_far: the estimate to start from.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         tolerance: singular values that are smaller shares of the largest count as zero.
     """

@@ -38,7 +38,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.information import JointInformation
 from module_agent.model.regressor import PER_BODY
 
-# Torques without noise, as a simulation may have them, would weigh infinitely.
+# Simulated torques without noise would have infinite weight.
 _MIN_SIGMA_NM = 1e-9
 
 
