@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 # Half a minute of feedback of 16 modules at ten batches a second to a file and a live viewer.
 QUEUE_LENGTH = 8192
-# Places that are kept for steps, topology and chain when there is too much data.
+# Places reserved for steps, topology and chain when there is too much data.
 RESERVED = 512
 IDLE_SECONDS = 0.25
 
@@ -46,7 +46,7 @@ class LoggingThread:
 
     @property
     def dropped(self) -> int:
-        """How many jobs found the queue full."""
+        """How many jobs were dropped because the queue was full."""
         return self._dropped
 
     @property

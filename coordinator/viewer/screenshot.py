@@ -153,7 +153,7 @@ def _settle(client: ViewerClient) -> None:
     last, same = b"", 0
     while same < SAME_PICTURES:
         if time.monotonic() > deadline:
-            raise ScreenshotFailed(f"the viewer kept changing for {SETTLE_SECONDS:.0f} s")
+            raise ScreenshotFailed(f"the picture did not become stable within {SETTLE_SECONDS:.0f} s")
         state = client.get_state()
         picture = client.take_screenshot(max_size=960)
         still = picture == last and not state.loading

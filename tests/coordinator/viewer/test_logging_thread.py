@@ -59,7 +59,9 @@ def test_steps_still_fit_behind_a_flood_of_data(gate: threading.Event) -> None:
     thread.close()
 
 
-def test_a_job_that_raises_is_counted_told_once_and_stops_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_job_that_raises_is_counted_reported_once_and_stops_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     def fail() -> None:
         raise ValueError("a bad value")
 

@@ -1,4 +1,4 @@
-"""What the viewer is handed of a session: every published row, once and at its time, and the poses."""
+"""What a feed shows of a session: every published row, once and at its time, and the poses."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -28,8 +28,8 @@ class Shown:
 
     def rows(self, serial: str, t_ns: np.ndarray, rows: np.ndarray) -> None:
         self.calls.append("rows")
-        found = zip(t_ns.tolist(), rows["position_rad"].tolist(), strict=True)
-        self.rows_of.setdefault(serial, []).extend(found)
+        shown = zip(t_ns.tolist(), rows["position_rad"].tolist(), strict=True)
+        self.rows_of.setdefault(serial, []).extend(shown)
 
     def poses(self, t_ns: Any, q_rad: Any, serials: Any) -> None:
         self.calls.append("poses")
@@ -40,7 +40,7 @@ class Shown:
 
 
 class Rig:
-    """A recording and the feed of a viewer, as a run feeds them."""
+    """A recording and the feed of a viewer, called as in a run."""
 
     def __init__(self, wire: SimpleNamespace):
         self.wire = wire
@@ -49,26 +49,26 @@ class Rig:
         self.feed = ViewerFeed(self.viewer, self.recording)
         self.feed.since_start(0)
 
-    def hear(self, entry: Entry) -> None:
+    def receive(self, entry: Entry) -> None:
         message = self.recording.add(entry)
         assert isinstance(message, Message)
         self.feed.on_message(entry, message)
 
-    def meet(self, *serials: str) -> None:
-        """Make modules known, with a round trip that says how far their clocks are ahead."""
+    def connect(self, *serials: str) -> None:
+        """Connect modules, with a round trip that tells how far their clocks are ahead."""
         for serial in serials:
-            self.hear(self.wire.request(Leaf.STATUS, self.wire.ask(serial, seq=4), 0))
+            self.receive(self.wire.request(Leaf.STATUS, self.wire.ask(serial, seq=4), 0))
             answer = self.wire.status(serial, re=4, t_ns=AHEAD_NS)
-            self.hear(self.wire.reply(Leaf.STATUS, answer, 0))
+            self.receive(self.wire.reply(Leaf.STATUS, answer, 0))
         self.feed.connected(dict.fromkeys(serials, "X5-4"), 0)
 
     def publish(self, first: int, serial: str = "A", late_ns: int = 0) -> None:
-        """Five rows, which arrive 2 ms after the last of them and `late_ns`."""
+        """Publish five rows, which arrive 2 ms and `late_ns` after the last of them."""
         block = self.wire.rows(first, 5)
         block["t_ns"] += AHEAD_NS
         arrival_ns = 4 * MS * (first + 4) + 2 * MS + late_ns
         feedback = self.wire.feedback(serial, first=first, rows=block)
-        self.hear(self.wire.publication(Leaf.FEEDBACK, feedback, arrival_ns))
+        self.receive(self.wire.publication(Leaf.FEEDBACK, feedback, arrival_ns))
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def _rows(*numbers: int) -> list[tuple[int, float]]:
 
 
 def test_every_row_is_shown_once_at_the_time_of_its_own_clock(rig: Rig) -> None:
-    rig.meet("A", "B")
+    rig.connect("A", "B")
     for first in range(0, 2000, 5):
         rig.publish(first, "A")
         rig.publish(first, "B")
@@ -95,8 +95,8 @@ def test_every_row_is_shown_once_at_the_time_of_its_own_clock(rig: Rig) -> None:
     assert rig.viewer.rows_of == {"A": _rows(*range(2000)), "B": _rows(*range(2000))}
 
 
-def test_rows_that_come_late_are_shown_when_they_come_and_lost_ones_are_not(rig: Rig) -> None:
-    rig.meet("A")
+def test_late_rows_are_shown_when_they_arrive_and_lost_ones_are_not(rig: Rig) -> None:
+    rig.connect("A")
     for first in (0, 10, 5, 15, 25, 30):
         rig.publish(first)
     # Far behind whatever is gathered together.
@@ -108,7 +108,7 @@ def test_rows_that_come_late_are_shown_when_they_come_and_lost_ones_are_not(rig:
 
 
 def test_rows_are_shown_ten_times_a_second(rig: Rig) -> None:
-    rig.meet("A", "B")
+    rig.connect("A", "B")
     for first in range(0, 5000, 5):
         rig.publish(first, "A")
         rig.publish(first, "B")
@@ -118,7 +118,7 @@ def test_rows_are_shown_ten_times_a_second(rig: Rig) -> None:
 
 
 def test_rows_of_a_module_that_fell_silent_are_shown_with_those_of_the_others(rig: Rig) -> None:
-    rig.meet("A", "B")
+    rig.connect("A", "B")
     rig.publish(0, "A")
     for first in range(0, 2000, 5):
         rig.publish(first, "B")
@@ -134,7 +134,7 @@ def test_nothing_is_shown_of_a_module_whose_clock_is_not_known(rig: Rig) -> None
 
 
 def test_the_robot_turns_thirty_times_a_second_as_its_newest_rows_say(rig: Rig) -> None:
-    rig.meet("A")
+    rig.connect("A")
     arm = Chain(("A",), (-1,), (False,), np.eye(3)[:1], np.zeros((1, 3)), np.eye(4)[None], np.eye(3)[2])
     fit = _fit(arm)
     rig.feed.chain(0, fit)

@@ -1,4 +1,4 @@
-"""States, colours and ranges of plots: what is worked out before anything is logged."""
+"""Envelopes, states, colours and axis ranges, which are computed before anything is logged."""
 
 import numpy as np
 from hypothesis import given
@@ -12,12 +12,12 @@ from module_agent.wire.feedback_rows import ROW
 
 def test_states_change_across_batches_and_an_unknown_state_is_shown_by_number() -> None:
     changes = StateChanges()
-    found = []
+    names = []
     for states in ([0, 0, 1], [1, 1], [9, 0]):
         rows = np.zeros(len(states), ROW)
         rows["state"] = states
-        found.append(changes.changes(Batch("a", np.arange(len(states)), rows))[1])
-    assert found == [["idle", "armed"], [], ["state 9", "idle"]]
+        names.append(changes.changes(Batch("a", np.arange(len(states)), rows))[1])
+    assert names == [["idle", "armed"], [], ["state 9", "idle"]]
 
 
 numbers = st.floats(-1e6, 1e6) | st.just(float("nan"))
@@ -57,15 +57,15 @@ def test_slow_feedback_is_shown_row_by_row() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(1e-6, 1.0)), min_size=2, max_size=40))
-def test_the_newest_estimate_and_its_band_can_always_be_seen(estimates: list[tuple[float, float]]) -> None:
-    seen, previous = None, None
+def test_the_newest_estimate_and_its_band_are_always_visible(estimates: list[tuple[float, float]]) -> None:
+    shown, previous = None, None
     for value, sigma in estimates:
-        seen = fitting(seen, value, sigma, previous)
-        assert seen is not None
-        low, high = seen
+        shown = fitting(shown, value, sigma, previous)
+        assert shown is not None
+        low, high = shown
         assert low <= value - sigma < value + sigma <= high
         if previous is not None and abs(value - previous) < sigma:
-            # A band below a thirtieth of the plot cannot be told from a line.
+            # A band below a thirtieth of the plot looks like a line.
             assert 2.0 * sigma > (high - low) / 30.001
         previous = value
 
@@ -75,12 +75,12 @@ def test_a_jump_of_many_sigmas_is_not_zoomed_away() -> None:
     assert low < 0.29 < 0.3 < high
 
 
-def test_a_converging_estimate_changes_its_plot_seldom() -> None:
+def test_a_converging_estimate_rarely_changes_its_plot() -> None:
     ranges = []
-    seen = None
+    shown = None
     for k in range(1, 1001):
-        seen = fitting(seen, 0.3, 0.1 / k, 0.3)
-        ranges.append(seen)
+        shown = fitting(shown, 0.3, 0.1 / k, 0.3)
+        ranges.append(shown)
     # From 0.1 down to 0.0001 by zooms of a factor of about two and more.
     assert 1 < len(dict.fromkeys(ranges)) < 12
 

@@ -1,4 +1,4 @@
-"""What a run leaves in its file, read back with Rerun's own reader."""
+"""The file that a viewer writes, read back with Rerun's own reader."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +20,7 @@ from module_agent.wire.feedback_rows import Rows
 
 Read = Callable[[Path, str], pd.DataFrame]
 MakeRows = Callable[[int, int], Rows]
-PERIOD_NS = 4_000_001  # no round number, so that times kept as float seconds would show
+PERIOD_NS = 4_000_001  # not a round number, so that times stored as float seconds would differ
 
 
 @pytest.fixture
@@ -85,7 +85,7 @@ def test_a_minute_of_feedback_needs_few_chunks(viewer: Viewer, file: Path, make_
     assert chunks.count("/estimates/link_length/a") <= 4
 
 
-def test_a_command_that_is_not_set_is_not_drawn_at_nought(
+def test_a_command_that_is_not_set_is_not_drawn_at_zero(
     viewer: Viewer, file: Path, make_rows: MakeRows, read: Read
 ) -> None:
     viewer.rows("a", INTERVAL_NS * np.arange(5), make_rows(0, 5))
@@ -124,7 +124,7 @@ def test_an_estimate_keeps_its_value_variance_and_unit(viewer: Viewer, file: Pat
     assert table[f"{path}:Measurements:units"][0][0] == "m"
 
 
-def test_an_estimate_has_the_ends_of_its_interval_and_the_truth_beside_it(
+def test_an_estimate_has_the_ends_of_its_interval_and_its_true_value(
     viewer: Viewer, file: Path, read: Read
 ) -> None:
     viewer.true_value("link_length", "a", 0.3)
@@ -158,7 +158,7 @@ def test_the_truth_and_the_estimate_turn_together_even_where_only_some_joints_ar
     assert turned[0, 0] == pytest.approx(np.cos(0.7))
 
 
-def test_held_out_torque_and_what_is_left_of_it(viewer: Viewer, file: Path, read: Read) -> None:
+def test_held_out_torque_and_its_residual(viewer: Viewer, file: Path, read: Read) -> None:
     viewer.residuals("a", np.array([1, 2]), [1.0, 2.0], [0.5, 2.25])
     done(viewer)
     error = read(file, "/residuals/a/error")

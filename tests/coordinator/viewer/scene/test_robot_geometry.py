@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coordinator.viewer.scene import robot_scene
-from coordinator.viewer.scene.robot_geometry import from_z, links, modules, reach_m, upright
+from coordinator.viewer.scene.robot_geometry import from_z, links, modules, reach_m, side_by_side, upright
 from coordinator.viewer.scene.topology_graph import as_topology, extent, positions
 from module_agent.model.chain import Chain
-from module_agent.model.forward_kinematics import body_displacements
+from module_agent.model.forward_kinematics import body_displacements, imu_poses
 
 directions = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3)
 
@@ -96,7 +96,7 @@ trees = st.integers(1, 20).flatmap(lambda n: st.tuples(*(st.integers(-1, k - 1) 
 
 
 @given(trees)
-def test_children_are_below_their_parents_and_nobody_is_on_anybody_else(parent: tuple[int, ...]) -> None:
+def test_children_are_below_their_parents_and_no_two_modules_overlap(parent: tuple[int, ...]) -> None:
     serials = [f"m{k}" for k in range(len(parent))]
     topology = as_topology(serials, parent, [False] * len(parent))
     base, *places = positions(topology)
@@ -111,3 +111,36 @@ def test_a_chain_of_sixty_four_modules_is_one_straight_line() -> None:
     serials = [f"m{k}" for k in range(64)]
     places = positions(as_topology(serials, range(-1, 63), [False] * 64))
     assert len(dict.fromkeys(x for x, _ in places)) == 1
+
+
+def three(arm: Chain) -> Chain:
+    """Return three arms at one place, on a tilted base."""
+    arrays = {name: np.concatenate([getattr(arm, name)] * 3) for name in ("axis", "point", "imu_home")}
+    return Chain(
+        serials=tuple(f"{s}{n}" for n in range(3) for s in arm.serials),
+        parent=(-1, 0, -1, 2, -1, 4),
+        reversed=arm.reversed * 3,
+        gravity=np.array([3.0, 5.0, 7.9]),
+        **arrays,
+    )
+
+
+def test_a_single_tree_is_not_moved(arm: Chain) -> None:
+    assert side_by_side(arm) is arm
+
+
+def test_trees_are_moved_apart_horizontally_and_not_changed(arm: Chain) -> None:
+    chain = three(arm)
+    apart = side_by_side(chain)
+    q = np.array([[0.3, -0.8] * 3])
+    before, after = imu_poses(chain, q)[0], imu_poses(apart, q)[0]
+    np.testing.assert_array_equal(after[:2], before[:2])
+    shift = after[:, :3, 3] - before[:, :3, 3]
+    np.testing.assert_allclose(shift @ chain.gravity, 0.0, atol=1e-12)
+    np.testing.assert_allclose(after[:, :3, :3], before[:, :3, :3], atol=1e-12)
+    for tree in (2, 4):
+        np.testing.assert_allclose(shift[tree], shift[tree + 1], atol=1e-12)
+    along = shift[2] / np.linalg.norm(shift[2])
+    reach = [(p @ along).tolist() for p in apart.imu_home[:, :3, 3].reshape(3, 2, 3)]
+    assert max(reach[0]) + 0.2 < min(reach[1])
+    assert max(reach[1]) + 0.2 < min(reach[2])

@@ -1,4 +1,4 @@
-"""Live viewers that are there, are not there, and die: the file has everything all the same."""
+"""Live viewers that listen, do not listen, or die: the file is complete in every case."""
 
 import subprocess
 from collections.abc import Callable
@@ -22,7 +22,7 @@ def log(viewer: Viewer, make_rows: MakeRows, first: int, count: int) -> None:
         viewer.rows("a", 4_000_000 * np.arange(i, i + 5), make_rows(i, 5))
 
 
-def test_with_nobody_at_the_address_the_file_is_complete(
+def test_without_a_viewer_at_the_address_the_file_is_complete(
     tmp_path: Path, make_rows: MakeRows, read: Read, caplog: pytest.LogCaptureFixture
 ) -> None:
     file, url = tmp_path / "run.rrd", proxy_url(viewer_process.free_port())
@@ -39,7 +39,7 @@ def test_an_address_of_another_kind_is_named(tmp_path: Path, caplog: pytest.LogC
     assert "'127.0.0.1:9876' is no viewer's address; one looks like 'rerun+http://" in caplog.text
 
 
-def test_a_file_that_cannot_be_written_is_said_at_once(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_reported_at_once(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError):
         Viewer("arm", "r", ViewerTargets(rrd=tmp_path))
 
@@ -76,6 +76,6 @@ def test_the_web_page_is_served_to_this_machine_only_and_ends_with_the_run() -> 
 
 
 @pytest.mark.integration
-def test_a_viewer_that_does_not_start_says_why() -> None:
+def test_a_viewer_that_does_not_start_reports_its_output() -> None:
     with pytest.raises(viewer_process.ViewerNotStarted, match="--no-such-option"):
         viewer_process.start(["--no-such-option"], viewer_process.free_port(), detached=False)

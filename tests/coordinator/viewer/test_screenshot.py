@@ -10,6 +10,7 @@ from coordinator.viewer.screenshot import ScreenshotFailed, screenshot, with_act
 from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.chain import Chain
+from module_agent.model.errors import UsageError
 
 BLUEPRINT = {
     "/container/1": {
@@ -38,8 +39,8 @@ def test_a_layout_without_that_tab_is_refused() -> None:
         with_active_tab(BLUEPRINT, "Dynamics")
 
 
-def test_a_tab_or_recording_that_does_not_exist_is_said_before_a_viewer_starts(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="'Kinematics'; there are Identification"):
+def test_a_tab_or_recording_that_does_not_exist_is_reported_before_a_viewer_starts(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="'Kinematics'; there are Identification"):
         screenshot(tmp_path / "run.rrd", tmp_path / "run.png", tab="Kinematics")
     with pytest.raises(FileNotFoundError, match=r"run\.rrd"):
         screenshot(tmp_path / "run.rrd", tmp_path / "run.png")
