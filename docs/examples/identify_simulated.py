@@ -3,10 +3,17 @@
 import sys
 
 from sim import simulate
+from sim.scoring.chain_score import link_errors
 
-robot = sys.argv[1] if len(sys.argv) > 1 else "thesis_171_horizontal"
-run = simulate(robot, noise="x5", seed=1, dynamics=False)
+run = simulate(
+    sys.argv[1] if len(sys.argv) > 1 else "thesis_171_horizontal", noise="x5", dynamics=False, seed=1
+)
+chain = run.identified.kinematics.fit.chain
 for link in run.identified.result.links:
-    print(f"{link.parent} - {link.child}: {link.link_length_mm:.2f} +- {link.link_length_sigma_mm:.2f} mm")
-for score in run.score().links:
-    print(f"{score.parent} - {score.child}: error {score.link_length_error_mm:+.2f} mm")
+    error = link_errors(chain, run.truth.chain, run.truth.chain.serials.index(link.child))
+    claimed = f"{link.link_length_mm:.2f} +- {link.link_length_sigma_mm:.2f} mm"
+    print(
+        f"{link.parent} - {link.child}: {claimed}, off by {1e3 * error.length_m:+.2f} mm"
+        if error
+        else claimed
+    )

@@ -1,0 +1,147 @@
+"""README and docs: commands do what they say, as a newcomer would type them, and tables agree with code."""
+
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from module_agent.wire.feedback_rows import ROW
+from module_agent.wire.topics import TOPICS
+from sim.robot.robot_file import load_robot
+
+ROOT = Path(__file__).parents[1]
+PAGES = {path.name: path.read_text() for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))}
+SCRIPTS = Path(sys.executable).parent
+# What a first-time user waits for at most; each of these takes well under a minute on two cores.
+PATIENCE_S = 240
+
+
+def blocks(language: str, *pages: str) -> list[str]:
+    pattern = re.compile(rf"^```{language}\n(.*?)^```", flags=re.DOTALL | re.MULTILINE)
+    return [block for page in pages or PAGES for block in pattern.findall(PAGES[page])]
+
+
+def commands(block: str) -> list[str]:
+    return [shlex.join(shlex.split(line, comments=True)) for line in block.splitlines() if line.strip()]
+
+
+@pytest.fixture
+def background() -> Iterator[list["subprocess.Popen[bytes]"]]:
+    started: list[subprocess.Popen[bytes]] = []
+    yield started
+    for process in reversed(started):
+        process.send_signal(signal.SIGTERM)
+    for process in reversed(started):
+        assert process.wait(30) == 0, f"{process.args!r} ended with {process.returncode}"
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PATH": f"{SCRIPTS}{os.pathsep}{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
+
+
+@pytest.mark.integration
+@pytest.mark.xdist_group("integration")
+@pytest.mark.parametrize("page", ["guide.md", "benchmarks.md"])
+def test_all_commands_of_a_page_succeed_one_after_the_other(
+    page: str, tmp_path: Path, background: "list[subprocess.Popen[bytes]]"
+) -> None:
+    (tmp_path / "runs").mkdir()
+    for line in (line for block in blocks("sh", page) for line in commands(block)):
+        words = shlex.split(line)
+        if words[-1] == "&":
+            background.append(subprocess.Popen(words[:-1], cwd=tmp_path, env=environment()))
+            continue
+        done = subprocess.run(
+            words, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    if page == "guide.md":
+        check_promised_files(tmp_path / "runs" / "virtual")
+
+
+def check_promised_files(run: Path) -> None:
+    promised = re.findall(r"^\| (`[a-z_.]+`(?:, `[a-z_.]+`)*) \|", PAGES["guide.md"], flags=re.MULTILINE)
+    names = [name for cell in promised for name in re.findall(r"`([a-z_]+\.[a-z]+)`", cell)]
+    assert len(names) >= 8
+    for name in names:
+        assert (run / name).stat().st_size > 0, f"{name} is missing"
+    assert json.loads((run / "score.json").read_text())["topology_correct"] is True
+
+
+def test_every_shell_block_is_run() -> None:
+    """Blocks of other pages hold only `make` commands, which take minutes: CI runs each of them as it is."""
+    ci = (ROOT / ".ci" / "run").read_text()
+    for page in PAGES.keys() - {"guide.md", "benchmarks.md"}:
+        for line in (line for block in blocks("sh", page) for line in commands(block)):
+            assert re.search(rf"^{line}$", ci, flags=re.MULTILINE), f"{page}: CI does not run `{line}`"
+
+
+def test_commands_named_in_sentences_exist_with_their_options() -> None:
+    helps: dict[tuple[str, str], str] = {}
+    for page, text in PAGES.items():
+        for inline in re.findall(r"`((?:\.venv/bin/)?x5-[a-z]+\s[a-z]+[^`]*)`", text):
+            program, command, *rest = shlex.split(inline.removeprefix(".venv/bin/"))
+            if (program, command) not in helps:
+                shown = subprocess.run(
+                    [program, command, "--help"], env=environment(), capture_output=True, text=True
+                )
+                assert shown.returncode == 0, f"{page}: there is no `{program} {command}`"
+                helps[program, command] = shown.stdout
+            for word in rest:
+                if word.startswith("--"):
+                    assert word in helps[program, command], f"{page}: {program} {command} has no {word}"
+
+
+def test_links_lead_somewhere() -> None:
+    for page, text in PAGES.items():
+        folder = ROOT if page == "README.md" else ROOT / "docs"
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)", text):
+            assert (folder / target).exists(), f"{page} links to {target}, which is not there"
+
+
+def test_files_named_on_the_pages_exist() -> None:
+    for page in ("architecture.md", "theory.md", "wire.md"):
+        for name in re.findall(
+            r"`((?:module_agent|coordinator|sim|tests)/[a-z_/0-9]+(?:\.[a-z]+)?)`", PAGES[page]
+        ):
+            assert (ROOT / name).exists(), f"{page} names {name}, which is not there"
+
+
+def test_the_readme_fits_on_a_first_screen_and_a_bit() -> None:
+    assert len(PAGES["README.md"].splitlines()) <= 150
+
+
+def test_the_robot_file_of_the_guide_is_a_robot(tmp_path: Path) -> None:
+    (text,) = blocks("toml")
+    path = tmp_path / "my_arm.toml"
+    path.write_text(text)
+    robot = load_robot(path)
+    assert [module.serial for module in robot.modules] == ["shoulder", "elbow"]
+
+
+def test_the_wire_page_has_every_topic_with_its_messages() -> None:
+    page = PAGES["wire.md"].partition("## A feedback row")[0]
+    rows = dict(re.findall(r"^\| `([a-z]+)` \| (.*?) \|", page, flags=re.MULTILINE))
+    assert rows.keys() == {leaf.value for leaf in TOPICS}
+    for leaf, topic in TOPICS.items():
+        for message in {topic.publication, topic.request, topic.request and topic.reply} - {None}:
+            assert message is not None
+            assert f"`{message.__name__}`" in rows[leaf.value], f"{leaf.value}: {message.__name__} is missing"
+
+
+def test_the_wire_page_has_the_fields_of_a_row_in_order() -> None:
+    shown = re.findall(
+        r"^\| `([a-z0-9_]+)` \| ((?:3 × )?[iuf][0-9]) \|", PAGES["wire.md"], flags=re.MULTILINE
+    )
+    assert [name for name, _ in shown] == list(ROW.names or ())
+    widths = [int(kind[-1]) * (3 if kind.startswith("3") else 1) for _, kind in shown]
+    assert sum(widths) == ROW.itemsize
+    assert f"{np.dtype(ROW).itemsize} bytes" in PAGES["wire.md"]
