@@ -1,4 +1,4 @@
-"""Random robots, and what their IMUs would see, told from how the IMUs are displaced when a joint turns."""
+"""Random robots, and the observations of their IMUs by the displacement when a joint turns."""
 
 from typing import Any
 

@@ -219,7 +219,7 @@ def _normal_equations(
 
 
 def _before(state: _State, prior: ImuPrior, flex: ComplianceJacobian) -> tuple[Array, Array]:
-    """Return the information on [increments (6 n), gravity (3), free IMU errors], and its right-hand side.
+    """Return the information on [perturbations (6 n), gravity (3), free IMU errors], and its right-hand side.
 
     These are the priors of the IMUs' errors, of the links' compliances, and of the magnitude of gravity,
     which makes the accelerometers' scales observable.
@@ -238,10 +238,10 @@ def _before(state: _State, prior: ImuPrior, flex: ComplianceJacobian) -> tuple[A
 
 def _places(modules: Sequence[int], imu: int, count: int, links: int, size: int) -> Index:
     """Return the indices of the parameters that one IMU depends on, in the order of its slopes."""
-    increments = [6 * module + np.arange(6) for module in modules]
+    perturbations = [6 * module + np.arange(6) for module in modules]
     shared = 6 * count + np.arange(3 + links)
     own = 6 * count + 3 + links + size * imu + np.arange(size)
-    return np.concatenate([*increments, shared, own])
+    return np.concatenate([*perturbations, shared, own])
 
 
 class _Spectrum(NamedTuple):

@@ -62,7 +62,7 @@ def screw_model(chain: Chain, types: Sequence[ModuleType], covariance: ArrayLike
     count = len(chain.serials)
     spread = np.asarray(covariance, dtype=float)
     if spread.shape != (6 * count, 6 * count):
-        raise ValueError(f"covariance of shape {spread.shape} for the increments of {count} modules")
+        raise ValueError(f"covariance of shape {spread.shape} for the perturbations of {count} modules")
     own = np.array([spread[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
     screws = screw_axes(chain)
     # Displaced by the twist d, a screw changes by ad(d) S = -ad(S) d.

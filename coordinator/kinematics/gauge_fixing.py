@@ -89,18 +89,18 @@ def moved(chain: Chain, free: Sequence[GaugeFreedom], amounts: Array) -> Chain:
     used = 0
     for one in free:
         twists = _twists(chain, one)
-        increment = np.zeros((len(chain.serials), 6))
-        increment[list(chain.descendants(one.branch))] = amounts[used : used + len(twists)] @ twists
-        chain = apply_perturbation(chain, increment.ravel())
+        perturbation = np.zeros((len(chain.serials), 6))
+        perturbation[list(chain.descendants(one.branch))] = amounts[used : used + len(twists)] @ twists
+        chain = apply_perturbation(chain, perturbation.ravel())
         used += len(twists)
     return chain
 
 
-def carried(before: Chain, after: Chain, increments: Array) -> Array:
+def carried(before: Chain, after: Chain, perturbations: Array) -> Array:
     """Return perturbations (6 n, k) of a chain expressed at the chain after free motions."""
     motions = after.imu_home @ np.linalg.inv(before.imu_home)
-    blocks = np.asarray(increments).reshape(len(before.serials), 6, -1)
-    return frozen((adjoint(np.asarray(motions)) @ blocks).reshape(np.shape(increments)))
+    blocks = np.asarray(perturbations).reshape(len(before.serials), 6, -1)
+    return frozen((adjoint(np.asarray(motions)) @ blocks).reshape(np.shape(perturbations)))
 
 
 def _twists(chain: Chain, one: GaugeFreedom) -> Array:

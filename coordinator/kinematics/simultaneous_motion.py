@@ -88,7 +88,7 @@ def simultaneous_response(
         bandwidth_hz: of their low-pass; there are 2 bandwidth / rate as many independent samples.
 
     Raises:
-        DataError: a joint hardly turned, or two joints cannot be told apart, with their columns.
+        DataError: a joint hardly turned, or two joints cannot be separated, with their columns.
     """
     _check_told_apart(data.qd_rad_s)
     independent = min(1.0, 2.0 * bandwidth_hz / rate_hz)

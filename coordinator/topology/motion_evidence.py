@@ -23,7 +23,7 @@ OUTLIER_SHARE = 1e-3
 RATIO_FLOOR = 0.05
 # Less than this over a motion is no motion: encoders and springs of a joint that is stuck still jitter.
 MIN_RATE_RAD_S = 0.02
-# Six blocks of four samples are the least that tells how much they differ.
+# Six blocks of four samples are the fewest that show their scatter.
 MIN_SAMPLES = 4 * BLOCKS
 # Share of a held joint's motion that remains after subtraction: its axis in the IMU's frame turns with the
 # joints between, by some tenths of a radian.

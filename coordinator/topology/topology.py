@@ -226,7 +226,7 @@ def _doubts(case: _Case, unmoved: Collection[str]) -> Iterator[Doubt]:
 
 
 def _parent_doubt(case: _Case, k: int) -> Doubt:
-    """Name the likeliest other parent, and the least certain of the observations that tell them apart."""
+    """Name the likeliest other parent, and the least certain observation that separates them."""
     rival = max((r for r in case.others if r[k] != case.parent[k]), key=lambda r: case.others[r])
     apart = np.argwhere(ancestors(case.parent) != ancestors(rival))
     i, o = min(apart, key=lambda pair: abs(case.odds[tuple(pair)]))

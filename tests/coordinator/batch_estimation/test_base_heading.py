@@ -1,4 +1,4 @@
-"""A base that moves is told from the noise of the IMU on it, carries all else along, and shows headings."""
+"""A base's motion is separated from its IMU's noise, carries all else along, and resolves headings."""
 
 from typing import Any
 

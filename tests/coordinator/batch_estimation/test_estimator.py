@@ -1,4 +1,4 @@
-"""The batch refinement recovers known robots, says honestly how well, and names what it cannot know."""
+"""The batch estimator recovers known robots with calibrated covariance and names what is unresolved."""
 
 import itertools
 from typing import Any
@@ -261,14 +261,14 @@ def test_scale_and_axes_of_an_imu_are_found_where_distal_joints_turn_it(robots: 
     calibrated = refine_chain(truth, _with_noise(data, 1), UNCALIBRATED)
     trusted = refine_chain(truth, _with_noise(data, 1), BIASES_ONLY)
     error = calibrated.intrinsics.errors - imus.errors
-    # Module 2 is turned by two joints and seen against a third; its gyro is told by their encoders.
+    # Module 2 is turned by two joints and observed against a third; their encoders make its gyro observable.
     before = np.abs(imus.errors[2, :9]).max()
     assert np.abs(error[2, :9]).max() < 0.5 * before
     # And what is trusted blindly bends the robot.
     assert np.abs(_increment(calibrated.chain, truth)).max() < np.abs(_increment(trusted.chain, truth)).max()
 
 
-def test_a_late_imu_is_told_by_how_late_it_is(robots: Any) -> None:
+def test_the_delay_of_an_imu_is_estimated(robots: Any) -> None:
     truth, _ = robots.random(4, joints=3, serial=True)
     data, imus = _uncalibrated(_sensed(truth), 5)
     found = refine_chain(truth, _with_noise(data, 2), UNCALIBRATED)
@@ -300,12 +300,12 @@ def test_what_the_model_leaves_out_widens_the_intervals(robots: Any, monkeypatch
     untold = refine_chain(truth, shaken)
     np.testing.assert_array_equal(told.chain.imu_home, untold.chain.imu_home)
     wider = np.diag(told.estimate.covariance)[6:] / np.diag(untold.estimate.covariance)[6:]
-    # Gyros alone know some parameters; those that the accelerometers tell are believed a good deal less.
+    # Gyros alone know some parameters; the sigmas of those by accelerometers grow by a good deal.
     assert wider.min() > 0.999
     assert wider.max() > 2.0
 
 
-def test_an_imu_worse_than_its_kind_is_told_apart(robots: Any) -> None:
+def test_an_imu_with_larger_errors_than_its_prior_is_detected(robots: Any) -> None:
     truth, _ = robots.random(4, joints=4, serial=True)
     data, _ = _uncalibrated(_sensed(truth), 3)
     usual = refine_chain(truth, _with_noise(data, 1), UNCALIBRATED)

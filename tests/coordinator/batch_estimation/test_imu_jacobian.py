@@ -1,4 +1,4 @@
-"""The slopes of what IMUs read, against differences of the readings themselves on random trees."""
+"""The derivatives of IMU readings agree with differences of the readings on random trees."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ def _read(chain: Chain, motion: tuple[Array, Array, Array]) -> Array:
 
 
 def _analytic(chain: Chain, motion: tuple[Array, Array, Array]) -> Array:
-    """Slopes (6 n + 3, m, n, 6) by all increments and gravity, zero where an IMU does not feel a module."""
+    """Slopes (6 n + 3, m, n, 6) by all perturbations and gravity, zero for modules that do not matter."""
     joints, samples = len(chain.serials), len(motion[0])
     found = np.zeros((6 * joints + 3, samples, joints, 6))
     bodies = body_motions(chain, *motion)
@@ -76,11 +76,11 @@ def test_an_imu_feels_the_joints_below_it_and_its_own_module_only(robots: Any) -
     motion = _motion(6, 3)
     bodies = body_motions(chain, *motion)
     for k in range(6):
-        felt, joint = {k}, chain.parent[k]
+        moved_by, joint = {k}, chain.parent[k]
         while joint >= 0:
-            felt.add(joint)
+            moved_by.add(joint)
             joint = chain.parent[joint]
-        assert set(imu_jacobian(chain, bodies, *motion[:2], k).modules) == felt
+        assert set(imu_jacobian(chain, bodies, *motion[:2], k).modules) == moved_by
 
 
 @pytest.mark.parametrize("seed", range(4))

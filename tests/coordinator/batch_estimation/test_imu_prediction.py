@@ -1,4 +1,4 @@
-"""What IMUs read, against pinocchio's frame velocities and classical accelerations on random trees."""
+"""IMU readings agree with pinocchio's frame velocities and classical accelerations on random trees."""
 
 from typing import Any
 
@@ -82,12 +82,12 @@ def test_readings_are_the_derivatives_of_the_imus_own_path(robots: Any, seed: in
     # Fourth-order central differences of positions: rounding 1e-16 / 1e-8 = 1e-8, truncation below it.
     weights = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / (12 * step**2)
     moved = np.einsum("s,skj->kj", weights, poses[:, :, :3, 3])
-    felt = np.einsum("kji,kj->ki", poses[2, :, :3, :3], moved + chain.gravity)
+    read = np.einsum("kji,kj->ki", poses[2, :, :3, :3], moved + chain.gravity)
     now = np.zeros((1, 1))
     found = imu_readings(
         chain, path(now), 2.0 * size * np.cos(2.0 * now + phase), -4.0 * size * np.sin(2.0 * now + phase)
     )
-    np.testing.assert_allclose(found.accel_m_s2[0], felt, atol=1e-6)
+    np.testing.assert_allclose(found.accel_m_s2[0], read, atol=1e-6)
 
 
 def test_at_rest_every_imu_reads_gravity_turned_into_its_frame(robots: Any) -> None:
@@ -105,5 +105,5 @@ def test_a_module_that_is_mounted_by_its_housing_does_not_feel_its_own_joint(rob
     q, qd = np.zeros((1, 6)), np.zeros((1, 6))
     for k in range(6):
         spun = imu_readings(chain, q, qd + np.eye(6)[k], np.eye(6)[[k]])
-        felt = float(np.abs(spun.gyro_rad_s[0, k]).max())
-        assert (felt > 0.1) == chain.reversed[k]
+        read = float(np.abs(spun.gyro_rad_s[0, k]).max())
+        assert (read > 0.1) == chain.reversed[k]

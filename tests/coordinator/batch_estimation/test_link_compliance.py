@@ -1,4 +1,4 @@
-"""Links that give turn as hinges do, under the moments of what they carry, and give themselves away."""
+"""Compliant links turn as hinges do under their loads, and their compliance is estimated."""
 
 from typing import Any
 
@@ -75,7 +75,7 @@ def test_a_turn_of_a_link_is_that_of_a_joint_in_it(robots: Any) -> None:
     found = readings_on(chain, body_motions(chain, q, qd, qdd, turns=turns), turns)
     rigid = imu_readings(chain, q, qd, qdd)
     for given, right, stiff in zip(found, exact, rigid, strict=True):
-        # The turn is felt, and felt rightly but for what goes with its square.
+        # The turn changes the readings, as predicted but for terms with its square.
         assert np.abs(right[:, 3] - stiff[:, 2]).max() > size
         np.testing.assert_allclose(given[:, 2], right[:, 3], atol=100 * size**2)
 
@@ -139,9 +139,9 @@ def test_links_that_bend_come_out_as_long_as_they_are(robots: Any, seed: int) ->
     found = refine_chain(chain, data, flex=flex)
     apart = [np.abs(one.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]).max() for one in (stiff, found)]
     assert apart[1] < 0.2 * apart[0]
-    # Links that carry something tell how they bend; the last one's load is a module of 0.3 kg.
-    told = found.compliance[0::2]
-    np.testing.assert_allclose(told[:2], 4.0, atol=1.0)
+    # The bending of loaded links is observable; the last one's load is a module of 0.3 kg.
+    bending = found.compliance[0::2]
+    np.testing.assert_allclose(bending[:2], 4.0, atol=1.0)
     # And none of them twists.
     assert np.abs(found.compliance[1::2]).max() < 5.0
 

@@ -1,4 +1,4 @@
-"""The thesis' tables must turn the robot as its screws do."""
+"""The Denavit-Hartenberg tables give the same poses as the chain's screws."""
 
 from typing import Any
 

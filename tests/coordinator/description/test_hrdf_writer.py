@@ -304,8 +304,8 @@ def test_what_is_no_real_body_is_replaced_and_said() -> None:
     phi = true_inertia(robot).copy()
     phi[1, 0] = -0.2
     root = hrdf_element(chain, types, phi.ravel())
-    said = [e for e in root if not isinstance(e.tag, str) and "no real body's" in str(e.text)]
-    assert len(said) == 1
+    comments = [e for e in root if not isinstance(e.tag, str) and "no real body's" in str(e.text)]
+    assert len(comments) == 1
     assert all(float(str(body.get("mass"))) >= 0.0 for body in root.iter("rigid-body"))
 
 

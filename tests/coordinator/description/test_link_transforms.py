@@ -1,4 +1,4 @@
-"""The six parameters of every link, their covariance, and which of them nothing tells."""
+"""The six parameters of every link, their covariance, and which of them are unobservable."""
 
 from typing import Any
 
@@ -80,7 +80,7 @@ def test_the_covariance_is_that_of_many_robots_drawn_from_the_chains(robots: Any
         for moved in (apply_perturbation(chain, root @ rng.normal(size=18)) for _ in range(3000))
     ]
     for link, found in zip(claimed, np.swapaxes(np.array(drawn), 0, 1), strict=True):
-        # 3000 draws tell a variance to 2.6 %; four of that over the 36 figures.
+        # 3000 draws determine a variance to 2.6 %; four of that over the 36 figures.
         scale = np.sqrt(np.outer(link.covariance.diagonal(), link.covariance.diagonal()))
         np.testing.assert_allclose(np.cov(found.T) / scale, link.covariance / scale, atol=0.11)
 
@@ -98,7 +98,7 @@ def _hidden(robots: Any, about: bool) -> tuple[LinkTransform, LinkTransform]:
     return near, far
 
 
-def test_an_offset_along_the_parents_axis_that_nothing_tells_is_the_unknown_z(robots: Any) -> None:
+def test_an_unobservable_offset_along_the_parents_axis_is_the_unknown_z(robots: Any) -> None:
     near, far = _hidden(robots, about=False)
     assert near.unknown == (False, False, True, False, False, False)
     np.testing.assert_allclose(np.abs(near.null_directions[:, 0]), [0, 0, 1, 0, 0, 0], atol=1e-9)
@@ -107,7 +107,7 @@ def test_an_offset_along_the_parents_axis_that_nothing_tells_is_the_unknown_z(ro
     assert far.null_directions.shape == (6, 0)
 
 
-def test_a_turn_about_the_parents_axis_that_nothing_tells_leaves_z_known(robots: Any) -> None:
+def test_an_unobservable_turn_about_the_parents_axis_leaves_z_known(robots: Any) -> None:
     near, far = _hidden(robots, about=True)
     assert near.unknown[5]
     assert near.unknown[:2] == (True, True)

@@ -83,7 +83,7 @@ def test_the_covariances_are_those_of_many_robots_drawn_from_the_chains(robots: 
     screws = np.array([screw_axes(one) for one in drawn])
     for k in range(1, 4):
         found = np.cov(screws[:, k].T)
-        # 4000 draws tell a variance to 2.2 %; five of that over some 20 figures.
+        # 4000 draws determine a variance to 2.2 %; five of that over some 20 figures.
         np.testing.assert_allclose(found, model.covariance[k], atol=0.11 * np.abs(found).max())
     np.testing.assert_array_equal(model.covariance[0], 0.0)
     tip = model.tips[-1]
@@ -114,7 +114,7 @@ def test_what_does_not_fit_the_chain_is_refused(robots: Any) -> None:
     model = screw_model(chain, types, np.zeros((18, 18)))
     with pytest.raises(ValueError, match="2 module types for a chain of 3"):
         screw_model(chain, types[:2], np.zeros((18, 18)))
-    with pytest.raises(ValueError, match=r"\(6, 6\) for the increments of 3"):
+    with pytest.raises(ValueError, match=r"\(6, 6\) for the perturbations of 3"):
         screw_model(chain, types, np.zeros((6, 6)))
     with pytest.raises(ValueError, match=r"\(samples, 3\)"):
         tip_poses(model, model.tips[0], np.zeros((4, 2)))

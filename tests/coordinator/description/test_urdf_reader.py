@@ -46,10 +46,10 @@ def link(name: str, rng: np.random.Generator) -> str:
     spread = shape @ shape.T
     inertia = np.trace(spread) * np.eye(3) - spread  # any positive mass distribution
     six = zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), inertia[np.triu_indices(3)], strict=True)
-    words = " ".join(f'{key}="{float(value)!r}"' for key, value in six)
+    text = " ".join(f'{key}="{float(value)!r}"' for key, value in six)
     return (
         f'<link name="{name}"><inertial>{origin(rng)}<mass value="{rng.uniform(0.1, 3.0)}"/>'
-        f"<inertia {words}/></inertial></link>"
+        f"<inertia {text}/></inertial></link>"
     )
 
 
@@ -83,7 +83,7 @@ def test_the_torques_of_the_urdfs_inertias_are_pinocchios(tmp_path: Path, joints
 
 def test_the_staubli_tx40s_torques_are_pinocchios() -> None:
     if not TX40.exists():
-        pytest.skip("the data of the Staubli TX40 is not beside the project")
+        pytest.skip("the data of the Staubli TX40 is not next to the project")
     compare(TX40, 6, 0)
 
 
@@ -114,7 +114,7 @@ def compare(
             np.testing.assert_allclose(block, expected, rtol=0, atol=1e-9 * np.abs(matrix).max())
 
 
-def test_a_robot_on_a_wall_feels_the_gravity_it_is_told(tmp_path: Path) -> None:
+def test_a_robot_on_a_wall_has_the_gravity_that_is_given(tmp_path: Path) -> None:
     path = tmp_path / "robot.urdf"
     path.write_text(random_urdf(5, 3))
     compare(path, 3, 5, gravity=(6.0, 0.0, -7.0))
@@ -133,7 +133,7 @@ def test_joints_written_in_any_order_give_the_same_tree(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "message"),
     [
         ('type="revolute"', 'type="prismatic"', "joint 'j0' is prismatic; revolute, continuous and fixed"),
         ('<parent link="base"/>', '<parent link="bed"/>', "joint 'j0' has parent 'bed', and no link has"),
@@ -145,13 +145,13 @@ def test_joints_written_in_any_order_give_the_same_tree(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_tree_of_turning_joints_is_refused_by_name(
-    tmp_path: Path, old: str, new: str, words: str
+    tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     path = tmp_path / "robot.urdf"
     text = random_urdf(7, 2)
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(UrdfError, match=words) as raised:
+    with pytest.raises(UrdfError, match=message) as raised:
         read_urdf(path)
     assert str(raised.value).startswith(str(path))
 

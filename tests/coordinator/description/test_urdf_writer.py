@@ -110,12 +110,12 @@ def test_what_is_no_real_body_is_replaced_and_said() -> None:
     phi = real_bodies(rng, chain)
     phi[1, 0] = -0.2
     robot = robot_element(chain, phi)
-    said = [
+    comments = [
         link.get("name")
         for link in robot.iter("link")
         if any("nearest real body" in str(child.text) for child in link if not isinstance(child.tag, str))
     ]
-    assert said == [f"body_{chain.serials[1]}"]
+    assert comments == [f"body_{chain.serials[1]}"]
     assert all(float(str(mass.get("value"))) > 0.0 for mass in robot.iter("mass"))
     assert len(list(robot.iter("mass"))) == 3
 

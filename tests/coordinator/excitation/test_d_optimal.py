@@ -1,4 +1,4 @@
-"""Chosen motions stay within every limit, and tell more of the inertia than joint after joint does."""
+"""Chosen motions stay within every limit and have more information than joint-by-joint motions."""
 
 from collections.abc import Sequence
 
@@ -54,7 +54,7 @@ def known_directions(total: Array) -> int:
 
 
 def thesis_information(task: ExcitationTask, name: str) -> Array:
-    """What the thesis' pattern tells, one joint after the other with the others held."""
+    """The information of the thesis' pattern, one joint after the other with the others held."""
     robot = load_robot(name)
     types = {module.serial: module_type(module.type) for module in robot.modules}
     count = len(task.limits)
@@ -97,7 +97,7 @@ def test_all_joints_together_tell_what_joint_after_joint_leaves_open(name: str) 
     found = design_excitation(task, np.random.default_rng(0), candidates=60)
     total = np.sum([information(task, sampled(s, RATE_HZ)) for s in found.segments], axis=0)
     assert known_directions(total) == found.rank
-    # Joints that never move together tell nothing of what couples them.
+    # Joints that never move together have no information about their coupling.
     assert known_directions(thesis_information(task, name)) < found.rank
 
 
@@ -121,7 +121,7 @@ def test_two_chosen_motions_are_the_best_of_all_pairs() -> None:
     pieces = [information(task, sampled(s, RATE_HZ)) for s in everything]
     pairs = [log_det([a, b]) for i, a in enumerate(pieces) for b in pieces[i + 1 :]]
     chosen = log_det([information(task, sampled(s, RATE_HZ)) for s in found.segments])
-    # Exchanging one at a time may end beside the best pair, but not far from it.
+    # Exchanging one at a time may end next to the best pair, but not far from it.
     assert sum(value > chosen + 1e-9 for value in pairs) <= 0.05 * len(pairs)
 
 
@@ -149,14 +149,14 @@ def test_the_same_seed_designs_the_same_motions() -> None:
     assert [s.patterns for s in first.segments] == [s.patterns for s in second.segments]
 
 
-def test_a_robot_too_heavy_for_its_motors_is_told_so() -> None:
+def test_a_robot_too_heavy_for_its_motors_is_refused_by_name() -> None:
     task = task_of("a2085_04", segments=2)
     heavy = task._replace(phi=50.0 * task.phi)
     with pytest.raises(NoExcitation, match="the motors' torques"):
         design_excitation(heavy, np.random.default_rng(0), candidates=8)
 
 
-def test_a_joint_at_the_end_of_its_range_is_told_so() -> None:
+def test_a_joint_at_the_end_of_its_range_is_refused_by_name() -> None:
     task = task_of("a2085_04", segments=2)
     stuck = task._replace(limits=(JointLimits(1.0, 1.0, -1.0, 0.0), *task.limits[1:]))
     with pytest.raises(NoExcitation, match="no room"):

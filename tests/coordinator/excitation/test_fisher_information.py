@@ -103,7 +103,7 @@ def test_with_all_else_known_the_bound_is_the_closed_form() -> None:
     noise = SensorNoise(1e-9, 0.0294)
     setting = upright()
     found = circle_covariance(setting, [path], noise, NOTHING_UNKNOWN)
-    # Tangential alpha and centripetal omega^2 both tell of the radius; gravity that is unknown but for a
+    # Tangential alpha and centripetal omega^2 both depend on the radius; gravity that is unknown but for a
     # bias of 1e-9 is one more unknown of three, which costs the part of both that does not change: none of
     # alpha, and the mean of omega^2.
     alpha2 = np.sum(path.qdd_rad_s2**2)
@@ -122,7 +122,7 @@ def test_gravity_calibrates_the_scale_of_a_link_that_swings_in_it_and_not_of_one
     swinging, flat = (
         np.sqrt(circle_covariance(s, motions, noise, UNCALIBRATED)[0, 0]) for s in (hanging(), upright())
     )
-    # Two axes with scales known to 1 % tell 0.3 m to 3 mm / sqrt(2); gravity is known to 0.2 %.
+    # Two axes with scales known to 1 % determine 0.3 m to 3 mm / sqrt(2); gravity is known to 0.2 %.
     assert flat == pytest.approx(2.1e-3, rel=0.1)
     assert swinging < 0.5 * flat
     assert np.sqrt(circle_covariance(upright(), motions, noise, CALIBRATED)[0, 0]) < 0.3e-3

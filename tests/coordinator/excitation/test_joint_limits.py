@@ -1,4 +1,4 @@
-"""A joint's own slow motion tells roughly what it moves, and how roughly."""
+"""The inertia that a joint moves is estimated from its own slow motion, with its uncertainty."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""All joints at once: told apart by frequency, within what every type can do, at rest at both ends."""
+"""Motions of all joints at once differ in frequency, stay within limits, and rest at both ends."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_no_joint_is_asked_for_more_speed_torque_or_room_than_it_has(
         offset, velocity, acceleration = sampled(pattern)
         limits = asked[serial].limits
         assert np.abs(velocity).max() <= 1.001 * limits.speed_rad_s < 0.75 * kind.max_speed_rad_s
-        # Samples fall beside the peaks by a thousandth at most.
+        # Samples miss the peaks by a thousandth at most.
         assert np.abs(acceleration).max() <= 1.001 * limits.accel_rad_s2
         assert limits.low_rad < home + offset.min()
         assert home + offset.max() < limits.high_rad
@@ -110,7 +110,7 @@ def test_a_motion_never_takes_the_torque_that_holds_the_arm() -> None:
     assert joint_limits(kind, 12.0, 1.0).accel_rad_s2 == 0.0
 
 
-def test_what_gravity_warms_is_what_the_copper_bears() -> None:
+def test_the_continuous_torque_warms_the_winding_to_its_limit() -> None:
     for kind in TYPES:
         motor = kind.motor
         current = continuous_torque_nm(kind) / (

@@ -1,4 +1,4 @@
-"""The motions of a plan are the thesis', and no module type is asked for more than it can do."""
+"""The motions of a plan are the thesis', within the limits of every module type."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A robot is excited within what its modules are, and within what they say that they do not exceed."""
+"""The excitation of a robot respects its modules' types and the limits that they report."""
 
 import numpy as np
 import pytest
@@ -42,8 +42,8 @@ def test_motions_stay_within_the_positions_that_modules_allow() -> None:
 
 
 def test_speed_and_torque_are_those_that_modules_say() -> None:
-    told = modules(max_speed_rad_s=0.5, max_effort_nm=1.5)
-    task = excitation_task(CHAIN, told, PLAN)
+    limited = modules(max_speed_rad_s=0.5, max_effort_nm=1.5)
+    task = excitation_task(CHAIN, limited, PLAN)
     assert all(limit.speed_rad_s <= 0.5 for limit in task.limits)
     assert (task.max_effort_nm <= 1.5).all()
     free = excitation_task(CHAIN, modules(), PLAN)
@@ -55,5 +55,5 @@ def test_a_module_that_may_not_leave_home_is_not_excited() -> None:
         robot_excitation(CHAIN, modules(min_position_rad=0.0, max_position_rad=1.0), PLAN)
 
 
-def test_the_same_robot_is_told_the_same_motions() -> None:
+def test_the_same_robot_gets_the_same_motions() -> None:
     assert robot_excitation(CHAIN, modules(), PLAN) == robot_excitation(CHAIN, modules(), PLAN)

@@ -1,4 +1,4 @@
-"""A robot that folds onto itself is seen to, and one that does not is left in peace."""
+"""A robot that folds onto itself is detected, and one that does not is not."""
 
 import numpy as np
 import pytest
@@ -46,9 +46,9 @@ def test_the_distance_of_two_segments_is_the_least_of_all_their_points(seed: int
 @pytest.mark.parametrize("across", [0.0, 0.3])
 def test_parallel_segments_are_as_far_apart_as_their_lines_or_their_ends(across: float) -> None:
     one = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    beside = np.array([[0.5, across, 0.0], [2.0, across, 0.0]])
+    parallel = np.array([[0.5, across, 0.0], [2.0, across, 0.0]])
     beyond = np.array([[1.4, across, 0.0], [2.0, across, 0.0]])
-    assert segment_distances(one, beside) == pytest.approx(across, abs=1e-9)
+    assert segment_distances(one, parallel) == pytest.approx(across, abs=1e-9)
     assert segment_distances(one, beyond) == pytest.approx(np.hypot(0.4, across), abs=1e-9)
 
 
@@ -78,7 +78,7 @@ def test_links_that_are_built_close_may_come_only_a_little_nearer() -> None:
     found = clearance_m(chain, q, home)
     assert found[0] > CLEARANCE_M
     assert found[1] > CLEARANCE_M
-    # At 2.6 rad the third link begins 0.06 sin(2.6) = 3 cm beside the first; 4 cm are allowed.
+    # At 2.6 rad the third link begins 0.06 sin(2.6) = 3 cm off the first; 4 cm are allowed.
     assert found[2] < CLEARANCE_M
 
 

@@ -1,4 +1,4 @@
-"""A joint's motions are the most telling of those that it can do in the time there is."""
+"""The motions of a joint are the most informative of those within its limits and time budget."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The chain must come out of circles and gravity, with what it cannot know named and left alone."""
+"""The chain follows from circles and gravity; unresolved directions are named and stay neutral."""
 
 from typing import Any
 
@@ -85,7 +85,7 @@ def test_two_trees_on_one_base_cannot_know_where_the_other_stands(robots: Any) -
             assert fit.estimate.link_length_m[k] == pytest.approx(length, abs=1e-6)
 
 
-def test_every_branch_of_a_tree_has_an_offset_of_its_own_that_nothing_tells(robots: Any) -> None:
+def test_every_branch_of_a_tree_has_an_unobservable_offset_of_its_own(robots: Any) -> None:
     homes = np.tile(np.eye(4), (3, 1, 1))
     homes[0] = robots.root_pose(X5)
     homes[1, :3, 3], homes[2, :3, 3] = [0.2, 0.0, 0.05], [-0.2, 0.1, 0.15]
@@ -101,7 +101,7 @@ def test_every_branch_of_a_tree_has_an_offset_of_its_own_that_nothing_tells(robo
 def test_modules_mounted_half_a_turn_from_straight_are_found_through_joints_that_swing_along(
     robots: Any,
 ) -> None:
-    """Parallel joints, links turned by half a turn: what is seen of an axis tells its sign all the same."""
+    """Parallel joints, links turned by half a turn: observations of an axis determine its sign."""
     homes = np.tile(np.eye(4), (5, 1, 1))
     homes[0] = robots.root_pose(X5)
     turns = [("z", 0.0), ("x", np.pi / 2), ("x", -np.pi / 2), ("x", np.pi / 2), ("y", np.pi / 2)]
@@ -202,7 +202,7 @@ def test_on_a_vertical_axis_the_yaw_of_the_next_module_is_unknown_and_said_so(ro
     assert fit.chain.imu_home[1, 2, 3] == pytest.approx(X5.output_xyz[2], abs=1e-4)
 
 
-def test_on_a_horizontal_axis_gravity_tells_the_yaw_but_not_the_offset(robots: Any) -> None:
+def test_on_a_horizontal_axis_gravity_resolves_the_yaw_but_not_the_offset(robots: Any) -> None:
     chain = two_modules(robots, np.array([1.0, 0.2, 0.0]), yaw=-0.7)
     fit = fit_exact(robots, chain, [X5, X5], 0)
     assert [(u.kind, u.joint) for u in fit.estimate.unresolved] == [("offset_along_axis", "M00")]

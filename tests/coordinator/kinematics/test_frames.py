@@ -1,4 +1,4 @@
-"""The angle between joints is what no turn about, or place along, the parent's axis changes."""
+"""The angle between axes does not depend on turns about, or shifts along, the parent's axis."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ def test_the_sigma_is_the_spread_of_many_robots_drawn_from_the_chains(robots: An
         for _ in range(4000)
     ]
     assert np.isnan(angle[0])
-    # 4000 draws tell a sigma to 1.1 %.
+    # 4000 draws determine a sigma to 1.1 %.
     np.testing.assert_allclose(np.std(drawn, axis=0)[1:], sigma[1:], rtol=0.05)
     cosine = np.sum(chain.axis[list(chain.parent)[1:]] * chain.axis[1:], axis=1)
     np.testing.assert_allclose(np.cos(angle[1:]), cosine, atol=1e-12)

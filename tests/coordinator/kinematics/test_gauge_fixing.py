@@ -1,4 +1,4 @@
-"""What no observation tells may be anywhere; brought back, the robot is the one that it was."""
+"""A robot moved along its gauge freedoms is brought back to the reference."""
 
 from typing import Any
 
@@ -72,7 +72,7 @@ def test_motions_of_another_tree_than_the_chains_are_left_out(robots: Any) -> No
     assert gauge_freedoms(chain, [combination]) == ()
 
 
-def test_a_fit_that_drifted_is_settled_with_all_that_is_known_of_it(robots: Any) -> None:
+def test_a_fit_that_drifted_is_fixed_with_its_covariance_and_null_space(robots: Any) -> None:
     chain, _ = robots.random(6, joints=5)
     items = hidden(chain)
     free = gauge_freedoms(chain, items)

@@ -1,4 +1,4 @@
-"""What no observation tells must have the right name, and must really leave every observation as it is."""
+"""Unobservable motions have the right names and leave every observation unchanged."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""All joints turn at once: who carries whom, axes and radial vectors come out of one motion."""
+"""Topology, axes and radial vectors from one motion of all joints at once."""
 
 from types import SimpleNamespace
 
@@ -109,7 +109,7 @@ def test_the_refinement_ends_where_it_would_have_ended_from_the_true_robot(
     sparse = SensorData(*(signal[::5] for signal in data))
     rng = np.random.default_rng(seed)
     motion = [rng.normal(0.0, size, (50, 6)) for size in (0.3, 1.0, 3.0)]
-    # What no motion tells differs by where one starts from; the readings of any motion do not.
+    # Unobservable directions differ with the start; the readings of any motion do not.
     own, true = (imu_readings(refine_chain(start, sparse).chain, *motion) for start in (first.chain, chain))
     np.testing.assert_allclose(own.gyro_rad_s, true.gyro_rad_s, atol=1e-6)
     np.testing.assert_allclose(own.accel_m_s2, true.accel_m_s2, atol=1e-5)

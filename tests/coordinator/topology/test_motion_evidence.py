@@ -1,4 +1,4 @@
-"""What one slow motion says of who was carried comes with an uncertainty that covers what went wrong."""
+"""Rate ratios of one slow motion have uncertainties that cover noise, shaking and compliant joints."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_the_spread_of_the_jackknife_is_that_of_repeated_motions_in_white_noise(
     # Of a vector of three components: the root of the summed variances.
     scatter = np.sqrt(np.array([seen.coefficient for seen in found]).var(axis=0).sum(axis=1))
     claimed = np.sqrt(np.mean([seen.sigma**2 for seen in found], axis=0))
-    # 300 repeats tell a scatter of three components to 2.4 %; the ramps make the first and last block count
+    # 300 repeats give a scatter of three components to 2.4 %; the ramps make the first and last block count
     # less, which the jackknife overstates a little.
     np.testing.assert_allclose(claimed, scatter, rtol=0.15)
 
@@ -83,7 +83,7 @@ def test_a_held_joint_that_gives_covers_the_error_that_it_makes(give: float) -> 
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, 0.3])
-def test_what_a_held_joint_gave_is_taken_off_where_it_is_known_whom_it_carries(turned_rad: float) -> None:
+def test_the_motion_of_a_held_joint_is_subtracted_where_its_imus_are_known(turned_rad: float) -> None:
     """Joint 1 carries the first two IMUs; joints between have turned its axis a little since it showed."""
     rate, give = rates(), 0.8
     rate[:, 1] = give * rate[:, 0]
@@ -136,7 +136,7 @@ def test_a_module_that_hardly_moved_is_less_certain_of_the_same_noise() -> None:
     assert odds[0] > odds[1] > odds[2] > 0.0
 
 
-def test_a_ratio_that_fits_neither_tells_next_to_nothing() -> None:
+def test_a_ratio_that_fits_neither_is_nearly_uninformative() -> None:
     assert carried_log_odds(1.0, 0.05) > 8.0
     assert carried_log_odds(0.0, 0.05) < -8.0
     for odd in (0.5, 0.4, 0.6, 2.5):

@@ -1,4 +1,4 @@
-"""When in doubt, another motion is asked for: of the right joint, of the right kind, and not for ever."""
+"""A doubt asks for another motion of the right joint and kind, a limited number of times."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The tree must come out of who moved with whom, with honest odds; what no tree allows must be named."""
+"""The tree follows from which IMU moved with which joint, with calibrated odds; contradictions are named."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def watch(
 
 
 @given(forests())
-def test_every_forest_is_recovered_from_who_moved_with_whom(
+def test_every_forest_is_recovered_from_which_imu_moved_with_which_joint(
     forest: tuple[dict[str, str | None], dict[str, bool]],
 ) -> None:
     parent, reverse = forest
@@ -138,7 +138,7 @@ FORWARD = {"A": False, "B": False, "C": False}
 def test_the_confidence_is_the_probability_of_the_least_certain_answer() -> None:
     seen = watch(CHAIN, FORWARD)
     assert find_topology(seen).confidence > 0.999
-    # Whether C is on B or beside it, what C saw of joint B alone tells.
+    # Whether C is on B or next to it, only C's observation of joint B decides.
     seen["B", "C"] = MotionObservation(True, 0.6, sigma=0.15)
     found = find_topology(seen)
     expected = 1.0 / (1.0 + np.exp(-seen["B", "C"].log_odds))
@@ -162,7 +162,7 @@ def test_a_larger_sigma_makes_less_certain_of_the_same_ratio() -> None:
 
 
 def test_two_observations_that_agree_are_surer_than_one() -> None:
-    """Whether B is on A, both IMUs beyond it tell as well; whether C is on B, C alone."""
+    """Whether B is on A, both IMUs beyond it decide; whether C is on B, C alone."""
     unclear = MotionObservation(True, 0.75, sigma=0.25)
     seen = {pair: unclear if o.moved else o for pair, o in watch(CHAIN, FORWARD).items()}
     found = likely_topology(seen)
@@ -244,10 +244,10 @@ def test_what_a_joint_that_is_stuck_carries_stands_on_what_carries_it_and_all_el
 def test_what_is_not_certain_of_a_module_is_said_in_words() -> None:
     seen = watch(CHAIN, FORWARD) | {("B", "C"): MotionObservation(True, 0.6, sigma=0.15)}
     found = likely_topology({pair: o for pair, o in seen.items() if pair[0] != "A"}, ["A"])
-    words = dict(zip(found.serials, (found.caveat(k) for k in range(3)), strict=True))
-    assert words["A"] == ", its joint did not move: mounting and what it carries unknown"
-    assert words["B"] == ""
-    assert words["C"].endswith(" % sure")
+    caveats = dict(zip(found.serials, (found.caveat(k) for k in range(3)), strict=True))
+    assert caveats["A"] == ", its joint did not move: mounting and what it carries unknown"
+    assert caveats["B"] == ""
+    assert caveats["C"].endswith(" % sure")
 
 
 def test_a_housing_that_turns_the_wrong_way_about_its_own_axis_is_named() -> None:
