@@ -1,8 +1,8 @@
-"""How well a model predicts torques that it was not fitted to: fitted to one half, tried on the other.
+"""Cross-validation: fit one half of a recording, predict the torques of the other.
 
-Both ways, so that every sample is predicted once. A gap lies between the halves, over which the low-pass
-mixes them. What is masked and what is not, raw and filtered, stand beside each other, because each of them
-flatters something: masking hides friction at reversals, filtering hides noise.
+Both ways, so that every sample is predicted once. Between the halves is a gap, over which the low-pass mixes
+them. Errors are given with and without mask, raw and filtered, because masking hides friction at reversals
+and filtering hides noise.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +22,7 @@ from module_agent.signals.torque_terms import Term
 
 Index = NDArray[np.int64]
 Tried = Literal["second half", "first half", "both", "other recording"]
-# From the samples that a model may see, and those that it is tried on, to what it says of the latter.
+# From the samples to fit and those to test, the predicted torques of the latter.
 Predictor = Callable[[slice, slice], Array]
 
 # Parts of a half of which the data-length curve is made.
@@ -39,7 +39,7 @@ class HeldOutError(NamedTuple):
 
 
 class CurvePoint(NamedTuple):
-    """What fitting to `seconds` of a half gives on the other one, both ways together."""
+    """The error of a fit to `seconds` of a half on the other half, both ways together."""
 
     seconds: float
     all_samples: float
@@ -47,7 +47,7 @@ class CurvePoint(NamedTuple):
 
 
 class TermGain(NamedTuple):
-    """The held-out error, both ways together, of a model that lacks something."""
+    """The held-out error, both ways together, of the model without a kind of term."""
 
     without: str
     all_samples: float
@@ -111,7 +111,7 @@ def mean_torque(problem: Problem) -> Predictor:
 
 
 def held_out_errors(problem: Problem, predictor: Predictor) -> tuple[HeldOutError, ...]:
-    """Try a predictor on either half and on both together: filtered and raw, all samples and masked.
+    """Test a predictor on either half and on both together: filtered and raw, all samples and masked.
 
     Raises:
         DataError: too few samples, see `halves` and `fit_part`.
@@ -124,7 +124,7 @@ def held_out_errors(problem: Problem, predictor: Predictor) -> tuple[HeldOutErro
 
 
 def errors_elsewhere(both: Problem, predictor: Predictor, seen: int) -> tuple[HeldOutError, ...]:
-    """Try a predictor that saw the first `seen` samples of two recordings (`joined`) on the second one.
+    """Test a predictor fitted to the first `seen` samples of two recordings (`joined`) on the second one.
 
     Raises:
         DataError: too few samples, see `fit_part`.
@@ -142,9 +142,9 @@ def _errors(problem: Problem, parts: Sequence[tuple[Tried, Index, Array]]) -> tu
 
 
 def length_curve(problem: Problem) -> Iterator[CurvePoint]:
-    """Yield the held-out error against the length of what was fitted, without lengths that are too short.
+    """Yield the held-out error by the length that was fitted, without lengths that are too short.
 
-    Of a half the part next to the gap is fitted, so that all lengths are as near to what they are tried on.
+    The part of a half next to the gap is fitted, so that all lengths are equally near to the tested half.
     """
     for part in CURVE_PARTS:
         try:
@@ -156,7 +156,7 @@ def length_curve(problem: Problem) -> Iterator[CurvePoint]:
 
 
 def gain_of_terms(problem: Problem) -> Iterator[TermGain]:
-    """Yield what each kind of term is worth: the held-out error of the model without it.
+    """Yield the held-out error of the model without each kind of term.
 
     Raises:
         DataError: too few samples.
@@ -201,5 +201,5 @@ def _shortened(problem: Problem, part: float) -> Predictor:
 
 def _error(problem: Problem, at: Index, predicted: Array, masked: bool, raw: bool) -> TorqueError:
     tau = (problem.log.tau_raw_nm if raw else problem.log.tau_nm)[at]
-    # Constant torques are a predictor of their own here.
+    # The constant mean is a predictor of its own here.
     return torque_error(tau, predicted, np.zeros(tau.shape[1]), problem.moving[at] if masked else None)

@@ -1,4 +1,4 @@
-"""A recording as the fit needs it: one low-pass over torque and motion, thinned to what that leaves."""
+"""Filter a recording for the fit: one low-pass over torque and motion, then fewer samples."""
 
 from typing import NamedTuple
 
@@ -16,8 +16,8 @@ _MOTION_POWER, _HARMONICS = 0.99, 5.0
 # Samples kept per cut-off: half of that is three cut-offs, where the low-pass leaves 2e-4 of the amplitude to
 # fold back.
 _KEPT_PER_CUTOFF = 6.0
-# A regressor of so many entries has 120 MB, and a fit holds some copies; a joint brings about so many
-# columns. Of a longer recording neighbours are left out that say nearly the same.
+# A regressor of so many entries has 120 MB, and a fit holds some copies; a joint has about so many columns.
+# Longer recordings are thinned further.
 _MAX_ENTRIES = 1.5e7
 _COLUMNS_PER_JOINT = 15
 
@@ -26,10 +26,10 @@ class FilteredLog(NamedTuple):
     """Filtered and thinned signals (m, n) of consecutive samples, read-only.
 
     tau_raw_nm: the torques as recorded at the same times. settling: samples over which the low-pass mixes
-        what lies before with what lies after. noise: |raw - filtered| / |raw| over all recorded samples, the
-        part of the torque that no model of this bandwidth can have.
-    fine_qd_rad_s, fine_qdd_rad_s2: filtered at the recording's own rate, for what changes within a kept
-        sample; see `low_passed`.
+        earlier and later ones. noise: |raw - filtered| / |raw| over all recorded samples, which no model of
+        this bandwidth can explain.
+    fine_qd_rad_s, fine_qdd_rad_s2: filtered at the recording's own rate, for nonlinear columns; see
+        `low_passed`.
     """
 
     rate_hz: float
@@ -129,5 +129,5 @@ def filtered_log(log: JointLog, cutoff_hz: float, max_count: int | None = None) 
 
 
 def _thinned(fine: Array, edge: int, step: int) -> Array:
-    """Return some of the samples, without the ends, where what is filtered once more has not settled."""
+    """Return every `step`-th sample without the ends, where a second low-pass has not settled."""
     return fine[edge : len(fine) - edge : step]

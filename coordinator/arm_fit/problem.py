@@ -24,7 +24,7 @@ from module_agent.signals.torque_terms import TERM_KINDS, Term
 
 
 class ModelChoice(NamedTuple):
-    """What the model has.
+    """The terms and options of the model.
 
     terms, coupled: see `drive_columns`. robust: Huber's weights. slow_part, mask_part: the speed below which
     the sign of friction fades, and that below which a sample is masked, in parts of the joint's top speed.
@@ -40,9 +40,9 @@ class ModelChoice(NamedTuple):
 class Problem(NamedTuple):
     """m samples of n joints and p columns, the inertial ones first; arrays are read-only.
 
-    moving: (m, n) samples whose joint turns fast enough that friction has a direction. Only these are
-        fitted to: what holds a joint that stands is decided by how it came to a stop. instruments: (m, n, p)
-        the regressor by other measurements of the same motion, None for least squares.
+    moving: (m, n) samples whose joint turns fast enough that friction has a direction. Only these are fitted:
+        friction at rest depends on how the joint came to a stop. instruments: (m, n, p) the regressor by
+        other measurements of the same motion, None for least squares.
     """
 
     robot: UrdfRobot
@@ -56,7 +56,7 @@ class Problem(NamedTuple):
 
     @property
     def inertial(self) -> int:
-        """How many of the columns are the bodies'."""
+        """The number of columns of the bodies."""
         return PER_BODY * len(self.robot.bodies)
 
     def with_drives(self, keep: Callable[[DriveColumn], bool], bodies: bool = True) -> "Problem":
@@ -87,12 +87,13 @@ def problem(
     again: FilteredLog | None = None,
     top_rad_s: Array | None = None,
 ) -> Problem:
-    """Return the columns of all samples of a recording.
+    """Pose the least-squares problem of a recording.
 
     Args:
-        robot, log, choice: what moved, what was recorded, and what the model has.
+        robot, log, choice: the arm, the filtered recording, and the model.
         again: the same motion at the same times by other measurements, for instruments (`in_two`).
-        top_rad_s: (n,) top speeds that count, of another recording that this one is compared with.
+        top_rad_s: (n,) top speeds that the speed limits refer to, of another recording; by default this
+        one's.
 
     Raises:
         UsageError: parts of speed out of range, or a joint that never moves.
@@ -124,7 +125,7 @@ def problem(
 
 
 def joined(one: Problem, other: Problem) -> Problem:
-    """Return the samples of both recordings, those of `one` first; for what is fitted to either but not both.
+    """Return the samples of both recordings, those of `one` first, to fit one and test on the other.
 
     Raises:
         ValueError: the two have different columns.
@@ -144,7 +145,7 @@ def joined(one: Problem, other: Problem) -> Problem:
         moving=np.concatenate([one.moving, other.moving]),
         instruments=None
         if one.instruments is None
-        # Only fitted to in `one`; what is tried needs none.
+        # Only `one` is fitted; the tested samples need none.
         else np.concatenate([one.instruments, other.regressor]),
     )
 
@@ -157,7 +158,7 @@ def _regressor(robot: UrdfRobot, drives: Sequence[DriveColumn], log: FilteredLog
 
 
 def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array) -> Array:
-    """Return the drives' signals (m, k) as they are behind the torque's low-pass."""
+    """Return the drives' signals (m, k) low-passed as the torques are."""
     signals = drive_signals(drives, log.qd_rad_s, log.qdd_rad_s2, slow_rad_s).copy()
     at = [k for k, drive in enumerate(drives) if not TERM_KINDS[drive.term].linear]
     fine = drive_signals([drives[k] for k in at], log.fine_qd_rad_s, log.fine_qdd_rad_s2, slow_rad_s)

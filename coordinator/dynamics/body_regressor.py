@@ -1,8 +1,8 @@
-"""How bodies move and where the joints' axes are, as they were seen: the regressor without a rigid chain.
+"""The torque regressor from measured motions of bodies, without assuming a rigid chain on a fixed base.
 
-`torque_regressor` takes every motion from the joints' positions, twice differentiated, on a base at rest
-and with links that do not give. Here motion and axes come from elsewhere: from a base that shakes, from links
-that turn under their load, from IMUs. What is done with them is the same (thesis eqs 25-28).
+`torque_regressor` computes every motion from the joints' positions, twice differentiated, on a base at rest
+and with rigid links. Here motions and axes are given: with a moving base, compliant links or IMUs. The
+regressor is the same (thesis eqs. 25-28).
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,9 @@ from module_agent.model.regressor import PER_BODY
 
 
 class Screw(NamedTuple):
-    """A joint's axis in the frame of a body that it carries: direction and moment, (3, m) each."""
+    """The screw of a joint's axis in the frame of a body that it carries: direction and moment, (3, m)
+    each.
+    """
 
     direction: Array
     moment: Array
@@ -26,8 +28,8 @@ class Screw(NamedTuple):
 class BodyTrack(NamedTuple):
     """One body's motion and the screws of the joints that carry it, by their index; both in its own frame.
 
-    Where the link to its first child gives, the frame is that beyond it: there the child's housing is, the
-    heaviest part of the body.
+    If the link to its first child is compliant, the frame is that beyond the link: there is the child's
+    housing, the heaviest part of the body.
     """
 
     motion: BodyMotion
@@ -42,8 +44,8 @@ def body_tracks(
     Args:
         chain: n joints.
         q_rad: (m, n) joint positions.
-        bodies: motions, as `inertial_prediction.body_motions` returns them for the same `turns`.
-        turns: how links turn, by the module that each carries.
+        bodies: motions, as `body_motions` returns them for the same `turns`.
+        turns: rotations of compliant links, by the module that each carries.
     """
     near: list[dict[int, Screw]] = []
     tracks = []
@@ -91,11 +93,11 @@ def _carried(chain: Chain, joint: int, q: Array, screw: Screw) -> Screw:
 
 
 def _row(motion: BodyMotion, screw: Screw) -> Array:
-    """Return what a joint feels of a body's ten parameters, (10, m); see `regressor_kernel`."""
+    """Return a joint's torque per parameter of a body, (10, m); see `regressor_kernel`."""
     (w, v), omega, alpha = screw, motion.omega, motion.alpha
     first = cross(motion.acceleration, w) + cross(v, alpha) + cross(omega, cross(omega, v))
     u = cross(w, omega)
-    # Of a symmetric matrix: the products of its rows and columns, those beside the diagonal twice.
+    # Of a symmetric matrix: the products of its rows and columns, off-diagonal ones twice.
     product = w[:, None] * alpha + u[:, None] * omega
     both = product + product.swapaxes(0, 1)
     return np.stack(

@@ -1,8 +1,8 @@
-"""What is known of the bodies before anything moved: the modules are of known make, the links are not.
+"""The prior of the bodies: modules from the catalogue, links by a guess of their mass per length.
 
-A body is what its joint turns: one side of its own module, the links to its children, and the held side of
-each child. Masses of modules are the catalogue's; the links' are a guess per length. The prior decides only
-where torques say little, so a guess that is off by a factor of two does no harm.
+A body is what its joint moves: one side of its own module, the links to its children, and the held side of
+each child. The prior decides only where torques determine little, so that an error of the guess by a factor
+of two does no harm.
 """
 
 from collections.abc import Sequence
@@ -22,12 +22,12 @@ OUTPUT_RADIUS_M = 0.02
 LINK_KG_M = 0.5
 # Modules stand apart by at least their screws and a plate.
 MIN_LINK_KG = 0.02
-# Nothing is thinner than this, and no place is known better.
+# Smallest radius of gyration, which is also the uncertainty of a place.
 SMEAR_M = 0.01
 
 
 def module_prior(chain: Chain, types: Sequence[ModuleType]) -> Array:
-    """Return the pseudo-inertia (n, 4, 4) that every body is expected to have, root frame, q = 0; read-only.
+    """Return the expected pseudo-inertia of every body (n, 4, 4) in the root frame at q = 0, read-only.
 
     Raises:
         ValueError: there is not one type per module.
@@ -41,10 +41,10 @@ def module_prior(chain: Chain, types: Sequence[ModuleType]) -> Array:
 
 
 def sides_prior(chain: Chain, types: Sequence[ModuleType]) -> tuple[Array, Array]:
-    """Return what every module's joint turns and what is held by it, with the link that leads to it.
+    """Return the side that every module's joint moves, and the held side with the link that leads to it.
 
-    Each (n, 4, 4), pseudo-inertias in the root frame at q = 0, read-only. Of a module on the base the link is
-    left out: no torque shows it.
+    Each (n, 4, 4), pseudo-inertias in the root frame at q = 0, read-only. The link of a module on the base is
+    left out: no torque depends on it.
 
     Raises:
         ValueError: there is not one type per module.

@@ -1,9 +1,9 @@
-"""Whether ten inertial parameters belong to a real body, and the nearest real body if they do not.
+"""Pseudo-inertias: physical consistency of ten inertial parameters, and the nearest consistent body.
 
-A body is real if some distribution of positive mass has its parameters, and that is so exactly if its
-pseudo-inertia matrix is positive definite (Wensing, Kim and Slotine 2018, Linear matrix inequalities for
-physically consistent inertial parameter identification). That one condition holds a positive mass, a positive
-definite inertia about the centre of mass and the triangle inequality of its principal moments.
+Parameters are physically consistent if some distribution of positive mass has them, which is the case exactly
+if the pseudo-inertia matrix is positive definite (Wensing, Kim and Slotine 2018, Linear matrix inequalities
+for physically consistent inertial parameter identification). This condition implies a positive mass, a
+positive definite inertia about the centre of mass and the triangle inequality of its principal moments.
 """
 
 from typing import NamedTuple
@@ -16,14 +16,13 @@ from module_agent.model.read_only import make_read_only
 
 # Parameters in kg, kg m and kg m^2 have no common size. First moments are measured per 0.3 m and inertias per
 # (0.3 m)^2, a usual reach of a module with its link, so that all are in kg. A scale per column of the
-# regressor would blow columns that are zero but for rounding up to full size, and they would count into the
-# rank.
+# regressor would enlarge columns of rounding errors, which would then count into the rank.
 REACH_M = 0.3
 
 
 # Half a gram at 0.3 m, 5e-5 kg m^2: below every module's inertia, and still far enough from singular for
 # simulators that invert it.
-SMALLEST_KG = 5e-4
+MIN_EIGENVALUE_KG = 5e-4
 
 _UPPER = np.triu_indices(3)
 
@@ -55,9 +54,9 @@ def parameters(pseudo: ArrayLike) -> Array:
 
 
 def parameter_transform(pose: ArrayLike) -> Array:
-    """Return the matrix (10, 10) that takes ten parameters from a frame into the one that sees it at `pose`.
+    """Return the matrix (10, 10) that transforms ten parameters from a frame at `pose` into the outer frame.
 
-    The pseudo-inertia goes over by J' = T J T^T, T the pose (4, 4), which is linear in the parameters.
+    The pseudo-inertia transforms by J' = T J T^T, T the pose (4, 4), which is linear in the parameters.
     """
     transform = np.asarray(pose, dtype=float)
     columns = [parameters(transform @ pseudo_inertia(unit) @ transform.T) for unit in np.eye(10)]
@@ -70,7 +69,7 @@ def smallest_eigenvalue(pseudo: ArrayLike) -> float:
 
 
 def is_consistent(pseudo: ArrayLike) -> bool:
-    """Tell whether a pseudo-inertia matrix is that of a real body of more than rounding's size.
+    """Tell whether a pseudo-inertia matrix is positive definite beyond rounding.
 
     The bound scales with the body, because a small one about a far origin is legitimately near singular.
     """
@@ -79,13 +78,14 @@ def is_consistent(pseudo: ArrayLike) -> bool:
 
 
 def nearest_consistent(pseudo: ArrayLike) -> Array:
-    """Return the nearest real body's pseudo-inertia (4, 4): eigenvalues below `SMALLEST_KG` are raised to it.
+    """Return the nearest consistent pseudo-inertia (4, 4): eigenvalues below `MIN_EIGENVALUE_KG` are raised
+    to it.
 
-    Nearest in the Frobenius norm with lengths counted in `REACH_M`, about the given origin. It is not the
+    Nearest in the Frobenius norm with lengths in `REACH_M`, about the given origin. It is not the consistent
     body that explains the torques best.
     """
     values, vectors = np.linalg.eigh(_in_kg(pseudo))
-    raised = vectors * np.maximum(values, SMALLEST_KG) @ vectors.T
+    raised = vectors * np.maximum(values, MIN_EIGENVALUE_KG) @ vectors.T
     nearest: Array = raised * _reach()
     return nearest
 
@@ -128,7 +128,7 @@ def _in_kg(pseudo: ArrayLike) -> Array:
 
 
 def parameter_scale(bodies: int) -> Array:
-    """Return the sizes (10 n,) in which parameters are counted: phi = scale * (parameters in kg).
+    """Return the common sizes of parameters (10 n,): phi = scale * (parameters in kg).
 
     The columns of the regressor are multiplied by it.
     """

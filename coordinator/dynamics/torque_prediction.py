@@ -1,7 +1,7 @@
-"""How well inertial parameters predict torques that they were not fitted to.
+"""Relative errors of predicted torques, of samples that the parameters were not fitted to.
 
-The figure is |e| / |tau| with 2-norms over the samples. It stands beside that of the simplest prediction, the
-mean torque of the motion that was fitted: a model that does not beat it has learnt nothing of the dynamics.
+The error is |e| / |tau| with 2-norms over the samples. It is compared with the simplest prediction, the mean
+torque of the motion that was fitted: a model with a larger error has learnt nothing of the dynamics.
 """
 
 from typing import NamedTuple
@@ -50,7 +50,7 @@ def torque_error(
         tau_nm, tau_predicted_nm: (m, n) of the held-out motion.
         tau_mean_nm: (n,) mean torques of the motion that was fitted (not of this one, which would favour
         them).
-        mask: (m, n) or (m, 1), True where to compare; None compares all. State both when you mask.
+        mask: (m, n) or (m, 1), True where to compare; None compares all. Report both if you mask.
 
     Raises:
         DataError: the mask leaves nothing to compare.

@@ -1,15 +1,14 @@
-"""Base parameters: the combinations of parameters that torques show, each named in words.
+"""Base parameters: the combinations of parameters that torques determine, with their names and frames.
 
-Least squares sees of the parameters x no more than the rows that span the regressor. r of its columns are
-chosen as independent; all others are sums of those, and so their parameters only ever appear added to those
+The torques depend on the parameters x through the row space of the regressor. r of its columns are chosen as
+independent; all others are linear combinations of those, so that their parameters only appear added to those
 of the chosen columns (Gautier and Khalil 1990, Direct calculation of minimum set of inertial parameters):
-beta_i = x_i + sum_j g_ij x_j. That beta is all there is to know, in whatever way the columns are chosen.
+beta_i = x_i + sum_j g_ij x_j. Any choice of the columns gives the same information.
 
-The frames in which a body's parameters read best: z along its joint's axis, x towards the next joint.
-
-In them most of what torques show is a parameter of its own, and the rest are sums of few (Khalil and Dombre
-2002, Modeling, identification and control of robots, section 3.2): along the common normal of two axes lies
-the distance that lumps the masses beyond.
+Combinations are shortest in frames with z along the body's joint axis and x towards the next joint
+(`joint_frames`). Most base parameters are single parameters then, because the distance that lumps the masses
+beyond lies along the common normal of two axes (Khalil and Dombre 2002, Modeling, identification and control
+of robots, section 3.2).
 """
 
 from collections.abc import Sequence
@@ -27,23 +26,24 @@ from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only, read_only
 from module_agent.model.regressor import PER_BODY
 
-# A column that keeps less than this of its length beside the columns chosen before it is passed over, so that
-# coefficients do not exceed its reciprocal: a sum is named by what it mostly is. With motions that show all
-# that can be shown, any value between 0.05 and 0.25 chooses the same columns.
+# A column with a smaller share of its length outside the span of the columns chosen before is passed over, so
+# that coefficients do not exceed the reciprocal and a combination is named by its largest member. With
+# motions that determine all base parameters, any value between 0.05 and 0.25 chooses the same columns.
 INDEPENDENT_ABOVE = 0.25
 
 # Of a parameter's own scale. Geometry that was itself estimated tilts the groupings by about its errors.
 NEGLIGIBLE = 2e-3
 
 _MOMENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
-# Within a body what its joint shows by itself comes first, and what moves into the body below comes last
-# (Khalil and Dombre 2002, Modeling, identification and control of robots, section 9.4.2, z along the axis):
-# Izz, first moments, the other moments, then Iyy, the first moment along the axis and the mass.
+# Within a body the parameters that its own joint determines come first, and those that are lumped into the
+# body below come last (Khalil and Dombre 2002, Modeling, identification and control of robots, section 9.4.2,
+# z along the axis): Izz, first moments, the other moments, then Iyy, the first moment along the axis, the
+# mass.
 _WITHIN_BODY = (9, 1, 2, 4, 5, 6, 8, 7, 3, 0)
 
 
 class Columns(NamedTuple):
-    """What the columns of a regressor are: their names, the common size of each parameter, and the order.
+    """The columns of a regressor: their names, the common size of each parameter, and the order of choice.
 
     scale: (p,) by which a parameter is counted, so that those of different units have one common size: the
         regressor's columns are multiplied by it. preferred: (p,) the order in which they are tried as the
@@ -55,9 +55,9 @@ class Columns(NamedTuple):
     preferred: NDArray[np.int64]
 
     def beside(self, names: Sequence[str], scale: ArrayLike = 1.0) -> "Columns":
-        """Return these columns and further ones after them, which are tried first.
+        """Return these columns with further ones appended, which are chosen first.
 
-        A friction or an offset is a parameter of its own; it is inertia that is lumped.
+        Friction and offsets are to be base parameters by themselves; inertias are lumped instead.
         """
         added = np.broadcast_to(np.asarray(scale, dtype=float), len(names))
         size = len(self.names)
@@ -70,8 +70,8 @@ class BaseParameters(NamedTuple):
 
     columns: what the regressor's columns are. independent: (r,) the columns that each base parameter starts
         with. grouping: (r, p), 1 there. value: (r,) their estimates. covariance: (r, r).
-    share: (p,) how much of a parameter by itself lies in what the data tell: 1 if it is known alone, 0 if it
-        has no effect.
+    share: (p,) squared length of a parameter's projection onto the row space: 1 if it is determined by
+        itself, 0 if it has no effect.
     condition: largest over smallest singular value that was kept, of the scaled regressor.
     """
 
@@ -85,7 +85,7 @@ class BaseParameters(NamedTuple):
 
     @property
     def rank(self) -> int:
-        """How many there are."""
+        """The number of base parameters."""
         return len(self.independent)
 
     @property
@@ -100,13 +100,13 @@ class BaseParameters(NamedTuple):
         return np.asarray(np.divide(self.sigma, size, out=np.full(self.rank, np.inf), where=size > 0.0))
 
     def lumped(self, i: int) -> tuple[int, ...]:
-        """Return the columns whose parameters are in base parameter `i`, its own first."""
+        """Return the columns whose parameters are in base parameter `i`, its independent one first."""
         of_scale = self.grouping[i] * self.columns.scale / self.columns.scale[self.independent[i]]
         others = np.flatnonzero(np.abs(of_scale) > NEGLIGIBLE)
         return (int(self.independent[i]), *(int(j) for j in others if j != self.independent[i]))
 
     def summary(self, i: int) -> str:
-        """Return base parameter `i` as a sum of named parameters, "m2 c2x + 0.225 (m3 + m4)"."""
+        """Return base parameter `i` as a combination of named parameters, "m2 c2x + 0.225 (m3 + m4)"."""
         groups: dict[tuple[bool, str], list[str]] = {}
         for j in self.lumped(i):
             factor = float(self.grouping[i, j])
@@ -134,12 +134,12 @@ def inertial_units(joints: int) -> tuple[str, ...]:
 
 
 def into_frames(triangle: ArrayLike, homes: ArrayLike) -> Array:
-    """Return rows (k, p) over parameters in the root frame as rows over those in the bodies' own frames.
+    """Transform rows (k, p) over parameters in the root frame to parameters in the bodies' own frames.
 
     Args:
         triangle: its first 10 n columns are `torque_regressor`'s; any further ones stay.
         homes: (n, 4, 4) poses of the bodies' frames in the root frame at q = 0. With z along the joint's axis
-            (`urdf.link_homes`) the groupings are those that one knows from books.
+            (`joint_frames`) the groupings are those of the literature.
     """
     rows = np.array(triangle, dtype=float)
     poses = np.asarray(homes, dtype=float)
@@ -151,7 +151,7 @@ def into_frames(triangle: ArrayLike, homes: ArrayLike) -> Array:
 def whitened(
     information: Sequence[JointInformation], sigma_nm: ArrayLike, independent_fraction: float = 1.0
 ) -> tuple[Array, Array]:
-    """Return the rows (k, p) and the target (k,) of all joints, in standard deviations of their noise.
+    """Return the whitened rows (k, p) and target (k,) of all joints: divided by their noise.
 
     Args:
         information: per joint.
@@ -159,7 +159,8 @@ def whitened(
         independent_fraction: independent samples per sample, below 1 after a low-pass.
 
     Raises:
-        ValueError: noise that is not positive or not one per joint, or a fraction out of range.
+        DataError: noise that is not positive, or not one per joint.
+        ValueError: a fraction out of range.
     """
     sigma = np.asarray(sigma_nm, dtype=float)
     if sigma.shape != (len(information),) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
@@ -182,19 +183,18 @@ def base_parameters(
 ) -> BaseParameters:
     """Return the base parameters of rows whose noise is white.
 
-    The rank is counted in singular values, which say how well a direction is seen whatever the columns; the
-    independent columns are found by QR with pivoting within what is left, in the order that `columns`
-    prefers as long as they are well apart.
+    The rank is the number of singular values above the tolerance. The independent columns are chosen by QR
+    with pivoting within the row space, in the order that `columns` prefers as long as they are well apart.
 
     Args:
         triangle: (k, p) the regressor, or any rows with the same R^T R, of `whitened` for example.
-        target: (k,) what the rows give for the true parameters, with noise.
-        columns: what the p columns are.
+        target: (k,) the rows times the true parameters, with noise.
+        columns: names, sizes and order of the p columns.
         sigma: standard deviation of the noise of `target`; 1 of rows that are `whitened`.
-        max_sigma: a direction known worse than this, in `columns.scale`, is not told by the data
-            (`identification.MAX_SIGMA_KG`); inf keeps all that rounding allows.
-        common_errors: (k, j) errors of the target that are not independent from row to row: each column is
-            one that comes as a whole, of one standard deviation (`common_errors`). They widen the covariance.
+        max_sigma: directions with a larger standard deviation, in `columns.scale`, are not determined
+            (`MAX_SIGMA_KG`); inf keeps all that rounding allows.
+        common_errors: (k, j) systematic errors of the target, each column one of one standard deviation
+            (`systematic_errors`). They widen the covariance.
         tolerance: singular values that are smaller shares of the largest count as zero.
 
     Raises:
@@ -210,7 +210,7 @@ def base_parameters(
     triangular = qr(space[:, chosen])
     back = solve_triangular(triangular[1], triangular[0].T)
     inverse = back / values @ whole.left[:, kept].T
-    # Both kinds of error side by side: their squares add.
+    # The covariances of noise and systematic errors add.
     spread = np.hstack([back / values * sigma, inverse @ common])
     own = columns.scale[chosen]
     grouping = own[:, None] * (back @ space) / columns.scale
@@ -243,7 +243,7 @@ def _rows(
 
 
 def _independent(space: Array, preferred: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return r independent columns (r,) of orthonormal rows (r, p), the preferred ones where they serve."""
+    """Return r independent columns (r,) of orthonormal rows (r, p), preferred ones where far enough apart."""
     rest = space.copy()
     chosen: list[int] = []
 
@@ -267,10 +267,10 @@ def _term(negative: bool, size: str, names: Sequence[str]) -> str:
     return f"{sign} {size} {names[0]}" if len(names) == 1 else f"{sign} {size} ({' + '.join(names)})"
 
 
-# Axes closer to parallel have a common normal that an estimate turns anywhere.
+# For axes closer to parallel the direction of the common normal is not determined by an estimate.
 _PARALLEL_BELOW = np.sin(np.radians(10.0))
-# Nearer than this is no direction to point to: axes that meet are found to pass each other by a few
-# millimetres, on either side.
+# Below this distance there is no direction: estimates of axes that intersect pass each other by a few
+# millimetres on either side.
 _APART_M = 5e-3
 
 

@@ -33,9 +33,9 @@ SHARE_TOLERANCE = 1e-5
 
 
 class InertialFit(NamedTuple):
-    """Parameters of n bodies as least squares gives them; arrays are read-only, p = 10 n.
+    """Least-squares parameters of n bodies; arrays are read-only, p = 10 n.
 
-    phi: (p,) as in `torque_regressor`. Only its projection is known.
+    phi: (p,) as in `torque_regressor`. Only its projection is determined.
     rank: number of parameter combinations that were identified; p - rank are `unidentifiable_count`.
     singular_values: (p,) of the weighted regressor in kg (see `REACH_M`), falling, the discarded ones too.
     condition: largest over smallest kept singular value.

@@ -1,12 +1,12 @@
-"""Real bodies that explain the torques: least squares over bodies that can exist, drawn towards a prior.
+"""Physically consistent bodies that explain the torques: least squares with a prior on the mass distribution.
 
-A body can exist if its pseudo-inertia J is positive definite (`consistency`). Torques leave many directions
-open; there a prior J0 decides, by the entropic divergence of two mass distributions (Lee, Wensing and Park
-2020, Geometric robot dynamic identification: a convex programming approach),
+A body is physically consistent if its pseudo-inertia J is positive definite (`pseudo_inertia`). Where torques
+do not determine it a prior J0 does, by the entropic divergence of two mass distributions (Lee, Wensing and
+Park 2020, Geometric robot dynamic identification: a convex programming approach),
 
     d(J | J0) = -log det(J J0^-1) + tr(J J0^-1) - 4,
 
-which does not depend on frames or units and grows without bound where J ceases to be a body's. So
+which does not depend on frames or units and is unbounded at the boundary of the consistent bodies. So
 
     minimise |R x - z|^2 / 2 + w sum_i d(J_i(x) | J0_i)
 
@@ -34,26 +34,26 @@ from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
 
 # Near the prior w d is w |dJ J0^-1|^2 / 2, so that a weight of 10 is the belief that a body's distribution of
-# mass is known to about 30 %: modules better, links worse. What no model has, friction and springs, is no
-# white noise, and a weaker prior buys it off with bodies of tons: weaker ones are for where this one costs
-# too much.
+# mass is known to about 30 %: modules better, links worse. Errors of the model, as friction and springs, are
+# not white, and a weaker prior fits them by bodies of tons: the weaker ones are for torques that this one
+# does not explain.
 WEIGHTS = (10.0, 1.0, 0.1, 0.01)
-# How much the relative torque error may grow from least squares' for the prior's sake: half of what is
-# promised for motions that were not fitted, because those are another sample of the same.
+# The prior may increase the relative torque error of least squares by this: half of the bound for motions
+# that were not fitted, because those are another sample of the same.
 MAX_COST = 5e-4
-# Of the torques' rms: no torque is known better, and a simulated one without noise is not solved better.
+# Smallest noise as a share of the torques' rms: simulated torques without noise are not fitted closer.
 _FINEST = 1e-5
 
 _MAX_STEPS = 200
 # Of the prior's weight: the objective is then within 1e-7 divergences of its minimum.
 _DECREMENT = 1e-7
-# Good enough to go on from, to the next smaller barrier: tenth by tenth.
+# Tolerance of all barriers but the last, each of which is a tenth of the one before.
 _ROUGHLY = 0.05
 _FALL = 10.0
-# On the way bodies may grow to this many times the prior where torques are silent.
+# Under a barrier bodies may grow to this many times the prior where torques do not determine them.
 _LARGEST = 1e3
 # A body far too small grows at most this many times over in a step.
-_LONGEST_STEP = 1e6
+_MAX_STEP = 1e6
 _UNITS = np.stack([pseudo_inertia(unit) for unit in np.eye(PER_BODY)])
 _TRACE = np.trace(_UNITS, axis1=1, axis2=2)
 
@@ -63,13 +63,13 @@ class NotSolvedError(DataError):
 
 
 class PhysicalFit(NamedTuple):
-    """n bodies that can exist and explain the torques; arrays are read-only.
+    """n physically consistent bodies that explain the torques; arrays are read-only.
 
-    phi: (10 n,) as in `torque_regressor`. covariance: (10 n, 10 n) with the prior taken for knowledge: it is
-        small where the prior holds, so compare `InertialFit.covariance`.
+    phi: (10 n,) as in `torque_regressor`. covariance: (10 n, 10 n) of the posterior: it is small where the
+        prior decides; that of the torques alone is `InertialFit.covariance`.
     pseudo: (n, 4, 4) the bodies' pseudo-inertias, in the root frame. divergence: (n,) from the prior.
     weight: of the prior. error: relative torque error |e| / |tau| of the fit. least_squares_error: that of
-        least squares, which leaves alone what the noise hides.
+        least squares, which keeps directions below the noise at zero.
     """
 
     phi: Array
@@ -82,9 +82,9 @@ class PhysicalFit(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """How much more of the torque is left unexplained than by least squares, as a share of |tau|.
+        """The relative torque error less that of least squares.
 
-        Negative where the prior gives directions a say that least squares leaves to the noise.
+        It is negative if the prior improves directions that least squares keeps at zero.
         """
         return self.error - self.least_squares_error
 
@@ -106,21 +106,21 @@ def fit_physical(
     max_cost: float = MAX_COST,
     effects: Sequence[Array] | None = None,
 ) -> PhysicalFit:
-    """Fit real bodies to the torques of all joints.
+    """Fit physically consistent bodies to the torques of all joints.
 
-    The prior has the largest of `WEIGHTS` with which the torques are explained worse than by least squares by
-    at most `max_cost`, or by no more than the noise that least squares fits; if none is, because friction is
-    missing in the model for example, then worse than by the best real bodies by at most `max_cost`.
+    The prior has the largest of `WEIGHTS` whose relative torque error exceeds that of least squares by at
+    most `max_cost`, or by no more than the noise that least squares fits. If there is none, because friction
+    is missing in the model for example, it is the largest within `max_cost` of the best of them.
 
     Args:
         information: per joint of n.
-        prior: (n, 4, 4) pseudo-inertias in the root frame at q = 0 (`parameter_prior.module_prior`).
-        least_squares: what is fitted without bodies to the same information. Its noise says how much the data
-            outweigh the prior; all joints count alike, as in unweighted least squares, so that the errors of
-            the two compare.
+        prior: (n, 4, 4) pseudo-inertias in the root frame at q = 0 (`inertia_prior.module_prior`).
+        least_squares: the fit without the constraint to the same information. Its noise weighs data against
+            prior; all joints count alike, as in unweighted least squares, so that the errors of the two
+            compare.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         max_cost: see above; a share of |tau|.
-        effects: (k_i, j) of every joint, of errors that come as a whole (`common_errors`); they widen the
+        effects: (k_i, j) of every joint, of systematic errors (`systematic_errors`); they widen the
             covariance.
 
     Raises:
@@ -177,14 +177,14 @@ def _strongest_prior(
         tried.append((solution, weight, error_of(solution.x)))
         if tried[-1][2] <= allowed:
             return tried[-1]
-    # No real bodies do as well as least squares: the model lacks something. What the prior adds to their
-    # price is kept small instead.
+    # No consistent bodies do as well as least squares: the model lacks something. The cost is counted from
+    # the best of them instead.
     cheapest = min(error for _, _, error in tried)
     return next(one for one in tried if one[2] - cheapest <= max_cost)
 
 
 def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:
-    """Minimise |R x - z|^2 / 2 + weight * divergence from the prior over bodies that can exist.
+    """Minimise |R x - z|^2 / 2 + weight * divergence from the prior over consistent bodies.
 
     Args:
         rows: (k, p) in standard deviations; the first 10 n columns are the bodies'. The rest are parameters
@@ -197,9 +197,9 @@ def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, 
     """
     problem = _problem(rows, target, prior, weight)
     y = problem.origin()
-    # Far from the minimum Newton's steps are many. So the logarithm alone begins with a weight beside which
-    # the misfit is small, and that falls to the prior's (the barrier method: Boyd and Vandenberghe, section
-    # 11.3). Were the whole divergence to fall with it, a prior that is far off would cost hundreds of steps.
+    # Far from the minimum Newton's method needs many steps. So the logarithm alone begins with a weight that
+    # dominates the misfit and decreases to the prior's (the barrier method: Boyd and Vandenberghe, section
+    # 11.3). If the whole divergence did, a prior that is far off would cost hundreds of steps.
     high = problem.misfit(y) / (4.0 * problem.bodies)
     times = max(0, int(np.ceil(np.log(high / weight) / np.log(_FALL)))) if high > 0.0 else 0
     steps = 0
@@ -222,18 +222,20 @@ def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, in
             down = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))
         except np.linalg.LinAlgError as error:
             raise NotSolvedError(
-                f"no real bodies were found, after {step} steps: {error}; parameters without a prior may be "
-                "such that the rows do not determine them"
+                f"no consistent bodies were found after {step} steps: {error}; the rows may not determine "
+                "the parameters without a prior"
             ) from error
         fall = float(-gradient @ down)
         if fall < 2.0 * decrement * problem.barrier:
             return y, step
         length = problem.best_length(y, down)
         if not length > 0.0:
-            # Rounding, not descent: nothing lower can be told from here.
+            # The rest is rounding: no lower objective is resolved.
             return y, step
         y = y + length * down
-    raise NotSolvedError(f"no real bodies were found in {_MAX_STEPS} steps; the last would gain {fall:.2g}")
+    raise NotSolvedError(
+        f"no consistent bodies were found in {_MAX_STEPS} steps; the last decrement is {fall:.2g}"
+    )
 
 
 class _Problem(NamedTuple):
@@ -268,14 +270,14 @@ class _Problem(NamedTuple):
         return np.asarray(np.sum(values - np.log(values) - 1.0, axis=1))
 
     def misfit(self, y: Array) -> float:
-        """Return |R x - z|^2 / 2 but for what no parameters explain."""
+        """Return |R x - z|^2 / 2 less the part that no parameters explain."""
         error = self.triangle @ y - self.target
         return float(0.5 * error @ error)
 
     def best_length(self, y: Array, down: Array) -> float:
         """Return the t that minimises the objective along y + t * down, 0 if it does not fall.
 
-        Steps that merely go down may end next to a body that cannot exist, and the next ones are then short.
+        Steps that merely decrease it may end next to the boundary, and the next ones are then short.
         Along a line log det(Y + t D) is the sum of log(1 + t l) over the eigenvalues l of L^-1 D L^-T.
         """
         lower = np.linalg.inv(np.linalg.cholesky(self.matrices(y)))
@@ -291,10 +293,10 @@ class _Problem(NamedTuple):
 
         if not grows(0.0) < 0.0:
             return 0.0
-        # The slope grows from below zero to above it before a body ceases to exist.
+        # The slope grows from below zero to above it before the boundary is reached.
         longest = 1.0 / -float(rates.min()) if rates.min() < 0.0 else np.inf
         reach = min(1.0, 0.5 * longest)
-        while grows(reach) < 0.0 and reach < _LONGEST_STEP:
+        while grows(reach) < 0.0 and reach < _MAX_STEP:
             reach = min(2.0 * reach, 0.5 * (reach + longest))
         return float(brentq(grows, 0.0, reach, rtol=1e-6)) if grows(reach) > 0.0 else reach
 
@@ -332,7 +334,7 @@ def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float
         raise DataError("a body of the prior cannot exist: its pseudo-inertia is not positive") from error
     scale = block_diag(*(parameter_transform(root) for root in roots), np.eye(free))
     square = qr(np.column_stack([matrix @ scale, measured]), mode="r", check_finite=False)[0]
-    # The last row is what no parameters explain: dropped, so that small gains are not lost beside it.
+    # The last row is what no parameters explain; without it small decreases are not lost in rounding.
     square = square[: matrix.shape[1]]
     return _Problem(
         triangle=square[:, :-1],

@@ -1,12 +1,11 @@
-"""Weighted, robust and instrumental least squares of joint torques, with residuals that are not independent.
+"""Weighted, robust and instrumental least squares of joint torques with autocorrelated residuals.
 
-A joint's rows count by its residual's standard deviation, so that a large noisy joint does not drown a small
-quiet one; weights, noise and fit are found in turn. What the fit claims to know counts how many of the rows
-are independent: a low-pass, and every effect that no column has, leave residuals that resemble their
-neighbours.
+A joint's rows are divided by the standard deviation of its residual, so that a large noisy joint does not
+dominate a small quiet one; weights, noise and fit are iterated. The covariance uses the number of independent
+rows: a low-pass, and every effect that the model lacks, make residuals autocorrelated.
 
-Noise in the regressor, of an encoder differentiated twice, makes least squares come out too small.
-Instruments are a second regressor of the same motion with noise of its own: Z^T (tau - Y x) = 0 has no such
+Noise in the regressor, of an encoder differentiated twice, biases least squares towards zero. Instruments are
+a second regressor of the same motion with noise of its own: Z^T (tau - Y x) = 0 has no such
 bias (Young 2011, Recursive estimation and time-series analysis, section 6.2; Janot, Vandanjon and Gautier
 2014, A generic instrumental variable approach for industrial robot identification).
 """
@@ -33,21 +32,21 @@ from module_agent.signals.autocorrelation import autocovariance
 HUBER_LIMIT = 1.345
 # From the median of absolute deviations to the standard deviation of normal noise.
 _MAD_TO_SIGMA = 1.4826
-# The window of the autocorrelation's sum, in correlation times (Sokal 1997, Monte Carlo methods, eq. 3.19).
+# The window of the autocorrelation's sum in correlation times (Sokal 1997, Monte Carlo methods, eq. 3.19).
 _WINDOW_TIMES = 5.0
 _MAX_ROUNDS, _SETTLED = 30, 1e-4
 _MIN_NM = 1e-75
 
 
 class WeightedFit(NamedTuple):
-    """Parameters of p columns, as n joints show them; arrays are read-only.
+    """Parameters of p columns fitted to the torques of n joints; arrays are read-only.
 
-    parameters: (p,) the smallest ones that fit best, counted in the columns' scale; only their projection
-        onto what the rows show is known (see `base_parameters`).
-    covariance: (p, p) of what the rows show; zero along all else, which is not certainty.
+    parameters: (p,) the solution of least norm in the columns' scale; only its projection onto the row space
+        is determined (see `base_parameters`).
+    covariance: (p, p) of that projection; zero along all else, which is not certainty.
     rows, target: (k, p) and (k,) square-root information, weighted: the input of `base_parameters`.
     rank, condition: of the scaled rows.
-    sigma_nm: (n,) noise of the torques. correlation: (n,) samples that hold as much as one independent one.
+    sigma_nm: (n,) noise of the torques. correlation: (n,) samples that count as one independent one.
     samples: (n,) that were used. downweighted: (n,) fraction of them beyond Huber's limit, zero if not
         robust.
     """
@@ -65,7 +64,7 @@ class WeightedFit(NamedTuple):
 
     @property
     def independent_samples(self) -> float:
-        """How many independent samples the fit had."""
+        """The number of independent samples of the fit."""
         return float(np.sum(self.samples / self.correlation))
 
 
@@ -80,9 +79,9 @@ class _JointRows(NamedTuple):
 class _Solution(NamedTuple):
     """The solution (p,) of weighted rows, and its inverse (p, rank): their own directions, over their size.
 
-    hat: per joint (k, rank), orthonormal columns together. spread: per joint (k, rank) what the noise of a
-        row adds to the solution along those directions: `hat`, or what the instruments make of it.
-    rows, target: the triangle and what belongs to it. condition: of the scaled rows.
+    hat: per joint (k, rank), orthonormal columns together. spread: per joint (k, rank) the sensitivity of the
+        solution along those directions to the noise of a row: `hat`, or its equivalent by the instruments.
+    rows, target: the triangle and its right-hand side. condition: of the scaled rows.
     """
 
     parameters: Array
@@ -147,7 +146,7 @@ def fit_weighted(
 def _fit(
     solution: _Solution, used: NDArray[np.bool_], weights: Array, sigma: Array, correlation: Array
 ) -> WeightedFit:
-    # The rows' noise is 1, but so many of them count as one.
+    # The noise of the rows is 1, but several of them count as one.
     along = spread(solution.spread, correlation)
     samples = used.sum(axis=0, dtype=np.int64)
     fit = WeightedFit(
@@ -167,7 +166,7 @@ def _fit(
 
 
 def correlation_times(residual: ArrayLike) -> Array:
-    """Return of (m, n) residuals, NaN where one was not used, how many samples count as one (n,), at least 1.
+    """Return how many samples of residuals (m, n) count as one (n,), at least 1; unused ones are NaN.
 
     That is 1 + 2 sum rho_k over the lags k up to a window of five such times (Sokal 1997, eq. 3.19).
     """
@@ -187,7 +186,7 @@ def _correlation_time(residual: Array) -> float:
 
 
 def _joint_rows(y: Array, tau: Array, other: Array | None, weights: Array) -> list[_JointRows]:
-    """Compress each joint's samples into the triangle of their QR, which keeps all products of columns."""
+    """Compress each joint's samples into the triangle of their QR, which has the same products of columns."""
     size = y.shape[2]
     joints = []
     for i in range(y.shape[1]):
@@ -218,7 +217,7 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, with_instrum
             target=target,
             condition=condition,
         )
-    # Along the regressor's own directions, so that what it does not show stays zero: Z^T U c = Z^T tau.
+    # Along the regressor's own directions, so that undetermined ones stay zero: Z^T U c = Z^T tau.
     tools = np.vstack([joint.z @ inverse / own for joint, own in zip(joints, sigma, strict=True)])
     torques = np.concatenate([joint.tau / own for joint, own in zip(joints, sigma, strict=True)])
     through = np.linalg.solve(tools.T @ np.vstack(hat), tools.T).T
@@ -244,7 +243,7 @@ def _huber(off: Array) -> Array:
 def _noise(joints: list[_JointRows], solution: _Solution, used: NDArray[np.bool_]) -> Array:
     """Return the rms of each joint's residual (n,)."""
     left = [float(np.sum((joint.tau - joint.y @ solution.parameters) ** 2)) for joint in joints]
-    # Torques without noise leave rounding; weights must stay finite.
+    # Without noise the residual is rounding; weights must stay finite.
     rms: Array = np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _MIN_NM)
     return rms
 

@@ -280,7 +280,7 @@ def test_what_does_not_fit_is_named(arm: Case) -> None:
         physically_consistent(np.zeros((3, 40)), np.zeros(3), arm.prior, 0.0)
     with pytest.raises(DataError, match="a body of the prior cannot exist"):
         physically_consistent(np.zeros((3, 40)), np.zeros(3), -arm.prior, 1.0)
-    with pytest.raises(NotSolvedError, match="the rows do not determine them"):
+    with pytest.raises(NotSolvedError, match="the rows may not determine the parameters"):
         physically_consistent(np.zeros((3, 41)), np.zeros(3), arm.prior, 1.0)
     still = tuple(JointInformation(p.r, np.zeros_like(p.z), 0.0, p.samples) for p in arm.information)
     with pytest.raises(UndeterminedError, match="all torques are zero"):
