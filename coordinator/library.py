@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from coordinator.baseline.known_robot import BaselineError
+from coordinator.baseline.baseline_robot import BaselineError
 from coordinator.description.denavit_hartenberg import DhPath, dh_paths
 from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf

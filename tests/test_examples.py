@@ -21,7 +21,7 @@ from coordinator import (
     load_run,
     read_urdf,
 )
-from coordinator.baseline.known_robot import BaselineError
+from coordinator.baseline.baseline_robot import BaselineError
 from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import apply_perturbation
 from sim import simulate

@@ -1,19 +1,16 @@
-"""Two sessions of one robot, both fitted with the same errors of its IMUs.
+"""Detection of changed links between two sessions of one robot, with size and significance.
 
-An IMU's scale and axes are as they were: they change with years, not between two sessions. What a session
-gets wrong of them, it gets wrong of both alike, so that it cancels in the difference of the two chains. The
-same goes for whatever else the model leaves out, as far as the motions are the same. Biases drift, and are
-free in each session.
+Both sessions are fitted with the same scale and misalignment of the IMUs, which change over years, not
+between two sessions: their errors cancel in the difference of the two chains. So do other model errors, if
+the motions are the same. Biases drift, and are free in each session.
 
-Which link of a robot has changed between two sessions, by how much, and how surely.
-
-The increments from the former chain to the later one, d ~ N(D x, C), are compared under hypotheses; C is
-that of the sensors' noise alone, as what a model leaves out is common to both sessions, and of the floors
+The perturbations from the former chain to the later one, d ~ N(D x, C), are compared under hypotheses; C is
+that of the sensors' noise alone, since model errors are common to both sessions, and of the floors
 below. A link that changes by a twist displaces everything beyond it by that same twist, so that "link k
 changed" has six parameters, and "nothing changed" none. The gain in chi^2 of the best six is
-chi^2-distributed with as many degrees of freedom as of the six can be seen (Wilks, 1938); the probability of
-as large a gain by chance is multiplied by the number of links that are looked at (Bonferroni). Links are
-taken in one by one, the one that explains most first, until what is left is chance.
+chi^2-distributed with as many degrees of freedom as directions of the six are observable (Wilks, 1938); the
+probability of as large a gain by chance is multiplied by the number of links tested (Bonferroni). Links are
+added one by one, the one that explains most first, until the residual is insignificant.
 """
 
 from collections.abc import Sequence
@@ -22,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from coordinator.baseline.known_robot import BaselineRobot
+from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics
 from coordinator.identification.robot_refinement import KEEP_EVERY, MAX_IMU_SAMPLES
@@ -34,7 +31,7 @@ from module_agent.model.perturbation import adjoint, perturbation_between
 from module_agent.model.read_only import frozen
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, settling_samples
 
-# Scale and axes of an IMU that has been corrected for them: for the two sessions they are the same.
+# Prior of corrected IMUs: scale and misalignment are the same in both sessions.
 TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5)
 MOVING: tuple[Purpose, ...] = ("constant", "windowed_sine", "whole")
 
@@ -60,7 +57,7 @@ def tied_fits(known: BaselineRobot, later: BaselineRobot) -> TiedFits:
 
 
 def exploration(run: BaselineRobot, serials: Sequence[str]) -> list[Window]:
-    """Return what all modules read during the last exploration of every joint, in the order of `serials`."""
+    """Return the readings of all modules during the last exploration of every joint, ordered by `serials`."""
     margin = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
     moving = run.recording.motions(*MOVING)
     # All take part in a motion of the whole robot: it is one stretch of the recording.
@@ -90,10 +87,10 @@ def _fit(chain: Chain, windows: Sequence[Window]) -> Refinement:
     return refine_chain(chain, sensor_data(windows, REFINEMENT_CUTOFF_HZ, keep_every), TIED)
 
 
-# What two sessions of unlike motions leave between them for each link, of the same robot: links and springs
-# that give, filters. Measured: up to 0.2 mm and 0.45 mrad where the sessions' motions have other lengths.
+# Differences of an unchanged link between two sessions with different motions, by compliance and filters.
+# Measured: up to 0.2 mm and 0.45 mrad where the sessions' motions have other lengths.
 FLOOR_RAD, FLOOR_M = 3e-4, 1e-4
-# Of all checks of a robot that has not changed, how many may say that it has.
+# Probability that a check of an unchanged robot reports a change.
 FALSE_ALARMS = 1e-4
 
 
@@ -103,7 +100,7 @@ class LinkChange(NamedTuple):
     rotation_rad, displacement_m: (3,), zero along what cannot be seen. covariance: (6, 6) of [rotation,
     displacement] over what can be seen. unseen: (k, 6) orthonormal directions of the same that cannot.
     gain: by how much the change lowers chi^2, which has `seen` degrees of freedom; of several links together
-    what each of them adds to the others.
+    the additional gain of each.
     """
 
     child: int
@@ -115,7 +112,7 @@ class LinkChange(NamedTuple):
 
     @property
     def seen(self) -> int:
-        """How many of the six parameters can be seen."""
+        """The number of observable directions of the six."""
         return 6 - len(self.unseen)
 
     @property
@@ -139,19 +136,20 @@ class LinkChange(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """What a comparison says.
+    """Result of a comparison.
 
-    changed: the links that changed, with the rest taken as unchanged, the surest first. false_alarm: for each
-    of these the probability that it is one, over all links. each: every link with all the others free to
-    have changed as well. would_find_m: (n,) the smallest displacement of every link that would surely have
-    been found, whatever its direction of those that can be seen; NaN for the root.
+    changed: the links that changed, estimated with the rest unchanged, the most certain first.
+    false_alarm: for each of these the probability that it is one, over all links. each: every link with
+    all the others free to have changed as well. would_find_m: (n,) the smallest displacement of every
+    link that would surely have been found, whatever its direction of those that can be seen; NaN for the
+    root.
     """
 
     changed: tuple[LinkChange, ...]
     false_alarm: tuple[float, ...]
     each: tuple[LinkChange, ...]
     would_find_m: Array
-    least_false_alarm: float
+    min_false_alarm: float
 
 
 class _Problem(NamedTuple):

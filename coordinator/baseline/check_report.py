@@ -1,4 +1,4 @@
-"""`check.json`: what a check says of every link of a known robot, in figures and in words."""
+"""`check.json`: the change of every link of a robot against its baseline."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from coordinator.baseline.change_detection import Findings, LinkChange
 from module_agent.model.chain import Chain
 from module_agent.model.files import write_json
 
-SCHEMA = 1
+SCHEMA = 2
 BASE_NAME = "base"
 # The accelerometer's bias may drift by 5 mg between two sessions, which is 0.3 deg.
 TILT_ABOVE_DEG = 0.5
@@ -22,12 +22,12 @@ class _Part(BaseModel):
 
 
 class LinkCheck(_Part):
-    """One link: how the child's IMU is displaced and turned against the parent, in the IMU's frame at q = 0.
+    """Displacement and rotation of a child's IMU against its parent, in the IMU's frame at q = 0.
 
-    Of a link that changed it is the change that explains the differences best with all others unchanged, of
-    the others the apparent change with all free. false_alarm_probability: that chance alone makes it look as
-    changed, over all links. unseen: in words, what of the change cannot be seen by any motion.
-    would_find_mm: the smallest displacement that would surely have been found; None if none would.
+    For a changed link it is estimated with all others unchanged, for the others with all free.
+    false_alarm_probability: of as large a change by chance, over all links. unseen: descriptions of
+    the directions that no motion observes. would_find_mm: the smallest displacement that would have been
+    detected for certain; None if there is none.
     """
 
     parent: str
@@ -46,10 +46,10 @@ class LinkCheck(_Part):
 
 
 class CheckReport(_Part):
-    """The whole check. `changed`: a link or the modules themselves are not what they were."""
+    """The whole check. `changed`: a link changed, or modules were exchanged or moved."""
 
     robot: str
-    known: str
+    baseline: str
     changed: bool
     modules_missing: list[str]
     modules_new: list[str]
@@ -58,15 +58,15 @@ class CheckReport(_Part):
     false_alarm_probability: float
     base_tilt_deg: float | None
     robot_time_s: float
-    words: list[str]
+    summary: list[str]
     schema_version: int = Field(default=SCHEMA, alias="schema")
 
 
 class Session(_Part):
-    """What is said of the two sessions beside the figures."""
+    """The two sessions that are compared."""
 
     robot: str
-    known: str
+    baseline: str
     robot_time_s: float
 
 
@@ -81,20 +81,20 @@ def compared(session: Session, before: Chain, after: Chain, found: Findings) -> 
         modules_new=[],
         remounted=[],
         links=links,
-        false_alarm_probability=found.least_false_alarm,
+        false_alarm_probability=found.min_false_alarm,
         base_tilt_deg=tilt,
-        words=[*_words(links), *_tilt_words(tilt)],
+        summary=[*_summary(links), *_tilt_summary(tilt)],
     )
 
 
 def other_robot(
     session: Session, missing: Sequence[str], new: Sequence[str], remounted: Sequence[str]
 ) -> CheckReport:
-    """Report on a robot whose modules are not those that are known, or not mounted as they were."""
-    words = [f"module {s} is gone" for s in missing]
-    words += [f"module {s} is new" for s in new]
-    words += [f"module {s} is mounted elsewhere than it was" for s in remounted]
-    words.append("links are compared only where all modules are as they were: measure the robot again")
+    """Report on a robot with other modules than the baseline, or mounted differently."""
+    summary = [f"module {s} is missing" for s in missing]
+    summary += [f"module {s} is new" for s in new]
+    summary += [f"module {s} is mounted differently" for s in remounted]
+    summary.append("links are compared only if all modules are as in the baseline: identify the robot again")
     return CheckReport(
         **session.model_dump(),
         changed=True,
@@ -104,7 +104,7 @@ def other_robot(
         links=[],
         false_alarm_probability=0.0,
         base_tilt_deg=None,
-        words=words,
+        summary=summary,
     )
 
 
@@ -145,7 +145,7 @@ def _triple(values: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> tupl
 
 
 def _direction(row: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> str:
-    """Name a direction of [rotation, displacement] by whichever it mostly is: 1 rad counts as 1 m."""
+    """Describe a direction of [rotation, displacement] by its larger part; 1 rad counts as 1 m."""
     turn, shift = np.linalg.norm(row[:3]), np.linalg.norm(row[3:])
     kind, part = ("turn about", row[:3]) if turn > shift else ("displacement along", row[3:])
     unit = part / np.linalg.norm(part)
@@ -158,23 +158,23 @@ def _tilt_deg(before: Chain, after: Chain) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(up, then)), up @ then)))
 
 
-def _tilt_words(tilt_deg: float) -> list[str]:
+def _tilt_summary(tilt_deg: float) -> list[str]:
     if tilt_deg < TILT_ABOVE_DEG:
         return []
-    return [f"the base, or the first module on it, leans by {tilt_deg:.1f} deg against how it stood"]
+    return [f"the base, or the first module on it, is tilted by {tilt_deg:.1f} deg against the baseline"]
 
 
-def _words(links: Sequence[LinkCheck]) -> list[str]:
+def _summary(links: Sequence[LinkCheck]) -> list[str]:
     changed = sorted((link for link in links if link.changed), key=lambda link: link.false_alarm_probability)
     lines = [_changed(link) for link in changed]
     if not changed and links:
         lines.append("no link has changed")
         limits = [link.would_find_mm for link in links if link.would_find_mm is not None]
         if limits:
-            lines[-1] += f": of any of them {max(limits):.1f} mm would have been found"
+            lines[-1] += f"; a displacement of {max(limits):.1f} mm of any link would have been detected"
     hidden = [f"{link.parent} - {link.child}: {', '.join(link.unseen)}" for link in links if link.unseen]
     if hidden:
-        lines.append(f"no motion shows, in the IMU's frame, of {'; '.join(hidden)}")
+        lines.append(f"not observable by any motion, in the IMU's frame: {'; '.join(hidden)}")
     return lines
 
 
@@ -185,7 +185,7 @@ def _changed(link: LinkCheck) -> str:
         f"the link {link.parent} - {link.child} has changed: its far end is displaced by "
         f"{link.length_mm:.2f} +- {link.length_sigma_mm:.2f} mm, ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm in the "
         f"frame of {link.child}'s IMU, and turned by {turn:.2f} +- {max(link.rotation_sigma_deg):.2f} deg; "
-        f"chance alone would say so of a sound robot in {_odds(link.false_alarm_probability)} checks "
+        f"probability of a false alarm: {_odds(link.false_alarm_probability)} "
         f"({link.sigmas:.1f} sigma)"
     )
 

@@ -1,7 +1,7 @@
-"""What is other about a robot than it was: modules that came, went or are mounted elsewhere, and what stays.
+"""Differences between two topologies of a robot: modules added, removed or moved, and unchanged parts.
 
-A link is kept if both its modules are there, the one still on the other and mounted the same way. Modules
-that hang together by kept links are a part of the robot that is as it was known.
+A link is unchanged if both its modules are present and mounted on each other as before. Modules connected by
+unchanged links form a part.
 """
 
 from typing import NamedTuple
@@ -11,35 +11,35 @@ from module_agent.model.chain import BASE
 
 
 class Difference(NamedTuple):
-    """A robot found against a known one.
+    """Differences between a later topology and a baseline.
 
-    new, gone, moved: serials that are new, not there any more, or there on another parent or otherwise
-    mounted. parts: serials that hang together by kept links, with the topmost module first; a module none of
-    whose links is kept is a part by itself. same_root: whether the first module is the known one.
+    new, removed: serials that were added or removed. moved: serials on another parent, or mounted the other
+    way round. parts: serials connected by unchanged links, the topmost module first; a module without an
+    unchanged link is a part by itself. same_root: whether the first module is the same.
     """
 
     new: tuple[str, ...]
-    gone: tuple[str, ...]
+    removed: tuple[str, ...]
     moved: tuple[str, ...]
     parts: tuple[tuple[str, ...], ...]
     same_root: bool
 
     @property
     def nothing(self) -> bool:
-        """Whether all is as it was known."""
-        return not (self.new or self.gone or self.moved)
+        """Whether there is no difference."""
+        return not (self.new or self.removed or self.moved)
 
-    def words(self) -> list[str]:
-        """Return what is other, in lines to read."""
+    def summary(self) -> list[str]:
+        """Return the differences as lines of text."""
         lines = [f"module {serial} is new" for serial in self.new]
-        lines += [f"module {serial} is gone" for serial in self.gone]
-        lines += [f"module {serial} is mounted elsewhere than it was" for serial in self.moved]
-        return lines or ["all modules are mounted as they were known"]
+        lines += [f"module {serial} is missing" for serial in self.removed]
+        lines += [f"module {serial} is mounted differently" for serial in self.moved]
+        return lines or ["all modules are mounted as in the baseline"]
 
 
-def difference(known: Topology, found: Topology) -> Difference:
+def difference(baseline: Topology, found: Topology) -> Difference:
     """Compare two topologies."""
-    before, after = _mounted(known), _mounted(found)
+    before, after = _mounted(baseline), _mounted(found)
     part_of: dict[str, list[str]] = {}
     for serial in found.serials:
         parent = after[serial][0]
@@ -49,18 +49,18 @@ def difference(known: Topology, found: Topology) -> Difference:
     parts = tuple(tuple(part_of[s]) for s in found.serials if part_of[s][0] == s)
     return Difference(
         new=tuple(s for s in found.serials if s not in before),
-        gone=tuple(s for s in known.serials if s not in after),
+        removed=tuple(s for s in baseline.serials if s not in after),
         moved=tuple(s for s in found.serials if s in before and before[s] != after[s]),
         parts=parts,
-        same_root=known.serials[0] == found.serials[0],
+        same_root=baseline.serials[0] == found.serials[0],
     )
 
 
 def joints_to_explore(found: Topology, other: Difference) -> tuple[str, ...]:
-    """Return the joints whose motion tells the links that are not known.
+    """Return the joints whose motion determines the changed links.
 
-    The joint below a link tells four of its six parameters; the offset along that joint's axis and the turn
-    about it come from the one further up.
+    The joint below a link determines four of its six parameters; the offset along that joint's axis and the
+    rotation about it are determined by the next joint towards the base.
     """
     index = {serial: k for k, serial in enumerate(found.serials)}
     wanted = set()

@@ -1,4 +1,4 @@
-"""`payload.json`: what a robot carries that it did not carry when it was identified."""
+"""`payload.json`: the payload that a robot carries and did not carry in its baseline."""
 
 from pathlib import Path
 
@@ -11,27 +11,27 @@ from coordinator.parameter_fit.payload import Payload
 from module_agent.model.chain import Chain
 from module_agent.model.files import write_json
 
-SCHEMA = 1
-# The next best carrier must explain that much less, in variances of the torques' noise, to be ruled out.
+SCHEMA = 2
+# The next best carrier must explain that much less, in chi^2 of the torques, to be ruled out.
 SURE_ABOVE = 25.0
 
 Triple = tuple[float, float, float]
 
 
 class PayloadReport(BaseModel):
-    """What was added, and on which body: that of the module whose joint turns it.
+    """A payload and its carrier, the module whose joint turns the body that it is on.
 
-    taken_off: the same was there when the robot was identified, and is not any more. explained: whether a
-    payload on one body is all that has changed; the other figures mean nothing if it is not.
+    taken_off: the payload was there in the baseline, and is not any more. explained: whether a payload on one
+    body explains all that has changed; if not, the other figures are meaningless.
     com_mm and inertia_kg_m2 (ixx, ixy, ixz, iyy, iyz, izz, about the centre) are in that body's link frame of
-    `robot.urdf`. rival: another module that may as well carry it, if one may. gain: by how much the payload
-    makes the misfit of the torques smaller, in variances of their noise.
+    `robot.urdf`. rival: another possible carrier, if there is one. gain: decrease of the torques' chi^2
+    by the payload.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     robot: str
-    known: str
+    baseline: str
     found: bool
     taken_off: bool
     explained: bool
@@ -44,14 +44,14 @@ class PayloadReport(BaseModel):
     inertia_kg_m2: tuple[float, float, float, float, float, float]
     gain: float
     motion_s: float
-    words: list[str]
+    summary: list[str]
     schema_version: int = SCHEMA
 
 
 def payload_report(
-    found: Payload, chain: Chain, robot: str, known: str, motion_s: float, taken_off: bool = False
+    found: Payload, chain: Chain, robot: str, baseline: str, motion_s: float, taken_off: bool = False
 ) -> PayloadReport:
-    """Put a payload into figures and words; `known` names the run that the robot is known from."""
+    """Put a payload into figures and words; `baseline` names the run that the robot is known from."""
     into = np.linalg.inv(link_homes(chain)[found.carrier])
     own = body(into @ found.pseudo @ into.T)
     turn = into[:3, :3]
@@ -61,7 +61,7 @@ def payload_report(
     rival = chain.serials[found.rival_carrier] if unsure and found.rival_carrier is not None else None
     report = PayloadReport(
         robot=robot,
-        known=known,
+        baseline=baseline,
         found=found.found,
         taken_off=taken_off,
         explained=found.explains,
@@ -74,9 +74,9 @@ def payload_report(
         inertia_kg_m2=_upper(own),
         gain=found.gain,
         motion_s=motion_s,
-        words=[],
+        summary=[],
     )
-    return report.model_copy(update={"words": _words(report)})
+    return report.model_copy(update={"summary": _summary(report)})
 
 
 def write_payload(path: Path, report: PayloadReport) -> None:
@@ -84,27 +84,30 @@ def write_payload(path: Path, report: PayloadReport) -> None:
     write_json(path, report)
 
 
-def _words(report: PayloadReport) -> list[str]:
+def _summary(report: PayloadReport) -> list[str]:
     if not report.explained:
         return [
-            "the torques are others than when the robot was identified, in a way that no payload on one body "
-            "explains: several were added, a link has changed, or something holds the robot"
+            "the torques have changed in a way that no payload on one body explains: several payloads, a "
+            "changed link, or contact with the environment"
         ]
     if not report.found:
         return [
-            f"nothing was added that the torques show: the best guess, {1e3 * report.mass_kg:.0f} g on what "
-            f"{report.carrier} turns, explains no more of them than chance does"
+            f"no payload detected: the best estimate, {1e3 * report.mass_kg:.0f} g on the body that "
+            f"{report.carrier} turns, is not significant"
         ]
     x, y, z = report.com_mm
-    done = "taken off" if report.taken_off else "added to"
+    change = "removed from" if report.taken_off else "added to"
     sx, sy, sz = report.com_sigma_mm
-    words = [
-        f"{report.mass_kg:.3f} +- {report.mass_sigma_kg:.3f} kg were {done} what {report.carrier} turns",
+    lines = [
+        f"{report.mass_kg:.3f} +- {report.mass_sigma_kg:.3f} kg were {change} the body that {report.carrier} "
+        "turns",
         f"centre at ({x:.1f}, {y:.1f}, {z:.1f}) +- ({sx:.1f}, {sy:.1f}, {sz:.1f}) mm in its link's frame",
     ]
     if report.rival is not None:
-        words.append(f"it may as well be on what {report.rival} turns: the motion does not tell them apart")
-    return words
+        lines.append(
+            f"the motion does not distinguish it from a payload on the body that {report.rival} turns"
+        )
+    return lines
 
 
 def _triple(values: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> Triple:

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from coordinator.baseline.known_robot import BaselineRobot
+from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.commands.options import ConnectOptions
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result

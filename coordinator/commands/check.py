@@ -7,9 +7,9 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from coordinator.baseline.baseline_robot import load_baseline
 from coordinator.baseline.check import check, check_plan
 from coordinator.baseline.check_report import CheckReport, write_check
-from coordinator.baseline.known_robot import load_baseline
 from coordinator.commands.attended_run import run_short
 from coordinator.commands.options import (
     AsJson,
@@ -66,12 +66,12 @@ def _print(report: CheckReport, as_json: bool) -> None:
         return
     if report.links:
         Terminal().console.print(_table(report))
-    for line in report.words:
+    for line in report.summary:
         typer.echo(line)
 
 
 def _table(report: CheckReport) -> Table:
-    table = Table(title=f"{report.robot} against {report.known}")
+    table = Table(title=f"{report.robot} against {report.baseline}")
     for name in ("parent", "child"):
         table.add_column(name)
     for name in ("displaced [mm]", "+-", "turned [deg]", "+-", "false alarm"):

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.baseline.known_robot import load_baseline
+from coordinator.baseline.baseline_robot import load_baseline
 from coordinator.commands.monitor_view import MonitorScreen
 from coordinator.commands.options import ConnectOptions, DynamicsFolder, Speed
 from coordinator.live_robot.connection import Place, open_connection, sender_name

@@ -78,7 +78,7 @@ class MonitorScreen:
         since = 1e-9 * (finding.since_ns - self.start_ns)
         sure = f"{finding.gain:.0f} against {finding.level:.0f}" if finding.kind != "collision" else ""
         over = "" if finding.until_ns is None or finding.kind == "collision" else ", over now"
-        return f"{since:8.2f} s  {finding.kind}: {finding.words}{f' ({sure})' if sure else ''}{over}"
+        return f"{since:8.2f} s  {finding.kind}: {finding.summary}{f' ({sure})' if sure else ''}{over}"
 
     def _line(self, text: str) -> None:
         if self._live is None:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.baseline.known_robot import load_baseline
+from coordinator.baseline.baseline_robot import load_baseline
 from coordinator.baseline.payload import payload_plan, search_payload
 from coordinator.baseline.payload_report import write_payload
 from coordinator.commands.attended_run import run_short
@@ -50,4 +50,4 @@ def find_payload(
     assert folder is not None
     report = search_payload(before, load_baseline(folder))
     write_payload(folder / PAYLOAD, report)
-    typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.words))
+    typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.summary))

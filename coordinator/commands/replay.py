@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.baseline.known_robot import baseline_within
+from coordinator.baseline.baseline_robot import baseline_within
 from coordinator.baseline.update import updated
 from coordinator.commands.run import print_result
 from coordinator.identification.identified import IdentificationError

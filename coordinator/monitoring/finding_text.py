@@ -33,7 +33,7 @@ def collision_finding(reference: Reference, thresholds: Thresholds, contact: Con
         unit=UNITS["collision"],
         gain=strength,
         level=1.0,
-        words=f"something pushes what {serials[last]} turns, or what is beyond, {lasted}: felt by {felt} "
+        summary=f"something pushes what {serials[last]} turns, or what is beyond, {lasted}: felt by {felt} "
         f"with up to {strongest:.2f} Nm, {strength:.1f} times what goes unnoticed",
     )
 
@@ -62,7 +62,7 @@ def load_finding(
         unit=UNITS["payload"],
         gain=load.gain,
         level=thresholds.payload,
-        words=f"{found.mass_kg:.3f} +- {found.mass_sigma_kg:.3f} kg {done} what {serial} turns",
+        summary=f"{found.mass_kg:.3f} +- {found.mass_sigma_kg:.3f} kg {done} what {serial} turns",
     )
 
 
@@ -84,7 +84,7 @@ def wear_finding(
         unit=UNITS["wear"],
         gain=link.gain,
         level=thresholds.link,
-        words=f"the link from {parent} to {serial} is displaced by {1e3 * link.shift_m:.1f} +- "
+        summary=f"the link from {parent} to {serial} is displaced by {1e3 * link.shift_m:.1f} +- "
         f"{1e3 * link.sigma_m:.1f} mm and turned by {1e3 * link.turn_rad:.1f} mrad; `x5-coordinator check` "
         "measures it",
     )
@@ -108,7 +108,7 @@ def friction_finding(
         unit=UNITS["friction"],
         gain=drive.gain,
         level=thresholds.drive,
-        words=f"the drive of {serial} has {abs(100.0 * drive.change):.0f} +- {100.0 * drive.sigma:.0f} % "
+        summary=f"the drive of {serial} has {abs(100.0 * drive.change):.0f} +- {100.0 * drive.sigma:.0f} % "
         f"{more} friction at half its speed",
     )
 
@@ -130,6 +130,6 @@ def unexplained_finding(
         unit=UNITS["unexplained"],
         gain=load.gain,
         level=thresholds.payload,
-        words="the torques have changed in a way that no payload on one body explains: something holds the "
+        summary="the torques have changed in a way that no payload on one body explains: something holds the "
         "robot, several things were added, or a joint's torque sensor is off",
     )

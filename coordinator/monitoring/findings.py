@@ -45,7 +45,7 @@ class Finding(BaseModel):
     unit: str
     gain: float
     level: float
-    words: str
+    summary: str
 
     @property
     def key(self) -> tuple[str, str | int]:

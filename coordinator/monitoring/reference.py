@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from coordinator.baseline.known_robot import BaselineRobot
+from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.monitoring.contact import ContactModel, contact_model, fast_part
 from coordinator.monitoring.likelihood_ratio import ChangeTest, WhitenedRows, find_change, joined, without_own
 from coordinator.monitoring.momentum_observer import MomentumObserver

@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from coordinator.baseline.baseline_robot import baseline_within, keep_baseline, load_baseline
 from coordinator.baseline.difference import difference, joints_to_explore
-from coordinator.baseline.known_robot import baseline_within, keep_baseline, load_baseline
 from coordinator.baseline.update import updated
 from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
@@ -247,7 +247,7 @@ class Run:
         if self._known is None:
             return ()
         other = difference(self._known.topology, found.topology)
-        for line in other.words():
+        for line in other.summary():
             self._screen.note(line)
         return joints_to_explore(found.topology, other)
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from coordinator.baseline.known_robot import BaselineError
+from coordinator.baseline.baseline_robot import BaselineError
 from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.pseudo_inertia import parameter_transform
 from coordinator.identification.result import BodiesPart, ModuleBodyPart, Result

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.baseline.known_robot import KNOWN, BaselineRobot, load_baseline
+from coordinator.baseline.baseline_robot import BASELINE, BaselineRobot, load_baseline
 from coordinator.excitation.plan import Plan
 from coordinator.main import app
 from coordinator.recording.run_folder import RESULT
@@ -114,7 +114,7 @@ def test_a_module_that_was_taken_off_moves_nothing_but_a_glance(bring: Bring) ->
     robot = load_robot(ARM)
     done = bring(robot, _without_last(robot))
     assert _explored(done.notes) == []
-    assert f"module {robot.serials[-1]} is gone" in done.notes
+    assert f"module {robot.serials[-1]} is missing" in done.notes
     assert done.found.chain.serials == robot.serials[:-1]
     kept = (_seen_from(run.chain, *robot.serials[:2]) for run in (done.known, done.found))
     assert np.allclose(next(kept), next(kept), atol=1e-9)
@@ -125,7 +125,7 @@ def test_of_a_module_that_was_swapped_only_its_own_links_are_measured_again(brin
     robot = load_robot(ARM)
     done = bring(robot, _swapped(robot, 1))
     assert _explored(done.notes) == [robot.serials[0], "spare"]
-    assert {f"module {robot.serials[1]} is gone", "module spare is new"} <= set(done.notes)
+    assert {f"module {robot.serials[1]} is missing", "module spare is new"} <= set(done.notes)
     found = score(done.found.folder)
     assert found.topology_correct
     for link in found.links:
@@ -137,7 +137,7 @@ def test_of_a_module_that_was_swapped_only_its_own_links_are_measured_again(brin
 def test_the_folder_tells_the_robot_by_itself_and_a_replay_the_same(bring: Bring, tmp_path: Path) -> None:
     robot = load_robot(ARM)
     done = bring(robot, _swapped(robot, 1))
-    assert (done.found.folder / KNOWN / "session.mcap").is_file()
+    assert (done.found.folder / BASELINE / "session.mcap").is_file()
     again = CliRunner().invoke(
         app, ["replay", str(done.found.folder / "session.mcap"), "--out", str(tmp_path)]
     )

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from coordinator.baseline.baseline_robot import BaselineError, BaselineRobot, load_baseline
 from coordinator.baseline.check import check, check_plan
-from coordinator.baseline.known_robot import BaselineError, BaselineRobot, load_baseline
 from coordinator.commands.check import CHECK
 from coordinator.excitation.plan import Plan
 from coordinator.main import app
@@ -67,7 +67,7 @@ def days(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_an_unchanged_robot_raises_no_alarm(days: Days) -> None:
     report = check(days.known, days.sound)
     assert not report.changed
-    assert report.words[0].startswith("no link has changed")
+    assert report.summary[0].startswith("no link has changed")
     # What would have been found is about what is: no claim of micrometres.
     assert all(link.would_find_mm is None or link.would_find_mm > 0.5 for link in report.links)
     # Three joints of 8 s, and the session's own 6 s; motions that are designed take 10 s a joint, and more
@@ -97,7 +97,7 @@ def test_a_link_that_slipped_is_found_located_and_sized(days: Days) -> None:
     assert np.linalg.norm(np.array(named[0].displacement_mm) - 1e3 * days.change.displacement_m) < 0.5
     assert abs(named[0].length_mm - 1e3 * SLIPPED_M) < 3.0 * named[0].length_sigma_mm
     assert named[0].sigmas > 4.0
-    assert days.change.child in report.words[0]
+    assert days.change.child in report.summary[0]
 
 
 def test_the_command_says_so_and_exits_with_4(days: Days) -> None:

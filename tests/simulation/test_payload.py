@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from coordinator.baseline.known_robot import BaselineRobot, load_baseline
+from coordinator.baseline.baseline_robot import BaselineRobot, load_baseline
 from coordinator.baseline.payload import PayloadError, payload_plan, search_payload
 from coordinator.commands.payload import PAYLOAD
 from coordinator.description.urdf_writer import link_homes
@@ -75,7 +75,7 @@ def test_an_arm_that_was_handed_nothing_says_so(known: BaselineRobot, tmp_path: 
     report = search_payload(known, same)
     assert not report.found
     assert report.explained
-    assert "nothing was added" in report.words[0]
+    assert "no payload detected" in report.summary[0]
 
 
 def test_what_was_taken_off_is_not_taken_for_something_added(known: BaselineRobot, tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_what_was_taken_off_is_not_taken_for_something_added(known: BaselineRobo
     assert report.taken_off
     assert report.carrier == known.chain.serials[-1]
     assert report.mass_kg == pytest.approx(0.2, abs=0.006)
-    assert "taken off" in report.words[0]
+    assert "removed from" in report.summary[0]
 
 
 def test_the_command_writes_what_it_says(known: BaselineRobot, later: BaselineRobot) -> None:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.baseline.check import check, check_plan
 from coordinator.baseline.check_report import CheckReport, LinkCheck
-from coordinator.baseline.known_robot import BaselineRobot
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify_kinematics
 from module_agent.model.chain import BASE, Array, Chain
@@ -169,7 +169,7 @@ def _trial(report: CheckReport, change: LinkChange | None) -> LinkChangeTrial:
         robot_time_s=report.robot_time_s,
         vector_error_m=errors[1],
         child=child,
-        words=tuple(report.words),
+        words=tuple(report.summary),
     )
 
 

@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.stats import binom, chi2
 
-from coordinator.baseline.known_robot import BaselineRobot
+from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.identify import identify_kinematics
@@ -262,7 +262,7 @@ def _trial(happens: Happens, event: _Event, monitor: Monitor, findings: Sequence
         size_error=own.size - event.size if own is not None and event.size is not None else None,
         false_alarms=len(early) + len(others),
         monitored_s=monitor.monitored_s,
-        words=tuple(f.words for f in retained),
+        words=tuple(f.summary for f in retained),
     )
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.baseline.known_robot import BaselineRobot
+from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.baseline.payload import payload_plan, search_payload
 from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan

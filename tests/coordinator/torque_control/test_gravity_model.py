@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.baseline.known_robot import BaselineError
+from coordinator.baseline.baseline_robot import BaselineError
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Identified
 from coordinator.identification.identify import identify

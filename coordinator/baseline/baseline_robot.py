@@ -1,4 +1,4 @@
-"""A robot that is known from a former run: its recording, and what it says of the robot."""
+"""A robot as identified by an earlier run, its baseline: the recording and the kinematics."""
 
 import shutil
 from pathlib import Path
@@ -15,13 +15,12 @@ from module_agent.model.catalogue import ImuKind, UnknownModuleType
 from module_agent.model.chain import Chain
 from module_agent.model.errors import UsageError
 
-# In the folder of a run that brought a known robot up to date: the recording of the run that the robot was
-# known from, so that the folder tells the robot by itself.
-KNOWN = "known"
+# Subfolder of a run with a baseline, with the baseline's recording, so that the folder is complete.
+BASELINE = "known"
 
 
 class BaselineError(UsageError):
-    """The folder holds no run that a robot is known from; the message says what is missing, and where."""
+    """The folder holds no run that can be a baseline; the message says what is missing, and where."""
 
 
 class BaselineRobot(NamedTuple):
@@ -38,23 +37,23 @@ class BaselineRobot(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The robot's name, as the run was told."""
+        """The robot's name in the run."""
         return next((e.robot for e in reversed(self.recording.journal) if e.what == "session"), "")
 
     @property
     def imu(self) -> ImuKind:
-        """How well its IMUs were known, as the run was told."""
+        """The prior of its IMUs in the run."""
         return self.recording.imu
 
 
 def load_baseline(folder: Path) -> BaselineRobot:
     """Read a run's folder, and identify its robot again from the recording.
 
-    A run that brought a known robot up to date holds that one's recording too, and both together tell it.
-    The recording, not `result.json`, since two sessions are compared by what the sensors read.
+    A run with a baseline of its own holds that recording too, and both are combined. The recording is read,
+    not `result.json`, since two sessions are compared by their sensor readings.
 
     Raises:
-        KnownRobotError: there is no recording, or it is not one of a whole exploration.
+        BaselineError: there is no recording, or not of a complete exploration.
     """
     path = folder / SESSION
     if not path.is_file():
@@ -66,33 +65,33 @@ def load_baseline(folder: Path) -> BaselineRobot:
             kinematics = updated(before, kinematics)
         return BaselineRobot(folder, recording, kinematics)
     except (SessionFileError, IdentificationError, UnknownModuleType) as error:
-        raise BaselineError(f"{path} does not tell the robot: {error}") from error
+        raise BaselineError(f"{path} does not identify the robot: {error}") from error
 
 
 def baseline_within(folder: Path) -> Kinematics | None:
-    """Return the kinematics of the robot as it was known to the run in a folder; None if it was not.
+    """Return the kinematics of the baseline that the run in a folder had; None if it had none.
 
     Raises:
-        KnownRobotError: as `load_baseline`.
+        BaselineError: as `load_baseline`.
     """
-    return load_baseline(folder / KNOWN).kinematics if (folder / KNOWN).is_dir() else None
+    return load_baseline(folder / BASELINE).kinematics if (folder / BASELINE).is_dir() else None
 
 
-def keep_baseline(known: BaselineRobot, folder: Path) -> None:
-    """Copy the recordings that a robot is known from into the folder of a run."""
-    there, here = known.folder, folder / KNOWN
+def keep_baseline(baseline: BaselineRobot, folder: Path) -> None:
+    """Copy the recordings of a baseline into the folder of a run."""
+    there, here = baseline.folder, folder / BASELINE
     while (there / SESSION).is_file():
         here.mkdir()
         shutil.copyfile(there / SESSION, here / SESSION)
-        there, here = there / KNOWN, here / KNOWN
+        there, here = there / BASELINE, here / BASELINE
 
 
-def hurried(plan: Plan, known: BaselineRobot) -> dict[str, object]:
-    """Return settings with which a robot that is known is moved again: only what for, and fast about it."""
+def shortened_settings(plan: Plan, baseline: BaselineRobot) -> dict[str, object]:
+    """Return the settings of a short run of a robot with a baseline."""
     return {
         "dynamics": False,
-        "imu": known.imu,
-        "torque": known.recording.torque,
+        "imu": baseline.imu,
+        "torque": baseline.recording.torque,
         "discover_s": min(plan.discover_s, 0.5),
         "link_s": min(plan.link_s, 0.5),
         "settle_s": min(plan.settle_s, 0.3),

@@ -213,5 +213,5 @@ def test_what_the_known_robot_did_not_tell_stays_untold() -> None:
 def test_a_part_of_modules_that_are_not_known_is_refused() -> None:
     full = true_chain(_robot(ARM))
     short = true_chain(_without(_robot(ARM), "A-6"))
-    with pytest.raises(ValueError, match="the known robot has no module A-6"):
+    with pytest.raises(ValueError, match="the baseline has no module A-6"):
         placed(_fit(short, _spread(short, {})), _fit(full, _spread(full, {})), [full.serials])
