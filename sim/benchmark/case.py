@@ -1,4 +1,4 @@
-"""What a benchmark consists of: cases, their trials, and the rows that follow from what the trials found."""
+"""The parts of a benchmark: cases, their trials, and the rows computed from the trials' results."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from sim.benchmark.row import Row
 class Trial(NamedTuple):
     """One piece of work for a worker process: a function of a module and its arguments, both picklable.
 
-    cost_s: about how long it takes; long ones are begun first, so that all processes end together.
+    cost_s: approximate duration; long trials start first, so that all processes end together.
     """
 
     work: Callable[..., Any]
@@ -21,7 +21,7 @@ class Trial(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """What stands in place of a trial's result when it raised; `text` says what."""
+    """The result of a trial that raised; `text` describes the exception."""
 
     text: str
 
@@ -45,7 +45,7 @@ class Case(NamedTuple):
 
 
 class CaseResult(NamedTuple):
-    """What came of a case; failures in words. cpu_s: processor time of all its trials."""
+    """The result of a case; failures described. cpu_s: processor time of all its trials."""
 
     case: str
     trials: int

@@ -32,7 +32,7 @@ class Cost(NamedTuple):
 
 
 class Results(NamedTuple):
-    """The rows of a benchmark, what failed in words, what was asked for, and what it cost."""
+    """The rows of a benchmark, its failures, settings, processor and wall time."""
 
     benchmark: str
     settings: dict[str, object]
@@ -133,7 +133,7 @@ def plot(rows: Sequence[Row], path: Path) -> None:
 
 
 def _panels(rows: Sequence[Row]) -> list[_Panel]:
-    """Group the rows with a bar by their figure; of how many a count is does not tell figures apart."""
+    """Group the rows with a bar by their figure, without the number that a count is out of."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if row.limit is not None:

@@ -65,7 +65,7 @@ def rms(values: Sequence[float | None]) -> float | None:
 
 
 def largest(values: Sequence[float | None]) -> float | None:
-    """Return the largest size of the values that are there, None if none is; no number if one is none."""
+    """Return the largest size of the values that are there, None if none is; NaN if one is NaN."""
     known = [abs(value) for value in values if value is not None]
     # Python's max passes over a NaN, or not, by its place.
     return float(np.max(known)) if known else None
@@ -87,7 +87,7 @@ def scaled(value: float | None, factor: float) -> float | None:
 
 
 def count(case: str, figure: str, hits: Sequence[bool]) -> Row:
-    """Return how often something was so that must never be; of no cases there is nothing to tell."""
+    """Return a row that counts what must never happen, with a bar of 0; None without any trial."""
     return Row(case, f"{figure}, of {len(hits)}", None, float(sum(hits)) if hits else None, None, 0.0)
 
 

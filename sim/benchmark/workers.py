@@ -1,9 +1,7 @@
-"""Worker processes for trials: as many as cores, renewed after some trials, and gone when they must be.
+"""The runner of all experiments: trials in worker processes, and the cases of a benchmark on top of it.
 
-A process grows by tens of megabytes with every virtual run, so that each works for some minutes only. One
-that dies takes its trial with it, which counts as failed, and is replaced.
-
-Runs the cases of a benchmark in worker processes, all their trials mixed, and hears how it goes.
+A process grows by tens of megabytes with every virtual run, so each is replaced after some minutes. A process
+that dies is replaced too, and its trial counts as failed. The trials of all cases are mixed.
 """
 
 import multiprocessing
@@ -19,9 +17,9 @@ from typing import Any, NamedTuple
 
 from sim.benchmark.case import Case, CaseResult, Failed, Trial, concluded
 
-# To start a process costs about three seconds of imports.
+# Starting a process costs about three seconds of imports.
 SECONDS_PER_PROCESS = 150.0
-LONGEST_WORDS = 40
+MAX_TEXT_LENGTH = 40
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
@@ -35,9 +33,10 @@ class Done(NamedTuple):
 def run_trials(
     trials: Sequence[Trial], processes: int, on_done: Callable[[int, Any], None] = lambda index, result: None
 ) -> list[Done]:
-    """Run trials in several processes and return what came of them, in order.
+    """Run trials in several processes and return their results in order.
 
-    Whatever ends this early ends the processes at once and removes their temporary folders.
+    Any exception ends the processes at once and removes their temporary folders. `on_done` receives index and
+    result of each trial as it ends.
     """
     done: dict[int, Done] = {}
     waiting = sorted(range(len(trials)), key=lambda index: -trials[index].cost_s)
@@ -47,15 +46,15 @@ def run_trials(
                 if waiting and not worker.busy:
                     index = waiting.pop(0)
                     worker.begin(index, trials[index])
-            for index, found in _finished(team):
-                done[index] = found
-                on_done(index, found.result)
+            for index, ended in _finished(team):
+                done[index] = ended
+                on_done(index, ended.result)
     return [done[index] for index in range(len(trials))]
 
 
 @contextmanager
 def _team(size: int) -> Iterator[list["_Worker"]]:
-    # Trials that are ended in their middle leave temporary folders behind: all of them are in this one.
+    # Trials that are terminated leave temporary folders behind: all of them are in this one.
     with tempfile.TemporaryDirectory(prefix="x5-benchmark-") as folder:
         team = [_Worker(folder) for _ in range(size)]
         try:
@@ -96,7 +95,7 @@ class _Worker:
         self.pipe.send(trial)
 
     def finish(self) -> tuple[int, Done]:
-        """Return the trial's index and what came of it; to be called when the pipe has something to say."""
+        """Return the trial's index and result; call it when the pipe is readable."""
         index, self._index = self._index, None
         assert index is not None
         try:
@@ -123,7 +122,7 @@ class _Worker:
         self.pipe, far = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(target=_work, args=(far, self._folder), daemon=True)
         self._process.start()
-        # Only the worker holds the far end from here on, so that its death is heard.
+        # Only the worker holds the far end from here on, so that its death closes the pipe.
         far.close()
         self._left_s = SECONDS_PER_PROCESS
 
@@ -135,7 +134,7 @@ class _Worker:
 
 def _work(pipe: Connection, folder: str) -> None:
     """Run trials until the pipe is closed."""
-    # Ctrl-C, which a terminal sends to all processes, is for the one that started them to hear.
+    # Ctrl-C goes to all processes of a terminal; the one that started them handles it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tempfile.tempdir = folder
     while True:
@@ -154,20 +153,20 @@ def _result(trial: Trial) -> Any:
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{last.filename.rpartition('/')[2]}, line {last.lineno}"
-        words = ", ".join(_short(argument) for argument in trial.arguments)
-        return Failed(f"{trial.work.__name__}({words}): {type(error).__name__} in {place}: {error}")
+        text = ", ".join(_short(argument) for argument in trial.arguments)
+        return Failed(f"{trial.work.__name__}({text}): {type(error).__name__} in {place}: {error}")
 
 
 def _short(argument: object) -> str:
-    """Return an argument in a few words: a profile or a robot by its name."""
-    words = str(getattr(argument, "name", argument))
-    return words if len(words) <= LONGEST_WORDS else words[:LONGEST_WORDS] + "..."
+    """Return a short text of an argument: a profile or a robot by its name."""
+    text = str(getattr(argument, "name", argument))
+    return text if len(text) <= MAX_TEXT_LENGTH else text[:MAX_TEXT_LENGTH] + "..."
 
 
 def run_cases(
     cases: Sequence[Case], processes: int, on_trial: Callable[[Case, int], None] = lambda case, left: None
 ) -> list[CaseResult]:
-    """Run all trials of all cases; `on_trial` is told of the case of each, and how many it has left.
+    """Run all trials of all cases; `on_trial` receives the case of each, and the number of trials left.
 
     The results do not depend on the number of processes.
     """

@@ -119,7 +119,7 @@ def _numbers(
 
 
 def table(found: Sequence[Repeats], filtered: bool = True) -> Table:
-    """Return tables 4 and 5 of the thesis with the simulated figures beside, to print."""
+    """Return tables 4 and 5 of the thesis with the simulated figures."""
     how = "" if filtered else ", without the filter"
     shown = Table(title=f"Repeated trials at the thesis' amplitudes{how}")
     columns = ("arm", "A [rad]", "trials", "mean [mm]", "error [mm]", "error [%]", "scatter [mm]")

@@ -115,12 +115,12 @@ def assistance_table(found: Sequence[Combination]) -> Table:
 
 
 def bar_lines(judged: Sequence[Bar]) -> list[str]:
-    """Return the bars in words, and what is unstable below them."""
+    """Return a line for each bar, and below it the combinations that miss it or are unstable."""
     lines = []
     for bar in judged:
         verdict = "holds" if bar.holds else "does not hold"
         lines.append(f"{bar.asked}: {verdict}, in {bar.kept} of {bar.stable} stable combinations")
-        lines += [f"  not so: {words}" for words in bar.missed]
+        lines += [f"  missed: {words}" for words in bar.missed]
         lines += [f"  unstable: {words}" for words in bar.unstable]
     return lines
 

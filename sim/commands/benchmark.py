@@ -40,7 +40,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
-    help="Measure the whole system on simulated robots, against the bars that are set for it.",
+    help="Measure the whole system on simulated robots against its bars.",
 )
 
 
@@ -65,7 +65,7 @@ def dynamics(
     only: Only = "",
     processes: WorkerCount = None,
 ) -> None:
-    """Measure regressor, inertia, payloads, shared work, assistance and watching, against the truth.
+    """Measure regressor, inertia, payloads, merging, assistance and monitoring against the truth.
 
     Exit codes as of `kinematics`.
     """
@@ -89,7 +89,7 @@ def kinematics(
         typer.Option(
             "--quick",
             help="Every row in a minute on two cores: one trial each, the thesis' motions cut short for "
-            "arms, the smallest of ten random robots, wear by all joints at once.",
+            "arms, the smallest of ten random robots, link changes by all joints at once.",
         ),
     ] = False,
     trials: Annotated[
@@ -146,7 +146,7 @@ def _run(cases: list[Case], processes: int) -> list[CaseResult]:
     def show(case: Case, left: int) -> None:
         nonlocal done
         done += 1
-        # A pipe is told of whole cases only.
+        # A pipe gets one line per case.
         if terminal.console.is_terminal or not left:
             terminal.step(done, total, case.name)
 

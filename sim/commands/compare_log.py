@@ -22,7 +22,7 @@ def compare_log(
     log: Annotated[Path, typer.Argument(help="CSV log of one module alone, strategy 3, factory gains.")],
     kind: Annotated[str, typer.Option("--type", help=f"Module type: {', '.join(CATALOGUE)}.")] = "X5-1",
     out: Annotated[
-        Path | None, typer.Option(help="Plot to write; its figures go beside it [LOG.png].")
+        Path | None, typer.Option(help="Plot to write; its figures go next to it as JSON [LOG.png].")
     ] = None,
     noise: Annotated[str, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")] = "ideal",
     with_effects: With = None,

@@ -43,7 +43,7 @@ class Hinge(NamedTuple):
 
 
 class PlacedPart(NamedTuple):
-    """A part seen from its input frame: the pose of its output frame (4, 4), its body, and where it gives."""
+    """A part in its input frame: pose of its output frame (4, 4), its body, and its hinge if compliant."""
 
     output: Array
     body: RigidBody

@@ -175,7 +175,7 @@ def _effect(name: str) -> Effect:
 
 
 def imu_kind(noise: NoiseProfile) -> ImuKind:
-    """Return what is to be told of the IMUs of a profile."""
+    """Return which IMU prior fits a profile."""
     return (
         "uncalibrated"
         if noise.accel_scale or noise.gyro_scale or noise.imu_misalignment_rad

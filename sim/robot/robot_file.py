@@ -85,7 +85,7 @@ class BaseCompliance(_Strict):
 
     A stiffness of 0, or none, stands for a rigid direction. The rotations are about `pivot_m`, a point of the
     base frame. `mass_kg`, `com_xyz_m` (base frame) and `inertia` (ixx, iyy, izz, ixy, ixz, iyz about that
-    centre, base axes) describe what shakes with the base beside the modules' own parts.
+    centre, base axes) describe the mass that moves with the base in addition to the modules' own parts.
     """
 
     mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0

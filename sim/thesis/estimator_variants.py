@@ -1,18 +1,16 @@
-"""Where the joint regression may take the joint's motion from, and what each source makes of one trial.
+"""Variants of the joint regression by the source of the joint's motion, compared on the same trials.
 
-The encoder counts in steps, the gyro drifts and sees the link's bending too, the command is what the joint
-was told and not what it did. All variants solve the same equations (`joint_regression`); they differ in the
-angle that these are written in, and in what weighs them:
+The encoder is quantised, the gyro drifts and also measures the bending of the link, the command differs from
+the motion. All variants solve the same equations (`joint_regression`); they differ in the joint angle and in
+the instruments of the equations:
 
-    encoder   the encoder's angle; the gyro is a reading, which tells the axis and how the link bends
-    gyro      the gyro's integral, of which the encoder tells offset and slope only
-    fused     the gyro's integral where it is fast, the encoder's angle where it is slow
-    command   the encoder's angle, the equations weighed with the command behind the filter that fits it
+    encoder   the encoder's angle; the gyro is a measurement that determines the axis and the bending
+    gyro      the gyro's integral; the encoder determines its offset and slope only
+    fused     the gyro's integral at high, the encoder's angle at low frequencies
+    command   the encoder's angle, with the filtered command as instrument
 
-Gyro and fused see the bending and a base's swing as they are, but not how a swinging base pushes; of a gyro
-whose scale is wrong they take the error. The agents use `encoder`.
-
-What came of comparing estimators: one row for each arm and estimator, to print and as JSON.
+Gyro and fused include the bending and the swing of a base, but not the acceleration of a swinging base; they
+inherit the gyro's scale error. The agents use `encoder`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,24 +35,24 @@ from sim.test_bench.one_joint_rig import IMU, OneJointRig, TrialRows, analyse, r
 from sim.thesis.joint_trial import bound_m, imu_knowledge, trial_plan
 from sim.thesis.published import Alignment, thesis_length
 
-# The encoder tells what is slower than this Gaussian low-pass, the gyro the rest: 96 % of 2 Hz, so that a
-# link's bending is all in the angle.
+# Below this Gaussian low-pass the encoder is used, above it the gyro: it has 96 % of 2 Hz, so that the angle
+# includes the link's bending.
 CROSSOVER_S = 0.2
 # The joint follows its command within this many rows of 4 ms either way.
 FOLLOWS_ROWS = 24
 
 
-class Found(NamedTuple):
-    """An estimator's error of the distance, and one sigma as it states it, both in metres."""
+class Estimate(NamedTuple):
+    """An estimator's error of the distance, and its claimed sigma, both in metres."""
 
     error_m: float
     sigma_m: float
 
 
 class Comparison(NamedTuple):
-    """What every estimator made of one trial, by name, and the bound of that recording [m]."""
+    """The estimates of one trial by estimator, and the bound of that recording [m]."""
 
-    found: dict[str, Found]
+    estimates: dict[str, Estimate]
     bound_m: float
 
 
@@ -62,7 +60,7 @@ Variant = Callable[[TrialRows, NoiseProfile], tuple[float, float]]
 
 
 def compare(length_mm: int, alignment: Alignment, profile: NoiseProfile, seed: int) -> Comparison:
-    """Run one trial of the thesis' arm and all estimators on it, without those that find too little motion.
+    """Run one trial of the thesis' arm and all estimators on it, except those for which it moves too little.
 
     Raises:
         KeyError: the thesis had no such arm.
@@ -71,19 +69,19 @@ def compare(length_mm: int, alignment: Alignment, profile: NoiseProfile, seed: i
     robot = load_robot(f"thesis_{length_mm}_{alignment}")
     with OneJointRig(robot, seed, profile) as rig:
         trial = rig.trial(trial_plan(thesis_length(alignment, length_mm), profile))
-    return judge_all(trial, profile, link_length_m(true_chain(robot), child=IMU))
+    return compare_estimators(trial, profile, link_length_m(true_chain(robot), child=IMU))
 
 
-def judge_all(trial: TrialRows, profile: NoiseProfile, true_m: float) -> Comparison:
+def compare_estimators(trial: TrialRows, profile: NoiseProfile, true_m: float) -> Comparison:
     """Run all estimators on one recording whose true distance is known."""
-    found: dict[str, Found] = {}
+    estimates: dict[str, Estimate] = {}
     for name, variant in VARIANTS.items():
         try:
             distance_m, sigma_m = variant(trial, profile)
         except DataError:
             continue
-        found[name] = Found(distance_m - true_m, sigma_m)
-    return Comparison(found, bound_m(trial, profile))
+        estimates[name] = Estimate(distance_m - true_m, sigma_m)
+    return Comparison(estimates, bound_m(trial, profile))
 
 
 # ---------------------------------------------------------------------- the variants
@@ -95,7 +93,7 @@ def _thesis(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
 
 
 def _encoder(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
-    return _told(regress(trial, imu_knowledge(profile)))
+    return _distance(regress(trial, imu_knowledge(profile)))
 
 
 def _gyro(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
@@ -127,11 +125,11 @@ VARIANTS: Mapping[str, Variant] = {
 
 def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[ObservedMotion]) -> tuple[float, float]:
     rest = rest_reading(imu_window(trial.rest))
-    return _told(regress_joint(motions, rest, imu_knowledge(profile)))
+    return _distance(regress_joint(motions, rest, imu_knowledge(profile)))
 
 
-def _told(found: JointRegression) -> tuple[float, float]:
-    return found.distance_m, found.sigma_distance_m
+def _distance(fit: JointRegression) -> tuple[float, float]:
+    return fit.distance_m, fit.sigma_distance_m
 
 
 def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None) -> ObservedMotion:
@@ -158,7 +156,7 @@ def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None)
 
 
 def _commanded(joint: JointWindow, command_rad: Array) -> JointWindow:
-    """Return the joint's motion as its command tells it: the command behind the filter that fits it best."""
+    """Return the joint's motion predicted from its command by the best FIR filter."""
     command = np.where(np.isfinite(command_rad), command_rad, joint.position_rad)
     padded = np.pad(command, (FOLLOWS_ROWS, 0), mode="edge")
     lags = np.lib.stride_tricks.sliding_window_view(padded, FOLLOWS_ROWS + 1)[:, ::4]
@@ -181,7 +179,7 @@ class Arm(NamedTuple):
 class EstimatorRow(NamedTuple):
     """An estimator on an arm: figures over all trials, lengths in millimetres.
 
-    ratio: rms error over the bound, both over all trials. covered: the share of 95 % intervals that hold the
+    ratio: rms error over the bound, both over all trials. covered: share of 95 % intervals that contain the
     truth.
     """
 
@@ -199,11 +197,11 @@ class EstimatorRow(NamedTuple):
 
 
 def estimator_rows(arm: Arm, comparisons: Sequence[Comparison]) -> list[EstimatorRow]:
-    """Return a row for every estimator that found something in any trial of an arm."""
+    """Return a row for every estimator with an estimate in any trial of an arm."""
     bound = _rms(np.array([each.bound_m for each in comparisons]))
     rows = []
     for name in VARIANTS:
-        found = [each.found[name] for each in comparisons if name in each.found]
+        found = [each.estimates[name] for each in comparisons if name in each.estimates]
         if not found:
             continue
         error, sigma = np.array(found).T

@@ -4,10 +4,8 @@ The bound is that of an estimator that knows the noise of the IMU and the joint'
 else that `joint_regression` does not know either: axis, radial vector, gravity, biases, delays, the link's
 compliance, and the sensors' scales and axes within what is believed of them beforehand (then it is the
 Bayesian bound of van Trees). A calibrated IMU is believed to 1e-4, while the simulated one has no error of
-scale and axes at all: whoever knew that had a bound that is lower by a third at 484 mm and by a hundredth to
-a tenth at 171 mm. The hinge of a bent link it knows to be where it is.
-
-One trial on the thesis' one-joint arm, and what the thesis' estimator, ours and the bound say of it.
+scale and axes at all; with that knowledge the bound is lower by a third at 484 mm, and by a hundredth to a
+tenth at 171 mm. The hinge of a bent link is known.
 """
 
 from math import acos, degrees, pi
@@ -104,7 +102,7 @@ def joint_trial(
     Args:
         length_mm, alignment: one of the thesis' eight arms (`thesis_lengths`).
         noise: profile, by name or as `switched` makes it.
-        seed: of the rig's modules, their noise, and the place where it stands.
+        seed: of the rig's modules, their noise, and the site.
         plan: the motions; those of `trial_plan` when None.
 
     Raises:

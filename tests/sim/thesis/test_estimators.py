@@ -18,11 +18,11 @@ from sim.thesis.estimator_variants import (
     VARIANTS,
     Arm,
     Comparison,
+    Estimate,
     EstimatorRow,
-    Found,
     _commanded,
+    compare_estimators,
     estimator_rows,
-    judge_all,
 )
 
 SOLID = switched(NOISE_PROFILES["x5"], off=("base-shake",))
@@ -31,11 +31,11 @@ SOLID = switched(NOISE_PROFILES["x5"], off=("base-shake",))
 def test_every_source_of_the_motion_gives_the_same_length_within_its_interval() -> None:
     with OneJointRig(load_robot("thesis_171_horizontal"), 2, SOLID) as rig:
         trial = rig.trial(Plan(sine_amplitude_rad=0.2))
-    compared = judge_all(trial, SOLID, 0.171)
-    assert set(compared.found) == set(VARIANTS)
-    assert compared.found["thesis"].error_m > 2e-3  # its filter alone makes 171 mm 1.3 mm too long
+    compared = compare_estimators(trial, SOLID, 0.171)
+    assert set(compared.estimates) == set(VARIANTS)
+    assert compared.estimates["thesis"].error_m > 2e-3  # its filter alone makes 171 mm 1.3 mm too long
     for name in set(VARIANTS) - {"thesis"}:
-        found = compared.found[name]
+        found = compared.estimates[name]
         assert abs(found.error_m) < 4.0 * found.sigma_m, name
         assert found.sigma_m < 4.0 * compared.bound_m, name
 
@@ -52,7 +52,7 @@ def test_a_command_that_the_joint_follows_late_explains_it_without_the_counts() 
 
 def test_rows_are_means_and_roots_of_what_was_found() -> None:
     found = [
-        Comparison({"thesis": Found(2e-3, 1e-3), "encoder": Found(error, 1e-4)}, 1e-4)
+        Comparison({"thesis": Estimate(2e-3, 1e-3), "encoder": Estimate(error, 1e-4)}, 1e-4)
         for error in (3e-4, -1e-4)
     ]
     thesis, ours = estimator_rows(Arm("vertical", 245), found)
