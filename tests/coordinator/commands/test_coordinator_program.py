@@ -174,7 +174,7 @@ def test_a_viewer_is_a_word_or_an_address() -> None:
     assert viewer_choice("serve").serve
     assert viewer_choice("rerun+http://host:9876/proxy").connect == "rerun+http://host:9876/proxy"
     for nonsense in ("", "rerun+http://", "ftp://host", "spawned"):
-        with pytest.raises(ValueError, match="it must be none, spawn, serve"):
+        with pytest.raises(UsageError, match="it must be none, spawn, serve"):
             viewer_choice(nonsense)
 
 
