@@ -25,6 +25,7 @@ from coordinator.runtime.event_loop import Interruption, run_to_end
 from coordinator.runtime.exit_codes import explain
 from coordinator.viewer.targets import ViewerChoice, viewer_choice
 from module_agent.model.catalogue import CATALOGUE, module_type
+from module_agent.model.errors import UsageError
 from module_agent.transport.transport import Event, Liveness, Reply, Sink
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, key
