@@ -23,8 +23,10 @@ from coordinator.session.run import Run, RunConfig
 from module_agent.model.errors import UsageError
 
 
-def run_attended(config: RunConfig, place: Place, speed: float, terminal: Terminal, advice: str) -> Result:
-    """Run to the end; a first signal stops the robot in order.
+def run_attended(
+    config: RunConfig, place: Place, speed: float, terminal: Terminal, advice: str
+) -> tuple[Result, BaselineRobot]:
+    """Run to the end, and return the result and the robot; a first signal stops the robot in order.
 
     Raises:
         CommandFailed: the run ended early; the text says why, what is recorded, and the advice.
@@ -39,7 +41,7 @@ def run_attended(config: RunConfig, place: Place, speed: float, terminal: Termin
         for number in SIGNALS:
             loop.add_signal_handler(number, interruption)
         try:
-            return run_to_end(loop, task)
+            return run_to_end(loop, task), work.robot
         except BaseException as error:
             failure = explain(error)
             if failure is None:
@@ -68,9 +70,9 @@ def _prepared(config: RunConfig, place: Place, loop: ScaledLoop, terminal: Termi
 
 def run_short(
     baseline: BaselineRobot, at: ConnectOptions, out: Path, plan: Plan, expect: int | None, speed: float
-) -> None:
+) -> BaselineRobot:
     """Run the robot of a baseline once more, into a new folder; raises as `run_attended`."""
     place = at.place(baseline.name)
     config = RunConfig(robot=place.robot, out=out, sender=sender_name(), plan=plan, expect=expect)
     with Terminal(at.quiet) as terminal:
-        run_attended(config, place, check_speed(speed), terminal, advice="")
+        return run_attended(config, place, check_speed(speed), terminal, advice="")[1]

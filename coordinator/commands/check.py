@@ -48,13 +48,13 @@ def check_robot(
     if (out is None) == (measured is None):
         raise UsageError("give either --out, to measure the robot, or --measured, a run to compare with")
     before = load_baseline(baseline)
-    folder = measured
     if out is not None:
-        folder = out
-        run_short(before, at, out, check_plan(before, planned(plan)), expect, speed)
-    assert folder is not None
-    report = check(before, load_baseline(folder))
-    write_check(folder / CHECK, report)
+        after = run_short(before, at, out, check_plan(before, planned(plan)), expect, speed)
+    else:
+        assert measured is not None
+        after = load_baseline(measured)
+    report = check(before, after)
+    write_check(after.folder / CHECK, report)
     _print(report, as_json)
     if report.changed:
         raise typer.Exit(EXIT_FINDING)

@@ -43,11 +43,11 @@ def find_payload(
     if (out is None) == (measured is None):
         raise UsageError("give either --out, to move the robot, or --measured, a run to compare with")
     before = load_baseline(baseline)
-    folder = measured
     if out is not None:
-        folder = out
-        run_short(before, at, out, payload_plan(before, planned(plan)), expect, speed)
-    assert folder is not None
-    report = search_payload(before, load_baseline(folder))
-    write_payload(folder / PAYLOAD, report)
+        after = run_short(before, at, out, payload_plan(before, planned(plan)), expect, speed)
+    else:
+        assert measured is not None
+        after = load_baseline(measured)
+    report = search_payload(before, after)
+    write_payload(after.folder / PAYLOAD, report)
     typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.summary))

@@ -63,7 +63,7 @@ def run(
     )
     advice = f"to resume: {resuming(context)}" if advise else ""
     with Terminal(at.quiet) as terminal:
-        result = run_attended(config, place, speed, terminal, advice)
+        result, _ = run_attended(config, place, speed, terminal, advice)
     print_result(result, terminal)
     terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from coordinator.baseline.baseline_robot import baseline_within, keep_baseline, load_baseline
+from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within, keep_baseline, load_baseline
 from coordinator.baseline.difference import difference, joints_to_explore
 from coordinator.baseline.update import updated
 from coordinator.description.hrdf_writer import write_hrdf
@@ -131,6 +131,7 @@ class Run:
         self._looks = Previewer(self.recording, config.refined_previews)
         self._looking: asyncio.Task[None] | None = None
         self._chain: Chain | None = None
+        self._identified: Identified | None = None
         if crashed is not None:
             self._take_over(crashed)
         self._radio = Messenger(transport, config.robot, clock, post, self._record)
@@ -295,6 +296,7 @@ class Run:
             self._screen.note("estimating")
             found = await self._compute(lambda: identify(self.recording, self._revised, kinematics))
             self._write(found)
+            self._identified = found
             for line in found.inertia.summary() if found.inertia is not None else ():
                 self._screen.note(line)
             if self._crashed is not None:
@@ -326,6 +328,12 @@ class Run:
         with contextlib.suppress(NoAnswer, Refused, ModuleLost):
             await self._link.close_gaps()
         return found
+
+    @property
+    def robot(self) -> BaselineRobot:
+        """The robot as this run identified it, once it has ended."""
+        assert self._identified is not None, "the run has not ended"
+        return BaselineRobot(self._config.out, self.recording, self._identified.kinematics)
 
     @property
     def standstill(self) -> str:
