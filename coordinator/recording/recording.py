@@ -24,6 +24,8 @@ from module_agent.wire.topics import TOPICS, Exchange
 
 Kind = Exchange | Literal["journal"]
 JOURNAL_TOPIC = "journal"
+# Requests that wait for an answer; an answer comes within seconds, if it comes.
+MAX_OPEN_REQUESTS = 4096
 
 
 class Entry(NamedTuple):
@@ -122,6 +124,8 @@ class Recording:
             raise WireError(Refusal.WRONG_SERIAL, f"{message.serial} speaks on the key of {parts.serial}")
         if exchange == "request":
             self._sent[entry.topic, message.seq] = entry.t_ns
+            if len(self._sent) > MAX_OPEN_REQUESTS:
+                del self._sent[next(iter(self._sent))]
             if isinstance(message, InformationRequest):
                 self.questions.setdefault(message.digest(), message)
             return message
