@@ -1,4 +1,4 @@
-"""What a person sees of a watch: a table that changes on a terminal, lines in a pipe; and a JSON file."""
+"""Findings of the monitor: a live table on a terminal, lines in a pipe; and a JSON file."""
 
 import json
 from collections.abc import Iterable
@@ -52,7 +52,7 @@ class MonitorScreen:
             self._line(self.sentence(finding))
             self._write({"finding": finding.model_dump()})
         for key in update.withdrawn:
-            self._line(f"taken back: {_named(key, self.start_ns)}; what is said above explains it")
+            self._line(f"withdrawn: {_named(key, self.start_ns)}; explained by the finding above")
             self._write({"withdrawn": list(key)})
 
     def show_summary(self) -> None:
@@ -60,18 +60,18 @@ class MonitorScreen:
         found, monitor = self._watcher.finding_log.all, self._watcher
         self._write(
             {
-                "watched_s": round(monitor.monitored_s, 3),
+                "monitored_s": round(monitor.monitored_s, 3),
                 "findings": [finding.model_dump() for finding in found],
             }
         )
         if self._live is not None:
             self._live.refresh()
             return
-        self._console.print(f"watched for {monitor.monitored_s:.1f} s", markup=False)
+        self._console.print(f"monitored for {monitor.monitored_s:.1f} s", markup=False)
         for finding in found:
             self._console.print(f"  {self.sentence(finding)}", markup=False, soft_wrap=True)
         if not found:
-            self._console.print("  nothing is other than it was", markup=False)
+            self._console.print("  no findings", markup=False)
 
     def sentence(self, finding: Finding) -> str:
         """Return a finding in a line."""
@@ -94,7 +94,7 @@ class MonitorScreen:
     def _shown(self) -> Group:
         monitor, outside = self._watcher, self._watcher.outside_nm
         table = Table(
-            "joint", "from outside [Nm]", "level [Nm]", title=f"{monitor.monitored_s:.0f} s watched"
+            "joint", "external torque [Nm]", "threshold [Nm]", title=f"{monitor.monitored_s:.0f} s monitored"
         )
         for k, serial in enumerate(monitor.reference.chain.serials):
             now = "-" if outside is None else f"{outside[k]:+.2f}"
@@ -110,4 +110,4 @@ def _named(key: Key, start_ns: int) -> str:
     kind, at = key
     if isinstance(at, int) and at:
         return f"the {kind} of {1e-9 * (at - start_ns):.2f} s"
-    return "a payload, or torques that nothing explained" if kind == "load" else f"{kind} {at}"
+    return "a payload, or unexplained torques" if kind == "load" else f"{kind} {at}"

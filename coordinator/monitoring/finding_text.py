@@ -1,4 +1,4 @@
-"""Findings from what tests say, with a sentence for who reads them."""
+"""Findings from the results of the tests, each with a summary sentence."""
 
 import numpy as np
 
@@ -11,15 +11,13 @@ from coordinator.parameter_fit.payload import Payload
 
 
 def collision_finding(reference: Reference, thresholds: Thresholds, contact: Contact, now_ns: int) -> Finding:
-    """Say that something touched the robot, and which joints felt it."""
+    """Return the finding of a collision, with the joints that measured it."""
     serials, strength = reference.chain.serials, contact.strength(thresholds.contact_nm)
     last = contact.joints[-1] if contact.joints else int(np.argmax(np.abs(contact.peak_nm)))
     strongest = float(np.abs(contact.peak_nm).max())
     felt = ", ".join(serials[k] for k in contact.joints) or serials[last]
     lasted = (
-        "and goes on"
-        if contact.end_ns is None
-        else f"for {1e-6 * (contact.end_ns - contact.start_ns):.0f} ms"
+        "ongoing" if contact.end_ns is None else f"for {1e-6 * (contact.end_ns - contact.start_ns):.0f} ms"
     )
     return Finding(
         kind="collision",
@@ -33,8 +31,8 @@ def collision_finding(reference: Reference, thresholds: Thresholds, contact: Con
         unit=UNITS["collision"],
         gain=strength,
         level=1.0,
-        summary=f"something pushes what {serials[last]} turns, or what is beyond, {lasted}: felt by {felt} "
-        f"with up to {strongest:.2f} Nm, {strength:.1f} times what goes unnoticed",
+        summary=f"external force on the body that {serials[last]} turns, or beyond it, {lasted}: "
+        f"measured by {felt}, up to {strongest:.2f} Nm, {strength:.1f} times the threshold",
     )
 
 
@@ -46,9 +44,9 @@ def load_finding(
     since_ns: int,
     now_ns: int,
 ) -> Finding:
-    """Say what is carried that was not carried before, or the other way round."""
+    """Return the finding of a payload that was added or removed."""
     serial, taken_off = reference.chain.serials[load.carrier], load.taken_off
-    done = "was taken off" if taken_off else "is on"
+    change = "removed from" if taken_off else "added to"
     mass = -found.mass_kg if taken_off else found.mass_kg
     return Finding(
         kind="payload",
@@ -62,14 +60,14 @@ def load_finding(
         unit=UNITS["payload"],
         gain=load.gain,
         level=thresholds.payload,
-        summary=f"{found.mass_kg:.3f} +- {found.mass_sigma_kg:.3f} kg {done} what {serial} turns",
+        summary=f"{found.mass_kg:.3f} +- {found.mass_sigma_kg:.3f} kg {change} the body that {serial} turns",
     )
 
 
 def wear_finding(
     reference: Reference, thresholds: Thresholds, link: LinkShift, since_ns: int, now_ns: int
 ) -> Finding:
-    """Say which link is not where it was."""
+    """Return the finding of a displaced link."""
     chain = reference.chain
     serial, parent = chain.serials[link.child], chain.serials[chain.parent[link.child]]
     return Finding(
@@ -93,7 +91,7 @@ def wear_finding(
 def friction_finding(
     reference: Reference, thresholds: Thresholds, drive: DriveShift, since_ns: int, now_ns: int
 ) -> Finding:
-    """Say whose drive turns with more friction, or less."""
+    """Return the finding of a drive with changed friction."""
     serial = reference.chain.serials[drive.joint]
     more = "more" if drive.change > 0.0 else "less"
     return Finding(
@@ -116,7 +114,7 @@ def friction_finding(
 def unexplained_finding(
     reference: Reference, thresholds: Thresholds, load: LoadShift, since_ns: int, now_ns: int
 ) -> Finding:
-    """Say that torques have changed in a way that no payload on one body explains."""
+    """Return the finding of torques that no payload on one body explains."""
     serial = reference.chain.serials[load.carrier]
     return Finding(
         kind="unexplained",

@@ -1,7 +1,7 @@
-"""The watch itself: takes what was recorded since, returns what there is to say. No clock, no network.
+"""The monitor of one robot: takes new recorded data, returns new findings. No clock, no network.
 
-Contacts are said within some hundredths of a second, and are looked at again: one that leaves the torques
-changed was the moment in which a load was put on, or a link slipped, and no collision.
+Contacts are reported within some hundredths of a second and revised later: a contact after which the torques
+stay changed was the moment at which a payload was added or a link slipped, and no collision.
 """
 
 from collections import deque
@@ -76,7 +76,7 @@ class _Hypothesis(NamedTuple):
 
 
 class Monitor:
-    """Watches one robot.
+    """Compares one robot with its reference.
 
     ledger: what it holds to be so. looked_s: how long all modules were heard together.
     """
@@ -284,7 +284,7 @@ class Monitor:
             return []
         self._untimed = poor
         if not poor:
-            return ["all clocks are known well again: everything is watched"]
+            return ["all clocks are accurate again: all tests are active"]
         worst = max(clocks[s].sigma_ns for s in poor)
         return [
             f"the network is slow: when {', '.join(poor)} read what they say is known to "
@@ -295,7 +295,7 @@ class Monitor:
     def _hindered(self, gaps: Sequence[Gap], silent: tuple[str, ...]) -> list[str]:
         notes = [
             f"module {gap.serial}: {1e-6 * (gap.to_ns - gap.from_ns):.0f} ms of its feedback are missing; "
-            "the watch begins anew after them"
+            "monitoring restarts after them"
             for gap in gaps
         ]
         if gaps:
@@ -305,9 +305,11 @@ class Monitor:
             self._agreed, self._agreed_for = None, 0
         if silent != self._silent:
             notes += [
-                f"module {s} is silent: nothing is judged without it" for s in silent if s not in self._silent
+                f"module {s} sends no feedback: the tests are suspended"
+                for s in silent
+                if s not in self._silent
             ]
-            notes += [f"module {s} is heard again" for s in self._silent if s not in silent]
+            notes += [f"module {s} sends feedback again" for s in self._silent if s not in silent]
             self._silent = silent
         return notes
 
