@@ -131,7 +131,7 @@ class Rig(VirtualRobot):
     def run(self, work: Coroutine[Any, Any, T]) -> T:
         return self.loop.run_until_complete(work)
 
-    def link(self, sender: str = "tester") -> tuple[Messenger, Recording, ModuleGroup]:
+    def group(self, sender: str = "tester") -> tuple[Messenger, Recording, ModuleGroup]:
         """A coordinator's hold on the robot."""
         recording = Recording()
 
@@ -142,15 +142,15 @@ class Rig(VirtualRobot):
                 return None
             return message if isinstance(message, Message) else None
 
-        radio = Messenger(
+        messenger = Messenger(
             _Cuttable(self, self.endpoint(sender)),
             self.robot.name,
             lambda: self.loop.now_ns,
             self.loop.call_soon,
             record,
         )
-        radio.start()
-        return radio, recording, ModuleGroup(radio, recording, lambda: self.loop.now_ns, sender)
+        messenger.start()
+        return messenger, recording, ModuleGroup(messenger, recording, lambda: self.loop.now_ns, sender)
 
     def session(self, out: Path, plan: Plan, resume: bool = False, sender: str = "coordinator") -> Result:
         """Run a whole identification and write its folder, truth included."""

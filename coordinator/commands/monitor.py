@@ -109,8 +109,8 @@ def _monitor_live(
     try:
         screen.start_ns = loop.clock_ns()
         live = LiveMonitor(monitor, loop.clock_ns, sender_name(), screen.report)
-        radio = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
-        task = loop.create_task(_attend(live, radio, monitor, for_s, loop.clock_ns))
+        messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
+        task = loop.create_task(_attend(live, messenger, monitor, for_s, loop.clock_ns))
         for number in SIGNALS:
             loop.add_signal_handler(number, task.cancel)
         # A signal cancels the task; the summary of the findings follows.
@@ -127,13 +127,15 @@ def _monitor_live(
 
 
 async def _attend(
-    live: LiveMonitor, radio: Messenger, monitor: Monitor, for_s: float | None, clock: Callable[[], int]
+    live: LiveMonitor, messenger: Messenger, monitor: Monitor, for_s: float | None, clock: Callable[[], int]
 ) -> None:
     start_ns = clock()
-    radio.start()
+    messenger.start()
     try:
-        await live.watch(radio, start_ns + round(_FIRST_FEEDBACK_S * 1e9), lambda: monitor.monitored_s > 0.0)
+        await live.watch(
+            messenger, start_ns + round(_FIRST_FEEDBACK_S * 1e9), lambda: monitor.monitored_s > 0.0
+        )
         if monitor.monitored_s > 0.0:
-            await live.watch(radio, None if for_s is None else clock() + round(for_s * 1e9))
+            await live.watch(messenger, None if for_s is None else clock() + round(for_s * 1e9))
     finally:
-        radio.close()
+        messenger.close()

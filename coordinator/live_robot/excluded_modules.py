@@ -18,40 +18,40 @@ FEEDBACK_WAIT_S = 1.0
 class ExcludedModules:
     """The modules that a session goes on without, with the reason. `note` keeps and shows a journal event."""
 
-    def __init__(self, link: ModuleGroup, note: Callable[[str, str], None]):
-        self._link = link
+    def __init__(self, group: ModuleGroup, note: Callable[[str, str], None]):
+        self._group = group
         self._note = note
         self.why: dict[str, str] = {}
 
     def movers(self) -> tuple[str, ...]:
         """Return the modules that take part."""
-        return tuple(s for s in self._link.serials if s not in self.why)
+        return tuple(s for s in self._group.serials if s not in self.why)
 
     async def meet(self, serials: Sequence[str]) -> None:
         """Meet all modules, but for those that announce themselves and do not answer, or send no feedback."""
         met = []
         for serial in serials:
             try:
-                await self._link.meet([serial])
+                await self._group.meet([serial])
                 met.append(serial)
             except NoAnswer as error:
                 self._leave(serial, str(error))
-        self._link.serials = tuple(met)
-        await self._link.wait(lambda: not self._mute(), FEEDBACK_WAIT_S)
+        self._group.serials = tuple(met)
+        await self._group.wait(lambda: not self._mute(), FEEDBACK_WAIT_S)
         mute = self._mute()
-        self._link.serials = tuple(s for s in met if s not in mute)
+        self._group.serials = tuple(s for s in met if s not in mute)
         for serial in mute:
             self._leave(serial, f"module {serial} answers, but sends no feedback")
 
     def _mute(self) -> list[str]:
-        return [s for s in self._link.serials if not self._link.module(s).arrivals]
+        return [s for s in self._group.serials if not self._group.module(s).arrivals]
 
     def without(self, error: Refused | MotionInterrupted) -> bool:
         """Leave the module of an error out if it will not move, whatever is tried; False if it might.
 
         A command beyond its limits is refused for good, and a module that protects itself needs minutes.
         """
-        serial, status = error.serial, self._link.module(error.serial).status
+        serial, status = error.serial, self._group.module(error.serial).status
         beyond = isinstance(error, Refused) and error.ack.reason == Refusal.LIMIT.value
         protects = status is not None and status.state == "fault"
         if serial in self.why or not (beyond or protects) or len(self.movers()) < 2:

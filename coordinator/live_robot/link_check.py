@@ -17,53 +17,53 @@ LOOKS = 3
 BETWEEN_S = 0.03
 
 
-async def check_link(link: ModuleGroup, clock: Clock, seconds: float, note: Callable[[str], None]) -> None:
+async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Callable[[str], None]) -> None:
     """Measure rates and round trips of all modules and note them.
 
     Raises:
         UnfitLink: a module's feedback does not come through, or commands would be too old on arrival; said
         after as many looks as `LOOKS`.
     """
-    before = {serial: link.module(serial).rows.end_row for serial in link.serials}
+    before = {serial: group.module(serial).rows.end_row for serial in group.serials}
     start_ns = clock()
     for look in range(1, LOOKS + 1):
         end_ns = start_ns + look * int(seconds * 1e9)
-        await gather_all(_ask_until(link, serial, clock, end_ns) for serial in link.serials)
+        await gather_all(_ask_until(group, serial, clock, end_ns) for serial in group.serials)
         span_s = (clock() - start_ns) / 1e9
-        rates = {s: (link.module(s).rows.end_row - before[s]) / span_s for s in link.serials}
-        faults = [fault for s in link.serials if (fault := _fault(link, s, rates[s]))]
+        rates = {s: (group.module(s).rows.end_row - before[s]) / span_s for s in group.serials}
+        faults = [fault for s in group.serials if (fault := _fault(group, s, rates[s]))]
         if not faults:
             break
-    for serial in link.serials:
-        note(_words(link, serial, rates[serial]))
+    for serial in group.serials:
+        note(_words(group, serial, rates[serial]))
     if faults:
         raise UnfitLink(faults[0])
 
 
-async def _ask_until(link: ModuleGroup, serial: str, clock: Clock, end_ns: int) -> None:
+async def _ask_until(group: ModuleGroup, serial: str, clock: Clock, end_ns: int) -> None:
     while clock() < end_ns:
-        await link.ask_status(serial)
+        await group.ask_status(serial)
         await asyncio.sleep(BETWEEN_S)
 
 
-def _trips_ms(link: ModuleGroup, serial: str) -> list[float]:
-    return [(trip.received_ns - trip.sent_ns) / 1e6 for trip in link.module(serial).round_trips]
+def _trips_ms(group: ModuleGroup, serial: str) -> list[float]:
+    return [(trip.received_ns - trip.sent_ns) / 1e6 for trip in group.module(serial).round_trips]
 
 
-def _words(link: ModuleGroup, serial: str, rate: float) -> str:
-    median, most = (float(np.percentile(_trips_ms(link, serial), share)) for share in (50, 95))
-    kind = link.info(serial).module_type
+def _words(group: ModuleGroup, serial: str, rate: float) -> str:
+    median, most = (float(np.percentile(_trips_ms(group, serial), share)) for share in (50, 95))
+    kind = group.info(serial).module_type
     return f"{serial} ({kind}): {rate:.0f} rows/s, round trip {median:.2f} ms, 95 % {most:.2f} ms"
 
 
-def _fault(link: ModuleGroup, serial: str, rate: float) -> str:
-    info = link.info(serial)
+def _fault(group: ModuleGroup, serial: str, rate: float) -> str:
+    info = group.info(serial)
     if rate < 0.5 * info.feedback_rate_hz:
         return (
             f"unfit: module {serial} delivers {rate:.0f} rows/s of {info.feedback_rate_hz:.0f}; "
             "check the network and the load of its machine"
         )
-    slow_ms, life_ms = np.percentile(_trips_ms(link, serial), 100.0 * FIT_FRACTION), info.lifetime_ns / 1e6
+    slow_ms, life_ms = np.percentile(_trips_ms(group, serial), 100.0 * FIT_FRACTION), info.lifetime_ns / 1e6
     if slow_ms > 0.5 * life_ms:
         return (
             f"unfit: of the round trips to module {serial} one in five takes more than {slow_ms:.0f} ms, "

@@ -63,10 +63,10 @@ class _Started(NamedTuple):
 class ModuleGroup:
     """Commands to the modules of one robot under this sender's leases."""
 
-    def __init__(self, radio: Messenger, recording: Recording, clock: Clock, sender: str):
+    def __init__(self, messenger: Messenger, recording: Recording, clock: Clock, sender: str):
         self.serials: tuple[str, ...] = ()
         self.sender = sender
-        self._radio = radio
+        self._messenger = messenger
         self._recording = recording
         self._clock = clock
         self._tokens: dict[str, int] = {}
@@ -122,8 +122,8 @@ class ModuleGroup:
         return status
 
     async def _ask(self, serial: str, leaf: Leaf) -> object:
-        ask = Ask(serial=serial, boot=0, seq=self._radio.next_seq(), sender=self.sender)
-        return await self._radio.ask(serial, leaf, ask)
+        ask = Ask(serial=serial, boot=0, seq=self._messenger.next_seq(), sender=self.sender)
+        return await self._messenger.ask(serial, leaf, ask)
 
     async def _persist(self, serial: str, attempt: Callable[[], Awaitable[T]]) -> T:
         """Try until answered; a network may lose questions and answers."""
@@ -154,7 +154,7 @@ class ModuleGroup:
             if record.boot != self._boots[serial]:
                 raise ModuleLost(serial, "it has booted anew")
             heard = record.arrivals[-1][0] if record.arrivals else now
-            if serial not in self._radio.alive and now - heard > TOKEN_GONE_NS:
+            if serial not in self._messenger.alive and now - heard > TOKEN_GONE_NS:
                 raise ModuleLost(serial, "its agent has left the network")
             if record.arrivals and now - heard > SILENT_NS:
                 raise ModuleLost(serial, f"no feedback for {(now - heard) / 1e9:.1f} s")
@@ -201,7 +201,7 @@ class ModuleGroup:
         """
 
         async def attempt() -> Ack:
-            return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "acquire"))
+            return await self._messenger.command(serial, Leaf.LEASE, self._lease(serial, "acquire"))
 
         self._running.pop(serial, None)
         ack = await self._persist(serial, attempt)
@@ -217,7 +217,7 @@ class ModuleGroup:
         return {
             "serial": serial,
             "boot": self._boots[serial],
-            "seq": self._radio.next_seq(),
+            "seq": self._messenger.next_seq(),
             "sender": self.sender,
             "token": self._tokens.get(serial, 0),
             "echo_ns": self.module(serial).newest_ns,
@@ -252,7 +252,7 @@ class ModuleGroup:
     async def _renew(self, serial: str) -> None:
         sent_ns = self._clock()
         try:
-            await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
+            await self._messenger.command(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
         except NoAnswer:
             pass  # lost on the way; the next one follows, and silence is noticed by `check`
         except Refused as refused:
@@ -269,7 +269,7 @@ class ModuleGroup:
         motion = self._motion(serial, running)
         # Lost or refused: the next renewal follows.
         with contextlib.suppress(NoAnswer, Refused):
-            await self._radio.command(serial, Leaf.MOTION, motion, timeout_s=0.3)
+            await self._messenger.command(serial, Leaf.MOTION, motion, timeout_s=0.3)
 
     async def release_all(self) -> None:
         """Let go of all modules; their motors are off then."""
@@ -277,7 +277,7 @@ class ModuleGroup:
 
     async def _release(self, serial: str) -> None:
         async def attempt() -> Ack:
-            return await self._radio.command(serial, Leaf.LEASE, self._lease(serial, "release"))
+            return await self._messenger.command(serial, Leaf.LEASE, self._lease(serial, "release"))
 
         try:
             await self._persist(serial, attempt)
@@ -297,9 +297,9 @@ class ModuleGroup:
 
     async def _stop(self, serial: str, why: str) -> None:
         for left in reversed(range(3)):
-            stop = Stop(serial=serial, boot=0, seq=self._radio.next_seq(), sender=self.sender, why=why)
+            stop = Stop(serial=serial, boot=0, seq=self._messenger.next_seq(), sender=self.sender, why=why)
             try:
-                await self._radio.command(serial, Leaf.STOP, stop, timeout_s=0.3)
+                await self._messenger.command(serial, Leaf.STOP, stop, timeout_s=0.3)
                 return
             except NoAnswer:
                 if not left:
@@ -312,7 +312,7 @@ class ModuleGroup:
 
         async def attempt() -> Ack:
             command = GainsCommand.model_validate({**self._head(serial), "gains": gains})
-            return await self._radio.command(serial, Leaf.GAINS, command)
+            return await self._messenger.command(serial, Leaf.GAINS, command)
 
         await self._persist(serial, attempt)
 
@@ -325,7 +325,9 @@ class ModuleGroup:
     ) -> None:
         """Send one set-point, which nobody answers; what is None switches its loop off."""
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
-        self._radio.publish(serial, Leaf.SETPOINT, Setpoint.model_validate({**self._head(serial), **point}))
+        self._messenger.publish(
+            serial, Leaf.SETPOINT, Setpoint.model_validate({**self._head(serial), **point})
+        )
 
     def _next_id(self) -> int:
         # Numbers grow over coordinators too, so that a new one does not repeat an old one's.
@@ -406,7 +408,7 @@ class ModuleGroup:
 
     async def _start(self, serial: str, motion: _Started) -> None:
         async def attempt() -> Ack:
-            return await self._radio.command(serial, Leaf.MOTION, self._motion(serial, motion))
+            return await self._messenger.command(serial, Leaf.MOTION, self._motion(serial, motion))
 
         self._running.pop(serial, None)
         try:
@@ -447,12 +449,12 @@ class ModuleGroup:
         request = HistoryRequest(
             serial=serial,
             boot=self._boots[serial],
-            seq=self._radio.next_seq(),
+            seq=self._messenger.next_seq(),
             sender=self.sender,
             first_row=first,
             end_row=end,
         )
-        answer = await self._radio.ask(serial, Leaf.HISTORY, request)
+        answer = await self._messenger.ask(serial, Leaf.HISTORY, request)
         if isinstance(answer, Ack):
             raise Refused(serial, Leaf.HISTORY, answer)
         return answer
@@ -470,10 +472,10 @@ class ModuleGroup:
             return found()
         for _ in range(ATTEMPTS):
             request = EstimateRequest(
-                serial=observer, boot=0, seq=self._radio.next_seq(), sender=self.sender, joint=joint
+                serial=observer, boot=0, seq=self._messenger.next_seq(), sender=self.sender, joint=joint
             )
             try:
-                await self._radio.ask(observer, Leaf.ESTIMATE, request)
+                await self._messenger.ask(observer, Leaf.ESTIMATE, request)
             except NoAnswer:
                 self.check()
             if await self.wait(lambda: found() is not None, 0.3):

@@ -27,7 +27,7 @@ Report = Callable[[MonitorUpdate], None]
 
 
 class LiveMonitor:
-    """One watch over a radio. `record` is what the radio is given to hear with."""
+    """Monitoring over one messenger, which is given `record` to record with."""
 
     def __init__(self, monitor: Monitor, clock: Clock, sender: str, report: Report):
         self.recording = Recording()
@@ -49,15 +49,15 @@ class LiveMonitor:
         return message if isinstance(message, Message) else None
 
     async def watch(
-        self, radio: Messenger, until_ns: int | None = None, enough: Callable[[], bool] = lambda: False
+        self, messenger: Messenger, until_ns: int | None = None, enough: Callable[[], bool] = lambda: False
     ) -> None:
         """Watch until a time [ns], until it is enough, or until cancelled."""
-        asking = asyncio.create_task(self._ask_all(radio))
+        asking = asyncio.create_task(self._ask_all(messenger))
         mapped_ns = 0
         try:
             while (until_ns is None or self._clock() < until_ns) and not enough():
                 await asyncio.sleep(UPDATE_S)
-                self._note_presence(radio)
+                self._note_presence(messenger)
                 if self._clocks is None or self._clock() - mapped_ns > REMAP_S * 1e9:
                     self._map_clocks()
                     mapped_ns = self._clock()
@@ -83,17 +83,17 @@ class LiveMonitor:
         for found in self.recording.estimates.values():
             found.clear()
 
-    async def _ask_all(self, radio: Messenger) -> None:
+    async def _ask_all(self, messenger: Messenger) -> None:
         while True:
             # At once: two modules that are asked at the same moment tell their clocks apart.
-            asks = [self._ask(radio, serial) for serial in self._serials if serial in radio.alive]
+            asks = [self._ask(messenger, serial) for serial in self._serials if serial in messenger.alive]
             await asyncio.gather(*asks)
             await asyncio.sleep(ASK_S if self._clocks is not None else 0.2 * ASK_S)
 
-    async def _ask(self, radio: Messenger, serial: str) -> None:
-        ask = Ask(serial=serial, boot=0, seq=radio.next_seq(), sender=self._sender)
+    async def _ask(self, messenger: Messenger, serial: str) -> None:
+        ask = Ask(serial=serial, boot=0, seq=messenger.next_seq(), sender=self._sender)
         try:
-            await radio.ask(serial, Leaf.STATUS, ask)
+            await messenger.ask(serial, Leaf.STATUS, ask)
         except NoAnswer:
             return  # one of many; who is gone is noticed by its token and its silence
 
@@ -109,9 +109,9 @@ class LiveMonitor:
         if notes:
             self._report(MonitorUpdate((), (), tuple(notes)))
 
-    def _note_presence(self, radio: Messenger) -> None:
+    def _note_presence(self, messenger: Messenger) -> None:
         # Only of those that were there: at the beginning all are on their way.
-        left = tuple(s for s in self._serials if s in self.recording.modules and s not in radio.alive)
+        left = tuple(s for s in self._serials if s in self.recording.modules and s not in messenger.alive)
         if left == self._left:
             return
         notes = [f"module {s} has left the network" for s in left if s not in self._left]

@@ -27,9 +27,14 @@ class InformationRequests:
     """Of one session; `note` takes a line for whoever watches."""
 
     def __init__(
-        self, radio: Messenger, recording: Recording, clock: Clock, sender: str, note: Callable[[str], None]
+        self,
+        messenger: Messenger,
+        recording: Recording,
+        clock: Clock,
+        sender: str,
+        note: Callable[[str], None],
     ):
-        self._radio = radio
+        self._messenger = messenger
         self._recording = recording
         self._clock = clock
         self._sender = sender
@@ -54,7 +59,7 @@ class InformationRequests:
                     CollectRequest(
                         serial=serial,
                         boot=self._recording.modules[serial].boot,
-                        seq=self._radio.next_seq(),
+                        seq=self._messenger.next_seq(),
                         sender=self._sender,
                         motion_id=number,
                         rows=rows,
@@ -66,7 +71,7 @@ class InformationRequests:
     async def _collect_one(self, request: CollectRequest) -> None:
         for _ in range(ATTEMPTS):
             try:
-                answer = await self._radio.ask(request.serial, Leaf.COLLECT, request)
+                answer = await self._messenger.ask(request.serial, Leaf.COLLECT, request)
             except NoAnswer:
                 continue
             if isinstance(answer, Ack) and not answer.accepted:
@@ -89,11 +94,11 @@ class InformationRequests:
             head = {
                 "serial": serial,
                 "boot": self._recording.modules[serial].boot,
-                "seq": self._radio.next_seq(),
+                "seq": self._messenger.next_seq(),
                 "offset": offset,
             }
             try:
-                answer = await self._radio.ask(serial, Leaf.INFORMATION, asked.model_copy(update=head))
+                answer = await self._messenger.ask(serial, Leaf.INFORMATION, asked.model_copy(update=head))
             except NoAnswer:
                 silent += 1
                 continue

@@ -134,9 +134,9 @@ class Run:
         self._identified: Identified | None = None
         if crashed is not None:
             self._take_over(crashed)
-        self._radio = Messenger(transport, config.robot, clock, post, self._record)
-        self._link = ModuleGroup(self._radio, self.recording, clock, config.sender)
-        self._torques = InformationRequests(self._radio, self.recording, clock, config.sender, self.note)
+        self._messenger = Messenger(transport, config.robot, clock, post, self._record)
+        self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender)
+        self._torques = InformationRequests(self._messenger, self.recording, clock, config.sender, self.note)
 
     def _take_over(self, crashed: Path) -> None:
         try:
@@ -175,7 +175,7 @@ class Run:
     def step(self, index: int, total: int, text: str) -> None:
         """Pass on that a step begins."""
         self._screen.step(index, total, text)
-        self._feed.connected({s: self._link.kind(s).name for s in self._link.serials}, self._clock())
+        self._feed.connected({s: self._group.kind(s).name for s in self._group.serials}, self._clock())
         self._feed.step(self._clock(), f"{index} of {total}: {text}")
 
     def note(self, text: str) -> None:
@@ -235,7 +235,7 @@ class Run:
         """Design motions of all joints at once for the chain that has just been found."""
         assert self._chain is not None, "all joints are explored before any is excited"
         chain, plan = self._chain, self._config.plan
-        modules = [RobotModule(self._link.kind(s), self._link.info(s).limits) for s in chain.serials]
+        modules = [RobotModule(self._group.kind(s), self._group.info(s).limits) for s in chain.serials]
         try:
             return await self._compute(lambda: robot_excitation(chain, modules, plan))
         except NoExcitation as error:
@@ -261,7 +261,7 @@ class Run:
         """Run to the end and write the files; on any error what was recorded is complete on disk."""
         config = self._config
         try:
-            self._radio.start()
+            self._messenger.start()
             self._journal(
                 JournalEvent(
                     t_ns=self._clock(),
@@ -273,15 +273,15 @@ class Run:
             )
             closer = self._closer if self._known is not None else None
             session = Session(
-                self._link,
-                self._radio,
+                self._group,
+                self._messenger,
                 self.recording,
                 config.plan,
                 self._clock,
                 self._journal,
                 self,
                 closer,
-                lambda: self._torques.collect(self._link.serials),
+                lambda: self._torques.collect(self._group.serials),
             )
             await session.run(config.expect)
             kinematics = await self._ask_torques()
@@ -291,7 +291,7 @@ class Run:
                 )
             )
             # Nothing more is recorded from here on: a replay must see exactly what this result is made of.
-            self._radio.close()
+            self._messenger.close()
             self._writer.close()
             self._screen.note("estimating")
             found = await self._compute(lambda: identify(self.recording, self._revised, kinematics))
@@ -303,13 +303,13 @@ class Run:
                 self._crashed.unlink()
             return found.result
         finally:
-            self._radio.close()
+            self._messenger.close()
             self._writer.close()
             await self._looked()
             self._feed.close()
-            if self._radio.dropped:
+            if self._messenger.dropped:
                 self._screen.note(
-                    f"{self._radio.dropped} messages were dropped unread: this machine is too slow"
+                    f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
                 )
 
     async def _ask_torques(self) -> Kinematics | None:
@@ -326,7 +326,7 @@ class Run:
             return None  # said when everything is identified, and the recording is whole
         await self._torques.ask(found.fit.chain, found.clocks)
         with contextlib.suppress(NoAnswer, Refused, ModuleLost):
-            await self._link.close_gaps()
+            await self._group.close_gaps()
         return found
 
     @property

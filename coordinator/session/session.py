@@ -75,8 +75,8 @@ class Session:
 
     def __init__(
         self,
-        link: ModuleGroup,
-        radio: Messenger,
+        group: ModuleGroup,
+        messenger: Messenger,
         recording: Recording,
         plan: Plan,
         clock: Clock,
@@ -85,21 +85,21 @@ class Session:
         closer: Callable[[], Awaitable[Sequence[str]]] | None = None,
         share: Callable[[], Awaitable[None]] | None = None,
     ):
-        self.link = link
+        self.group = group
         self._share = share
         self._closer = closer
-        self._radio = radio
+        self._messenger = messenger
         self._recording = recording
         self._plan = plan
         self._clock = clock
         self._journal = journal
         self._reporter = reporter
-        self._choice = MotionChoice(plan, recording, lambda: self._left_out.movers(), link.kind)
+        self._choice = MotionChoice(plan, recording, lambda: self._left_out.movers(), group.kind)
         self._done = {e.step: e for e in recording.journal if e.what == "done"}
         self._index = 0
         self._total = 4
         self._keeper: asyncio.Task[None] | None = None
-        self._left_out = ExcludedModules(link, self._note_left_out)
+        self._left_out = ExcludedModules(group, self._note_left_out)
 
     # ------------------------------------------------------------------ the run
 
@@ -107,8 +107,8 @@ class Session:
         """Discover, check, take, move, and let go; raises what went wrong after stopping the robot."""
         await self._discover(expect)
         self._report("checking the link")
-        await check_link(self.link, self._clock, self._plan.link_s, self._reporter.note)
-        serials = self.link.serials
+        await check_link(self.group, self._clock, self._plan.link_s, self._reporter.note)
+        serials = self.group.serials
         explorations = (
             1 if self._plan.mode == "simultaneous" else len(serials) + (self._plan.motions == "optimised")
         )
@@ -144,8 +144,8 @@ class Session:
         end = self._clock() + int((self._plan.discover_s + (10.0 if expect else 3.0)) * 1e9)
         while self._clock() < end:
             await asyncio.sleep(0.05)
-            if frozenset(self._radio.alive) != known:
-                known, quiet_since = frozenset(self._radio.alive), self._clock()
+            if frozenset(self._messenger.alive) != known:
+                known, quiet_since = frozenset(self._messenger.alive), self._clock()
             settled = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
             if known and settled and (expect is None or len(known) >= expect):
                 break
@@ -154,13 +154,13 @@ class Session:
             wanted = "at least one" if expect is None else str(expect)
             raise NoModulesFound(f"{wanted} module expected, found {len(known)}: {names}")
         await self._left_out.meet(sorted(known))
-        if not self.link.serials:
+        if not self.group.serials:
             raise NoModulesFound(
                 f"none of the modules that announced themselves responds: {', '.join(sorted(known))}"
             )
-        for serial in self.link.serials:
-            self.link.kind(serial)
-        self._reporter.note(f"found {len(self.link.serials)}: {', '.join(self.link.serials)}")
+        for serial in self.group.serials:
+            self.group.kind(serial)
+        self._reporter.note(f"found {len(self.group.serials)}: {', '.join(self.group.serials)}")
 
     def _mend_after_restart(self) -> None:
         """Forget what the journal says is done if a module has booted since: its zero may have moved."""
@@ -177,7 +177,7 @@ class Session:
 
     async def _take(self) -> None:
         # The keeper first: what is taken already must not expire while the next one is slow to answer.
-        self._keeper = asyncio.create_task(self.link.keep_alive())
+        self._keeper = asyncio.create_task(self.group.keep_alive())
         await self._arm()
 
     async def _arm(self) -> None:
@@ -186,15 +186,15 @@ class Session:
         await gather_all(self._arm_one(serial) for serial in self._left_out.movers())
 
     async def _arm_one(self, serial: str) -> None:
-        await self.link.acquire(serial)
+        await self.group.acquire(serial)
         if self._plan.hold_stiffness != 1.0:
-            strategy = self.link.info(serial).gains.strategy
-            gains = self._plan.exploring_gains(self.link.kind(serial), strategy)
-            await self.link.set_gains(serial, gains)
+            strategy = self.group.info(serial).gains.strategy
+            gains = self._plan.exploring_gains(self.group.kind(serial), strategy)
+            await self.group.set_gains(serial, gains)
 
     def _retries(self) -> int:
         """Return how often an interrupted step is done again."""
-        return self._plan.retries * (POOR_RETRIES if self.link.is_poor else 1)
+        return self._plan.retries * (POOR_RETRIES if self.group.is_poor else 1)
 
     async def _step(
         self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
@@ -210,14 +210,14 @@ class Session:
                 await work(*arguments)
                 break
             except MotionInterrupted as error:
-                await self.link.check_now()
+                await self.group.check_now()
                 if attempt >= self._retries():
                     raise
                 self._reporter.note(f"{error}; re-arming and trying again")
                 self._journal(JournalEvent(t_ns=self._clock(), what="note", step=name, text=str(error)))
-        await self.link.complete_rows()
+        await self.group.complete_rows()
         serial = arguments[0] if arguments else ""
-        boot = self.link.module(serial).boot if serial else 0
+        boot = self.group.module(serial).boot if serial else 0
         self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
 
     async def _if_it_moves(
@@ -246,12 +246,12 @@ class Session:
 
         async def back() -> None:
             movers = self._left_out.movers()
-            await self.link.run({s: GoTo(target_rad=starts[s], max_speed_rad_s=speed) for s in movers})
+            await self.group.run({s: GoTo(target_rad=starts[s], max_speed_rad_s=speed) for s in movers})
 
         await self._step("back", "back to where it stood", back)
-        await self.link.release_all()
+        await self.group.release_all()
         await self._stop_keeping()
-        await self.link.close_gaps()
+        await self.group.close_gaps()
 
     async def _stop_keeping(self) -> None:
         if self._keeper is not None:
@@ -262,7 +262,7 @@ class Session:
     async def _abandon(self, error: BaseException) -> None:
         await self._stop_keeping()
         why = str(error) or type(error).__name__
-        deaf = await self.link.stop_all(why[:200])
+        deaf = await self.group.stop_all(why[:200])
         text = f"stopped: {why}" + (f"; no confirmation from {', '.join(deaf)}" if deaf else "")
         self._journal(JournalEvent(t_ns=self._clock(), what="failed", text=text, deaf=tuple(deaf)))
         self._reporter.note(text)
@@ -271,7 +271,7 @@ class Session:
 
     async def _home(self) -> None:
         speed, home = self._plan.travel_speed_rad_s, self._plan.home_rad
-        await self.link.run(
+        await self.group.run(
             {s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self._left_out.movers()}
         )
         await asyncio.sleep(self._plan.settle_s)
@@ -279,7 +279,7 @@ class Session:
     async def _rest(self) -> None:
         longest = WHOLE_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
         pattern = Rest(duration_s=min(longest, self._plan.rest_s))
-        records = await self.link.run(dict.fromkeys(self._left_out.movers(), pattern))
+        records = await self.group.run(dict.fromkeys(self._left_out.movers(), pattern))
         for serial, record in records.items():
             self._note_motion("rest", serial, record, "rest")
 
@@ -344,14 +344,14 @@ class Session:
 
     async def _explore_all(self) -> None:
         """All joints about home at the same time, each at frequencies of its own (thesis 7.2)."""
-        records = await self.link.run(self._choice.whole())
+        records = await self.group.run(self._choice.whole())
         for serial, record in records.items():
             self._note_motion("explore", serial, record, "whole")
 
     async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
         record = await self._move(f"explore/{serial}", serial, pattern, purpose)
-        for observer in self.link.serials:
-            found = await self.link.estimate(observer, serial, record.motion_id, ESTIMATE_WAIT_S)
+        for observer in self.group.serials:
+            found = await self.group.estimate(observer, serial, record.motion_id, ESTIMATE_WAIT_S)
             if found is None:
                 self._reporter.note(f"{observer} has no estimate of the {purpose} motion of {serial}")
             elif found.note:
@@ -362,7 +362,7 @@ class Session:
         """Excite all joints together, if all of them move and motions for that can be designed."""
         motions = await self._reporter.excitation() if self._together() else ()
         serials = self._left_out.movers() if not motions else ()
-        self._total += (len(motions) or 2 * len(serials)) - self._excitations(len(self.link.serials))
+        self._total += (len(motions) or 2 * len(serials)) - self._excitations(len(self.group.serials))
         for number, motion in enumerate(motions):
             last = number == len(motions) - 1
             purpose: Purpose = "held_out" if last else "dynamic"
@@ -395,17 +395,17 @@ class Session:
     async def _run_together(self, step: str, motion: RobotMotion, purpose: Purpose) -> None:
         # The ways between home and the pose are known to be clear, and between two poses they are not.
         await self._go_all(motion.pose_rad)
-        for serial, record in (await self.link.run(dict(motion.patterns))).items():
+        for serial, record in (await self.group.run(dict(motion.patterns))).items():
             self._note_motion(step, serial, record, purpose)
         await self._go_all(dict.fromkeys(motion.pose_rad, self._plan.home_rad))
 
     async def _excite(self, serial: str) -> None:
-        pattern = self._plan.dynamic(self.link.kind(serial))
+        pattern = self._plan.dynamic(self.group.kind(serial))
         await self._move(f"excite/{serial}", serial, pattern, "dynamic")
         await self._go(serial, self._plan.home_rad)
 
     async def _hold_out(self, serial: str) -> None:
-        pattern = self._plan.held_out(self.link.kind(serial))
+        pattern = self._plan.held_out(self.group.kind(serial))
         await self._move(f"held_out/{serial}", serial, pattern, "held_out")
         await self._go(serial, self._plan.home_rad)
 
@@ -416,16 +416,16 @@ class Session:
 
     async def _go_all(self, targets_rad: Mapping[str, float]) -> None:
         speed = self._plan.travel_speed_rad_s
-        await self.link.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in targets_rad.items()})
+        await self.group.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in targets_rad.items()})
         await asyncio.sleep(self._plan.settle_s)
 
     async def _move(self, step: str, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
-        record = (await self.link.run({serial: pattern}))[serial]
+        record = (await self.group.run({serial: pattern}))[serial]
         self._note_motion(step, serial, record, purpose)
         return record
 
     def _note_motion(self, step: str, serial: str, record: MotionRecord, purpose: Purpose) -> None:
-        boot = self.link.module(serial).boot
+        boot = self.group.module(serial).boot
         self._journal(
             JournalEvent(
                 t_ns=self._clock(),
@@ -439,7 +439,7 @@ class Session:
         )
 
     def _position(self, serial: str) -> float:
-        log = self.link.module(serial).rows
+        log = self.group.module(serial).rows
         rows = log.rows(log.end_row - 1, log.end_row)
         return float(rows["position_rad"][-1]) if len(rows) else self._plan.home_rad
 

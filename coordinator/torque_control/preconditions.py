@@ -34,7 +34,7 @@ class RestReading(NamedTuple):
     accel_m_s2: Array
 
 
-async def find_robot(link: ModuleGroup, radio: Messenger, model: GravityModel, clock: Clock) -> None:
+async def find_robot(group: ModuleGroup, messenger: Messenger, model: GravityModel, clock: Clock) -> None:
     """Wait until all modules of the model are there, and check that they are the same.
 
     Serials and types must be the same; boots may differ.
@@ -43,34 +43,34 @@ async def find_robot(link: ModuleGroup, radio: Messenger, model: GravityModel, c
         RobotMismatch: a module is missing, has another type, sends no feedback, or is not in the model.
     """
     known = set(model.chain.serials)
-    await _gathered(radio, known, clock)
-    if missing := sorted(known - radio.alive):
-        there = ", ".join(sorted(radio.alive)) or "none"
+    await _gathered(messenger, known, clock)
+    if missing := sorted(known - messenger.alive):
+        there = ", ".join(sorted(messenger.alive)) or "none"
         raise RobotMismatch(
             f"module {missing[0]} is missing ({len(missing)} of {len(known)} are); present: {there}"
         )
     await asyncio.sleep(UNKNOWN_MODULES_S)
-    if unknown := sorted(radio.alive - known):
+    if unknown := sorted(messenger.alive - known):
         raise RobotMismatch(
             f"module {unknown[0]} is not in the model, which has {', '.join(model.chain.serials)}; identify "
             "the robot again with it"
         )
-    await link.meet(model.chain.serials)
+    await group.meet(model.chain.serials)
     for serial, kind in zip(model.chain.serials, model.types, strict=True):
-        reported = link.info(serial).module_type
+        reported = group.info(serial).module_type
         if reported != kind:
             raise RobotMismatch(f"module {serial} is of type {reported}, in the model it is {kind}")
-    if not await link.wait(lambda: not _without_feedback(link), FEEDBACK_S):
-        raise RobotMismatch(f"module {_without_feedback(link)[0]} answers, but sends no feedback")
+    if not await group.wait(lambda: not _without_feedback(group), FEEDBACK_S):
+        raise RobotMismatch(f"module {_without_feedback(group)[0]} answers, but sends no feedback")
 
 
-async def _gathered(radio: Messenger, known: set[str], clock: Clock) -> None:
+async def _gathered(messenger: Messenger, known: set[str], clock: Clock) -> None:
     """Wait until all modules are there, or no more appear."""
-    present, end_ns = set(radio.alive), clock() + int((QUIET_S if radio.alive else DISCOVER_S) * 1e9)
-    while not known <= radio.alive and clock() < end_ns:
+    present, end_ns = set(messenger.alive), clock() + int((QUIET_S if messenger.alive else DISCOVER_S) * 1e9)
+    while not known <= messenger.alive and clock() < end_ns:
         await asyncio.sleep(POLL_S)
-        if radio.alive != present:
-            present, end_ns = set(radio.alive), clock() + int(QUIET_S * 1e9)
+        if messenger.alive != present:
+            present, end_ns = set(messenger.alive), clock() + int(QUIET_S * 1e9)
 
 
 def check_gravity(chain: Chain, rest: RestReading) -> None:
@@ -92,5 +92,5 @@ def check_gravity(chain: Chain, rest: RestReading) -> None:
         )
 
 
-def _without_feedback(link: ModuleGroup) -> list[str]:
-    return [serial for serial in link.serials if not link.module(serial).arrivals]
+def _without_feedback(group: ModuleGroup) -> list[str]:
+    return [serial for serial in group.serials if not group.module(serial).arrivals]

@@ -97,8 +97,8 @@ class CompensationSession:
         sender: str,
     ):
         self._recording = Recording()
-        self._radio = Messenger(transport, name, clock, post, self._record)
-        self._link = ModuleGroup(self._radio, self._recording, clock, sender)
+        self._messenger = Messenger(transport, name, clock, post, self._record)
+        self._group = ModuleGroup(self._messenger, self._recording, clock, sender)
         self._model, self._plan, self._clock, self._screen = model, plan, clock, screen
         self._serials = model.chain.serials
         self._tally = CompensationTally(self._serials)
@@ -128,11 +128,11 @@ class CompensationSession:
             RobotMismatch, CompensationRefused: nothing has moved.
             StaleFeedback, ModuleLost, RobotStopped, NoAnswer, Refused: the robot has been told to stop.
         """
-        self._radio.start()
+        self._messenger.start()
         try:
             return await self._run()
         finally:
-            self._radio.close()
+            self._messenger.close()
 
     def _record(self, entry: Entry) -> Message | None:
         try:
@@ -142,8 +142,8 @@ class CompensationSession:
         return message if isinstance(message, Message) else None
 
     async def _run(self) -> CompensationSummary:
-        await find_robot(self._link, self._radio, self._model, self._clock)
-        reported = [self._link.info(serial) for serial in self._serials]
+        await find_robot(self._group, self._messenger, self._model, self._clock)
+        reported = [self._group.info(serial) for serial in self._serials]
         stale_s = STALE_SHARE * 1e-9 * min(info.lifetime_ns for info in reported)
         settings = self._plan.settings._replace(stale_s=min(stale_s, self._plan.settings.stale_s))
         compensator = GravityCompensator(self._model, tuple(info.limits for info in reported), settings)
@@ -158,7 +158,7 @@ class CompensationSession:
             return self._tally.summary(self._asked, is_fault=False)
         streaming: asyncio.Task[None] | None = None
         try:
-            await gather_all(self._link.acquire(serial) for serial in self._serials)
+            await gather_all(self._group.acquire(serial) for serial in self._serials)
             streaming = asyncio.create_task(self._stream(compensator))
             await self._compensate(compensator, streaming)
             await self._return(compensator, stood.q_rad, streaming)
@@ -181,7 +181,7 @@ class CompensationSession:
             check_gravity(self._model.chain, self._rest_reading())
             damping = self._plan.settings.damping_nm_s_rad
             await gather_all(
-                self._link.set_gains(s, compensation_gains(self._link.kind(s), damping))
+                self._group.set_gains(s, compensation_gains(self._group.kind(s), damping))
                 for s in self._serials
             )
             self._is_under_torque = True
@@ -196,7 +196,7 @@ class CompensationSession:
         await self._until(lambda: compensator.is_in("held"), streaming)
         if self._is_under_torque:
             await gather_all(
-                self._link.set_gains(s, holding_gains(self._link.kind(s))) for s in self._serials
+                self._group.set_gains(s, holding_gains(self._group.kind(s))) for s in self._serials
             )
 
     def _is_over(self, compensator: GravityCompensator) -> bool:
@@ -207,7 +207,7 @@ class CompensationSession:
         while not condition():
             if streaming.done():
                 streaming.result()
-            self._link.check()
+            self._group.check()
             await asyncio.sleep(POLL_S)
 
     async def _stream(self, compensator: GravityCompensator) -> None:
@@ -220,7 +220,7 @@ class CompensationSession:
             self._check_states()
             self._step(compensator, now_s)
             if now_s - renewed_s >= KEEP_ALIVE_S:
-                self._link.renew()
+                self._group.renew()
                 renewed_s = now_s
             if now_s - forgot_s >= _FORGET_EVERY_S:
                 self._forget()
@@ -246,7 +246,7 @@ class CompensationSession:
         for k, serial in enumerate(self._serials):
             place = None if targets.position_rad is None else float(targets.position_rad[k])
             rate, effort = float(targets.velocity_rad_s[k]), float(targets.effort_nm[k])
-            self._link.stream(serial, place, rate, effort)
+            self._group.stream(serial, place, rate, effort)
         self._tally.sent += 1
 
     def _check_states(self) -> None:
@@ -259,7 +259,7 @@ class CompensationSession:
         self._held_all = self._held_all or set(states.values()) == {"streaming"}
         for serial, state in states.items():
             if self._held_all and state in _RELEASED_STATES:
-                status = self._link.module(serial).status
+                status = self._group.module(serial).status
                 note = status.note if status is not None and status.state == state else ""
                 if state == "stopped":
                     raise RobotStopped(serial, note or "stopped")
@@ -299,15 +299,15 @@ class CompensationSession:
         await self._until(lambda: self._now_s() >= end_s, streaming)
 
     async def _release_all(self) -> None:
-        keeper = asyncio.create_task(self._link.keep_alive())
+        keeper = asyncio.create_task(self._group.keep_alive())
         try:
-            await self._link.release_all()
+            await self._group.release_all()
         finally:
             await _cancelled(keeper)
 
     async def _abandon(self, error: BaseException) -> None:
         why = str(error) or type(error).__name__
-        unconfirmed = await self._link.stop_all(why[:200])
+        unconfirmed = await self._group.stop_all(why[:200])
         self._screen.note(
             f"stopped: {why}" + (f"; no confirmation from {', '.join(unconfirmed)}" if unconfirmed else "")
         )
@@ -318,7 +318,7 @@ class CompensationSession:
         return 1e-9 * self._clock()
 
     def _newest(self, serial: str, count: int = 1) -> Rows:
-        log = self._link.module(serial).rows
+        log = self._group.module(serial).rows
         return log.rows(log.end_row - count, log.end_row)
 
     def _reading(self, count: int = 1) -> Reading:
@@ -331,7 +331,7 @@ class CompensationSession:
 
     def _received_ns(self, serial: str) -> int:
         """Return when the newest row of a module first arrived; later arrivals are dropped."""
-        arrivals = self._link.module(serial).arrivals
+        arrivals = self._group.module(serial).arrivals
         arrivals[:] = [first_of_newest(arrivals)]
         return arrivals[0][0]
 
@@ -344,7 +344,7 @@ class CompensationSession:
 
     def _forget(self) -> None:
         for serial in self._serials:
-            record = self._link.module(serial)
+            record = self._group.module(serial)
             record.rows.forget_before(record.rows.end_row - _RETAINED_ROWS)
             record.round_trips.clear()
 

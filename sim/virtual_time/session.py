@@ -43,9 +43,9 @@ def record_session(
     robot = VirtualRobot(settings, loop)
     keeper = _Keeper(plan)
     endpoint = robot.endpoint(COORDINATOR)
-    radio = Messenger(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
-    link = ModuleGroup(radio, keeper.recording, lambda: loop.now_ns, COORDINATOR)
-    session = Session(link, radio, keeper.recording, plan, lambda: loop.now_ns, keeper.journal, keeper)
+    messenger = Messenger(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
+    group = ModuleGroup(messenger, keeper.recording, lambda: loop.now_ns, COORDINATOR)
+    session = Session(group, messenger, keeper.recording, plan, lambda: loop.now_ns, keeper.journal, keeper)
     robot.start()
     try:
         keeper.journal(
@@ -57,7 +57,7 @@ def record_session(
                 torque=plan.torque,
             )
         )
-        run_to_end(loop, loop.create_task(_to_end(session, radio, robot)))
+        run_to_end(loop, loop.create_task(_to_end(session, messenger, robot)))
         keeper.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))
         if at_end is not None:
             at_end(robot)
@@ -67,12 +67,12 @@ def record_session(
         loop.close()
 
 
-async def _to_end(session: Session, radio: Messenger, robot: VirtualRobot) -> None:
-    radio.start()
+async def _to_end(session: Session, messenger: Messenger, robot: VirtualRobot) -> None:
+    messenger.start()
     try:
         await session.run(len(robot.world.modules))
     finally:
-        radio.close()
+        messenger.close()
         robot.stop()
         await asyncio.sleep(0)
 

@@ -31,26 +31,26 @@ ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
 
 
-async def _explore(link: Any, joint: str) -> None:
+async def _explore(group: Any, joint: str) -> None:
     """The motions of an exploration, without all else that a session does."""
     await asyncio.sleep(0.2)
-    await link.meet([BASE, TIP])
-    for serial in link.serials:
-        await link.acquire(serial)
-    keeper = asyncio.create_task(link.keep_alive())
-    await link.run(dict.fromkeys(link.serials, Rest(duration_s=1.0)))
+    await group.meet([BASE, TIP])
+    for serial in group.serials:
+        await group.acquire(serial)
+    keeper = asyncio.create_task(group.keep_alive())
+    await group.run(dict.fromkeys(group.serials, Rest(duration_s=1.0)))
     for pattern in (
         GoTo(target_rad=-0.45, max_speed_rad_s=1.2),
         ConstantMotion(velocity_rad_s=1.0, duration_s=0.75),
         GoTo(target_rad=0.0, max_speed_rad_s=1.2),
         WindowedSine(amplitude=0.08, centre_s=1.2, sigma_s=0.5),
     ):
-        record = (await link.run({joint: pattern}))[joint]
+        record = (await group.run({joint: pattern}))[joint]
         await asyncio.sleep(0.3)
         if not isinstance(pattern, GoTo):
             # As a session does: the next motion waits until everybody has understood this one.
-            for observer in link.serials:
-                assert await link.estimate(observer, joint, record.motion_id, 0.6) is not None
+            for observer in group.serials:
+                assert await group.estimate(observer, joint, record.motion_id, 0.6) is not None
     keeper.cancel()
 
 
@@ -68,7 +68,7 @@ def test_a_module_finds_the_circle_of_another_joint_through_a_network_that_loses
 
     listener.subscribe(key(rig.robot.name, TIP, Leaf.ESTIMATE), on_estimate)
     listener.subscribe(key(rig.robot.name, BASE, Leaf.ESTIMATE), on_estimate)
-    rig.run(_explore(rig.link()[2], BASE))
+    rig.run(_explore(rig.group()[2], BASE))
     # Each module says once what it makes of each of the two motions.
     assert [len(found) for found in estimates_of.values()] == [2, 2]
     constant, sine = estimates_of[TIP]
@@ -88,15 +88,15 @@ def test_a_module_finds_the_circle_of_another_joint_through_a_network_that_loses
 
 def test_a_motion_of_a_single_tick_does_not_end_the_agents(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM)
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
         await asyncio.sleep(0.1)
-        await link.meet([BASE, TIP])
-        await link.acquire(BASE)
+        await group.meet([BASE, TIP])
+        await group.acquire(BASE)
         blink = ConstantMotion(velocity_rad_s=0.1, duration_s=1e-3, ramp_s=0.0)
         for _ in range(4):
-            assert (await link.run({BASE: blink}))[BASE].outcome == "done"
+            assert (await group.run({BASE: blink}))[BASE].outcome == "done"
         await asyncio.sleep(0.5)
 
     rig.run(work())

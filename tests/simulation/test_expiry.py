@@ -48,14 +48,14 @@ class Blackbox:
 
     def silence(self, how: str, after_s: float) -> None:
         """Arm, run a brisk motion, fall silent in the midst of it, and let a second and a half pass."""
-        _, _, link = self.rig.link()
+        _, _, group = self.rig.group()
 
         async def work() -> None:
             await asyncio.sleep(0.1)
-            await link.meet([BASE])
-            await link.acquire(BASE)
-            keeper = asyncio.create_task(link.keep_alive())
-            motion = asyncio.create_task(link.run({BASE: BRISK}))
+            await group.meet([BASE])
+            await group.acquire(BASE)
+            keeper = asyncio.create_task(group.keep_alive())
+            motion = asyncio.create_task(group.run({BASE: BRISK}))
             await asyncio.sleep(after_s)
             assert self.rig.state(BASE) == "moving"
             if how == "killed":
@@ -100,13 +100,13 @@ def test_the_motor_is_off_within_the_lifetime_and_two_ticks_of_the_last_accepted
 def test_it_stays_off_when_the_network_comes_back_with_old_commands(rigs: Callable[..., Any]) -> None:
     box = Blackbox(rigs, HORIZONTAL, "lan")
     rig = box.rig
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
         await asyncio.sleep(0.1)
-        await link.meet([BASE])
-        await link.acquire(BASE)
-        keeper = asyncio.create_task(link.keep_alive())
+        await group.meet([BASE])
+        await group.acquire(BASE)
+        keeper = asyncio.create_task(group.keep_alive())
         await asyncio.sleep(0.5)
         rig.cut = True
         await asyncio.sleep(0.6)
@@ -115,7 +115,7 @@ def test_it_stays_off_when_the_network_comes_back_with_old_commands(rigs: Callab
         await asyncio.sleep(0.5)
         assert rig.state(BASE) == "expired"
         assert recording.modules[BASE].status.expiries == 1
-        await link.acquire(BASE)
+        await group.acquire(BASE)
         assert rig.state(BASE) == "armed"
         keeper.cancel()
 
@@ -156,18 +156,18 @@ def test_a_module_that_is_to_damp_brakes_and_never_drives(rigs: Callable[..., An
 @pytest.mark.parametrize("robot", [HORIZONTAL, VERTICAL, "thesis_484_horizontal"])
 def test_a_stop_brings_a_moving_arm_to_rest_and_leaves_it_there(rigs: Callable[..., Any], robot: str) -> None:
     box = Blackbox(rigs, robot, "lan")
-    _, _, link = box.rig.link()
+    _, _, group = box.rig.group()
     stopped_ns = 0
 
     async def work() -> None:
         nonlocal stopped_ns
         await asyncio.sleep(0.1)
-        await link.meet([BASE])
-        await link.acquire(BASE)
-        keeper = asyncio.create_task(link.keep_alive())
-        motion = asyncio.create_task(link.run({BASE: BRISK}))
+        await group.meet([BASE])
+        await group.acquire(BASE)
+        keeper = asyncio.create_task(group.keep_alive())
+        motion = asyncio.create_task(group.run({BASE: BRISK}))
         await asyncio.sleep(1.1)
-        assert await link.stop_all("test") == []
+        assert await group.stop_all("test") == []
         stopped_ns = box.rig.loop.now_ns
         keeper.cancel()
         motion.cancel()

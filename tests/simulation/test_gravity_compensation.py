@@ -265,7 +265,7 @@ def test_when_an_agent_dies_the_others_are_told_to_stop_and_it_is_named(rigs: Ca
 def test_somebody_elses_stop_ends_it_and_is_not_overruled(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     floating, seen = session(rig)
-    _, _, other = rig.link("other")
+    _, _, other = rig.group("other")
 
     async def both() -> None:
         work = asyncio.ensure_future(floating.run())
@@ -304,7 +304,7 @@ async def _until(rig: Any, t_s: float) -> None:
 def test_a_module_that_somebody_holds_is_not_taken_from_him(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     floating, _ = session(rig)
-    _, _, other = rig.link("other")
+    _, _, other = rig.group("other")
 
     async def both() -> None:
         await asyncio.sleep(0.1)

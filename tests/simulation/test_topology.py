@@ -86,10 +86,12 @@ class Watcher:
 def explore(
     rig: Any, plan: Plan = PLAN, on_step: Callable[[str], None] = lambda text: None
 ) -> tuple[Recording, Watcher]:
-    radio, recording, link = rig.link("coordinator")
+    messenger, recording, group = rig.group("coordinator")
     watcher = Watcher(recording, on_step)
-    rig.run(Session(link, radio, recording, plan, lambda: rig.loop.now_ns, watcher.journal, watcher).run())
-    radio.close()
+    rig.run(
+        Session(group, messenger, recording, plan, lambda: rig.loop.now_ns, watcher.journal, watcher).run()
+    )
+    messenger.close()
     return recording, watcher
 
 

@@ -78,7 +78,7 @@ def monitor_robot(
     listener = Messenger(
         robot.endpoint(MONITOR), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
     )
-    link = ModuleGroup(mover, recording, lambda: loop.now_ns, MOVER)
+    group = ModuleGroup(mover, recording, lambda: loop.now_ns, MOVER)
     for one in events:
         loop.schedule_ns(round(one.at_s * 1e9), lambda one=one: one.what(robot.world))  # type: ignore[misc]
     robot.start()
@@ -88,7 +88,7 @@ def monitor_robot(
         listener.start()
         attending = asyncio.create_task(watch.watch(listener))
         try:
-            await _move(link, mover, motions, len(settings.robot.modules), round(for_s * 1e9), loop)
+            await _move(group, mover, motions, len(settings.robot.modules), round(for_s * 1e9), loop)
         finally:
             attending.cancel()
             (failure,) = await asyncio.gather(attending, return_exceptions=True)
@@ -118,31 +118,31 @@ def _kept(recording: Recording) -> Callable[[Entry], Message | None]:
 
 
 async def _move(
-    link: ModuleGroup,
-    radio: Messenger,
+    group: ModuleGroup,
+    messenger: Messenger,
     motions: Sequence[RobotMotion],
     count: int,
     until_ns: int,
     loop: VirtualLoop,
 ) -> None:
-    while len(radio.alive) < count:
+    while len(messenger.alive) < count:
         await asyncio.sleep(0.05)
-    await link.meet(sorted(radio.alive))
+    await group.meet(sorted(messenger.alive))
     await asyncio.sleep(0.3)
-    keeper = asyncio.create_task(link.keep_alive())
-    await gather_all(link.acquire(serial) for serial in link.serials)
+    keeper = asyncio.create_task(group.keep_alive())
+    await gather_all(group.acquire(serial) for serial in group.serials)
     turn = 0
     while loop.now_ns < until_ns:
         motion = motions[turn % len(motions)]
         turn += 1
         try:
             goals = {s: GoTo(target_rad=q, max_speed_rad_s=TRAVEL_RAD_S) for s, q in motion.pose_rad.items()}
-            await link.run(goals)
+            await group.run(goals)
             await asyncio.sleep(SETTLE_S)
-            await link.run(dict(motion.patterns))
+            await group.run(dict(motion.patterns))
         except MotionInterrupted:
             # A collision may make a module drop its lease; the mover acquires it again.
-            await gather_all(link.acquire(serial) for serial in link.serials)
-    await link.release_all()
+            await gather_all(group.acquire(serial) for serial in group.serials)
+    await group.release_all()
     keeper.cancel()
     await asyncio.gather(keeper, return_exceptions=True)

@@ -18,13 +18,13 @@ SECOND_S = 1.0
 
 def _checked(rig: Any, look_s: float = LOOK_S) -> list[str]:
     """Meet both modules, check the link, and return what was noted."""
-    _, _, link = rig.link()
+    _, _, group = rig.group()
     notes: list[str] = []
 
     async def work() -> None:
         await asyncio.sleep(0.2)
-        await link.meet((BASE, TIP))
-        await check_link(link, lambda: rig.loop.now_ns, look_s, notes.append)
+        await group.meet((BASE, TIP))
+        await check_link(group, lambda: rig.loop.now_ns, look_s, notes.append)
 
     rig.run(work())
     return notes
@@ -49,15 +49,15 @@ def test_trips_of_which_too_many_are_slow_are_unfit_by_name_and_number(rigs: Cal
 
 def test_a_module_whose_rows_come_slower_than_it_says_is_unfit(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
         await asyncio.sleep(0.2)
-        await link.meet((BASE, TIP))
+        await group.meet((BASE, TIP))
         # As from a module on a machine that is too slow for what it was told to do.
         told = recording.modules[TIP].info
         recording.modules[TIP].info = told.model_copy(update={"feedback_rate_hz": 1000.0})
-        await check_link(link, lambda: rig.loop.now_ns, LOOK_S, lambda note: None)
+        await check_link(group, lambda: rig.loop.now_ns, LOOK_S, lambda note: None)
 
     with pytest.raises(UnfitLink, match=rf"unfit: module {TIP} delivers 2\d\d rows/s of 1000"):
         rig.run(work())

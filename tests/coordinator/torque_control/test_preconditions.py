@@ -64,17 +64,17 @@ def known(**changes: object) -> GravityModel:
 
 def test_the_known_robot_is_found_and_met(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    radio, recording, link = rig.link()
-    rig.run(find_robot(link, radio, known(), lambda: rig.loop.now_ns))
-    assert link.serials == ("X-00009", "X-00010")
-    assert all(recording.modules[serial].arrivals for serial in link.serials)
+    messenger, recording, group = rig.group()
+    rig.run(find_robot(group, messenger, known(), lambda: rig.loop.now_ns))
+    assert group.serials == ("X-00009", "X-00010")
+    assert all(recording.modules[serial].arrivals for serial in group.serials)
 
 
 def test_a_module_that_is_missing_of_another_type_or_no_part_of_it_is_named(
     rigs: Callable[..., Any],
 ) -> None:
     rig = rigs(ARM, "lan")
-    radio, _, link = rig.link()
+    messenger, _, group = rig.group()
     whole = known()
     rename = whole.chain._replace(serials=("X-00009", "gone"))
     less = whole.chain._replace(serials=("X-00009",))
@@ -84,4 +84,4 @@ def test_a_module_that_is_missing_of_another_type_or_no_part_of_it_is_named(
         (known(types=("X5-9", "X5-1")), "module X-00009 is of type X5-"),
     ):
         with pytest.raises(RobotMismatch, match=words):
-            rig.run(find_robot(link, radio, model, lambda: rig.loop.now_ns))
+            rig.run(find_robot(group, messenger, model, lambda: rig.loop.now_ns))

@@ -28,7 +28,7 @@ class Bench:
         self.module: VirtualEndpoint = self.network.endpoint("module")
         self.entries: list[Entry] = []
         self.recording = Recording()
-        self.radio = Messenger(
+        self.messenger = Messenger(
             self.network.endpoint("coordinator"),
             wire.robot,
             lambda: self.loop.now_ns,
@@ -56,8 +56,8 @@ class Bench:
         return self.loop.run_until_complete(work)
 
     def stop(self) -> Coroutine[Any, Any, Ack]:
-        message = Stop(serial="A", boot=0, seq=self.radio.next_seq(), sender="tester")
-        return self.radio.command("A", Leaf.STOP, message)
+        message = Stop(serial="A", boot=0, seq=self.messenger.next_seq(), sender="tester")
+        return self.messenger.command("A", Leaf.STOP, message)
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def bench(wire: SimpleNamespace) -> Iterator[Bench]:
 def test_question_and_answer_are_recorded_as_they_pass(bench: Bench) -> None:
     wire = bench.wire
     bench.serve(Leaf.STATUS, lambda _: encode(wire.status(re=1, t_ns=9)))
-    found = bench.run(bench.radio.ask("A", Leaf.STATUS, wire.ask(seq=1)))
+    found = bench.run(bench.messenger.ask("A", Leaf.STATUS, wire.ask(seq=1)))
     assert found == wire.status(re=1, t_ns=9)
     assert [(e.kind, e.payload) for e in bench.entries] == [
         ("request", encode(wire.ask(seq=1))),
@@ -91,7 +91,7 @@ def test_answers_find_their_own_questions_in_whatever_order_they_come(bench: Ben
     bench.module.serve(key(wire.robot, "A", Leaf.STATUS), later)
 
     async def work() -> list[Any]:
-        asks = [bench.radio.ask("A", Leaf.STATUS, wire.ask(seq=i)) for i in range(5)]
+        asks = [bench.messenger.ask("A", Leaf.STATUS, wire.ask(seq=i)) for i in range(5)]
         return await asyncio.gather(*asks)
 
     assert [status.re for status in bench.run(work())] == [0, 1, 2, 3, 4]
@@ -100,13 +100,13 @@ def test_answers_find_their_own_questions_in_whatever_order_they_come(bench: Ben
 def test_silence_is_an_error_that_names_module_and_question_when_the_time_is_up(bench: Bench) -> None:
     bench.serve(Leaf.STATUS, lambda _: None)
     with pytest.raises(NoAnswer, match="module A did not answer on status: Timeout"):
-        bench.run(bench.radio.ask("A", Leaf.STATUS, bench.wire.ask(), timeout_s=0.25))
+        bench.run(bench.messenger.ask("A", Leaf.STATUS, bench.wire.ask(), timeout_s=0.25))
     assert bench.loop.time() == pytest.approx(0.25, abs=1e-6)
 
 
 def test_a_module_that_is_not_there_is_not_waited_for(bench: Bench) -> None:
     with pytest.raises(NoAnswer, match="module B did not answer on info"):
-        bench.run(bench.radio.ask("B", Leaf.INFO, bench.wire.ask("B"), timeout_s=60.0))
+        bench.run(bench.messenger.ask("B", Leaf.INFO, bench.wire.ask("B"), timeout_s=60.0))
     assert bench.loop.time() < 1.0
 
 
@@ -114,10 +114,10 @@ def test_an_answer_that_cannot_be_read_is_no_answer(bench: Bench) -> None:
     wire = bench.wire
     bench.serve(Leaf.STATUS, lambda _: b"noise")
     with pytest.raises(NoAnswer, match="its answer could not be read"):
-        bench.run(bench.radio.ask("A", Leaf.STATUS, wire.ask()))
+        bench.run(bench.messenger.ask("A", Leaf.STATUS, wire.ask()))
     bench.serve(Leaf.INFO, lambda _: encode(wire.info("B")))
     with pytest.raises(NoAnswer, match="could not be read"):
-        bench.run(bench.radio.ask("A", Leaf.INFO, wire.ask()))
+        bench.run(bench.messenger.ask("A", Leaf.INFO, wire.ask()))
     assert bench.recording.refused == {"malformed": 1, "wrong_serial": 1}
 
 
@@ -136,23 +136,23 @@ def test_an_accepted_command_returns_its_acknowledgement(bench: Bench) -> None:
 
 
 def test_tokens_tell_who_is_there(bench: Bench) -> None:
-    bench.radio.start()
+    bench.messenger.start()
     token = bench.module.declare_alive(key(bench.wire.robot, "A", Leaf.ALIVE))
     bench.module.declare_alive(key(bench.wire.robot, "B", Leaf.ALIVE))
     bench.module.declare_alive(key("other", "C", Leaf.ALIVE))
     bench.run(asyncio.sleep(0.01))
-    assert sorted(bench.radio.alive) == ["A", "B"]
+    assert sorted(bench.messenger.alive) == ["A", "B"]
     token.undeclare()
     bench.run(asyncio.sleep(0.01))
-    assert sorted(bench.radio.alive) == ["B"]
+    assert sorted(bench.messenger.alive) == ["B"]
     bench.network.kill("module")
     bench.run(asyncio.sleep(0.01))
-    assert bench.radio.alive == set()
+    assert bench.messenger.alive == set()
 
 
 def test_a_burst_larger_than_one_turn_of_the_loop_is_heard_to_the_end_and_in_order(bench: Bench) -> None:
     wire = bench.wire
-    bench.radio.start()
+    bench.messenger.start()
     topic = key(wire.robot, "A", Leaf.STATUS)
     for number in range(10_000):
         bench.module.publish(topic, encode(wire.status(t_ns=number)))
@@ -161,44 +161,46 @@ def test_a_burst_larger_than_one_turn_of_the_loop_is_heard_to_the_end_and_in_ord
     assert [e.payload for e in bench.entries[::999]] == [
         encode(wire.status(t_ns=number)) for number in range(0, 10_000, 999)
     ]
-    assert bench.radio.dropped == 0
+    assert bench.messenger.dropped == 0
 
 
 def test_what_a_loop_that_hangs_cannot_take_is_counted(bench: Bench) -> None:
     wire, posted = bench.wire, []
-    radio = Messenger(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
-    radio.start()
+    messenger = Messenger(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
+    messenger.start()
     payload = encode(wire.status())
     for _ in range(100_007):
         bench.module.publish(key(wire.robot, "A", Leaf.STATUS), payload)
     bench.run(asyncio.sleep(0.01))
-    assert radio.dropped == 7
+    assert messenger.dropped == 7
     assert len(posted) == 1  # one call is under way however many events wait
 
 
 def test_numbers_grow(bench: Bench) -> None:
-    numbers = [bench.radio.next_seq() for _ in range(5)]
+    numbers = [bench.messenger.next_seq() for _ in range(5)]
     assert numbers == sorted(set(numbers))
 
 
 def test_after_closing_nothing_is_heard_and_nothing_can_be_asked(bench: Bench) -> None:
-    bench.radio.start()
-    bench.radio.close()
+    bench.messenger.start()
+    bench.messenger.close()
     bench.module.publish(key(bench.wire.robot, "A", Leaf.STATUS), encode(bench.wire.status()))
     bench.run(asyncio.sleep(0.01))
     assert bench.entries == []
     with pytest.raises(TransportError):
-        bench.run(bench.radio.ask("A", Leaf.STATUS, bench.wire.ask()))
-    bench.radio.close()
+        bench.run(bench.messenger.ask("A", Leaf.STATUS, bench.wire.ask()))
+    bench.messenger.close()
 
 
 def test_closing_ends_the_questions_under_way(bench: Bench) -> None:
     bench.serve(Leaf.STATUS, lambda _: None)
 
     async def work() -> None:
-        question = asyncio.create_task(bench.radio.ask("A", Leaf.STATUS, bench.wire.ask(), timeout_s=60.0))
+        question = asyncio.create_task(
+            bench.messenger.ask("A", Leaf.STATUS, bench.wire.ask(), timeout_s=60.0)
+        )
         await asyncio.sleep(0.01)
-        bench.radio.close()
+        bench.messenger.close()
         with pytest.raises(NoAnswer):
             await question
 

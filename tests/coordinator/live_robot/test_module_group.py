@@ -22,30 +22,30 @@ PATIENT_NS = 500_000_000
 SLOW = GoTo(target_rad=1.0, max_speed_rad_s=0.6)
 
 
-async def _met(link: ModuleGroup, *serials: str) -> None:
+async def _met(group: ModuleGroup, *serials: str) -> None:
     await asyncio.sleep(0.1)
-    await link.meet(serials or (BASE, TIP))
+    await group.meet(serials or (BASE, TIP))
 
 
-async def _armed(link: ModuleGroup, *serials: str) -> asyncio.Task[None]:
+async def _armed(group: ModuleGroup, *serials: str) -> asyncio.Task[None]:
     """Meet, take, and keep alive until the task is cancelled."""
-    await _met(link, *serials)
-    for serial in link.serials:
-        await link.acquire(serial)
-    return asyncio.create_task(link.keep_alive())
+    await _met(group, *serials)
+    for serial in group.serials:
+        await group.acquire(serial)
+    return asyncio.create_task(group.keep_alive())
 
 
 def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(link)
-        there = await link.run({BASE: GoTo(target_rad=0.4, max_speed_rad_s=0.8)})
-        both = await link.run(
+        keeper = await _armed(group)
+        there = await group.run({BASE: GoTo(target_rad=0.4, max_speed_rad_s=0.8)})
+        both = await group.run(
             {BASE: ConstantMotion(velocity_rad_s=0.5, duration_s=0.3), TIP: Rest(duration_s=0.2)}
         )
-        await link.complete_rows()
+        await group.complete_rows()
         assert list(both) == [BASE, TIP]
         for serial, record in {**there, **both}.items():
             assert record.outcome == "done"
@@ -53,7 +53,7 @@ def test_a_motion_runs_on_the_module_and_its_record_and_rows_come_back(rigs: Cal
             assert len(rows) == record.end_row - record.start_row
             assert set(rows["motion_id"].tolist()) == {record.motion_id}
         keeper.cancel()
-        await link.release_all()
+        await group.release_all()
 
     rig.run(work())
     assert [rig.state(s) for s in rig.serials] == ["idle", "idle"]
@@ -64,25 +64,25 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
     rigs: Callable[..., Any], seed: int
 ) -> None:
     rig = rigs(ARM, "bad", seed, lifetime_ns=PATIENT_NS)
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
     interrupted = 0
 
     async def work() -> dict[str, int]:
         nonlocal interrupted
-        keeper = await _armed(link)
+        keeper = await _armed(group)
         for target in (0.3, 0.0, 0.3, 0.0):
             for _ in range(5):
                 try:
-                    await link.run({BASE: GoTo(target_rad=target, max_speed_rad_s=0.8)})
+                    await group.run({BASE: GoTo(target_rad=target, max_speed_rad_s=0.8)})
                     break
                 except MotionInterrupted:
                     interrupted += 1
-                    for serial in link.serials:
-                        await link.acquire(serial)
-        heard = {serial: recording.modules[serial].rows.end_row for serial in link.serials}
-        await link.complete_rows()
+                    for serial in group.serials:
+                        await group.acquire(serial)
+        heard = {serial: recording.modules[serial].rows.end_row for serial in group.serials}
+        await group.complete_rows()
         keeper.cancel()
-        await link.release_all()
+        await group.release_all()
         return heard
 
     for serial, end in rig.run(work()).items():
@@ -95,18 +95,18 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
 
 def test_when_everything_comes_twice_nothing_is_done_twice(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, NetworkProfile(name="echo", delay_ms=2.0, jitter_ms=5.0, duplicate=1.0))
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(link)
+        keeper = await _armed(group)
         for target in (0.3, 0.0):
-            assert (await link.run({BASE: GoTo(target_rad=target, max_speed_rad_s=0.8)}))[
+            assert (await group.run({BASE: GoTo(target_rad=target, max_speed_rad_s=0.8)}))[
                 BASE
             ].outcome == "done"
-        await link.set_gains(BASE, link.info(BASE).gains)
+        await group.set_gains(BASE, group.info(BASE).gains)
         assert recording.modules[BASE].status.token == 1
         keeper.cancel()
-        await link.release_all()
+        await group.release_all()
 
     rig.run(work())
 
@@ -115,8 +115,8 @@ def test_of_two_commanders_the_second_is_told_who_holds_the_module_and_for_how_l
     rigs: Callable[..., Any],
 ) -> None:
     rig = rigs(ARM, "lan")
-    _, _, first = rig.link("first")
-    _, _, second = rig.link("second")
+    _, _, first = rig.group("first")
+    _, _, second = rig.group("second")
 
     async def work() -> None:
         keeper = await _armed(first)
@@ -137,8 +137,8 @@ def test_of_two_commanders_the_second_is_told_who_holds_the_module_and_for_how_l
 
 def test_a_holder_whose_lease_is_taken_notices(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM)
-    _, _, first = rig.link("first")
-    _, _, second = rig.link("second")
+    _, _, first = rig.group("first")
+    _, _, second = rig.group("second")
 
     async def work() -> None:
         keeper = await _armed(first)
@@ -156,14 +156,14 @@ def test_a_holder_whose_lease_is_taken_notices(rigs: Callable[..., Any]) -> None
 
 def test_a_killed_agent_is_missed_within_a_third_of_a_second_of_its_token(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, _, link = rig.link()
+    _, _, group = rig.group()
 
     async def work() -> int:
-        await _armed(link)
+        await _armed(group)
         rig.kill(TIP)
         killed = rig.loop.now_ns
         with pytest.raises(ModuleLost, match=f"module {TIP} is lost: its agent has left the network"):
-            await link.run({BASE: SLOW})
+            await group.run({BASE: SLOW})
         return int(rig.loop.now_ns - killed)
 
     # 300 ms that a token may be gone (a router restarts), one poll, one batch of feedback.
@@ -172,14 +172,14 @@ def test_a_killed_agent_is_missed_within_a_third_of_a_second_of_its_token(rigs: 
 
 def test_a_frozen_agent_is_missed_by_its_silence_though_its_token_stays(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, _, link = rig.link()
+    _, _, group = rig.group()
 
     async def work() -> int:
-        await _armed(link)
+        await _armed(group)
         rig.freeze(TIP)
         frozen = rig.loop.now_ns
         with pytest.raises(ModuleLost, match=rf"module {TIP} is lost: no feedback for 1\.\d s"):
-            await link.run({BASE: SLOW})
+            await group.run({BASE: SLOW})
         return int(rig.loop.now_ns - frozen)
 
     assert 0.9e9 < rig.run(work()) < 1.1e9
@@ -187,14 +187,14 @@ def test_a_frozen_agent_is_missed_by_its_silence_though_its_token_stays(rigs: Ca
 
 def test_an_agent_that_boots_anew_is_another_module(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
-        await _armed(link)
+        await _armed(group)
         rig.kill(TIP)
         rig.boot(TIP)
         with pytest.raises(ModuleLost, match=f"module {TIP} is lost: it has booted anew"):
-            await link.run({BASE: SLOW})
+            await group.run({BASE: SLOW})
 
     rig.run(work())
     assert [boot for serial, boot in recording.past if serial == TIP] == [102, 103]
@@ -202,37 +202,37 @@ def test_an_agent_that_boots_anew_is_another_module(rigs: Callable[..., Any]) ->
 
 def test_commands_to_a_module_that_is_not_there_end_in_a_named_error(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM)
-    _, _, link = rig.link()
+    _, _, group = rig.group()
 
     async def work() -> None:
         with pytest.raises(NoAnswer, match="module X-99999 did not answer on info"):
-            await link.meet(["X-99999"])
+            await group.meet(["X-99999"])
 
     rig.run(work())
 
 
 def test_a_motion_is_not_started_unarmed(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM)
-    _, _, link = rig.link()
+    _, _, group = rig.group()
 
     async def work() -> None:
-        await _met(link)
+        await _met(group)
         with pytest.raises(MotionInterrupted, match=r"refused: .* holds no lease: acquire it first"):
-            await link.run({BASE: SLOW})
+            await group.run({BASE: SLOW})
 
     rig.run(work())
 
 
 def test_a_refusal_that_no_repetition_can_mend_is_passed_on_at_once(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(link)
-        running = asyncio.create_task(link.run({BASE: SLOW}))
+        keeper = await _armed(group)
+        running = asyncio.create_task(group.run({BASE: SLOW}))
         await asyncio.sleep(0.5)
         with pytest.raises(Refused, match=r"refused motion: busy: motion .* is running"):
-            await link.run({BASE: Rest(duration_s=0.1)})
+            await group.run({BASE: Rest(duration_s=0.1)})
         # The motion that runs is none the worse for it.
         assert (await running)[BASE].outcome == "done"
         assert recording.modules[BASE].status.refusals == {"busy": 1}
@@ -243,21 +243,21 @@ def test_a_refusal_that_no_repetition_can_mend_is_passed_on_at_once(rigs: Callab
 
 def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, _, link = rig.link()
+    _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(link)
+        keeper = await _armed(group)
         keeper.cancel()
         # Either may expire first, by the age of its last feedback.
         why = f"the motion of module {BASE} was (expired|spoilt: module {TIP} expired and let go)"
         with pytest.raises(MotionInterrupted, match=why):
-            await link.run({BASE: SLOW})
+            await group.run({BASE: SLOW})
         await asyncio.sleep(0.05)
         assert rig.state(BASE) == "expired"
-        for serial in link.serials:
-            await link.acquire(serial)
-        keeper = asyncio.create_task(link.keep_alive())
-        assert (await link.run({BASE: SLOW}))[BASE].outcome == "done"
+        for serial in group.serials:
+            await group.acquire(serial)
+        keeper = asyncio.create_task(group.keep_alive())
+        assert (await group.run({BASE: SLOW}))[BASE].outcome == "done"
         keeper.cancel()
 
     rig.run(work())
@@ -268,11 +268,11 @@ def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_a
     rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = rigs(ARM, "lan")
-    radio, recording, link = rig.link()
+    messenger, recording, group = rig.group()
     lost: list[Ack] = []
 
     async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
-        ack = await Messenger.command(radio, serial, leaf, message, timeout_s)
+        ack = await Messenger.command(messenger, serial, leaf, message, timeout_s)
         if leaf is Leaf.MOTION and not lost:
             lost.append(ack)
             # The answer is lost, and for longer than a command lives so are the keep-alives.
@@ -282,15 +282,15 @@ def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_a
             raise NoAnswer(serial, leaf, "Timeout")
         return ack
 
-    monkeypatch.setattr(radio, "command", command)
+    monkeypatch.setattr(messenger, "command", command)
 
     async def work() -> None:
-        keeper = await _armed(link)
+        keeper = await _armed(group)
         with pytest.raises(MotionInterrupted, match="was expired: use a new number"):
-            await link.run({BASE: SLOW})
-        for serial in link.serials:
-            await link.acquire(serial)
-        assert (await link.run({BASE: SLOW}))[BASE].outcome == "done"
+            await group.run({BASE: SLOW})
+        for serial in group.serials:
+            await group.acquire(serial)
+        assert (await group.run({BASE: SLOW}))[BASE].outcome == "done"
         keeper.cancel()
 
     rig.run(work())
@@ -300,12 +300,12 @@ def test_a_motion_that_began_and_expired_while_its_answer_was_lost_can_be_done_a
 
 def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
-    _, _, link = rig.link()
+    _, _, group = rig.group()
 
     async def work() -> list[str]:
-        await _armed(link)
+        await _armed(group)
         rig.freeze(TIP)
-        return await link.stop_all("enough")
+        return await group.stop_all("enough")
 
     assert rig.run(work()) == [TIP]
     assert rig.state(BASE) == "stopped"
@@ -313,25 +313,25 @@ def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Ca
 
 def test_what_the_network_drops_of_feedback_and_estimates_is_fetched(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "bad", 3, lifetime_ns=PATIENT_NS)
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(link)
+        keeper = await _armed(group)
         await asyncio.sleep(1.0)
         rows = recording.modules[BASE].rows
         assert rows.missing(rows.first_row, rows.end_row)  # 5 % are lost: the test would test nothing
-        records = await link.run(dict.fromkeys(link.serials, Rest(duration_s=1.0)))
-        await link.complete_rows()
+        records = await group.run(dict.fromkeys(group.serials, Rest(duration_s=1.0)))
+        await group.complete_rows()
         for serial, record in records.items():
             assert (
                 len(recording.rows(serial, record.start_row, record.end_row))
                 == record.end_row - record.start_row
             )
-        moved = await link.run({BASE: ConstantMotion(velocity_rad_s=0.5, duration_s=0.5)})
-        found = await link.estimate(TIP, BASE, moved[BASE].motion_id, 1.0)
+        moved = await group.run({BASE: ConstantMotion(velocity_rad_s=0.5, duration_s=0.5)})
+        found = await group.estimate(TIP, BASE, moved[BASE].motion_id, 1.0)
         assert found is not None
         assert found.moved
-        assert await link.estimate(TIP, BASE, 12345, 0.01) is None
+        assert await group.estimate(TIP, BASE, 12345, 0.01) is None
         keeper.cancel()
 
     rig.run(work())
@@ -339,8 +339,8 @@ def test_what_the_network_drops_of_feedback_and_estimates_is_fetched(rigs: Calla
 
 def test_motion_numbers_grow_from_one_coordinator_to_the_next(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM)
-    _, _, first = rig.link("first")
-    _, _, second = rig.link("second")
+    _, _, first = rig.group("first")
+    _, _, second = rig.group("second")
 
     async def work() -> None:
         keeper = await _armed(first, BASE)
@@ -356,16 +356,16 @@ def test_motion_numbers_grow_from_one_coordinator_to_the_next(rigs: Callable[...
     rig.run(work())
 
 
-def _commands(monkeypatch: pytest.MonkeyPatch, radio: Messenger) -> list[MotionCommand]:
+def _commands(monkeypatch: pytest.MonkeyPatch, messenger: Messenger) -> list[MotionCommand]:
     """Return a list that fills with the motion commands that go out."""
     sent: list[MotionCommand] = []
 
     async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
         if isinstance(message, MotionCommand):
             sent.append(message)
-        return await Messenger.command(radio, serial, leaf, message, timeout_s)
+        return await Messenger.command(messenger, serial, leaf, message, timeout_s)
 
-    monkeypatch.setattr(radio, "command", command)
+    monkeypatch.setattr(messenger, "command", command)
     return sent
 
 
@@ -380,20 +380,20 @@ def test_efforts_go_with_the_motion_they_are_for_and_with_no_other(
     rigs: Callable[..., Any], network: str | NetworkProfile
 ) -> None:
     rig = rigs(ARM, network)
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
     # 0 to 1.2 Nm in 0.6 s, and so until the end of 0.8 s.
     ramp = effort_profile(np.linspace(0.0, 1.2, 61), 10_000_000)
     rest = Rest(duration_s=0.8)
 
     async def work() -> None:
-        await _met(link)
+        await _met(group)
         # First, as in a session: what is armed must hear renewals while the next answers slowly.
-        keeper = asyncio.create_task(link.keep_alive())
-        for serial in link.serials:
-            await link.acquire(serial)
-        both = await link.run({BASE: rest, TIP: rest}, {BASE: ramp})
-        after = await link.run({BASE: rest, TIP: rest})
-        await link.complete_rows()
+        keeper = asyncio.create_task(group.keep_alive())
+        for serial in group.serials:
+            await group.acquire(serial)
+        both = await group.run({BASE: rest, TIP: rest}, {BASE: ramp})
+        after = await group.run({BASE: rest, TIP: rest})
+        await group.complete_rows()
         t_s = 4e-3 * np.arange(len(_fed(recording, both[BASE], BASE)))
         # A row tells of the last tick before it.
         wanted = np.minimum(2.0 * t_s, 1.2)
@@ -401,7 +401,7 @@ def test_efforts_go_with_the_motion_they_are_for_and_with_no_other(
         for record, serial in ((both[TIP], TIP), (after[BASE], BASE), (after[TIP], TIP)):
             assert np.isnan(_fed(recording, record, serial)[1:]).all()
         keeper.cancel()
-        await link.release_all()
+        await group.release_all()
 
     rig.run(work())
 
@@ -410,16 +410,16 @@ def test_efforts_for_a_module_without_a_motion_are_refused_before_anything_moves
     rigs: Callable[..., Any],
 ) -> None:
     rig = rigs(ARM)
-    _, _, link = rig.link()
+    _, _, group = rig.group()
 
     async def work() -> None:
-        keeper = await _armed(link)
+        keeper = await _armed(group)
         with pytest.raises(
             KeyError, match=f"efforts for {TIP}, which has no motion; of those that have one: {BASE}"
         ):
-            await link.run({BASE: SLOW}, {TIP: effort_profile([0.0, 1.0], 10_000_000)})
+            await group.run({BASE: SLOW}, {TIP: effort_profile([0.0, 1.0], 10_000_000)})
         keeper.cancel()
-        await link.release_all()
+        await group.release_all()
 
     rig.run(work())
     assert abs(rig.world.plant.q_rad[0]) < 1e-2
@@ -430,24 +430,24 @@ def test_where_renewals_are_slow_motions_are_told_again_and_run_once(
     rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, delay_ms: float, is_poor: bool
 ) -> None:
     rig = rigs(ARM, NetworkProfile(name="slow", delay_ms=delay_ms))
-    radio, recording, link = rig.link()
-    sent = _commands(monkeypatch, radio)
+    messenger, recording, group = rig.group()
+    sent = _commands(monkeypatch, messenger)
 
     async def work() -> None:
-        await _met(link)
+        await _met(group)
         # First, as in a session: what is armed must hear renewals while the next answers slowly.
-        keeper = asyncio.create_task(link.keep_alive())
-        for serial in link.serials:
-            await link.acquire(serial)
-        record = (await link.run({BASE: SLOW}))[BASE]
+        keeper = asyncio.create_task(group.keep_alive())
+        for serial in group.serials:
+            await group.acquire(serial)
+        record = (await group.run({BASE: SLOW}))[BASE]
         assert record.outcome == "done"
-        assert link.is_poor == is_poor
+        assert group.is_poor == is_poor
         assert {command.motion_id for command in sent} == {record.motion_id}
         assert (len(sent) > 1) == is_poor
         # Newer than each other, as renewals are: a copy that is late has no say.
         assert [command.seq for command in sent] == sorted({command.seq for command in sent})
         keeper.cancel()
-        await link.complete_rows()
+        await group.complete_rows()
 
     rig.run(work())
     moved = recording.modules[BASE].rows.rows(0, recording.modules[BASE].rows.end_row)["motion_id"]
@@ -459,23 +459,23 @@ def test_a_motion_during_which_another_joint_let_go_is_spoilt(
     rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = rigs(ARM, "lan")
-    radio, _, link = rig.link()
+    messenger, _, group = rig.group()
 
     async def command(serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
         if serial == TIP and leaf is Leaf.LEASE and rig.state(BASE) == "moving":
             raise NoAnswer(serial, leaf, "Timeout")
-        return await Messenger.command(radio, serial, leaf, message, timeout_s)
+        return await Messenger.command(messenger, serial, leaf, message, timeout_s)
 
-    monkeypatch.setattr(radio, "command", command)
+    monkeypatch.setattr(messenger, "command", command)
 
     async def work() -> None:
-        keeper = await _armed(link)
+        keeper = await _armed(group)
         why = f"the motion of module {BASE} was spoilt: module {TIP} expired and let go"
         with pytest.raises(MotionInterrupted, match=why):
-            await link.run({BASE: SLOW})
+            await group.run({BASE: SLOW})
         # Armed again, both move as before.
-        for serial in link.serials:
-            await link.acquire(serial)
+        for serial in group.serials:
+            await group.acquire(serial)
         keeper.cancel()
 
     rig.run(work())
@@ -484,23 +484,23 @@ def test_a_motion_during_which_another_joint_let_go_is_spoilt(
 def test_many_holes_of_all_modules_are_fetched_together(rigs: Callable[..., Any]) -> None:
     """One after the other 40 holes at 60 ms a round trip would take the longer half of a motion."""
     rig = rigs(ARM, NetworkProfile(name="far", delay_ms=30.0))
-    _, recording, link = rig.link()
+    _, recording, group = rig.group()
 
     async def work() -> float:
-        keeper = await _armed(link)
-        await link.complete_rows()
+        keeper = await _armed(group)
+        await group.complete_rows()
         for _ in range(20):
             rig.cut = True
             await asyncio.sleep(0.02)
             rig.cut = False
             await asyncio.sleep(0.06)
         begun_s = rig.loop.time()
-        await link.complete_rows()
+        await group.complete_rows()
         keeper.cancel()
         return rig.loop.time() - begun_s
 
     taken_s = rig.run(work())
-    for serial in link.serials:
+    for serial in group.serials:
         log = recording.modules[serial].rows
         assert log.missing(0, log.end_row - 50) == [] or log.first_row > 0
     # A question for the status and at most six rounds of eight holes, each within 80 ms by the ticks.
