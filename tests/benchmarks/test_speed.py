@@ -67,7 +67,7 @@ def test_firmware_step() -> None:
     def tick() -> None:
         nonlocal now
         now += 1_000_000
-        sample = SensorSample(now, now // 4_000_000 * 4_000_000, *([0.0] * 6), 40.0, 24.0, *([0.0] * 6))
+        sample = SensorSample(now, now // 4_000_000 * 4_000_000, *([0.0] * 6), 40.0, 24.0, *([0.0] * 6))  # type: ignore[call-arg]
         wired.tick(sample)
 
     _report(

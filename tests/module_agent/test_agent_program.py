@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from module_agent import main as agent_program
 from module_agent.hardware.hardware import HardwareLost
 from module_agent.main import app
-from module_agent.model.errors import UsageError
+from module_agent.model.errors import EXIT_LOST, UsageError
 from module_agent.network_emulation.impaired_transport import ImpairedTransport, inject
 from module_agent.network_emulation.profile import NetworkProfile, PathProfile, profile
 from module_agent.transport.endpoint import check_endpoint
@@ -132,4 +132,4 @@ def test_a_signal_in_the_middle_of_closing_does_not_leave_an_agent_half_closed()
         for number, handler in before.items():
             signal.signal(number, handler)
     assert host.closed
-    assert ended.value.exit_code == agent_program.EXIT_LOST
+    assert ended.value.exit_code == EXIT_LOST

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from coordinator.excitation.plan import Plan
-from coordinator.live_robot.module_group import ModuleLost
+from coordinator.live_robot.errors import ModuleLost
 from coordinator.recording.run_folder import load_recording
 from module_agent.network_emulation.profile import NetworkProfile, Stall, profile
 from module_agent.network_emulation.profile_file import network

@@ -127,7 +127,7 @@ def _bent(chain: Chain, types: list[ModuleType], compliance: float, seed: int) -
     seen = readings_on(chain, body_motions(chain, *few, turns=turns), turns)
     rng = np.random.default_rng(seed)
     gyro, accel = (true + rng.normal(0, s, true.shape) for true, s in zip(seen, (5e-4, 1e-2), strict=True))
-    return SensorData(*few, gyro, accel), loads
+    return SensorData(*few, gyro, accel), loads  # type: ignore[call-arg]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from coordinator.batch_estimation.estimator import SensorData, refine_chain
+from coordinator.batch_estimation.estimator import refine_chain
 from coordinator.batch_estimation.imu_prediction import imu_readings
+from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.simultaneous_motion import (
     SimultaneousMotion,

@@ -144,7 +144,7 @@ def test_an_estimate_has_the_ends_of_its_interval_and_its_true_value(
 def test_the_truth_and_the_estimate_turn_together_even_where_only_some_joints_are_identified(
     viewer: Viewer, file: Path, read: Read, arm: Chain, types: dict[str, str]
 ) -> None:
-    part = Chain(*(value[:1] for value in arm[:6]), arm.gravity)  # type: ignore[arg-type]
+    part = Chain(*(value[:1] for value in arm[:6]), arm.gravity)  # type: ignore[arg-type, call-arg]
     viewer.modules(["a"], {"a": types["a"]})
     viewer.true_chain(5, arm, types)
     viewer.chain(10, part)

@@ -410,7 +410,7 @@ class Wired:
             Incoming(leaf, encode(kind(**self._head(echo_ns), **rest)), 1) for leaf, kind, rest in messages
         ]
         still = (0.0, 0.0, 0.0, 30.0, 24.0, 0.0, 0.0, 0.0, 0.0, 0.0, 9.8)
-        sample = SensorSample(self._now_ns, self._now_ns, *measured, *still)
+        sample = SensorSample(self._now_ns, self._now_ns, *measured, *still)  # type: ignore[call-arg]
         out, sent = self._wired.tick(sample, inbox)
         answers = [decode(Ack, o.payload) for o in sent if isinstance(o, Answer)]
         assert all(a.accepted for a in answers), answers

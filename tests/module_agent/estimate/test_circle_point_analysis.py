@@ -21,8 +21,8 @@ from module_agent.wire.messages import CircleEstimate
 
 def analyse(hinge: Any, seed: int = 0, amplitude: float = 0.2, velocity: float = 1.0) -> CircleFit:
     rest = hinge.rest(np.random.default_rng(1000 + seed))
-    constant = align(*hinge.constant(velocity, 10 * seed), 0)
-    return circle_point_analysis(rest, constant, align(*hinge.sine(amplitude, 10 * seed + 1), 0))
+    constant = align(*hinge.constant(velocity, 10 * seed), 0)  # type: ignore[call-arg]
+    return circle_point_analysis(rest, constant, align(*hinge.sine(amplitude, 10 * seed + 1), 0))  # type: ignore[call-arg]
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:
@@ -80,8 +80,8 @@ def test_the_stated_sigmas_are_those_of_the_errors(horizontal_link: Any) -> None
 def test_a_correlated_residual_widens_the_sigma(horizontal_link: Any) -> None:
     """A base that shakes slowly leaves a residual whose neighbours agree: fewer independent samples."""
     hinge = horizontal_link._replace(gravity=9.81 * horizontal_link.axis)
-    rest, cm = hinge.rest(np.random.default_rng(0)), align(*hinge.constant(1.0, 1), 0)
-    sine = align(*hinge.sine(0.1, 2), 0)
+    rest, cm = hinge.rest(np.random.default_rng(0)), align(*hinge.constant(1.0, 1), 0)  # type: ignore[call-arg]
+    sine = align(*hinge.sine(0.1, 2), 0)  # type: ignore[call-arg]
     noise = np.random.default_rng(3).normal(0, 0.2, sine.t_s.size)
     slow = np.convolve(noise, np.ones(25) / 5, mode="same")  # the same rms, correlated over 0.1 s
     tangent = np.cross(hinge.axis, hinge.radial) / 0.245
@@ -100,7 +100,7 @@ def test_an_imu_on_the_axis_has_no_length_but_an_axis(horizontal_link: Any) -> N
 
 def test_the_axis_of_a_motion_forth_and_back_is_the_same(horizontal_link: Any) -> None:
     rest = rest_reading(horizontal_link.rest(np.random.default_rng(1)))
-    found = [joint_axis(align(*horizontal_link.constant(v, 4), 0), rest).axis for v in (0.9, -0.9)]
+    found = [joint_axis(align(*horizontal_link.constant(v, 4), 0), rest).axis for v in (0.9, -0.9)]  # type: ignore[call-arg]
     assert angle(*found) < 1e-3
 
 
@@ -121,8 +121,8 @@ def test_the_message_says_what_the_fit_says(horizontal_link: Any) -> None:
 
 def test_too_little_data_is_refused_with_the_reason(horizontal_link: Any) -> None:
     rest = horizontal_link.rest(np.random.default_rng(0))
-    cm, sine = align(*horizontal_link.constant(1.0, 1), 0), align(*horizontal_link.sine(0.1, 2), 0)
-    still = align(*horizontal_link._replace(noise=0.0).sine(0.0, 2), 0)
+    cm, sine = align(*horizontal_link.constant(1.0, 1), 0), align(*horizontal_link.sine(0.1, 2), 0)  # type: ignore[call-arg]
+    still = align(*horizontal_link._replace(noise=0.0).sine(0.0, 2), 0)  # type: ignore[call-arg]
     with pytest.raises(DataError, match=r"turned at .* in the constant motion"):
         circle_point_analysis(rest, still, sine)
     with pytest.raises(DataError, match=r"accelerated by .* in the windowed sine"):

@@ -57,12 +57,12 @@ def test_a_clock_that_drifts_by_100_ppm_is_found_as_its_mean(horizontal_link: An
 
 def test_the_sign_and_size_of_the_gain_do_not_matter(horizontal_link: Any) -> None:
     mirrored = shifted(horizontal_link, carried=-0.3)
-    found = clock_delay(*mirrored.sine(0.1, 5), OFFSET_NS + 30_000_000)
+    found = clock_delay(*mirrored.sine(0.1, 5), OFFSET_NS + 30_000_000)  # type: ignore[call-arg]
     assert abs(found.offset_ns - OFFSET_NS) < 200_000
 
 
 def test_an_imu_that_does_not_move_leaves_the_rough_offset_as_it_is(horizontal_link: Any) -> None:
-    found = clock_delay(*shifted(horizontal_link, carried=0.0).sine(0.1, 6), OFFSET_NS + 30_000_000)
+    found = clock_delay(*shifted(horizontal_link, carried=0.0).sine(0.1, 6), OFFSET_NS + 30_000_000)  # type: ignore[call-arg]
     assert not found.determined
     assert found.offset_ns == OFFSET_NS + 30_000_000
     assert found.sigma_s == float("inf")
@@ -88,7 +88,7 @@ def test_windows_that_do_not_overlap_are_refused(horizontal_link: Any) -> None:
 
 def test_a_joint_at_rest_has_no_delay_to_find(horizontal_link: Any) -> None:
     quiet = horizontal_link._replace(noise=0.0)
-    assert not clock_delay(*quiet.sine(0.0, 9), 0).determined
+    assert not clock_delay(*quiet.sine(0.0, 9), 0).determined  # type: ignore[call-arg]
 
 
 def test_aligned_positions_are_those_of_the_same_instant(horizontal_link: Any) -> None:

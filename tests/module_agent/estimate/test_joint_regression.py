@@ -57,7 +57,7 @@ def test_the_bias_of_the_circle_point_analysis_is_absent(link: Any) -> None:
     for seed in range(8):
         ours.append(regressed(link, seed).distance_m - LENGTH_M)
         rest = link.rest(np.random.default_rng(seed + 100))
-        slow, fast = (align(*w, 0) for w in (link.constant(1.0, seed), link.sine(0.1, seed)))
+        slow, fast = (align(*w, 0) for w in (link.constant(1.0, seed), link.sine(0.1, seed)))  # type: ignore[call-arg]
         thesis.append(circle_point_analysis(rest, slow, fast).distance_m - LENGTH_M)
     # The thesis' filter alone makes 245 mm too long by 1.9 mm. The mean of eight has 0.1 mm of noise.
     assert np.mean(thesis) > 1e-3

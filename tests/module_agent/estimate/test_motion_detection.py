@@ -11,7 +11,7 @@ from module_agent.model.errors import DataError
 
 
 def motions(hinge: Any, seed: int = 0) -> list[AlignedMotion]:
-    return [align(*hinge.constant(1.0, seed), 0), align(*hinge.sine(0.1, seed + 1), 0)]
+    return [align(*hinge.constant(1.0, seed), 0), align(*hinge.sine(0.1, seed + 1), 0)]  # type: ignore[call-arg]
 
 
 def test_a_rigidly_carried_imu_answers_one_to_one_about_the_axis(horizontal_link: Any) -> None:
@@ -50,7 +50,7 @@ def test_a_constant_motion_alone_is_enough(horizontal_link: Any) -> None:
 
 
 def test_a_joint_at_rest_is_refused(horizontal_link: Any) -> None:
-    still = align(*horizontal_link._replace(noise=0.0).sine(0.0, 0), 0)
+    still = align(*horizontal_link._replace(noise=0.0).sine(0.0, 0), 0)  # type: ignore[call-arg]
     with pytest.raises(DataError, match="turned at only"):
         detect_motion([still], horizontal_link.gyro_offset)
     with pytest.raises(DataError, match="no motion"):

@@ -372,7 +372,7 @@ def test_a_row_holds_the_sample_and_the_command_field_by_field() -> None:
     wired = WiredFirmware(config)
     now = 5_000 * MS
     # Every value another one, and all of them exact in four bytes.
-    sample = SensorSample(now, now - MS, *(0.25 + 0.5 * n for n in range(6)), 40.0, 24.0, *range(1, 7))
+    sample = SensorSample(now, now - MS, *(0.25 + 0.5 * n for n in range(6)), 40.0, 24.0, *range(1, 7))  # type: ignore[call-arg]
     head = {"serial": "A", "boot": BOOT, "seq": 1, "sender": "me", "echo_ns": now}
     values = {"position_rad": 0.75, "velocity_rad_s": None, "effort_nm": -0.5}
     acquire, setpoint = LeaseRequest(**head, token=0, action="acquire"), Setpoint(**head, token=1, **values)

@@ -21,7 +21,7 @@ def made() -> RobotBodies:
     chain, rng = true_chain(ROBOT), default_rng(8)
     signals = rng.uniform(-1.0, 1.0, (3, 2000, 4)) * np.array([3.0, 2.0, 10.0])[:, None, None]
     tau = inverse_dynamics(chain, true_inertia(ROBOT), *signals) + 0.005 * rng.normal(size=(2000, 4))
-    information = gather(chain, *signals, tau)
+    information = gather(chain, *signals, tau)  # type: ignore[call-arg]
     return robot_bodies(information, chain, build_tree(ROBOT).types, solve_information(information), 1.0)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim.benchmark.case import Case, Summary
+from sim.benchmark.case import Case, Summary, concluded
 from sim.benchmark.cases.arm import (
     ARMS,
     COST_ARM,
@@ -30,7 +30,6 @@ from sim.benchmark.cases.suites import (
 )
 from sim.benchmark.cases.topology import TopologyTrial, topology_cases
 from sim.benchmark.row import Row
-from sim.benchmark.workers import concluded
 from sim.robot.random_robot import random_robot
 from sim.thesis.joint_trial import JointTrial
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM
