@@ -18,7 +18,9 @@ TICK_NS = 1_000_000
 def test_every_motion_is_within_what_the_firmware_accepts(kind: ModuleType) -> None:
     plan = Plan()
     for pattern in (plan.constant(), plan.sine(kind), plan.dynamic(kind), plan.held_out(kind)):
-        check_motion(Motion(pattern, 0.0, 0), catalogue_limits(kind))
+        motion = Motion(pattern, 0.0, 0)
+        check_motion(motion, catalogue_limits(kind))
+        assert motion.top_speed_rad_s < kind.max_speed_rad_s
 
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.name)

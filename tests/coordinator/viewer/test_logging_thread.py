@@ -85,7 +85,9 @@ def test_one_job_runs_while_nothing_comes_and_another_last_of_all() -> None:
     assert ran == ["job", "end"]
 
 
-def test_closing_twice_is_no_mistake() -> None:
-    thread = LoggingThread(nothing, nothing)
+def test_closing_twice_ends_once() -> None:
+    ended: list[str] = []
+    thread = LoggingThread(nothing, lambda: ended.append("end"))
     thread.close()
     thread.close()
+    assert ended == ["end"]

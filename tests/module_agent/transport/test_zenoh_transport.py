@@ -191,6 +191,8 @@ def test_a_second_hub_learns_that_the_port_is_taken_and_may_join_as_a_spoke(endp
 def test_a_port_is_free_again_after_close(endpoint) -> None:
     for _ in range(3):
         open_zenoh(ZenohConfig.hub(endpoint)).close()
+    with socket.create_server(("127.0.0.1", int(endpoint.rpartition(":")[2]))) as own:
+        assert own.getsockname()[1] > 0
 
 
 def test_a_client_without_a_hub_gives_up_in_time_and_says_what_to_check(endpoint) -> None:
