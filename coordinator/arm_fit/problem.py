@@ -117,7 +117,7 @@ def problem(
         log=log,
         choice=choice,
         drives=drives,
-        columns=inertial_columns(len(robot.bodies)).beside([drive.name for drive in drives]),
+        columns=inertial_columns(len(robot.bodies)).append([drive.name for drive in drives]),
         regressor=_regressor(robot, drives, log, slow_rad_s),
         moving=moving,
         instruments=None if again is None else _regressor(robot, drives, again, slow_rad_s),

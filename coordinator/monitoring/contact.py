@@ -1,8 +1,9 @@
-"""Is something touching the robot? The fast part of the torques from outside, against what is normal.
+"""Detect contacts from the fast part of the external torques.
 
-A slow high-pass takes out what lasts: payloads and what the model is wrong about in a pose. What is left of
-a robot that nobody touches scatters with a known size and bandwidth, and crosses a level u of a Gaussian
-process with zero crossings nu0 per second nu0 exp(-u^2 / 2 sigma^2) times a second (Rice 1945).
+A high-pass of `LASTING_S` removes what lasts: payloads and the model's errors in a pose. Without contact the
+rest is noise of known standard deviation sigma. A Gaussian process with nu0 upward zero crossings per second
+crosses a level u upward nu0 exp(-u^2 / 2 sigma^2) times a second (Rice 1945), which gives the level for a
+rate of false alarms.
 """
 
 from typing import NamedTuple
@@ -24,14 +25,14 @@ OVER_S = 0.25
 
 
 class ContactModel(NamedTuple):
-    """What is normal of the torques from outside, (n,) each: scatter [Nm], largest, upcrossings a second."""
+    """External torques without contact, (n,) each: standard deviation, maximum [Nm], upcrossings [Hz]."""
 
     sigma_nm: Array
     largest_nm: Array
     crossings_hz: Array
 
     def level_nm(self, alarms_per_hour: float) -> Array:
-        """Return the levels (n,) that a robot that nobody touches crosses so often, all joints together."""
+        """Return the levels (n,) that all joints together cross `alarms_per_hour` times without contact."""
         share = alarms_per_hour / (3600.0 * len(self.sigma_nm))
         # Up or down; and a level below two sigmas is none.
         ratio = np.maximum(2.0 * self.crossings_hz / share, np.e**2)
@@ -42,8 +43,8 @@ class ContactModel(NamedTuple):
 class Contact(NamedTuple):
     """Something touched the robot.
 
-    joints: indices of those that felt it. peak_nm: (n,) the largest torque of each, signed. end_ns: None as
-    long as it lasts.
+    joints: indices of those whose torque crossed its level. peak_nm: (n,) the largest torque of each, signed.
+    end_ns: None as long as it lasts.
     """
 
     start_ns: int
@@ -83,7 +84,7 @@ def fast_part(signal: Array, rate_hz: float) -> Array:
 
 
 def contact_model(fast_nm: Array, rate_hz: float = 250.0) -> ContactModel:
-    """Learn what is normal from the fast part (m, n) of a run in which nobody touched the robot."""
+    """Fit the model to the fast part (m, n) [Nm] of a run without contacts."""
     settled = fast_nm[round(LASTING_S * rate_hz) :]
     sigma = settled.std(axis=0)
     upward = (settled[:-1] < 0.0) & (settled[1:] >= 0.0)
@@ -92,7 +93,7 @@ def contact_model(fast_nm: Array, rate_hz: float = 250.0) -> ContactModel:
 
 
 class ContactDetector:
-    """Hears the fast part of the torques from outside, and says when something touches the robot."""
+    """Detects contacts in the fast part of the external torques, block by block."""
 
     def __init__(self, level_nm: Array):
         self.level_nm = level_nm

@@ -31,7 +31,7 @@ from module_agent.model.forward_kinematics import places_on_axes
 from module_agent.model.information import JointInformation, merge
 from module_agent.model.regressor import PER_BODY
 
-# What nobody would call a displaced link: IMUs sit on boards, and links give by as much.
+# Smaller displacements are no finding: IMUs move with their boards, and links bend, by as much.
 MIN_SHIFT_M, MIN_TURN_RAD = 3e-3, 3e-3
 # Under a payload links give by more than they did; what that is taken for is below.
 LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3

@@ -21,15 +21,16 @@ UNITS: dict[Kind, str] = {
 
 
 class Finding(BaseModel):
-    """One thing that is other than it was.
+    """One detected change of the robot or contact with it.
 
-    serial: the module: of a collision, the last joint that felt it, so that it was on what this turns, or
-    beyond; of a payload, whose joint turns the body that carries it; of friction, whose drive; of wear, whose
-    link to its parent. since_ns, found_ns, said_ns, until_ns: session time of its beginning, of the first and
-    of the latest word on it, and of its end, None as long as it lasts.
-    size, sigma: in `unit`, one standard deviation. gain: by how much it makes the misfit smaller, in
-    variances of the noise, above the `level` that chance exceeds as seldom as asked for; of a collision, how
-    many times its level the torque was.
+    serial: the module: for a collision, the last joint whose torque crossed its level: the contact is on a
+    body that this joint moves; for a payload, the joint that moves the loaded body; for friction, the drive;
+    for wear, the module whose link to its parent changed.
+    since_ns, detected_ns, reported_ns, until_ns: session time of its beginning, of the first and the last
+    report, and of its end, None as long as it lasts.
+    size, sigma: in `unit`, one standard deviation. gain: reduction of the residual's sum of squares in
+    variances of the noise; `level` is the threshold for it that gives the rate of false alarms asked for. For
+    a collision, the gain is the peak torque over its level.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -1,4 +1,4 @@
-"""Watching a robot that somebody moves: hears feedback, asks for status, holds no lease, moves nothing.
+"""Monitor a robot that another program moves: subscribe to feedback, query status, hold no lease.
 
 The watch itself is `watching.monitor`; here is its place on a network and on a clock, real or virtual.
 """

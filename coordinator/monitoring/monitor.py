@@ -41,7 +41,7 @@ MAX_COLLISION_NS = 1_000_000_000
 MERGED_WITHIN_NS = 2_000_000_000
 # Of a blow, what is not to be taken for a change: before, as the filter looks ahead, and after, as it rings.
 BEFORE_NS, AFTER_NS = 200_000_000, 300_000_000
-# Clocks that are known worse than this set samples of different instants beside each other: at 1 rad/s and
+# With clocks of a larger standard deviation, samples of different instants would be compared: at 1 rad/s and
 # 0.35 m a millisecond is 0.35 mm of a link, and 0.6 % of a torque that swings at 1 Hz.
 WORST_CLOCK_NS = 1e6
 # A change began with a contact, if there was one so shortly before it was first seen.

@@ -54,7 +54,7 @@ class Columns(NamedTuple):
     scale: Array
     preferred: NDArray[np.int64]
 
-    def beside(self, names: Sequence[str], scale: ArrayLike = 1.0) -> "Columns":
+    def append(self, names: Sequence[str], scale: ArrayLike = 1.0) -> "Columns":
         """Return these columns with further ones appended, which are chosen first.
 
         Friction and offsets are to be base parameters by themselves; inertias are lumped instead.
@@ -287,7 +287,7 @@ def joint_frames(chain: Chain) -> Array:
         child = next(iter(chain.children(i)), None)
         normal = None if child is None else _towards(axis, point, chain.axis[child], chain.point[child])
         if normal is None:
-            normal = _beside(axis, point, chain.imu_home[i, :3, 3]) or (_any_normal(axis), point)
+            normal = _normal_towards(axis, point, chain.imu_home[i, :3, 3]) or (_any_normal(axis), point)
         x, origin = normal
         frame[:3, :3] = np.column_stack([x, np.cross(axis, x), axis])
         frame[:3, 3] = origin
@@ -299,15 +299,15 @@ def _towards(axis: Array, point: Array, other: Array, there: Array) -> tuple[Arr
     normal = np.cross(axis, other)
     size = float(np.linalg.norm(normal))
     if size < _PARALLEL_BELOW:
-        return _beside(axis, point, there)
+        return _normal_towards(axis, point, there)
     normal = normal / size
     # point + s axis + h normal = there + t other.
     along, _, apart = np.linalg.solve(np.column_stack([axis, -other, normal]), there - point)
     return (-normal if apart < -_APART_M else normal), point + along * axis
 
 
-def _beside(axis: Array, point: Array, place: Array) -> tuple[Array, Array] | None:
-    """Return the direction from the axis to a place beside it, and the foot; None for a place on the axis."""
+def _normal_towards(axis: Array, point: Array, place: Array) -> tuple[Array, Array] | None:
+    """Return the normal of the axis towards a place, and its foot on the axis; None for a place on it."""
     foot = point + axis * (axis @ (place - point))
     distance = float(np.linalg.norm(place - foot))
     return ((place - foot) / distance, foot) if distance > _APART_M else None

@@ -44,8 +44,8 @@ class InertialFit(NamedTuple):
     identifiable: (p,) parameters known by themselves. without_effect: (p,) those in no identified
         combination. The rest are known only in combination with others.
     residual_rms_nm: (n,) of the torque. torque_sigma_nm: (n,) noise estimated from it (degrees of freedom
-        taken off); without weights a quiet joint's comes out too large beside a noisy one, because the noisy
-        one's errors in the parameters act on it too. samples: (n,) per joint.
+        taken off); without weights a noisy joint's errors of the parameters add to a quiet joint's residual,
+        whose noise then comes out too large. samples: (n,) per joint.
     """
 
     phi: Array

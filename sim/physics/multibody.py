@@ -102,7 +102,8 @@ def _configure(client: int, body: int, skeleton: Skeleton, dt_s: float) -> None:
         pybullet.changeDynamics(
             body, i, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client
         )
-    # The default clamps at 100 rad/s. Its own call: it would turn other arguments beside it to the base.
+    # The default clamps at 100 rad/s. It needs a call of its own: in a common one the other arguments would
+    # be applied to the base.
     pybullet.changeDynamics(body, -1, maxJointVelocity=1e4, physicsClientId=client)
     # Switch the default velocity motors off.
     pybullet.setJointMotorControlArray(

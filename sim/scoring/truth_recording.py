@@ -1,7 +1,7 @@
-"""The truth in the recording of a run whose processes did not know it: added when the run is over.
+"""Add the true robot to the viewer's recording of a run, after the run, as its processes do not know it.
 
-The motion is the true one, at the times that the viewer shows; the robot is drawn from when all joints had
-been explored, so that the identified one beside it is the whole one.
+The motion is the true one, at the times that the viewer shows. The true robot appears when all joints have
+been explored, when the identified robot is complete as well.
 """
 
 from collections.abc import Callable
@@ -37,9 +37,9 @@ class _Shown(NamedTuple):
 
 
 def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None:
-    """Draw the true robot in a run's recording, and in the viewer at an address if it still is there.
+    """Draw the true robot in a run's recording, and in the viewer at an address if that is still reachable.
 
-    What cannot be added is said, and the recording is as it was.
+    A failure is reported by `say`; the recording then stays as it was.
     """
     try:
         recording, result = load_recording(run / SESSION), _result(run)
@@ -77,9 +77,9 @@ def _motion(recording: Recording, motion: Motion) -> _Shown:
     serial = next(s for s in motion.serials if recording.modules[s].round_trips)
     clock = map_clocks({serial: recording.modules[serial].round_trips})[serial]
     session_ns = clock.to_session(motion.clock_ns[:, motion.serials.index(serial)])
-    kept = np.flatnonzero((session_ns >= explored[-1]) & (session_ns <= recording.journal[-1].t_ns))
-    if not kept.size:
+    shown = np.flatnonzero((session_ns >= explored[-1]) & (session_ns <= recording.journal[-1].t_ns))
+    if not shown.size:
         raise DataError("the true motion ends before the exploration")
     step = max(1, round(PERIOD_NS / float(np.median(np.diff(session_ns)))))
-    rows = kept[::step]
+    rows = shown[::step]
     return _Shown(motion.serials, session_ns[rows] - begun[-1], motion.q_rad[rows])

@@ -11,8 +11,8 @@ The chain of a chip, in order:
 A chip saturates before its low-pass; here a blow that the filter spreads out is clipped less than there.
 1 is constant and linear and 2 treats all axes alike, so they commute: the filter runs every tick on the true
 values, the rest once per reading. The stamp is the sampling instant. The low-pass delays slow motion by
-sqrt(2) / (2 pi f), 2.4 ms at 92 Hz, and no stamp makes up for that, as on the real module: whoever compares
-IMU and encoder meets it as a delay of the IMU.
+sqrt(2) / (2 pi f), 2.4 ms at 92 Hz. As on the real module the stamp does not include this delay: against the
+encoder the IMU appears late by as much.
 """
 
 from collections.abc import Sequence

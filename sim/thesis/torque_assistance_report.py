@@ -212,9 +212,9 @@ def _panel(axes: Any, one: Combination) -> None:
         f"{1e3 * each.rms_error_rad:.1f}" + ("*" if each.unstable else "") for each in one.follows
     )
     number = _FIGURES.get((case.alignment or "", case.gains.name))
-    beside = f"figure {number}" if number is not None else "no figure"
+    figure = f"figure {number}" if number is not None else "no figure"
     axes.set_title(
-        f"{case.alignment}, strategy {case.gains.strategy}, {case.gains.name} ({beside})\n"
+        f"{case.alignment}, strategy {case.gains.strategy}, {case.gains.name} ({figure})\n"
         f"{case.motion}, rms error {rms} mrad",
         fontsize=9,
     )

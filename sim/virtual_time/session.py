@@ -33,7 +33,7 @@ def record_session(
 ) -> Recording:
     """Run one session from discovery to its end and return what the coordinator has recorded of it.
 
-    `at_end` is handed the robot when the session is over, for whoever compares it with the truth.
+    `at_end` is called with the robot when the session is over, to compare the recording with the truth.
 
     Raises:
         what `coordinator.session.session` raises: no module found, an unfit link, a module lost, a motion
@@ -78,7 +78,7 @@ async def _to_end(session: Session, messenger: Messenger, robot: VirtualRobot) -
 
 
 class _Keeper:
-    """Keeps what is recorded; nobody watches the session."""
+    """Records the session in memory; progress and estimates are not displayed."""
 
     def __init__(self, plan: Plan) -> None:
         self.recording = Recording()
@@ -95,13 +95,13 @@ class _Keeper:
         self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
 
     def step(self, index: int, total: int, text: str) -> None:
-        """Nobody watches."""
+        """Ignore the progress."""
 
     def note(self, text: str) -> None:
-        """Nobody reads."""
+        """Ignore the note."""
 
     def estimates(self, joint: str) -> None:
-        """Nothing is drawn."""
+        """Draw nothing."""
 
     async def doubts(self) -> tuple[NextMotion, ...]:
         """Look for doubts about the topology, as a run does."""

@@ -90,7 +90,7 @@ class Inertia(NamedTuple):
     instrumental: parameters, terms and information with the best motion source, `motion_source`.
     noise_nm: (n,) torque residual with every motion source. effects: (k_i, j) of every joint: the effects of
     errors of the torques' scale, of the chain, and of offsets on its rows of `instrumental.information`.
-    gathered: by whom the information from encoders was gathered, None if no agent can have been asked.
+    gathered: the modules' agents' information from encoders, None if no agent was asked.
     """
 
     instrumental: InstrumentalFit

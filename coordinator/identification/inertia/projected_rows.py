@@ -40,11 +40,11 @@ class ProjectedRows:
         """Return the information in p + k columns, of the torques less the departures."""
         r, z = self._gathered.r, self._gathered.z
         effects = np.zeros((r.shape[1], 0)) if self._effects is None else self._effects
-        beside = self._projected(np.column_stack([self._departure, effects]))
-        left = z - beside[:, 0]
+        appended = self._projected(np.column_stack([self._departure, effects]))
+        left = z - appended[:, 0]
         size = float(z @ z) + self._gathered.rest + self._shared
         return self._gathered._replace(
-            r=np.hstack([r, beside[:, 1:]]), z=left, rest=max(size - float(left @ left), 0.0)
+            r=np.hstack([r, appended[:, 1:]]), z=left, rest=max(size - float(left @ left), 0.0)
         )
 
     def _projected(self, products: Array) -> Array:

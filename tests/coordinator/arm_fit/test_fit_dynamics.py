@@ -147,7 +147,7 @@ def test_terms_left_out_are_left_out_of_everything(recording: Any) -> None:
 
 def test_instruments_find_the_inertia_that_a_noisy_encoder_hides(recording: Any) -> None:
     robot = read_urdf(recording.urdf)
-    # 0.1 mrad is an encoder of 14 bits; the cut-off is far above the motion, which nobody knows beforehand.
+    # 0.1 mrad is an encoder of 14 bits; the cut-off is far above the motion, which is not known beforehand.
     shaken = recording.q_rad + 1e-4 * default_rng(5).normal(size=recording.q_rad.shape)
     log, cutoff_hz = JointLog(RATE_HZ, shaken, None, recording.tau_nm, False), 60.0
     one, again = (filtered_log(half, cutoff_hz) for half in in_two(log))
@@ -236,7 +236,7 @@ def test_a_joint_that_never_moves_is_named(recording: Any) -> None:
 
 def test_the_staubli_tx40_is_predicted_within_the_best_known_errors() -> None:
     if not TX40.is_dir():
-        pytest.skip("the data of the Staubli TX40 is not beside the project")
+        pytest.skip("the data of the Staubli TX40 is not next to the project")
     found = report(TX40 / "tx40.urdf", TX40 / "motion.npz", ModelChoice(coupled=((4, 5),)))
     # What weighted least squares with the same terms reaches elsewhere: 12.3 % of all samples, 7.9 % masked.
     for tried_on in ("first half", "second half", "both"):

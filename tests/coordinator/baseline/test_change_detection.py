@@ -181,7 +181,7 @@ def test_it_is_the_generalised_least_squares_estimate(draw: Draw) -> None:
 def test_what_neither_session_sees_is_named_and_left_at_zero(draw: Draw) -> None:
     chain = _true(ARM)
     lost = np.zeros((36, 1))
-    # A displacement of all beyond A-6 along one direction of its IMU: nobody sees it.
+    # A displacement of all beyond A-6 along one direction of its IMU: not observable.
     lost[30:, 0] = adjoint(chain.imu_home[5]) @ np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     lost /= np.linalg.norm(lost)
     twist = np.array([0.0, 0.0, 0.0, 2e-3, 2e-3, 0.0])

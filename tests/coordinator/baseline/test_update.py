@@ -1,4 +1,4 @@
-"""A known robot brought up to date: what is kept stays as it was, what is other comes from the session."""
+"""A known robot brought up to date: what is kept stays as it was, what changed comes from the session."""
 
 from collections.abc import Mapping
 from functools import cache

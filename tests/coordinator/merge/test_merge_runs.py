@@ -57,7 +57,7 @@ def assembled(rng: Generator, order: tuple[int, ...] = (0, 1, 2)) -> Chain:
 
 
 class Errors(NamedTuple):
-    """What a run errs by beside noise.
+    """A run's systematic errors.
 
     off: (18,) by how much the chain that it takes is off. spread: (18, 18) of such errors.
     scale: (3,) of every module's torque sensor, which shows 1 / (1 + scale) of the torque. taken: (n,) what

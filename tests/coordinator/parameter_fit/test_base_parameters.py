@@ -194,7 +194,7 @@ def test_friction_beside_inertia_stays_a_parameter_of_its_own(rng: Generator) ->
     signals = motion(rng, 200, 2)
     y = torque_regressor(chain, *signals).reshape(-1, 20)
     viscous = (signals[1][:, :, None] * np.eye(2)).reshape(-1, 2)
-    columns = inertial_columns(2).beside(["viscous 1", "viscous 2"])
+    columns = inertial_columns(2).append(["viscous 1", "viscous 2"])
     truth = np.concatenate([bodies(rng, 2), [0.3, 0.7]])
     rows = np.hstack([y, viscous])
     found = base_parameters(rows, rows @ truth, columns)

@@ -1,4 +1,4 @@
-"""What torque readings hold beside the bodies' torque is found, and nothing else is taken for it."""
+"""Terms of the torque readings other than the bodies' torque are identified exactly where they are."""
 
 import numpy as np
 import pytest

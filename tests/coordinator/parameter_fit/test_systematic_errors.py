@@ -125,7 +125,7 @@ def test_what_a_chain_does_hardly_depends_on_how_bodies_are_split_into_parts(rng
 
 
 def rows_of(chain_moved: Array, spread: Array, rng: Generator) -> tuple[list[JointInformation], list[Array]]:
-    """Rows by a chain that is wrong, beside what its errors do."""
+    """Rows by a chain with errors, and the effects of these errors."""
     moved = motion(np.random.default_rng(5))
     wrong = apply_perturbation(CHAIN, chain_moved)
     regressor = torque_regressor(wrong, *moved[1:4])

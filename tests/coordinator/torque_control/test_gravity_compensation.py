@@ -227,7 +227,7 @@ def test_a_pose_that_is_too_heavy_for_the_joint_is_held_at_what_it_can_bear() ->
 
 
 def test_held_before_it_is_free_it_keeps_its_full_grip_and_bears_what_it_bore() -> None:
-    # What it bears is 0.3 Nm more than what is known, of which half is let go half way.
+    # The measured torque is 0.3 Nm above the model's; half of the difference is released half way.
     borne = LEVEL_NM - 0.3
     it = compensator()
     it.step(10.0, reading(effort=borne))

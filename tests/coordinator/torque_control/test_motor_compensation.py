@@ -1,4 +1,4 @@
-"""What a motor takes beside its spring's torque, held against the simulated motor with its own equations."""
+"""The motor compensation, compared with the simulated motor, which has equations of its own."""
 
 import numpy as np
 import pytest

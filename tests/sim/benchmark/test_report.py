@@ -85,7 +85,7 @@ def test_rows_with_a_bar_are_drawn(tmp_path: Path, suffix: str) -> None:
 def test_the_picture_shows_every_case_under_its_figure(tmp_path: Path) -> None:
     path = tmp_path / "found.svg"
     plot(ROWS, path)
-    # Letters are drawn as paths; the text stands beside each as a comment.
+    # Letters are drawn as paths, each with its text as a comment.
     text = path.read_text()
     for words in ("length [mm]", "runs without the right topology", "tall post", "all cases"):
         assert f"<!-- {words} -->" in text

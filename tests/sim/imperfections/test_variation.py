@@ -25,10 +25,10 @@ def test_modules_differ_by_the_profiles_spreads() -> None:
     assert abs(np.corrcoef(np.log(found.motor), np.log(found.resistance))[0, 1]) < 0.17
 
 
-def test_a_module_keeps_its_character_whoever_stands_beside_it_and_another_seed_gives_another() -> None:
+def test_a_modules_variation_depends_on_the_seed_and_its_serial_alone() -> None:
     profile = noise_profile("x5")
-    alone, beside = draw_variation(5, ["b"], profile), draw_variation(5, ["a", "b"], profile)
-    for one, two in zip(alone, beside, strict=True):
+    alone, with_another = draw_variation(5, ["b"], profile), draw_variation(5, ["a", "b"], profile)
+    for one, two in zip(alone, with_another, strict=True):
         assert one[0] == two[1]
     assert draw_variation(6, ["b"], profile).friction[0] != alone.friction[0]
 

@@ -276,7 +276,7 @@ class Bell:
         return omega, np.einsum("ji,j,ji->i", shapes, damping, shapes) / (2.0 * omega), shapes, mass
 
     def struck(self, shape: Array, ticks: int) -> Array:
-        """The joints' motion (ticks, m) about rest after being let go from a little along the shape."""
+        """The joints' motion (ticks, m) about rest after a release from a little along the shape."""
         actuators = Actuators(self.types, TICK_S, STUCK, skeleton=self.skeleton)
         actuators.reset(self.start_rad, self.load)
         body = Multibody("bell", self.skeleton, TICK_S)

@@ -297,7 +297,7 @@ def test_a_truth_that_ends_before_the_held_out_motion_is_named(tmp_path: Path) -
 
 
 def test_two_roots_in_another_order_are_the_same_robot(tmp_path: Path) -> None:
-    # A second robot beside the first: the result begins at the other root, so its root frame is another one.
+    # A second robot next to the first: the result begins at the other root, so its root frame is another one.
     rng = default_rng(4)
     one, two = TRUTH, TRUTH
     offset = np.eye(4)

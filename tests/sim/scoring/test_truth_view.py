@@ -15,7 +15,7 @@ from module_agent.model.perturbation import apply_perturbation
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.gauge_alignment import move_root, reorder
-from sim.scoring.truth_view import beside
+from sim.scoring.truth_view import aligned_truth
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
 
@@ -49,7 +49,7 @@ def test_what_cannot_be_known_is_taken_from_the_estimate(name: str, by: float) -
     truth = true_chain(load_robot(name))
     unresolved = free(truth)
     estimated = moved(truth, unresolved, by)
-    drawn = beside(truth, estimated, unresolved)
+    drawn = aligned_truth(truth, estimated, unresolved)
     np.testing.assert_allclose(drawn.imu_home, estimated.imu_home, atol=1e-6)
     np.testing.assert_allclose(drawn.axis, estimated.axis, atol=1e-6)
 
@@ -59,13 +59,13 @@ def test_an_error_that_can_be_known_stays_in_the_picture() -> None:
     wrong = np.zeros((4, 6))
     wrong[3, 3:] = 0.005 * (truth.imu_home[3, :3, 3] - truth.imu_home[2, :3, 3]) / 0.35
     estimated = moved(apply_perturbation(truth, wrong.ravel()), free(truth), 0.4)
-    drawn = beside(truth, estimated, free(truth))
+    drawn = aligned_truth(truth, estimated, free(truth))
     apart = np.linalg.norm(drawn.imu_home[3, :3, 3] - estimated.imu_home[3, :3, 3])
     # 5 mm, of which the unknown turn and height take up no more than they can.
     assert 0.002 < apart <= 0.0051
 
 
-def test_a_part_of_the_robot_in_its_own_frame_has_the_whole_truth_beside_it() -> None:
+def test_a_part_of_the_robot_in_its_own_frame_has_the_whole_truth_aligned_truth_it() -> None:
     truth = true_chain(load_robot("a2085_04"))
     # From the elbow on, as it is known when only the elbow has moved.
     root = truth.serials.index("elbow")
@@ -82,7 +82,7 @@ def test_a_part_of_the_robot_in_its_own_frame_has_the_whole_truth_beside_it() ->
         imu_home=there.imu_home[kept],
         gravity=there.gravity,
     )
-    drawn = beside(truth, part, ())
+    drawn = aligned_truth(truth, part, ())
     assert drawn.serials == truth.serials
     np.testing.assert_allclose(drawn.imu_home[kept], part.imu_home, atol=1e-9)
 
@@ -92,7 +92,7 @@ def test_the_order_of_the_estimates_modules_does_not_matter() -> None:
     order = ("root", "right-1", "left-1", "left-2", "right-2", "left-3")
     unresolved = free(truth)
     estimated = moved(truth, unresolved, 0.5)
-    one, other = (beside(truth, e, unresolved) for e in (estimated, reorder(estimated, order)))
+    one, other = (aligned_truth(truth, e, unresolved) for e in (estimated, reorder(estimated, order)))
     np.testing.assert_allclose(one.imu_home, other.imu_home, atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The joint regression on the simulated one-joint arm, beside the thesis' estimator and the bound."""
+"""The joint regression on the simulated one-joint arm, against the thesis' estimator and the bound."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_a_tall_base_that_rocks_is_seen_by_the_joints_own_module_and_taken_off()
     assert all(motion.base is not None and motion.base.shakes for motion in observed_motions(windows(trial)))
     found = regress(trial)
     assert found.base_shakes
-    # It rocks by 3 % of the joint's angle: 5 to 10 mm where nobody takes it off (measured).
+    # It rocks by 3 % of the joint's angle: 5 to 10 mm of error unless it is taken off (measured).
     assert found.distance_m == pytest.approx(0.484, abs=1.5e-3)
     blind = regress(without_carrier(trial))
     assert not blind.base_shakes

@@ -63,7 +63,7 @@ def test_a_motor_with_more_friction_turns_slower_under_the_same_duty() -> None:
 
 def test_friction_is_changed_of_modules_that_are_there_and_to_what_it_can_be() -> None:
     world = World(ARM, 0, "ideal")
-    with pytest.raises(ValueError, match="no module nobody"):
-        world.change_friction("nobody", 2.0)
+    with pytest.raises(ValueError, match="no module absent"):
+        world.change_friction("absent", 2.0)
     with pytest.raises(ValueError, match="no friction"):
         world.change_friction(TIP, -1.0)

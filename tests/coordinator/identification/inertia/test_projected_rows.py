@@ -1,4 +1,4 @@
-"""A signal put beside rows that were gathered before is what it would have been as a column of theirs."""
+"""A signal appended to rows that were gathered before gives the same as a column gathered with them."""
 
 import numpy as np
 import pytest
@@ -38,10 +38,10 @@ def fit(rows: Array, target: Array) -> Array:
 def test_estimates_and_what_errors_do_to_them_are_those_of_all_samples(rng: Generator) -> None:
     parts = [stretch(rng, samples) for samples in (60, 45)]
     total = merge_joint(*(gathered(rows, torque) for rows, torque, *_ in parts))
-    beside = ProjectedRows(total)
+    projected = ProjectedRows(total)
     for part in parts:
-        beside.add(*part)
-    found = beside.rows()
+        projected.add(*part)
+    found = projected.rows()
     rows, torque, departure, effects = (np.concatenate(each) for each in zip(*parts, strict=True))
     own, target = found.r[:, :COLUMNS], found.z
     np.testing.assert_allclose(fit(own, target), fit(rows, torque - departure), rtol=1e-8, atol=1e-10)
@@ -54,12 +54,12 @@ def test_estimates_and_what_errors_do_to_them_are_those_of_all_samples(rng: Gene
     assert left @ left + found.rest == pytest.approx(misfit @ misfit, rel=1e-8)
 
 
-def test_with_nothing_beside_them_rows_are_as_they_were(rng: Generator) -> None:
+def test_with_nothing_projected_them_rows_are_as_they_were(rng: Generator) -> None:
     rows, torque, _, effects = stretch(rng, 40)
     before = gathered(rows, torque)
-    beside = ProjectedRows(before)
-    beside.add(rows, torque, np.zeros(40), effects[:, :0])
-    found = beside.rows()
+    projected = ProjectedRows(before)
+    projected.add(rows, torque, np.zeros(40), effects[:, :0])
+    found = projected.rows()
     np.testing.assert_array_equal(found.r, before.r)
     np.testing.assert_array_equal(found.z, before.z)
     assert found.rest == pytest.approx(before.rest, rel=1e-9)

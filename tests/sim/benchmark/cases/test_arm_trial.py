@@ -1,4 +1,4 @@
-"""A trial is a run like any other, kept in memory: the same messages and chain, the thesis' beside it."""
+"""A trial is a run like any other, kept in memory: the same messages and chain, compared with the thesis'."""
 
 from pathlib import Path
 

@@ -197,7 +197,7 @@ def test_shortened_motions_meet_no_bar_of_time_and_one_arm_moves_in_full_all_the
     assert plans[0] == arm_plan("joint", "calibrated")
     assert [plan.imu for plan in plans] == ["calibrated", "uncalibrated"] * 3
     assert all(plan.sine_centre_s < plans[0].sine_centre_s for plan in plans[1:])
-    # Whoever chooses the motions: those are the thesis', shortened.
+    # Whatever motions are chosen: in these cases they are the thesis', shortened.
     quick = kinematic_cases(QUICK_KINEMATICS, seed=0, motions="optimised")
     motions = [c.trials[0].arguments[-1].motions for c in chosen(quick, "joint by joint")]
     assert motions == ["optimised"] + ["standard"] * 5
