@@ -7,6 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -113,6 +114,22 @@ def test_files_named_on_the_pages_exist() -> None:
             r"`((?:module_agent|coordinator|sim|tests)/[a-z_/0-9]+(?:\.[a-z]+)?)`", PAGES[page]
         ):
             assert (ROOT / name).exists(), f"{page} names {name}, which is not there"
+
+
+def test_the_floors_of_the_architecture_are_those_that_the_linter_holds() -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    held = {
+        c["containers"][0]: [re.findall(r"\w+", x) for x in c["layers"]]
+        for c in contracts
+        if "containers" in c
+    }
+    table = PAGES["architecture.md"].partition("| module_agent | coordinator | sim |\n|---|---|---|\n")[2]
+    rows = [
+        [re.findall(r"\w+", cell) for cell in row.split("|")[1:-1]]
+        for row in re.findall(r"^\|.*", table, re.M)
+    ]
+    for column, package in enumerate(("module_agent", "coordinator", "sim")):
+        assert [row[column] for row in rows if row[column]] == held[package][::-1], package
 
 
 def test_the_readme_fits_on_a_first_screen_and_a_bit() -> None:
