@@ -7,7 +7,14 @@ unchanged links form a part.
 from typing import NamedTuple
 
 from coordinator.topology.topology import Topology
-from module_agent.model.chain import BASE
+from module_agent.model.chain import BASE, Chain
+
+
+class Mounting(NamedTuple):
+    """What a module is mounted on, None for the base, and whether the other way round (by its output)."""
+
+    parent: str | None
+    reversed: bool
 
 
 class Difference(NamedTuple):
@@ -37,45 +44,46 @@ class Difference(NamedTuple):
         return lines or ["all modules are mounted as in the baseline"]
 
 
-def difference(baseline: Topology, found: Topology) -> Difference:
-    """Compare two topologies."""
-    before, after = _mounted(baseline), _mounted(found)
+def difference(baseline: Topology | Chain, later: Topology | Chain) -> Difference:
+    """Compare two topologies, or the topologies of two chains; modules are matched by serial."""
+    before, after = mountings(baseline), mountings(later)
     part_of: dict[str, list[str]] = {}
-    for serial in found.serials:
-        parent = after[serial][0]
-        kept = parent is not None and before.get(serial) == after[serial] and parent in before
-        part_of[serial] = part_of[parent] if kept and parent is not None else []
+    for serial in later.serials:
+        parent = after[serial].parent
+        unchanged = parent is not None and before.get(serial) == after[serial] and parent in before
+        part_of[serial] = part_of[parent] if unchanged and parent is not None else []
         part_of[serial].append(serial)
-    parts = tuple(tuple(part_of[s]) for s in found.serials if part_of[s][0] == s)
+    parts = tuple(tuple(part_of[s]) for s in later.serials if part_of[s][0] == s)
     return Difference(
-        new=tuple(s for s in found.serials if s not in before),
+        new=tuple(s for s in later.serials if s not in before),
         removed=tuple(s for s in baseline.serials if s not in after),
-        moved=tuple(s for s in found.serials if s in before and before[s] != after[s]),
+        moved=tuple(s for s in later.serials if s in before and before[s] != after[s]),
         parts=parts,
-        same_root=baseline.serials[0] == found.serials[0],
+        same_root=baseline.serials[0] == later.serials[0],
     )
 
 
-def joints_to_explore(found: Topology, other: Difference) -> tuple[str, ...]:
+def mountings(topology: Topology | Chain) -> dict[str, Mounting]:
+    """Return how every module is mounted, by serial."""
+    names: tuple[str | None, ...] = (*topology.serials, None)
+    return {
+        serial: Mounting(names[parent], backwards)
+        for serial, parent, backwards in zip(
+            topology.serials, topology.parent, topology.reversed, strict=True
+        )
+    }
+
+
+def joints_to_explore(topology: Topology, changes: Difference) -> tuple[str, ...]:
     """Return the joints whose motion determines the changed links.
 
     The joint below a link determines four of its six parameters; the offset along that joint's axis and the
     rotation about it are determined by the next joint towards the base.
     """
-    index = {serial: k for k, serial in enumerate(found.serials)}
+    index = {serial: k for k, serial in enumerate(topology.serials)}
     wanted = set()
-    for part in other.parts:
-        parent = found.parent[index[part[0]]]
+    for part in changes.parts:
+        parent = topology.parent[index[part[0]]]
         if parent != BASE:
-            wanted |= {parent, found.parent[parent]} - {BASE}
-    return tuple(s for s in found.serials if index[s] in wanted)
-
-
-def _mounted(topology: Topology) -> dict[str, tuple[str | None, bool]]:
-    names: tuple[str | None, ...] = (*topology.serials, None)
-    return {
-        serial: (names[parent], backwards)
-        for serial, parent, backwards in zip(
-            topology.serials, topology.parent, topology.reversed, strict=True
-        )
-    }
+            wanted |= {parent, topology.parent[parent]} - {BASE}
+    return tuple(s for s in topology.serials if index[s] in wanted)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.baseline.difference import difference, mountings
 from module_agent.model.chain import Array, Chain
 from sim.scoring.gauge_alignment import align_gauge, move_root, reorder, reorder_basis, tip_error
 
@@ -29,19 +30,19 @@ class LinkErrors(NamedTuple):
 
 def topology_differences(estimated: Chain, truth: Chain) -> list[str]:
     """Say in words where parents or mounting differ, in the order of the truth; empty if all is right."""
-    words = [f"module {s} was not found" for s in truth.serials if s not in estimated.serials]
-    words += [f"module {s} does not exist" for s in estimated.serials if s not in truth.serials]
-    for true_index, serial in enumerate(truth.serials):
-        if serial not in estimated.serials:
-            continue
-        index = estimated.serials.index(serial)
-        is_on, found_on = _parent(truth, true_index), _parent(estimated, index)
-        if is_on != found_on:
-            words.append(f"module {serial} is mounted on {is_on}, the result says on {found_on}")
-        if truth.reversed[true_index] != estimated.reversed[index]:
-            is_so, found_so = _mounting(truth, true_index), _mounting(estimated, index)
-            words.append(f"module {serial} is mounted {is_so}, the result says {found_so}")
-    return words
+    changes, result, actual = difference(estimated, truth), mountings(estimated), mountings(truth)
+    lines = [f"module {s} was not found" for s in changes.new]
+    lines += [f"module {s} does not exist" for s in changes.removed]
+    for serial in changes.moved:
+        is_on, result_on = (mounted[serial].parent or "the base" for mounted in (actual, result))
+        if is_on != result_on:
+            lines.append(f"module {serial} is mounted on {is_on}, the result says on {result_on}")
+        is_so, result_so = (
+            "reversed" if mounted[serial].reversed else "forward" for mounted in (actual, result)
+        )
+        if is_so != result_so:
+            lines.append(f"module {serial} is mounted {is_so}, the result says {result_so}")
+    return lines
 
 
 def link_length_m(chain: Chain, child: int) -> float:
@@ -100,7 +101,3 @@ def _seen(chain: Chain, child: int) -> tuple[Array, Array]:
 
 def _parent(chain: Chain, index: int) -> str:
     return "the base" if chain.parent[index] < 0 else chain.serials[chain.parent[index]]
-
-
-def _mounting(chain: Chain, index: int) -> str:
-    return "reversed" if chain.reversed[index] else "forward"
