@@ -42,7 +42,7 @@ def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = Fa
 def open_search(place: Place, quiet: bool, expect: int | None) -> tuple[Transport, Search]:
     """Join a robot's network to look for its modules; as its hub, wait for the agents to connect."""
     connection = open_connection(place, Terminal(quiet).note)
-    return connection.transport, Search(least_s=AS_HUB_S if connection.is_hub else 0.0, expect=expect)
+    return connection.transport, Search(min_s=AS_HUB_S if connection.is_hub else 0.0, expect=expect)
 
 
 def check_count(robot: str, answering: int, expect: int | None) -> None:

@@ -1,10 +1,12 @@
-"""Looking at a robot without holding it: who is there, and stopping all of them."""
+"""Discovery of the modules of a robot, and the commands that need no lease: list and stop."""
 
+import asyncio
 import queue
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from coordinator.live_robot.messenger import Clock, Messenger
 from module_agent.transport.transport import Event, Liveness, Reply, Transport
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, every, key, parse
@@ -12,51 +14,74 @@ from module_agent.wire.messages import Ack, Ask, Status, Stop
 from module_agent.wire.refusal import WireError
 
 ANSWER_S = 1.0
+POLL_S = 0.02
 
 
 class Search(NamedTuple):
-    """How long to look for modules: until nothing was heard for `quiet_s`, and for `least_s` at least.
+    """How long to wait for modules: until none has come or left for `quiet_s`, at least `min_s`.
 
-    With `expect` the search ends as soon as so many are there.
+    With `expect` the search ends as soon as so many are present.
     """
 
     quiet_s: float = 1.0
-    least_s: float = 0.0
+    min_s: float = 0.0
     expect: int | None = None
 
 
-# Agents without a hub look for one once a second, and each try lasts a second: whoever becomes their hub
-# waits for them.
+# Agents without a hub look for one once a second, and each try lasts a second: a program that becomes their
+# hub waits for them.
 AS_HUB_S = 2.5
 MAX_S = 10.0
 
 
+async def await_modules(
+    messenger: Messenger,
+    clock: Clock,
+    complete: Callable[[frozenset[str], float], bool],
+    timeout_s: float = float("inf"),
+    poll_s: float = POLL_S,
+) -> frozenset[str]:
+    """Wait until `complete(present, quiet_s)`, or until the time is up; return the serials present.
+
+    present: the modules whose liveliness token is on the network. quiet_s: time since one came or left.
+    """
+    start_ns = changed_ns = clock()
+    present = frozenset[str]()
+    while True:
+        if messenger.alive != present:
+            present, changed_ns = frozenset(messenger.alive), clock()
+        now_ns = clock()
+        if complete(present, (now_ns - changed_ns) / 1e9) or now_ns - start_ns >= 1e9 * timeout_s:
+            return present
+        await asyncio.sleep(poll_s)
+
+
 def _present(transport: Transport, robot: str, search: Search) -> list[str]:
     events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-    watch = transport.watch_alive(every(robot, Leaf.ALIVE), events.put)
+    declared = transport.watch_alive(every(robot, Leaf.ALIVE), events.put)
     alive: dict[str, bool] = {}
-    start = heard = time.monotonic()
+    start = changed = time.monotonic()
     while search.expect is None or sum(alive.values()) < search.expect:
-        end = min(max(start + search.least_s, heard + search.quiet_s), start + MAX_S)
+        end = min(max(start + search.min_s, changed + search.quiet_s), start + MAX_S)
         try:
             event = events.get(timeout=max(0.0, end - time.monotonic()))
         except queue.Empty:
             break
         if isinstance(event, Liveness):
             alive[parse(event.key).serial] = event.alive
-            heard = time.monotonic()
-    watch.undeclare()
-    return sorted(serial for serial, here in alive.items() if here)
+            changed = time.monotonic()
+    declared.undeclare()
+    return sorted(serial for serial, present in alive.items() if present)
 
 
 def _ask_all(
-    transport: Transport, robot: str, leaf: Leaf, questions: Sequence[tuple[str, bytes]]
+    transport: Transport, robot: str, leaf: Leaf, requests: Sequence[tuple[str, bytes]]
 ) -> dict[str, bytes]:
     events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-    for tag, (serial, payload) in enumerate(questions):
+    for tag, (serial, payload) in enumerate(requests):
         transport.query(key(robot, serial, leaf), payload, ANSWER_S, events.put, tag)
     answers: dict[str, bytes] = {}
-    for _ in questions:
+    for _ in requests:
         event = events.get(timeout=ANSWER_S + 5.0)
         if isinstance(event, Reply) and event.payload is not None:
             answers[parse(event.key).serial] = event.payload
@@ -64,11 +89,11 @@ def _ask_all(
 
 
 def listed(transport: Transport, robot: str, search: Search) -> tuple[list[Status], list[str]]:
-    """Return the statuses, and the serials that gave no answer to read. Closes the transport."""
+    """Return the statuses, and the serials without a readable answer. Closes the transport."""
     try:
         serials = _present(transport, robot, search)
-        questions = [(s, encode(Ask(serial=s, boot=0, seq=1, sender="list"))) for s in serials]
-        answers = _ask_all(transport, robot, Leaf.STATUS, questions)
+        requests = [(s, encode(Ask(serial=s, boot=0, seq=1, sender="list"))) for s in serials]
+        answers = _ask_all(transport, robot, Leaf.STATUS, requests)
     finally:
         transport.close()
     statuses = [status for s in serials if s in answers if (status := _status(answers[s])) is not None]
@@ -80,17 +105,17 @@ def _status(payload: bytes) -> Status | None:
     try:
         return decode(Status, payload)
     except WireError:
-        return None  # its serial is then among those that gave no answer to read
+        return None  # its serial is then among those without a readable answer
 
 
 def stop_robot(transport: Transport, robot: str, sender: str, search: Search) -> tuple[list[str], list[str]]:
     """Stop every module; return the serials that confirmed and those that did not. Closes the transport."""
     try:
         serials = _present(transport, robot, search)
-        questions = [
+        requests = [
             (s, encode(Stop(serial=s, boot=0, seq=1, sender=sender, why="stop command"))) for s in serials
         ]
-        answers = _ask_all(transport, robot, Leaf.STOP, questions)
+        answers = _ask_all(transport, robot, Leaf.STOP, requests)
         stopped = [s for s in serials if s in answers and _accepted(answers[s])]
         return stopped, [s for s in serials if s not in stopped]
     finally:

@@ -11,6 +11,7 @@ from typing import Protocol
 
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
+from coordinator.live_robot.discovery import await_modules
 from coordinator.live_robot.errors import MotionInterrupted
 from coordinator.live_robot.excluded_modules import ExcludedModules
 from coordinator.live_robot.link_check import check_link
@@ -23,6 +24,7 @@ from coordinator.topology.next_motion import MAX_REPEATS, NextMotion
 from module_agent.model.errors import RobotError
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
+DISCOVERY_POLL_S = 0.05
 # Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
 ESTIMATE_WAIT_S = 0.6
 # A poor network interrupts more than one motion in ten; so many times the plan's retries leave none undone.
@@ -140,15 +142,14 @@ class Session:
 
     async def _discover(self, expect: int | None) -> None:
         self._report("discovering modules")
-        quiet_since, known = self._clock(), frozenset[str]()
-        end = self._clock() + int((self._plan.discover_s + (10.0 if expect else 3.0)) * 1e9)
-        while self._clock() < end:
-            await asyncio.sleep(0.05)
-            if frozenset(self._messenger.alive) != known:
-                known, quiet_since = frozenset(self._messenger.alive), self._clock()
-            settled = self._clock() - quiet_since >= int(self._plan.discover_s * 1e9)
-            if known and settled and (expect is None or len(known) >= expect):
-                break
+        quiet_s, count = self._plan.discover_s, expect or 1
+        known = await await_modules(
+            self._messenger,
+            self._clock,
+            lambda present, settled_s: settled_s >= quiet_s and len(present) >= count,
+            quiet_s + (10.0 if expect else 3.0),
+            DISCOVERY_POLL_S,
+        )
         if not known or (expect is not None and len(known) != expect):
             names = ", ".join(sorted(known)) or "none"
             wanted = "at least one" if expect is None else str(expect)

@@ -317,5 +317,5 @@ def test_a_hub_waits_for_agents_that_try_once_a_second(wire: Any) -> None:
     statuses, _ = listed(late, "arm", QUICK)
     assert statuses == []
     late = Late(wire, ("A",))
-    statuses, _ = listed(late, "arm", Search(quiet_s=0.02, least_s=20.0, expect=1))
+    statuses, _ = listed(late, "arm", Search(quiet_s=0.02, min_s=20.0, expect=1))
     assert [status.serial for status in statuses] == ["A"]
