@@ -29,7 +29,8 @@ from coordinator.description.urdf_writer import write_urdf
 from coordinator.identification.identified import Identified
 from coordinator.identification.result import Result
 from coordinator.live_robot.connection import Place, open_connection, sender_name
-from coordinator.live_robot.messenger import Messenger
+from coordinator.live_robot.discovery import await_modules
+from coordinator.live_robot.messenger import Messenger, Record
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.run_folder import HELD_OUT, RESULT, SESSION
@@ -44,11 +45,14 @@ from module_agent.model.perturbation import apply_perturbation
 from module_agent.signals.clock_map import ClockMap
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.messages import GoTo, Message
+from module_agent.wire.messages import Feedback, GoTo, Message
 from module_agent.wire.refusal import WireError
 
 _STEP = 1e-6
 _NS = 1e-9
+# Ten minutes of feedback at 250 Hz, and of lease renewals. To drop rows copies those that remain, so it is not
+# done before there is a tenth more.
+_RETAINED_ROWS, _RETAINED_TRIPS = 150_000, 10_000
 # Feedback is published whether a module is held or not; a network may lose some.
 _FEEDBACK_S = 3.0
 
@@ -287,7 +291,7 @@ def _described(robot: SavedRun | Identified) -> tuple[Chain, Array | None, Mappi
 
 
 class LiveRobot:
-    """A connected robot: everything that it sends is in `recording`; `group` takes commands.
+    """A connected robot: what it has sent in the last ten minutes is in `recording`; `group` takes commands.
 
     Modules that are not held move for other programs and send their feedback all the same.
     """
@@ -372,16 +376,10 @@ async def connect(
     """
     loop = asyncio.get_running_loop()
     recording = Recording()
-
-    def record(entry: Entry) -> Message | None:
-        try:
-            message = recording.add(entry)
-        except WireError:
-            return None  # counted in `recording.refused`
-        return message if isinstance(message, Message) else None
-
     transport = open_connection(Place(robot, listen, tuple(routers)), lambda text: None).transport
-    messenger = Messenger(transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, record)
+    messenger = Messenger(
+        transport, robot, time.monotonic_ns, loop.call_soon_threadsafe, _recorder(recording)
+    )
     live = LiveRobot(
         messenger, ModuleGroup(messenger, recording, time.monotonic_ns, sender_name()), recording
     )
@@ -395,17 +393,30 @@ async def connect(
         await live.close()
 
 
+def _recorder(recording: Recording, retained_rows: int = _RETAINED_ROWS) -> Record:
+    """Return what adds messages to a recording that retains the newest feedback rows of every module."""
+
+    def record(entry: Entry) -> Message | None:
+        try:
+            message = recording.add(entry)
+        except WireError:
+            return None  # counted in `recording.refused`
+        if isinstance(message, Feedback):
+            module = recording.module(message.serial, message.boot)
+            if module.rows.end_row - module.rows.first_row > 1.1 * retained_rows:
+                module.forget(retained_rows, _RETAINED_TRIPS)
+        return message if isinstance(message, Message) else None
+
+    return record
+
+
 async def _present(messenger: Messenger, robot: str, expect: int | None, timeout_s: float) -> list[str]:
-    end = quiet = time.monotonic()
-    end += timeout_s
-    present: set[str] = set()
-    while time.monotonic() < end:
-        await asyncio.sleep(0.02)
-        if messenger.alive != present:
-            present, quiet = set(messenger.alive), time.monotonic()
-        complete = time.monotonic() - quiet > 1.0 if expect is None else len(present) >= expect
-        if present and complete:
-            return sorted(present)
+    def complete(present: frozenset[str], quiet_s: float) -> bool:
+        return bool(present) and (quiet_s > 1.0 if expect is None else len(present) >= expect)
+
+    present = await await_modules(messenger, time.monotonic_ns, complete, timeout_s)
+    if present and len(present) >= (expect or 1):
+        return sorted(present)
     wanted = "at least one module" if expect is None else f"{expect} modules"
     raise LostError(
         f"{wanted} of robot {robot!r} expected within {timeout_s:g} s, {len(present)} answered: "

@@ -51,4 +51,4 @@ class RowCompletion:
 
     @property
     def _first(self) -> int:
-        return self._log.first_row if self._whole_to is None else self._whole_to
+        return max(self._log.first_row, self._whole_to or 0)

@@ -44,7 +44,7 @@ class ExcludedModules:
             self._leave(serial, f"module {serial} answers, but sends no feedback")
 
     def _mute(self) -> list[str]:
-        return [s for s in self._group.serials if not self._group.module(s).arrivals]
+        return [s for s in self._group.serials if self._group.module(s).feedback_ns is None]
 
     def without(self, error: Refused | MotionInterrupted) -> bool:
         """Leave the module of an error out if it will not move, whatever is tried; False if it might.

@@ -153,11 +153,11 @@ class ModuleGroup:
             record = self.module(serial)
             if record.boot != self._boots[serial]:
                 raise ModuleLost(serial, "it has booted anew")
-            heard = record.arrivals[-1][0] if record.arrivals else now
-            if serial not in self._messenger.alive and now - heard > TOKEN_GONE_NS:
+            silent_ns = 0 if record.feedback_ns is None else now - record.feedback_ns
+            if serial not in self._messenger.alive and silent_ns > TOKEN_GONE_NS:
                 raise ModuleLost(serial, "its agent has left the network")
-            if record.arrivals and now - heard > SILENT_NS:
-                raise ModuleLost(serial, f"no feedback for {(now - heard) / 1e9:.1f} s")
+            if silent_ns > SILENT_NS:
+                raise ModuleLost(serial, f"no feedback for {silent_ns / 1e9:.1f} s")
             if serial in self._taken_by:
                 raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
             status = record.status

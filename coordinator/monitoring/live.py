@@ -77,9 +77,7 @@ class LiveMonitor:
         for serial in self._serials:
             record = self.recording.modules.get(serial)
             if record is not None:
-                record.rows.forget_before(record.rows.end_row - RETAINED_ROWS)
-                del record.arrivals[:-1]
-                del record.round_trips[:-MAX_TRIPS]
+                record.forget(RETAINED_ROWS, MAX_TRIPS)
         for found in self.recording.estimates.values():
             found.clear()
 

@@ -46,7 +46,12 @@ class RoundTrip(NamedTuple):
 
 
 class ModuleRecord:
-    """What is known of one boot of one module."""
+    """What is known of one boot of one module; times in nanoseconds.
+
+    newest_ns: latest module time in any message. feedback_ns: session time at which feedback was published
+    last, None before the first. newest_row_ns, newest_row_arrival_ns: module time of the newest published
+    row, and session time at which it first arrived; messages that come late or twice do not change them.
+    """
 
     def __init__(self, serial: str, boot: int):
         self.serial = serial
@@ -57,17 +62,30 @@ class ModuleRecord:
         self.round_trips: list[RoundTrip] = []
         self.settled_trips: int | None = None
         self.information: dict[bytes, dict[int, Information]] = {}
-        self.arrivals: list[tuple[int, int]] = []
         self.newest_ns = 0
+        self.feedback_ns: int | None = None
+        self.newest_row_ns = -1
+        self.newest_row_arrival_ns = 0
 
     @property
     def trips(self) -> list[RoundTrip]:
         """The round trips that clocks are mapped by: all, until it is settled what is known."""
         return self.round_trips[: self.settled_trips]
 
-    def see(self, t_ns: int) -> None:
-        """Note a module time that was heard."""
+    def note_time(self, t_ns: int) -> None:
+        """Note a module time that was received."""
         self.newest_ns = max(self.newest_ns, t_ns)
+
+    def note_feedback(self, session_ns: int, row_ns: int) -> None:
+        """Note that feedback was published whose newest row has this module time."""
+        self.feedback_ns = session_ns
+        if row_ns > self.newest_row_ns:
+            self.newest_row_ns, self.newest_row_arrival_ns = row_ns, session_ns
+
+    def forget(self, rows: int, round_trips: int) -> None:
+        """Drop all but the newest rows and round trips, for sessions that go on for long."""
+        self.rows.forget_before(self.rows.end_row - rows)
+        del self.round_trips[: max(0, len(self.round_trips) - round_trips)]
 
 
 class Recording:
@@ -141,19 +159,19 @@ class Recording:
                 rows = module.rows.add(message)
                 if len(rows):
                     newest = int(rows["t_ns"][-1])
-                    module.see(newest)
+                    module.note_time(newest)
                     if entry.kind == "publication":
-                        module.arrivals.append((entry.t_ns, newest))
+                        module.note_feedback(entry.t_ns, newest)
             case Status():
                 module.status = message
-                module.see(message.t_ns)
+                module.note_time(message.t_ns)
                 self._note_round_trip(module, entry, message.re, message.t_ns)
             case Ack():
-                module.see(message.t_ns)
+                module.note_time(message.t_ns)
                 self._note_round_trip(module, entry, message.re, message.t_ns)
             case Info():
                 module.info = message
-                module.see(message.t_ns)
+                module.note_time(message.t_ns)
             case Estimate():
                 found = self.estimates.setdefault((message.joint, message.serial), {})
                 found[message.motion_ids] = message

@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.live_robot.discovery import await_modules
 from coordinator.live_robot.messenger import Clock, Messenger
-from coordinator.live_robot.module_group import POLL_S, ModuleGroup
+from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.torque_control.gravity_model import GravityModel
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import RobotError
@@ -43,7 +44,11 @@ async def find_robot(group: ModuleGroup, messenger: Messenger, model: GravityMod
         RobotMismatch: a module is missing, has another type, sends no feedback, or is not in the model.
     """
     known = set(model.chain.serials)
-    await _gathered(messenger, known, clock)
+    await await_modules(
+        messenger,
+        clock,
+        lambda present, quiet_s: known <= present or quiet_s >= (QUIET_S if present else DISCOVER_S),
+    )
     if missing := sorted(known - messenger.alive):
         there = ", ".join(sorted(messenger.alive)) or "none"
         raise RobotMismatch(
@@ -62,15 +67,6 @@ async def find_robot(group: ModuleGroup, messenger: Messenger, model: GravityMod
             raise RobotMismatch(f"module {serial} is of type {reported}, in the model it is {kind}")
     if not await group.wait(lambda: not _without_feedback(group), FEEDBACK_S):
         raise RobotMismatch(f"module {_without_feedback(group)[0]} answers, but sends no feedback")
-
-
-async def _gathered(messenger: Messenger, known: set[str], clock: Clock) -> None:
-    """Wait until all modules are there, or no more appear."""
-    present, end_ns = set(messenger.alive), clock() + int((QUIET_S if messenger.alive else DISCOVER_S) * 1e9)
-    while not known <= messenger.alive and clock() < end_ns:
-        await asyncio.sleep(POLL_S)
-        if messenger.alive != present:
-            present, end_ns = set(messenger.alive), clock() + int(QUIET_S * 1e9)
 
 
 def check_gravity(chain: Chain, rest: RestReading) -> None:
@@ -93,4 +89,4 @@ def check_gravity(chain: Chain, rest: RestReading) -> None:
 
 
 def _without_feedback(group: ModuleGroup) -> list[str]:
-    return [serial for serial in group.serials if not group.module(serial).arrivals]
+    return [serial for serial in group.serials if group.module(serial).feedback_ns is None]

@@ -5,7 +5,7 @@ their motors off when the lifetime of their commands is over.
 """
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -324,16 +324,12 @@ class CompensationSession:
     def _reading(self, count: int = 1) -> Reading:
         """Return the mean of the newest `count` rows of each module."""
         now_ns = self._clock()
-        ages = [1e-9 * (now_ns - self._received_ns(serial)) for serial in self._serials]
+        ages = [
+            1e-9 * (now_ns - self._group.module(serial).newest_row_arrival_ns) for serial in self._serials
+        ]
         rows = [self._newest(serial, count) for serial in self._serials]
         means = ([row[name].mean(dtype=float) for row in rows] for name in _READ)
         return Reading(np.array(ages), *(np.array(values) for values in means))
-
-    def _received_ns(self, serial: str) -> int:
-        """Return when the newest row of a module first arrived; later arrivals are dropped."""
-        arrivals = self._group.module(serial).arrivals
-        arrivals[:] = [first_of_newest(arrivals)]
-        return arrivals[0][0]
 
     def _rest_reading(self) -> RestReading:
         rows = [self._newest(serial, _REST_ROWS) for serial in self._serials]
@@ -344,17 +340,7 @@ class CompensationSession:
 
     def _forget(self) -> None:
         for serial in self._serials:
-            record = self._group.module(serial)
-            record.rows.forget_before(record.rows.end_row - _RETAINED_ROWS)
-            record.round_trips.clear()
-
-
-def first_of_newest(arrivals: Sequence[tuple[int, int]]) -> tuple[int, int]:
-    """Return the first arrival, (session time, newest module time) [ns], of the newest module time.
-
-    Messages that overtake one another, or arrive twice, do not count.
-    """
-    return min(arrivals, key=lambda one: (-one[1], one[0]))
+            self._group.module(serial).forget(_RETAINED_ROWS, 0)
 
 
 async def _cancelled(task: "asyncio.Task[None]") -> None:

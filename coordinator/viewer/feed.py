@@ -164,7 +164,7 @@ class ViewerFeed:
             return
         self._network_ns[status.serial] = entry.t_ns
         trip = record.round_trips[-1]
-        age_ns = entry.t_ns - record.arrivals[-1][0] if record.arrivals else 0
+        age_ns = 0 if record.feedback_ns is None else entry.t_ns - record.feedback_ns
         refused = sum(status.refusals.values())
         round_trip_ms = (trip.received_ns - trip.sent_ns) / 1e6
         self._viewer.network(

@@ -134,7 +134,36 @@ def test_only_published_rows_tell_when_a_module_was_heard_last(
 ) -> None:
     heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=10), t_ns=1000))
     heard.add(wire.reply(Leaf.HISTORY, wire.feedback(first=0), t_ns=2000))
-    assert heard.modules["A"].arrivals == [(1000, 14 * 4_000_000)]
+    module = heard.modules["A"]
+    assert (module.feedback_ns, module.newest_row_ns, module.newest_row_arrival_ns) == (
+        1000,
+        56_000_000,
+        1000,
+    )
+
+
+def test_late_and_repeated_feedback_does_not_change_when_the_newest_row_arrived(
+    heard: Recording, wire: SimpleNamespace
+) -> None:
+    # Session times and first rows: the third message was overtaken, the fourth is the second again.
+    for t_ns, first in ((100, 0), (105, 10), (110, 5), (115, 10)):
+        heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first), t_ns=t_ns))
+    module = heard.modules["A"]
+    assert (module.feedback_ns, module.newest_row_arrival_ns) == (115, 105)
+    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=20), t_ns=120))
+    assert module.newest_row_arrival_ns == 120
+
+
+def test_forgetting_retains_the_newest_rows_and_round_trips(heard: Recording, wire: SimpleNamespace) -> None:
+    for first in range(0, 100, 5):
+        heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first)))
+    module = heard.modules["A"]
+    module.round_trips.extend(RoundTrip(t, t + 2, t + 1) for t in range(6))
+    module.forget(rows=10, round_trips=2)
+    assert (module.rows.first_row, module.rows.end_row) == (90, 100)
+    assert [trip.sent_ns for trip in module.round_trips] == [4, 5]
+    module.forget(rows=10, round_trips=0)
+    assert module.round_trips == []
 
 
 def test_estimates_are_found_by_joint_observer_and_motion(heard: Recording, wire: SimpleNamespace) -> None:

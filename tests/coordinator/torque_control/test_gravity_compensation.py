@@ -22,7 +22,6 @@ from coordinator.torque_control.gravity_compensation import (
     Targets,
 )
 from coordinator.torque_control.gravity_model import GravityModel
-from coordinator.torque_control.session import first_of_newest
 from module_agent.control.gains import catalogue_limits
 from module_agent.model.catalogue import CATALOGUE
 from module_agent.model.chain import Chain
@@ -429,12 +428,3 @@ def test_a_damping_that_no_module_can_give_makes_no_gains(damping: float) -> Non
     with pytest.raises(UsageError, match=r"module type X5-4 takes 0 to 1\.2 Nm s/rad"):
         compensation_gains(X5_4, damping)
     assert compensation_gains(X5_4, max_damping_nm_s_rad(X5_4)).velocity.kp == pytest.approx(1.2)
-
-
-# --------------------------------------------------------------------------- what is newest
-
-
-def test_messages_that_overtake_one_another_or_come_twice_make_nothing_newer() -> None:
-    # Session time and newest module time: the third is a straggler, the fourth came before.
-    assert first_of_newest([(100, 10), (105, 20), (110, 15), (115, 20)]) == (105, 20)
-    assert first_of_newest([(100, 10), (105, 20), (110, 30)]) == (110, 30)

@@ -67,7 +67,7 @@ def test_the_known_robot_is_found_and_met(rigs: Callable[..., Any]) -> None:
     messenger, recording, group = rig.group()
     rig.run(find_robot(group, messenger, known(), lambda: rig.loop.now_ns))
     assert group.serials == ("X-00009", "X-00010")
-    assert all(recording.modules[serial].arrivals for serial in group.serials)
+    assert all(recording.modules[serial].feedback_ns is not None for serial in group.serials)
 
 
 def test_a_module_that_is_missing_of_another_type_or_no_part_of_it_is_named(
