@@ -50,8 +50,8 @@ from module_agent.wire.refusal import WireError
 
 _STEP = 1e-6
 _NS = 1e-9
-# Ten minutes of feedback at 250 Hz, and of lease renewals. To drop rows copies those that remain, so it is not
-# done before there is a tenth more.
+# Ten minutes of feedback at 250 Hz, and of lease renewals.
+# Dropping copies the rows that remain, so it is done when there is a tenth more.
 _RETAINED_ROWS, _RETAINED_TRIPS = 150_000, 10_000
 # Feedback is published whether a module is held or not; a network may lose some.
 _FEEDBACK_S = 3.0
