@@ -1,4 +1,4 @@
-"""Whole recordings from a network that drops: a module's feedback rows that are missing are asked for."""
+"""Complete recordings over a network that loses messages: missing feedback rows are requested again."""
 
 from collections.abc import Callable, Coroutine
 
@@ -13,42 +13,42 @@ Fetch = Callable[[int, int], Coroutine[None, None, None]]
 
 
 class RowCompletion:
-    """Keeps one module's log of rows whole from its first row on, by `fetch(first, end)`."""
+    """Completes one module's log of rows, from its first row on, by `fetch(first, end)`."""
 
     def __init__(self, log: RowLog, fetch: Fetch):
         self._log = log
         self._fetch = fetch
         self._met_row = log.end_row
-        self._whole_to: int | None = None
+        self._complete_to: int | None = None
 
     def has_gap(self, end: int) -> bool:
         """Return whether a row before `end` is missing."""
         return bool(self._log.missing(self._first, end))
 
     async def complete(self, end: int) -> None:
-        """Fetch what is missing before row `end`.
+        """Fetch the rows missing before row `end`.
 
-        After `ROUNDS` it is given up until the next time; what is missing still counts as missing.
+        After `ROUNDS` rounds it returns; rows still missing are requested by the next call.
 
         Raises:
-            Refused: rows since the module was met are kept no longer.
+            Refused: the module no longer has rows that it sent since the session began.
             NoAnswer: it does not answer.
         """
         first = self._first
         for _ in range(ROUNDS):
             missing = self._log.missing(first, end)
             if not missing:
-                self._whole_to = end
+                self._complete_to = end
                 return
             try:
-                await gather_all(self._fetch(*hole) for hole in missing[:HOLES_AT_ONCE])
+                await gather_all(self._fetch(*gap) for gap in missing[:HOLES_AT_ONCE])
             except Refused as refused:
-                # What passed while nobody listened, between a crash and its resumption, may be forgotten by
-                # now; steps that are done had all their rows before.
+                # The module may no longer have the rows of the time between a crash and the resumption; the
+                # steps that are done had all their rows before.
                 if refused.ack.reason != Refusal.GONE.value or missing[0][0] >= self._met_row:
                     raise
                 first = missing[0][1]
 
     @property
     def _first(self) -> int:
-        return max(self._log.first_row, self._whole_to or 0)
+        return max(self._log.first_row, self._complete_to or 0)

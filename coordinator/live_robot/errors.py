@@ -1,14 +1,14 @@
-"""How the hold on a robot is not to be had, or lost in the middle of a session; each names the module."""
+"""Errors of the connection to a robot, before and during a session; the messages name the module."""
 
 from module_agent.model.errors import LostError, RobotError
 
 
 class UnfitLink(RobotError):
-    """The network cannot carry a session; nothing has moved. The message says what was measured."""
+    """The network is too slow for a session; nothing has moved. The message gives the measurement."""
 
 
 class ModuleLost(LostError):
-    """A module left in the middle of the session; `serial` says which."""
+    """The module `serial` was lost during the session."""
 
     def __init__(self, serial: str, why: str):
         super().__init__(f"module {serial} is lost: {why}")
@@ -16,7 +16,7 @@ class ModuleLost(LostError):
 
 
 class RobotStopped(RobotError):
-    """Somebody said stop in the middle of the session; a program does not overrule that."""
+    """A stop command came during the session; the session does not override it."""
 
     def __init__(self, serial: str, note: str):
         super().__init__(f"module {serial} was {note}")
@@ -24,7 +24,7 @@ class RobotStopped(RobotError):
 
 
 class MotionInterrupted(RobotError):
-    """A motion ended before its end; it can be tried again after re-arming."""
+    """A motion did not complete; it can be tried again after re-arming."""
 
     def __init__(self, serial: str, outcome: str):
         super().__init__(f"the motion of module {serial} was {outcome}")

@@ -1,4 +1,4 @@
-"""Whether the network to a robot can carry a session: measured before anything moves."""
+"""Check of the network to a robot before anything moves: feedback rates and round trips of all modules."""
 
 import asyncio
 from collections.abc import Callable
@@ -9,11 +9,11 @@ from coordinator.live_robot.errors import UnfitLink
 from coordinator.live_robot.messenger import Clock, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
 
-# Of the round trips so many must take at most half a command's life: the keep-alives between them, several to
-# a life, bridge the rest.
+# This share of the round trips must take at most half a command's lifetime: the keep-alives in between,
+# several per lifetime, bridge the rest.
 FIT_FRACTION = 0.8
-# Looks, each as long as the plan says: a second of a poor network may be its worst.
-LOOKS = 3
+# Measurements at most, each as long as the plan says: a poor network may be worst during one of them.
+MAX_MEASUREMENTS = 3
 BETWEEN_S = 0.03
 
 
@@ -21,13 +21,13 @@ async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Cal
     """Measure rates and round trips of all modules and note them.
 
     Raises:
-        UnfitLink: a module's feedback does not come through, or commands would be too old on arrival; said
-        after as many looks as `LOOKS`.
+        UnfitLink: after `MAX_MEASUREMENTS`, feedback of a module is lost, or commands would be too old on
+            arrival.
     """
     before = {serial: group.module(serial).rows.end_row for serial in group.serials}
     start_ns = clock()
-    for look in range(1, LOOKS + 1):
-        end_ns = start_ns + look * int(seconds * 1e9)
+    for number in range(1, MAX_MEASUREMENTS + 1):
+        end_ns = start_ns + number * int(seconds * 1e9)
         await gather_all(_ask_until(group, serial, clock, end_ns) for serial in group.serials)
         span_s = (clock() - start_ns) / 1e9
         rates = {s: (group.module(s).rows.end_row - before[s]) / span_s for s in group.serials}
@@ -35,7 +35,7 @@ async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Cal
         if not faults:
             break
     for serial in group.serials:
-        note(_words(group, serial, rates[serial]))
+        note(_summary(group, serial, rates[serial]))
     if faults:
         raise UnfitLink(faults[0])
 
@@ -50,7 +50,7 @@ def _trips_ms(group: ModuleGroup, serial: str) -> list[float]:
     return [(trip.received_ns - trip.sent_ns) / 1e6 for trip in group.module(serial).round_trips]
 
 
-def _words(group: ModuleGroup, serial: str, rate: float) -> str:
+def _summary(group: ModuleGroup, serial: str, rate: float) -> str:
     median, most = (float(np.percentile(_trips_ms(group, serial), share)) for share in (50, 95))
     kind = group.info(serial).module_type
     return f"{serial} ({kind}): {rate:.0f} rows/s, round trip {median:.2f} ms, 95 % {most:.2f} ms"

@@ -1,8 +1,6 @@
-"""The coordinator's clock: an argument, so that the same code runs in real and in virtual time.
+"""The coordinator's asyncio interface to a transport: publications, requests and replies, all recorded.
 
-The coordinator's asyncio face of a transport; all that is heard and said passes through `record`.
-
-Several things done at once, all to their end.
+Clock and event loop are arguments, so that the same code runs in real and in virtual time.
 """
 
 import asyncio
@@ -43,9 +41,10 @@ class Refused(RobotError):
 
 
 class Messenger:
-    """Publishes, asks and listens for the coordinator.
+    """Publishes, sends requests and receives for the coordinator; every message passes through `record`.
 
-    `post` runs a function on the event loop from any thread (`call_soon_threadsafe` in real time).
+    `alive`: serials of the modules on the network. `post` runs a function on the event loop from any thread
+    (`call_soon_threadsafe` in real time).
     """
 
     def __init__(self, transport: Transport, robot: str, clock: Clock, post: Post, record: Record):
@@ -87,16 +86,16 @@ class Messenger:
 
     def _drain(self) -> None:
         self._draining = False
-        # A few at a time: after a stall the keep-alives that are due must not wait for all that has piled up.
+        # A few at a time: after a stall the keep-alives that are due must not wait for the whole inbox.
         for event in self._inbox.drain(limit=32):
-            self._hear(event)
+            self._handle(event)
         if len(self._inbox) and not self._draining:
             self._draining = True
             self._post(self._drain)
 
-    def _hear(self, event: Event) -> None:
+    def _handle(self, event: Event) -> None:
         if self._closed:
-            # A recording that is closed must not change any more; whoever still waits is let go.
+            # A closed recording must not change any more; pending requests end with an error.
             if isinstance(event, Reply):
                 self._answer(event._replace(payload=None, error=CLOSED))
         elif isinstance(event, Sample):
@@ -120,7 +119,7 @@ class Messenger:
         """Ask a module and return its answer, which may be a refusal.
 
         Raises:
-            NoAnswer: nobody answered within the time, or the answer could not be read.
+            NoAnswer: no answer within the time, or an unreadable one.
         """
         topic, payload = key(self.robot, serial, leaf), encode(message)
         self._tag += 1
@@ -141,11 +140,11 @@ class Messenger:
         return answer
 
     async def command(self, serial: str, leaf: Leaf, message: Message, timeout_s: float = 0.5) -> Ack:
-        """Ask for something to be done.
+        """Send a command; return the module's acknowledgement.
 
         Raises:
-            Refused: the module said no.
-            NoAnswer: it said nothing.
+            Refused: the module refused it.
+            NoAnswer: see `ask`.
         """
         answer = await self.ask(serial, leaf, message, timeout_s)
         if not isinstance(answer, Ack):
@@ -155,7 +154,7 @@ class Messenger:
         return answer
 
     def close(self) -> None:
-        """Stop listening and leave the network; what has arrived and is not recorded yet never will be."""
+        """Stop receiving and leave the network; messages that are not recorded yet are dropped."""
         self._closed = True
         for declared in reversed(self._declared):
             declared.undeclare()
@@ -164,7 +163,7 @@ class Messenger:
 
 
 async def gather_all(work: Iterable[Coroutine[None, None, object]]) -> None:
-    """Do all of it at once, all to its end; raise what the first of those that failed raised."""
+    """Run all coroutines concurrently to their end; then raise the first error, if any."""
     for outcome in await asyncio.gather(*work, return_exceptions=True):
         if isinstance(outcome, BaseException):
             raise outcome

@@ -1,4 +1,4 @@
-"""The coordinator's hold on all modules of a robot: leases, keep-alives, motions, complete recordings."""
+"""All modules of one robot under one sender's leases: keep-alives, motions, complete recordings."""
 
 import asyncio
 import contextlib
@@ -36,24 +36,24 @@ from module_agent.wire.refusal import Refusal
 POLL_S = 0.02
 # Four keep-alives within the default lifetime of 250 ms.
 KEEP_ALIVE_S = 0.06
-# A renewal that takes longer, or is lost, says for a while that the network is poor.
+# A renewal that takes longer, or is lost, marks the network as poor for a while.
 LATE_NS = 100_000_000
 POOR_NS = 10_000_000_000
 LEASE_NS = 1_000_000_000
 ATTEMPTS = 8
 SILENT_NS = 1_000_000_000
 TOKEN_GONE_NS = 300_000_000
-# Refusals that the next attempt can mend: it carries a newer echo and a newer sequence number.
+# Refusals that the next attempt can resolve: it carries a newer echo and a newer sequence number.
 PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
-# Refusals of a motion that arming again mends. SEQUENCE that does not pass says that the motion has ended
-# already: it had begun, the answer was lost, and so were the keep-alives.
+# Refusals of a motion that re-arming resolves. A SEQUENCE refusal of every attempt means that the motion has
+# ended already: it had begun, and the answer and the keep-alives were lost.
 UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.value)
 
 T = TypeVar("T")
 
 
 class _Started(NamedTuple):
-    """A motion that a module has been told to begin."""
+    """A motion that was commanded to a module."""
 
     number: int
     pattern: Pattern
@@ -79,29 +79,29 @@ class ModuleGroup:
         self._running: dict[str, _Started] = {}
         self._poor_until_ns = 0
 
-    # ------------------------------------------------------------------ knowing them
+    # ------------------------------------------------------------------ presence and state
 
     def module(self, serial: str) -> ModuleRecord:
-        """Return what is recorded of a module."""
+        """Return the record of a module."""
         return self._recording.modules[serial]
 
     def kind(self, serial: str) -> ModuleType:
         """Return the catalogue entry of a module.
 
         Raises:
-            KeyError: the catalogue does not know what the module says it is.
+            KeyError: the catalogue does not have the type that the module reports.
         """
         return module_type(self.info(serial).module_type)
 
     def info(self, serial: str) -> Info:
-        """Return what a module says it is."""
+        """Return a module's own description: type, limits, gains."""
         info = self.module(serial).info
         if info is None:
             raise NoAnswer(serial, Leaf.INFO, "it has not told its type")
         return info
 
     async def meet(self, serials: Sequence[str]) -> None:
-        """Ask every module who it is, and remember its boot."""
+        """Request every module's description, and note its boot."""
         for serial in serials:
             info = await self._ask_info(serial)
             if not isinstance(info, Info):
@@ -126,7 +126,7 @@ class ModuleGroup:
         return await self._messenger.ask(serial, leaf, ask)
 
     async def _persist(self, serial: str, attempt: Callable[[], Awaitable[T]]) -> T:
-        """Try until answered; a network may lose questions and answers."""
+        """Try until answered; a network may lose requests and answers."""
         for left in reversed(range(ATTEMPTS)):
             try:
                 return await attempt()
@@ -142,11 +142,12 @@ class ModuleGroup:
         raise AssertionError("unreachable")
 
     def check(self) -> None:
-        """Check that every module is still there.
+        """Check that every module is still present and held.
 
         Raises:
-            ModuleLost: a module's token is gone, it is silent, it booted anew, or somebody took its lease.
-            RobotStopped: somebody has stopped a module that this sender holds.
+            ModuleLost: a module's token is missing, it sends no feedback, it has booted again, or another
+                sender took its lease.
+            RobotStopped: a module that this sender holds was stopped.
         """
         now = self._clock()
         for serial in self.serials:
@@ -161,13 +162,13 @@ class ModuleGroup:
             if serial in self._taken_by:
                 raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
             status = record.status
-            # A status from before the lease was taken tells of an earlier stop.
+            # A status from before the lease was taken may report an earlier stop.
             fresh = status is not None and serial in self._tokens and status.t_ns > self._armed_ns[serial]
             if fresh and status is not None and status.state == "stopped":
                 raise RobotStopped(serial, status.note)
 
     async def check_now(self) -> None:
-        """Ask every module how it is, then `check`; a status may not have arrived yet."""
+        """Request every module's status, then `check`."""
         for serial in self.serials:
             await self.ask_status(serial)
         self.check()
@@ -188,7 +189,7 @@ class ModuleGroup:
 
     @property
     def is_poor(self) -> bool:
-        """Whether of late the network was slow with renewals, or lost some."""
+        """Whether renewals were late or lost within the last `POOR_NS`."""
         return self._clock() < self._poor_until_ns
 
     # ------------------------------------------------------------------ leases
@@ -197,7 +198,7 @@ class ModuleGroup:
         """Take the lease of a module and arm it.
 
         Raises:
-            Refused: somebody else holds it; the message names the holder and the time left.
+            Refused: another sender holds it; the message names the holder and the time left.
         """
 
         async def attempt() -> Ack:
@@ -206,14 +207,14 @@ class ModuleGroup:
         self._running.pop(serial, None)
         ack = await self._persist(serial, attempt)
         self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
-        # Its life counts from what was known before the question: on a slow network little of it is left.
+        # Its lifetime counts from the echo in the request: on a slow network little of it is left.
         self._send(self._renew(serial))
 
     def _lease(self, serial: str, action: str) -> LeaseRequest:
         return LeaseRequest.model_validate({**self._head(serial), "action": action, "duration_ns": LEASE_NS})
 
     def _head(self, serial: str) -> dict[str, object]:
-        """Return what every command carries."""
+        """Return the fields that every command carries."""
         return {
             "serial": serial,
             "boot": self._boots[serial],
@@ -226,9 +227,9 @@ class ModuleGroup:
     async def keep_alive(self) -> None:
         """Renew all leases until cancelled; a late answer does not hold up the next renewal.
 
-        While renewals come late or not at all, the modules' motions are told again in between, which says as
-        much as a renewal does. Messages on one key keep their order, so that one that is held up holds up
-        all behind it; on two keys that seldom happens at the same time.
+        While renewals are late or lost, the running motions are commanded again in between, which renews the
+        lease too. Messages on one key keep their order, so that a late one delays all behind it; on two keys
+        that seldom happens at the same time.
         """
         while True:
             self.renew()
@@ -240,7 +241,7 @@ class ModuleGroup:
             await asyncio.sleep(0.5 * KEEP_ALIVE_S)
 
     def renew(self) -> None:
-        """Renew all leases once; whoever commands without `keep_alive` does so every `KEEP_ALIVE_S`."""
+        """Renew all leases once; needed every `KEEP_ALIVE_S` without `keep_alive`."""
         for serial in list(self._tokens):
             self._send(self._renew(serial))
 
@@ -254,7 +255,7 @@ class ModuleGroup:
         try:
             await self._messenger.command(serial, Leaf.LEASE, self._lease(serial, "renew"), timeout_s=0.3)
         except NoAnswer:
-            pass  # lost on the way; the next one follows, and silence is noticed by `check`
+            pass  # lost; the next one follows, and `check` notices missing feedback
         except Refused as refused:
             if refused.ack.reason == Refusal.HELD.value:
                 self._taken_by[serial] = refused.ack.detail
@@ -262,7 +263,7 @@ class ModuleGroup:
             self._poor_until_ns = self._clock() + POOR_NS
 
     async def _repeat(self, serial: str) -> None:
-        """Tell a module again of its latest motion; it begins no motion twice."""
+        """Command a module's latest motion again; a module begins no motion twice."""
         running = self._running.get(serial)
         if running is None:
             return
@@ -272,7 +273,7 @@ class ModuleGroup:
             await self._messenger.command(serial, Leaf.MOTION, motion, timeout_s=0.3)
 
     async def release_all(self) -> None:
-        """Let go of all modules; their motors are off then."""
+        """Release all modules; their motors are off then."""
         await asyncio.gather(*(self._release(serial) for serial in list(self._tokens)))
 
     async def _release(self, serial: str) -> None:
@@ -288,8 +289,8 @@ class ModuleGroup:
         self._tokens.pop(serial, None)
 
     async def stop_all(self, why: str) -> list[str]:
-        """Tell every module that this sender holds to stop; return the serials that did not confirm."""
-        # A module that another coordinator holds is its business.
+        """Stop every module that this sender holds; return the serials that did not confirm."""
+        # Not the modules whose lease another coordinator has taken.
         held = [serial for serial in self._tokens if serial not in self._taken_by]
         self._tokens.clear()
         done = await asyncio.gather(*(self._stop(serial, why) for serial in held), return_exceptions=True)
@@ -323,14 +324,14 @@ class ModuleGroup:
         velocity_rad_s: float | None,
         effort_nm: float | None,
     ) -> None:
-        """Send one set-point, which nobody answers; what is None switches its loop off."""
+        """Send one set-point, which is not acknowledged; None switches a loop off."""
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
         self._messenger.publish(
             serial, Leaf.SETPOINT, Setpoint.model_validate({**self._head(serial), **point})
         )
 
     def _next_id(self) -> int:
-        # Numbers grow over coordinators too, so that a new one does not repeat an old one's.
+        # Numbers grow from one coordinator to the next, so that none repeats.
         clock_ms = self._clock() // 1_000_000 & 0x3FFFFFFF
         self._last_id = max(self._last_id + 1, clock_ms)
         return self._last_id
@@ -338,7 +339,7 @@ class ModuleGroup:
     async def run(
         self, patterns: Mapping[str, Pattern], efforts: Mapping[str, EffortProfile] | None = None
     ) -> dict[str, MotionRecord]:
-        """Run one motion on each of the given modules at the same time; return how they went.
+        """Run one motion on each of the given modules at the same time; return their records.
 
         `efforts` are fed forward along the motions of the modules that they name; the effort loops of the
         others are off.
@@ -346,7 +347,7 @@ class ModuleGroup:
         Raises:
             KeyError: efforts of a module that has no motion.
             MotionInterrupted: one of them expired or was stopped, or another module that this sender holds
-            expired meanwhile and let go of its joint.
+                expired meanwhile and released its joint.
             ModuleLost: see `check`.
         """
         fed = efforts or {}
@@ -361,16 +362,18 @@ class ModuleGroup:
         ended = await self.wait(
             lambda: (
                 all(self._ended(serial, number) for serial, number in numbers.items())
-                or self._limp(numbers) is not None
+                or self._expired(numbers) is not None
             ),
             longest + 3.0,
         )
         if self.is_poor:
-            # What is to tell of a module that let go may itself be lost.
+            # The status of a module that expired may itself be lost.
             await gather_all(self.ask_status(serial) for serial in self._tokens)
-        limp = self._limp(numbers)
-        if limp is not None:
-            raise MotionInterrupted(next(iter(patterns)), f"spoilt: module {limp} expired and let go")
+        expired = self._expired(numbers)
+        if expired is not None:
+            raise MotionInterrupted(
+                next(iter(patterns)), f"interrupted: module {expired} expired and released its joint"
+            )
         records: dict[str, MotionRecord] = {}
         for serial, number in numbers.items():
             status = self.module(serial).status if ended else await self.ask_status(serial)
@@ -380,8 +383,8 @@ class ModuleGroup:
             records[serial] = motion
         return records
 
-    def _limp(self, moved: Container[str]) -> str | None:
-        """Return a module that should have held still meanwhile and has expired."""
+    def _expired(self, moved: Container[str]) -> str | None:
+        """Return a held module without a motion that has expired meanwhile."""
         for serial in self._tokens:
             status = self.module(serial).status
             fresh = status is not None and status.t_ns > self._armed_ns[serial]
@@ -422,7 +425,7 @@ class ModuleGroup:
     # ------------------------------------------------------------------ recordings
 
     async def complete_rows(self) -> None:
-        """Fetch whatever feedback rows the network has dropped, of every module, up to now."""
+        """Fetch the feedback rows that the network has lost, of every module, up to now."""
         await gather_all(self._complete_now(serial) for serial in self.serials)
 
     async def _complete_now(self, serial: str) -> None:
@@ -430,9 +433,9 @@ class ModuleGroup:
         await self._rows[serial].complete(status.next_row)
 
     async def close_gaps(self) -> None:
-        """Fetch what is missing before the newest row of every module that has arrived.
+        """Fetch the rows missing before the newest of every module that has arrived.
 
-        Nothing is missing on return, and while the caller does not give way to the event loop.
+        None is missing on return, until the caller next yields to the event loop.
         """
         for _ in range(ATTEMPTS):
             ends = {serial: self.module(serial).rows.end_row for serial in self.serials}
@@ -442,7 +445,7 @@ class ModuleGroup:
             await gather_all(self._rows[serial].complete(ends[serial]) for serial in gaps)
 
     async def _fetch(self, serial: str, first: int, end: int) -> None:
-        """Ask for rows until they, or a refusal, have come."""
+        """Request rows until they, or a refusal, have come."""
         await self._persist(serial, lambda: self._ask_history(serial, first, end))
 
     async def _ask_history(self, serial: str, first: int, end: int) -> object:
@@ -460,16 +463,16 @@ class ModuleGroup:
         return answer
 
     async def estimate(self, observer: str, joint: str, motion_id: int, timeout_s: float) -> Estimate | None:
-        """Wait for what `observer` makes of a motion, and ask if it was lost; None if there is none."""
+        """Wait for the observer's estimate of a motion, requested again if lost; None if there is none."""
 
-        def found() -> Estimate | None:
+        def received() -> Estimate | None:
             for ids, estimate in self._recording.estimates.get((joint, observer), {}).items():
                 if motion_id in ids:
                     return estimate
             return None
 
-        if await self.wait(lambda: found() is not None, timeout_s):
-            return found()
+        if await self.wait(lambda: received() is not None, timeout_s):
+            return received()
         for _ in range(ATTEMPTS):
             request = EstimateRequest(
                 serial=observer, boot=0, seq=self._messenger.next_seq(), sender=self.sender, joint=joint
@@ -478,6 +481,6 @@ class ModuleGroup:
                 await self._messenger.ask(observer, Leaf.ESTIMATE, request)
             except NoAnswer:
                 self.check()
-            if await self.wait(lambda: found() is not None, 0.3):
+            if await self.wait(lambda: received() is not None, 0.3):
                 break
-        return found()
+        return received()

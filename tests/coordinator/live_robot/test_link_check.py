@@ -7,16 +7,16 @@ from typing import Any
 import pytest
 
 from coordinator.live_robot.errors import UnfitLink
-from coordinator.live_robot.link_check import LOOKS, check_link
+from coordinator.live_robot.link_check import MAX_MEASUREMENTS, check_link
 from module_agent.network_emulation.profile import NetworkProfile, profile
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
-LOOK_S = 0.4
+MEASUREMENT_S = 0.4
 SECOND_S = 1.0
 
 
-def _checked(rig: Any, look_s: float = LOOK_S) -> list[str]:
+def _checked(rig: Any, duration_s: float = MEASUREMENT_S) -> list[str]:
     """Meet both modules, check the link, and return what was noted."""
     _, _, group = rig.group()
     notes: list[str] = []
@@ -24,7 +24,7 @@ def _checked(rig: Any, look_s: float = LOOK_S) -> list[str]:
     async def work() -> None:
         await asyncio.sleep(0.2)
         await group.meet((BASE, TIP))
-        await check_link(group, lambda: rig.loop.now_ns, look_s, notes.append)
+        await check_link(group, lambda: rig.loop.now_ns, duration_s, notes.append)
 
     rig.run(work())
     return notes
@@ -57,7 +57,7 @@ def test_a_module_whose_rows_come_slower_than_it_says_is_unfit(rigs: Callable[..
         # As from a module on a machine that is too slow for what it was told to do.
         told = recording.modules[TIP].info
         recording.modules[TIP].info = told.model_copy(update={"feedback_rate_hz": 1000.0})
-        await check_link(group, lambda: rig.loop.now_ns, LOOK_S, lambda note: None)
+        await check_link(group, lambda: rig.loop.now_ns, MEASUREMENT_S, lambda note: None)
 
     with pytest.raises(UnfitLink, match=rf"unfit: module {TIP} delivers 2\d\d rows/s of 1000"):
         rig.run(work())
@@ -68,4 +68,4 @@ def test_a_bad_moment_is_looked_past(rigs: Callable[..., Any]) -> None:
     parted = profile("lan").model_copy(update={"partitions": ((0.25, 0.55),)})
     rig = rigs(ARM, parted)
     assert len(_checked(rig)) == 2
-    assert 0.2 + LOOK_S < rig.loop.time() < 0.4 + (LOOKS + 1) * LOOK_S
+    assert 0.2 + MEASUREMENT_S < rig.loop.time() < 0.4 + (MAX_MEASUREMENTS + 1) * MEASUREMENT_S

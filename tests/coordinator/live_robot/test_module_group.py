@@ -249,7 +249,8 @@ def test_without_keep_alives_a_motion_expires_and_can_be_done_again(rigs: Callab
         keeper = await _armed(group)
         keeper.cancel()
         # Either may expire first, by the age of its last feedback.
-        why = f"the motion of module {BASE} was (expired|spoilt: module {TIP} expired and let go)"
+        other = f"interrupted: module {TIP} expired and released its joint"
+        why = f"the motion of module {BASE} was (expired|{other})"
         with pytest.raises(MotionInterrupted, match=why):
             await group.run({BASE: SLOW})
         await asyncio.sleep(0.05)
@@ -455,7 +456,7 @@ def test_where_renewals_are_slow_motions_are_told_again_and_run_once(
     assert np.count_nonzero(np.diff((moved > 0).astype(int)) > 0) == 1
 
 
-def test_a_motion_during_which_another_joint_let_go_is_spoilt(
+def test_a_motion_during_which_another_joint_expires_is_interrupted(
     rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = rigs(ARM, "lan")
@@ -470,7 +471,7 @@ def test_a_motion_during_which_another_joint_let_go_is_spoilt(
 
     async def work() -> None:
         keeper = await _armed(group)
-        why = f"the motion of module {BASE} was spoilt: module {TIP} expired and let go"
+        why = f"the motion of module {BASE} was interrupted: module {TIP} expired and released its joint"
         with pytest.raises(MotionInterrupted, match=why):
             await group.run({BASE: SLOW})
         # Armed again, both move as before.
