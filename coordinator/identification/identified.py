@@ -35,8 +35,8 @@ class Kinematics(NamedTuple):
         """The refined chain and what is known of it."""
         return self.refinement.estimate
 
-    def words(self) -> list[str]:
-        """Return the tree and the links in lines to read."""
+    def summary(self) -> list[str]:
+        """Return the tree and the links as lines of text."""
         lines = []
         for k, serial in enumerate(self.topology.serials):
             parent = self.topology.parent[k]

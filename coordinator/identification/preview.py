@@ -1,12 +1,9 @@
-"""The robot as far as it is known while its joints are still being explored: cheap, to be looked at.
+"""Previews of a robot while its joints are being explored: assembled from circles, refined by a few samples.
 
-Joints that have not moved yet are as good as locked. So a module stands on the nearest joint that has been
-explored and moves it, and modules that nothing ties to another one yet are left out. The chain is assembled
-from the modules' own circle point analyses (`kinematics.assembly`); the batch refinement comes at the end.
-
-Looks at a robot while its joints are being explored: assembled from circles, refined by a few samples.
-
-Every motion is filtered once and kept thinned, so that a look costs little more than its refinement.
+Joints that have not moved yet count as locked: a module is mounted on the nearest explored joint that moves
+it, and modules without a link to another one yet are excluded. The chain is assembled from the modules'
+circle point analyses (`kinematics.assembly`); the batch estimate follows at the end of the run. Every motion
+is filtered once and its thinned samples retained, so that a preview costs little more than its refinement.
 """
 
 from collections.abc import Collection, Sequence
@@ -33,38 +30,40 @@ from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, settling_samples
 from module_agent.wire.messages import Estimate
 
-# Of the weighted squares: far less than their noise.
+# Least gain of the weighted sum of squares: far less than its noise.
 MIN_GAIN = 1e-3
 
 
 class Preview(NamedTuple):
-    """A chain of the modules that are tied to others by now.
+    """A chain of the modules that are linked to others so far.
 
-    explored: serials of the joints that have been explored. beside: (n,) whether nothing that is still to be
-    explored can lie between a module and its parent, so that what joins them is one link.
+    explored: serials of the explored joints. adjacent: (n,) whether a module is mounted directly on its
+    parent, with no unexplored joint possible in between.
     """
 
     fit: ChainEstimate
     explored: tuple[str, ...]
-    beside: tuple[bool, ...]
+    adjacent: tuple[bool, ...]
 
 
 def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
-    """Assemble what the joints explored so far tell; None as long as they tie no module to another.
+    """Assemble the chain of the explored joints; None as long as no module is linked to another.
 
     Raises:
-        DataError: the estimates contradict each other, or modules were not seen at rest.
+        DataError: the estimates contradict each other, or a module has no rows at rest.
     """
     serials = sorted({e.serial for e in recording.latest_motions("rest")})
     moved = sorted(set(explored) & set(serials))
-    seen = {(i, k): e for i in moved for k in serials if (e := _seen(recording, i, k)) is not None}
-    if not seen:
+    observations = {
+        (i, k): e for i in moved for k in serials if (e := _observation(recording, i, k)) is not None
+    }
+    if not observations:
         return None
-    found = likely_topology(seen, [s for s in serials if s not in moved])
-    kept = _tied(found)
-    if not kept:
+    forest = likely_topology(observations, [s for s in serials if s not in moved])
+    linked = _linked(forest)
+    if not linked:
         return None
-    topology = _part(found, kept)
+    topology = _part(forest, linked)
     rest = rest_observation(recording, topology.serials)
     pairs = [
         pair
@@ -76,40 +75,40 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     ]
     types = [recording.module_type(s) for s in topology.serials]
     fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
-    return Preview(fit, tuple(moved), beside(fit.chain, moved))
+    return Preview(fit, tuple(moved), adjacent(fit.chain, moved))
 
 
-def beside(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
-    """Return (n,) whether a module of a chain so far is known to be mounted on its parent and nothing else.
+def adjacent(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
+    """Return (n,) whether a module is known to be mounted directly on its parent.
 
-    A joint that is still to be explored may carry what now stands beside it.
+    An unexplored joint may carry its siblings: they may then be its children.
     """
-    open_ = [s not in explored for s in chain.serials]
+    unexplored = [s not in explored for s in chain.serials]
     return tuple(
-        parent != BASE and not any(open_[other] for other in chain.children(parent) if other != k)
+        parent != BASE and not any(unexplored[other] for other in chain.children(parent) if other != k)
         for k, parent in enumerate(chain.parent)
     )
 
 
-# ---------------------------------------------------------------------- what was seen
+# ---------------------------------------------------------------------- observations
 
 
-def _seen(recording: Recording, joint: str, observer: str) -> MotionObservation | None:
-    """Return who moved with whom, by the slow motion where there is one (see `estimate.observer`)."""
-    found = list(recording.estimates.get((joint, observer), {}).values())
-    if not found:
+def _observation(recording: Recording, joint: str, observer: str) -> MotionObservation | None:
+    """Return whether a joint moved an observer, by the slow motion where there is one."""
+    estimates = list(recording.estimates.get((joint, observer), {}).values())
+    if not estimates:
         return None
     slow_ids = {
         e.motion.motion_id for e in _motions(recording, joint) if e.purpose == "constant" and e.motion
     }
-    slow = [e for e in found if e.motion_ids[-1] in slow_ids]
-    estimate, turned = (slow or found)[-1], _circle(found)
+    slow = [e for e in estimates if e.motion_ids[-1] in slow_ids]
+    estimate, turned = (slow or estimates)[-1], _circle(estimates)
     axis = np.array(turned.circle.axis) if turned is not None and turned.circle is not None else None
     return MotionObservation(estimate.moved, estimate.rate_ratio, axis)
 
 
-def _circle(found: Sequence[Estimate]) -> Estimate | None:
-    circles = [e for e in found if e.circle is not None]
+def _circle(estimates: Sequence[Estimate]) -> Estimate | None:
+    circles = [e for e in estimates if e.circle is not None]
     return circles[-1] if circles else None
 
 
@@ -143,76 +142,76 @@ def _mean_position(recording: Recording, joint: str, motion_ids: Sequence[int]) 
     return float(rows[-1].mean())
 
 
-# ---------------------------------------------------------------------- what hangs together
+# ---------------------------------------------------------------------- linked modules
 
 
-def _tied(topology: Topology) -> list[int]:
-    """Return the modules of all trees of more than one."""
+def _linked(topology: Topology) -> list[int]:
+    """Return the modules of all trees with more than one module."""
     root: list[int] = []
     for k, parent in enumerate(topology.parent):
         root.append(k if parent == BASE else root[parent])
     return [k for k, r in enumerate(root) if root.count(r) > 1]
 
 
-def _part(topology: Topology, kept: Sequence[int]) -> Topology:
+def _part(topology: Topology, linked: Sequence[int]) -> Topology:
     """Return whole trees of a topology, in its order."""
-    place = {k: n for n, k in enumerate(kept)} | {BASE: BASE}
+    place = {k: n for n, k in enumerate(linked)} | {BASE: BASE}
     return Topology(
-        serials=tuple(topology.serials[k] for k in kept),
-        parent=tuple(place[topology.parent[k]] for k in kept),
-        reversed=tuple(topology.reversed[k] for k in kept),
+        serials=tuple(topology.serials[k] for k in linked),
+        parent=tuple(place[topology.parent[k]] for k in linked),
+        reversed=tuple(topology.reversed[k] for k in linked),
         confidence=topology.confidence,
     )
 
 
-# 50 samples a second are kept of every motion, for the loads of its links; the refinement has a quarter of
-# them: six of every period of the windowed sine.
-KEPT_EVERY, FITTED_EVERY = 5, 4
-# Farther from where the circles put a module the refinement has found something else than the robot.
-LOST_ABOVE_M = 0.15
+# 50 samples per second of every motion are retained, for the loads of its links; the refinement uses a
+# quarter of them: six per period of the windowed sine.
+RETAINED_EVERY, FITTED_EVERY = 5, 4
+# A refinement that moves a module farther than this from its assembled position has diverged.
+MAX_SHIFT_M = 0.15
 
 
 class Previewer:
-    """The looks at one robot, one after the other, from its recording as it grows; one at a time.
+    """Computes previews of one robot from its growing recording, one at a time.
 
-    Robots of more than `most_refined` modules are only assembled: a refinement of seven costs half a second,
-    and grows with the square.
+    Robots of more than `max_refined` modules are only assembled: a refinement of seven modules costs half a
+    second, and the cost grows with the square of their number.
     """
 
-    def __init__(self, recording: Recording, most_refined: int | None = None):
+    def __init__(self, recording: Recording, max_refined: int | None = None):
         self._recording = recording
-        self._most_refined = most_refined
+        self._max_refined = max_refined
         self._parts: dict[tuple[str, int, tuple[str, ...]], SensorData] = {}
 
-    def look(self, explored: Collection[str]) -> Preview | None:
-        """Return the robot as far as the joints `explored` tell; None as long as they tie nothing together.
+    def preview(self, explored: Collection[str]) -> Preview | None:
+        """Return a preview from the explored joints; None as long as no module is linked to another.
 
-        Where samples are missing, or do not fit, it is as assembled.
+        It is not refined if samples are missing or the refinement fails.
 
         Raises:
             DataError: see `preview`.
         """
-        found = preview(self._recording, explored)
-        if found is None or not self._is_refined(found):
-            return found
+        assembled = preview(self._recording, explored)
+        if assembled is None or not self._is_refined(assembled):
+            return assembled
         try:
-            return _refined(found, self._kinds(found), self._parts_of(found), self._prior)
+            return _refined(assembled, self._kinds(assembled), self._parts_of(assembled), self._prior)
         except (DataError, np.linalg.LinAlgError):
-            return found
+            return assembled
 
-    def _is_refined(self, found: Preview) -> bool:
-        return self._most_refined is None or len(found.fit.chain.serials) <= self._most_refined
+    def _is_refined(self, assembled: Preview) -> bool:
+        return self._max_refined is None or len(assembled.fit.chain.serials) <= self._max_refined
 
     @property
     def _prior(self) -> ImuPrior:
         return IMU_PRIORS[self._recording.imu]
 
-    def _kinds(self, found: Preview) -> list[ModuleType]:
-        return [self._recording.module_type(s) for s in found.fit.chain.serials]
+    def _kinds(self, assembled: Preview) -> list[ModuleType]:
+        return [self._recording.module_type(s) for s in assembled.fit.chain.serials]
 
-    def _parts_of(self, found: Preview) -> list[SensorData]:
+    def _parts_of(self, assembled: Preview) -> list[SensorData]:
         """Return the samples of every slow and fast motion so far, modules as in the chain."""
-        serials = found.fit.chain.serials
+        serials = assembled.fit.chain.serials
         events: dict[tuple[str, str], JournalEvent] = {}
         for event in self._recording.journal:
             if event.what == "motion" and event.purpose in ("constant", "windowed_sine"):
@@ -220,9 +219,9 @@ class Previewer:
         moved = [event for event in events.values() if event.serial in serials and event.motion is not None]
         if not moved:
             raise DataError("no motion of these modules is recorded")
-        everybody = tuple(sorted(self._recording.modules))
-        order = [everybody.index(s) for s in serials]
-        return [_columns(self._part(event, everybody), order) for event in moved]
+        all_serials = tuple(sorted(self._recording.modules))
+        order = [all_serials.index(s) for s in serials]
+        return [_columns(self._part(event, all_serials), order) for event in moved]
 
     def _part(self, event: JournalEvent, serials: tuple[str, ...]) -> SensorData:
         assert event.motion is not None
@@ -231,7 +230,7 @@ class Previewer:
             clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
             margin_s = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
             whole = filtered(window(self._recording, clocks, serials, event, margin_s), REFINEMENT_CUTOFF_HZ)
-            self._parts[key] = thinned([whole], KEPT_EVERY)
+            self._parts[key] = thinned([whole], RETAINED_EVERY)
         return self._parts[key]
 
 
@@ -244,16 +243,16 @@ def _columns(part: SensorData, order: Sequence[int]) -> SensorData:
 
 
 def _refined(
-    found: Preview, kinds: Sequence[ModuleType], parts: Sequence[SensorData], prior: ImuPrior
+    assembled: Preview, kinds: Sequence[ModuleType], parts: Sequence[SensorData], prior: ImuPrior
 ) -> Preview:
-    """Refine the robot as if it were rigid, and again with links that give under their loads."""
+    """Refine the rigid chain, then again with compliant links."""
     data = thinned(parts, FITTED_EVERY)
-    rigid = refine_chain(found.fit.chain, data, prior)
-    loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / KEPT_EVERY), FITTED_EVERY)
+    rigid = refine_chain(assembled.fit.chain, data, prior)
+    loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / RETAINED_EVERY), FITTED_EVERY)
     refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(rigid.chain, data.joints, loads))
-    return found if _is_lost(found, refined) else found._replace(fit=refined.estimate)
+    return assembled if _has_diverged(assembled, refined) else assembled._replace(fit=refined.estimate)
 
 
-def _is_lost(found: Preview, refined: Refinement) -> bool:
-    off = refined.chain.imu_home[:, :3, 3] - found.fit.chain.imu_home[:, :3, 3]
-    return not bool(np.linalg.norm(off, axis=1).max() < LOST_ABOVE_M)
+def _has_diverged(assembled: Preview, refined: Refinement) -> bool:
+    off = refined.chain.imu_home[:, :3, 3] - assembled.fit.chain.imu_home[:, :3, 3]
+    return not bool(np.linalg.norm(off, axis=1).max() < MAX_SHIFT_M)

@@ -1,4 +1,4 @@
-"""A whole identification run: session, recording, estimates, viewer and files, on any transport and clock."""
+"""An identification run: session, recording, estimates, viewer and files, on any transport and clock."""
 
 import asyncio
 import contextlib
@@ -64,12 +64,12 @@ logger = logging.getLogger(__name__)
 
 
 class RunConfig(NamedTuple):
-    """What a run is told. `inline` computes on the event loop, as virtual time needs it.
+    """Settings of a run.
 
-    `refined_previews`: modules up to which the robot is refined, not only assembled, for every preview while
-    it is being explored; None for any number, as in a thread beside the run it keeps nobody waiting.
-    `baseline`: the folder of an earlier run of this robot. Then all joints are moved at once, and one by one
-    only those next to what differs from that run.
+    inline: compute on the event loop, as virtual time needs it, instead of in a thread.
+    refined_previews: modules up to which previews are refined, not only assembled; None for any number.
+    baseline: the folder of an earlier run of this robot. Then all joints are moved at once, and one by one
+    only those next to a difference from that run.
     """
 
     robot: str
@@ -90,7 +90,7 @@ class Run:
     """One run in one folder.
 
     Raises:
-        UsageError: a plan that leaves out what a run needs; a folder that is not to be used, or that tells no
+        UsageError: the plan leaves out motions that a run needs; the folder is in use; the baseline holds no
             robot.
     """
 
@@ -103,7 +103,7 @@ class Run:
         screen: Screen,
         overlay: Overlay | None = None,
     ):
-        # Before anything is made of the new folder.
+        # Before the new folder is made.
         if config.plan.topology_only:
             raise UsageError(
                 "the plan sets topology_only, which leaves out the fast motions; a run identifies the chain "
@@ -113,8 +113,8 @@ class Run:
         crashed = open_run_folder(config.out, config.resume, config.robot)
         if before is not None:
             keep_baseline(before, config.out)
-        self._known = before.kinematics if before is not None else baseline_within(config.out)
-        if self._known is not None:
+        self._baseline = before.kinematics if before is not None else baseline_within(config.out)
+        if self._baseline is not None:
             config = config._replace(plan=config.plan.model_copy(update={"mode": "simultaneous"}))
         self._config = config
         self._clock = clock
@@ -128,15 +128,15 @@ class Run:
         )
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
         self._feed = ViewerFeed(viewer, self.recording, overlay)
-        self._looks = Previewer(self.recording, config.refined_previews)
-        self._looking: asyncio.Task[None] | None = None
+        self._previewer = Previewer(self.recording, config.refined_previews)
+        self._preview_task: asyncio.Task[None] | None = None
         self._chain: Chain | None = None
         self._identified: Identified | None = None
         if crashed is not None:
             self._take_over(crashed)
         self._messenger = Messenger(transport, config.robot, clock, post, self._record)
         self._group = ModuleGroup(self._messenger, self.recording, clock, config.sender)
-        self._torques = InformationRequests(self._messenger, self.recording, clock, config.sender, self.note)
+        self._requests = InformationRequests(self._messenger, self.recording, clock, config.sender, self.note)
 
     def _take_over(self, crashed: Path) -> None:
         try:
@@ -173,66 +173,66 @@ class Run:
     # ------------------------------------------------------------------ reporter of the session
 
     def step(self, index: int, total: int, text: str) -> None:
-        """Pass on that a step begins."""
+        """Show that a step begins."""
         self._screen.step(index, total, text)
         self._feed.connected({s: self._group.kind(s).name for s in self._group.serials}, self._clock())
         self._feed.step(self._clock(), f"{index} of {total}: {text}")
 
     def note(self, text: str) -> None:
-        """Pass on a line."""
+        """Show a line of text."""
         self._screen.note(text)
 
     def estimates(self, joint: str) -> None:
-        """Show the local estimates of a joint, and the robot as far as it is known now."""
+        """Show the modules' estimates of a joint, and a preview of the robot."""
         self._feed.estimates(joint, self._clock())
-        # Of a resumed run the joints of before too.
+        # Of a resumed run also the joints explored before.
         explored = sorted({moved for moved, _ in self.recording.estimates})
         if self._config.inline:
-            self._show_so_far(self._so_far(explored))
-        elif self._looking is None or self._looking.done():
-            # While the last look is still being worked out there is no other: the next joint brings one.
-            self._looking = asyncio.create_task(self._look(explored))
+            self._show_preview(self._preview(explored))
+        elif self._preview_task is None or self._preview_task.done():
+            # One preview at a time: while one is being computed, a joint does not start another.
+            self._preview_task = asyncio.create_task(self._show_preview_later(explored))
 
-    async def _look(self, explored: list[str]) -> None:
-        self._show_so_far(await self._compute(lambda: self._so_far(explored)))
+    async def _show_preview_later(self, explored: list[str]) -> None:
+        self._show_preview(await self._compute(lambda: self._preview(explored)))
 
-    def _so_far(self, explored: list[str]) -> Preview | None:
-        """Return the robot as far as it is known; only to be looked at, so that a run does not fail by it."""
+    def _preview(self, explored: list[str]) -> Preview | None:
+        """Return a preview of the robot, None if there is none; a run does not fail for lack of one."""
         try:
-            return self._looks.look(explored)
+            return self._previewer.preview(explored)
         except (DataError, KeyError) as error:
-            logger.info("nothing to show of the robot so far: %s", error)
+            logger.info("no preview of the robot: %s", error)
         except Exception:
-            # A run must not end for want of a picture.
-            logger.exception("the robot so far could not be worked out")
+            # A run must not end for lack of a picture.
+            logger.exception("the preview of the robot failed")
         return None
 
-    def _show_so_far(self, found: Preview | None) -> None:
-        if found is not None:
-            self._feed.preview(self._clock(), found)
+    def _show_preview(self, preview: Preview | None) -> None:
+        if preview is not None:
+            self._feed.preview(self._clock(), preview)
 
-    async def _looked(self) -> None:
-        """Wait for a look that is still being worked out: what comes after it is newer."""
-        if self._looking is not None:
-            (failure,) = await asyncio.gather(self._looking, return_exceptions=True)
+    async def _await_preview(self) -> None:
+        """Wait for a preview that is still being computed, so that it does not replace a newer chain."""
+        if self._preview_task is not None:
+            (failure,) = await asyncio.gather(self._preview_task, return_exceptions=True)
             if isinstance(failure, Exception):
-                logger.warning("the robot so far could not be shown: %s", failure)
+                logger.warning("the preview of the robot could not be shown: %s", failure)
 
     async def doubts(self) -> tuple[NextMotion, ...]:
-        """Look for doubts about the topology as soon as all joints are explored."""
+        """Return the motions to repeat to settle doubts about the topology."""
         return await self._compute(lambda: doubtful_motions(self.recording))
 
     async def explored(self) -> None:
-        """Assemble topology and chain as soon as all joints are explored, and show them."""
-        await self._looked()
-        found = await self._compute(lambda: self._revised(identify_kinematics(self.recording)))
-        self._chain = found.fit.chain
-        self._feed.chain(self._clock(), found.fit)
-        for line in found.words():
+        """Identify topology and chain, and show them."""
+        await self._await_preview()
+        kinematics = await self._compute(lambda: self._with_baseline(identify_kinematics(self.recording)))
+        self._chain = kinematics.fit.chain
+        self._feed.chain(self._clock(), kinematics.fit)
+        for line in kinematics.summary():
             self._screen.note(line)
 
     async def excitation(self) -> tuple[RobotMotion, ...]:
-        """Design motions of all joints at once for the chain that has just been found."""
+        """Design excitation motions of all joints at once for the identified chain."""
         assert self._chain is not None, "all joints are explored before any is excited"
         chain, plan = self._chain, self._config.plan
         modules = [RobotModule(self._group.kind(s), self._group.info(s).limits) for s in chain.serials]
@@ -242,23 +242,23 @@ class Run:
             self._screen.note(f"{error}; exciting joint by joint instead")
             return ()
 
-    async def _closer(self) -> Sequence[str]:
-        """Return the joints next to what is other about a known robot, by a glance at all of it."""
-        found = await self._compute(lambda: identify_kinematics(self.recording))
-        if self._known is None:
+    async def _single_joints(self) -> Sequence[str]:
+        """Return the joints to explore one by one: those next to a difference from the baseline."""
+        kinematics = await self._compute(lambda: identify_kinematics(self.recording))
+        if self._baseline is None:
             return ()
-        other = difference(self._known.topology, found.topology)
-        for line in other.summary():
+        changes = difference(self._baseline.topology, kinematics.topology)
+        for line in changes.summary():
             self._screen.note(line)
-        return joints_to_explore(found.topology, other)
+        return joints_to_explore(kinematics.topology, changes)
 
-    def _revised(self, found: Kinematics) -> Kinematics:
-        return updated(self._known, found) if self._known is not None else found
+    def _with_baseline(self, kinematics: Kinematics) -> Kinematics:
+        return updated(self._baseline, kinematics) if self._baseline is not None else kinematics
 
     # ------------------------------------------------------------------ the run
 
     async def run(self) -> Result:
-        """Run to the end and write the files; on any error what was recorded is complete on disk."""
+        """Run to the end and write the files; on any error the recording on disk is complete."""
         config = self._config
         try:
             self._messenger.start()
@@ -271,7 +271,7 @@ class Run:
                     torque=config.plan.torque,
                 )
             )
-            closer = self._closer if self._known is not None else None
+            single_joints = self._single_joints if self._baseline is not None else None
             session = Session(
                 self._group,
                 self._messenger,
@@ -280,54 +280,56 @@ class Run:
                 self._clock,
                 self._journal,
                 self,
-                closer,
-                lambda: self._torques.collect(self._group.serials),
+                single_joints,
+                lambda: self._requests.collect(self._group.serials),
             )
             await session.run(config.expect)
-            kinematics = await self._ask_torques()
+            kinematics = await self._request_information()
             self._journal(
                 JournalEvent(
                     t_ns=self._clock(), what="finished", wall_time_s=time.monotonic() - self._started_s
                 )
             )
-            # Nothing more is recorded from here on: a replay must see exactly what this result is made of.
+            # Nothing more is recorded: a replay must read exactly what this result is computed from.
             self._messenger.close()
             self._writer.close()
             self._screen.note("estimating")
-            found = await self._compute(lambda: identify(self.recording, self._revised, kinematics))
-            self._write(found)
-            self._identified = found
-            for line in found.inertia.summary() if found.inertia is not None else ():
+            identified = await self._compute(
+                lambda: identify(self.recording, self._with_baseline, kinematics)
+            )
+            self._write(identified)
+            self._identified = identified
+            for line in identified.inertia.summary() if identified.inertia is not None else ():
                 self._screen.note(line)
             if self._crashed is not None:
                 self._crashed.unlink()
-            return found.result
+            return identified.result
         finally:
             self._messenger.close()
             self._writer.close()
-            await self._looked()
+            await self._await_preview()
             self._feed.close()
             if self._messenger.dropped:
                 self._screen.note(
                     f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
                 )
 
-    async def _ask_torques(self) -> Kinematics | None:
-        """Ask the agents what their torques say, of the robot as it is known at last; return that robot.
+    async def _request_information(self) -> Kinematics | None:
+        """Request the agents' torque information for the identified kinematics; return these kinematics.
 
-        Nothing moves any more, and whatever does not come is computed from the recording instead.
+        Nothing moves any more. Information that does not come is computed from the recording instead.
         """
         if not dynamic_steps(self.recording):
             return None
         self._journal(JournalEvent(t_ns=self._clock(), what="settled"))
         try:
-            found = await self._compute(lambda: self._revised(identify_kinematics(self.recording)))
+            kinematics = await self._compute(lambda: self._with_baseline(identify_kinematics(self.recording)))
         except IdentificationError:
-            return None  # said when everything is identified, and the recording is whole
-        await self._torques.ask(found.fit.chain, found.clocks)
+            return None  # reported when everything is identified from the complete recording
+        await self._requests.ask(kinematics.fit.chain, kinematics.clocks)
         with contextlib.suppress(NoAnswer, Refused, ModuleLost):
             await self._group.close_gaps()
-        return found
+        return kinematics
 
     @property
     def robot(self) -> BaselineRobot:
@@ -337,7 +339,7 @@ class Run:
 
     @property
     def standstill(self) -> str:
-        """What is known of the robot after a run that ended before its end, in words."""
+        """What is known of the robot's motion after a run that failed, as a sentence."""
         return standstill(self.recording.journal)
 
     async def _compute(self, work: Callable[[], T]) -> T:
@@ -345,47 +347,47 @@ class Run:
             return work()
         return await asyncio.to_thread(work)
 
-    def _write(self, found: Identified) -> None:
+    def _write(self, identified: Identified) -> None:
         out = self._config.out
-        write_outputs(out, found)
-        self._feed.chain(self._clock(), found.kinematics.fit)
-        if found.held_out is not None:
-            self._feed.held_out(found.held_out)
+        write_outputs(out, identified)
+        self._feed.chain(self._clock(), identified.kinematics.fit)
+        if identified.held_out is not None:
+            self._feed.held_out(identified.held_out)
         self._feed.step(self._clock(), "done")
 
 
-def write_outputs(out: Path, found: Identified) -> None:
-    """Write everything that follows from a recording into a folder, each file whole or not at all."""
-    write_result(out / RESULT, found.result)
-    phi = found.real_phi
-    types = [module_type(found.result.types[s]) for s in found.result.serials]
-    write_urdf(out / URDF, found.kinematics.fit.chain, phi, found.result.robot, types)
-    write_hrdf(out / HRDF, found.kinematics.fit.chain, types, phi, found.result.robot)
-    if found.held_out is not None:
-        write_held_out(out / HELD_OUT, found.held_out)
-    if found.inertia is not None:
-        write_information(out / INFORMATION, _information(out.name, found, found.inertia, types))
+def write_outputs(out: Path, identified: Identified) -> None:
+    """Write all files computed from a recording into a folder, each whole or not at all."""
+    write_result(out / RESULT, identified.result)
+    phi = identified.real_phi
+    types = [module_type(identified.result.types[s]) for s in identified.result.serials]
+    write_urdf(out / URDF, identified.kinematics.fit.chain, phi, identified.result.robot, types)
+    write_hrdf(out / HRDF, identified.kinematics.fit.chain, types, phi, identified.result.robot)
+    if identified.held_out is not None:
+        write_held_out(out / HELD_OUT, identified.held_out)
+    if identified.inertia is not None:
+        write_information(out / INFORMATION, _information(out.name, identified, identified.inertia, types))
 
 
 def _information(
-    name: str, found: Identified, inertia: Inertia, types: Sequence[ModuleType]
+    name: str, identified: Identified, inertia: Inertia, types: Sequence[ModuleType]
 ) -> RunInformation:
-    seen, fit = inertia.instrumental, found.kinematics.fit
-    # Of the scales' effects what is known beforehand is kept, which several runs share.
+    instrumental, fit = inertia.instrumental, identified.kinematics.fit
+    # Of the scales' effects those of the prior remain: several runs share them.
     effects = tuple(one[:, len(types) :] for one in inertia.effects)
     directions = error_directions(fit.covariance)
-    # Offsets of the sensors, whose effects come last, move no chain.
+    # Offsets of the sensors, whose effects come last, do not move the chain.
     directions = np.hstack([directions, np.zeros((len(directions), len(types)))])
     return RunInformation(
         name=name,
-        session=found.result.trace_hash,
+        session=identified.result.trace_hash,
         chain=fit.chain,
-        joints=seen.information,
-        sigma_nm=seen.fit.torque_sigma_nm,
+        joints=instrumental.information,
+        sigma_nm=instrumental.fit.torque_sigma_nm,
         independent_fraction=INDEPENDENT_FRACTION,
-        phi_parts=likely_parts(fit.chain, types, seen.informed_phi),
+        phi_parts=likely_parts(fit.chain, types, instrumental.informed_phi),
         directions=directions,
         effects=effects,
-        scale=seen.scale.value,
-        scale_sigma=SCALE_SIGMA["uncalibrated" if seen.scale.covariance.any() else "calibrated"],
+        scale=instrumental.scale.value,
+        scale_sigma=SCALE_SIGMA["uncalibrated" if instrumental.scale.covariance.any() else "calibrated"],
     )

@@ -1,6 +1,6 @@
-"""One identification run, from discovery to the last motion. Estimation from what it recorded is `identify`.
+"""The steps of an identification run, from discovery to the last motion; `identify` evaluates its recording.
 
-Steps are journaled: a step that the journal says is done is not done again when a crashed run resumes.
+Steps are journaled; a resumed run skips the steps that are done.
 """
 
 import asyncio
@@ -25,54 +25,54 @@ from module_agent.model.errors import RobotError
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
 DISCOVERY_POLL_S = 0.05
-# Estimates take some tens of milliseconds; what has not come by then was lost on the way, and is asked for.
+# Estimates take some tens of milliseconds; one that has not come by then was lost, and is requested.
 ESTIMATE_WAIT_S = 0.6
-# A poor network interrupts more than one motion in ten; so many times the plan's retries leave none undone.
+# A poor network interrupts more than one motion in ten: factor on the plan's retries.
 POOR_RETRIES = 4
-# Who moves all joints at once is in a hurry; a second tells the gyros' offsets to 0.1 mrad/s.
-WHOLE_REST_S = 1.0
+# Rest of a run that moves all joints at once, for speed: 1 s determines the gyros' biases to 0.1 mrad/s.
+SIMULTANEOUS_REST_S = 1.0
 
 
 class Reporter(Protocol):
-    """Hears how the session goes; screen and viewer implement it."""
+    """Receives the progress of the session, and designs motions; implemented by `Run`."""
 
     def step(self, index: int, total: int, text: str) -> None:
-        """A step begins."""
+        """Report that a step begins."""
         ...
 
     def note(self, text: str) -> None:
-        """Something worth a line."""
+        """Report a line of text."""
         ...
 
     def estimates(self, joint: str) -> None:
-        """All estimates of the motions of a joint have arrived."""
+        """Report that all estimates of the motions of a joint have arrived."""
         ...
 
     async def doubts(self) -> Sequence[NextMotion]:
-        """All joints are explored. Return what to move again to settle doubts about the topology."""
+        """Return the motions to repeat to settle doubts about the topology, after all joints are explored."""
         ...
 
     async def explored(self) -> None:
-        """All joints are explored: topology and chain can be assembled. Raises if they cannot."""
+        """Assemble topology and chain, after all joints are explored; raises if they cannot be."""
         ...
 
     async def excitation(self) -> Sequence[RobotMotion]:
-        """Return motions of all joints at once that tell their inertia, the last to be held out.
+        """Return excitation motions of all joints at once, the last to be held out.
 
-        Empty if there are none that the robot could run.
+        Empty if none is feasible on this robot.
         """
         ...
 
 
 class NoModulesFound(RobotError):
-    """No module, or not as many as expected, announced itself."""
+    """No module, or another number than expected, is on the network."""
 
 
 class Session:
-    """Runs the steps on a robot. `journal` records an event; `reporter` hears of progress.
+    """Runs the steps on a robot. `journal` records an event; `reporter` receives the progress.
 
-    `closer` is asked after a motion of all joints at once which of them to explore by themselves as well.
-    `share` is called after every motion that tells the inertia, while the modules still have its rows.
+    `single_joints` returns, after a motion of all joints at once, which of them to explore one by one too.
+    `share` is called after every excitation motion, while the modules still have its rows.
     """
 
     def __init__(
@@ -84,50 +84,50 @@ class Session:
         clock: Clock,
         journal: Callable[[JournalEvent], None],
         reporter: Reporter,
-        closer: Callable[[], Awaitable[Sequence[str]]] | None = None,
+        single_joints: Callable[[], Awaitable[Sequence[str]]] | None = None,
         share: Callable[[], Awaitable[None]] | None = None,
     ):
         self.group = group
         self._share = share
-        self._closer = closer
+        self._single_joints = single_joints
         self._messenger = messenger
         self._recording = recording
         self._plan = plan
         self._clock = clock
         self._journal = journal
         self._reporter = reporter
-        self._choice = MotionChoice(plan, recording, lambda: self._left_out.movers(), group.kind)
+        self._choice = MotionChoice(plan, recording, lambda: self._excluded.movers(), group.kind)
         self._done = {e.step: e for e in recording.journal if e.what == "done"}
         self._index = 0
         self._total = 4
         self._keeper: asyncio.Task[None] | None = None
-        self._left_out = ExcludedModules(group, self._note_left_out)
+        self._excluded = ExcludedModules(group, self._note_exclusion)
 
     # ------------------------------------------------------------------ the run
 
     async def run(self, expect: int | None = None) -> None:
-        """Discover, check, take, move, and let go; raises what went wrong after stopping the robot."""
+        """Discover, check, acquire, move and release; on an error, stop the robot and raise it."""
         await self._discover(expect)
-        self._report("checking the link")
+        self._report("checking the network")
         await check_link(self.group, self._clock, self._plan.link_s, self._reporter.note)
         serials = self.group.serials
         explorations = (
             1 if self._plan.mode == "simultaneous" else len(serials) + (self._plan.motions == "optimised")
         )
         self._total = 6 + explorations + (self._excitations(len(serials)) if self._plan.dynamics else 0)
-        self._mend_after_restart()
+        self._invalidate_steps_before_boot()
         starts = {s: self._position(s) for s in serials}
         try:
             await self._take()
-            await self._if_it_moves("home", "all joints to their home position", self._home)
+            await self._step_unless_excluded("home", "all joints to their home position", self._home)
             await self._step("rest", "listening at rest", self._rest)
             if self._plan.mode == "simultaneous":
                 await self._step("explore", "exploring all joints at once", self._explore_all)
-                await self._look_closer()
+                await self._explore_single()
             else:
                 for serial in serials:
                     text = f"exploring joint {serial}"
-                    await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
+                    await self._step_unless_excluded(f"explore/{serial}", text, self._explore, serial)
                 if self._plan.motions == "optimised" and not self._plan.topology_only:
                     await self._step("explore", "exploring all joints at once", self._explore_all)
             await self._settle_doubts()
@@ -154,7 +154,7 @@ class Session:
             names = ", ".join(sorted(known)) or "none"
             wanted = "at least one" if expect is None else str(expect)
             raise NoModulesFound(f"{wanted} module expected, found {len(known)}: {names}")
-        await self._left_out.meet(sorted(known))
+        await self._excluded.meet(sorted(known))
         if not self.group.serials:
             raise NoModulesFound(
                 f"none of the modules that announced themselves responds: {', '.join(sorted(known))}"
@@ -163,8 +163,8 @@ class Session:
             self.group.kind(serial)
         self._reporter.note(f"found {len(self.group.serials)}: {', '.join(self.group.serials)}")
 
-    def _mend_after_restart(self) -> None:
-        """Forget what the journal says is done if a module has booted since: its zero may have moved."""
+    def _invalidate_steps_before_boot(self) -> None:
+        """Repeat steps whose module has booted since: its zero may have moved."""
         moved = [e for e in self._recording.journal if e.what == "motion"]
         for event in [*self._done.values(), *moved]:
             record = self._recording.modules.get(event.serial)
@@ -177,14 +177,14 @@ class Session:
             self._reporter.note(f"resuming: {len(self._done)} steps are done already")
 
     async def _take(self) -> None:
-        # The keeper first: what is taken already must not expire while the next one is slow to answer.
+        # The keep-alives first: a lease must not expire while the next module is slow to answer.
         self._keeper = asyncio.create_task(self.group.keep_alive())
         await self._arm()
 
     async def _arm(self) -> None:
-        """Acquire every module, and set gains where the plan wants others than the factory's."""
-        # At once: what is armed and has no motion yet expires the more easily.
-        await gather_all(self._arm_one(serial) for serial in self._left_out.movers())
+        """Acquire every module, and set the plan's gains if they are not the factory's."""
+        # Concurrently: a module that is armed without a motion expires sooner.
+        await gather_all(self._arm_one(serial) for serial in self._excluded.movers())
 
     async def _arm_one(self, serial: str) -> None:
         await self.group.acquire(serial)
@@ -194,7 +194,7 @@ class Session:
             await self.group.set_gains(serial, gains)
 
     def _retries(self) -> int:
-        """Return how often an interrupted step is done again."""
+        """Return how often an interrupted step is repeated."""
         return self._plan.retries * (POOR_RETRIES if self.group.is_poor else 1)
 
     async def _step(
@@ -221,20 +221,20 @@ class Session:
         boot = self.group.module(serial).boot if serial else 0
         self._journal(JournalEvent(t_ns=self._clock(), what="done", step=name, serial=serial, boot=boot))
 
-    async def _if_it_moves(
+    async def _step_unless_excluded(
         self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
     ) -> None:
-        """Do a step; without a module that will not move, however often it is told, if that comes up."""
-        while not (arguments and arguments[0] in self._left_out.why):
+        """Run a step; exclude a module that refuses to move, and go on without it."""
+        while not (arguments and arguments[0] in self._excluded.why):
             try:
                 await self._step(name, text, work, *arguments)
                 return
             except (Refused, MotionInterrupted) as error:
-                if not self._left_out.without(error):
+                if not self._excluded.without(error):
                     raise
                 await self._rearm()
 
-    def _note_left_out(self, serial: str, why: str) -> None:
+    def _note_exclusion(self, serial: str, why: str) -> None:
         self._reporter.note(f"going on without {serial}: {why}")
         self._journal(exclusion_event(self._clock(), serial, why))
 
@@ -246,7 +246,7 @@ class Session:
         speed = self._plan.travel_speed_rad_s
 
         async def back() -> None:
-            movers = self._left_out.movers()
+            movers = self._excluded.movers()
             await self.group.run({s: GoTo(target_rad=starts[s], max_speed_rad_s=speed) for s in movers})
 
         await self._step("back", "back to where it stood", back)
@@ -263,9 +263,9 @@ class Session:
     async def _abandon(self, error: BaseException) -> None:
         await self._stop_keeping()
         why = str(error) or type(error).__name__
-        deaf = await self.group.stop_all(why[:200])
-        text = f"stopped: {why}" + (f"; no confirmation from {', '.join(deaf)}" if deaf else "")
-        self._journal(JournalEvent(t_ns=self._clock(), what="failed", text=text, deaf=tuple(deaf)))
+        unconfirmed = await self.group.stop_all(why[:200])
+        text = f"stopped: {why}" + (f"; no confirmation from {', '.join(unconfirmed)}" if unconfirmed else "")
+        self._journal(JournalEvent(t_ns=self._clock(), what="failed", text=text, deaf=tuple(unconfirmed)))
         self._reporter.note(text)
 
     # ------------------------------------------------------------------ the steps
@@ -273,19 +273,19 @@ class Session:
     async def _home(self) -> None:
         speed, home = self._plan.travel_speed_rad_s, self._plan.home_rad
         await self.group.run(
-            {s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self._left_out.movers()}
+            {s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self._excluded.movers()}
         )
         await asyncio.sleep(self._plan.settle_s)
 
     async def _rest(self) -> None:
-        longest = WHOLE_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
-        pattern = Rest(duration_s=min(longest, self._plan.rest_s))
-        records = await self.group.run(dict.fromkeys(self._left_out.movers(), pattern))
+        longest_s = SIMULTANEOUS_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
+        pattern = Rest(duration_s=min(longest_s, self._plan.rest_s))
+        records = await self.group.run(dict.fromkeys(self._excluded.movers(), pattern))
         for serial, record in records.items():
             self._note_motion("rest", serial, record, "rest")
 
     async def _explore(self, serial: str) -> None:
-        """Constant motion through home, then the windowed sine about home (thesis 4.3.1)."""
+        """Run the constant motion through home, then the windowed sine about home (thesis 4.3.1)."""
         plan, home = self._plan, self._plan.home_rad
         constant = self._choice.slow(serial)
         travel = constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
@@ -299,7 +299,7 @@ class Session:
         await self._repeat(serial, [slow, fast])
 
     async def _repeat(self, serial: str, done: list[MotionRecord]) -> None:
-        """Repeat the fast motion, or another that tells more, until the radius is known as well as asked."""
+        """Repeat the fast motion, or a more informative one, until the radius has the plan's precision."""
         while (more := self._choice.again(serial, done)) is not None:
             done.append(await self._move(f"explore/{serial}", serial, more, "repeat"))
         if self._plan.precision_mm is not None:
@@ -308,16 +308,16 @@ class Session:
                 f"of radius by the sensors, {self._plan.precision_mm:.2f} mm asked for"
             )
 
-    async def _look_closer(self) -> None:
-        """Explore by itself every joint that a motion of all at once leaves open, if anybody says which."""
-        closer = await self._closer() if self._closer is not None else ()
-        self._total += len(closer)
-        for serial in closer:
+    async def _explore_single(self) -> None:
+        """Explore one by one the joints of `single_joints`, after a motion of all joints at once."""
+        serials = await self._single_joints() if self._single_joints is not None else ()
+        self._total += len(serials)
+        for serial in serials:
             text = f"exploring joint {serial}"
-            await self._if_it_moves(f"explore/{serial}", text, self._explore, serial)
+            await self._step_unless_excluded(f"explore/{serial}", text, self._explore, serial)
 
     async def _settle_doubts(self) -> None:
-        """Move again what leaves the topology in doubt, until nothing does or trying has no end."""
+        """Repeat motions until the topology is beyond doubt, at most `MAX_REPEATS` times."""
         for turn in range(MAX_REPEATS):
             motions = await self._reporter.doubts()
             self._total += len(motions)
@@ -334,7 +334,7 @@ class Session:
 
     async def _move_again(self, motion: NextMotion, serial: str) -> None:
         slow, home = self._plan.constant(), self._plan.home_rad
-        others = {s: home + motion.others_rad for s in self._left_out.movers() if s != serial}
+        others = {s: home + motion.others_rad for s in self._excluded.movers() if s != serial}
         if motion.others_rad:
             await self._go_all(others)
         await self._go(serial, home - 0.5 * motion.travel_rad(slow))
@@ -344,7 +344,7 @@ class Session:
             await self._go_all(dict.fromkeys(others, home))
 
     async def _explore_all(self) -> None:
-        """All joints about home at the same time, each at frequencies of its own (thesis 7.2)."""
+        """Move all joints about home at the same time, each at its own frequencies (thesis 7.2)."""
         records = await self.group.run(self._choice.whole())
         for serial, record in records.items():
             self._note_motion("explore", serial, record, "whole")
@@ -352,32 +352,32 @@ class Session:
     async def _observe(self, serial: str, pattern: Pattern, purpose: Purpose) -> MotionRecord:
         record = await self._move(f"explore/{serial}", serial, pattern, purpose)
         for observer in self.group.serials:
-            found = await self.group.estimate(observer, serial, record.motion_id, ESTIMATE_WAIT_S)
-            if found is None:
+            estimate = await self.group.estimate(observer, serial, record.motion_id, ESTIMATE_WAIT_S)
+            if estimate is None:
                 self._reporter.note(f"{observer} has no estimate of the {purpose} motion of {serial}")
-            elif found.note:
-                self._reporter.note(f"{observer} on joint {serial}: {found.note}")
+            elif estimate.note:
+                self._reporter.note(f"{observer} on joint {serial}: {estimate.note}")
         return record
 
     async def _show_inertia(self) -> None:
-        """Excite all joints together, if all of them move and motions for that can be designed."""
-        motions = await self._reporter.excitation() if self._together() else ()
-        serials = self._left_out.movers() if not motions else ()
+        """Excite all joints together if such motions can be designed, else joint by joint."""
+        motions = await self._reporter.excitation() if self._excites_together() else ()
+        serials = self._excluded.movers() if not motions else ()
         self._total += (len(motions) or 2 * len(serials)) - self._excitations(len(self.group.serials))
         for number, motion in enumerate(motions):
             last = number == len(motions) - 1
             purpose: Purpose = "held_out" if last else "dynamic"
             text = "held-out motion of all joints" if last else f"exciting all joints, {number + 1}"
-            work = partial(self._run_together, f"{purpose}/{number}", motion, purpose)
+            work = partial(self._run_simultaneous, f"{purpose}/{number}", motion, purpose)
             await self._step(f"{purpose}/{number}", text, work)
-            await self._shared()
+            await self._share_information()
         for serial in serials:
             await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
-            await self._shared()
+            await self._share_information()
         for serial in serials:
             await self._step(f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial)
 
-    async def _shared(self) -> None:
+    async def _share_information(self) -> None:
         if self._share is not None:
             await self._share()
 
@@ -385,16 +385,16 @@ class Session:
         """Return how many steps the plan takes to excite so many joints."""
         return 1 + self._plan.excitation_motions if self._plan.excitation == "d-optimal" else 2 * joints
 
-    def _together(self) -> bool:
+    def _excites_together(self) -> bool:
         if self._plan.excitation != "d-optimal":
             return False
-        if self._left_out.why:
-            # Its links are where they are, and it is not to be told to move again.
+        if self._excluded.why:
+            # The poses of excluded modules are fixed, and unknown to the design.
             self._reporter.note("exciting joint by joint: not all joints take part")
-        return not self._left_out.why
+        return not self._excluded.why
 
-    async def _run_together(self, step: str, motion: RobotMotion, purpose: Purpose) -> None:
-        # The ways between home and the pose are known to be clear, and between two poses they are not.
+    async def _run_simultaneous(self, step: str, motion: RobotMotion, purpose: Purpose) -> None:
+        # The paths between home and the pose are checked for collisions, those between two poses are not.
         await self._go_all(motion.pose_rad)
         for serial, record in (await self.group.run(dict(motion.patterns))).items():
             self._note_motion(step, serial, record, purpose)

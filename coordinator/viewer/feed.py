@@ -208,7 +208,7 @@ class ViewerFeed:
     def preview(self, session_ns: int, preview: Preview) -> None:
         """Show the robot as far as it is known, and the links that are final: between adjacent modules."""
         self._draw(session_ns, preview.fit)
-        self._show_links(session_ns, preview.fit, preview.beside)
+        self._show_links(session_ns, preview.fit, preview.adjacent)
 
     def chain(self, session_ns: int, fit: ChainEstimate) -> None:
         """Show the identified robot; from then on it turns with the robot."""

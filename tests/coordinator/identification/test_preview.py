@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.identification.preview import beside, preview
+from coordinator.identification.preview import adjacent, preview
 from coordinator.kinematics.chain_estimate import link_lengths
 from coordinator.recording.recording import Recording
 from module_agent.model.chain import Chain
@@ -90,7 +90,7 @@ def test_when_all_joints_have_moved_the_robot_is_the_whole_one(robots: Any, seed
     assert parents == {
         s: chain.serials[p] if p >= 0 else None for s, p in zip(chain.serials, chain.parent, strict=True)
     }
-    assert found.beside == tuple(p >= 0 for p in so_far.parent)
+    assert found.adjacent == tuple(p >= 0 for p in so_far.parent)
     lengths, _ = link_lengths(chain, np.zeros((6 * len(types),) * 2))
     expected = [lengths[chain.serials.index(s)] for s in so_far.serials]
     # Work ends when the squares shrink by a thousandth: far below the 0.3 mm that circles are believed to.
@@ -119,17 +119,17 @@ def test_a_module_stands_on_the_nearest_joint_that_has_moved_and_moves_it(robots
         for k, serial in enumerate(so_far.serials):
             on = so_far.serials[so_far.parent[k]] if so_far.parent[k] >= 0 else None
             assert on == nearest[serial]
-            if found.beside[k]:
+            if found.adjacent[k]:
                 assert on == chain.serials[chain.parent[chain.serials.index(serial)]]
 
 
 def test_a_link_is_one_link_only_when_nothing_unexplored_can_lie_on_it(robots: Any) -> None:
     chain, _ = forward(robots, 3, joints=4)
     star = chain._replace(parent=(-1, 0, 0, 0))
-    assert beside(star, chain.serials[:1]) == (False,) * 4
+    assert adjacent(star, chain.serials[:1]) == (False,) * 4
     # One that is open itself can only be at the end.
-    assert beside(star, chain.serials[:3]) == (False, False, False, True)
-    assert beside(star, chain.serials) == (False, True, True, True)
+    assert adjacent(star, chain.serials[:3]) == (False, False, False, True)
+    assert adjacent(star, chain.serials) == (False, True, True, True)
 
 
 def test_bands_grow_narrower_the_more_joints_have_moved(robots: Any) -> None:

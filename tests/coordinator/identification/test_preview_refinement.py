@@ -14,7 +14,7 @@ from coordinator.recording.run_folder import load_recording
 BASE, TIP = "X-00009", "X-00010"
 TRUE_M = 0.35
 # One process makes the recording that all tests here work on.
-pytestmark = pytest.mark.xdist_group("look")
+pytestmark = pytest.mark.xdist_group("preview")
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,7 @@ def recording(
 ) -> Recording:
     """A run on an arm of two modules; made once, read anew."""
     if not kept:
-        out = tmp_path_factory.mktemp("look") / "run"
+        out = tmp_path_factory.mktemp("preview") / "run"
         rigs("thesis_350_vertical", "lan", 3).session(out, quick_plan)
         kept.append(out / "session.mcap")
     return load_recording(kept[0])
@@ -49,10 +49,10 @@ def sigma(found: Preview | None) -> float:
 
 
 def test_one_joint_tells_the_link_beyond_it_within_what_it_claims(recording: Recording) -> None:
-    found = Previewer(until(recording, [BASE])).look([BASE])
+    found = Previewer(until(recording, [BASE])).preview([BASE])
     assert found is not None
     assert found.fit.chain.serials == (BASE, TIP)
-    assert found.beside == (False, True)
+    assert found.adjacent == (False, True)
     # Three sigma: a thing of 3 in 1000.
     assert abs(found.fit.link_length_m[1] - TRUE_M) < 3.0 * sigma(found)
     assert sigma(found) < 0.02
@@ -60,7 +60,7 @@ def test_one_joint_tells_the_link_beyond_it_within_what_it_claims(recording: Rec
 
 def test_samples_move_the_robot_within_what_the_circles_leave_open(recording: Recording) -> None:
     explored = [BASE, TIP]
-    circles, samples = preview(recording, explored), Previewer(recording).look(explored)
+    circles, samples = preview(recording, explored), Previewer(recording).preview(explored)
     assert circles is not None
     assert samples is not None
     apart = samples.fit.link_length_m[1] - circles.fit.link_length_m[1]
@@ -69,7 +69,7 @@ def test_samples_move_the_robot_within_what_the_circles_leave_open(recording: Re
 
 
 def test_a_robot_of_more_modules_than_are_to_be_refined_is_as_assembled(recording: Recording) -> None:
-    found, assembled = Previewer(recording, most_refined=1).look([BASE]), preview(recording, [BASE])
+    found, assembled = Previewer(recording, max_refined=1).preview([BASE]), preview(recording, [BASE])
     assert found is not None
     assert assembled is not None
     np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
@@ -78,7 +78,7 @@ def test_a_robot_of_more_modules_than_are_to_be_refined_is_as_assembled(recordin
 def test_where_samples_are_missing_the_robot_is_as_assembled(recording: Recording) -> None:
     assembled = preview(recording, [BASE])
     recording.modules[TIP].round_trips.clear()
-    found = Previewer(recording).look([BASE])
+    found = Previewer(recording).preview([BASE])
     assert found is not None
     assert assembled is not None
     np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
@@ -86,11 +86,11 @@ def test_where_samples_are_missing_the_robot_is_as_assembled(recording: Recordin
 
 def test_the_same_look_twice_is_the_same_to_the_last_bit(recording: Recording) -> None:
     looks = Previewer(recording)
-    one, two = (looks.look([BASE, TIP]) for _ in range(2))
+    one, two = (looks.preview([BASE, TIP]) for _ in range(2))
     assert one is not None
     assert two is not None
     np.testing.assert_array_equal(one.fit.chain.imu_home, two.fit.chain.imu_home)
 
 
 def test_before_anything_has_moved_there_is_nothing_to_see(recording: Recording) -> None:
-    assert Previewer(until(recording, [])).look([]) is None
+    assert Previewer(until(recording, [])).preview([]) is None
