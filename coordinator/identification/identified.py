@@ -1,4 +1,4 @@
-"""What is identified from a recording: topology, chain, inertia, held-out motions."""
+"""Results of an identification: topology, chain, inertia, held-out motions."""
 
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from module_agent.signals.clock_map import ClockMap
 
 
 class IdentificationError(DataError):
-    """The recording does not hold what is needed; the message says what is missing and where."""
+    """Data is missing from the recording; the message says what and where."""
 
 
 class Kinematics(NamedTuple):
@@ -32,7 +32,7 @@ class Kinematics(NamedTuple):
 
     @property
     def fit(self) -> ChainEstimate:
-        """The refined chain and what is known of it."""
+        """The refined chain with its covariance and unresolved directions."""
         return self.refinement.estimate
 
     def summary(self) -> list[str]:
@@ -78,7 +78,7 @@ class Identified(NamedTuple):
 
     @property
     def real_phi(self) -> Array | None:
-        """The inertial parameters for files that other programs read: of real bodies, if any were found."""
+        """The inertial parameters for URDF and HRDF: of physically consistent bodies if there are any."""
         if self.bodies is not None and self.bodies.fit is not None:
             return self.bodies.fit.phi
         return self.inertia.instrumental.fit.phi if self.inertia is not None else None

@@ -1,7 +1,7 @@
-"""From a recording to what it says of the robot: pure, so that a replay computes the same.
+"""Identification from a recording, without side effects: a replay computes the same.
 
-Topology from who moved, a first chain from the agents' circle point analyses, one batch refinement of it
-over all exploration motions, then the inertial parameters, checked on motions that nothing was fitted to.
+Topology from observed motions, a first chain from the agents' circle point analyses, one batch refinement
+over all exploration motions, then the inertial parameters, checked on held-out motions.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,8 +50,8 @@ from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, JointMotion, settling_samples
 from module_agent.wire.messages import Estimate
 
-# Of some 30 errors an IMU the largest is below this in 99 of 100.
-STRANGE_ABOVE = 3.5
+# The largest of some 30 IMU errors, in standard deviations, is below this for 99 of 100 IMUs.
+OUTLIER_ABOVE = 3.5
 MIN_REST_ROWS = 10
 
 
@@ -60,12 +60,15 @@ def identify(
     revise: Callable[[Kinematics], Kinematics] | None = None,
     kinematics: Kinematics | None = None,
 ) -> Identified:
-    """Compute everything from a recording; `revise` is what is known beforehand put into the kinematics.
+    """Identify everything from a recording.
 
-    `kinematics` is what was computed already of this recording, `revise` included.
+    Args:
+        recording: of a whole session.
+        revise: combines the kinematics with prior knowledge, such as a baseline.
+        kinematics: the revised kinematics of this recording, if they are computed already.
 
     Raises:
-        IdentificationError: what is needed is not there, or contradicts itself.
+        IdentificationError: data is missing or contradicts itself.
     """
     if kinematics is None:
         kinematics = identify_kinematics(recording)
@@ -80,13 +83,15 @@ def identify(
         windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
         clocks = kinematics.clocks
         inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
-        seen = inertia.instrumental
-        bodies = robot_bodies(seen.information, chain, types, seen.fit, INDEPENDENT_FRACTION, inertia.effects)
+        estimate = inertia.instrumental
+        bodies = robot_bodies(
+            estimate.information, chain, types, estimate.fit, INDEPENDENT_FRACTION, inertia.effects
+        )
         if recording.latest_motions("held_out"):
-            means = joined_motions([without_terms(one, seen) for one in windows]).tau_nm.mean(axis=0)
+            means = joined_motions([without_terms(one, estimate) for one in windows]).tau_nm.mean(axis=0)
             windows = dynamic_windows(recording, kinematics.clocks, serials, "held_out")
-            motion = joined_motions([without_terms(one, seen) for one in windows])
-            held_out = _held_out(kinematics, motion, seen.fit.phi, means)
+            motion = joined_motions([without_terms(one, estimate) for one in windows])
+            held_out = _held_out(kinematics, motion, estimate.fit.phi, means)
             bodies = _checked(bodies, kinematics, motion, means)
     result = build_result(recording, kinematics, inertia, held_out, bodies)
     return Identified(kinematics, inertia, bodies, held_out, result)
@@ -96,7 +101,7 @@ def identify(
 
 
 def identify_kinematics(recording: Recording) -> Kinematics:
-    """Find topology and chain.
+    """Identify topology and chain.
 
     Raises:
         IdentificationError: see `identify`.
@@ -104,8 +109,8 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     serials = _explored(recording)
     try:
         clocks = map_clocks({s: recording.modules[s].trips for s in serials})
-        found = search_topology(recording, serials)
-        topology = found.topology
+        search = search_topology(recording, serials)
+        topology = search.topology
         types = [recording.module_type(s) for s in topology.serials]
         windows = _exploration(recording, clocks, topology.serials)
         first = assemble(
@@ -123,24 +128,24 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         raise IdentificationError(str(error)) from error
     notes = tuple(
         f"{estimate.serial} on joint {estimate.joint}: {estimate.note}"
-        # Copies: while this is computed beside a session, late estimates still arrive.
-        for found in list(recording.estimates.values())
-        for estimate in list(found.values())
+        # Copies: during a session late estimates still arrive.
+        for estimates in list(recording.estimates.values())
+        for estimate in list(estimates.values())
         if estimate.note
     )
-    notes += found.notes
-    notes += _strange_imus(topology.serials, refined, prior)
+    notes += search.notes
+    notes += _imu_outliers(topology.serials, refined, prior)
     return Kinematics(topology, first, refined, clocks, notes)
 
 
-def _strange_imus(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:
-    """Say whose IMU came out with errors that its kind does not have: then something is not in the model."""
-    far = dict(zip(serials, beyond(refined.intrinsics, prior), strict=True))
+def _imu_outliers(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:
+    """Return notes on IMUs whose estimated errors are outliers of the prior: the model lacks an effect."""
+    ratio = dict(zip(serials, beyond(refined.intrinsics, prior), strict=True))
     return tuple(
-        f"{serial}: its IMU seems to have {far[serial]:.1f} times the error that its kind has. It is poor, "
+        f"{serial}: its IMU seems to have {ratio[serial]:.1f} times the error that its kind has. It is poor, "
         "or the robot's base or links give; lengths and axes near it may be worse than claimed"
         for serial in serials
-        if far[serial] > STRANGE_ABOVE
+        if ratio[serial] > OUTLIER_ABOVE
     )
 
 
@@ -165,9 +170,9 @@ def _explored(recording: Recording) -> list[str]:
 
 
 def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose) -> Estimate | None:
-    """Return what `observer` made of the latest motion of this purpose of `joint`."""
-    found = [e for e in recording.latest_motions(purpose) if e.serial == joint]
-    number = found[-1].motion.motion_id if found and found[-1].motion is not None else -1
+    """Return the observer's estimate of the latest motion of a joint with this purpose."""
+    motions = [e for e in recording.latest_motions(purpose) if e.serial == joint]
+    number = motions[-1].motion.motion_id if motions and motions[-1].motion is not None else -1
     for ids, estimate in list(recording.estimates.get((joint, observer), {}).items()):
         if ids[-1] == number:
             return estimate
@@ -199,7 +204,7 @@ def _pairs(
 
 
 def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topology) -> NoiseFloor | None:
-    """Return the noise of the IMU that rides on the base, if the first module's does."""
+    """Return the noise of the first module's IMU at rest; None if that IMU is not fixed to the base."""
     if topology.reversed[0]:
         return None
     still = [e for e in recording.latest_motions("rest") if e.serial == topology.serials[0]]
@@ -207,11 +212,11 @@ def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topo
 
 
 def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
-    """Return the motions that the chain is fitted to, of modules that take part in it."""
+    """Return the motions to which the chain is fitted, of the modules in it."""
     alone = recording.latest_motions("constant", "windowed_sine")
     whole, repeats = recording.latest_motions("whole"), recording.motions("repeat")
     alone, whole, repeats = ([e for e in some if e.serial in serials] for some in (alone, whole, repeats))
-    # All joints at once are in the window of any of them.
+    # The window of any one joint of a simultaneous motion holds all joints.
     return [*alone, *whole[:1], *repeats]
 
 
@@ -224,7 +229,7 @@ def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Seq
 
 
 def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Array) -> HeldOutMotion:
-    found = check_held_out(kinematics.fit.chain, phi, motion, means)
+    check = check_held_out(kinematics.fit.chain, phi, motion, means)
     serials = kinematics.topology.serials
     return HeldOutMotion(
         serials,
@@ -232,17 +237,17 @@ def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Ar
         np.stack([kinematics.clocks[s].to_module(motion.t_ns) for s in serials], axis=1),
         motion.q_rad,
         motion.tau_nm,
-        found.tau_predicted_nm,
-        found.error,
+        check.tau_predicted_nm,
+        check.error,
     )
 
 
 def _checked(bodies: RobotBodies, kinematics: Kinematics, motion: JointMotion, means: Array) -> RobotBodies:
-    """Return the bodies with how well they predict held-out torques."""
+    """Return the bodies with their held-out torque error."""
     if bodies.fit is None:
         return bodies
-    found = check_held_out(kinematics.fit.chain, bodies.fit.phi, motion, means)
-    return bodies._replace(held_out_error=found.error.overall)
+    check = check_held_out(kinematics.fit.chain, bodies.fit.phi, motion, means)
+    return bodies._replace(held_out_error=check.error.overall)
 
 
 def write_held_out(path: Path, held_out: HeldOutMotion) -> None:

@@ -1,4 +1,4 @@
-"""`result.json`: what a session found, in a versioned schema; written whole or not at all."""
+"""`result.json`: the results of an identification in a versioned schema; written whole or not at all."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -54,7 +54,7 @@ class LinkPart(Part):
 
 
 class UnknownPart(Part):
-    """Which parameters of one link are not known (names as in `TransformPart.parameters`)."""
+    """Unidentifiable parameters of one link (names as in `TransformPart.parameters`)."""
 
     parent: str
     child: str
@@ -62,7 +62,7 @@ class UnknownPart(Part):
 
 
 class UnresolvedPart(Part):
-    """What the data do not determine: as a sentence, as parameters of links, and what would resolve it."""
+    """Directions that the data do not determine: as a sentence, as parameters of links, and the remedy."""
 
     kind: str
     joint: str
@@ -75,8 +75,8 @@ class UnresolvedPart(Part):
 class TransformPart(Part):
     """The pose of a child's mounting face in its parent's moved face; see `kinematics.link_transforms`.
 
-    values and covariance are in the units that `parameters` names. sigma is None where a parameter takes part
-    in what no observation tells; the covariance is that of what is known.
+    values and covariance are in the units that `parameters` names. sigma is None for a parameter with an
+    unobservable part; the covariance is that of the observable part.
     """
 
     parent: str
@@ -118,9 +118,9 @@ class ExponentialsPart(Part):
 class MountingPart(Part):
     """Where a module is mounted (`parent` is None on the base) and which way round, with log-odds of both.
 
-    Log-odds of 4.6 are 99 %, 0 is a toss-up, None says that nothing else is possible. A module whose joint
-    did not move shows as a leaf, and its way round is not known. There is no such list of a topology that
-    was known beforehand.
+    Log-odds of 4.6 are 99 %, 0 is undecided, None: there is no alternative. A module whose joint did not move
+    shows as a leaf, and its mounting direction is not known. The list is empty for a topology taken from a
+    baseline.
     """
 
     serial: str
@@ -161,7 +161,7 @@ class DhPart(Part):
 
 
 class HeldOutPart(Part):
-    """How well the model predicts torques of a motion that it was not fitted to: |e| / |tau|, 2-norms."""
+    """Relative torque error of held-out motions: |e| / |tau|, 2-norms."""
 
     relative_error: float
     relative_error_per_joint: dict[str, float]
@@ -179,10 +179,10 @@ class ModuleBodyPart(BodyPart):
 
 
 class BodiesPart(Part):
-    """Real bodies that explain the torques; what these do not tell is what modules of the type have.
+    """Physically consistent bodies fitted to the torques, with the module types as prior.
 
-    relative_error is |e| / |tau| of the motions that were fitted, least_squares_error that of the best
-    parameters, be they a body's or not. prior_weight is how much the modules' make counts.
+    relative_error is |e| / |tau| of the fitted motions, least_squares_error that of the best parameters
+    without the constraint. prior_weight is the weight of the prior.
     """
 
     bodies: list[ModuleBodyPart]
@@ -193,7 +193,7 @@ class BodiesPart(Part):
 
 
 class IdentifiabilityPart(Part):
-    """Whether one parameter is known.
+    """Whether one inertial parameter is identifiable.
 
     identifiability: `identified` (by torques alone, within 10 %), `weak` (worse, or only with the prior of
     the module type) or `not identifiable`. base_parameters: the indices of the base parameters that it is
@@ -228,15 +228,15 @@ class TorqueTermPart(Part):
 class DynamicsPart(Part):
     """The inertial parameters; see `dynamics.regressor` for the order and frame of `phi`.
 
-    `phi` predicts torques but need not be of real bodies: those are `bodies`. summary: what is known, body
-    by body. frames are the poses (4, 4) at q = 0 in the root frame in which base parameters and
+    `phi` predicts torques but need not be physically consistent: see `bodies`. summary: lines of text,
+    body by body. frames are the poses (4, 4) at q = 0 in the root frame in which base parameters and
     identifiability are stated: z along the joint's axis, x towards the next joint; m, m c and I of body k
     (counted from 1 along the chain) are in frame k, about its origin. motion_source: the sensors from which
-    the bodies' motion is known; noise_nm: the torque residual with each motion source.
+    the bodies' motion is computed; noise_nm: the torque residual with each motion source.
 
-    gathered_by: who projected the encoders' rows, from which what only IMUs measure is subtracted; by_agents
-    are the modules that projected their own. gathered_difference: the largest relative difference between
-    those and the coordinator's.
+    gathered_by: who projected the encoders' rows, from which the motion measured by IMUs alone is subtracted;
+    by_agents are the modules that projected their own. gathered_difference: the largest relative difference
+    between their projections and the coordinator's.
     """
 
     phi: list[float]
@@ -261,10 +261,10 @@ class DynamicsPart(Part):
 
 
 class Result(Part):
-    """Everything that one session found.
+    """All results of one session.
 
-    chain_covariance and null_basis, (6 n, 6 n) and (6 n, k), are over the increments of
-    `kinematics.increments`: per module of the chain a twist of its pose at q = 0 in the root frame.
+    chain_covariance and null_basis, (6 n, 6 n) and (6 n, k), are over the perturbations of
+    `model.perturbation`: per module of the chain a twist of its pose at q = 0 in the root frame.
     """
 
     robot: str

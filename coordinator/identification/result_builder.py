@@ -1,4 +1,4 @@
-"""Putting what was identified into the schema of `result.json`."""
+"""The result of an identification in the schema of `result.json`."""
 
 from typing import TYPE_CHECKING, Literal
 
@@ -87,10 +87,10 @@ def build_result(
 
 
 def _notes(inertia: "Inertia | None", bodies: "RobotBodies | None") -> list[str]:
-    said = [bodies.note] if bodies is not None else []
+    notes = [bodies.note] if bodies is not None else []
     if inertia is not None and inertia.gathered is not None:
-        said.append(inertia.gathered.note)
-    return [note for note in said if note]
+        notes.append(inertia.gathered.note)
+    return [note for note in notes if note]
 
 
 def _mountings(topology: "Topology") -> list[MountingPart]:
@@ -153,7 +153,7 @@ def _unresolved(fit: "ChainEstimate", types: list[ModuleType], item: "Unresolved
 
 
 def _summary(item: "Unresolved", links: list[UnknownPart]) -> str:
-    """Say which parameters of which links are not known, why, and what would tell them."""
+    """Describe which parameters of which links are unresolved, why, and what would resolve them."""
     short = [", ".join(name.split("_")[0] for name in link.parameters) for link in links]
     of = [
         f"{names} of the link {link.parent} - {link.child}" for names, link in zip(short, links, strict=True)
@@ -171,10 +171,9 @@ def _columns(item: "Unresolved") -> Array:
 
 
 def _transforms(fit: "ChainEstimate", types: list[ModuleType]) -> list[TransformPart]:
-    # The motions that have been named, not the null vectors of the fit: those are mixed, and off by its
-    # noise.
-    nothing = np.zeros((len(fit.covariance), 0))
-    hidden = np.concatenate([nothing, *(_columns(item) for item in fit.unresolved)], axis=1)
+    # The named gauge freedoms, not the null vectors of the fit, which are mixed and affected by its noise.
+    no_directions = np.zeros((len(fit.covariance), 0))
+    hidden = np.concatenate([no_directions, *(_columns(item) for item in fit.unresolved)], axis=1)
     return [_transform(link) for link in link_transforms(fit.chain, types, fit.covariance, hidden)]
 
 
@@ -215,8 +214,8 @@ def _exponentials(fit: "ChainEstimate", types: list[ModuleType]) -> Exponentials
 
 def _pairs(recording: Recording) -> list[PairPart]:
     parts = []
-    for (joint, observer), found in sorted(recording.estimates.items()):
-        estimate = list(found.values())[-1]
+    for (joint, observer), estimates in sorted(recording.estimates.items()):
+        estimate = list(estimates.values())[-1]
         circle = estimate.circle
         parts.append(
             PairPart(
@@ -241,35 +240,36 @@ def _dh(kinematics: "Kinematics") -> list[DhPart]:
 
 def _dynamics(
     kinematics: "Kinematics",
-    found: "Inertia | None",
+    inertia: "Inertia | None",
     held_out: "HeldOutMotion | None",
     bodies: "RobotBodies | None",
 ) -> DynamicsPart | None:
-    if found is None:
+    if inertia is None:
         return None
-    serials, inertia = kinematics.topology.serials, found.instrumental.fit
+    serials, fit = kinematics.topology.serials, inertia.instrumental.fit
     return DynamicsPart(
-        phi=inertia.phi.tolist(),
-        rank=inertia.rank,
-        parameters=len(inertia.phi),
-        condition=inertia.condition,
-        sigma=(inertia.covariance.diagonal() ** 0.5).tolist(),
-        identifiable=inertia.identifiable.tolist(),
-        residual_rms_nm=dict(zip(serials, inertia.residual_rms_nm.tolist(), strict=True)),
+        phi=fit.phi.tolist(),
+        rank=fit.rank,
+        parameters=len(fit.phi),
+        condition=fit.condition,
+        sigma=(fit.covariance.diagonal() ** 0.5).tolist(),
+        identifiable=fit.identifiable.tolist(),
+        residual_rms_nm=dict(zip(serials, fit.residual_rms_nm.tolist(), strict=True)),
         held_out=_held_out(serials, held_out) if held_out is not None else None,
         bodies=_bodies(bodies) if bodies is not None else None,
         base_parameters=base_parameter_parts(bodies.base) if bodies is not None else [],
         identifiability=_identifiability(bodies) if bodies is not None else [],
         summary=bodies.summary() if bodies is not None else [],
         frames=bodies.frames.tolist() if bodies is not None else [],
-        motion_source=found.motion_source,
-        gathered_by=_gathered_by(found.gathered, len(serials)),
-        by_agents=list(found.gathered.by_agents) if found.gathered is not None else [],
-        gathered_difference=found.gathered.difference if found.gathered is not None else None,
+        motion_source=inertia.motion_source,
+        gathered_by=_gathered_by(inertia.gathered, len(serials)),
+        by_agents=list(inertia.gathered.by_agents) if inertia.gathered is not None else [],
+        gathered_difference=inertia.gathered.difference if inertia.gathered is not None else None,
         noise_nm={
-            eyes: dict(zip(serials, noise.tolist(), strict=True)) for eyes, noise in found.noise_nm.items()
+            source: dict(zip(serials, noise.tolist(), strict=True))
+            for source, noise in inertia.noise_nm.items()
         },
-        torque_terms=_torque_terms(serials, found.instrumental),
+        torque_terms=_torque_terms(serials, inertia.instrumental),
     )
 
 
@@ -279,8 +279,8 @@ def _gathered_by(shared: "AgentInformation | None", joints: int) -> Literal["age
     return "agents" if len(shared.by_agents) == joints else "both"
 
 
-def _torque_terms(serials: tuple[str, ...], seen: "InstrumentalFit") -> list[TorqueTermPart]:
-    terms, scale = seen.terms, seen.scale
+def _torque_terms(serials: tuple[str, ...], estimate: "InstrumentalFit") -> list[TorqueTermPart]:
+    terms, scale = estimate.terms, estimate.scale
     return [
         TorqueTermPart(
             serial=serial,
@@ -306,32 +306,32 @@ def _torque_terms(serials: tuple[str, ...], seen: "InstrumentalFit") -> list[Tor
     ]
 
 
-def _bodies(found: "RobotBodies") -> BodiesPart | None:
-    if found.fit is None:
+def _bodies(robot: "RobotBodies") -> BodiesPart | None:
+    if robot.fit is None:
         return None
     return BodiesPart(
         bodies=[
             ModuleBodyPart(**dict(body_part(one)), serial=serial)
-            for serial, one in zip(found.serials, found.bodies, strict=True)
+            for serial, one in zip(robot.serials, robot.bodies, strict=True)
         ],
-        relative_error=found.fit.error,
-        least_squares_error=found.fit.least_squares_error,
-        prior_weight=found.fit.weight,
-        held_out_relative_error=found.held_out_error,
+        relative_error=robot.fit.error,
+        least_squares_error=robot.fit.least_squares_error,
+        prior_weight=robot.fit.weight,
+        held_out_relative_error=robot.held_out_error,
     )
 
 
-def _identifiability(found: "RobotBodies") -> list[IdentifiabilityPart]:
+def _identifiability(robot: "RobotBodies") -> list[IdentifiabilityPart]:
     return [
         IdentifiabilityPart(
             parameter=one.name,
-            serial=found.serials[k // PER_BODY],
+            serial=robot.serials[k // PER_BODY],
             identifiability=one.kind,
             value=one.value,
             sigma=one.sigma,
             base_parameters=list(one.base_parameters),
         )
-        for k, one in enumerate(found.identifiabilities)
+        for k, one in enumerate(robot.identifiabilities)
     ]
 
 

@@ -1,6 +1,6 @@
-"""The batch refinement of a whole robot from its windows: rigid at first, then with what gives in it.
+"""Batch refinement of a robot from its motion windows: rigid first, then with compliant links and base.
 
-A base that shakes and links that bend are found in turn: each needs a chain that is roughly right.
+Base motion and link compliance are estimated in turn; each needs an approximate chain.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.read_only import frozen
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
 
-# Half the time constant of that low-pass: about as many independent samples as there are.
+# Half the time constant of the low-pass: about the number of independent samples.
 KEEP_EVERY = 5
 # IMU samples that the refinement works on at most: its cost grows with them and with the modules squared.
 MAX_IMU_SAMPLES = 40_000
-# Before the last step a quarter of them will do.
+# All steps but the last use a quarter of them.
 COARSE = 4
 
 
@@ -43,7 +43,7 @@ def refine_robot(
     prior: ImuPrior,
     floor: NoiseFloor | None = None,
 ) -> Refinement:
-    """Refine a chain that is roughly right by all motions of its joints.
+    """Refine an approximate chain with all motions of its joints.
 
     Args:
         chain: n joints.
@@ -51,22 +51,22 @@ def refine_robot(
         windows: the motions, columns in the order of the chain.
         prior: how well the IMUs are known.
         floor: the noise of the first module's IMU at rest, if that module is bolted to the base by its
-            housing: what it sees beyond is the base's motion. None takes it that the base rests.
+            housing: its readings beyond this noise are the base's motion. None: the base rests.
 
     Raises:
-        ValueError: as `refine_chain`.
+        DataError: as `refine_chain`.
     """
     keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MAX_IMU_SAMPLES))
     parts = _parts(windows, floor)
     rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior)
-    # The first IMU may see no motion that would tell how late it is; all are of one make.
+    # The first IMU may have no motion to determine its delay; all IMUs are of one type.
     late_s = float(np.median(rigid.intrinsics.errors[1:, DELAY])) if len(chain.serials) > 1 else 0.0
     parts = _parts(windows, floor, late_s, encoder_steps(windows))
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
     giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
     if not giving.compliance.size:
         return refine_chain(giving.chain, thinned(parts, keep), prior)._replace(late_s=late_s)
-    # Where the hinges are changes what turns them: once roughly, then for good.
+    # The hinges' positions change the torques that turn them: first a coarse estimate, then the final one.
     coarse = thinned(parts, COARSE * keep)
     flex = _hinged(giving.chain, coarse, joined(loads, COARSE * keep), giving.compliance)
     hinged = refine_chain(giving.chain, coarse, prior, flex)
@@ -78,9 +78,9 @@ def refine_robot(
     loads = with_hinges_moved(loads, joints, moved)
     fine = thinned(parts, keep)
     flex = _hinged(hinged.chain, fine, joined(loads, keep), hinged.compliance[:links], moved)
-    found = refine_chain(hinged.chain, fine, prior, flex)
-    # Of the hinges the last step finds by how much more they are elsewhere.
-    return found._replace(compliance=frozen(found.compliance + flex.taken), late_s=late_s)
+    refined = refine_chain(hinged.chain, fine, prior, flex)
+    # The last step estimates the change of the hinges' positions.
+    return refined._replace(compliance=frozen(refined.compliance + flex.taken), late_s=late_s)
 
 
 def _hinged(
@@ -110,23 +110,23 @@ def _giving(
     prior: ImuPrior,
     keep: int,
 ) -> tuple[Refinement, list[SensorData]]:
-    """Let links and base give; the base only if the other IMUs feel what the one on it reads.
+    """Refine with compliant links, and with base motion if that reduces the other IMUs' residuals.
 
-    They do not where that one is shaken by its own gears.
+    It does not if the first module's own gears shake the IMU on the base.
     """
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
     flex = compliance_jacobian(rigid.chain, resting.smooth, loads)
     at_rest = refine_chain(rigid.chain, resting, prior, flex)
     data = thinned(parts, keep)
-    nobody_else = len(rigid.chain.serials) == 1
-    if data.base_motion is None or not data.base_motion.any() or nobody_else:
+    single_module = len(rigid.chain.serials) == 1
+    if data.base_motion is None or not data.base_motion.any() or single_module:
         return at_rest, still
     shaken = refine_chain(faced(rigid.chain, data, rigid.estimate.null_basis), data, prior, flex)
     return (shaken, parts) if _misfit(shaken) < _misfit(at_rest) else (at_rest, still)
 
 
 def _misfit(fit: Refinement) -> float:
-    """Return the mean logarithm of what an IMU that does not ride on the base scatters about a fit."""
+    """Return the mean log residual of the IMUs that are not fixed to the base."""
     residuals = np.concatenate([fit.residual_gyro_rad_s[1:], fit.residual_accel_m_s2[1:]])
     return float(np.log(residuals).mean())

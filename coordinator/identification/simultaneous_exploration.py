@@ -1,4 +1,4 @@
-"""What a motion of all joints at once says of who carries whom and of every circle, out of a recording."""
+"""Response of all modules to a motion of all joints at once, from a recording."""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,9 +19,9 @@ from module_agent.signals.filtering import SIMULTANEOUS_CUTOFF_HZ, filtered_sign
 
 
 def simultaneous_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent | None:
-    """Return the latest motion in which all these joints took part at once, as that of the first of them.
+    """Return the latest motion of all these joints at once, as the event of the first of them.
 
-    None if not all of them did, or if all were moved one by one as well: those motions tell more clearly.
+    None if not all took part, or if all were moved one by one as well: those motions are more informative.
     """
     latest = {e.serial: e for e in recording.motions("whole")}
     alone = {e.serial for e in recording.motions("windowed_sine")}
@@ -33,7 +33,7 @@ def simultaneous_motion(recording: Recording, serials: Sequence[str]) -> Journal
 def respond(
     recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], event: JournalEvent
 ) -> SimultaneousResponse:
-    """Regress what all modules saw on what all joints did; columns in the order of `serials`.
+    """Regress all IMUs' readings on all joints' motions; columns in the order of `serials`.
 
     Raises:
         DataError: see `simultaneous_response`; also a hole in the recording, or no rest.

@@ -1,9 +1,9 @@
-"""Who moved with whom, out of a recording: every slow motion of every joint, as every IMU saw it.
+"""Observations of which joint moved which IMU, from every slow motion of every joint in a recording.
 
-Slow motion decides: near a resonance of the held joints a fast one shakes modules that it does not carry, and
-holds others still that it does. The feedback of all modules at once tells more than each module's own view:
-how much other joints gave way, and how far the stretches of the motion agree. What a module found itself
-stands in where its feedback is missing, and makes less certain where it says otherwise.
+Slow motions decide: near a resonance of the held joints a fast motion shakes modules that it does not carry,
+and leaves others at rest that it does. The feedback of all modules together is more informative than each
+module's own estimate: it shows how much other joints gave way, and whether the segments of the motion agree.
+A module's own estimate replaces feedback that is missing, and increases the uncertainty where the two differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,56 +29,56 @@ from module_agent.signals.filtering import TOPOLOGY_CUTOFF_HZ, filtered_signals,
 from module_agent.wire.messages import Estimate, MotionRecord
 
 KEEP_EVERY = 5
-# An axis that joints between have turned by less is still where it was seen: what is left of it is some
-# tenths (`motion_evidence.RESIDUAL_GIVE`).
+# Up to this rotation of the joints in between, an axis counts as unchanged: the residual is some tenths of it
+# (`motion_evidence.RESIDUAL_GIVE`).
 TURNED_RAD = 0.3
-# Of a module's own finding nobody knows how far it may be wrong: held joints give by 20 to 30 %.
+# Sigma of a module's own rate ratio, which does not account for held joints that give by 20 to 30 %.
 OWN_SIGMA = 0.2
 
 
-class Seen(NamedTuple):
-    """What a recording says of who moved with whom.
+class ObservedMotions(NamedTuple):
+    """Which joint moved which IMU, from a recording.
 
-    observations: {(joint, observer): MotionObservation}, of what was seen.
-    unmoved: joints that were told to move and did not, with the reason in words.
-    blind: modules that saw no motion at all: no feedback, no clock, no findings.
+    observations: {(joint, observer): MotionObservation}.
+    unmoved: joints that did not move although commanded, with the reason as text.
+    silent: modules without any observation: no feedback, no clock, no estimates.
     """
 
     observations: Observations
     unmoved: Mapping[str, str]
-    blind: tuple[str, ...]
+    silent: tuple[str, ...]
 
 
-def observe(recording: Recording, serials: Sequence[str]) -> Seen:
-    """Evaluate all slow motions of these modules; what is missing is left out rather than guessed.
+def observe(recording: Recording, serials: Sequence[str]) -> ObservedMotions:
+    """Evaluate all slow motions of these modules; missing observations are left out.
 
-    Twice: what the first look is sure of, whom a joint carries about which axis, tells the second what held
-    joints that gave way did to the IMUs.
+    In two passes: the first finds about which axes joints certainly carry IMUs; from these axes the second
+    computes the contribution of held joints that gave way to the gyros' readings.
     """
-    heard = [s for s in serials if recording.modules[s].round_trips and recording.modules[s].rows.end_row]
-    clocks = map_clocks({s: recording.modules[s].round_trips for s in heard}) if heard else {}
-    ear = _Ear(recording, clocks, {s: _gyro_offset(recording, s) for s in heard})
-    heard_of = {joint: _heard(ear, joint) for joint in serials}
-    first, _ = _look(recording, serials, heard_of, None)
-    surely = {pair: _axis(seen) for pair, seen in first.items() if abs(seen.log_odds) > DOUBTFUL_BELOW}
-    axes = Axes(surely, _usual_pose(heard_of))
-    observations, unmoved = _look(recording, serials, heard_of, axes)
-    watching = {observer for _, observer in observations}
-    return Seen(observations, unmoved, tuple(s for s in serials if s not in watching))
+    sources = [s for s in serials if recording.modules[s].round_trips and recording.modules[s].rows.end_row]
+    clocks = map_clocks({s: recording.modules[s].round_trips for s in sources}) if sources else {}
+    source = _Source(recording, clocks, {s: _gyro_offset(recording, s) for s in sources})
+    motions = {joint: _slow_feedback(source, joint) for joint in serials}
+    first, _ = _evaluate(recording, serials, motions, None)
+    certain = {pair: _axis(one) for pair, one in first.items() if abs(one.log_odds) > DOUBTFUL_BELOW}
+    axes = Axes(certain, _usual_pose(motions))
+    observations, unmoved = _evaluate(recording, serials, motions, axes)
+    observing = {observer for _, observer in observations}
+    return ObservedMotions(observations, unmoved, tuple(s for s in serials if s not in observing))
 
 
-def _usual_pose(heard_of: Mapping[str, Sequence["Heard"]]) -> dict[str, float]:
-    """Return where every joint was in the median of all motions."""
+def _usual_pose(motions: Mapping[str, Sequence["MotionFeedback"]]) -> dict[str, float]:
+    """Return the median position of every joint over all motions."""
     places: dict[str, list[float]] = {}
-    for heard in (heard for motions in heard_of.values() for heard in motions):
-        for serial, q in zip(heard.watchers, heard.q_mean_rad, strict=True):
+    for feedback in (feedback for of_joint in motions.values() for feedback in of_joint):
+        for serial, q in zip(feedback.observers, feedback.q_mean_rad, strict=True):
             places.setdefault(serial, []).append(float(q))
-    return {serial: float(np.median(found)) for serial, found in places.items()}
+    return {serial: float(np.median(positions)) for serial, positions in places.items()}
 
 
-def _axis(seen: MotionObservation) -> Array | None:
+def _axis(observation: MotionObservation) -> Array | None:
     """Return the axis of a joint in the frame of an IMU, zero if it does not carry it."""
-    return seen.axis if seen.moved else np.zeros(3)
+    return observation.axis if observation.moved else np.zeros(3)
 
 
 def slow_motions(recording: Recording, joint: str) -> list[JournalEvent]:
@@ -96,159 +96,162 @@ def slow_motions(recording: Recording, joint: str) -> list[JournalEvent]:
     ]
 
 
-class _Ear(NamedTuple):
-    """The recording, and of every module that was heard its clock and its gyro's offset."""
+class _Source(NamedTuple):
+    """The recording, and clock and gyro offset of every module with feedback."""
 
     recording: Recording
     clocks: Mapping[str, ClockMap]
     offsets: Mapping[str, Array]
 
 
-class Heard(NamedTuple):
-    """One motion of one joint, as all that have feedback of it read it: kept samples (m, n) and (m, n, 3)."""
+class MotionFeedback(NamedTuple):
+    """One motion of one joint in the feedback of n observers: joints (m, n), gyros (m, n, 3)."""
 
     event: JournalEvent
-    watchers: tuple[str, ...]
+    observers: tuple[str, ...]
     q_mean_rad: Array
     qd_rad_s: Array
     gyro_rad_s: Array
     offset_rad_s: Array
 
 
-def _heard(ear: _Ear, joint: str) -> list[Heard]:
-    """Return the slow motions of a joint; without watchers, those of which its own feedback is missing."""
-    return [_of_motion(ear, event) for event in slow_motions(ear.recording, joint)]
+def _slow_feedback(source: _Source, joint: str) -> list[MotionFeedback]:
+    """Return the slow motions of a joint; one whose own feedback is missing has no observers."""
+    return [_of_motion(source, event) for event in slow_motions(source.recording, joint)]
 
 
-def _of_motion(ear: _Ear, event: JournalEvent) -> Heard:
-    watchers = _watchers(ear, event)
-    if event.serial not in watchers:
-        return Heard(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
+def _of_motion(source: _Source, event: JournalEvent) -> MotionFeedback:
+    observers = _observers(source, event)
+    if event.serial not in observers:
+        return MotionFeedback(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
     edge = settling_samples(RATE_HZ, TOPOLOGY_CUTOFF_HZ)
-    one = window(ear.recording, ear.clocks, watchers, event, edge / RATE_HZ)
+    one = window(source.recording, source.clocks, observers, event, edge / RATE_HZ)
     signals = filtered_signals(one.q_rad, [one.gyro_rad_s], RATE_HZ, TOPOLOGY_CUTOFF_HZ, KEEP_EVERY)
     q, qd, _, gyro = signals.settled()
-    offset = np.array([ear.offsets[s] for s in watchers])
+    offset = np.array([source.offsets[s] for s in observers])
     mean = q.mean(axis=0)
-    return Heard(event, tuple(watchers), mean, qd, gyro, offset)
+    return MotionFeedback(event, tuple(observers), mean, qd, gyro, offset)
 
 
 class Axes(NamedTuple):
-    """What a first look is sure of: {(joint, observer): axis in the observer's frame, zero if not carried}.
+    """The certain axes: {(joint, observer): axis in the observer's frame, zero if it is not carried}.
 
-    pose_rad: where the joints were, in the median of all motions.
+    pose_rad: median position of the joints over all motions.
     """
 
-    found: Mapping[tuple[str, str], Array | None]
+    certain: Mapping[tuple[str, str], Array | None]
     pose_rad: Mapping[str, float]
 
     def of(self, names: Sequence[str]) -> Array:
-        """Return (n, n, 3) of all pairs, NaN where nothing is sure."""
+        """Return (n, n, 3) of all pairs, NaN where none is certain."""
         unknown = np.full(3, np.nan)
-        rows = [[self.found.get((o, k)) for k in names] for o in names]
+        rows = [[self.certain.get((o, k)) for k in names] for o in names]
         return np.array([[unknown if axis is None else axis for axis in row] for row in rows])
 
-    def turned_away(self, heard: Heard) -> bool:
-        """Return whether joints were elsewhere than where the axes were seen, so that these are others."""
-        pairs = zip(heard.watchers, heard.q_mean_rad, strict=True)
-        others = [abs(q - self.pose_rad[s]) for s, q in pairs if s != heard.event.serial]
+    def turned_away(self, feedback: MotionFeedback) -> bool:
+        """Return whether the joints were too far from `pose_rad` for the axes to hold."""
+        pairs = zip(feedback.observers, feedback.q_mean_rad, strict=True)
+        others = [abs(q - self.pose_rad[s]) for s, q in pairs if s != feedback.event.serial]
         return bool(sum(others) > TURNED_RAD)
 
 
-def _look(
-    recording: Recording, serials: Sequence[str], heard_of: Mapping[str, list[Heard]], axes: Axes | None
+def _evaluate(
+    recording: Recording,
+    serials: Sequence[str],
+    motions: Mapping[str, list[MotionFeedback]],
+    axes: Axes | None,
 ) -> tuple[dict[tuple[str, str], MotionObservation], dict[str, str]]:
-    """Return what was seen of all joints, and of those of which nothing was, why not."""
+    """Return the observations of all joints, and for joints without any the reason."""
     observations: dict[tuple[str, str], MotionObservation] = {}
     unmoved: dict[str, str] = {}
     for joint in serials:
-        found, why = _of_joint(recording, serials, heard_of[joint], axes)
-        observations |= {(joint, observer): combined_observation(many) for observer, many in found.items()}
-        if not found:
+        observed, why = _of_joint(recording, serials, motions[joint], axes)
+        observations |= {(joint, observer): combined_observation(many) for observer, many in observed.items()}
+        if not observed:
             unmoved[joint] = why
     return observations, unmoved
 
 
 def _of_joint(
-    recording: Recording, serials: Sequence[str], motions: Sequence[Heard], axes: Axes | None
+    recording: Recording, serials: Sequence[str], motions: Sequence[MotionFeedback], axes: Axes | None
 ) -> tuple[dict[str, list[MotionObservation]], str]:
-    """Return what everyone saw of all motions of a joint; without any, why not."""
-    found: dict[str, list[MotionObservation]] = {}
-    why = "it was never told to move, or never came to the end of its motion"
-    for heard in motions:
-        assert heard.event.motion is not None
+    """Return all observers' observations of the motions of a joint; without any, the reason."""
+    observed: dict[str, list[MotionObservation]] = {}
+    why = "it was never commanded to move, or did not complete its motion"
+    for feedback in motions:
+        assert feedback.event.motion is not None
         try:
-            seen_by = by_feedback(heard, axes)
+            by_observer = by_feedback(feedback, axes)
         except NotMoved as error:
             why = str(error)
             continue
         for observer in serials:
-            finding = _finding(recording, heard.event.motion, heard.event.serial, observer)
-            seen = _checked(seen_by.get(observer), finding)
-            if seen is not None:
-                found.setdefault(observer, []).append(seen)
-        why = "nobody saw its motion"
-    return found, why
+            own = _own_estimate(recording, feedback.event.motion, feedback.event.serial, observer)
+            observation = _compared(by_observer.get(observer), own)
+            if observation is not None:
+                observed.setdefault(observer, []).append(observation)
+        why = "no module observed its motion"
+    return observed, why
 
 
-def by_feedback(heard: Heard, axes: Axes | None) -> dict[str, MotionObservation]:
-    """Return what the feedback of all modules says of one motion; nothing without that of the joint.
+def by_feedback(feedback: MotionFeedback, axes: Axes | None) -> dict[str, MotionObservation]:
+    """Return the observations of one motion from all feedback; none without that of the joint.
 
     Raises:
         NotMoved: the joint hardly moved.
     """
-    names = heard.watchers
+    names = feedback.observers
     if not names:
         return {}
-    joint = names.index(heard.event.serial)
-    known = axes.of(names) if axes is not None and not axes.turned_away(heard) else None
-    seen = motion_evidence(joint, heard.qd_rad_s, heard.gyro_rad_s, heard.offset_rad_s, known)
-    return {s: _motion_seen(seen, k) for k, s in enumerate(names)}
+    joint = names.index(feedback.event.serial)
+    known = axes.of(names) if axes is not None and not axes.turned_away(feedback) else None
+    evidence = motion_evidence(joint, feedback.qd_rad_s, feedback.gyro_rad_s, feedback.offset_rad_s, known)
+    return {s: _observation(evidence, k) for k, s in enumerate(names)}
 
 
-def _watchers(ear: _Ear, event: JournalEvent) -> list[str]:
-    """Return the modules that have feedback of all of a motion; a module may fall silent in between."""
-    everyone = sorted(ear.clocks)
-    if event.serial not in everyone or _covered(ear, everyone, event):
+def _observers(source: _Source, event: JournalEvent) -> list[str]:
+    """Return the modules with feedback over a whole motion; a module may stop sending during it."""
+    everyone = sorted(source.clocks)
+    if event.serial not in everyone or _covered(source, everyone, event):
         return everyone
-    return [s for s in everyone if _covered(ear, [event.serial, s], event)]
+    return [s for s in everyone if _covered(source, [event.serial, s], event)]
 
 
-def _covered(ear: _Ear, serials: Sequence[str], event: JournalEvent) -> bool:
+def _covered(source: _Source, serials: Sequence[str], event: JournalEvent) -> bool:
     margin_s = settling_samples(RATE_HZ, TOPOLOGY_CUTOFF_HZ) / RATE_HZ
     try:
-        found = window(ear.recording, ear.clocks, serials, event, margin_s)
+        joint_window = window(source.recording, source.clocks, serials, event, margin_s)
     except DataError:
         return False
-    # A window is cut to what all modules have: one that fell silent early must not cut the others short.
-    whole = window(ear.recording, ear.clocks, [event.serial], event, margin_s)
-    return len(found.t_ns) > 0.9 * len(whole.t_ns)
+    # A window is cut to the rows of all modules: one that stopped sending must not shorten the others'.
+    whole = window(source.recording, source.clocks, [event.serial], event, margin_s)
+    return len(joint_window.t_ns) > 0.9 * len(whole.t_ns)
 
 
-def _motion_seen(seen: MotionEvidence, k: int) -> MotionObservation:
-    ratio = float(seen.rate_ratio[k])
+def _observation(evidence: MotionEvidence, k: int) -> MotionObservation:
+    ratio = float(evidence.rate_ratio[k])
     moved = ratio > 0.5
-    axis = seen.coefficient[k] / ratio if moved else None
-    return MotionObservation(moved, ratio, axis, float(seen.ratio_sigma[k]), float(seen.give[k]))
+    axis = evidence.coefficient[k] / ratio if moved else None
+    return MotionObservation(moved, ratio, axis, float(evidence.ratio_sigma[k]), float(evidence.give[k]))
 
 
-def _finding(recording: Recording, motion: MotionRecord, joint: str, observer: str) -> Estimate | None:
-    """Return what a module itself found of one slow motion, if it found anything."""
-    found = recording.estimates.get((joint, observer), {}).get((motion.motion_id,))
-    return found if found is not None and not found.note else None
+def _own_estimate(recording: Recording, motion: MotionRecord, joint: str, observer: str) -> Estimate | None:
+    """Return a module's own estimate of one slow motion, if it has a valid one."""
+    estimate = recording.estimates.get((joint, observer), {}).get((motion.motion_id,))
+    return estimate if estimate is not None and not estimate.note else None
 
 
-def _checked(seen: MotionObservation | None, finding: Estimate | None) -> MotionObservation | None:
-    """Return what the feedback says, less certain if the module itself found otherwise."""
-    if finding is None:
-        return seen
-    if seen is None:
-        return MotionObservation(finding.moved, finding.rate_ratio, None, OWN_SIGMA)
-    apart = abs(seen.rate_ratio - finding.rate_ratio)
-    return seen._replace(sigma=float(np.hypot(seen.sigma, max(0.0, apart - seen.sigma))))
+def _compared(observed: MotionObservation | None, own: Estimate | None) -> MotionObservation | None:
+    """Return the observation from feedback, less certain if the module's own estimate differs."""
+    if own is None:
+        return observed
+    if observed is None:
+        return MotionObservation(own.moved, own.rate_ratio, None, OWN_SIGMA)
+    apart = abs(observed.rate_ratio - own.rate_ratio)
+    return observed._replace(sigma=float(np.hypot(observed.sigma, max(0.0, apart - observed.sigma))))
 
 
 def _gyro_offset(recording: Recording, serial: str) -> Array:
-    """Average the gyro over the module's last rest; zero if it was never seen at rest."""
+    """Average the gyro over the module's last rest; zero if there is none."""
     rows = recording.rest_rows(serial)
     return np.asarray(rows["gyro_rad_s"].astype(float).mean(axis=0)) if len(rows) else np.zeros(3)

@@ -1,10 +1,10 @@
-"""The topology out of a recording: what is found, what is missing, and what to move next when in doubt."""
+"""The topology from a recording, notes on missing observations, and the motions to repeat when in doubt."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
-from coordinator.identification.topology_observations import Seen, observe, slow_motions
+from coordinator.identification.topology_observations import ObservedMotions, observe, slow_motions
 from coordinator.kinematics.simultaneous_motion import motion_observations
 from coordinator.recording.journal import excluded_modules
 from coordinator.recording.recording import Recording
@@ -22,7 +22,7 @@ from module_agent.model.errors import DataError
 
 
 class TopologyFound(NamedTuple):
-    """The topology of the modules that respond, and notes in words on those that do not, and on doubts."""
+    """The topology of the modules with observations, and notes on the others and on doubts."""
 
     topology: Topology
     notes: tuple[str, ...]
@@ -31,66 +31,66 @@ class TopologyFound(NamedTuple):
 def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFound:
     """Find the topology of these modules by their slow motions.
 
-    Of all joints moved at once, that motion counts along. A module that saw nothing is left out; one whose
-    joint did not move is part of it, as a leaf.
+    A motion of all joints at once counts too. A module without observations is left out; one whose joint did
+    not move is included as a leaf.
 
     Raises:
-        TopologyError: what was seen contradicts itself or leaves open how a module is mounted.
+        TopologyError: the observations contradict each other or leave open how a module is mounted.
     """
-    seen = _seen(recording, serials)
-    if not seen.observations:
-        raise TopologyError(_nothing_seen(seen), tuple(serials))
-    topology = find_topology(*_usable(seen))
-    without = [f"{s} took no part: {why}" for s, why in excluded_modules(recording.journal).items()]
-    return TopologyFound(topology, (*without, *_notes(seen, topology)))
+    observed = _observed_motions(recording, serials)
+    if not observed.observations:
+        raise TopologyError(_no_observations(observed), tuple(serials))
+    topology = find_topology(*_usable(observed))
+    excluded = [f"{s} took no part: {why}" for s, why in excluded_modules(recording.journal).items()]
+    return TopologyFound(topology, (*excluded, *_notes(observed, topology)))
 
 
 def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
-    """Return what to move next to settle doubts about the topology, nothing if there are none left."""
+    """Return the motions to repeat to settle doubts about the topology; none if there is no doubt."""
     serials = sorted({e.serial for e in recording.journal if e.what == "motion" and e.purpose == "rest"})
     try:
-        observations, unmoved = _usable(_seen(recording, serials))
+        observations, unmoved = _usable(_observed_motions(recording, serials))
         doubts = likely_topology(observations, unmoved).doubts
     except DataError:
-        return ()  # nothing to go by; whoever assembles the robot next says what is missing
+        return ()  # the identification reports what is missing
     first = 0 if simultaneous_motion(recording, serials) is not None else 1
     repeated = {s: len(slow_motions(recording, s)) - first for s in serials}
     return next_motions(doubts, observations, repeated)
 
 
-def _seen(recording: Recording, serials: Sequence[str]) -> Seen:
-    """Return what the slow motions say, and the motion of all joints at once, put together.
+def _observed_motions(recording: Recording, serials: Sequence[str]) -> ObservedMotions:
+    """Return the observations of the slow motions combined with those of a motion of all joints at once.
 
     Raises:
-        ValueError: the motion of all joints cannot be evaluated; see `whole_exploration.respond`.
+        DataError: the motion of all joints cannot be evaluated; see `simultaneous_exploration.respond`.
     """
     slow, whole = observe(recording, serials), simultaneous_motion(recording, serials)
     if whole is None:
         return slow
     clocks = map_clocks({s: recording.modules[s].round_trips for s in serials})
-    found = dict(motion_observations(serials, respond(recording, clocks, serials, whole)))
-    for pair, seen in slow.observations.items():
-        found[pair] = combined_observation([found[pair], seen])
-    return Seen(found, {}, ())
+    combined = dict(motion_observations(serials, respond(recording, clocks, serials, whole)))
+    for pair, observed in slow.observations.items():
+        combined[pair] = combined_observation([combined[pair], observed])
+    return ObservedMotions(combined, {}, ())
 
 
-def _usable(seen: Seen) -> tuple[dict[tuple[str, str], MotionObservation], list[str]]:
-    """Return the observations among modules that saw something, and the joints that did not move."""
-    left = {p: o for p, o in seen.observations.items() if p[0] not in seen.blind}
-    return left, [s for s in seen.unmoved if s not in seen.blind]
+def _usable(observed: ObservedMotions) -> tuple[dict[tuple[str, str], MotionObservation], list[str]]:
+    """Return the observations of modules that are not silent, and the joints that did not move."""
+    left = {p: o for p, o in observed.observations.items() if p[0] not in observed.silent}
+    return left, [s for s in observed.unmoved if s not in observed.silent]
 
 
-def _nothing_seen(seen: Seen) -> str:
-    reasons = "; ".join(f"joint {serial}: {why}" for serial, why in seen.unmoved.items())
-    return f"no module saw any motion, so nothing is known of the topology. {reasons}"
+def _no_observations(observed: ObservedMotions) -> str:
+    reasons = "; ".join(f"joint {serial}: {why}" for serial, why in observed.unmoved.items())
+    return f"no module observed any motion: the topology cannot be identified. {reasons}"
 
 
-def _notes(seen: Seen, topology: Topology) -> list[str]:
-    notes = [f"{s} saw no motion at all and is left out: who carries it is not known" for s in seen.blind]
+def _notes(observed: ObservedMotions, topology: Topology) -> list[str]:
+    notes = [f"{s} observed no motion and is left out: its parent is not known" for s in observed.silent]
     notes += [
-        f"joint {s} did not move ({why}): its mounting is not known, and whatever it carries shows on what "
-        "carries it"
-        for s, why in seen.unmoved.items()
+        f"joint {s} did not move ({why}): its mounting is not known, and what it carries is attributed to "
+        "its parent"
+        for s, why in observed.unmoved.items()
         if s in topology.unmoved
     ]
     notes += [f"in doubt: {doubt.text}" for doubt in topology.doubts]

@@ -1,10 +1,10 @@
-"""The modules' clocks refined from the motion itself: gyros against the rates of the joints that turn them.
+"""Refinement of the modules' clocks from motion: gyros against the rates of the joints that turn them.
 
-Round trips leave the clocks of two modules apart by what the ways there and back differ. Where an IMU rides
-on a joint, both have seen the same motion: the gyro lags the encoder's rate by the IMU's own delay and by the
-error of the one clock less that of the other. All lags of all motions go into one weighted least squares for
-offset and drift of every clock and for the IMUs' delay, with the round trips as what is known before; clocks
-that no common motion ties keep their round trips, and the covariance says so.
+Round trips leave an error of half the difference between the ways there and back. An IMU carried by a joint
+measures the same motion: its gyro lags the encoder's rate by the IMU's delay and by the difference of the two
+clocks' errors. All lags of all motions enter one weighted least squares for offset and drift of every clock
+and for the IMUs' delay, with the round trips as prior; clocks without a common motion keep their round trips'
+maps and covariance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,18 +23,18 @@ from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import CLOCK_CUTOFF_HZ, filtered_signals
 
 RATE_HZ = 250.0
-# Half the time constant of that low-pass: about as many samples as are independent.
+# Half the time constant of the low-pass: about the number of independent samples.
 KEEP_EVERY = 5
-# What shifts a single lag without any clock: a gyro that feels acceleration (0.1 deg/s/g on 0.3 m), a link
-# that gives. Lags of other motions and IMUs are shifted otherwise.
+# Error of a single lag that is not due to clocks: a gyro's sensitivity to acceleration (0.1 deg/s/g at 0.3 m)
+# or a compliant link. Those of other motions and IMUs are independent of it.
 LAG_FLOOR_S = 8e-5
 # Scale and axes of the gyros and the chain's own axes together; then the gyros' noise.
 AXES, FIRST_RAD_S = 0.05, 1e-3
-# A gyro that reads otherwise than the joints that carry it, by this share, tells nothing of clocks.
+# A gyro whose readings deviate from the joints' rates by more than this share is not used.
 MAX_OFF = 0.3
-# An angular rate that no sensor resolves, and the rounding of 16 bit readings [rad/s].
+# Rates below this are rest; rounding of 16 bit readings [rad/s].
 STILL_RAD_S, FINEST_RAD_S = 0.02, 3e-4
-# A base clock runs as it does by definition.
+# Sigma of the base clock, exact by definition.
 EXACT = 1e-12
 # One second of residuals (every fifth sample at 250 Hz).
 _MAX_LAG = 50
@@ -63,8 +63,8 @@ class ClockRefinement(NamedTuple):
     """Refined maps of n clocks.
 
     covariance: (2 n, 2 n), read-only, of [offsets [s] at the maps' origins, drifts], all against the clock
-    that is the base; zero for that. imu_delay_s: how late the IMUs' readings are in the mean. lags: how many
-    pairs of an IMU and a motion that turned it spoke.
+    that is the base; zero for that. imu_delay_s: mean delay of the IMUs' readings. lags: number of pairs of
+    an IMU and a motion that were used.
     """
 
     clocks: dict[str, ClockMap]
@@ -96,7 +96,7 @@ def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequenc
     n = len(serials)
     before = _before([clocks[s] for s in serials])
     origins = np.array([int(clocks[s].to_session(np.array([clocks[s].origin_ns]))[0]) for s in serials])
-    # In units of what is known before, which span many orders of magnitude.
+    # In units of the prior sigmas, which span many orders of magnitude.
     information, rhs, lags = np.eye(3 * n + 1), np.zeros(3 * n + 1), 0
     for motion in motions:
         since_s = 1e-9 * (int(motion.t_ns.mean()) - origins).astype(np.float64)
@@ -106,13 +106,13 @@ def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequenc
             rhs += onto.T @ lag.rhs
             lags += 1
     covariance = np.linalg.inv(information) * np.outer(before, before)
-    found = covariance @ (rhs / before)
+    estimate = covariance @ (rhs / before)
     base = _base([clocks[s] for s in serials])
     against = np.eye(2 * n)
     against[:n, base] -= 1.0
     against[:n, n + base] -= 1e-9 * (origins - origins[base])
     against[n:, n + base] -= 1.0
-    errors = against @ found[: 2 * n]
+    errors = against @ estimate[: 2 * n]
     spread = against @ covariance[: 2 * n, : 2 * n] @ against.T
     spread[[base, n + base]] = spread[:, [base, n + base]] = 0.0
     sigmas = np.sqrt(np.diagonal(spread))
@@ -123,48 +123,48 @@ def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequenc
         for k, s in enumerate(serials)
     }
     return ClockRefinement(
-        refined, frozen(spread), float(found[2 * n]), float(np.sqrt(covariance[2 * n, 2 * n])), lags
+        refined, frozen(spread), float(estimate[2 * n]), float(np.sqrt(covariance[2 * n, 2 * n])), lags
     )
 
 
 def _before(clocks: Sequence[ClockMap]) -> Array:
-    """Return what is known before: sigmas of [offset errors, drift errors, common delay, its spread]."""
+    """Return the prior sigmas of [offset errors, drift errors, common delay, its spread]."""
     offsets = [max(1e-9 * clock.sigma_ns, EXACT) for clock in clocks]
     drifts = [max(clock.drift_sigma, EXACT) for clock in clocks]
     return np.array([*offsets, *drifts, DELAY_RMS_S, *[DELAY_SPREAD_S] * len(clocks)])
 
 
 def _base(clocks: Sequence[ClockMap]) -> int:
-    """Return the clock that the others are mapped to: it has no drift, and no doubt about that."""
+    """Return the clock to which the others are mapped: the one without drift."""
     return min(range(len(clocks)), key=lambda k: (abs(clocks[k].drift), clocks[k].drift_sigma))
 
 
 def _onto(n: int, imu: int, since_s: Array) -> Array:
     """Return the slopes (n + 1, 3 n + 1) of clock errors at a time, and of the observer's lag."""
-    found = np.zeros((n + 1, 3 * n + 1))
+    slopes = np.zeros((n + 1, 3 * n + 1))
     modules = np.arange(n)
-    found[modules, modules] = 1.0
-    found[modules, n + modules] = since_s
+    slopes[modules, modules] = 1.0
+    slopes[modules, n + modules] = since_s
     # The observer's readings are stamped by its clock, and late by its delay.
-    found[n] = found[imu]
-    found[n, [2 * n, 2 * n + 1 + imu]] = 1.0
-    return found
+    slopes[n] = slopes[imu]
+    slopes[n, [2 * n, 2 * n + 1 + imu]] = 1.0
+    return slopes
 
 
 def _lags(chain: Chain, motion: Moved) -> list[tuple[int, _Normal]]:
-    """Return what every IMU that was turned says of its lag."""
+    """Return the normal equations of the lag of every IMU that was turned."""
     signals = filtered_signals(motion.q_rad, [motion.gyro_rad_s], RATE_HZ, CLOCK_CUTOFF_HZ, KEEP_EVERY)
     *joints, gyro = signals.settled()
-    found = []
+    lags = []
     for imu in range(len(chain.serials)):
         lag = _lag(chain, imu, tuple(joints), gyro[:, imu])
         if lag is not None:
-            found.append((imu, lag))
-    return found
+            lags.append((imu, lag))
+    return lags
 
 
 def _lag(chain: Chain, imu: int, joints: tuple[Array, ...], gyro: Array) -> _Normal | None:
-    """Return the normal equations of one IMU's lag behind the joints that turn it, None if they hardly do.
+    """Return the normal equations of one IMU's lag behind the joints that turn it; None if it hardly turns.
 
     gyro = b + (I + E) rate + sum over the joints of slopes_j (e_j - lag), where slopes_j is how the rate
     changes with time by joint j alone; b and E, known to be small, are taken out.
@@ -222,16 +222,16 @@ def _variance(residual: Array) -> float:
 
 
 def _turns(chain: Chain, imu: int, q: Array, qd: Array, qdd: Array) -> tuple[Array, list[int], Array] | None:
-    """Return the rate (m, 3) of an IMU by the joints, who they are, and their slopes (j, m, 3)."""
+    """Return the rate (m, 3) of an IMU from the joints, these joints, and their slopes (j, m, 3)."""
     path = list(chain.ancestors(chain.carrier(imu)))
     if not path:
         return None
     samples = len(q)
     axes = np.zeros((3, 0, samples))
     for joint in path:
-        seen = turned(chain.axis[joint], -q[:, joint], axes) if axes.shape[1] else axes
+        carried = turned(chain.axis[joint], -q[:, joint], axes) if axes.shape[1] else axes
         own = np.broadcast_to(chain.axis[joint][:, None, None], (3, 1, samples))
-        axes = np.concatenate([seen, own], axis=1)
+        axes = np.concatenate([carried, own], axis=1)
     parts = axes * qd[:, path].T
     below = np.cumsum(parts, axis=1) - parts
     turning = np.swapaxes(cross(np.swapaxes(below, 0, 1), np.swapaxes(axes, 0, 1)), 0, 1)

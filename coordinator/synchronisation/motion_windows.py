@@ -1,7 +1,4 @@
-"""Stretches of a recording with all modules on one time base: what estimators work on.
-
-The motions of a recording as the regressor needs them: filtered alike, all joints on one time base.
-"""
+"""Motions of a recording for the estimators: all modules resampled on one time base and filtered alike."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -37,7 +34,7 @@ class Window(NamedTuple):
     """All modules during one motion: `t_ns` (m,) session time; joints (m, n); IMUs (m, n, 3).
 
     step_rad: (n,) the smallest difference between two readings of every encoder, 0 if all were alike.
-    Velocities are not among them: those of the modules are late by their filters.
+    Velocities are not included: those of the modules are delayed by their filters.
     """
 
     t_ns: NDArray[np.int64]
@@ -108,7 +105,7 @@ def _step(position: Array) -> float:
 def span(
     recording: Recording, clocks: Mapping[str, ClockMap], event: JournalEvent, margin_s: float
 ) -> tuple[int, int]:
-    """Return from when to when a motion lasted in session time, with a margin on either side.
+    """Return start and end of a motion in session time, with a margin on either side.
 
     Raises:
         DataError: no row of the motion is recorded.
@@ -130,7 +127,7 @@ def _no_row(serial: str, event: JournalEvent) -> str:
 
 
 def noise_floor(rest: Window, cutoff_hz: float, module: int) -> NoiseFloor:
-    """Return what one module's IMU scatters at rest, through the same low-pass as `sensor_data`."""
+    """Return the noise of one module's IMU at rest, through the same low-pass as `sensor_data`."""
     edge = settling_samples(RATE_HZ, cutoff_hz)
     gyro, accel = (
         zero_phase_low_pass(signal[:, module], RATE_HZ, cutoff_hz)[edge:-edge].var(axis=0)
@@ -150,16 +147,16 @@ def sensor_data(
 
 
 def encoder_steps(windows: Sequence[Window]) -> Array | None:
-    """Return what the encoders resolve (n,), by the smallest change in any window; 0 if none."""
+    """Return the encoders' resolution (n,), the smallest change in any window; 0 if none."""
     steps = [one.step_rad for one in windows if one.step_rad is not None]
     if not steps:
         return None
-    found = np.min(np.where(np.array(steps) > 0.0, steps, np.inf), axis=0)
-    return np.asarray(np.where(np.isfinite(found), found, 0.0))
+    resolution = np.min(np.where(np.array(steps) > 0.0, steps, np.inf), axis=0)
+    return np.asarray(np.where(np.isfinite(resolution), resolution, 0.0))
 
 
 def thinned(parts: Sequence[SensorData], keep_every: int) -> SensorData:
-    """Join what was filtered, one sample in `keep_every` of each."""
+    """Join filtered windows, one sample in `keep_every` of each."""
     parts = [
         part._replace(motion=np.full(len(part.q_rad), number, dtype=np.int64))
         for number, part in enumerate(parts)
@@ -177,13 +174,13 @@ def filtered(
     imu_late_s: float = 0.0,
     step_rad: Array | None = None,
 ) -> SensorData:
-    """Filter all signals of a window alike and differentiate; what the filter has not settled on is cut.
+    """Filter all signals of a window alike and differentiate; the filter's settling time is cut.
 
-    The joints are seen as late as the IMUs are. With the steps (n,) of their encoders, which make noise that
-    differentiation brings up, the instrument is what stands out of it.
+    The joints are delayed as the IMUs are. Given the resolution (n,) of the encoders, whose noise
+    differentiation amplifies, the instrument is the part of the motion above that noise.
     """
     others = [one.gyro_rad_s, one.accel_m_s2]
-    q, qd, qdd, (gyro, accel), kept = filtered_signals(
+    q, qd, qdd, (gyro, accel), settled = filtered_signals(
         one.q_rad, others, RATE_HZ, cutoff_hz, late_s=imu_late_s
     )
     instrument = None
@@ -191,19 +188,27 @@ def filtered(
         slow = zero_phase_low_pass(q, RATE_HZ, INSTRUMENT_CUTOFF_HZ)
         smooth = np.where(q.std(axis=0) > MOVING_STEPS * step_rad, slow, q.mean(axis=0))
         speed = differentiate(smooth, RATE_HZ)
-        instrument = np.concatenate([smooth, speed, differentiate(speed, RATE_HZ)], axis=1)[kept]
+        instrument = np.concatenate([smooth, speed, differentiate(speed, RATE_HZ)], axis=1)[settled]
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
     base = None
     if floor is not None:
         omega = outstanding(gyro[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
         force = outstanding(accel[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
-        base = np.concatenate([omega, differentiate(omega, RATE_HZ), force], axis=1)[kept]
+        base = np.concatenate([omega, differentiate(omega, RATE_HZ), force], axis=1)[settled]
     return SensorData(
-        q[kept], qd[kept], qdd[kept], gyro[kept], accel[kept], rates[kept], base, None, instrument
+        q[settled],
+        qd[settled],
+        qdd[settled],
+        gyro[settled],
+        accel[settled],
+        rates[settled],
+        base,
+        None,
+        instrument,
     )
 
 
-# The low-pass leaves so many independent samples a sample.
+# Independent samples per sample after the low-pass.
 INDEPENDENT_FRACTION = min(1.0, 2.0 * DYNAMIC_CUTOFF_HZ / RATE_HZ)
 
 
@@ -212,7 +217,7 @@ def dynamic_windows(
 ) -> list[Window]:
     """Return all motions of some purposes, columns in the order of `serials`, with the low-pass' margins.
 
-    Of a step that was done again the latest counts.
+    Of a repeated step the latest counts.
 
     Raises:
         DataError: there is no such motion, or the recording has a hole in it.
@@ -244,5 +249,5 @@ def joined_motions(motions: Sequence[JointMotion]) -> JointMotion:
 
 def filtered_window(one: Window) -> JointMotion:
     """Return a window as the regressor needs it, without its margins."""
-    # No velocity: that of the modules is late by their filter.
+    # No velocity: that of the modules is delayed by their filter.
     return filtered_motion(one.t_ns, one.q_rad, None, one.tau_nm, RATE_HZ, DYNAMIC_CUTOFF_HZ)

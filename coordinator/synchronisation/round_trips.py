@@ -1,9 +1,9 @@
-"""How the modules' clocks map to session time and to each other, from round trips.
+"""Maps of the modules' clocks to session time and to each other, from round trips.
 
-A module answers at a time that lies between sending and receiving; the middle is wrong by at most half the
-round trip, so the quickest trips say most. Offset and drift are fitted by least squares with weights that
-fall with the excess of a trip over the quickest one: the tail of slow trips has no say, however heavy.
-What no number of trips tells is how the quickest one divides into there and back.
+A module answers at a time between sending and receiving; the middle is off by at most half the round trip, so
+that short trips are the most informative. Offset and drift are fitted by least squares with weights that fall
+with the excess of a trip over the shortest one: a heavy tail of slow trips has no influence. The asymmetry of
+the shortest trip is not observable from round trips.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,16 +16,16 @@ from coordinator.recording.recording import RoundTrip
 from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap, Times
 
-# Half a tick of waiting inside the module: trips closer than this to the quickest are equally good.
+# Half a tick of waiting inside the module: trips this close to the shortest have the same weight.
 FLOOR_NS = 300_000.0
-# Shorter than this, a slope is noise: crystals are within 100 ppm, which is 1 ms in 10 s.
-SHORTEST_FIT_NS = 10_000_000_000
-# Questions to two modules that were asked within this are compared with each other.
+# Over a shorter time a slope is noise: crystals are within 100 ppm, which is 1 ms in 10 s.
+MIN_FIT_NS = 10_000_000_000
+# Requests to two modules within this time are compared with each other.
 SAME_MOMENT_NS = 5_000_000
-FEWEST_PAIRS = 5
-# What holds up one trip holds up its neighbours: their errors count as one within this.
-TOGETHER_NS = 500_000_000
-# A crystal's rate where no slope is fitted; and what temperature does to it within a session.
+MIN_PAIRS = 5
+# A delay affects successive trips: errors within this time count as one.
+CORRELATED_NS = 500_000_000
+# Sigma of a crystal's rate if no slope is fitted; least sigma, by its change with temperature in a session.
 CRYSTAL_DRIFT, MIN_DRIFT_SIGMA = 1e-4, 1e-7
 
 
@@ -51,11 +51,11 @@ def _map(trips: _Columns) -> ClockMap:
 
 
 def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
-    """Map all modules to one time base that runs as their own clocks do: that of the first module.
+    """Map all modules to one time base: the first module's clock, shifted to session time by a constant.
 
-    The base is that clock, shifted to session time once. The session's own clock would not do: a simulated
-    world that falls behind its machine stretches it, and lengths would come out wrong by the square of the
-    stretch. Two modules that were asked at the same moment tell their clocks apart, whatever that moment was.
+    The session's own clock is not suitable: a simulated world that falls behind its machine stretches it, and
+    lengths would be wrong by the square of the stretch. Requests to two modules at the same moment determine
+    the difference of their clocks independently of the session's clock.
 
     Raises:
         DataError: a module has no round trip.
@@ -64,11 +64,14 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
     reference, *others = columns
     whole = _map(columns[reference])
     base = whole._replace(drift=0.0, drift_sigma=0.0)
-    return {reference: base, **{name: _beside(base, columns[reference], columns[name]) for name in others}}
+    return {
+        reference: base,
+        **{name: _relative_map(base, columns[reference], columns[name]) for name in others},
+    }
 
 
-def _beside(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
-    """Return the map of a module whose trips went out beside those of the reference, whose map is `base`."""
+def _relative_map(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
+    """Return the map of a module from trips simultaneous with those of the reference, whose map is `base`."""
     sent_r, received_r, module_r = reference
     sent, received, module = trips
     order = np.argsort(sent_r, kind="stable")
@@ -78,7 +81,7 @@ def _beside(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
     before, after = order[at - 1], order[at]
     near = np.where(np.abs(sent_r[after] - sent) < np.abs(sent_r[before] - sent), after, before)
     same = np.abs(sent_r[near] - sent) <= SAME_MOMENT_NS
-    if np.count_nonzero(same) < FEWEST_PAIRS:
+    if np.count_nonzero(same) < MIN_PAIRS:
         return _map(trips)
     near, sent, received, module = near[same], sent[same], received[same], module[same]
     apart = 0.5 * ((sent - sent_r[near]) + (received - received_r[near])).astype(np.float64)
@@ -87,8 +90,8 @@ def _beside(base: ClockMap, reference: _Columns, trips: _Columns) -> ClockMap:
     offset = (module_r[near] - (module + shift)).astype(np.float64) + apart
     both = (received - sent + received_r[near] - sent_r[near]).astype(np.float64)
     line = _fit(module - origin, offset, both)
-    found = _fitted(origin, shift, line, (received - sent).astype(np.float64))
-    return found._replace(offset_ns=base.offset_ns + found.offset_ns)
+    fitted = _fitted(origin, shift, line, (received - sent).astype(np.float64))
+    return fitted._replace(offset_ns=base.offset_ns + fitted.offset_ns)
 
 
 def _columns(trips: Sequence[RoundTrip]) -> _Columns:
@@ -109,7 +112,7 @@ class _Line(NamedTuple):
 
 
 def _fitted(origin_ns: int, base_ns: int, line: _Line, trip_ns: NDArray[np.float64]) -> ClockMap:
-    # There may take any share of the quickest trip: uniform, so that half of it is root three sigmas.
+    # The way there may be any share of the shortest trip: uniform, so that half of it is root three sigmas.
     divided = 0.5 * float(trip_ns.min()) / np.sqrt(3.0)
     sigma = float(np.hypot(divided, line.constant_sigma_ns))
     drift_sigma = max(line.slope_sigma, MIN_DRIFT_SIGMA)
@@ -117,18 +120,18 @@ def _fitted(origin_ns: int, base_ns: int, line: _Line, trip_ns: NDArray[np.float
 
 
 def _fit(since: Times, offset: NDArray[np.float64], trip: NDArray[np.float64]) -> _Line:
-    """Fit a line, of slope zero over a time too short for one.
+    """Fit a line, of slope zero if the time is too short for one.
 
-    Sigmas are those of weighted least squares whose errors differ in size and come together (White, 1980;
-    Liang and Zeger, 1986): from the scatter of what the trips of one moment add to the estimate.
+    Sigmas are those of weighted least squares with heteroscedastic, clustered errors (White, 1980; Liang and
+    Zeger, 1986), clustered by `CORRELATED_NS`.
     """
     weight = (trip - trip.min() + FLOOR_NS) ** -2.0
     weight = weight / weight.sum()
     centre = round(float(weight @ since))
     x = (since - centre).astype(np.float64)
     constant = float(weight @ offset)
-    moments = np.unique(since // TOGETHER_NS, return_inverse=True)[1]
-    if x.max() - x.min() < SHORTEST_FIT_NS:
+    moments = np.unique(since // CORRELATED_NS, return_inverse=True)[1]
+    if x.max() - x.min() < MIN_FIT_NS:
         scatter = np.bincount(moments, weight * (offset - constant))
         return _Line(centre, constant, 0.0, float(np.linalg.norm(scatter)), CRYSTAL_DRIFT)
     lever = weight * x / float(weight @ x**2)

@@ -1,4 +1,4 @@
-"""Who moved with whom out of a recording: all that was seen counts, what is missing is named, not guessed."""
+"""Which joint moved which IMU: all observations count, missing ones are named and not guessed."""
 
 from collections.abc import Collection
 from types import SimpleNamespace
@@ -30,7 +30,7 @@ def _rate(start: int, end: int) -> np.ndarray:
 
 
 def _feedback(serial: str, joint_rate: dict[str, np.ndarray], seed: int) -> np.ndarray:
-    """A module of a chain feels all joints before it, each about an axis of its own."""
+    """Gyros of a chain: every joint moves the modules beyond it, each about its own axis."""
     rng, before = np.random.default_rng(seed), SERIALS[: SERIALS.index(serial)]
     rows = np.zeros(ROWS, dtype=ROW)
     rows["t_ns"] = rows["imu_t_ns"] = STEP_NS * np.arange(ROWS)
@@ -45,11 +45,11 @@ def _feedback(serial: str, joint_rate: dict[str, np.ndarray], seed: int) -> np.n
 def recorded(
     wire: SimpleNamespace,
     stuck: Collection[str] = (),
-    mute_from: dict[str, int] | None = None,
+    silent_from: dict[str, int] | None = None,
     again: bool = False,
     spoilt: bool = False,
 ) -> Recording:
-    """A session of a chain of three. `mute_from`: the row from which on a module's feedback is missing.
+    """A session of a chain of three. `silent_from`: the row from which on a module's feedback is missing.
 
     again: A moves twice; spoilt: C's IMU turns along the other way in its first motion.
     """
@@ -65,7 +65,7 @@ def recorded(
         rows = _feedback(serial, rate, n)
         if spoilt and serial == "C":
             rows["gyro_rad_s"][: AGAIN[0], 0] -= rate["A"][: AGAIN[0]].astype(np.float32)
-        end = (mute_from or {}).get(serial, ROWS)
+        end = (silent_from or {}).get(serial, ROWS)
         for first in range(0, end, 500):
             block = rows[first : min(first + 500, end)]
             recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(serial, first=first, rows=block)))
@@ -79,62 +79,62 @@ def recorded(
     return recording
 
 
-def test_the_feedback_alone_tells_the_chain(wire: SimpleNamespace) -> None:
+def test_feedback_alone_determines_the_chain(wire: SimpleNamespace) -> None:
     recording = recorded(wire)
-    seen = observe(recording, SERIALS)
-    assert (dict(seen.unmoved), seen.blind) == ({}, ())
-    for (joint, observer), one in seen.observations.items():
+    observed = observe(recording, SERIALS)
+    assert (dict(observed.unmoved), observed.silent) == ({}, ())
+    for (joint, observer), one in observed.observations.items():
         carried = SERIALS.index(joint) < SERIALS.index(observer)
         assert one.moved == carried
         assert one.rate_ratio == pytest.approx(float(carried), abs=0.01)
-    found = search_topology(recording, SERIALS)
-    assert (found.topology.serials, found.topology.parent) == (SERIALS, (-1, 0, 1))
-    assert found.notes == ()
+    result = search_topology(recording, SERIALS)
+    assert (result.topology.serials, result.topology.parent) == (SERIALS, (-1, 0, 1))
+    assert result.notes == ()
     assert doubtful_motions(recording) == ()
 
 
 def test_a_joint_that_is_stuck_is_a_leaf_and_named_with_how_little_it_moved(wire: SimpleNamespace) -> None:
-    found = search_topology(recorded(wire, stuck=["B"]), SERIALS)
-    assert found.topology.parent == (-1, 0, 0)
-    assert found.topology.unmoved == ("B",)
-    (note,) = found.notes
+    result = search_topology(recorded(wire, stuck=["B"]), SERIALS)
+    assert result.topology.parent == (-1, 0, 0)
+    assert result.topology.unmoved == ("B",)
+    (note,) = result.notes
     assert "joint B did not move (it turned at only" in note
 
 
-def test_where_no_joint_moved_that_is_what_is_said(wire: SimpleNamespace) -> None:
-    with pytest.raises(TopologyError, match=r"no module saw any motion.*joint A: it turned at only"):
+def test_without_any_moved_joint_the_error_says_so(wire: SimpleNamespace) -> None:
+    with pytest.raises(TopologyError, match=r"no module observed any motion.*joint A: it turned at only"):
         search_topology(recorded(wire, stuck=SERIALS), SERIALS)
 
 
-def test_a_module_that_falls_silent_before_all_motions_is_left_out(wire: SimpleNamespace) -> None:
-    found = search_topology(recorded(wire, mute_from={"C": 150}), SERIALS)
-    assert (found.topology.serials, found.topology.parent) == (("A", "B"), (-1, 0))
-    assert found.notes[0].startswith("C saw no motion at all and is left out")
+def test_a_module_that_falls_silent_before_all_motions_is_excluded(wire: SimpleNamespace) -> None:
+    result = search_topology(recorded(wire, silent_from={"C": 150}), SERIALS)
+    assert (result.topology.serials, result.topology.parent) == (("A", "B"), (-1, 0))
+    assert result.notes[0].startswith("C observed no motion and is left out")
 
 
-def test_a_module_that_falls_silent_in_between_has_seen_what_it_has_seen(wire: SimpleNamespace) -> None:
-    """C saw joint A, and is silent when B moves: whether it is on A or on B, nobody knows."""
-    recording = recorded(wire, mute_from={"C": 500})
-    seen = observe(recording, SERIALS)
-    assert ("A", "C") in seen.observations
-    assert ("B", "C") not in seen.observations
+def test_observations_before_a_module_falls_silent_count(wire: SimpleNamespace) -> None:
+    """C observes joint A and is silent when B moves: it may be on A or on B."""
+    recording = recorded(wire, silent_from={"C": 500})
+    observed = observe(recording, SERIALS)
+    assert ("A", "C") in observed.observations
+    assert ("B", "C") not in observed.observations
     with pytest.raises(TopologyError, match="C saw nothing of joint B"):
         search_topology(recording, SERIALS)
     motions = doubtful_motions(recording)
     assert "B" in [motion.joint for motion in motions]
 
 
-def test_a_modules_own_finding_stands_in_for_its_missing_feedback(wire: SimpleNamespace) -> None:
-    recording = recorded(wire, mute_from={"C": 500})
-    found = wire.estimate("B", "C", ids=(11,), moved=True, rate_ratio=0.97)
-    recording.add(wire.publication(Leaf.ESTIMATE, found))
+def test_a_modules_own_estimate_replaces_its_missing_feedback(wire: SimpleNamespace) -> None:
+    recording = recorded(wire, silent_from={"C": 500})
+    result = wire.estimate("B", "C", ids=(11,), moved=True, rate_ratio=0.97)
+    recording.add(wire.publication(Leaf.ESTIMATE, result))
     topology = search_topology(recording, SERIALS).topology
     assert topology.parent == (-1, 0, 1)
     # It is believed less than the feedback would be.
     assert topology.parent_log_odds[2] < topology.parent_log_odds[1]
 
 
-def test_a_module_that_finds_otherwise_than_its_feedback_makes_less_certain(wire: SimpleNamespace) -> None:
+def test_an_own_estimate_that_differs_from_the_feedback_reduces_the_certainty(wire: SimpleNamespace) -> None:
     recording = recorded(wire)
     before = observe(recording, SERIALS).observations["B", "C"]
     recording.add(wire.publication(Leaf.ESTIMATE, wire.estimate("B", "C", ids=(11,), rate_ratio=0.4)))
@@ -143,7 +143,7 @@ def test_a_module_that_finds_otherwise_than_its_feedback_makes_less_certain(wire
     assert after.log_odds < before.log_odds - 3.0
 
 
-def test_a_motion_done_twice_counts_twice_and_outvotes_nothing_that_agrees(wire: SimpleNamespace) -> None:
+def test_a_repeated_motion_that_agrees_counts_twice(wire: SimpleNamespace) -> None:
     once, twice = (observe(recorded(wire, again=a), SERIALS).observations["A", "C"] for a in (False, True))
     assert twice.log_odds == pytest.approx(2.0 * once.log_odds, rel=0.05)
     assert len(slow_motions(recorded(wire, again=True), "A")) == 2
