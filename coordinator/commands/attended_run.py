@@ -52,7 +52,7 @@ def run_attended(
         loop.run_until_complete(loop.shutdown_default_executor())
         # Closing hands the signals back to Python.
         loop.close()
-        if interruption is not None and interruption.asked:
+        if interruption is not None and interruption.requested:
             ignore_signals()
 
 

@@ -124,7 +124,7 @@ def _attended(
         _give_up(error)
     finally:
         loop.close()
-        if interruption is not None and interruption.asked:
+        if interruption is not None and interruption.requested:
             ignore_signals()
 
 

@@ -1,6 +1,6 @@
-"""The journal of a session: which step began and ended, with which motions, kept inside the recording.
+"""The journal of a session: begin and end of every step, with its motions; part of the recording.
 
-A crashed run resumes from it, and a replay knows from it which motion served which purpose.
+A crashed run resumes from it, and a replay reads from it the purpose of every motion.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.wire.messages import MotionRecord
 
-# Step of the notes that say which modules a session goes on without.
+# Prefix of the steps of notes on excluded modules.
 STEP = "left_out/"
 
 Purpose = Literal["rest", "constant", "windowed_sine", "repeat", "whole", "dynamic", "held_out", "other"]
@@ -20,9 +20,9 @@ Purpose = Literal["rest", "constant", "windowed_sine", "repeat", "whole", "dynam
 class JournalEvent(BaseModel):
     """One line of the journal; `what` says which of the other fields are set.
 
-    `settled`: what follows is asked of the modules with what is known by then, and no later round trip may
-    change that. `deaf` are the modules that did not confirm to have stopped, of a session that failed; None
-    in an older journal, which names them in its text.
+    `settled`: the clocks are mapped by the round trips before this event; later requests to the modules do
+    not change them. `deaf`: modules that did not confirm the stop of a failed session; None in an older
+    journal, which names them in its text.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -47,7 +47,7 @@ class JournalEvent(BaseModel):
 
 
 def standstill(journal: Sequence[JournalEvent]) -> str:
-    """Return in words what is known of the robot after a session that ended before its end."""
+    """Return a sentence on whether the robot stands still after a session that failed."""
     if not journal or journal[-1].what != "failed":
         return "the robot was not moving"
     last = journal[-1]
@@ -59,16 +59,16 @@ def standstill(journal: Sequence[JournalEvent]) -> str:
 
 
 def excluded_modules(journal: Sequence[JournalEvent]) -> dict[str, str]:
-    """Return the modules that a session went on without, and that no later one has moved."""
-    found: dict[str, str] = {}
+    """Return the excluded modules with the reason, without those that a resumed session has moved."""
+    excluded: dict[str, str] = {}
     for event in journal:
         if event.what == "note" and event.step.startswith(STEP):
-            found[event.step.removeprefix(STEP)] = event.text
+            excluded[event.step.removeprefix(STEP)] = event.text
         elif event.what == "motion" and event.purpose in ("windowed_sine", "whole"):
-            found.pop(event.serial, None)
-    return found
+            excluded.pop(event.serial, None)
+    return excluded
 
 
 def exclusion_event(t_ns: int, serial: str, why: str) -> JournalEvent:
-    """Return the journal's note on a module that is left out."""
+    """Return the journal's note on an excluded module."""
     return JournalEvent(t_ns=t_ns, what="note", step=STEP + serial, text=why)

@@ -1,7 +1,7 @@
-"""Everything that a session received and sent, in order, and what follows from it without looking further.
+"""All messages that a session received and sent, in order, with indices over them.
 
-The live session and a replay feed the same entries through the same `Recording`, so that both compute the
-same results. The recording's hash is the trace hash of the run.
+The live session and a replay add the same entries to the same `Recording`, so that both compute the same
+results. The recording's hash is the trace hash of the run.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ MAX_OPEN_REQUESTS = 4096
 
 
 class Entry(NamedTuple):
-    """One message as it passed: `topic` is its key (or `journal`), `t_ns` the session time."""
+    """One recorded message: `topic` is its key (or `journal`), `t_ns` the session time."""
 
     kind: Kind
     topic: str
@@ -38,7 +38,7 @@ class Entry(NamedTuple):
 
 
 class RoundTrip(NamedTuple):
-    """A question and its answer: session times of sending and receiving, module time of answering."""
+    """A request and its reply: session times of sending and receiving, module time of the reply."""
 
     sent_ns: int
     received_ns: int
@@ -69,7 +69,7 @@ class ModuleRecord:
 
     @property
     def trips(self) -> list[RoundTrip]:
-        """The round trips that clocks are mapped by: all, until it is settled what is known."""
+        """The round trips for mapping clocks: all up to the journal's `settled` event."""
         return self.round_trips[: self.settled_trips]
 
     def note_time(self, t_ns: int) -> None:
@@ -108,17 +108,17 @@ class Recording:
 
     def module(self, serial: str, boot: int) -> ModuleRecord:
         """Return the record of one boot of a module, new if it was not known."""
-        found = self.past.get((serial, boot))
-        if found is None:
-            # A straggler of an earlier boot, known already, does not make that boot the latest again.
-            found = self.past[serial, boot] = self.modules[serial] = ModuleRecord(serial, boot)
-        return found
+        record = self.past.get((serial, boot))
+        if record is None:
+            # A late message of an earlier boot does not make that boot the latest again.
+            record = self.past[serial, boot] = self.modules[serial] = ModuleRecord(serial, boot)
+        return record
 
     def add(self, entry: Entry) -> Message | JournalEvent:
-        """Take in one entry; return what it says.
+        """Add one entry; return its message.
 
         Raises:
-            WireError: the bytes are not what their key announces; they are counted in `refused`.
+            WireError: the bytes are not a message of their key; counted in `refused` by reason.
         """
         if entry.kind == "journal":
             event = JournalEvent.model_validate_json(entry.payload)
@@ -173,8 +173,8 @@ class Recording:
                 module.info = message
                 module.note_time(message.t_ns)
             case Estimate():
-                found = self.estimates.setdefault((message.joint, message.serial), {})
-                found[message.motion_ids] = message
+                estimates = self.estimates.setdefault((message.joint, message.serial), {})
+                estimates[message.motion_ids] = message
             case Information():
                 module.information.setdefault(message.digest, {})[message.offset] = message
             case _:
@@ -187,21 +187,21 @@ class Recording:
 
     @property
     def imu(self) -> ImuKind:
-        """How well the IMUs are known beforehand, as the session was told last."""
-        told = [event.imu for event in list(self.journal) if event.what == "session"]
-        return told[-1] if told else "uncalibrated"
+        """The prior of the IMUs, as of the latest session event."""
+        kinds = [event.imu for event in list(self.journal) if event.what == "session"]
+        return kinds[-1] if kinds else "uncalibrated"
 
     @property
     def torque(self) -> TorqueKind:
-        """How well the torque sensors' scales are known beforehand, as the session was told last."""
-        told = [event.torque for event in list(self.journal) if event.what == "session"]
-        return told[-1] if told else "uncalibrated"
+        """The prior of the torque sensors' scales, as of the latest session event."""
+        kinds = [event.torque for event in list(self.journal) if event.what == "session"]
+        return kinds[-1] if kinds else "uncalibrated"
 
     def motions(self, *purposes: Purpose) -> list[JournalEvent]:
         """Return the motions of these purposes whose rows are those of their module's latest boot.
 
-        A module that boots numbers its rows anew, and may have lost its zero: what it did before is no part
-        of the robot that is there.
+        A module that boots numbers its rows from zero again, and may have lost its joint zero: its earlier
+        motions do not describe the present robot.
         """
         boots = {serial: module.boot for serial, module in list(self.modules.items())}
         return [

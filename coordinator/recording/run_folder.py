@@ -30,7 +30,7 @@ class RunFolderError(UsageError):
 def check_free(path: Path) -> None:
     """Check that a new run may use the folder, without making it.
 
-    A run that ended before it did anything, because nobody was there for example, does not count.
+    A run that ended before its first step, for example because no module was found, does not count.
 
     Raises:
         RunFolderError: it holds a run already.
@@ -46,12 +46,12 @@ def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path 
 
     Args:
         path: of the folder.
-        resume: go on with what is in it.
-        robot: whose run it must be to be resumed; None for anybody's.
+        resume: continue the run in the folder.
+        robot: name of the robot that the run to resume must be of; None for any.
 
     Raises:
-        RunFolderError: the folder holds a run already and is not to be resumed, or there is nothing to
-        resume, or the run is another robot's.
+        RunFolderError: the folder holds a run already and `resume` is false, or nothing is there to resume,
+            or the run is another robot's.
     """
     if not resume:
         check_free(path)
@@ -64,8 +64,8 @@ def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path 
     session, aside = path / SESSION, path / ASIDE
     if not session.exists() and not aside.exists():
         raise RunFolderError(f"{path} holds no recording to resume")
-    # Crashed while resuming: what was set aside first has everything that the new file had begun to repeat,
-    # unless the new file went further.
+    # After a crash while resuming, the recording set aside is complete, unless the new file, which begins
+    # with a copy of it, is longer.
     older = aside.exists() and (not session.exists() or session.stat().st_size < aside.stat().st_size)
     _check_robot(aside if older else session, robot)
     if not older:
@@ -85,7 +85,7 @@ def _has_begun(session: Path) -> bool:
     try:
         return any(event.what == "begin" for event in _journal(session))
     except (SessionFileError, ValidationError):
-        # Whatever that is, it is not ours to write over.
+        # An unreadable file is not overwritten.
         return True
 
 
@@ -99,7 +99,7 @@ def _check_robot(session: Path, robot: str | None) -> None:
 
 
 def load_recording(path: Path) -> Recording:
-    """Read a recording; what could not be understood when it came is left out as it was then."""
+    """Read a recording; messages that could not be decoded are left out, as in the live session."""
     recording = Recording()
     for entry in read_session(path):
         try:

@@ -75,21 +75,21 @@ def lazy_app(program: str, help_text: str, table: Mapping[str, LazyCommand]) -> 
         help=help_text,
     )
     # Without a callback typer takes a program for a single command.
-    app.callback()(_nothing)
+    app.callback()(_no_callback)
     return app
 
 
-def _nothing() -> None:
+def _no_callback() -> None:
     pass
 
 
 def _loaded(name: str, command: LazyCommand) -> Any:
-    found = getattr(import_module(command.module), command.attribute)
-    if not isinstance(found, typer.Typer):
+    loaded = getattr(import_module(command.module), command.attribute)
+    if not isinstance(loaded, typer.Typer):
         single = typer.Typer(add_completion=False, rich_markup_mode=None)
-        single.command(name)(found)
-        found = single
-    return get_command(found)
+        single.command(name)(loaded)
+        loaded = single
+    return get_command(loaded)
 
 
 def with_options(function: Callable[..., None]) -> Callable[..., None]:

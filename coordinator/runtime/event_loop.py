@@ -1,7 +1,4 @@
-"""An asyncio loop whose clock runs faster or slower than real time, for a simulation run at another speed.
-
-A task that a signal may end, with all that it does in its `finally`.
-"""
+"""An asyncio loop at a multiple of real time, for simulations, and interruption of its task by signals."""
 
 import asyncio
 import math
@@ -64,7 +61,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def ignore_signals() -> None:
-    """Ignore what has been obeyed, up to the end of the process: it would end with another exit code."""
+    """Ignore signals until the process ends, so that a second one does not change the exit code."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 
@@ -75,23 +72,23 @@ class Interruption:
     def __init__(self, loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]"):
         self._loop = loop
         self._task = task
-        self.asked = False
+        self.requested = False
 
     def __call__(self, *_: object) -> None:
         """Cancel the task, once; to be called from the loop's thread."""
-        if not self.asked:
-            self.asked = True
+        if not self.requested:
+            self.requested = True
             # By the loop, so that a task that has not begun yet runs as far as its `try` first.
             self._loop.call_soon(self._task.cancel, "interrupted")
 
 
 def run_to_end(loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]") -> T:
-    """Run a task, then cancel and await whatever it has left on the loop; return or raise what it did."""
+    """Run a task, then cancel and await its remaining tasks; return its result or raise its error."""
     try:
         return loop.run_until_complete(task)
     finally:
-        left = sorted(asyncio.all_tasks(loop), key=lambda each: each.get_name())
-        loop.run_until_complete(_end(left))
+        remaining = sorted(asyncio.all_tasks(loop), key=lambda each: each.get_name())
+        loop.run_until_complete(_end(remaining))
 
 
 async def _end(tasks: "list[asyncio.Task[object]]") -> None:

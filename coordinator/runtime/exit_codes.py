@@ -1,4 +1,4 @@
-"""What a program prints, and with which code it exits, when a run ends before its end."""
+"""Text and exit code of a program whose run fails or is interrupted."""
 
 import asyncio
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""What a person sees of a run in the terminal: a line of progress, notes above; plain lines in a pipe."""
+"""Terminal output of a run: a progress line with notes above it; plain lines in a pipe."""
 
 import time
 
@@ -12,7 +12,7 @@ _PIPE_WIDTH = 140
 def print_table(table: Table) -> None:
     """Print a command's result on standard output, with colours where it is a terminal."""
     console = Console(highlight=False)
-    # A pipe has no width; cells cut short in it would be lost for whoever searches them.
+    # A pipe has no width; truncated cells could not be searched.
     console.width = console.width if console.is_terminal else _PIPE_WIDTH
     console.print(table)
 
@@ -44,12 +44,12 @@ class Terminal:
             self._progress.stop()
 
     def step(self, index: int, total: int, text: str) -> None:
-        """A step begins."""
+        """Show that a step begins."""
         if self._live:
             self._progress.update(self._task, description=text, completed=index - 1, total=total)
         else:
             self.console.print(f"[{index}/{total}] {text}", markup=False, soft_wrap=True)
 
     def note(self, text: str) -> None:
-        """Something worth a line."""
+        """Show a line of text."""
         self.console.print(f"  {text}", markup=False, soft_wrap=True)

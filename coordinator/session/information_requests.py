@@ -1,6 +1,6 @@
-"""Asking the modules what their own torques say: to keep the rows of every motion, and at last for the sum.
+"""Requests to the modules to project their own torques: retain the rows of every motion, then sum them up.
 
-A session does not fail by it: what a module does not tell is computed from the recording.
+Information that a module does not deliver is computed from the recording instead.
 """
 
 import asyncio
@@ -19,12 +19,12 @@ from module_agent.wire.refusal import Refusal
 
 ATTEMPTS = 10
 POLL_S = 0.1
-# An agent has to load what it computes with, and on a poor network to fetch rows again and again.
+# An agent first loads its numerical libraries, and on a poor network requests rows repeatedly.
 PATIENCE_NS = 40_000_000_000
 
 
 class InformationRequests:
-    """Of one session; `note` takes a line for whoever watches."""
+    """The information requests of one session; `note` shows a line of text."""
 
     def __init__(
         self,
@@ -39,16 +39,16 @@ class InformationRequests:
         self._clock = clock
         self._sender = sender
         self._note = note
-        self._kept: set[int] = set()
+        self._collected: set[int] = set()
 
     async def collect(self, serials: tuple[str, ...]) -> None:
-        """Ask all modules to keep the rows of the motions that they were not asked to keep yet."""
+        """Request that all modules retain the rows of the motions since the last call."""
         for event in dynamic_steps(self._recording):
             assert event.motion is not None
             number = event.motion.motion_id
-            if number in self._kept:
+            if number in self._collected:
                 continue
-            self._kept.add(number)
+            self._collected.add(number)
             try:
                 rows = rows_to_keep(self._recording, serials, event)
             except DataError as error:
@@ -75,19 +75,19 @@ class InformationRequests:
             except NoAnswer:
                 continue
             if isinstance(answer, Ack) and not answer.accepted:
-                self._note(f"{request.serial} does not keep motion {request.motion_id}: {answer.detail}")
+                self._note(f"{request.serial} does not retain motion {request.motion_id}: {answer.detail}")
             return
 
     async def ask(self, chain: Chain, clocks: Mapping[str, ClockMap]) -> None:
-        """Ask every module of a chain what its torques tell; the answers are in the recording."""
+        """Request every module's torque information; the answers are in the recording."""
         try:
-            asked = question(self._recording, chain, clocks, self._sender)
+            request = question(self._recording, chain, clocks, self._sender)
         except DataError as error:
-            self._note(f"the agents are not asked for what their torques say: {error}")
+            self._note(f"no torque information is requested from the agents: {error}")
             return
-        await gather_all(self._ask_one(serial, asked) for serial in chain.serials)
+        await gather_all(self._ask_one(serial, request) for serial in chain.serials)
 
-    async def _ask_one(self, serial: str, asked: InformationRequest) -> None:
+    async def _ask_one(self, serial: str, request: InformationRequest) -> None:
         end_ns = self._clock() + PATIENCE_NS
         silent, offset = 0, 0
         while silent < ATTEMPTS and self._clock() < end_ns:
@@ -98,7 +98,7 @@ class InformationRequests:
                 "offset": offset,
             }
             try:
-                answer = await self._messenger.ask(serial, Leaf.INFORMATION, asked.model_copy(update=head))
+                answer = await self._messenger.ask(serial, Leaf.INFORMATION, request.model_copy(update=head))
             except NoAnswer:
                 silent += 1
                 continue
@@ -111,6 +111,6 @@ class InformationRequests:
                 await asyncio.sleep(POLL_S)
             else:
                 why = answer.detail if isinstance(answer, Ack) else type(answer).__name__
-                self._note(f"{serial} does not say what its torques tell: {why}")
+                self._note(f"{serial} does not deliver torque information: {why}")
                 return
-        self._note(f"{serial} has not said in time what its torques tell")
+        self._note(f"{serial} has not delivered its torque information in time")

@@ -1,4 +1,4 @@
-"""Which motions a session runs: the plan's, or designed ones, from what the recording says of every joint."""
+"""Motions of a session: the plan's, or motions designed from each joint's recorded load."""
 
 from collections.abc import Callable, Sequence
 
@@ -27,21 +27,21 @@ from module_agent.model.catalogue import ModuleType
 from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.wire.messages import ConstantMotion, MotionRecord, MultiSine, Pattern, WindowedSine
 
-# A session of designed motions: 10 s a joint and a little to spare, less what it takes to find and check the
-# modules, rest, and move all joints at once.
-JOINT_S = 9.8
+# A session of designed motions: just under 10 s per joint, less the time to discover and check the modules,
+# to rest and to move all joints at once.
+DESIGNED_JOINT_S = 9.8
 AROUND_S = 19.0
-# Below the shortest no designed motion fits: short journeys, two settlings and ramps take most of it.
-SHORTEST_S, LONGEST_S = 5.25, 9.0
-# Asking all modules for their estimates, and the module's own ticks between motions.
+# In less time no designed motion fits: travel, settling and ramps take most of it.
+MIN_JOINT_S, MAX_JOINT_S = 5.25, 9.0
+# Requests for all modules' estimates, and the modules' ticks between motions.
 ANSWERS_S = 0.3
-# A repeat that takes less than this off the predicted sigma is not worth its time.
-WORTH_SHARE = 0.05
+# A repetition must reduce the predicted sigma by this share.
+MIN_GAIN_SHARE = 0.05
 MAX_MOTIONS = 8
 
 
 class MotionChoice:
-    """Chooses motions; `serials` tells which joints there are to move, `kind` the type of a module."""
+    """Chooses motions; `serials` returns the joints to move, `kind` the type of a module."""
 
     def __init__(
         self,
@@ -56,19 +56,19 @@ class MotionChoice:
         self._kind = kind
 
     def slow(self, serial: str) -> ConstantMotion:
-        """Return a joint's slow motion, before anything is known of its load but whom there is to carry."""
-        found = self._designed(serial, self._unmoved_limits(serial)) if self._designs() else None
-        return found.constant if found is not None else self._plan.constant()
+        """Return a joint's slow motion, designed for the likely load, before it is measured."""
+        designed = self._designed(serial, self._unmoved_limits(serial)) if self._designs() else None
+        return designed.constant if designed is not None else self._plan.constant()
 
     def fast(self, serial: str, slow: MotionRecord) -> WindowedSine:
-        """Return a joint's fast motion, from the load that its slow motion has shown."""
+        """Return a joint's fast motion, designed for the load measured in its slow motion."""
         if not self._designs() or not isinstance(slow.pattern, ConstantMotion):
             return self._plan.sine(self._kind(serial))
-        found = self._designed(serial, self._moved_limits(serial, slow), slow.pattern)
-        return found.sine if found is not None else self._plan.sine(self._kind(serial))
+        designed = self._designed(serial, self._moved_limits(serial, slow), slow.pattern)
+        return designed.sine if designed is not None else self._plan.sine(self._kind(serial))
 
     def again(self, serial: str, done: Sequence[MotionRecord]) -> WindowedSine | None:
-        """Return one more fast motion if the precision asked for needs one and it would help; else None."""
+        """Return one more fast motion if the plan's precision needs one and it helps enough; else None."""
         wanted_mm = self._plan.precision_mm
         if wanted_mm is None or len(done) >= MAX_MOTIONS:
             return None
@@ -78,14 +78,14 @@ class MotionChoice:
         more = next_sine(task, patterns, 2.0 * self._plan.sine_centre_s)
         if sigma <= 1e-3 * wanted_mm or more is None:
             return None
-        return more if predicted_sigma_m(task, [*patterns, more]) < (1.0 - WORTH_SHARE) * sigma else None
+        return more if predicted_sigma_m(task, [*patterns, more]) < (1.0 - MIN_GAIN_SHARE) * sigma else None
 
     def predicted_mm(self, serial: str, done: Sequence[MotionRecord]) -> float:
-        """Return what the sensors' noise and errors leave of the radius after these motions [mm]."""
+        """Return the predicted sigma of the radius after these motions [mm]."""
         task = self._task(serial, self._moved_limits(serial, done[0]))
         return 1e3 * predicted_sigma_m(task, [record.pattern for record in done])
 
-    def whole(self) -> dict[str, MultiSine]:
+    def simultaneous(self) -> dict[str, MultiSine]:
         """Return the motions of all joints at once."""
         home = self._plan.home_rad
         settings = {s: JointSetting(self._unmoved_limits(s), home) for s in self._serials()}
@@ -99,7 +99,7 @@ class MotionChoice:
     def _designed(
         self, serial: str, limits: JointLimits, slow: ConstantMotion | None = None
     ) -> JointMotions | None:
-        """Return the best motions; none if none fits into the time, and the plan's have to do."""
+        """Return the best motions; None if none fits into the time."""
         try:
             return design_joint(self._task(serial, limits), slow)
         except NoExcitation:
@@ -120,14 +120,16 @@ class MotionChoice:
 
     def _joint_s(self) -> float:
         count = len(self._serials())
-        return self._plan.joint_s or float(np.clip(JOINT_S - AROUND_S / count, SHORTEST_S, LONGEST_S))
+        return self._plan.joint_s or float(
+            np.clip(DESIGNED_JOINT_S - AROUND_S / count, MIN_JOINT_S, MAX_JOINT_S)
+        )
 
     def _radius_m(self, serial: str) -> float:
-        """Return the largest radius that any module has seen of this joint, likely before any has."""
+        """Return the largest estimated radius about this joint; a likely one before there is any estimate."""
         circles = [
             estimate.circle.distance_m
-            for (joint, observer), found in self._recording.estimates.items()
-            for estimate in found.values()
+            for (joint, observer), estimates in self._recording.estimates.items()
+            for estimate in estimates.values()
             if joint == serial and observer != serial and estimate.circle is not None
         ]
         return max(circles, default=LIKELY_RADIUS_M)
@@ -143,10 +145,10 @@ class MotionChoice:
         return self._limits(serial, load.at_most_kg_m2)
 
     def _limits(self, serial: str, inertia_kg_m2: float) -> JointLimits:
-        found = joint_limits(self._kind(serial), self._rest_torque_nm(serial), inertia_kg_m2)
+        limits = joint_limits(self._kind(serial), self._rest_torque_nm(serial), inertia_kg_m2)
         least = least_accel_rad_s2(len(self._serials()))
-        return found._replace(accel_rad_s2=max(found.accel_rad_s2, least))
+        return limits._replace(accel_rad_s2=max(limits.accel_rad_s2, least))
 
     def _rest_torque_nm(self, serial: str) -> float:
-        """Return what a joint holds at home, as it did at rest."""
+        """Return a joint's mean torque at rest in the home position."""
         return float(self._recording.rest_rows(serial)["effort_nm"].astype(float).mean())

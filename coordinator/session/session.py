@@ -345,7 +345,7 @@ class Session:
 
     async def _explore_all(self) -> None:
         """Move all joints about home at the same time, each at its own frequencies (thesis 7.2)."""
-        records = await self.group.run(self._choice.whole())
+        records = await self.group.run(self._choice.simultaneous())
         for serial, record in records.items():
             self._note_motion("explore", serial, record, "whole")
 

@@ -183,5 +183,5 @@ def test_what_a_module_does_not_keep_is_said_and_computed_from_the_recording(
     found = run_virtual(config, screen).dynamics
     assert found is not None
     assert (found.gathered_by, found.by_agents) == ("coordinator", [])
-    assert any("does not keep motion" in note and "no room" in note for note in screen.notes)
+    assert any("does not retain motion" in note and "no room" in note for note in screen.notes)
     assert any("was not collected here" in note for note in screen.notes)

@@ -126,8 +126,8 @@ def test_motions_are_repeated_until_the_precision_is_reached_or_more_does_not_he
 
 def test_all_joints_at_once_move_whatever_they_hold() -> None:
     # 2.5 Nm is all that this type has: what holds itself can be moved a little all the same.
-    strained = choice(Plan(mode="simultaneous"), Told(0.1, rest_nm=2.4), "X5-1").whole()
+    strained = choice(Plan(mode="simultaneous"), Told(0.1, rest_nm=2.4), "X5-1").simultaneous()
     assert set(strained) == set(SERIALS)
-    easy = choice(Plan(mode="simultaneous"), Told(0.1), "X5-1").whole()
+    easy = choice(Plan(mode="simultaneous"), Told(0.1), "X5-1").simultaneous()
     for serial in SERIALS:
         assert strained[serial].sines[1].amplitude_rad <= easy[serial].sines[1].amplitude_rad
