@@ -9,13 +9,14 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo kinematics dynamics test check bench clean
+.PHONY: help demo kinematics dynamics test coverage check bench clean
 
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh, one process per module, and is scored"
 	@echo "make kinematics  the thesis' estimator, ours and the physical limit, every row in about a minute"
 	@echo "make dynamics    inertia, payloads, torque control and monitoring, every row in about a minute"
 	@echo "make test    all tests"
+	@echo "make coverage  branch coverage of what runs in one process"
 	@echo "make check   format, lint, types, floors and doors"
 	@echo "make bench   benchmarks"
 	@echo "make clean   remove .venv and caches; runs/ stays"
@@ -52,6 +53,11 @@ dynamics: $(DEV)
 
 test: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+# Processes of their own and compiled kernels are not counted; tracing makes everything about twice as slow.
+coverage: $(DEV)
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --ignore tests/integration --ignore tests/simulation \
+		--cov module_agent --cov coordinator --cov sim --cov-branch --cov-report term:skip-covered
 
 check: $(DEV)
 	$(BIN)/ruff format --check .

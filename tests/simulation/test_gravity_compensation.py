@@ -259,7 +259,7 @@ def test_when_an_agent_dies_the_others_are_told_to_stop_and_it_is_named(rigs: Ca
     with pytest.raises(StaleFeedback, match=f"module {ELBOW}: newest feedback is 20"):
         rig.run(floating.run())
     assert [rig.state(serial) for serial in rig.hosts] == ["stopped", "stopped"]
-    assert seen.notes[-1].startswith("stopped: module elbow was last heard")
+    assert seen.notes[-1].startswith("stopped: module elbow: newest feedback is ")
 
 
 def test_somebody_elses_stop_ends_it_and_is_not_overruled(rigs: Callable[..., Any]) -> None:

@@ -24,7 +24,7 @@ from coordinator.recording.session_file import SessionWriter
 from coordinator.runtime.event_loop import Interruption, run_to_end
 from coordinator.runtime.exit_codes import explain
 from coordinator.viewer.targets import ViewerChoice, viewer_choice
-from module_agent.model.catalogue import CATALOGUE, module_type
+from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
 from module_agent.model.errors import UsageError
 from module_agent.transport.transport import Event, Liveness, Reply, Sink
 from module_agent.wire.codec import decode, encode
@@ -160,7 +160,7 @@ def test_every_end_of_a_run_has_a_sentence_and_a_code_and_a_defect_has_none() ->
         failure = explain(error)
         assert failure is not None
         assert failure.exit_code == code
-    with pytest.raises(KeyError) as unknown:
+    with pytest.raises(UnknownModuleType) as unknown:
         module_type("X5-7")
     failure = explain(unknown.value)
     assert failure is not None
