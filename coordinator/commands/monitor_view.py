@@ -22,7 +22,7 @@ class MonitorScreen:
 
     def __init__(self, monitor: Monitor, json_file: Path | None, quiet: bool = False):
         self.start_ns = 0
-        self._watcher = monitor
+        self._monitor = monitor
         self._file: TextIO | None = json_file.open("w", encoding="utf-8") if json_file else None
         self._console = Console(highlight=False, quiet=quiet)
         self._live: Live | None = None
@@ -57,7 +57,7 @@ class MonitorScreen:
 
     def show_summary(self) -> None:
         """Show all that was found, as it is held at the end."""
-        found, monitor = self._watcher.finding_log.all, self._watcher
+        found, monitor = self._monitor.finding_log.all, self._monitor
         self._write(
             {
                 "monitored_s": round(monitor.monitored_s, 3),
@@ -92,7 +92,7 @@ class MonitorScreen:
             self._file.flush()
 
     def _shown(self) -> Group:
-        monitor, outside = self._watcher, self._watcher.outside_nm
+        monitor, outside = self._monitor, self._monitor.outside_nm
         table = Table(
             "joint", "external torque [Nm]", "threshold [Nm]", title=f"{monitor.monitored_s:.0f} s monitored"
         )
