@@ -123,10 +123,10 @@ class Rig(VirtualRobot):
 
         def watch() -> None:
             if condition():
-                self.watchers.remove(watch)
+                self.on_tick.remove(watch)
                 call()
 
-        self.watchers.append(watch)
+        self.on_tick.append(watch)
 
     def run(self, work: Coroutine[Any, Any, T]) -> T:
         return self.loop.run_until_complete(work)

@@ -12,8 +12,8 @@ torque it transmits: driving, the output gets eff times the motor's torque; driv
 in between it sticks. The last line is the average-acceleration rule (Newmark, 1959, beta = 1/4), linearised
 at the step's beginning. It needs qdd = M^-1 (ts - bias), so springs and bodies are solved together, which is
 stable for any stiffness and any inertia. A passive joint of stiffness k and damping c exerts, by the same
-rule, -k q - c qd - (k h^2/4 + c h/2) qdd. An end stop pushes back what is beyond it, by implicit Euler. All
-losses are taken at the mean speeds, at which the discrete equations conserve energy.
+rule, -k q - c qd - (k h^2/4 + c h/2) qdd. An end stop is a one-sided spring, by implicit Euler. All losses
+are taken at the mean speeds, at which the discrete equations conserve energy.
 """
 
 from collections.abc import Sequence
@@ -34,12 +34,12 @@ BUS_VOLTAGE_V = 24.0
 # Gains are normalised to 48 V: the duty applied is the firmware's PWM times 48 V / bus voltage.
 GAIN_VOLTAGE_V = 48.0
 # The spring's loss: damping over stiffness. Springs of this kind are rubber bonded between plates (Rollinson
-# et al. 2013), whose loss factor is taken as 0.1: an assumption, met at 5 Hz, where an arm of half a metre
-# rings on its spring. With a third of it light arms ring on after every reversal of the gear's friction, and
-# circle point analysis of them on a solid table comes out 10 to 30 % long, where the thesis saw under 5 %.
+# et al. 2013). Their loss factor is assumed to be 0.1 at 5 Hz, where an arm of half a metre rings on its
+# spring. With a third of it light arms ring after every reversal of the gear's friction, and the lengths by
+# circle point analysis on a solid table are 10 to 30 % too long; the thesis measured less than 5 %.
 SPRING_LOSS_S = 3e-3
-# End stops, where a type has them: 0.2 deg deep under the type's largest torque, and a blow is over at once.
-# An assumption: what they are made of is not published.
+# End stops, where a type has them: 0.2 deg deep under the type's largest torque, without rebound. An
+# assumption: their material is not published.
 STOP_NM_RAD = 2000.0
 STOP_LOSS_S = 2e-3
 # A gear that loses nearly all still has to turn.
@@ -49,7 +49,7 @@ _MIN_EFFICIENCY = 0.05
 class Power(NamedTuple):
     """Where the electrical power went in the last step, (n,) each [W], read-only.
 
-    What is left of it is in the motion of the rotors and in the springs: see `Actuators.stored_j`.
+    The rest of it is stored in rotors and springs: see `Actuators.stored_j`.
     """
 
     electrical_w: Array
@@ -119,9 +119,9 @@ class Actuators:
     ) -> Array:
         """Advance the motors by one step; return the forces on the joints (m,) [Nm, N] for that step.
 
-        `mass` (m, m) and `bias` (m,) are the multibody's at (q, qd); `resistance_factor` (n,) is what warm
-        windings have over cold ones. The current, deflection, torque and power kept in `self` belong to the
-        instant of q, as does the acceleration that the forces bring about.
+        `mass` (m, m) and `bias` (m,) are the multibody's at (q, qd); `resistance_factor` (n,) is the
+        resistance of the warm windings over that of cold ones. The current, deflection, torque and power in
+        `self` belong to the instant of q, as does the acceleration that results from the forces.
         """
         force, self._state = kernel.advance(
             self._modules,
@@ -156,7 +156,7 @@ class Actuators:
 
     @property
     def torque_nm(self) -> Array:
-        """What the springs exert on the outputs."""
+        """The springs' torques on the outputs."""
         return self._row(kernel.TORQUE_NM)
 
     @property
@@ -171,7 +171,7 @@ class Actuators:
 
     @property
     def duty(self) -> Array:
-        """What the bridges apply."""
+        """The duties that the bridges apply."""
         return self._row(kernel.DUTY)
 
     @property
@@ -216,6 +216,6 @@ def _module_records(
     records["rotor_kg_m2"] = gear**2 * [m.rotor_inertia_kg_m2 for m in motors]
     records["spring_loss_s"] = SPRING_LOSS_S
     ranges = [(-np.inf, np.inf) if t.range_rad is None else t.range_rad for t in types]
-    records["least_rad"], records["most_rad"] = np.array(ranges).T
+    records["min_rad"], records["max_rad"] = np.array(ranges).T
     records["stop_nm_rad"], records["stop_loss_s"] = STOP_NM_RAD, STOP_LOSS_S
     return records

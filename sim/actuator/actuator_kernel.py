@@ -25,8 +25,8 @@ MODULE = np.dtype(
         ("cubic_nm_rad3", np.float64),
         ("spring_loss_s", np.float64),
         ("half_gap_rad", np.float64),
-        ("least_rad", np.float64),  # the end stops; infinite without
-        ("most_rad", np.float64),
+        ("min_rad", np.float64),  # the end stops; infinite without
+        ("max_rad", np.float64),
         ("stop_nm_rad", np.float64),
         ("stop_loss_s", np.float64),
     ]
@@ -45,8 +45,8 @@ def _clamp(value: float, limit: float) -> float:
 
 
 @compiled
-def _clamp_between(value: float, least: float, most: float) -> float:
-    return min(max(value, least), most)
+def _clamp_between(value: float, low: float, high: float) -> float:
+    return min(max(value, low), high)
 
 
 @compiled
@@ -79,7 +79,7 @@ def _spring(own: Any, stretch: float, rate: float) -> tuple[float, float, float,
     elastic = (own.linear_nm_rad + own.cubic_nm_rad3 * y * y) * y
     stiffness = own.linear_nm_rad + 3.0 * own.cubic_nm_rad3 * y * y
     push = elastic + own.spring_loss_s * stiffness * rate
-    # Flanks of teeth do not pull: a spring that goes back slower than the gap opens lets go.
+    # Flanks of teeth do not pull: contact is lost if the spring relaxes more slowly than the gap opens.
     if own.half_gap_rad > 0.0 and (y == 0.0 or push * y < 0.0):
         return y, elastic, 0.0, 0.0
     return y, elastic, push, stiffness
@@ -149,12 +149,12 @@ def advance(
 
 @compiled
 def _stop(own: Any, q: float, qd: float, dt_s: float) -> tuple[float, float]:
-    """Return what an end stop exerts on the output at qdd = 0, and by how much less per qdd."""
-    beyond = q - _clamp_between(q, own.least_rad, own.most_rad)
-    # Implicit Euler, as the blow of a bare output is over within a step: a rule that keeps its energy would
-    # throw it back and forth for ever.
+    """Return an end stop's torque on the output at qdd = 0, and by how much it falls with qdd."""
+    beyond = q - _clamp_between(q, own.min_rad, own.max_rad)
+    # Implicit Euler, as the impact of an unloaded output is shorter than a step: with a rule that conserves
+    # energy it would bounce for ever.
     push = own.stop_nm_rad * (beyond + (dt_s + own.stop_loss_s) * qd)
-    # A stop does not hold back what leaves it.
+    # A stop does not pull.
     if beyond == 0.0 or push * beyond <= 0.0:
         return 0.0, 0.0
     return -push, own.stop_nm_rad * (dt_s + own.stop_loss_s) * dt_s
@@ -170,9 +170,9 @@ def _friction_limit(own: Any, amps: float) -> float:
 def _pull(
     own: Any, state: Array, drive_v: float, resistance_factor: float, dt_s: float, q: float, qd: float
 ) -> tuple[float, float, float, float, float]:
-    """Return what the spring exerts at qdd = 0, by how much less per qdd, and the motor's side of it.
+    """Return the spring's torque at qdd = 0, by how much it falls with qdd, momentum, inertia and current.
 
-    That is the motor's momentum over the step but for friction and spring, its inertia, and the current.
+    The momentum is the motor's over the step without friction and spring.
     """
     speed = state[MOTOR_RAD_S]
     ohm = own.resistance_ohm * resistance_factor
@@ -203,7 +203,7 @@ def _account(
     output_rad_s: float,
     after: Array,
 ) -> None:
-    """Fill in the current at the instant itself, and where the power goes; every entry by its own law."""
+    """Fill in the current at the instant itself and all powers; every entry by its own law."""
     rate = after[RATE_RAD_S]
     amps = (after[DUTY] * voltage_v - own.per_amp_nm * rate) / ohm
     y, elastic, push, _ = _spring(own, stretch, rate - output_rad_s)

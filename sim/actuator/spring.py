@@ -1,8 +1,8 @@
-"""The springs between gear and output: linear, stiffening or between, and in series with a gap.
+"""The springs between gear and output: linear to stiffening, in series with the gear's gap.
 
-    torque(y) = linear y + cubic y^3        y: the spring's own deflection, motor before output
+    torque(y) = linear y + cubic y^3        y: the spring's own deflection, motor minus output
 
-is monotone, and its energy linear y^2 / 2 + cubic y^4 / 4 is known. Within the gap of the gear y is zero.
+is monotone; its energy is linear y^2 / 2 + cubic y^4 / 4. Within the gap of the gear y is zero.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Springs(NamedTuple):
     gap_rad: Array
 
     def deflection(self, stretch_rad: Array) -> Array:
-        """Return the springs' own deflections where motors are before outputs by the given angles."""
+        """Return the springs' own deflections for given angles, motors minus outputs."""
         half = self.gap_rad / 2.0
         return read_only(stretch_rad - np.clip(stretch_rad, -half, half))
 
@@ -44,7 +44,7 @@ class Springs(NamedTuple):
         return read_only((self.linear_nm_rad / 2.0 + self.cubic_nm_rad3 / 4.0 * square) * square)
 
     def stretch(self, torque_nm: Array) -> Array:
-        """Return by how much motors are before outputs where the springs carry the torques [rad]."""
+        """Return the angles, motors minus outputs, at which the springs transmit the torques [rad]."""
         y = torque_nm / self.linear_nm_rad
         # Newton's method on a convex function comes down to the root from beyond without overshoot; far off,
         # where the cube rules, every round leaves two thirds.

@@ -30,7 +30,7 @@ def _warmed(above_k: Array, flow: Array, kelvin_per_w: float, heat_w: Array) -> 
 class Windings:
     """The temperatures of n modules above the ambient, rows winding, housing, body: (3, n) [K].
 
-    `heat` multiplies what warms them: with 0 they stay at the ambient temperature.
+    `heat` multiplies the losses: with 0 they stay at the ambient temperature.
     """
 
     def __init__(self, n: int, dt_s: float, heat: float = 1.0):

@@ -106,7 +106,7 @@ def _numbers(
     text: str, option: str, kind: Callable[[str], T], fits: Callable[[T], bool], right: str
 ) -> list[T]:
     """Read numbers separated by commas, each once and in their order, or end the command."""
-    found = []
+    values = []
     for word in text.split(","):
         try:
             value = kind(word)
@@ -114,18 +114,18 @@ def _numbers(
             fail(f"{option} {text}: {word!r} is no number", EXIT_USAGE)
         if not fits(value):
             fail(f"{option} {text}: {word} must be {right}", EXIT_USAGE)
-        found.append(value)
-    return list(dict.fromkeys(found))
+        values.append(value)
+    return list(dict.fromkeys(values))
 
 
-def table(found: Sequence[Repeats], filtered: bool = True) -> Table:
+def table(summaries: Sequence[Repeats], filtered: bool = True) -> Table:
     """Return tables 4 and 5 of the thesis with the simulated figures."""
     how = "" if filtered else ", without the filter"
     shown = Table(title=f"Repeated trials at the thesis' amplitudes{how}")
     columns = ("arm", "A [rad]", "trials", "mean [mm]", "error [mm]", "error [%]", "scatter [mm]")
     for name in (*columns, "thesis' mean [mm]", "its error [%]"):
         shown.add_column(name, justify="left" if name == "arm" else "right")
-    for row in found:
+    for row in summaries:
         thesis = row.thesis
         shown.add_row(
             f"{thesis.length_mm} mm {thesis.alignment}",

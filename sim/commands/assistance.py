@@ -83,7 +83,7 @@ def _run(
         return trial_results(terminal, work, processes, lambda _: "following", len(robots), total)
 
 
-def assistance_table(found: Sequence[Combination]) -> Table:
+def assistance_table(combinations: Sequence[Combination]) -> Table:
     """Return the combinations as a table, a section for each robot; * marks what is unstable."""
     titles = (
         "robot",
@@ -91,14 +91,14 @@ def assistance_table(found: Sequence[Combination]) -> Table:
         "read",
         "motion",
         "set-points",
-        "asked",
+        "commanded",
         "mode 1",
         "mode 2",
         "mode 3",
         "2 / 3",
     )
     shown = Table(*titles, title="Rms tracking error by input mode in mrad, * unstable")
-    for each, following in zip(found, [*found[1:], None], strict=True):
+    for each, following in zip(combinations, [*combinations[1:], None], strict=True):
         case = each.case
         shown.add_row(
             robot_and_pose(each),
@@ -114,17 +114,17 @@ def assistance_table(found: Sequence[Combination]) -> Table:
     return shown
 
 
-def bar_lines(judged: Sequence[Bar]) -> list[str]:
+def bar_lines(checked: Sequence[Bar]) -> list[str]:
     """Return a line for each bar, and below it the combinations that miss it or are unstable."""
     lines = []
-    for bar in judged:
-        verdict = "holds" if bar.holds else "does not hold"
-        lines.append(f"{bar.asked}: {verdict}, in {bar.kept} of {bar.stable} stable combinations")
-        lines += [f"  missed: {words}" for words in bar.missed]
-        lines += [f"  unstable: {words}" for words in bar.unstable]
+    for bar in checked:
+        outcome = "holds" if bar.holds else "does not hold"
+        lines.append(f"{bar.requirement}: {outcome}, in {bar.met} of {bar.stable} stable combinations")
+        lines += [f"  missed: {text}" for text in bar.missed]
+        lines += [f"  unstable: {text}" for text in bar.unstable]
     return lines
 
 
 def _error(one: Follow) -> str:
-    words = f"{1e3 * one.rms_error_rad:.2f}" if isfinite(one.rms_error_rad) else "-"
-    return f"{words} *" if one.unstable else words
+    text = f"{1e3 * one.rms_error_rad:.2f}" if isfinite(one.rms_error_rad) else "-"
+    return f"{text} *" if one.unstable else text

@@ -126,14 +126,14 @@ def _benchmark(
     json_file: Path | None,
     plot_file: Path | None,
 ) -> None:
-    """Run the cases that are wanted, report, and end with the exit code that they earn."""
+    """Run the selected cases, report, and exit with `EXIT_MISSED` if a bar is missed."""
     check_writable(json_file, plot_file)
-    wanted = chosen(cases, only)
-    if not wanted:
+    selected = chosen(cases, only)
+    if not selected:
         fail(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases), EXIT_USAGE)
     started_s = time.monotonic()
-    found = _run(wanted, worker_count(processes))
-    results = gathered(name, settings, found, over_all(found), time.monotonic() - started_s)
+    measured = _run(selected, worker_count(processes))
+    results = gathered(name, settings, measured, over_all(measured), time.monotonic() - started_s)
     _report(results, json_file, plot_file)
     if results.missed:
         raise typer.Exit(EXIT_MISSED)
@@ -188,7 +188,7 @@ def table(rows: Sequence[Row], title: str) -> Table:
         cells = (_number(row.thesis), _number(row.ours), _number(row.bound), _bar(row.limit))
         # Units stand in brackets, which are markup to rich.
         name = escape(row.case) if row.case != before else ""
-        shown.add_row(name, escape(row.figure), *cells, _verdict(row.holds))
+        shown.add_row(name, escape(row.figure), *cells, _outcome(row.holds))
         before = row.case
     return shown
 
@@ -201,7 +201,7 @@ def print_rows(rows: Sequence[Row], title: str) -> None:
     console.print(table(rows, title))
 
 
-def _verdict(holds: bool | None) -> str:
+def _outcome(holds: bool | None) -> str:
     return "" if holds is None else "[green]holds[/]" if holds else "[bold red]MISSED[/]"
 
 

@@ -12,8 +12,9 @@ from coordinator.runtime.command_line import fail
 from coordinator.runtime.terminal import print_table
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
 from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, UsageError
+from sim.commands.experiment import chosen_profile
 from sim.commands.options import Seed, With, Without
-from sim.imperfections.noise_profile import NOISE_PROFILES, noise_profile, switched
+from sim.imperfections.noise_profile import NOISE_PROFILES
 from sim.real_module.comparison import CommandRefused, SignalRow, compare, simulate
 from sim.real_module.real_log import LogFileError, read_log
 
@@ -33,7 +34,7 @@ def compare_log(
     """Run a real module's commands through the simulated module and compare what both did."""
     try:
         module_type(kind)
-        profile = switched(noise_profile(noise), tuple(with_effects or ()), tuple(without_effects or ()))
+        profile = chosen_profile(noise, with_effects, without_effects)
     except UnknownModuleType as error:
         fail(f"--type: {error}", EXIT_USAGE)
     except UsageError as error:

@@ -27,14 +27,14 @@ _UNITS = (
 OFF = "off"
 _PERCENT = ("_fraction", "_spread", "_scale")
 
-_HEAD = f"""# What the simulated module does as a real one does
+_HEAD = f"""# Imperfections of the simulated module
 
 Every effect can be switched on its own: `--with NAME` and `--without NAME` of `x5-sim run`, `launch` and
 `world`. A noise profile (`--noise`) is a set of them: `ideal` has perfect sensors on a rigid robot, `x5` is a
-module with a calibrated IMU, `{DEFAULT_PROFILE}` (the default) one as delivered, `poor` has everything, and
-larger. Sizes are one standard deviation where they differ between modules or samples, unless the model says
-otherwise; they are drawn once per module from the seed. The network is chosen by `--network NAME|FILE`, the
-robot's structure is in its file. `x5-sim effects` prints the same table.
+module with a calibrated IMU, `{DEFAULT_PROFILE}` (the default) one as delivered, `poor` has all of them, and
+larger ones. Sizes are one standard deviation where they differ between modules or samples, unless the model
+says otherwise; they are drawn once per module from the seed. The network is chosen by
+`--network NAME|FILE`, the robot's structure is in its file. `x5-sim effects` prints the same table.
 
 """
 
@@ -86,8 +86,8 @@ def _always() -> str:
             "spring loss",
             "damping over stiffness of the spring",
             f"{1e3 * SPRING_LOSS_S:g} ms",
-            "an assumption: rubber's loss factor of 0.1 at 5 Hz, chosen as light arms then ring as little as "
-            "the thesis' did; with a third of it their lengths come out 10 % longer",
+            "an assumption: rubber's loss factor of 0.1 at 5 Hz, chosen so that light arms ring as little as "
+            "the thesis' did; with a third of it their estimated lengths are 10 % longer",
         ),
         (
             "end stops",
@@ -126,7 +126,7 @@ def _network() -> str:
     rows = (
         (
             "delay and jitter",
-            "least delay, and what a gamma, lognormal or Pareto adds; order kept as by one TCP link",
+            "minimum delay plus a gamma, lognormal or Pareto variate; order preserved as by one TCP link",
             f"{lan.delay_ms:g} ms and {lan.jitter_ms:g} ms (`lan`); {wifi.delay_ms:g} ms and "
             f"{wifi.jitter_ms:g} ms (`wifi`)",
             "real X5-1: round trip 0.70 ms; `wifi`: Huitema 2023",
@@ -139,7 +139,7 @@ def _network() -> str:
         ),
         (
             "stalls",
-            "nothing passes for a while, then all that has waited",
+            "nothing passes for a while, then all waiting messages",
             f"`wifi`: {stall.mean_ms:g} ms every {stall.apart_s:g} s",
             "Huitema 2023: latency spikes of Wi-Fi",
         ),
@@ -153,9 +153,9 @@ def _network() -> str:
             "reordering and duplication",
             "a message overtakes, or arrives twice",
             f"`wifi`: {wifi.reorder:.1%} and {wifi.duplicate:.1%}",
-            "an assumption: what retransmission below the transport leaves",
+            "an assumption: residue of retransmission below the transport",
         ),
-        ("partition", "nothing passes in given intervals", "off; in a network file", "chosen by who tests"),
+        ("partition", "nothing passes in given intervals", "off; in a network file", "chosen by the user"),
         (
             "recorded trace",
             "delays and losses as measured, repeated",

@@ -67,9 +67,9 @@ def monitoring(
         trials, after_s, segments = 1, _QUICK_AFTER_S, [_QUICK_SEGMENT_S]
     else:
         after_s, segments = AFTER_S, [_SEGMENT_S] * max(1, round(3600.0 * hours / _SEGMENT_S))
-    found = _run(subject, trials, after_s, segments, processes)
-    happened = [one for one in found if isinstance(one, MonitoringTrial)]
-    quiet = [one for one in found if isinstance(one, Alarms)]
+    results = _run(subject, trials, after_s, segments, processes)
+    happened = [one for one in results if isinstance(one, MonitoringTrial)]
+    quiet = [one for one in results if isinstance(one, Alarms)]
     alarms = Alarms(sum(one.alarms for one in quiet), sum(one.monitored_s for one in quiet))
     print_table(confusion_table(happened))
     print_table(size_table(happened))
@@ -109,10 +109,10 @@ def size_table(trials: Sequence[MonitoringTrial]) -> Table:
         title="Median; how large",
     )
     for kind, one in summary(trials).items():
-        sizes = f"{one['least']:.2f} to {one['largest']:.2f} {UNITS[kind]}" if one["sized"] else "-"
+        sizes = f"{one['smallest']:.2f} to {one['largest']:.2f} {UNITS[kind]}" if one["sized"] else "-"
         table.add_row(
             kind,
-            _number(one["first_word_s"], 3),
+            _number(one["first_finding_s"], 3),
             _number(one["named_s"], 2),
             sizes,
             _number(one["error_rms"], 3),
@@ -123,30 +123,30 @@ def size_table(trials: Sequence[MonitoringTrial]) -> Table:
 
 def summary(trials: Sequence[MonitoringTrial]) -> dict[Kind, dict[str, Any]]:
     """Return the figures of every kind; None where there is nothing to measure."""
-    found: dict[Kind, dict[str, Any]] = {}
+    by_kind: dict[Kind, dict[str, Any]] = {}
     for kind in _KINDS:
         own = [trial for trial in trials if trial.happened == kind]
         if not own:
             continue
         errors = np.array([t.size_error for t in own if t.size_error is not None])
-        found[kind] = {
+        by_kind[kind] = {
             "trials": len(own),
             "right": sum(t.found == kind for t in own),
             "located": sum(t.located for t in own),
             "false_alarms": sum(t.false_alarms for t in own),
-            "first_word_s": _median([t.latency_s for t in own]),
+            "first_finding_s": _median([t.latency_s for t in own]),
             "named_s": _median([t.named_s for t in own]),
             "sized": bool(errors.size),
-            "least": min(t.size for t in own),
+            "smallest": min(t.size for t in own),
             "largest": max(t.size for t in own),
             "error_rms": float(np.sqrt(np.mean(errors**2))) if errors.size else None,
             "error_largest": float(np.abs(errors).max()) if errors.size else None,
         }
-    return found
+    return by_kind
 
 
 def figures(trials: Sequence[MonitoringTrial], alarms: Alarms) -> dict[str, object]:
-    """Return everything as it stands in JSON."""
+    """Return the contents of the JSON file."""
     return {
         "confusion": confusion(trials),
         "kinds": summary(trials),

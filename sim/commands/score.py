@@ -23,26 +23,26 @@ def score_run(
 def print_score(folder: Path, as_json: bool = False) -> None:
     """Score a run, write `score.json` into its folder and print it, or end the command."""
     try:
-        found = score(folder)
+        result = score(folder)
     except ScoreError as error:
         raise DataError(str(error)) from error
-    write_score(folder / "score.json", found)
+    write_score(folder / "score.json", result)
     if as_json:
         typer.echo((folder / "score.json").read_text())
     else:
-        print_table(table(found))
+        print_table(table(result))
 
 
-def table(found: Score) -> Table:
+def table(result: Score) -> Table:
     """Return the score as a table to print."""
-    excused = "\n".join(f"Not identifiable: {words}" for words in found.unidentifiable)
-    shown = Table(title="Result against truth", caption=excused or None, caption_justify="left")
+    unidentifiable = "\n".join(f"Not identifiable: {summary}" for summary in result.unidentifiable)
+    shown = Table(title="Result against truth", caption=unidentifiable or None, caption_justify="left")
     for name in ("", "truth", "error", "claimed sigma", "axis error"):
         shown.add_column(name, justify="left" if not name else "right")
-    shown.add_row("topology", "", "correct" if found.topology_correct else "WRONG", "", "")
-    for line in found.topology_differences:
+    shown.add_row("topology", "", "correct" if result.topology_correct else "WRONG", "", "")
+    for line in result.topology_differences:
         shown.add_row(f"  {line}", "", "", "", "")
-    for link in found.links:
+    for link in result.links:
         shown.add_row(
             f"link {link.parent} - {link.child}",
             f"{link.link_length_true_mm:.2f} mm",
@@ -51,18 +51,18 @@ def table(found: Score) -> Table:
             _shown(link.axis_error_deg, ".3f", " deg"),
         )
     shown.add_section()
-    shown.add_row("tip position, rms", "", _shown(found.tip_position_rms_mm, ".2f", " mm"), "", "")
-    shown.add_row("tip orientation, rms", "", _shown(found.tip_orientation_rms_deg, ".3f", " deg"), "", "")
-    shown.add_row("held-out torque against the true", "", _shown(found.torque_relative_error, ".2%"), "", "")
-    for serial, error in (found.torque_relative_error_per_joint or {}).items():
-        absolute = (found.torque_rms_error_nm_per_joint or {}).get(serial)
-        words = _shown(absolute, ".3f", " Nm") if error is None else _shown(error, ".2%")
-        shown.add_row(f"  of {serial}", "", words, "", "")
-    measured = _shown(found.torque_relative_error_measured, ".2%")
+    shown.add_row("tip position, rms", "", _shown(result.tip_position_rms_mm, ".2f", " mm"), "", "")
+    shown.add_row("tip orientation, rms", "", _shown(result.tip_orientation_rms_deg, ".3f", " deg"), "", "")
+    shown.add_row("held-out torque against the true", "", _shown(result.torque_relative_error, ".2%"), "", "")
+    for serial, error in (result.torque_relative_error_per_joint or {}).items():
+        absolute = (result.torque_rms_error_nm_per_joint or {}).get(serial)
+        shown_error = _shown(absolute, ".3f", " Nm") if error is None else _shown(error, ".2%")
+        shown.add_row(f"  of {serial}", "", shown_error, "", "")
+    measured = _shown(result.torque_relative_error_measured, ".2%")
     shown.add_row("held-out torque against the measured", "", measured, "", "")
     shown.add_section()
-    shown.add_row("robot time", _shown(found.robot_time_s, ".1f", " s"), "", "", "")
-    shown.add_row("wall time", _shown(found.wall_time_s, ".1f", " s"), "", "", "")
+    shown.add_row("robot time", _shown(result.robot_time_s, ".1f", " s"), "", "", "")
+    shown.add_row("wall time", _shown(result.wall_time_s, ".1f", " s"), "", "", "")
     return shown
 
 

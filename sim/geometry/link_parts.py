@@ -32,7 +32,7 @@ _HOWELL_HINGE, _HOWELL_STIFFNESS = 0.15, 2.25
 
 
 class Hinge(NamedTuple):
-    """A place about which a part gives: its pose (4, 4), and its stiffness and damping about x, y, z, (3,).
+    """A compliant joint within a part: pose (4, 4), stiffness and damping about its x, y, z, (3,) each.
 
     A stiffness of zero stands for a rigid direction.
     """
@@ -82,10 +82,10 @@ class Tube(_Strict):
 
 
 def check_inertia(mass_kg: float, inertia: tuple[float, float, float, float, float, float]) -> None:
-    """Check that some solid of that mass has that inertia (ixx, iyy, izz, ixy, ixz, iyz) about its centre.
+    """Check that a solid of this mass can have this inertia (ixx, iyy, izz, ixy, ixz, iyz) about its centre.
 
     Raises:
-        ValueError: none has; the message gives the principal moments.
+        ValueError: it cannot; the message gives the principal moments.
     """
     moments = np.linalg.eigvalsh(tensor(*inertia))
     if mass_kg == 0.0 and any(inertia):
@@ -101,7 +101,7 @@ class FreePose(_Strict):
     """Any rigid part: the pose of its output, and its mass, centre and inertia about that centre.
 
     `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) [kg m^2]; all is in the part's input frame. A part without
-    mass only leads from one frame to the next.
+    mass is a transform only.
     """
 
     xyz_m: Xyz = (0.0, 0.0, 0.0)
@@ -138,7 +138,7 @@ class Part(_Strict):
 
 
 def placed(part: Part) -> PlacedPart:
-    """Return where a part leads and what it weighs."""
+    """Return a part's output frame, body and hinge in its input frame."""
     if part.tube is not None:
         return _tube(part.tube)
     if part.bracket is not None:
@@ -165,7 +165,7 @@ def _tube(tube: Tube) -> PlacedPart:
 
 
 def _tube_hinge(length_m: float) -> Hinge:
-    """Return where a tube clamped at its input bends (about y and z) and twists (about x) by beam theory."""
+    """Return the hinge of a tube clamped at its input: bending about y, z, torsion about x (beam theory)."""
     area_moment = pi / 4.0 * (_TUBE_RADIUS_M**4 - _TUBE_INNER_RADIUS_M**4)
     bending = _HOWELL_STIFFNESS * _ALUMINIUM_E_PA * area_moment / length_m
     twisting = _ALUMINIUM_G_PA * 2.0 * area_moment / length_m

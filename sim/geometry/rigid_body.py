@@ -1,4 +1,4 @@
-"""Mass, centre of mass and inertia of a rigid body; bodies are moved and put together."""
+"""Mass, centre of mass and inertia of a rigid body; transforms and sums of bodies."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -26,7 +26,7 @@ def tensor(ixx: float, iyy: float, izz: float, ixy: float, ixz: float, iyz: floa
 
 
 def moved(body: RigidBody, transform: Array) -> RigidBody:
-    """Return the body seen from the frame in which its own frame has the pose `transform` (4, 4)."""
+    """Return the body in the frame in which its own frame has the pose `transform` (4, 4)."""
     rotation = transform[:3, :3]
     com = rotation @ body.com_m + transform[:3, 3]
     return RigidBody(body.mass_kg, read_only(com), read_only(rotation @ body.inertia_kg_m2 @ rotation.T))
@@ -39,7 +39,7 @@ def about_origin(body: RigidBody) -> Array:
 
 
 def joined(bodies: Iterable[RigidBody]) -> RigidBody:
-    """Return the one body that the given ones, all in the same frame, make up. A negative mass takes away."""
+    """Return the sum of bodies given in one frame; a body of negative mass is subtracted."""
     parts = [b for b in bodies if b.mass_kg != 0.0]
     mass = sum(b.mass_kg for b in parts)
     if mass == 0.0:
@@ -51,7 +51,7 @@ def joined(bodies: Iterable[RigidBody]) -> RigidBody:
 
 
 def negative(body: RigidBody) -> RigidBody:
-    """Return the body that takes the given one away when joined."""
+    """Return the body of negative mass, which `joined` subtracts."""
     return RigidBody(-body.mass_kg, body.com_m, read_only(-body.inertia_kg_m2))
 
 

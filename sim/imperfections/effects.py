@@ -1,4 +1,4 @@
-"""The table of what the simulated module does as a real one: effect, model, typical size, source, switch.
+"""The table of imperfections of the simulated module: effect, model, typical size, source, switch.
 
 The same table is the page `docs/effects.md`, the switches `--with` and `--without` of the command line, and
 the material of the named profiles.
@@ -32,7 +32,7 @@ _TABLE = (
     Effect(
         "gear-loss",
         "actuator",
-        "a friction that grows with the torque transmitted: driving loses 35 %, being driven back nothing",
+        "a friction that grows with the torque transmitted: 35 % loss when driving, none when driven back",
         {"gear_loss": 1.0},
         "published efficiency 0.65",
     ),
@@ -158,7 +158,7 @@ _TABLE = (
     Effect(
         "motor-speed-estimate",
         "encoder and torque",
-        "a first-order low-pass of the motor's speed, as in feedback; whether control sees it is not known",
+        "a first-order low-pass of the motor's speed, as in feedback; whether it enters control is not known",
         {"motor_velocity_bandwidth_hz": 15.0},
         "real X5-1 log: the motor's speed is 10.7 ms late",
     ),
@@ -186,7 +186,7 @@ _TABLE = (
     Effect(
         "clock",
         "clock",
-        "started at some time before, runs fast or slow",
+        "an offset, as modules start at different times, and a rate that is fast or slow",
         {"clock_offset_min_s": 1.0, "clock_offset_max_s": 100.0, "clock_drift_ppm": 20.0},
         "data sheets of quartz oscillators: 20 ppm; the start is an assumption",
     ),
@@ -200,14 +200,14 @@ _TABLE = (
     Effect(
         "base-shake",
         "structure",
-        "the base gives as the robot file says: stiffness, damping, up to six directions",
+        "compliance of the base by the robot file: stiffness, damping, up to six directions",
         {"base_shake": 1.0},
         "thesis 6.1, figures 17 and 18; the stiffnesses in the robot files are assumptions",
     ),
     Effect(
         "link-flex",
         "structure",
-        "links bend and twist on hinges: tubes by a pseudo-rigid beam, others as the robot file says",
+        "links bend and twist on hinges: tubes by a pseudo-rigid beam, others by the robot file",
         {"link_flex": 1.0},
         "beam theory (Howell 2001) with the tube's published mass and radius; 2 % damping at 40 Hz",
     ),

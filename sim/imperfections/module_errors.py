@@ -1,6 +1,6 @@
-"""How modules of one type differ from each other: factors on the catalogue's figures, drawn from a seed.
+"""Constant differences between modules of one type, drawn once per module from a seed.
 
-The constant errors of the modules' sensors: drawn once per module, the same for as long as it lives.
+Factors multiply the catalogue's figures of the actuators; errors of the sensors are offsets, scales and axes.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import numpy as np
 
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.read_only import read_only
-from sim.geometry.pose import Array
+from sim.geometry.pose import Array, skew
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.imperfections.random_streams import generator
 
@@ -28,7 +28,7 @@ class Variation(NamedTuple):
 
 
 def alike(n: int) -> Variation:
-    """Return modules that are all as catalogued."""
+    """Return the factors of modules as catalogued: 1."""
     return Variation(*(read_only(np.ones(n)) for _ in Variation._fields))
 
 
@@ -71,7 +71,7 @@ def draw_sensor_errors(
     effort = _normals(seed, serials, "torque calibration", (2,))
     limit = np.array([t.max_effort_nm for t in types])
     turn = profile.imu_misalignment_rad * _normals(seed, serials, "imu misalignment", (2, 3))
-    skew = profile.imu_skew_rad * _normals(seed, serials, "imu skew", (2, 3))
+    oblique = profile.imu_skew_rad * _normals(seed, serials, "imu skew", (2, 3))
     return SensorErrors(
         imu_bias=read_only(
             _per_axis(profile.gyro_bias_rad_s, profile.accel_bias_m_s2)
@@ -82,7 +82,10 @@ def draw_sensor_errors(
         ),
         misalignment=read_only(
             np.array(
-                [[_axes(t, s) for t, s in zip(*both, strict=True)] for both in zip(turn, skew, strict=True)]
+                [
+                    [_axes(t, s) for t, s in zip(*both, strict=True)]
+                    for both in zip(turn, oblique, strict=True)
+                ]
             )
         ),
         g_sensitivity=read_only(
@@ -104,8 +107,7 @@ def _per_axis(gyro: float, accel: float) -> Array:
 def _axes(turn_rad: Array, skew_rad: Array) -> Array:
     """Return a sensor's axes (rows) in the IMU frame: the IMU's, turned by a vector and then made oblique."""
     angle = float(np.linalg.norm(turn_rad))
-    x, y, z = turn_rad
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = skew(turn_rad)
     # Rodrigues with (1 - cos a) / a^2 = sinc(a/2)^2 / 2, which is defined at no turn.
     rotation = (
         np.eye(3) + np.sinc(angle / np.pi) * cross + np.sinc(angle / 2.0 / np.pi) ** 2 / 2.0 * cross @ cross

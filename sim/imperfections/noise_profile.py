@@ -1,7 +1,7 @@
-"""How imperfect a simulated robot is: every imperfection's size, and the named profiles.
+"""Sizes of all imperfections of a simulated robot, and the named profiles.
 
-A size of zero switches an imperfection off. Which sizes belong together, where they come from and how the
-switches on the command line are called is the table of `sim.imperfections.effects`.
+A size of zero switches an imperfection off. The table of `sim.imperfections.effects` groups the sizes into
+effects, with their sources and their switches on the command line.
 """
 
 from math import pi, radians
@@ -19,7 +19,7 @@ STANDARD_GRAVITY_M_S2 = 9.80665
 
 
 class NoiseProfile(BaseModel):
-    """The sizes of all imperfections; standard deviations unless said otherwise, constants drawn per module.
+    """The sizes of all imperfections: standard deviations unless noted, constants drawn per module.
 
     Sensors: the IMU's white noise is that of an output rate of 250 Hz and grows with the square root of the
     rate. Biases wander around their drawn value as a Gauss-Markov process of the given sigma and correlation
@@ -175,7 +175,7 @@ def _effect(name: str) -> Effect:
 
 
 def imu_kind(noise: NoiseProfile) -> ImuKind:
-    """Return which IMU prior fits a profile."""
+    """Return the kind of IMU prior that fits a profile."""
     return (
         "uncalibrated"
         if noise.accel_scale or noise.gyro_scale or noise.imu_misalignment_rad

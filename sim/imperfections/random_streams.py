@@ -16,8 +16,8 @@ _BLOCK = 512
 
 def generator(seed: int, serial: str, purpose: str) -> np.random.Generator:
     """Return the generator of one module's one purpose."""
-    words = (seed, zlib.crc32(serial.encode()), zlib.crc32(purpose.encode()))
-    return np.random.default_rng(np.random.SeedSequence(words))
+    entropy = (seed, zlib.crc32(serial.encode()), zlib.crc32(purpose.encode()))
+    return np.random.default_rng(np.random.SeedSequence(entropy))
 
 
 class StandardNormals:

@@ -1,4 +1,4 @@
-"""Where a robot that gives comes to rest: its passive joints deflected until they carry the weight."""
+"""Static equilibrium of a compliant robot: passive joints deflect until their springs carry the weight."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _TOLERANCE = 1e-12
 
 
 class FallsOver(RobotFileError):
-    """A robot file that describes a robot too soft to carry itself."""
+    """The base or the links of a robot are too soft to carry its weight."""
 
 
 def equilibrium(name: str, tree: RigidTree, skeleton: Skeleton, module_rad: Array) -> tuple[Array, Array]:
@@ -24,7 +24,7 @@ def equilibrium(name: str, tree: RigidTree, skeleton: Skeleton, module_rad: Arra
 
     Raises:
         FallsOver: the springs are too soft to carry the weight.
-        RuntimeError: no rest was found.
+        RuntimeError: Newton's method did not converge.
     """
     q = np.zeros(len(skeleton.names))
     q[list(skeleton.module)] = module_rad
@@ -52,5 +52,7 @@ def equilibrium(name: str, tree: RigidTree, skeleton: Skeleton, module_rad: Arra
             break
     else:
         if passive:
-            raise RuntimeError(f"robot {name!r} finds no rest within {_ROUNDS} rounds of Newton's method")
+            raise RuntimeError(
+                f"equilibrium of robot {name!r}: Newton's method did not converge in {_ROUNDS} iterations"
+            )
     return q, tree.mass_and_bias(q, still)[1][list(skeleton.module)]

@@ -1,9 +1,7 @@
-"""PyBullet, imported without the greeting that its C code prints.
+"""PyBullet's articulated-body dynamics: semi-implicit Euler, without damping or clamped velocities.
 
-Standard output belongs to results, some of them machine-readable, and standard error to what a person must
-know.
-
-PyBullet's articulated-body dynamics, set up to be exact: semi-implicit Euler, no hidden damping.
+PyBullet is imported without the greeting that its C code prints: standard output belongs to results, some of
+them machine-readable, and standard error to messages for the user.
 """
 
 import ctypes
@@ -26,18 +24,18 @@ def _imported_quietly() -> Any:
     streams = (1, 2)
     sys.stdout.flush()
     sys.stderr.flush()
-    kept, nowhere = [os.dup(n) for n in streams], os.open(os.devnull, os.O_WRONLY)
+    saved, null = [os.dup(n) for n in streams], os.open(os.devnull, os.O_WRONLY)
     try:
         for number in streams:
-            os.dup2(nowhere, number)
+            os.dup2(null, number)
         return importlib.import_module("pybullet")
     finally:
         # The greeting waits in the C library's buffer.
         ctypes.CDLL(None).fflush(None)
-        for number, copy in zip(streams, kept, strict=True):
+        for number, copy in zip(streams, saved, strict=True):
             os.dup2(copy, number)
             os.close(copy)
-        os.close(nowhere)
+        os.close(null)
 
 
 pybullet: Any = _imported_quietly()
@@ -78,7 +76,7 @@ class Multibody:
         return both[:, 0].copy(), both[:, 1].copy()
 
     def close(self) -> None:
-        """Let the physics client go. May be called twice."""
+        """Disconnect the physics client. May be called twice."""
         if not self.closed:
             self.closed = True
             pybullet.disconnect(physicsClientId=self._client)
@@ -112,10 +110,10 @@ def _configure(client: int, body: int, skeleton: Skeleton, dt_s: float) -> None:
 
 
 def _check(client: int, body: int, skeleton: Skeleton) -> None:
-    """Make sure that the engine took over every joint in our order and every inertia unchanged.
+    """Check that the engine has the joints in the skeleton's order, and every inertia unchanged.
 
     Raises:
-        RuntimeError: it did not (it zeroes an impossible inertia tensor with no more than a warning).
+        RuntimeError: it has not (it zeroes an impossible inertia tensor with no more than a warning).
     """
     for i, (body_name, wanted) in enumerate(zip(skeleton.names, skeleton.bodies, strict=True)):
         name = pybullet.getJointInfo(body, i, physicsClientId=client)[1].decode()

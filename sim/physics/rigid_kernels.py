@@ -108,7 +108,7 @@ def _move(
 
 
 @compiled
-def feel(
+def imu_readings(
     parent: Indices,
     prismatic: Indices,
     sign: Array,
@@ -160,9 +160,9 @@ def mass_and_biases(
     rates: Array,
     up_m_s2: float,
 ) -> tuple[Array, Array]:
-    """Return the mass matrix (m, m), and for R velocities (R, m) the forces that they and gravity ask for.
+    """Return the mass matrix (m, m), and the bias forces (R, m) of gravity and each of R velocities (R, m).
 
-    Composite rigid bodies for the one, recursive Newton-Euler for the others.
+    The matrix is computed by composite rigid bodies, the forces by recursive Newton-Euler.
     """
     where, arm = _place(parent, prismatic, sign, rotation, offset, q)
     spin, travel, place = _twists(parent, prismatic, sign, where, arm)
@@ -178,7 +178,7 @@ def mass_and_biases(
 
 
 @compiled
-def reach(
+def joint_loads(
     parent: Indices,
     prismatic: Indices,
     sign: Array,
@@ -190,7 +190,7 @@ def reach(
     force: Array,
     moment: Array,
 ) -> Array:
-    """Return what a wrench on a body does to the joints (m,), J^T w.
+    """Return the joints' forces or torques (m,) of a wrench w on a body, J^T w.
 
     The force acts at `point` in the body's frame; force and moment are in world axes.
     """
@@ -244,7 +244,7 @@ def _bodies(com: Array, inertia: Array, where: Array) -> tuple[Array, Array]:
 def _composite(
     parent: Indices, spin: Array, travel: Array, mass: Array, centre: Array, central: Array
 ) -> Array:
-    """Return the mass matrix: what every joint carries, added up from the leaves, projected on the joints."""
+    """Return the mass matrix: distal inertia of every joint, projected on the joints' twists."""
     m = len(parent)
     matrix, total = np.zeros((m, m)), mass.copy()
     first, whole = np.empty((m, 3)), central.copy()

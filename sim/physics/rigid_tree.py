@@ -1,14 +1,14 @@
-"""A skeleton's mechanics at one instant: mass matrix, bias, and what the IMUs feel.
+"""Mass matrix, bias forces and IMU readings of a skeleton at one instant.
 
-What the IMUs feel is to be evaluated where position, velocity and acceleration belong to one instant: with
-semi-implicit Euler that is (q_n, (qd_n + qd_{n+1})/2, (qd_{n+1} - qd_n)/dt). Measured: paired otherwise the
-specific force is wrong by 3e-2 m/s^2 on a 2 Hz motion, paired so by less than 1e-4.
+IMU readings need position, velocity and acceleration of one instant: with semi-implicit Euler that is
+(q_n, (qd_n + qd_{n+1})/2, (qd_{n+1} - qd_n)/dt). Measured on a 2 Hz motion: the specific force is then wrong
+by less than 1e-4 m/s^2, with other combinations by 3e-2.
 """
 
 import numpy as np
 
 from sim.geometry.pose import Array
-from sim.physics.rigid_kernels import feel, mass_and_biases, reach
+from sim.physics.rigid_kernels import imu_readings, joint_loads, mass_and_biases
 from sim.physics.skeleton import Skeleton
 
 
@@ -37,9 +37,9 @@ class RigidTree:
         )
 
     def mass_and_bias(self, q: Array, qd: Array) -> tuple[Array, Array]:
-        """Return the mass matrix (m, m), and the forces (m,) that hold gravity and velocity forces.
+        """Return the mass matrix M (m, m) and the bias forces (m,) of gravity and velocities.
 
-        With both, M qdd + bias is what the joints' forces or torques add up to.
+        The joints' forces or torques are M qdd + bias.
         """
         mass, biases = self.mass_and_biases(q, qd[None])
         return mass, biases[0]
@@ -48,13 +48,13 @@ class RigidTree:
         """Return the same, with one row of biases (R, m) for each of several velocities (R, m)."""
         return mass_and_biases(*self._joints, *self._bodies, q, rates, self._gravity_m_s2)
 
-    def feel(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
+    def imu_readings(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         """Return the angular rates and specific forces (n, 3) in the IMUs' frames [rad/s, m/s^2]."""
-        return feel(*self._joints, q, qd, qdd, self._gravity_m_s2, *self._imus)
+        return imu_readings(*self._joints, q, qd, qdd, self._gravity_m_s2, *self._imus)
 
-    def reach(self, q: Array, body: int, point_m: Array, force_n: Array, moment_nm: Array) -> Array:
+    def joint_loads(self, q: Array, body: int, point_m: Array, force_n: Array, moment_nm: Array) -> Array:
         """Return the forces or torques (m,) on the joints of a wrench on one body.
 
         The force acts at `point_m` in the body's frame; force and moment are in world axes, (3,) each.
         """
-        return reach(*self._joints, q, body, point_m, force_n, moment_nm)
+        return joint_loads(*self._joints, q, body, point_m, force_n, moment_nm)

@@ -1,4 +1,4 @@
-"""All joints of the simulated robot: those of its modules, and the passive ones by which its structure gives.
+"""All joints of the simulated robot: those of its modules, and the passive ones of its compliant structure.
 
 A passive joint is a spring with a damper in one direction. Passive joints come before the joint that they
 carry, so the order stays depth first, as physics engines number their links.
@@ -15,7 +15,7 @@ from sim.geometry.rigid_body import RigidBody, joined, moved, tensor
 from sim.robot.robot_file import BASE, BaseCompliance, Robot
 from sim.robot.robot_tree import RobotTree, Segment, build_tree
 
-# Between two passive joints at one place is a body that only physics engines ask for; far below all others.
+# Physics engines need a body between two passive joints at one place; its mass is far below all others.
 _LIGHT = RigidBody(1e-6, read_only(np.zeros(3)), read_only(np.eye(3) * 1e-10))
 _AXES = "xyz"
 
@@ -84,7 +84,7 @@ def _hang_base(frame: "_Frame", given: BaseCompliance, base: Array, factor: floa
         for axis in (a for a in range(3) if stiffness[a] > 0.0):
             name = f"{BASE}/{prefix}{_AXES[axis]}"
             last = frame.add(name, last, place @ _Z_ALONG[axis], prismatic)
-            frame.give(stiffness[axis], damping[axis], factor)
+            frame.add_spring(stiffness[axis], damping[axis], factor)
     body = RigidBody(given.mass_kg, read_only(np.array(given.com_xyz_m)), tensor(*given.inertia))
     frame.pieces[last].append(moved(body, base))
     return last
@@ -95,14 +95,14 @@ def _hang_segment(frame: "_Frame", held: int, name: str, segment: Segment, facto
         hinge: Hinge = segment.hinge
         for axis in np.flatnonzero(hinge.stiffness_nm_rad):
             held = frame.add(f"{name}-{_AXES[axis]}", held, hinge.pose @ _Z_ALONG[axis])
-            frame.give(hinge.stiffness_nm_rad[axis], hinge.damping_nm_s_rad[axis], factor)
+            frame.add_spring(hinge.stiffness_nm_rad[axis], hinge.damping_nm_s_rad[axis], factor)
     if held >= 0:
         frame.pieces[held].append(segment.body)
     return held
 
 
 def _z_along() -> tuple[Array, Array, Array]:
-    """Return the turns that lay z along x, y and z: cyclic exchanges of the axes."""
+    """Return the rotations that take z to x, y and z: cyclic permutations of the axes."""
     turns = []
     for axis in range(3):
         turn = np.eye(4)
@@ -115,7 +115,7 @@ _Z_ALONG = _z_along()
 
 
 class _Frame:
-    """A skeleton in the making; poses and bodies in the world."""
+    """Accumulates the joints of a skeleton; poses and bodies in the world."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -135,11 +135,11 @@ class _Frame:
         self.pieces.append([])
         return len(self.names) - 1
 
-    def give(self, stiffness: float, damping: float, factor: float) -> None:
-        """Make the last joint a spring."""
+    def add_spring(self, stiffness: float, damping: float, factor: float) -> None:
+        """Make the last joint a passive spring, softer by `factor`."""
         self.springs.append((len(self.names) - 1, stiffness / factor, damping / factor**0.5))
 
-    def _seen_from(self, body: int, transform: Array) -> Array:
+    def _relative_to(self, body: int, transform: Array) -> Array:
         return transform if body < 0 else inverse(self.home[body]) @ transform
 
     def skeleton(self, tree: RobotTree, module: list[int], imu_body: list[int]) -> Skeleton:
@@ -151,7 +151,7 @@ class _Frame:
             parent=tuple(self.parent),
             prismatic=tuple(self.prismatic),
             axis_sign=read_only(np.array(self.sign)),
-            origin=read_only(np.array([self._seen_from(p, home) for p, home in pairs])),
+            origin=read_only(np.array([self._relative_to(p, home) for p, home in pairs])),
             bodies=tuple(
                 moved(joined(own), inverse(home)) if own else _LIGHT
                 for own, home in zip(self.pieces, self.home, strict=True)
@@ -161,6 +161,8 @@ class _Frame:
             stiffness=read_only(np.array(stiffness)),
             damping=read_only(np.array(damping)),
             imu_body=tuple(imu_body),
-            imu_pose=read_only(np.array([self._seen_from(b, h @ pose(kind.imu_xyz)) for b, h, kind in imus])),
+            imu_pose=read_only(
+                np.array([self._relative_to(b, h @ pose(kind.imu_xyz)) for b, h, kind in imus])
+            ),
             gravity_m_s2=tree.gravity_m_s2,
         )

@@ -1,10 +1,8 @@
-"""How warm a logged module was inside when its log began.
+"""Compare a real module's log with the simulated module under the same commands.
 
-A real module's log against the simulated module: the same commands, then the signals side by side.
-
-The log is of a module alone, its housing held and its output bare or nearly so. Its commands go through the
-firmware with factory gains, as setpoints from the network do. The simulated module begins where the recorded
-one does, and as warm.
+The log is of a single module, its housing fixed and its output unloaded or nearly so. Its commands go through
+the firmware with factory gains, as set-points from the network do. The simulated module starts at the
+recorded position, and at temperatures that are fitted to the recorded ones.
 """
 
 import math
@@ -30,6 +28,15 @@ from sim.real_module.real_log import RealLog
 from sim.robot.robot_file import Robot, parse_robot
 from sim.world.world import TICK_S, World, WorldWires
 
+SERIAL = "X-LOG"
+SENDER = "log"
+BOOT = 1
+# Age of a recorded command at its sample, of the 10 ms between samples. It is not recorded: this is the
+# middle. The recorded X5-1 starts from rest on its first command and has reached 2.6 rad/s by its first
+# sample, which takes 4 to 6 ms; at 3 to 8 ms the ratios differ by a few hundredths.
+COMMAND_AGE_S = 0.005
+SIGNALS = ("position_rad", "velocity_rad_s", "pwm", "winding_current_a", "effort_nm", "winding_temperature_c")
+SETTLED_S = 0.5
 _STEP_S = 0.01
 
 
@@ -38,7 +45,7 @@ def start_warmth(log: RealLog) -> Array:
 
     The winding's temperature is recorded. Housing and body are not: they are those from which the module's
     heat capacities cool the winding as recorded, by least squares. The motor's own heat during the log is
-    left out: of a module that is warm from work before and idles, it is a few tenths of a kelvin.
+    neglected: in a module that is warm from earlier work and idles, it is a few tenths of a kelvin.
     """
     steps = np.rint((log.t_s - log.t_s[0]) / _STEP_S).astype(np.int64)
     # The winding's row of flow^steps, by eigenvalues: heat flows between neighbours only, so they are real.
@@ -47,17 +54,6 @@ def start_warmth(log: RealLog) -> Array:
     above = log.winding_temperature_c - AMBIENT_C
     rest, *_ = np.linalg.lstsq(shares[:, 1:], above - shares[:, 0] * above[0])
     return read_only(np.array([above[0], *rest]))
-
-
-SERIAL = "X-LOG"
-SENDER = "log"
-BOOT = 1
-# How long the command that a sample shows had been in force by then, of the 10 ms between samples. It is not
-# recorded: this is the middle. The recorded X5-1 starts from rest on its first command and has reached
-# 2.6 rad/s by its first sample, which takes 4 to 6 ms; at 3 to 8 ms the ratios differ by a few hundredths.
-COMMAND_AGE_S = 0.005
-SIGNALS = ("position_rad", "velocity_rad_s", "pwm", "winding_current_a", "effort_nm", "winding_temperature_c")
-SETTLED_S = 0.5
 
 
 class Simulated(NamedTuple):
@@ -72,7 +68,7 @@ class Simulated(NamedTuple):
 
 
 class SignalRow(NamedTuple):
-    """How far one signal is off: root mean squares in its own unit, and their ratio.
+    """Difference of one signal, recorded minus simulated: root mean squares in its unit, and their ratio.
 
     `settled_ratio` leaves out the first half second, in which the module catches up with the command. A ratio
     to nothing (a signal that is zero throughout, a log of less than half a second) is None.
@@ -155,19 +151,19 @@ def compare(log: RealLog, simulated: Simulated) -> list[SignalRow]:
 
 
 class _Bench:
-    """One module in a world of its own, and who commands it."""
+    """One module in a world of its own, commanded by the log."""
 
     def __init__(self, world: World):
         self._hardware = LoopInside(WorldWires(world))
         self._firmware = Firmware(config_of(self._hardware.information[0], BOOT), self._hardware)
-        self._seen_ns = 0
+        self._sample_ns = 0
         self._seq = 0
         self._inbox: list[Incoming] = []
 
     def tick(self) -> tuple[float, ...]:
         """Advance by one tick; return its row of `Simulated`."""
         (sample,) = self._hardware.receive()
-        self._seen_ns = sample.sensors.t_ns
+        self._sample_ns = sample.sensors.t_ns
         if not self._firmware.lease.token:
             self._send(Leaf.LEASE, self._request("acquire"))
         inbox, self._inbox = self._inbox, []
@@ -206,7 +202,7 @@ class _Bench:
             "seq": self._seq,
             "sender": SENDER,
             "token": self._firmware.lease.token,
-            "echo_ns": self._seen_ns,
+            "echo_ns": self._sample_ns,
         }
 
 

@@ -13,14 +13,14 @@ from sim.geometry.pose import Array
 
 
 class LogFileError(UsageError):
-    """A file that is no such log; the message names file, line and column."""
+    """A log file is invalid; the message names file, line and column."""
 
 
 class RealLog(NamedTuple):
-    """What one module reported, arrays (k,), read-only; a command that was not set is NaN.
+    """Feedback of one module, arrays (k,), read-only; a command that was not set is NaN.
 
-    `pwm` is the duty of the bus voltage that the bridge applied, in [-1, 1]. Columns that a file has beyond
-    these are left alone.
+    `pwm` is the duty of the bus voltage that the bridge applied, in [-1, 1]. Other columns of the file are
+    ignored.
     """
 
     t_s: Array
@@ -61,15 +61,15 @@ def read_log(path: Path) -> RealLog:
 
 def _parse(rows: list[list[str]], name: str) -> RealLog:
     header = rows[0] if rows else []
-    wanted = [_COLUMNS.get(field, field) for field in RealLog._fields]
-    if missing := [column for column in wanted if column not in header]:
+    columns = [_COLUMNS.get(field, field) for field in RealLog._fields]
+    if missing := [column for column in columns if column not in header]:
         raise LogFileError(f"{name}:1: columns missing: {', '.join(missing)}")
     if len(rows) < 3:
         raise LogFileError(f"{name}: {len(rows) - 1} rows of data; at least 2 are needed")
     for line, row in enumerate(rows[1:], 2):
         if len(row) != len(header):
             raise LogFileError(f"{name}:{line}: {len(row)} values for {len(header)} columns")
-    places = [header.index(column) for column in wanted]
+    places = [header.index(column) for column in columns]
     values = {f: _column(rows, place, f, name) for f, place in zip(RealLog._fields, places, strict=True)}
     late = np.flatnonzero(np.diff(values["t_s"]) <= 0.0)
     if late.size:

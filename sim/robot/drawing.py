@@ -1,4 +1,4 @@
-"""A picture of a robot at q = 0, for people: modules, links, axes, IMUs and gravity."""
+"""Draw a robot at q = 0: modules, links, axes, IMUs and gravity."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a person asks for on the command line: a noise profile, and effects switched on and off in it."""
+"""A noise profile as chosen on the command line, with effects switched on and off in it."""
 
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ class NoiseChoice(NamedTuple):
     off: tuple[str, ...] = ()
 
     def of(self, robot: Robot) -> NoiseProfile:
-        """Return the profile that this choice means for a robot.
+        """Return the chosen profile for a robot.
 
         Raises:
             KeyError: unknown profile or effect; the message lists the known ones.
@@ -25,7 +25,7 @@ class NoiseChoice(NamedTuple):
     @property
     def arguments(self) -> tuple[str, ...]:
         """The same choice as arguments for another program."""
-        words = [] if self.profile is None else ["--noise", self.profile]
-        words += [word for name in self.on for word in ("--with", name)]
-        words += [word for name in self.off for word in ("--without", name)]
-        return tuple(words)
+        arguments = [] if self.profile is None else ["--noise", self.profile]
+        arguments += [argument for name in self.on for argument in ("--with", name)]
+        arguments += [argument for name in self.off for argument in ("--without", name)]
+        return tuple(arguments)

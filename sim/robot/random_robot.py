@@ -19,24 +19,24 @@ from sim.geometry.rigid_body import about_origin, joined, moved
 from sim.robot.robot_file import BASE, MOUNTS, Robot
 from sim.robot.robot_tree import build_tree
 
-FEWEST, MOST = 3, 16
+MIN_MODULES, MAX_MODULES = 3, 16
 # A held joint that carries half of what its motor can do at standstill still moves at half its free speed.
 GRAVITY_SHARE = 0.5
 # Of a sine of 2 Hz and 0.1 rad, the sharpest motion that a joint is explored with: A (2 pi f)^2.
 ACCELERATION_RAD_S2 = 16.0
 # Its two right-angle ends alone take this much.
-SHORTEST_TUBE_M = 0.06
+MIN_TUBE_M = 0.06
 _LADDER = ("X5-1", "X5-4", "X5-9")
 _TRIES = 40
 _SHRINK = 0.85
 
 
 class RobotNotDrawn(RobotError):
-    """No robot that carries itself was found; the message gives the seed."""
+    """No drawn robot can carry its own weight; the message gives the seed."""
 
 
 class JointLoad(NamedTuple):
-    """What a joint has to carry: the largest moment of weight in any pose of the base, and the inertia."""
+    """Load of a joint: largest torque of gravity over all base orientations, and inertia about the axis."""
 
     weight_nm: float
     inertia_kg_m2: float
@@ -49,7 +49,7 @@ def random_robot(seed: int) -> Robot:
         RobotNotDrawn: every try was too heavy for the strongest modules.
     """
     rng = np.random.default_rng(seed)
-    count = int(rng.integers(FEWEST, MOST + 1))
+    count = int(rng.integers(MIN_MODULES, MAX_MODULES + 1))
     parents = _parents(rng, count)
     serials = [f"M-{number:05d}" for number in rng.choice(100_000, count, replace=False)]
     head = {"name": f"random_{seed}", "network": "lan", "base": _base(rng)}
@@ -65,18 +65,18 @@ def random_robot(seed: int) -> Robot:
 
 
 def joint_loads(robot: Robot) -> tuple[JointLoad, ...]:
-    """Return what every joint carries at q = 0: distal mass times its distance from the axis, times g."""
+    """Return every joint's load at q = 0; the torque is g times distal mass times distance to the axis."""
     tree = build_tree(robot)
     loads = []
     for k in range(len(tree.serials)):
-        distal = [i for i in range(len(tree.serials)) if k in _way_down(tree.parent, i)]
+        distal = [i for i in range(len(tree.serials)) if k in _with_ancestors(tree.parent, i)]
         whole = joined([moved(tree.bodies[i], inverse(tree.home[k]) @ tree.home[i]) for i in distal])
         arm = float(np.hypot(whole.com_m[0], whole.com_m[1]))
         loads.append(JointLoad(tree.gravity_m_s2 * whole.mass_kg * arm, float(about_origin(whole)[2, 2])))
     return tuple(loads)
 
 
-def _way_down(parent: Sequence[int], k: int) -> list[int]:
+def _with_ancestors(parent: Sequence[int], k: int) -> list[int]:
     way = []
     while k >= 0:
         way.append(k)
@@ -85,14 +85,14 @@ def _way_down(parent: Sequence[int], k: int) -> list[int]:
 
 
 def carries(kind: str, load: JointLoad) -> bool:
-    """Return whether a module of that type holds a load, and moves it as exploring does."""
+    """Return whether a module of that type can hold a load, and move it as an exploration does."""
     most = CATALOGUE[kind].max_effort_nm
     moving = load.weight_nm + ACCELERATION_RAD_S2 * load.inertia_kg_m2
     return load.weight_nm <= GRAVITY_SHARE * most and moving <= most
 
 
 def _strong_enough(robot: Robot) -> Robot | None:
-    """Replace modules that carry too much until none does; nothing if the strongest type is too weak."""
+    """Replace overloaded modules by stronger ones until none is left; None if the strongest is too weak."""
     while True:
         loads = joint_loads(robot)
         modules = list(robot.modules)
@@ -120,7 +120,7 @@ def _parents(rng: np.random.Generator, count: int) -> list[int]:
     roots = [-1] if rng.random() < 0.2 else []
     parents = [-1]
     for k in range(1, count):
-        choices = [k - 1] if rng.random() < straight else _way_down(parents, k - 1) + roots
+        choices = [k - 1] if rng.random() < straight else _with_ancestors(parents, k - 1) + roots
         parents.append(int(rng.choice(choices)))
     return parents
 
@@ -152,7 +152,7 @@ def _module(
 
 def _part(rng: np.random.Generator, scale: float) -> dict[str, Any]:
     kind, length = rng.random(), scale * rng.uniform(0.1, 0.33)
-    if kind < 0.5 and length >= SHORTEST_TUBE_M:
+    if kind < 0.5 and length >= MIN_TUBE_M:
         return {"tube": {"length_m": float(length), "twist_rad": float(rng.uniform(-np.pi, np.pi))}}
     if 0.5 <= kind < 0.8:
         return {"bracket": str(rng.choice(sorted(BRACKETS)))}

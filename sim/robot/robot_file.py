@@ -44,7 +44,7 @@ MOUNTS: dict[MountName, tuple[float, float, float]] = {
 
 
 class RobotFileError(UsageError):
-    """A robot file that describes no robot; the message names file, line and key."""
+    """A robot file is invalid; the message names file, line and key."""
 
 
 def _in_a_list(value: Any) -> Any:
@@ -81,7 +81,7 @@ def _check_springs(kind: str, stiffness: Stiffnesses, damping: Dampings) -> None
 
 
 class BaseCompliance(_Strict):
-    """How the base gives: springs and dampers in base axes, in up to six directions.
+    """Compliance of the base: springs and dampers in base axes, in up to six directions.
 
     A stiffness of 0, or none, stands for a rigid direction. The rotations are about `pivot_m`, a point of the
     base frame. `mass_kg`, `com_xyz_m` (base frame) and `inertia` (ixx, iyy, izz, ixy, ixz, iyz about that
@@ -114,7 +114,7 @@ class BaseCompliance(_Strict):
 
 
 class Flex(_Strict):
-    """How a link gives about its held end: springs and dampers about x, y, z of the parent's distal frame.
+    """Compliance of a link at its proximal end: springs and dampers about axes of the parent's distal frame.
 
     A stiffness of 0 stands for a rigid direction; with all three the link is rigid, tubes included.
     """
@@ -129,9 +129,9 @@ class Flex(_Strict):
 
 
 class Base(_Strict):
-    """How the base frame stands in gravity: a named mount, or roll, pitch, yaw in a world with z up.
+    """Orientation of the base frame: a named mount, or roll, pitch, yaw in a world with z up.
 
-    `gravity_m_s2` is how strong it is there: 9.764 to 9.834 on the Earth.
+    `gravity_m_s2` is the local gravity: 9.764 to 9.834 on the Earth.
     """
 
     mount: MountName | None = None
@@ -155,8 +155,8 @@ class Base(_Strict):
 class Module(_Strict):
     """One module and the link that holds it: a list of parts, from the parent on.
 
-    Without `flex` tubes give by beam theory, and all else is rigid. `payload` is carried by what the module's
-    joint turns: mass, centre and inertia in its output's frame, or the housing's if it is mounted reversed.
+    Without `flex` tubes are compliant by beam theory, and all else is rigid. `payload` is fixed to the distal
+    side of the joint: mass, centre and inertia in the output's frame, or the housing's if mounted reversed.
     """
 
     serial: str
@@ -201,8 +201,8 @@ class Robot(_Strict):
     @field_validator("network")
     @classmethod
     def _known_network(cls, name: str, info: ValidationInfo) -> str:
-        found = network_relative_to(name, (info.context or {}).get("folder", Path()))
-        return _known(found, network)
+        resolved = network_relative_to(name, (info.context or {}).get("folder", Path()))
+        return _known(resolved, network)
 
     @field_validator("noise")
     @classmethod
@@ -240,7 +240,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
     """Load a shipped robot by name, or a robot file by path.
 
     Raises:
-        RobotFileError: the file describes no robot; the message names file, line and key.
+        RobotFileError: the file is invalid; the message names file, line and key.
         FileNotFoundError: neither a shipped robot nor a file; the message lists the shipped ones.
     """
     path = ROBOTS / f"{name_or_path}.toml" if str(name_or_path) in shipped_robots() else Path(name_or_path)
@@ -253,7 +253,7 @@ def load_robot(name_or_path: str | Path) -> Robot:
 
 
 def parse_robot(text: str, name: str) -> Robot:
-    """Parse the text of a robot file; `name` is what errors call it.
+    """Parse the text of a robot file; errors call the file `name`.
 
     Raises:
         RobotFileError: as `load_robot`.

@@ -1,4 +1,4 @@
-"""A robot as rigid bodies and joints: frames, inertia, and where the IMUs are: the simulation's truth.
+"""Rigid bodies, joints and IMU poses of a robot, from its file: the simulation's true model.
 
 Body i is everything rigid together on the distal side of joint i. Its frame has its origin on the joint's
 axis and is parallel to the module's output frame at q = 0; the world has z up.
@@ -20,9 +20,9 @@ _FLANGE_KG, _FLANGE_RADIUS_M, _FLANGE_HEIGHT_M = 0.030, 0.018, 0.006
 
 
 class Segment(NamedTuple):
-    """A stretch of a link that is rigid in itself, in the world at q = 0: its mass, and what it hangs on.
+    """A rigid segment of a link, in the world at q = 0: its body, and the hinge at its proximal end.
 
-    Without a hinge it is one with what holds it: the segment before it, or the parent's body.
+    Without a hinge it is fixed to the segment before it, or to the parent's body.
     """
 
     body: RigidBody
@@ -32,11 +32,11 @@ class Segment(NamedTuple):
 class RobotTree(NamedTuple):
     """A tree of n bodies, parents before children; poses are in the world at q = 0.
 
-    The bodies, and all that refers to them, are those of the rigid robot; its links' segments tell the rest.
+    The bodies, and all that refers to them, are those of the rigid robot; `segments` describe its compliance.
 
     types: the modules' catalogue entries.
     parent: index of the parent body, -1 for the fixed base.
-    axis_sign: (n,) the body turns about this times the z axis of its frame when the joint's position grows.
+    axis_sign: (n,) the joint's axis is this times the z axis of the body's frame.
     home: (n, 4, 4) the bodies' frames. origin: (n, 4, 4) the same in the parent's frame (the world for -1).
     bodies: every body's mass and inertia in its own frame.
     housing: (n, 4, 4) the modules' housing frames. output: (n, 4, 4) their output frames.
@@ -44,7 +44,7 @@ class RobotTree(NamedTuple):
     way: for every module the corners of its link, (k, 3), from the parent's distal frame to its own.
     moved: for every module what its joint alone turns (flange, or housing if reversed), in the world.
     segments: for every module the segments of its link, its own held part in the last of them.
-    gravity_m_s2: how strongly it is pulled along -z of the world.
+    gravity_m_s2: gravity along -z of the world.
     """
 
     serials: tuple[str, ...]
@@ -66,7 +66,7 @@ class RobotTree(NamedTuple):
 
 
 def flange(kind: ModuleType) -> RigidBody:
-    """Return what turns with a module's output, in the output frame: a small disc just below its face."""
+    """Return the body that turns with a module's output, in the output frame: a small disc below its face."""
     across = _FLANGE_KG * (3 * _FLANGE_RADIUS_M**2 + _FLANGE_HEIGHT_M**2) / 12
     along = _FLANGE_KG * _FLANGE_RADIUS_M**2 / 2
     com = read_only(np.array([0.0, 0.0, -_FLANGE_HEIGHT_M / 2]))
@@ -74,13 +74,13 @@ def flange(kind: ModuleType) -> RigidBody:
 
 
 def housing(kind: ModuleType) -> RigidBody:
-    """Return a module but for its flange, in the housing frame; both together are what the catalogue says."""
+    """Return a module without its flange, in the housing frame; the sum of both is the catalogue's body."""
     whole = RigidBody(kind.mass_kg, read_only(np.array(kind.com_xyz)), tensor(*kind.inertia))
     return joined([whole, negative(moved(flange(kind), pose(kind.output_xyz)))])
 
 
 def build_tree(robot: Robot) -> RobotTree:
-    """Put a robot together at q = 0."""
+    """Return the tree of a robot."""
     housings: list[Array] = []
     outputs: list[Array] = []
     links: list[_Link] = []
@@ -106,7 +106,7 @@ def build_tree(robot: Robot) -> RobotTree:
 
 
 class _Link:
-    """A link in the making: where it ends so far, its corners, and its segments."""
+    """Accumulates the parts of a link: its end so far, its corners, and its segments."""
 
     def __init__(self, start: Array, module: Module):
         self.end = start
@@ -154,7 +154,7 @@ def _tree(
         if p >= 0:
             pieces[p] += [segment.body for segment in link]
 
-    def seen_from(body: int, transform: Array) -> Array:
+    def relative_to(body: int, transform: Array) -> Array:
         return transform if body < 0 else inverse(outputs[body]) @ transform
 
     return RobotTree(
@@ -164,12 +164,12 @@ def _tree(
         reversed=backwards,
         axis_sign=read_only(np.where(backwards, -1.0, 1.0)),
         home=read_only(outputs),
-        origin=read_only(np.array([seen_from(p, outputs[i]) for i, p in enumerate(parent)])),
+        origin=read_only(np.array([relative_to(p, outputs[i]) for i, p in enumerate(parent)])),
         bodies=tuple(moved(joined(own), inverse(outputs[i])) for i, own in enumerate(pieces)),
         housing=read_only(housings),
         output=read_only(outputs),
         imu_body=imu_body,
-        imu_pose=read_only(np.array([seen_from(b, imu_home[i]) for i, b in enumerate(imu_body)])),
+        imu_pose=read_only(np.array([relative_to(b, imu_home[i]) for i, b in enumerate(imu_body)])),
         way=tuple(link.way for link in links),
         moved=tuple(own),
         segments=segments,

@@ -1,7 +1,7 @@
-"""How near an identified chain comes to the true one: topology, links, tips.
+"""Errors of an identified chain against the true one: topology, links, tips.
 
-Modules are matched by serial number. Directions in which a chain is unidentifiable are removed before the
-tips are compared, and nothing else is.
+Modules are matched by serial number. Before tips are compared the estimate is moved along its unidentifiable
+directions, and along no others.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ _SEED = 1
 
 
 class LinkErrors(NamedTuple):
-    """How far a link is off: estimate - truth of its length, and sizes of the errors of vector and axis.
+    """Errors of a link: of its length, estimate - truth; of its vector and its axis, sizes.
 
     The length is the perpendicular distance from the parent's joint axis to the child's IMU at q = 0, the
     vector that distance with its direction; vector and axis are compared in the child's IMU frame at q = 0.
@@ -29,7 +29,7 @@ class LinkErrors(NamedTuple):
 
 
 def topology_differences(estimated: Chain, truth: Chain) -> list[str]:
-    """Say in words where parents or mounting differ, in the order of the truth; empty if all is right."""
+    """List where parents or mounting differ, in the order of the truth; empty if all is right."""
     changes, result, actual = difference(estimated, truth), mountings(estimated), mountings(truth)
     lines = [f"module {s} was not found" for s in changes.new]
     lines += [f"module {s} does not exist" for s in changes.removed]
@@ -81,7 +81,10 @@ def link_errors(estimated: Chain, truth: Chain, child: int) -> LinkErrors | None
     own = estimated.serials.index(serial)
     if _parent(estimated, own) != _parent(truth, child):
         return None
-    (axis, vector), (true_axis, true_vector) = _seen(estimated, own), _seen(truth, child)
+    (axis, vector), (true_axis, true_vector) = (
+        _link_in_imu_frame(estimated, own),
+        _link_in_imu_frame(truth, child),
+    )
     angle = np.arctan2(np.linalg.norm(np.cross(axis, true_axis)), axis @ true_axis)
     return LinkErrors(
         length_m=float(np.linalg.norm(vector) - np.linalg.norm(true_vector)),
@@ -90,7 +93,7 @@ def link_errors(estimated: Chain, truth: Chain, child: int) -> LinkErrors | None
     )
 
 
-def _seen(chain: Chain, child: int) -> tuple[Array, Array]:
+def _link_in_imu_frame(chain: Chain, child: int) -> tuple[Array, Array]:
     """Return the parent's axis, and the vector from it to the child's IMU, in that IMU's frame at q = 0."""
     parent, home = chain.parent[child], chain.imu_home[child]
     arm = home[:3, 3] - chain.point[parent]

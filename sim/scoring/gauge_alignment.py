@@ -1,8 +1,8 @@
-"""Remove from an estimated chain what no sensor could have told, before it is compared with the truth.
+"""Align an estimated chain with the truth along its gauge freedoms, before both are compared.
 
-A result lists the directions in which its chain may be moved without any measurement changing (its null
-basis). The truth lies somewhere along them; where, is chosen here so that the remaining difference is the
-smallest. Only those directions are used: an error in any other stays.
+A result lists the directions in which its chain can be moved without a change of any measurement (its null
+basis). Along these the estimate is moved to where the remaining difference is smallest; an error in any other
+direction stays.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from module_agent.model.forward_kinematics import imu_poses
 from module_agent.model.perturbation import adjoint, apply_perturbation
 from module_agent.model.read_only import frozen
 
-# What a wrong orientation counts against a wrong position: the displacement at a usual module's reach.
+# Weight of orientation against position: the displacement at a usual module's reach.
 REACH_M = 0.3
 
 
@@ -68,7 +68,7 @@ def align_gauge(estimated: Chain, reference: Chain, null_basis: ArrayLike, q_rad
 
     Args:
         estimated, reference: chains of the same modules in the same order.
-        null_basis: (6 n, k) directions of `increments.apply_perturbation`.
+        null_basis: (6 n, k) directions of `apply_perturbation`.
         q_rad: (m, n) the configurations over which nearness is measured, by least squares of position and of
             orientation times `REACH_M`.
 
@@ -85,26 +85,26 @@ def align_gauge(estimated: Chain, reference: Chain, null_basis: ArrayLike, q_rad
     def misfit(z: Array) -> Array:
         return _misfit(imu_poses(apply_perturbation(estimated, basis @ z), q)[:, tips], target)
 
-    found = least_squares(
+    fit = least_squares(
         misfit, _start(misfit, basis), jac="3-point", method="trf", xtol=1e-13, ftol=1e-13, gtol=1e-13
     )
-    return apply_perturbation(estimated, basis @ found.x)
+    return apply_perturbation(estimated, basis @ fit.x)
 
 
 def tip_error(estimated: Chain, reference: Chain, q_rad: ArrayLike) -> TipError:
     """Compare the leaf IMUs' poses in the root frame over configurations (m, n)."""
     tips = list(reference.leaves)
-    found, target = imu_poses(estimated, q_rad)[:, tips], imu_poses(reference, q_rad)[:, tips]
-    offset = found[..., :3, 3] - target[..., :3, 3]
-    chord = np.linalg.norm(found[..., :3, :3] - target[..., :3, :3], axis=(-2, -1))
+    poses, target = imu_poses(estimated, q_rad)[:, tips], imu_poses(reference, q_rad)[:, tips]
+    offset = poses[..., :3, 3] - target[..., :3, 3]
+    chord = np.linalg.norm(poses[..., :3, :3] - target[..., :3, :3], axis=(-2, -1))
     # |R1 - R2| = 2 sqrt(2) sin(angle / 2): precise for small angles, where the trace is not.
     angle = 2.0 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
     return TipError(float(np.sqrt(np.mean(np.sum(offset**2, axis=-1)))), float(np.sqrt(np.mean(angle**2))))
 
 
-def _misfit(found: Array, target: Array) -> Array:
-    position = (found[..., :3, 3] - target[..., :3, 3]).ravel()
-    orientation = (found[..., :3, :3] - target[..., :3, :3]).ravel() * (REACH_M / np.sqrt(2.0))
+def _misfit(poses: Array, target: Array) -> Array:
+    position = (poses[..., :3, 3] - target[..., :3, 3]).ravel()
+    orientation = (poses[..., :3, :3] - target[..., :3, :3]).ravel() * (REACH_M / np.sqrt(2.0))
     return np.concatenate([position, orientation])
 
 

@@ -1,7 +1,7 @@
-"""How near a run's result comes to the simulator's truth: `score.json`.
+"""Errors of a run's result against the simulator's truth: `score.json`.
 
-Modules are matched by serial number. What the result itself lists as unidentifiable is removed before the
-tips are compared, and nothing else is.
+Modules are matched by serial number. Before tips are compared the estimate is moved along the directions that
+the result lists as unidentifiable, and along no others.
 """
 
 import json
@@ -22,13 +22,12 @@ from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.world.truth import Motion, read_motion, read_truth
 
-# A torque below what the sensor resolves is no scale to measure errors by: a bare output turns against next
-# to nothing.
+# A torque below the sensor's resolution gives no meaningful relative error: an unloaded output needs less.
 MIN_TORQUE_NM = 0.02
 
 
 class ScoreError(RobotError):
-    """A run that cannot be scored; the message names the file and what is wrong with it."""
+    """A run cannot be scored; the message names the file and what is wrong with it."""
 
 
 class LinkScore(BaseModel):
@@ -51,11 +50,11 @@ class LinkScore(BaseModel):
 
 
 class Score(BaseModel):
-    """What `score.json` holds; None where nothing could be compared.
+    """The contents of `score.json`; None where nothing could be compared.
 
     Tip errors are root mean squares over 1000 random poses of all leaf IMUs in the root frame. Torque errors
     are |e| / |tau| on the held-out motion, against the true torque and against the measured one; None for a
-    joint whose true torque is below `MIN_TORQUE_NM` (rms), whose error in Nm is there all the same.
+    joint whose true torque is below `MIN_TORQUE_NM` (rms); its error in Nm is given nevertheless.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -75,7 +74,7 @@ class Score(BaseModel):
 
 
 class _ResultFile(BaseModel):
-    """What scoring needs of `result.json`."""
+    """The part of `result.json` that scoring needs."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -130,7 +129,7 @@ def score(run: Path) -> Score:
 
 
 def score_identified(identified: Identified, truth: Chain, motion: Motion) -> Score:
-    """Compare what was identified with the true chain and the true motion, without files.
+    """Compare an identification with the true chain and the true motion, without files.
 
     Raises:
         ScoreError: the true motion does not cover the held-out motion.
@@ -163,20 +162,20 @@ def _compared(
     )
 
 
-def write_score(path: Path, found: Score) -> None:
+def write_score(path: Path, result: Score) -> None:
     """Write `score.json`; the file is the complete old or the complete new one."""
-    write_json(path, found)
+    write_json(path, result)
 
 
 def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[LinkScore]:
     sigma = {(link.parent, link.child): link.link_length_sigma_mm for link in claimed}
-    found = []
+    scores = []
     for child, serial in enumerate(truth.serials):
         if truth.parent[child] < 0:
             continue
         parent = truth.serials[truth.parent[child]]
         error = link_errors(estimated, truth, child)
-        found.append(
+        scores.append(
             LinkScore(
                 parent=parent,
                 child=serial,
@@ -187,7 +186,7 @@ def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[Link
                 axis_error_deg=None if error is None else error.axis_deg,
             )
         )
-    return found
+    return scores
 
 
 def _torque(serials: tuple[str, ...], held_out: _HeldOut, motion: Motion, source: str) -> _TorqueScore:
@@ -212,12 +211,12 @@ def _true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], source: s
     """Interpolate a module's true torque at times of its own clock."""
     column = motion.serials.index(serial)
     try:
-        found = resample([motion.clock_ns[:, column]], [motion.spring_torque_nm[:, column]], t_ns)
+        torque = resample([motion.clock_ns[:, column]], [motion.spring_torque_nm[:, column]], t_ns)
     except DataError as error:
         raise ScoreError(
             f"{source} does not cover the held-out motion of module {serial}: {error}"
         ) from error
-    return found[:, 0]
+    return torque[:, 0]
 
 
 def _ratio(predicted: Array, true: Array) -> float | None:
@@ -235,8 +234,8 @@ def _rms(columns: Array) -> list[float]:
 def _existing(path: Path) -> Path:
     if not path.is_file():
         hints = {
-            "result.json": "the run has not come to its end, or this is no run's folder",
-            "held_out.npz": "result.json tells of a held-out motion",
+            "result.json": "the run has not ended, or this is not the folder of a run",
+            "held_out.npz": "result.json refers to a held-out motion",
         }
         raise ScoreError(f"{path} is missing: {hints.get(path.name, 'only simulated runs can be scored')}")
     return path
@@ -245,18 +244,18 @@ def _existing(path: Path) -> Path:
 def _read_result(path: Path) -> _ResultFile:
     try:
         document = json.loads(_existing(path).read_text(encoding="utf-8"))
-        found = _ResultFile.model_validate(migrate(document))
+        result = _ResultFile.model_validate(migrate(document))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise ScoreError(f"{path}: {where or 'the document'}: {first['msg']}") from error
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ScoreError(f"{path} is not JSON: {error}") from error
-    if found.schema_version != SCHEMA:
-        raise ScoreError(f"{path} has schema {found.schema_version}; this program scores schema {SCHEMA}")
-    if found.serials != found.chain.serials:
+    if result.schema_version != SCHEMA:
+        raise ScoreError(f"{path} has schema {result.schema_version}; this program scores schema {SCHEMA}")
+    if result.serials != result.chain.serials:
         raise ScoreError(f"{path}: serials and chain.serials differ")
-    return found
+    return result
 
 
 def _null_basis(result: _ResultFile, path: Path) -> Array:
@@ -289,12 +288,12 @@ def _read_motion(path: Path) -> Motion:
 def _read_held_out(path: Path, joints: int) -> _HeldOut:
     try:
         with np.load(_existing(path), allow_pickle=False) as file:
-            found = _HeldOut(*(np.asarray(file[name]) for name in _HeldOut._fields))
+            held_out = _HeldOut(*(np.asarray(file[name]) for name in _HeldOut._fields))
     except KeyError as error:
         raise ScoreError(f"{path} lacks an array: {error}") from error
     except (ValueError, OSError, zipfile.BadZipFile) as error:
         raise ScoreError(f"{path} is broken: {error}") from error
-    for name, array in zip(_HeldOut._fields, found, strict=True):
-        if array.shape != (len(found.t_ns), joints):
+    for name, array in zip(_HeldOut._fields, held_out, strict=True):
+        if array.shape != (len(held_out.t_ns), joints):
             raise ScoreError(f"{path}: {name} has shape {array.shape}, (samples, {joints}) is needed")
-    return found
+    return held_out

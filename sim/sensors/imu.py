@@ -1,4 +1,4 @@
-"""What IMU chips make of the true angular rate and specific force.
+"""Readings of IMU chips, from the true angular rate and specific force.
 
 The chain of a chip, in order:
 
@@ -8,7 +8,7 @@ The chain of a chip, in order:
     4. bias, its first-order Gauss-Markov drift, white noise, noise of the gears;
     5. saturation, then quantisation.
 
-A chip saturates before its low-pass; here a blow that the filter spreads out is clipped less than there.
+A chip saturates before its low-pass; here an impact is clipped less, as the filter spreads it out first.
 1 is constant and linear and 2 treats all axes alike, so they commute: the filter runs every tick on the true
 values, the rest once per reading. The stamp is the sampling instant. The low-pass delays slow motion by
 sqrt(2) / (2 pi f), 2.4 ms at 92 Hz. As on the real module the stamp does not include this delay: against the
@@ -47,7 +47,7 @@ def butterworth(bandwidth_hz: float, tick_s: float) -> tuple[float, float, float
 
 
 class Imus:
-    """The IMUs of n modules. `feel` is called every tick that `every_tick` or a reading asks for."""
+    """The IMUs of n modules. `advance` is called every tick if `every_tick`, else before each reading."""
 
     def __init__(
         self,
@@ -86,14 +86,14 @@ class Imus:
         # In units of its own deviation, which it has from the beginning.
         self._drift = self._drifting.draw().copy()
         # The filter's output of this tick and the last one, and its two memories.
-        self._felt = np.zeros((4, n, 6))
+        self._filtered = np.zeros((4, n, 6))
         self._started = False
 
-    def feel(self, gyro_rad_s: Array, specific_force_m_s2: Array) -> None:
+    def advance(self, gyro_rad_s: Array, specific_force_m_s2: Array) -> None:
         """Advance the low-pass by one tick; both (n, 3) in IMU axes."""
         if not self._started:
             self._start(np.hstack((gyro_rad_s, specific_force_m_s2)))
-        _feel(self._filter, gyro_rad_s, specific_force_m_s2, self._felt)
+        _low_pass(self._filter, gyro_rad_s, specific_force_m_s2, self._filtered)
 
     def read(self, motor_rad_s: Array) -> Array:
         """Return a reading of all IMUs (n, 6): gyro [rad/s], accelerometer [m/s^2].
@@ -102,7 +102,7 @@ class Imus:
         """
         errors = self._errors
         values: Array = _read(
-            self._felt,
+            self._filtered,
             self._jitter_ticks * self._jitter.draw()[:, 0],
             errors.misalignment,
             errors.imu_scale,
@@ -118,10 +118,10 @@ class Imus:
         self._drift = self._keep * self._drift + sqrt(1.0 - self._keep**2) * self._drifting.draw()
         return values
 
-    def _start(self, felt: Array) -> None:
-        """Put the filter where it has felt this for ever."""
+    def _start(self, filtered: Array) -> None:
+        """Set the filter to its steady state under this input."""
         b0, _, b2, _, a2 = self._filter
-        self._felt[:] = felt, felt, (1.0 - b0) * felt, (b2 - a2) * felt
+        self._filtered[:] = filtered, filtered, (1.0 - b0) * filtered, (b2 - a2) * filtered
         self._started = True
 
 
@@ -130,22 +130,24 @@ def _axes(gyro: float, accel: float) -> Array:
 
 
 @compiled
-def _feel(taps: tuple[float, float, float, float, float], gyro: Array, force: Array, felt: Array) -> None:
-    """Transposed direct form II; `felt` holds output, last output and the two memories, (4, n, 6)."""
+def _low_pass(
+    taps: tuple[float, float, float, float, float], gyro: Array, force: Array, filtered: Array
+) -> None:
+    """Transposed direct form II; `filtered` holds output, last output and the two memories, (4, n, 6)."""
     b0, b1, b2, a1, a2 = taps
     for i in range(gyro.shape[0]):
         for axis in range(6):
             x = gyro[i, axis] if axis < 3 else force[i, axis - 3]
-            y = b0 * x + felt[2, i, axis]
-            felt[2, i, axis] = b1 * x - a1 * y + felt[3, i, axis]
-            felt[3, i, axis] = b2 * x - a2 * y
-            felt[1, i, axis] = felt[0, i, axis]
-            felt[0, i, axis] = y
+            y = b0 * x + filtered[2, i, axis]
+            filtered[2, i, axis] = b1 * x - a1 * y + filtered[3, i, axis]
+            filtered[3, i, axis] = b2 * x - a2 * y
+            filtered[1, i, axis] = filtered[0, i, axis]
+            filtered[0, i, axis] = y
 
 
 @compiled
 def _read(
-    felt: Array,
+    filtered: Array,
     jitter: Array,
     axes: Array,
     scale: Array,
@@ -163,25 +165,25 @@ def _read(
     now = np.empty(6)
     for i in range(scale.shape[0]):
         for k in range(6):
-            now[k] = felt[0, i, k] + jitter[i] * (felt[0, i, k] - felt[1, i, k])
+            now[k] = filtered[0, i, k] + jitter[i] * (filtered[0, i, k] - filtered[1, i, k])
         for k in range(6):
             sensor, row = k // 3, k % 3
-            seen = 0.0
+            value = 0.0
             for column in range(3):
-                seen += axes[i, sensor, row, column] * now[3 * sensor + column]
-            seen *= 1.0 + scale[i, k]
+                value += axes[i, sensor, row, column] * now[3 * sensor + column]
+            value *= 1.0 + scale[i, k]
             if sensor == 0:
                 for column in range(3):
-                    seen += g_sensitivity[i, row, column] * now[3 + column]
-            seen += bias[i, k] + sizes[1, k] * drift[i, k] + sizes[0, k] * white[i, k]
-            seen += per_speed[i, k] * abs(speed[i]) * vibration[i, k]
-            values[i, k] = _converted(seen, sizes[2, k], sizes[3, k])
+                    value += g_sensitivity[i, row, column] * now[3 + column]
+            value += bias[i, k] + sizes[1, k] * drift[i, k] + sizes[0, k] * white[i, k]
+            value += per_speed[i, k] * abs(speed[i]) * vibration[i, k]
+            values[i, k] = _converted(value, sizes[2, k], sizes[3, k])
     return values
 
 
 @compiled
 def _converted(value: float, limit: float, step: float) -> float:
-    """Return what a converter makes of a value: no more than its range, in whole steps; 0 means without."""
+    """Saturate a value at the limit and round it to whole steps; 0 switches either off."""
     if limit > 0.0:
         value = min(max(value, -limit), limit)
     if step > 0.0:

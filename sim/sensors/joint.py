@@ -1,20 +1,20 @@
-"""What encoder, speed estimates and torque sensor make of a joint's true motion.
+"""Readings of encoder, speed estimates and torque sensor, from a joint's true motion.
 
 Encoder: whole counts. Velocity: the module's own estimate, a first-order low-pass of the encoder readings'
 differences over the nominal tick, so that counts and sampling jitter show in it; the real X5-1's lags its
 encoder by 1.3 to 1.7 ms. The motor's speed comes from its commutation and is smoothed far more: in the same
-log it lags by 11 ms. That log is feedback: whether the module's control loops see it as late is not known.
+log it lags by 11 ms. The log is feedback; whether the module's control uses a speed as late is not known.
 
-Torque: the sensor reads the deflection and multiplies it by a constant stiffness, but part of what rubber
-transmits is inner friction, which it cannot see. That part is a Dahl element driven by the torque,
+Torque: the sensor reads the deflection and multiplies it by a constant stiffness, but part of the torque that
+rubber transmits is inner friction, which does not show in the deflection. That part is a Dahl element driven
+by the torque,
 
     dF/dT = (F_c / T_c) (1 - sign(dT) F / F_c),     reading = T - F,
 
-with T what the spring transmits (the plant's torque; the body feels all of it), F_c half the loop's width and
-T_c the torque over which a reversal is rounded. The law is rate-independent and is integrated exactly for any
-monotone change. Around a closed cycle the loop's area over the stiffness, the integral of F dT / k, is never
-negative: the reading lags behind the torque, as if energy had been lost. (P. Dahl,
-A solid friction model, 1968.)
+with T the torque that the spring transmits to the body, F_c half the loop's width and T_c the torque over
+which a reversal is rounded. The law is rate-independent and is integrated exactly for any monotone change.
+Around a closed cycle the loop's area over the stiffness, the integral of F dT / k, is never negative: the
+reading lags behind the torque, as if energy had been lost. (P. Dahl, A solid friction model, 1968.)
 """
 
 from collections.abc import Sequence
@@ -96,7 +96,7 @@ class JointSensors:
         )
 
     def _start(self, q_rad: Array, qd_rad_s: Array, motor_rad_s: Array, elastic_nm: Array) -> None:
-        """Remember as much as if the joint had always moved at this speed under this torque."""
+        """Set the memory to the steady state of this speed and torque."""
         tick_s, step = self._settings[:2]
         before = q_rad - qd_rad_s * tick_s
         counted = np.rint(before / step) * step if step else before

@@ -1,4 +1,4 @@
-"""What the modules' sensors make of the truth: one `SensorSample` per module and tick."""
+"""Readings of all sensors of the modules from the true state: one `SensorSample` per module and tick."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -41,8 +41,8 @@ class Sensors:
 
     The IMU is read every `imu_ticks` ticks; in between its last values are repeated with their own time.
     Sampling jitter moves a reading off its stamp, to first order and never the stamp itself, so the stamps of
-    successive ticks stay a tick of the module's clock apart. What is constant in a module hangs on `seed`,
-    what comes and goes on `noise_seed`, which is the same number if it is not given.
+    successive ticks stay a tick of the module's clock apart. A module's constants are drawn from `seed`, its
+    noise from `noise_seed` (by default the same number).
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class Sensors:
         """Return one sample per module. To be called once a tick, in order."""
         now = [module_time(clock, truth.t_ns) for clock in self.clocks]
         if self.imu_due(tick):
-            self._imus.feel(truth.gyro_rad_s, truth.specific_force_m_s2)
+            self._imus.advance(truth.gyro_rad_s, truth.specific_force_m_s2)
         if tick % self._imu_ticks == 0:
             self._imu_values = self._imus.read(truth.motor_rad_s)
             self._imu_ns = now

@@ -34,21 +34,21 @@ class Repeats(NamedTuple):
 def repeats(trials: Sequence[AmplitudeTrial], filtered: bool = True) -> list[Repeats]:
     """Summarise the repeated trials, arm by arm, in the order in which they come.
 
-    An arm on which no trial gave an estimate is left out.
+    An arm without any estimate is omitted.
     """
     arms: dict[tuple[Alignment, int], list[AmplitudeTrial]] = {}
     for trial in trials:
         if trial.purpose == "repeats":
             arms.setdefault((trial.alignment, trial.length_mm), []).append(trial)
-    found = []
+    summaries = []
     for (alignment, length), own in arms.items():
         estimates = [t.estimated_mm if filtered else t.unfiltered_mm for t in own]
         known = np.array([e for e in estimates if e is not None])
         if known.size:
             mean, scatter = float(known.mean()), float(known.std(ddof=min(1, known.size - 1)))
             thesis = thesis_length(alignment, length)
-            found.append(Repeats(thesis, known.size, own[0].true_mm, mean, scatter))
-    return found
+            summaries.append(Repeats(thesis, known.size, own[0].true_mm, mean, scatter))
+    return summaries
 
 
 def write_results(folder: Path, settings: dict[str, object], trials: Sequence[AmplitudeTrial]) -> None:
@@ -198,10 +198,10 @@ def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[f
 
 
 def _thesis_mark(axes: Any, alignment: Alignment, length_mm: int, half: float) -> None:
-    found = thesis_length(alignment, length_mm)
+    published = thesis_length(alignment, length_mm)
     axes.plot(
-        [found.amplitude_rad],
-        [found.mean_mm],
+        [published.amplitude_rad],
+        [published.mean_mm],
         marker="*",
         markersize=10.0,
         linestyle="none",

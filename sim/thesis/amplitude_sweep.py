@@ -1,7 +1,7 @@
 """The thesis' amplitude experiment: series of trials on one rig.
 
-A series is one rig, put up once, on which trials of given amplitudes are run in turn, as the thesis ran them:
-the same modules, with the same errors, that get warmer. Rigs differ in their seed.
+A series is one rig, assembled once, on which trials of given amplitudes are run in turn, as in the thesis:
+the same modules, with the same errors, which get warmer. Rigs differ in their seed.
 """
 
 from collections.abc import Sequence
@@ -70,8 +70,8 @@ class AmplitudeTrial(NamedTuple):
 
     def error(self, filtered: bool = True) -> float | None:
         """Return the relative error of the estimate, with the thesis' filter or without."""
-        found = self.estimated_mm if filtered else self.unfiltered_mm
-        return None if found is None else found / self.true_mm - 1.0
+        estimate = self.estimated_mm if filtered else self.unfiltered_mm
+        return None if estimate is None else estimate / self.true_mm - 1.0
 
 
 def sweep_series(
@@ -83,7 +83,15 @@ def sweep_series(
 ) -> list[Series]:
     """Return the sweep over amplitudes: every length in both alignments, on `rigs` rigs each."""
     return [
-        Series("sweep", alignment, length, rig, _seed(seed, 0, a, length, rig), tuple(amplitudes_rad), noise)
+        Series(
+            purpose="sweep",
+            alignment=alignment,
+            length_mm=length,
+            rig=rig,
+            seed=_seed(seed, 0, a, length, rig),
+            amplitudes_rad=tuple(amplitudes_rad),
+            noise=noise,
+        )
         for a, alignment in enumerate(ALIGNMENTS)
         for length in lengths_mm
         for rig in range(rigs)
@@ -99,13 +107,13 @@ def repeat_series(
     """Return the repeated trials at the amplitudes that the thesis chose (its tables 4 and 5)."""
     return [
         Series(
-            "repeats",
-            alignment,
-            length,
-            0,
-            _seed(seed, 1, a, length, 0),
-            (thesis_length(alignment, length).amplitude_rad,) * trials,
-            noise,
+            purpose="repeats",
+            alignment=alignment,
+            length_mm=length,
+            rig=0,
+            seed=_seed(seed, 1, a, length, 0),
+            amplitudes_rad=(thesis_length(alignment, length).amplitude_rad,) * trials,
+            noise=noise,
         )
         for a, alignment in enumerate(ALIGNMENTS)
         for length in lengths_mm
@@ -120,7 +128,7 @@ def _seed(seed: int, *key: int) -> int:
 
 
 def run_series(series: Series) -> list[AmplitudeTrial]:
-    """Put up the rig and run its trials.
+    """Assemble the rig and run its trials.
 
     Raises:
         ExperimentFailed: a module refused a motion or broke it off.
@@ -128,13 +136,13 @@ def run_series(series: Series) -> list[AmplitudeTrial]:
     """
     robot = series.robot
     true_mm = 1e3 * link_length_m(true_chain(robot), child=1)
-    found = []
+    trials = []
     with OneJointRig(robot, series.seed, series.noise.of(robot)) as rig:
         clamp = rig.modules[JOINT].firmware.config.kind.velocity_clamp_rad_s
         for number, amplitude in enumerate(series.amplitudes_rad):
             rows = rig.trial(Plan(sine_amplitude_rad=amplitude))
-            found.append(_trial(series, number, amplitude, true_mm, rows, clamp))
-    return found
+            trials.append(_trial(series, number, amplitude, true_mm, rows, clamp))
+    return trials
 
 
 def _trial(

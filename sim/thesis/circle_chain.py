@@ -1,7 +1,7 @@
-"""The chain that the thesis' way makes of a recording: put together from circle point analyses, no more.
+"""Assemble a chain by the thesis' method: from circle point analyses only.
 
-Only what the agents found by that analysis counts, in the fast motion of every joint by itself, and gravity
-as the IMUs felt it at rest. As the thesis has it (chapter 4.3), all other joints stand still meanwhile.
+Inputs are the agents' circle fits of every joint's fast motion, during which all other joints stand still
+(chapter 4.3), and gravity as the IMUs measure it at rest.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ from module_agent.wire.messages import Estimate
 def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | None:
     """Return the chain by circle point analysis; None without a joint moved by itself, or without a chain.
 
-    The topology is given: the thesis' own motions tell it as well as any.
+    The topology is given: the thesis' motions determine it too.
 
     Raises:
-        DataError: a module has not told its type, or was not recorded at rest.
+        DataError: the type of a module is not recorded, or no rest.
     """
     types = [recording.module_type(serial) for serial in topology.serials]
     rest = rest_observation(recording, topology.serials)
@@ -35,7 +35,7 @@ def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | No
     try:
         return assemble(topology, types, pairs, [rest]).estimate
     except AssemblyError:
-        # What the circles of an arm that gives say may contradict itself: the thesis' way has no answer then.
+        # Circles of a compliant arm may contradict each other: the thesis' method has no result then.
         return None
 
 
@@ -48,23 +48,23 @@ def _pairs(recording: Recording, serials: Sequence[str], still_rad: Array) -> li
         q_rad = still_rad.copy()
         q_rad[k] = float(_rows(recording, event)["position_rad"].mean())
         for observer in serials:
-            found = _estimate(recording, joint, observer, event.motion.motion_id)
-            if found is None or joint == observer:
+            estimate = _estimate(recording, joint, observer, event.motion.motion_id)
+            if estimate is None or joint == observer:
                 continue
-            pair = circle_observation(found, q_rad)
+            pair = circle_observation(estimate, q_rad)
             pairs += [] if pair is None else [pair]
     return pairs
 
 
 def _estimate(recording: Recording, joint: str, observer: str, motion_id: int) -> Estimate | None:
-    found = recording.estimates.get((joint, observer), {})
-    return next((estimate for ids, estimate in found.items() if ids[-1] == motion_id), None)
+    estimates = recording.estimates.get((joint, observer), {})
+    return next((estimate for ids, estimate in estimates.items() if ids[-1] == motion_id), None)
 
 
 def _last(recording: Recording, purpose: Purpose, serial: str) -> JournalEvent | None:
     motions = [event for event in recording.journal if event.what == "motion"]
-    found = [event for event in motions if (event.purpose, event.serial) == (purpose, serial)]
-    return found[-1] if found else None
+    own = [event for event in motions if (event.purpose, event.serial) == (purpose, serial)]
+    return own[-1] if own else None
 
 
 def _rows(recording: Recording, event: JournalEvent) -> Rows:

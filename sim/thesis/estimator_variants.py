@@ -106,8 +106,10 @@ def _fused(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
 
 def _command(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
     motions = [
-        seen._replace(instrument=SmoothMotion(_commanded(window.joint, motion.joint["position_command_rad"])))
-        for seen, window, motion in zip(
+        observed._replace(
+            instrument=SmoothMotion(_commanded(window.joint, motion.joint["position_command_rad"]))
+        )
+        for observed, window, motion in zip(
             observed_motions(windows(trial)), windows(trial), (trial.constant, trial.sine), strict=True
         )
     ]
@@ -201,23 +203,23 @@ def estimator_rows(arm: Arm, comparisons: Sequence[Comparison]) -> list[Estimato
     bound = _rms(np.array([each.bound_m for each in comparisons]))
     rows = []
     for name in VARIANTS:
-        found = [each.estimates[name] for each in comparisons if name in each.estimates]
-        if not found:
+        estimates = [each.estimates[name] for each in comparisons if name in each.estimates]
+        if not estimates:
             continue
-        error, sigma = np.array(found).T
+        error, sigma = np.array(estimates).T
         rows.append(
             EstimatorRow(
-                arm.alignment,
-                arm.length_mm,
-                name,
-                len(found),
-                1e3 * float(np.abs(error).mean()),
-                1e3 * float(error.mean()),
-                1e3 * _rms(error),
-                1e3 * _rms(sigma),
-                1e3 * bound,
-                _rms(error) / bound,
-                float(np.mean(np.abs(error) < _WITHIN * sigma)),
+                alignment=arm.alignment,
+                length_mm=arm.length_mm,
+                estimator=name,
+                trials=len(estimates),
+                mean_error_mm=1e3 * float(np.abs(error).mean()),
+                bias_mm=1e3 * float(error.mean()),
+                rms_mm=1e3 * _rms(error),
+                sigma_mm=1e3 * _rms(sigma),
+                bound_mm=1e3 * bound,
+                ratio=_rms(error) / bound,
+                covered=float(np.mean(np.abs(error) < _WITHIN * sigma)),
             )
         )
     return rows

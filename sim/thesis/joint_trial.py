@@ -1,11 +1,11 @@
 """The Cramer-Rao bound of one joint's radial distance, for one recording.
 
-The bound is that of an estimator that knows the noise of the IMU and the joint's true motion, and nothing
-else that `joint_regression` does not know either: axis, radial vector, gravity, biases, delays, the link's
-compliance, and the sensors' scales and axes within what is believed of them beforehand (then it is the
-Bayesian bound of van Trees). A calibrated IMU is believed to 1e-4, while the simulated one has no error of
-scale and axes at all; with that knowledge the bound is lower by a third at 484 mm, and by a hundredth to a
-tenth at 171 mm. The hinge of a bent link is known.
+The bound is that of an estimator that knows the noise of the IMU and the joint's true motion. Its unknowns
+are those of `joint_regression`: axis, radial vector, gravity, biases, delays, the link's compliance, and
+scales and axes of the sensors with their prior (which makes it the Bayesian bound of van Trees). The prior of
+a calibrated IMU is 1e-4, while the simulated one has no error of scale and axes at all; with that knowledge
+the bound is lower by a third at 484 mm, and by a hundredth to a tenth at 171 mm. The hinge of a bent link is
+known.
 """
 
 from math import acos, degrees, pi
@@ -19,8 +19,8 @@ from module_agent.estimate.joint_regression import distance_bound_m
 from module_agent.estimate.observed_motion import observed_motions
 from module_agent.estimate.windows import imu_window
 from module_agent.model.errors import DataError
-from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED, ImuPrior
-from sim.imperfections.noise_profile import NoiseProfile, noise_profile
+from module_agent.model.imu_prior import CALIBRATED, IMU_PRIORS, ImuPrior
+from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.robot.variants import at_random_site
@@ -29,14 +29,13 @@ from sim.sensors.imu import WHITE_RATE_HZ
 from sim.test_bench.one_joint_rig import IMU, JOINT, OneJointRig, TrialRows, analyse, regress, windows
 from sim.thesis.published import Alignment, ThesisLength, thesis_length
 
-# Passes 2 Hz with 0.998, and leaves so little of the encoder's counts that they feign no information.
+# Passes 2 Hz with 0.998, and removes the encoder's counts, which would look like information.
 _LIGHTLY_S = 0.010
 
 
 def imu_knowledge(profile: NoiseProfile) -> ImuPrior:
-    """Return what is known beforehand of an IMU under this profile: whether it is calibrated."""
-    errs = profile.accel_scale or profile.gyro_scale or profile.imu_misalignment_rad
-    return UNCALIBRATED if errs else CALIBRATED
+    """Return the prior of an IMU under this profile."""
+    return IMU_PRIORS[imu_kind(profile)]
 
 
 def white_noise(profile: NoiseProfile, rate_hz: float = WHITE_RATE_HZ) -> tuple[float, float]:
@@ -71,7 +70,7 @@ class JointTrial(NamedTuple):
         motion.
     ours_sigma_m: as our estimator states it. bound_m: Cramer-Rao (`joint_bound`).
     axis_error_deg: between our axis and the true one, in the IMU's frame.
-    robot_time_s: of the trial with all ways between its motions.
+    robot_time_s: of the trial, travel between its motions included.
     """
 
     thesis_error_m: float | None
@@ -83,7 +82,7 @@ class JointTrial(NamedTuple):
 
 
 def trial_plan(arm: ThesisLength, profile: NoiseProfile) -> Plan:
-    """Return the thesis' motions for an arm, at the amplitude that it chose.
+    """Return the thesis' motions for an arm, at the thesis' amplitude.
 
     An IMU that is not calibrated is calibrated by gravity, if the slow motion lets gravity change along the
     tangent of the IMU's circle: an arm about a horizontal axis then swings about where it hangs, and not
@@ -97,7 +96,7 @@ def trial_plan(arm: ThesisLength, profile: NoiseProfile) -> Plan:
 def joint_trial(
     length_mm: int, alignment: Alignment, noise: str | NoiseProfile, seed: int, plan: Plan | None = None
 ) -> JointTrial:
-    """Put up a rig, run one trial on it, and estimate.
+    """Run one trial on a new rig and evaluate it.
 
     Args:
         length_mm, alignment: one of the thesis' eight arms (`thesis_lengths`).
@@ -111,15 +110,15 @@ def joint_trial(
         ValueError: too little motion, with what would be enough.
     """
     profile = noise_profile(noise) if isinstance(noise, str) else noise
-    wanted = plan if plan is not None else trial_plan(thesis_length(alignment, length_mm), profile)
+    motions = plan if plan is not None else trial_plan(thesis_length(alignment, length_mm), profile)
     robot = at_random_site(load_robot(f"thesis_{length_mm}_{alignment}"), seed)
     with OneJointRig(robot, seed, profile) as rig:
-        rows = rig.trial(wanted)
-        return judge(rig, rows, profile)
+        rows = rig.trial(motions)
+        return evaluate(rig, rows, profile)
 
 
-def judge(rig: OneJointRig, rows: TrialRows, profile: NoiseProfile) -> JointTrial:
-    """Estimate from a trial on a rig, and compare with the rig's truth.
+def evaluate(rig: OneJointRig, rows: TrialRows, profile: NoiseProfile) -> JointTrial:
+    """Estimate the distance from a trial, and compare it with the rig's truth.
 
     Raises:
         ValueError: too little motion, with what would be enough.

@@ -1,6 +1,7 @@
-"""The thesis' one-joint arms and what it measured on them: chapter 6.2, tables 4 and 5.
+"""Published figures of the thesis.
 
-The PID settings that the thesis tried torque assistance with: tables 7, 8 and 9 (8 and 9 are alike).
+One-joint arms and the lengths measured on them: chapter 6.2, tables 4 and 5. PID settings of the torque
+assistance: tables 7, 8 and 9 (8 and 9 are alike).
 """
 
 from typing import Literal, NamedTuple
@@ -41,22 +42,22 @@ THESIS_LENGTHS: tuple[ThesisLength, ...] = (
 
 
 def thesis_length(alignment: Alignment, length_mm: int) -> ThesisLength:
-    """Look up what the thesis found for an arm.
+    """Look up the thesis' result for an arm.
 
     Raises:
         UsageError: the thesis had no such arm; the message lists its lengths.
     """
-    for found in THESIS_LENGTHS:
-        if (found.alignment, found.length_mm) == (alignment, length_mm):
-            return found
+    for each in THESIS_LENGTHS:
+        if (each.alignment, each.length_mm) == (alignment, length_mm):
+            return each
     raise UsageError(
         f"the thesis had no {alignment} arm of {length_mm} mm; its lengths are "
         f"{', '.join(map(str, LENGTHS_MM))} mm"
     )
 
 
-# The thesis gives bare numbers. What an integral or a derivative gain multiplies is either a rate per second,
-# as this firmware has it, or what sums up or changes from one tick of 1 ms to the next.
+# The thesis gives numbers without units. Integral and derivative gains are either per second, as in this
+# firmware, or per tick of 1 ms.
 Reading = Literal["per second", "per tick"]
 READINGS: tuple[Reading, ...] = ("per tick", "per second")
 TICK_S = 1e-3
@@ -98,14 +99,14 @@ def setting(name: str) -> PidSetting:
     Raises:
         UsageError: there is no such setting; the message lists those that there are.
     """
-    for found in SETTINGS:
-        if found.name == name:
-            return found
+    for each in SETTINGS:
+        if each.name == name:
+            return each
     raise UsageError(f"no PID setting {name!r}; the thesis has {', '.join(s.name for s in SETTINGS)}")
 
 
 def thesis_gains(kind: ModuleType, chosen: PidSetting, reading: Reading) -> GainSet:
-    """Return a setting as this firmware takes it; what the thesis does not print is as from the factory."""
+    """Return a setting as gains of this firmware; gains that the thesis does not print are the factory's."""
     factory = default_gains(kind, chosen.strategy)
     return factory.model_copy(
         update={

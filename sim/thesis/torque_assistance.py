@@ -37,7 +37,7 @@ from sim.thesis.published import Reading, setting, thesis_gains, without_velocit
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 
-# What a set-point holds: position; position and velocity; position, velocity and calculated torque.
+# Contents of a set-point: position; position and velocity; position, velocity and calculated torque.
 InputMode = Literal[1, 2, 3]
 MODES: tuple[InputMode, ...] = (1, 2, 3)
 
@@ -53,11 +53,11 @@ MAX_RINGING_RAD = 2e-3
 # So is one whose bridge is at its limit for more than this share of the motion: no loop is closed then.
 MAX_SATURATED = 0.25
 _SATURATED_DUTY = 0.98
-# And so is one whose loops answer single counts of the encoder with all that the bridge has: its duty jumps
-# by half of its range or more from one tick to the next. Where that happens at all, it does in 34 to 57 % of
-# the ticks; in the others in 6 % at most.
-MAX_THROWN = 0.20
-_THROWN_DUTY = 1.0
+# And so is one whose loops answer single encoder counts with the full range of the bridge: its duty jumps by
+# half of its range or more from one tick to the next. Measured: unstable joints do so in 34 to 57 % of the
+# ticks, all others in 6 % at most.
+MAX_DUTY_JUMPS = 0.20
+_DUTY_JUMP = 1.0
 
 
 class Delivery(NamedTuple):
@@ -80,19 +80,19 @@ class Gains(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The setting in a word."""
+        """The setting's name."""
         return f"factory S{self.strategy}" if self.setting is None else self.setting
 
 
 class Model(NamedTuple):
-    """What is known of a robot: chain and inertial parameters (10 n,), as identified."""
+    """A robot's model: chain and inertial parameters (10 n,)."""
 
     chain: Chain
     phi: Array
 
 
 class Stage(NamedTuple):
-    """A robot and the motion that it is asked for; joints without a pattern hold where they start."""
+    """A robot and its commanded motion; joints without a pattern hold their start position."""
 
     robot: Robot
     start_rad: Mapping[str, float]
@@ -100,38 +100,38 @@ class Stage(NamedTuple):
 
 
 class Follow(NamedTuple):
-    """How a motion was followed, over the joints that were asked to move.
+    """Tracking of a motion, over the joints that were commanded to move.
 
     rms_error_rad: of the true position, over the whole motion. motion_rms_rad: of the motion about its mean.
-    ringing_rad: the largest standard deviation of a joint at the end of its rest afterwards. saturated: the
-    largest share of the motion that a bridge was at its limit, thrown: of it that a duty jumped by half its
-    range or more within a tick. unstable: why it counts as such, empty if not.
-    asked_rad, done_rad: (m, k) of the joints that moved, at 250 Hz; empty if the motion was broken off.
+    ringing_rad: the largest standard deviation of a joint at the end of its rest afterwards.
+    saturated: the largest share of the motion during which a bridge is at its limit. duty_jumps: the largest
+    share of ticks in which a duty changes by half its range or more. unstable: the reason, empty if stable.
+    commanded_rad, true_rad: (m, k) of the joints that moved, at 250 Hz; empty if the motion was broken off.
     """
 
     rms_error_rad: float
     motion_rms_rad: float
     ringing_rad: float
     saturated: float
-    thrown: float
+    duty_jumps: float
     unstable: str
-    asked_rad: Array
-    done_rad: Array
+    commanded_rad: Array
+    true_rad: Array
 
 
 def identified_model(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> Model:
-    """Run one whole session on a simulated robot, and return what the coordinator makes of it.
+    """Run one whole session on a simulated robot, and return the identified model.
 
     Raises:
         what `record_session` and `identify` raise.
     """
     settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
-    found = identify(record_session(settings, plan or Plan(imu=imu_kind(noise))))
-    if found.inertia is None:
+    identified = identify(record_session(settings, plan or Plan(imu=imu_kind(noise))))
+    if identified.inertia is None:
         raise ValueError(
             f"the plan leaves out the dynamics of {robot.name}: there is nothing to calculate from"
         )
-    return Model(found.kinematics.fit.chain, found.inertia.instrumental.fit.phi)
+    return Model(identified.kinematics.fit.chain, identified.inertia.instrumental.fit.phi)
 
 
 def standing_robot(name: str, seed: int) -> Robot:
@@ -148,7 +148,7 @@ def follow(
     noise: NoiseProfile,
     seed: int,
 ) -> Follow:
-    """Let a robot follow a motion, and judge how it does.
+    """Run a motion on a robot and return its tracking.
 
     The joints go to the start under the factory's gains and settle under those of the trial, in the same
     input mode; then comes the motion, and a rest after it.
@@ -172,26 +172,26 @@ def follow(
     except ExperimentFailed as error:
         return _broken_off(points[1].reference, str(error))
     columns = [stage.robot.serials.index(serial) for serial in movers]
-    return judge(points[1].reference, *(_of(track, columns) for track in tracks[1:]))
+    return tracking(points[1].reference, *(_of(track, columns) for track in tracks[1:]))
 
 
-def judge(asked: Reference, moving: Track, after: Track) -> Follow:
-    """Return how a motion was followed; columns are the joints that moved, `after` is the rest behind it."""
-    q = asked.q_rad
+def tracking(commanded: Reference, moving: Track, after: Track) -> Follow:
+    """Return the tracking of a motion; columns are the joints that moved, `after` is the rest after it."""
+    q = commanded.q_rad
     error = moving.q_rad[: len(q)] - q
     still = round(_STILL_S * 1e3)
     ringing = float(after.q_rad[-still:].std(axis=0).max())
     saturated = _largest_share(np.abs(moving.duty) > _SATURATED_DUTY)
-    thrown = _largest_share(np.abs(np.diff(moving.duty, axis=0)) > _THROWN_DUTY)
+    duty_jumps = _largest_share(np.abs(np.diff(moving.duty, axis=0)) > _DUTY_JUMP)
     return Follow(
         rms_error_rad=_rms(error),
         motion_rms_rad=_rms(q - q.mean(axis=0)),
         ringing_rad=ringing,
         saturated=saturated,
-        thrown=thrown,
-        unstable=_unstable(ringing, saturated, thrown),
-        asked_rad=read_only(q[::4].copy()),
-        done_rad=read_only(moving.q_rad[: len(q) : 4].copy()),
+        duty_jumps=duty_jumps,
+        unstable=_unstable(ringing, saturated, duty_jumps),
+        commanded_rad=read_only(q[::4].copy()),
+        true_rad=read_only(moving.q_rad[: len(q) : 4].copy()),
     )
 
 
@@ -199,20 +199,20 @@ def _largest_share(when: NDArray[np.bool_]) -> float:
     return float(np.mean(when, axis=0).max())
 
 
-def _unstable(ringing_rad: float, saturated: float, thrown: float) -> str:
-    found = []
+def _unstable(ringing_rad: float, saturated: float, duty_jumps: float) -> str:
+    reasons = []
     if ringing_rad > MAX_RINGING_RAD:
-        found.append(f"rings by {1e3 * ringing_rad:.1f} mrad")
+        reasons.append(f"rings by {1e3 * ringing_rad:.1f} mrad")
     if saturated > MAX_SATURATED:
-        found.append(f"saturates {100.0 * saturated:.0f} % of the time")
-    if thrown > MAX_THROWN:
-        found.append(f"is thrown to and fro in {100.0 * thrown:.0f} % of the ticks")
-    return ", ".join(found)
+        reasons.append(f"saturates {100.0 * saturated:.0f} % of the time")
+    if duty_jumps > MAX_DUTY_JUMPS:
+        reasons.append(f"duty jumps in {100.0 * duty_jumps:.0f} % of the ticks")
+    return ", ".join(reasons)
 
 
-def _broken_off(asked: Reference, why: str) -> Follow:
-    nothing = read_only(np.empty((0, asked.q_rad.shape[1])))
-    motion = _rms(asked.q_rad - asked.q_rad.mean(axis=0))
+def _broken_off(commanded: Reference, why: str) -> Follow:
+    nothing = read_only(np.empty((0, commanded.q_rad.shape[1])))
+    motion = _rms(commanded.q_rad - commanded.q_rad.mean(axis=0))
     return Follow(np.inf, motion, np.inf, 1.0, 1.0, f"broken off: {why}", nothing, nothing)
 
 
@@ -228,7 +228,7 @@ def _phases(stage: Stage, model: Model) -> list[SetPoints]:
 def _driven(
     phases: list[SetPoints], kinds: list[ModuleType], gains: list[GainSet], winding_c: list[float]
 ) -> list[SetPoints]:
-    """Return phases that follow on each other with what the motors take, as they get warm on the way."""
+    """Return successive phases with motor compensation, in which the motors get warmer."""
     driven = with_motor_compensation(_joined(phases), kinds, gains, winding_c).effort_nm
     ends = np.cumsum([len(phase.effort_nm) for phase in phases])[:-1]
     parts = np.split(driven, ends)

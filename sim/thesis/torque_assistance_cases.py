@@ -41,7 +41,7 @@ _ON_SINE = ("#2", "#3")
 
 
 class Pose(NamedTuple):
-    """Where the joints of an arm are as the motion begins [rad]; those that are not named at zero."""
+    """The joint positions of an arm at the start of the motion [rad]; zero for joints without entry."""
 
     name: str
     robot: str
@@ -56,7 +56,7 @@ POSES = (
 
 
 class Case(NamedTuple):
-    """One combination: on it all input modes are tried. `pose` tells arms of six joints from one another."""
+    """One combination, tried in all input modes; `pose` is for arms of six joints."""
 
     robot: str
     pose: str
@@ -71,14 +71,14 @@ class Case(NamedTuple):
 
 
 class Combination(NamedTuple):
-    """What came of a case: one result for every input mode, in their order."""
+    """The results of a case: one for every input mode, in their order."""
 
     case: Case
     follows: tuple[Follow, Follow, Follow]
 
     @property
     def is_stable(self) -> bool:
-        """Whether input mode 3 is: then it is to be the best."""
+        """Whether input mode 3 is stable, which a bar presupposes."""
         return not self.follows[2].unstable
 
     @property
@@ -99,13 +99,13 @@ def thesis_robot(alignment: Alignment) -> str:
 
 
 def cases(quick: bool = False) -> list[Case]:
-    """Return all combinations; a quick choice of them has the thesis' figures, and one arm of six joints."""
-    found = []
+    """Return all combinations; when quick only the thesis' figures and one arm of six joints."""
+    combinations = []
     for alignment in ALIGNMENTS:
         readings: tuple[Reading, ...] = READINGS[:1] if quick else READINGS
-        found += [case for reading in readings for case in _thesis_cases(alignment, reading, quick)]
-        found += _factory_cases(alignment, quick)
-    return found + _arm_cases(quick)
+        combinations += [case for reading in readings for case in _thesis_cases(alignment, reading, quick)]
+        combinations += _factory_cases(alignment, quick)
+    return combinations + _arm_cases(quick)
 
 
 def robots_of(chosen: list[Case]) -> list[str]:
@@ -153,22 +153,22 @@ def _pattern(motion: Motion, alignment: Alignment) -> Pattern:
 
 
 def _thesis_cases(alignment: Alignment, reading: Reading, quick: bool) -> list[Case]:
-    found = []
+    combinations = []
     for each in SETTINGS:
         own: Motion = "sine" if each.name in _ON_SINE else "windowed sine"
         motions: tuple[Motion, ...] = (own,) if quick else (own, "pattern")
         gains = Gains(each.strategy, each.name, reading)
-        found += [Case(thesis_robot(alignment), "", motion, gains, ON_MODULE) for motion in motions]
-    return found
+        combinations += [Case(thesis_robot(alignment), "", motion, gains, ON_MODULE) for motion in motions]
+    return combinations
 
 
 def _factory_cases(alignment: Alignment, quick: bool) -> list[Case]:
     """Return the factory's gains on all motions, and streaming under them and under one of the thesis'."""
     motions: tuple[Motion, ...] = ("windowed sine",) if quick else ("windowed sine", "sine", "pattern")
     robot = thesis_robot(alignment)
-    found = [Case(robot, "", motion, gains, ON_MODULE) for motion in motions for gains in FACTORY]
+    combinations = [Case(robot, "", motion, gains, ON_MODULE) for motion in motions for gains in FACTORY]
     streamed = (*FACTORY, Gains(4, "#4", READINGS[0]))
-    return found + [
+    return combinations + [
         Case(robot, "", "windowed sine", gains, host)
         for host in (HOSTS[:1] if quick else HOSTS)
         for gains in streamed

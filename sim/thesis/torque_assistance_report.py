@@ -21,57 +21,57 @@ from sim.thesis.torque_assistance_cases import Combination
 if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
-# What the six joints of an arm are to gain under torque control.
+# The required gain of an arm of six joints under torque control.
 MIN_GAIN = 3.0
 
 
 class Bar(NamedTuple):
-    """What is asked of all combinations of some kind, of how many it is true, and of which it is not."""
+    """A requirement on a kind of combinations, how many are stable, how many meet it, and which do not."""
 
-    asked: str
+    requirement: str
     stable: int
-    kept: int
+    met: int
     missed: tuple[str, ...]
     unstable: tuple[str, ...]
 
     @property
     def holds(self) -> bool:
-        """Whether every stable combination keeps it."""
-        return self.kept == self.stable > 0
+        """Whether every stable combination meets it, and there is one."""
+        return self.met == self.stable > 0
 
 
-def bars(found: Sequence[Combination]) -> list[Bar]:
-    """Judge all combinations: the thesis' arm under its gains and the factory's, and arms of six joints.
+def bars(combinations: Sequence[Combination]) -> list[Bar]:
+    """Check all combinations: the thesis' arm under its gains and the factory's, and arms of six joints.
 
-    Under strategy 3 calculated torque has its limits: an effort loop that is on gives way to what it does
-    not know. With P the position's gain, E the effort's and F its feed-forward, a joint is as stiff as
-    P / (E + F) [Nm/rad], and P / F without one. An arm that stands upright and whose weight turns it over
-    faster than that falls, whatever it is told: it is unstable.
+    Under strategy 3 calculated torque has its limits: an active effort loop yields to unmodelled torque. With
+    P the position's gain, E the effort's and F its feed-forward, a joint's stiffness is P / (E + F) [Nm/rad],
+    and P / F without the loop. An upright arm whose weight has a larger negative stiffness falls with any
+    feed-forward: it is unstable.
     """
-    one = [each for each in found if each.case.alignment is not None]
-    six = [each for each in found if each.case.alignment is None]
-    judged = []
+    one = [each for each in combinations if each.case.alignment is not None]
+    six = [each for each in combinations if each.case.alignment is None]
+    checked = []
     for whose, thesis in (("thesis'", True), ("factory's", False)):
         own = [each for each in one if (each.case.gains.setting is not None) == thesis]
-        asked = f"one joint, the {whose} gains: mode 3 has the lowest rms error"
-        judged.append(_bar(asked, own, lambda each: each.helps))
+        requirement = f"one joint, the {whose} gains: mode 3 has the lowest rms error"
+        checked.append(_bar(requirement, own, lambda each: each.helps))
     for strategy in (4, 3):
         own = [each for each in six if each.case.gains.strategy == strategy]
-        asked = f"six joints, strategy {strategy}: mode 3 is {MIN_GAIN:g} times lower than mode 2"
-        judged.append(_bar(asked, own, lambda each: each.gain >= MIN_GAIN))
-    return [bar for bar in judged if bar.stable + len(bar.unstable)]
+        requirement = f"six joints, strategy {strategy}: mode 3 is {MIN_GAIN:g} times lower than mode 2"
+        checked.append(_bar(requirement, own, lambda each: each.gain >= MIN_GAIN))
+    return [bar for bar in checked if bar.stable + len(bar.unstable)]
 
 
-def _bar(asked: str, found: Sequence[Combination], keeps: Callable[[Combination], bool]) -> Bar:
-    stable = [each for each in found if each.is_stable]
-    missed = tuple(combination_words(each) for each in stable if not keeps(each))
+def _bar(requirement: str, combinations: Sequence[Combination], meets: Callable[[Combination], bool]) -> Bar:
+    stable = [each for each in combinations if each.is_stable]
+    missed = tuple(combination_text(each) for each in stable if not meets(each))
     unstable = tuple(
-        f"{combination_words(each)}: {each.follows[2].unstable}" for each in found if not each.is_stable
+        f"{combination_text(each)}: {each.follows[2].unstable}" for each in combinations if not each.is_stable
     )
-    return Bar(asked, len(stable), len(stable) - len(missed), missed, unstable)
+    return Bar(requirement, len(stable), len(stable) - len(missed), missed, unstable)
 
 
-def write_assistance(path: Path, settings: dict[str, object], found: Sequence[Combination]) -> None:
+def write_assistance(path: Path, settings: dict[str, object], combinations: Sequence[Combination]) -> None:
     """Write settings, combinations and bars as JSON; an error that is infinite, as null.
 
     Raises:
@@ -79,8 +79,8 @@ def write_assistance(path: Path, settings: dict[str, object], found: Sequence[Co
     """
     document = {
         "settings": settings,
-        "rows": [_row(each) for each in found],
-        "bars": [bar._asdict() | {"holds": bar.holds} for bar in bars(found)],
+        "rows": [_row(each) for each in combinations],
+        "bars": [bar._asdict() | {"holds": bar.holds} for bar in bars(combinations)],
     }
     write_json(path, document)
 
@@ -92,7 +92,7 @@ def _row(each: Combination) -> dict[str, object]:
             "rms_error_rad": _number(one.rms_error_rad),
             "ringing_rad": _number(one.ringing_rad),
             "saturated": one.saturated,
-            "thrown": one.thrown,
+            "duty_jumps": one.duty_jumps,
             "unstable": one.unstable,
         }
         for mode, one in zip(MODES, each.follows, strict=True)
@@ -120,8 +120,8 @@ def robot_and_pose(each: Combination) -> str:
     return each.case.alignment or f"{each.case.robot} {each.case.pose}"
 
 
-def combination_words(each: Combination) -> str:
-    """Return a combination in words: robot, gains, motion, and where set-points come from if from a host."""
+def combination_text(each: Combination) -> str:
+    """Return a combination as text: robot, gains, motion, and the delivery of set-points by a host."""
     case = each.case
     read = f" {case.gains.reading}" if case.gains.reading else ""
     delivered = "" if case.delivery == ON_MODULE else f", {case.delivery.name}"
@@ -134,7 +134,7 @@ def true_model(name: str, seed: int) -> Model:
     return Model(true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
 
 
-_ASKED = "#202020"
+_COMMANDED = "#202020"
 _COLOURS = ("#d07a1f", "#1f5fa8", "#2c8a4b")
 _LABELS = (
     "mode 1: position",
@@ -149,7 +149,7 @@ _SAMPLE_S = 0.004
 _COLUMNS = 3
 
 
-def plot_assistance(found: Sequence[Combination], path: Path, title: str) -> None:
+def plot_assistance(combinations: Sequence[Combination], path: Path, title: str) -> None:
     """Draw the thesis' settings and save (PNG, SVG or PDF by suffix): a panel for each with all modes.
 
     Raises:
@@ -157,7 +157,9 @@ def plot_assistance(found: Sequence[Combination], path: Path, title: str) -> Non
     """
     from matplotlib.figure import Figure
 
-    panels = [_first(found, alignment, each.name) for alignment in ALIGNMENTS[::-1] for each in SETTINGS]
+    panels = [
+        _first(combinations, alignment, each.name) for alignment in ALIGNMENTS[::-1] for each in SETTINGS
+    ]
     if not any(panels):
         raise UsageError("no combination of the thesis' arm and settings: nothing to draw")
     figure = Figure(figsize=(13.5, 12.0), dpi=120)
@@ -183,12 +185,12 @@ def _legend() -> list["Line2D"]:
     modes = [
         Line2D([], [], color=colour, label=label) for colour, label in zip(_COLOURS, _LABELS, strict=True)
     ]
-    return [Line2D([], [], color=_ASKED, linewidth=1.0, linestyle="--", label="asked for"), *modes]
+    return [Line2D([], [], color=_COMMANDED, linewidth=1.0, linestyle="--", label="commanded"), *modes]
 
 
-def _first(found: Sequence[Combination], alignment: str, setting: str) -> Combination | None:
+def _first(combinations: Sequence[Combination], alignment: str, setting: str) -> Combination | None:
     """Return the first combination of an alignment and a setting, on the module and in the first reading."""
-    for each in found:
+    for each in combinations:
         gains = each.case.gains
         if (each.case.alignment, gains.setting) == (alignment, setting) and (
             gains.reading == READINGS[0] and each.case.delivery == ON_MODULE
@@ -201,13 +203,13 @@ def _panel(axes: Any, one: Combination) -> None:
     case = one.case
     axes.grid(True, linewidth=0.4, color="#d5d5d5")
     for each, colour in zip(one.follows, _COLOURS, strict=True):
-        t_s = _SAMPLE_S * np.arange(len(each.done_rad))
-        # What rings hides the others: it is drawn thin and pale.
-        look = {"linewidth": 0.6, "alpha": 0.6} if each.unstable else {"linewidth": 1.3}
-        axes.plot(t_s, each.done_rad[:, :1], color=colour, **look)
-    longest = max(one.follows, key=lambda each: len(each.asked_rad))
-    t_s = _SAMPLE_S * np.arange(len(longest.asked_rad))
-    axes.plot(t_s, longest.asked_rad[:, :1], color=_ASKED, linewidth=1.0, linestyle="--")
+        t_s = _SAMPLE_S * np.arange(len(each.true_rad))
+        # A ringing motion would hide the others: it is drawn thin and pale.
+        style = {"linewidth": 0.6, "alpha": 0.6} if each.unstable else {"linewidth": 1.3}
+        axes.plot(t_s, each.true_rad[:, :1], color=colour, **style)
+    longest = max(one.follows, key=lambda each: len(each.commanded_rad))
+    t_s = _SAMPLE_S * np.arange(len(longest.commanded_rad))
+    axes.plot(t_s, longest.commanded_rad[:, :1], color=_COMMANDED, linewidth=1.0, linestyle="--")
     rms = " / ".join(
         f"{1e3 * each.rms_error_rad:.1f}" + ("*" if each.unstable else "") for each in one.follows
     )

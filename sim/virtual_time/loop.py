@@ -25,7 +25,7 @@ _Entry = tuple[int, int, Callable[[], object], events.TimerHandle | None]
 
 
 class VirtualDeadlock(RuntimeError):
-    """Nothing is scheduled and the loop has not been stopped: what it runs waits for what never comes."""
+    """Nothing is scheduled and the loop has not been stopped: its tasks wait for events that cannot come."""
 
 
 class VirtualLoop(asyncio.BaseEventLoop):

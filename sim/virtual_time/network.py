@@ -288,9 +288,9 @@ class VirtualNetwork:
     def _announce(self, key: str, alive: bool) -> None:
         self._tell(self._matching("liveness", key), Liveness(key, alive))
 
-    def _tell(self, watchers: tuple[_Declaration, ...], event: Liveness) -> None:
-        if watchers:
-            self._soon(lambda: _deliver(watchers, event))
+    def _tell(self, declarations: tuple[_Declaration, ...], event: Liveness) -> None:
+        if declarations:
+            self._soon(lambda: _deliver(declarations, event))
 
     def _matching(self, kind: str, key: str) -> tuple[_Declaration, ...]:
         return tuple(d for d in self._declared[kind] if matches(d.key_expr, key))

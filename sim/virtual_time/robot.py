@@ -60,7 +60,7 @@ class VirtualRobot:
     """Ticks the world and all agents once a virtual millisecond.
 
     Every agent has its own endpoint on the network, impaired by separate draws, like an agent process.
-    `pwm` is what the motors get in the next tick; `watchers` are called at the end of every tick.
+    `pwm` is what the motors get in the next tick; `on_tick` are called at the end of every tick.
 
     Args:
         settings: robot, network, noise and seeds.
@@ -90,7 +90,7 @@ class VirtualRobot:
         self.truth = TruthLog(self.world)
         self.pwm = [0.0] * len(self.serials)
         self.samples: Sequence[SensorSample] = ()
-        self.watchers: list[Callable[[], None]] = []
+        self.on_tick: list[Callable[[], None]] = []
         self._profile = settings.profile
         self._endpoint_seeds, self._boot_ids = self._draws(settings)
         self._firmware = {"feedback_rate_hz": settings.feedback_rate_hz, **firmware}
@@ -139,8 +139,8 @@ class VirtualRobot:
         for serial, host in list(self.hosts.items()):
             host.cycle()
             (self.pwm[self.serials.index(serial)],) = self._loops[serial].pwm
-        for watcher in self.watchers:
-            watcher()
+        for call in self.on_tick:
+            call()
         self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)
 
     def kill(self, serial: str) -> None:

@@ -67,13 +67,13 @@ def run_virtual(
     """
     loop = VirtualLoop()
     settings = VirtualSettings(
-        config.robot,
-        network(config.network),
-        config.seed,
-        config.noise,
-        config.feedback_rate_hz,
-        config.noise_seed,
-        config.pushes,
+        robot=config.robot,
+        profile=network(config.network),
+        seed=config.seed,
+        noise=config.noise,
+        feedback_rate_hz=config.feedback_rate_hz,
+        noise_seed=config.noise_seed,
+        pushes=config.pushes,
     )
     robot = VirtualRobot(settings, loop)
     try:

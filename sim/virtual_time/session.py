@@ -1,6 +1,6 @@
-"""A session in virtual time that is kept in memory: the same agents, coordinator and world, and no files.
+"""A session in virtual time, recorded in memory: the same agents, coordinator and world, and no files.
 
-What it records is what a run's `session.mcap` holds, for experiments that need many sessions and no folder.
+The recording equals a run's `session.mcap`; it is for experiments that need many sessions and no folder.
 """
 
 import asyncio
@@ -24,8 +24,7 @@ from module_agent.model.errors import RobotError
 from module_agent.wire.messages import Message
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
-
-COORDINATOR = "coordinator"
+from sim.virtual_time.run import COORDINATOR, SilentScreen
 
 
 def record_session(
@@ -41,14 +40,16 @@ def record_session(
     """
     loop = VirtualLoop()
     robot = VirtualRobot(settings, loop)
-    keeper = _Keeper(plan)
+    recorder = _MemoryRecorder(plan)
     endpoint = robot.endpoint(COORDINATOR)
-    messenger = Messenger(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, keeper.record)
-    group = ModuleGroup(messenger, keeper.recording, lambda: loop.now_ns, COORDINATOR)
-    session = Session(group, messenger, keeper.recording, plan, lambda: loop.now_ns, keeper.journal, keeper)
+    messenger = Messenger(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, recorder.record)
+    group = ModuleGroup(messenger, recorder.recording, lambda: loop.now_ns, COORDINATOR)
+    session = Session(
+        group, messenger, recorder.recording, plan, lambda: loop.now_ns, recorder.journal, recorder
+    )
     robot.start()
     try:
-        keeper.journal(
+        recorder.journal(
             JournalEvent(
                 t_ns=loop.now_ns,
                 what="session",
@@ -58,10 +59,10 @@ def record_session(
             )
         )
         run_to_end(loop, loop.create_task(_to_end(session, messenger, robot)))
-        keeper.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))
+        recorder.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))
         if at_end is not None:
             at_end(robot)
-        return keeper.recording
+        return recorder.recording
     finally:
         robot.close()
         loop.close()
@@ -77,7 +78,7 @@ async def _to_end(session: Session, messenger: Messenger, robot: VirtualRobot) -
         await asyncio.sleep(0)
 
 
-class _Keeper:
+class _MemoryRecorder(SilentScreen):
     """Records the session in memory; progress and estimates are not displayed."""
 
     def __init__(self, plan: Plan) -> None:
@@ -94,12 +95,6 @@ class _Keeper:
     def journal(self, event: JournalEvent) -> None:
         self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
 
-    def step(self, index: int, total: int, text: str) -> None:
-        """Ignore the progress."""
-
-    def note(self, text: str) -> None:
-        """Ignore the note."""
-
     def estimates(self, joint: str) -> None:
         """Draw nothing."""
 
@@ -113,8 +108,8 @@ class _Keeper:
     async def excitation(self) -> tuple[RobotMotion, ...]:
         """Design motions of all joints at once, as a run does; none if the robot could run none."""
         chain = identify_kinematics(self.recording).fit.chain
-        told = [self.recording.modules[serial].info for serial in chain.serials]
-        modules = [RobotModule(module_type(one.module_type), one.limits) for one in told if one is not None]
+        infos = [self.recording.modules[serial].info for serial in chain.serials]
+        modules = [RobotModule(module_type(one.module_type), one.limits) for one in infos if one is not None]
         try:
             return robot_excitation(chain, modules, self._plan)
         except NoExcitation:

@@ -88,7 +88,16 @@ def simulate(
     if dynamics is not None:
         planned = planned.model_copy(update={"dynamics": dynamics})
     if out is not None:
-        return _written(VirtualConfig(described, Path(out), seed, network, profile, planned, pushes=pushes))
+        config = VirtualConfig(
+            robot=described,
+            out=Path(out),
+            seed=seed,
+            network=network,
+            noise=profile,
+            plan=planned,
+            pushes=pushes,
+        )
+        return _written(config)
     ended: list[tuple[Truth, Motion]] = []
 
     def keep_truth(simulated: VirtualRobot) -> None:
@@ -97,7 +106,7 @@ def simulate(
     settings = VirtualSettings(described, network_profile(network), seed, profile, pushes=pushes)
     recording = record_session(settings, planned, keep_truth)
     simulation = Simulation(described, None, recording, *ended[0])
-    # Compute at once, so that what cannot be identified is said by this call.
+    # Compute at once, so that an identification error is raised by this call.
     _ = simulation.identified
     return simulation
 

@@ -233,15 +233,15 @@ class World:
         for push in (one for one in self._pushes if one.acts(self.t_ns)):
             body = int(self._joints[self.robot.serials.index(push.serial)])
             wrench = np.array(push.at_m), np.array(push.force_n), np.array(push.torque_nm)
-            load += self._tree.reach(q, body, *wrench)
+            load += self._tree.joint_loads(q, body, *wrench)
         return load
 
     def _rehearse(self, sensors: Sensors) -> None:
         """Call every function that is compiled at its first call, which would stop real time for seconds."""
         still, idle = np.zeros_like(self._q), np.zeros(len(self._joints))
-        self._imu_readings = self._tree.feel(self._q, still, still)
+        self._imu_readings = self._tree.imu_readings(self._q, still, still)
         mass, biases = self._tree.mass_and_biases(self._q, self._rates)
-        self._tree.reach(self._q, 0, *np.zeros((3, 3)))
+        self._tree.joint_loads(self._q, 0, *np.zeros((3, 3)))
         actuators = copy(self._actuators)
         actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
         copy(self._windings).step(actuators.copper_w)
@@ -249,7 +249,7 @@ class World:
 
     def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:
         if self._sensors.imu_due(self._tick):
-            self._imu_readings = self._tree.feel(q, rate, change)
+            self._imu_readings = self._tree.imu_readings(q, rate, change)
         return self._sensors.read(self._tick, self._instant(q, rate))
 
     def _instant(self, q: Array, rate: Array) -> Instant:

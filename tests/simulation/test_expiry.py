@@ -28,7 +28,7 @@ class Blackbox:
         self.rig = rigs(robot, network, tap=self._tap, **firmware)
         self.expired_ns = 0
         self.rows: list[tuple[int, float, float, float, float]] = []
-        self.rig.watchers.append(self._watch)
+        self.rig.on_tick.append(self._watch)
 
     def _tap(self, now_ns: int, endpoint: str, kind: str, key: str, payload: bytes) -> None:
         """Note when the module says yes to a command; answers leave in the tick of their cause."""

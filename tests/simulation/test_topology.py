@@ -120,7 +120,7 @@ def test_an_arm_that_nothing_disturbs_is_found_without_a_doubt(arm: Any) -> None
 
 def test_what_a_joint_with_a_dead_motor_carries_shows_on_what_carries_it(arm: Any) -> None:
     index = arm.serials.index("yaw")
-    arm.watchers.append(lambda: arm.pwm.__setitem__(index, 0.0))
+    arm.on_tick.append(lambda: arm.pwm.__setitem__(index, 0.0))
     found = search_topology(explore(arm)[0], arm.serials)
     assert found.topology.unmoved == ("yaw",)
     assert edges(found) == WHOLE | {"lift": ("base", False)}
@@ -139,7 +139,7 @@ def test_a_push_while_a_joint_moves_is_a_doubt_that_another_motion_settles(arm: 
         if arm.loop.time() < until_s[0]:
             arm.pwm[yaw] = 0.6
 
-    arm.watchers.append(push)
+    arm.on_tick.append(push)
     recording, watcher = explore(arm, on_step=listen)
     found = search_topology(recording, arm.serials)
     assert edges(found) == WHOLE

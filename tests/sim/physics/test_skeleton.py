@@ -54,8 +54,8 @@ def test_what_gives_is_at_rest_where_the_rigid_robot_is(name: str) -> None:
     full[list(giving.module)] = q
     still = np.zeros(len(q))
     np.testing.assert_allclose(
-        RigidTree(giving).feel(full, np.zeros_like(full), np.zeros_like(full))[1],
-        RigidTree(rigid).feel(q, still, still)[1],
+        RigidTree(giving).imu_readings(full, np.zeros_like(full), np.zeros_like(full))[1],
+        RigidTree(rigid).imu_readings(q, still, still)[1],
         atol=1e-12,
     )
     mass, _ = RigidTree(giving).mass_and_bias(full, np.zeros_like(full))

@@ -129,7 +129,9 @@ def test_a_random_tree_that_gives_has_pinocchios_mass_bias_and_imu_readings(seed
     mass, bias = tree.mass_and_bias(q, qd)
     np.testing.assert_allclose(mass, reference.mass(q), atol=1e-13)
     np.testing.assert_allclose(bias, reference.torque(q, qd, np.zeros(m)), atol=1e-11)
-    np.testing.assert_allclose(np.hstack(tree.feel(q, qd, qdd)), reference.felt(q, qd, qdd), atol=1e-11)
+    np.testing.assert_allclose(
+        np.hstack(tree.imu_readings(q, qd, qdd)), reference.felt(q, qd, qdd), atol=1e-11
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -146,7 +148,7 @@ def test_a_wrench_on_any_body_reaches_the_joints_as_pinocchios_jacobian_has_it(s
         axes = reference.data.oMi[joint].rotation
         wrench = np.concatenate([axes.T @ force, axes.T @ moment + np.cross(point, axes.T @ force)])
         wanted = (jacobian.T @ wrench)[reference.rows]
-        np.testing.assert_allclose(tree.reach(q, body, point, force, moment), wanted, atol=1e-11)
+        np.testing.assert_allclose(tree.joint_loads(q, body, point, force, moment), wanted, atol=1e-11)
 
 
 @pytest.mark.parametrize("seed", range(4))

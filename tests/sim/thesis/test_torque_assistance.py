@@ -31,8 +31,8 @@ from sim.thesis.torque_assistance import (
     Model,
     follow,
     identified_model,
-    judge,
     standing_robot,
+    tracking,
 )
 from sim.thesis.torque_assistance_cases import (
     HOSTS,
@@ -120,39 +120,39 @@ def still(m: int = 1500) -> Track:
     return Track(zero, zero, zero)
 
 
-ASKED = Reference(np.arange(1500) / 1e3, *(np.zeros((1500, 1)) for _ in range(3)))
+COMMANDED = Reference(np.arange(1500) / 1e3, *(np.zeros((1500, 1)) for _ in range(3)))
 
 
 def test_a_joint_that_stays_away_from_its_goal_is_wrong_but_stable() -> None:
     away = still()._replace(q_rad=np.full((1500, 1), 0.3))
-    found = judge(ASKED, away, away)
+    found = tracking(COMMANDED, away, away)
     assert found.rms_error_rad == pytest.approx(0.3)
     assert found.unstable == ""
 
 
 def test_a_joint_that_goes_on_in_a_cycle_is_unstable() -> None:
-    cycle = 1.5 * np.sqrt(2.0) * MAX_RINGING_RAD * np.sin(2 * np.pi * 8.0 * ASKED.t_s[:, None])
-    assert judge(ASKED, still(), still()._replace(q_rad=cycle)).unstable == "rings by 3.0 mrad"
-    faded = cycle * (ASKED.t_s[:, None] < 0.9)
-    assert judge(ASKED, still(), still()._replace(q_rad=faded)).unstable == ""
+    cycle = 1.5 * np.sqrt(2.0) * MAX_RINGING_RAD * np.sin(2 * np.pi * 8.0 * COMMANDED.t_s[:, None])
+    assert tracking(COMMANDED, still(), still()._replace(q_rad=cycle)).unstable == "rings by 3.0 mrad"
+    faded = cycle * (COMMANDED.t_s[:, None] < 0.9)
+    assert tracking(COMMANDED, still(), still()._replace(q_rad=faded)).unstable == ""
 
 
 def test_a_bridge_that_is_at_its_limit_most_of_the_time_is_unstable() -> None:
     duty = np.ones((1500, 1))
-    assert judge(ASKED, still()._replace(duty=duty), still()).unstable == "saturates 100 % of the time"
+    assert tracking(COMMANDED, still()._replace(duty=duty), still()).unstable == "saturates 100 % of the time"
     rare = duty * (np.arange(1500) < 0.9 * MAX_SATURATED * 1500)[:, None]
-    assert judge(ASKED, still()._replace(duty=rare), still()).unstable == ""
+    assert tracking(COMMANDED, still()._replace(duty=rare), still()).unstable == ""
 
 
 def test_loops_that_throw_the_motor_to_and_fro_at_every_count_are_unstable() -> None:
     tick = np.arange(1500)[:, None]
     # Below the limit, so that nothing saturates; 1.2 of the range of 2 from one tick to the next.
     duty = np.where(tick % 2 == 0, -0.6, 0.6)
-    words = judge(ASKED, still()._replace(duty=duty), still()).unstable
-    assert words == "is thrown to and fro in 100 % of the ticks"
+    words = tracking(COMMANDED, still()._replace(duty=duty), still()).unstable
+    assert words == "duty jumps in 100 % of the ticks"
     # A square wave of 5 Hz reverses as hard, but seldom.
     slow = np.where(tick // 100 % 2 == 0, -0.6, 0.6)
-    assert judge(ASKED, still()._replace(duty=slow), still()).unstable == ""
+    assert tracking(COMMANDED, still()._replace(duty=slow), still()).unstable == ""
 
 
 # --------------------------------------------------------------------------- gains
@@ -212,7 +212,7 @@ def test_a_bar_is_kept_by_the_stable_ones_and_names_all_others() -> None:
         combination(arm, 0.3, 0.29, 0.1),
     ]
     one, factory, six = bars(found)
-    assert (one.holds, one.stable, one.kept) == (False, 2, 1)
+    assert (one.holds, one.stable, one.met) == (False, 2, 1)
     assert one.missed == ("vertical, #4 per tick, sine",)
     assert one.unstable == ("vertical, #4 per tick, pattern: rings by 9.0 mrad",)
     assert (factory.holds, factory.stable) == (True, 1)

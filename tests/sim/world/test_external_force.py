@@ -56,7 +56,7 @@ def test_with_the_pushs_torque_the_plant_fulfils_the_equations_of_motion() -> No
         plant = world.plant
         mass, bias = tree.mass_and_bias(plant.q_rad, plant.qd_rad_s)
         wrench = np.array(push.at_m), np.array(push.force_n), np.array(push.torque_nm)
-        outside = tree.reach(plant.q_rad, len(robot.modules) - 1, *wrench)
+        outside = tree.joint_loads(plant.q_rad, len(robot.modules) - 1, *wrench)
         left = mass @ plant.qdd_rad_s2 + bias - plant.spring_torque_nm - outside
         # Of some Nm; the integrator foretells the velocity of velocity forces from the last acceleration.
         np.testing.assert_allclose(left, 0.0, atol=1e-3)
