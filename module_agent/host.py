@@ -243,7 +243,7 @@ class AgentHost:
         self._hardware = modules
         self._transport = transport
         self._worker = worker
-        self._neighbours = MotionListener()
+        self._motion_listener = MotionListener()
         self._from_others = Inbox(capacity=4096)
         self._findings: list[tuple[HostedModule, Finding]] = []
         self._listening: dict[str, Undeclare] = {}
@@ -283,7 +283,7 @@ class AgentHost:
         for module, pwm in zip(modules, self._hardware.send(commands), strict=True):
             for outgoing in module.publish(pwm):
                 self._send(module, outgoing)
-        if self._neighbours.has_work:
+        if self._motion_listener.has_work:
             self._attend_to_motions()
         if self._shared.collection.has_work:
             for wanted in self._shared.collection.poll(self.modules[0].now_ns):
@@ -326,12 +326,12 @@ class AgentHost:
             status = _of(
                 parts.serial, decode(Status, event.payload, TOPICS[Leaf.STATUS].max_bytes_from_module)
             )
-            self._neighbours.on_status(status, now_ns, clocks)
+            self._motion_listener.on_status(status, now_ns, clocks)
         else:
             feedback = _of(
                 parts.serial, decode(Feedback, event.payload, TOPICS[Leaf.FEEDBACK].max_bytes_from_module)
             )
-            self._neighbours.on_feedback(feedback, clocks)
+            self._motion_listener.on_feedback(feedback, clocks)
 
     def _on_history(self, asked: AskHistory, payload: bytes, clocks: dict[str, int]) -> None:
         try:
@@ -342,12 +342,12 @@ class AgentHost:
             if refused.reason in (Refusal.GONE.value, Refusal.WRONG_BOOT.value):
                 self._shared.collection.on_lost(asked)
             return
-        self._neighbours.on_feedback(feedback, clocks, live=False)
+        self._motion_listener.on_feedback(feedback, clocks, live=False)
         self._shared.collection.on_feedback(feedback)
 
     def _attend_to_motions(self) -> None:
         now_ns = self.modules[0].now_ns
-        requests, motions = self._neighbours.poll(now_ns)
+        requests, motions = self._motion_listener.poll(now_ns)
         for wanted in requests:
             if isinstance(wanted, Listen):
                 self._listen(wanted)

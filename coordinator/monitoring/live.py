@@ -1,6 +1,6 @@
 """Monitor a robot that another program moves: subscribe to feedback, query status, hold no lease.
 
-The watch itself is `watching.monitor`; here is its place on a network and on a clock, real or virtual.
+The monitor itself is `monitoring.monitor`; here is its place on a network and on a clock, real or virtual.
 """
 
 import asyncio
@@ -31,7 +31,7 @@ class LiveMonitor:
 
     def __init__(self, monitor: Monitor, clock: Clock, sender: str, report: Report):
         self.recording = Recording()
-        self._watcher = monitor
+        self._monitor = monitor
         self._clock = clock
         self._sender = sender
         self._report = report
@@ -71,7 +71,7 @@ class LiveMonitor:
         """Look at what was heard since the last look."""
         if self._clocks is None:
             return
-        update = self._watcher.advance(self.recording, self._clocks)
+        update = self._monitor.advance(self.recording, self._clocks)
         if any(update):
             self._report(update)
         for serial in self._serials:

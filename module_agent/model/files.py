@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the folder of `path`; what is written there takes its place if nothing was raised.
+    """Yield a temporary path next to `path`; what is written there takes its place if nothing was raised.
 
     Raises:
         OSError: the file cannot be put in its place.

@@ -204,7 +204,7 @@ def compensate_robot(
     loop = VirtualLoop()
     settings = VirtualSettings(robot, network(network_name), seed, noise, noise_seed=1, pushes=tuple(pushes))
     virtual = VirtualRobot(settings, loop)
-    watcher = _TruthAtSetPoints(virtual)
+    observer = _TruthAtSetPoints(virtual)
     session = CompensationSession(
         virtual.endpoint(COORDINATOR),
         robot.name,
@@ -212,13 +212,15 @@ def compensate_robot(
         plan,
         lambda: loop.now_ns,
         loop.call_soon,
-        watcher,
+        observer,
         COORDINATOR,
     )
     virtual.start()
     try:
         summary = run_to_end(loop, loop.create_task(_to_end(session, virtual)))
-        return CompensationRun(summary, tuple(watcher.phases), np.array(watcher.t_s), np.array(watcher.q_rad))
+        return CompensationRun(
+            summary, tuple(observer.phases), np.array(observer.t_s), np.array(observer.q_rad)
+        )
     finally:
         virtual.close()
         loop.close()
