@@ -8,13 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coordinator.arm_fit.data_file import read_log
-    from coordinator.arm_fit.fit_dynamics import fit_dynamics
-    from coordinator.batch_estimation.imu_prediction import imu_readings
-    from coordinator.description.urdf_reader import read_urdf
-    from coordinator.identification.identify import identify
-    from coordinator.kinematics.imu_links import link_from_imus, link_from_joint
-    from coordinator.library import (
+    from coordinator.api import (
         connect,
         denavit_hartenberg,
         export_hrdf,
@@ -23,22 +17,28 @@ if TYPE_CHECKING:
         load_recording,
         load_run,
     )
+    from coordinator.arm_fit.data_file import read_log
+    from coordinator.arm_fit.fit_dynamics import fit_dynamics
+    from coordinator.batch_estimation.imu_prediction import imu_readings
+    from coordinator.description.urdf_reader import read_urdf
+    from coordinator.identification.identify import identify
+    from coordinator.kinematics.imu_links import link_from_imus, link_from_joint
     from module_agent.model.regressor import inverse_dynamics, torque_regressor
 
 _HOMES = {
-    "connect": "coordinator.library",
-    "denavit_hartenberg": "coordinator.library",
-    "export_hrdf": "coordinator.library",
-    "export_urdf": "coordinator.library",
+    "connect": "coordinator.api",
+    "denavit_hartenberg": "coordinator.api",
+    "export_hrdf": "coordinator.api",
+    "export_urdf": "coordinator.api",
     "fit_dynamics": "coordinator.arm_fit.fit_dynamics",
-    "forward_kinematics": "coordinator.library",
+    "forward_kinematics": "coordinator.api",
     "identify": "coordinator.identification.identify",
     "imu_readings": "coordinator.batch_estimation.imu_prediction",
     "inverse_dynamics": "module_agent.model.regressor",
     "link_from_imus": "coordinator.kinematics.imu_links",
     "link_from_joint": "coordinator.kinematics.imu_links",
-    "load_recording": "coordinator.library",
-    "load_run": "coordinator.library",
+    "load_recording": "coordinator.api",
+    "load_run": "coordinator.api",
     "read_log": "coordinator.arm_fit.data_file",
     "read_urdf": "coordinator.description.urdf_reader",
     "torque_regressor": "module_agent.model.regressor",

@@ -2,7 +2,7 @@
 
 from types import SimpleNamespace
 
-from coordinator.library import _recorder
+from coordinator.api import _recorder
 from coordinator.recording.recording import Entry, Recording
 from module_agent.wire.keys import Leaf, key
 
