@@ -1,4 +1,4 @@
-"""`x5-sim assistance`: the thesis' torque assistance on simulated arms, by what they identify themselves."""
+"""`x5-sim assistance`: the thesis' torque assistance on simulated arms, with their identified models."""
 
 from collections.abc import Sequence
 from math import isfinite
@@ -46,7 +46,7 @@ def assistance(
         Path | None, typer.Option("--picture", help="Draw figures 52 to 61 (PNG, SVG or PDF).")
     ] = None,
 ) -> None:
-    """Track by position, with velocity too, and with calculated torque too, as the thesis did (6.3)."""
+    """Track motions by position, position and velocity, and with calculated torque too (thesis 6.3)."""
     profile = chosen_profile(noise, with_effects, without_effects)
     check_writable(json_file, picture)
     combinations = _run(cases(quick), profile, seed, processes)

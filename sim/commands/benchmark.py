@@ -77,7 +77,7 @@ def dynamics(
         if tx40 is not None and not (tx40 / name).is_file():
             fail(f"--tx40 {tx40}: there is no {name} in it", EXIT_USAGE)
     cases = dynamic_cases(effort, seed, tx40)
-    _benchmark("dynamics", cases, settings, only, processes, json_file, None)
+    _benchmark("dynamics", cases, settings, only=only, processes=processes, json_file=json_file)
 
 
 @app.command()
@@ -114,7 +114,15 @@ def kinematics(
     settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "motions": motions}
     settings |= effort._asdict()
     cases = kinematic_cases(effort, seed, motions)
-    _benchmark("kinematics", cases, settings, only, processes, json_file, plot_file)
+    _benchmark(
+        "kinematics",
+        cases,
+        settings,
+        only=only,
+        processes=processes,
+        json_file=json_file,
+        plot_file=plot_file,
+    )
 
 
 def _benchmark(
@@ -124,7 +132,7 @@ def _benchmark(
     only: str,
     processes: int | None,
     json_file: Path | None,
-    plot_file: Path | None,
+    plot_file: Path | None = None,
 ) -> None:
     """Run the selected cases, report, and exit with `EXIT_MISSED` if a bar is missed."""
     check_writable(json_file, plot_file)

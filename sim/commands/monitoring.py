@@ -37,12 +37,12 @@ from sim.imperfections.noise_profile import noise_profile
 from sim.robot.robot_file import load_robot
 
 _KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
-# A false alarm's trial: long ones would leave a process idle at the end.
+# Length of a trial without event: with longer ones processes would idle at the end.
 _SEGMENT_S = 300.0
 # Of the quick form.
 _QUICK_AFTER_S, _QUICK_SEGMENT_S = 5.0, 8.0
 _COST_SHARE = 0.2
-# Trials of unchanged robots are days of their own.
+# Trials of unchanged robots have numbers from here.
 _UNCHANGED_DAY = 500
 
 

@@ -16,9 +16,8 @@ from sim.world.bus_server import BusServer
 from sim.world.truth import LoggedWorld, write_truth
 from sim.world.world import World
 
-# How long the world waits for an agent that does not run on a busy machine, before it steps without it. The
-# world's clock may be stretched, while a motor without command in the middle of a motion spoils it. Agents
-# that died are noticed at once.
+# How long the world waits for an agent's command on a busy machine before it steps without it. A late step is
+# harmless, while a motor without command spoils a motion. Agents that ended are noticed at once.
 PATIENCE_S = 0.2
 
 

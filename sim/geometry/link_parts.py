@@ -70,11 +70,13 @@ BRACKETS: dict[str, Bracket] = {
 }
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
+    """A table of a robot file: unknown keys and numbers that are not finite are errors."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Tube(_Strict):
+class Tube(Strict):
     """An X5 tube with right-angle ends; the far end is twisted about the tube."""
 
     length_m: Annotated[float, Field(gt=0.0, le=3.0)]
@@ -97,7 +99,7 @@ def check_inertia(mass_kg: float, inertia: tuple[float, float, float, float, flo
         )
 
 
-class FreePose(_Strict):
+class FreePose(Strict):
     """Any rigid part: the pose of its output, and its mass, centre and inertia about that centre.
 
     `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) [kg m^2]; all is in the part's input frame. A part without
@@ -116,7 +118,7 @@ class FreePose(_Strict):
         return self
 
 
-class Part(_Strict):
+class Part(Strict):
     """One part of a link: exactly one of `tube`, `bracket` and `pose`."""
 
     tube: Tube | None = None

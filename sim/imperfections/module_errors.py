@@ -74,11 +74,11 @@ def draw_sensor_errors(
     oblique = profile.imu_skew_rad * _normals(seed, serials, "imu skew", (2, 3))
     return SensorErrors(
         imu_bias=read_only(
-            _per_axis(profile.gyro_bias_rad_s, profile.accel_bias_m_s2)
+            per_axis(profile.gyro_bias_rad_s, profile.accel_bias_m_s2)
             * _normals(seed, serials, "imu bias", (6,))
         ),
         imu_scale=read_only(
-            _per_axis(profile.gyro_scale, profile.accel_scale) * _normals(seed, serials, "imu scale", (6,))
+            per_axis(profile.gyro_scale, profile.accel_scale) * _normals(seed, serials, "imu scale", (6,))
         ),
         misalignment=read_only(
             np.array(
@@ -100,7 +100,8 @@ def _normals(seed: int, serials: Sequence[str], purpose: str, shape: tuple[int, 
     return np.array([generator(seed, serial, purpose).standard_normal(shape) for serial in serials])
 
 
-def _per_axis(gyro: float, accel: float) -> Array:
+def per_axis(gyro: float, accel: float) -> Array:
+    """Return a value per axis of an IMU, (6,): gyro, accelerometer."""
     return np.array([gyro] * 3 + [accel] * 3)
 
 

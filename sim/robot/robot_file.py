@@ -12,9 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import (
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     ValidationError,
     ValidationInfo,
@@ -27,7 +25,7 @@ from module_agent.model.errors import RobotError, UsageError
 from module_agent.network_emulation.profile_file import network, network_relative_to
 from module_agent.network_emulation.toml_location import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
-from sim.geometry.link_parts import Angle, FreePose, Moment, Part, Xyz, check_inertia
+from sim.geometry.link_parts import Angle, FreePose, Moment, Part, Strict, Xyz, check_inertia
 from sim.geometry.pose import Array, pose
 from sim.imperfections.noise_profile import DEFAULT_PROFILE, noise_profile
 
@@ -59,10 +57,6 @@ def _known(value: str, lookup: Any) -> str:
     return value
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
 Stiffness = Annotated[float, Field(ge=0.0, le=1e9)]
 Damping = Annotated[float, Field(ge=0.0, le=1e6)]
 Stiffnesses = tuple[Stiffness, Stiffness, Stiffness]
@@ -80,7 +74,7 @@ def _check_springs(kind: str, stiffness: Stiffnesses, damping: Dampings) -> None
             )
 
 
-class BaseCompliance(_Strict):
+class BaseCompliance(Strict):
     """Compliance of the base: springs and dampers in base axes, in up to six directions.
 
     A stiffness of 0, or none, stands for a rigid direction. The rotations are about `pivot_m`, a point of the
@@ -113,7 +107,7 @@ class BaseCompliance(_Strict):
         return self
 
 
-class Flex(_Strict):
+class Flex(Strict):
     """Compliance of a link at its proximal end: springs and dampers about axes of the parent's distal frame.
 
     A stiffness of 0 stands for a rigid direction; with all three the link is rigid, tubes included.
@@ -128,7 +122,7 @@ class Flex(_Strict):
         return self
 
 
-class Base(_Strict):
+class Base(Strict):
     """Orientation of the base frame: a named mount, or roll, pitch, yaw in a world with z up.
 
     `gravity_m_s2` is the local gravity: 9.764 to 9.834 on the Earth.
@@ -152,7 +146,7 @@ class Base(_Strict):
         return pose((0.0, 0.0, 0.0), (radians(roll), radians(pitch), radians(yaw)))
 
 
-class Module(_Strict):
+class Module(Strict):
     """One module and the link that holds it: a list of parts, from the parent on.
 
     Without `flex` tubes are compliant by beam theory, and all else is rigid. `payload` is fixed to the distal
@@ -181,7 +175,7 @@ class Module(_Strict):
         return _known(name, module_type)
 
 
-class Robot(_Strict):
+class Robot(Strict):
     """A robot as its file describes it; `modules` is ordered depth first, so parents precede children.
 
     `network` is a profile's name, or the path of a network file, in the robot's file from its own folder.

@@ -23,7 +23,7 @@ import numpy as np
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.compiled import compiled
 from sim.geometry.pose import Array
-from sim.imperfections.module_errors import SensorErrors
+from sim.imperfections.module_errors import SensorErrors, per_axis
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.imperfections.random_streams import StandardNormals
 
@@ -64,7 +64,7 @@ class Imus:
         self._filter = butterworth(profile.imu_bandwidth_hz, tick_s)
         self._jitter_ticks = profile.sampling_jitter_s / tick_s
         self._errors = errors
-        vibration = np.array([t.vibration for t in types])[:, None] * _axes(
+        vibration = np.array([t.vibration for t in types])[:, None] * per_axis(
             profile.vibration_rad_s, profile.vibration_m_s2
         )
         self._vibration_per_speed = vibration / np.array([t.max_speed_rad_s for t in types])[:, None]
@@ -72,10 +72,10 @@ class Imus:
         self._sizes = np.array(
             [
                 sqrt(1.0 / (period_s * WHITE_RATE_HZ))
-                * _axes(profile.gyro_white_rad_s, profile.accel_white_m_s2),
-                _axes(profile.gyro_drift_rad_s, profile.accel_drift_m_s2),
-                _axes(profile.gyro_range_rad_s, profile.accel_range_m_s2),
-                _axes(profile.gyro_step_rad_s, profile.accel_step_m_s2),
+                * per_axis(profile.gyro_white_rad_s, profile.accel_white_m_s2),
+                per_axis(profile.gyro_drift_rad_s, profile.accel_drift_m_s2),
+                per_axis(profile.gyro_range_rad_s, profile.accel_range_m_s2),
+                per_axis(profile.gyro_step_rad_s, profile.accel_step_m_s2),
             ]
         )
         self._keep = exp(-period_s / profile.drift_time_s) if profile.drift_time_s else 0.0
@@ -123,10 +123,6 @@ class Imus:
         b0, _, b2, _, a2 = self._filter
         self._filtered[:] = filtered, filtered, (1.0 - b0) * filtered, (b2 - a2) * filtered
         self._started = True
-
-
-def _axes(gyro: float, accel: float) -> Array:
-    return np.array([gyro] * 3 + [accel] * 3)
 
 
 @compiled

@@ -62,8 +62,18 @@ class Sensors:
         self._imu_ticks = imu_ticks
         self._gear = np.array([t.gear_ratio for t in types])
         noise = seed if noise_seed is None else noise_seed
-        self._joints = JointSensors(noise, serials, types, profile, self.errors, tick_s)
-        self._imus = Imus(noise, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
+        self._joints = JointSensors(
+            seed=noise, serials=serials, types=types, profile=profile, errors=self.errors, tick_s=tick_s
+        )
+        self._imus = Imus(
+            seed=noise,
+            serials=serials,
+            types=types,
+            profile=profile,
+            errors=self.errors,
+            tick_s=tick_s,
+            period_s=imu_ticks * tick_s,
+        )
         self._imu_values = np.zeros((len(types), 6))
         self._imu_ns = [0] * len(types)
 

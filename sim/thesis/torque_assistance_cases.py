@@ -117,7 +117,8 @@ def try_case(case: Case, model: Model, noise: NoiseProfile, seed: int) -> Combin
     """Try all input modes on a combination."""
     stage = stage_of(case, seed)
     first, second, third = (
-        follow(stage, case.gains, mode, case.delivery, model, noise, seed) for mode in MODES
+        follow(stage, case.gains, mode=mode, delivery=case.delivery, model=model, noise=noise, seed=seed)
+        for mode in MODES
     )
     return Combination(case, (first, second, third))
 
