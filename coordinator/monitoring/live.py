@@ -15,10 +15,10 @@ from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ask, Message
 
-# How often the watch looks: a blow is said by so much later.
+# Period of the updates, and so the additional latency of a finding.
 UPDATE_S = 0.02
 ASK_S, REMAP_S = 0.25, 5.0
-# What a clock is mapped by: the last minute's trips; so many are enough to begin with.
+# Round trips for a clock map: those of the last minute; the first map needs fewer.
 MAX_TRIPS, MIN_TRIPS = 240, 6
 # Rows that are kept, at 250 a second; none is older than the cubic's and the filter's reach.
 RETAINED_ROWS = 2000
@@ -41,7 +41,7 @@ class LiveMonitor:
         self._left: tuple[str, ...] = ()
 
     def record(self, entry: Entry) -> Message | None:
-        """Take in what was heard."""
+        """Add a received message to the recording."""
         try:
             message = self.recording.add(entry)
         except RobotError:
