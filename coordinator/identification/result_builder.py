@@ -1,12 +1,16 @@
 """The result of an identification in the schema of `result.json`."""
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from coordinator.description.denavit_hartenberg import dh_paths
 from coordinator.description.link_transforms import PARAMETERS, LinkTransform, link_transforms
 from coordinator.description.product_of_exponentials import screw_model
+from coordinator.identification.identified import HeldOutMotion, Kinematics
+from coordinator.identification.inertia.agent_information import AgentInformation
+from coordinator.identification.inertia.inertia import Inertia
+from coordinator.identification.inertia.robot_bodies import RobotBodies
 from coordinator.identification.result import (
     BodiesPart,
     ChainPart,
@@ -28,30 +32,24 @@ from coordinator.identification.result import (
     UnknownPart,
     UnresolvedPart,
 )
+from coordinator.kinematics.chain_estimate import ChainEstimate
+from coordinator.kinematics.null_space import Unresolved
+from coordinator.parameter_fit.instrumental_variables import InstrumentalFit
 from coordinator.parameter_fit.report_parts import base_parameter_parts, body_part
 from coordinator.recording.recording import Recording
+from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Array
 from module_agent.model.regressor import PER_BODY
 from module_agent.signals.torque_terms import READING_TERMS, TERM_KINDS
 
-if TYPE_CHECKING:
-    from coordinator.identification.identified import HeldOutMotion, Kinematics
-    from coordinator.identification.inertia.agent_information import AgentInformation
-    from coordinator.identification.inertia.inertia import Inertia
-    from coordinator.identification.inertia.robot_bodies import RobotBodies
-    from coordinator.kinematics.chain_estimate import ChainEstimate
-    from coordinator.kinematics.null_space import Unresolved
-    from coordinator.parameter_fit.instrumental_variables import InstrumentalFit
-    from coordinator.topology.topology import Topology
-
 
 def build_result(
     recording: Recording,
-    kinematics: "Kinematics",
-    inertia: "Inertia | None",
-    held_out: "HeldOutMotion | None",
-    bodies: "RobotBodies | None" = None,
+    kinematics: Kinematics,
+    inertia: Inertia | None,
+    held_out: HeldOutMotion | None,
+    bodies: RobotBodies | None = None,
 ) -> Result:
     """Return the result of a session."""
     fit, topology = kinematics.fit, kinematics.topology
@@ -86,14 +84,14 @@ def build_result(
     )
 
 
-def _notes(inertia: "Inertia | None", bodies: "RobotBodies | None") -> list[str]:
+def _notes(inertia: Inertia | None, bodies: RobotBodies | None) -> list[str]:
     notes = [bodies.note] if bodies is not None else []
     if inertia is not None and inertia.gathered is not None:
         notes.append(inertia.gathered.note)
     return [note for note in notes if note]
 
 
-def _mountings(topology: "Topology") -> list[MountingPart]:
+def _mountings(topology: Topology) -> list[MountingPart]:
     if not topology.parent_log_odds:
         return []
     columns = zip(
@@ -122,7 +120,7 @@ def _type_name(recording: Recording, serial: str) -> str:
     return info.module_type if info is not None else "unknown"
 
 
-def _links(kinematics: "Kinematics") -> list[LinkPart]:
+def _links(kinematics: Kinematics) -> list[LinkPart]:
     topology, fit = kinematics.topology, kinematics.fit
     return [
         LinkPart(
@@ -136,7 +134,7 @@ def _links(kinematics: "Kinematics") -> list[LinkPart]:
     ]
 
 
-def _unresolved(fit: "ChainEstimate", types: list[ModuleType], item: "Unresolved") -> UnresolvedPart:
+def _unresolved(fit: ChainEstimate, types: list[ModuleType], item: Unresolved) -> UnresolvedPart:
     links = [
         UnknownPart(parent=link.parent, child=link.child, parameters=_unknown(link))
         for link in link_transforms(fit.chain, types, np.zeros_like(fit.covariance), _columns(item))
@@ -152,7 +150,7 @@ def _unresolved(fit: "ChainEstimate", types: list[ModuleType], item: "Unresolved
     )
 
 
-def _summary(item: "Unresolved", links: list[UnknownPart]) -> str:
+def _summary(item: Unresolved, links: list[UnknownPart]) -> str:
     """Describe which parameters of which links are unresolved, why, and what would resolve them."""
     short = [", ".join(name.split("_")[0] for name in link.parameters) for link in links]
     of = [
@@ -166,11 +164,11 @@ def _unknown(link: LinkTransform) -> list[str]:
     return [name for name, unknown in zip(PARAMETERS, link.unknown, strict=True) if unknown]
 
 
-def _columns(item: "Unresolved") -> Array:
+def _columns(item: Unresolved) -> Array:
     return np.asarray(item.directions / np.linalg.norm(item.directions, axis=0))
 
 
-def _transforms(fit: "ChainEstimate", types: list[ModuleType]) -> list[TransformPart]:
+def _transforms(fit: ChainEstimate, types: list[ModuleType]) -> list[TransformPart]:
     # The named gauge freedoms, not the null vectors of the fit, which are mixed and affected by its noise.
     no_directions = np.zeros((len(fit.covariance), 0))
     hidden = np.concatenate([no_directions, *(_columns(item) for item in fit.unresolved)], axis=1)
@@ -192,7 +190,7 @@ def _transform(link: LinkTransform) -> TransformPart:
     )
 
 
-def _exponentials(fit: "ChainEstimate", types: list[ModuleType]) -> ExponentialsPart:
+def _exponentials(fit: ChainEstimate, types: list[ModuleType]) -> ExponentialsPart:
     model = screw_model(fit.chain, types, fit.covariance)
     return ExponentialsPart(
         screws=[
@@ -231,7 +229,7 @@ def _pairs(recording: Recording) -> list[PairPart]:
     return parts
 
 
-def _dh(kinematics: "Kinematics") -> list[DhPart]:
+def _dh(kinematics: Kinematics) -> list[DhPart]:
     return [
         DhPart(base=path.base.tolist(), rows=[DhRowPart(**row._asdict()) for row in path.rows])
         for path in dh_paths(kinematics.fit.chain)
@@ -239,10 +237,10 @@ def _dh(kinematics: "Kinematics") -> list[DhPart]:
 
 
 def _dynamics(
-    kinematics: "Kinematics",
-    inertia: "Inertia | None",
-    held_out: "HeldOutMotion | None",
-    bodies: "RobotBodies | None",
+    kinematics: Kinematics,
+    inertia: Inertia | None,
+    held_out: HeldOutMotion | None,
+    bodies: RobotBodies | None,
 ) -> DynamicsPart | None:
     if inertia is None:
         return None
@@ -273,13 +271,13 @@ def _dynamics(
     )
 
 
-def _gathered_by(shared: "AgentInformation | None", joints: int) -> Literal["agents", "coordinator", "both"]:
+def _gathered_by(shared: AgentInformation | None, joints: int) -> Literal["agents", "coordinator", "both"]:
     if shared is None or not shared.by_agents:
         return "coordinator"
     return "agents" if len(shared.by_agents) == joints else "both"
 
 
-def _torque_terms(serials: tuple[str, ...], estimate: "InstrumentalFit") -> list[TorqueTermPart]:
+def _torque_terms(serials: tuple[str, ...], estimate: InstrumentalFit) -> list[TorqueTermPart]:
     terms, scale = estimate.terms, estimate.scale
     return [
         TorqueTermPart(
@@ -306,7 +304,7 @@ def _torque_terms(serials: tuple[str, ...], estimate: "InstrumentalFit") -> list
     ]
 
 
-def _bodies(robot: "RobotBodies") -> BodiesPart | None:
+def _bodies(robot: RobotBodies) -> BodiesPart | None:
     if robot.fit is None:
         return None
     return BodiesPart(
@@ -321,7 +319,7 @@ def _bodies(robot: "RobotBodies") -> BodiesPart | None:
     )
 
 
-def _identifiability(robot: "RobotBodies") -> list[IdentifiabilityPart]:
+def _identifiability(robot: RobotBodies) -> list[IdentifiabilityPart]:
     return [
         IdentifiabilityPart(
             parameter=one.name,
@@ -335,7 +333,7 @@ def _identifiability(robot: "RobotBodies") -> list[IdentifiabilityPart]:
     ]
 
 
-def _held_out(serials: tuple[str, ...], held_out: "HeldOutMotion") -> HeldOutPart:
+def _held_out(serials: tuple[str, ...], held_out: HeldOutMotion) -> HeldOutPart:
     error = held_out.error
     return HeldOutPart(
         relative_error=error.overall,

@@ -50,28 +50,26 @@ def _event(entry: Entry) -> JournalEvent | None:
     return JournalEvent.model_validate_json(entry.payload) if entry.kind == "journal" else None
 
 
-def _without(entries: list[Entry], gone: Callable[[JournalEvent], bool]) -> list[Entry]:
-    return [e for e in entries if (event := _event(e)) is None or not gone(event)]
+def _without(entries: list[Entry], dropped: Callable[[JournalEvent], bool]) -> list[Entry]:
+    return [e for e in entries if (event := _event(e)) is None or not dropped(event)]
 
 
 def _on(entry: Entry, leaf: Leaf, serial: str) -> bool:
     return entry.kind != "journal" and parse(entry.topic)[1:] == (serial, leaf)
 
 
-def test_the_arm_is_found_with_its_inertia_and_predicts_what_it_was_not_fitted_to(
-    run: list[Entry], tmp_path: Path
-) -> None:
-    found = identify(_recorded(run))
-    topology, fit = found.kinematics.topology, found.kinematics.fit
+def test_the_arm_is_identified_and_predicts_held_out_torques(run: list[Entry], tmp_path: Path) -> None:
+    identified = identify(_recorded(run))
+    topology, fit = identified.kinematics.topology, identified.kinematics.fit
     assert (topology.serials, topology.parent, topology.reversed) == ((BASE, TIP), (-1, 0), (False, False))
     assert fit.link_length_m[1] == pytest.approx(0.171, abs=2e-3)  # see tests/simulation/test_robots
-    assert found.inertia is not None
-    assert found.held_out is not None
+    assert identified.inertia is not None
+    assert identified.held_out is not None
     # The base joint carries 0.2 m of arm against gravity: 1 % of its torque; the tip turns nothing.
-    assert found.held_out.error.per_joint[0] < 0.03
-    assert found.result.dynamics is not None
-    assert found.result.dynamics.rank < found.result.dynamics.parameters
-    write_held_out(tmp_path / "held_out.npz", found.held_out)
+    assert identified.held_out.error.per_joint[0] < 0.03
+    assert identified.result.dynamics is not None
+    assert identified.result.dynamics.rank < identified.result.dynamics.parameters
+    write_held_out(tmp_path / "held_out.npz", identified.held_out)
     with np.load(tmp_path / "held_out.npz") as file:
         assert sorted(file) == sorted(
             ("serials", "t_ns", "session_ns", "q_rad", "tau_measured_nm", "tau_predicted_nm")
@@ -80,18 +78,18 @@ def test_the_arm_is_found_with_its_inertia_and_predicts_what_it_was_not_fitted_t
 
 
 def test_the_bodies_in_the_files_are_real_and_predict_as_well(run: list[Entry], tmp_path: Path) -> None:
-    found = identify(_recorded(run))
-    assert found.bodies is not None
-    assert found.bodies.held_out_error is not None
-    assert found.held_out is not None
-    assert found.bodies.held_out_error < found.held_out.error.overall + 1e-3
-    write_outputs(tmp_path, found)
+    identified = identify(_recorded(run))
+    assert identified.bodies is not None
+    assert identified.bodies.held_out_error is not None
+    assert identified.held_out is not None
+    assert identified.bodies.held_out_error < identified.held_out.error.overall + 1e-3
+    write_outputs(tmp_path, identified)
     assert "nearest real body" not in (tmp_path / "robot.urdf").read_text()
     model = ElementTree.parse(tmp_path / "robot.urdf")
     masses = [float(mass.get("value", "nan")) for mass in model.iter("mass")]
-    assert found.result.dynamics is not None
-    assert found.result.dynamics.bodies is not None
-    assert masses == pytest.approx([body.mass_kg for body in found.result.dynamics.bodies.bodies])
+    assert identified.result.dynamics is not None
+    assert identified.result.dynamics.bodies is not None
+    assert masses == pytest.approx([body.mass_kg for body in identified.result.dynamics.bodies.bodies])
     # Torques show no mass of an arm on one moving joint; what modules weigh is near all the same.
     for mass, true in zip(masses, true_inertia(load_robot("thesis_171_vertical"))[:, 0], strict=True):
         assert 0.3 < mass / true < 3.0
@@ -109,13 +107,13 @@ def test_the_result_says_what_is_known_of_every_parameter(run: list[Entry]) -> N
         if any(sums[place].summary == v.parameter for place in v.base_parameters)
     ]
     assert alone
-    for verdict in alone:
+    for entry in alone:
         # Known by itself: the one sum that it is in is it.
-        (place,) = verdict.base_parameters
-        assert (sums[place].value, sums[place].sigma) == (verdict.value, verdict.sigma)
+        (place,) = entry.base_parameters
+        assert (sums[place].value, sums[place].sigma) == (entry.value, entry.sigma)
         relative = sums[place].relative_sigma
         assert relative is not None
-        assert verdict.identifiability == ("identified" if relative <= 0.1 else "weak")
+        assert entry.identifiability == ("identified" if relative <= 0.1 else "weak")
     assert {v.serial for v in dynamics.identifiability} == {BASE, TIP}
     assert len(dynamics.summary) == 3
 
@@ -123,8 +121,8 @@ def test_the_result_says_what_is_known_of_every_parameter(run: list[Entry]) -> N
 def test_the_axis_of_the_joint_and_gravity_stand_as_in_the_robot(run: list[Entry]) -> None:
     chain = identify_kinematics(_recorded(run)).fit.chain
     truth = true_chain(load_robot("thesis_171_vertical"))
-    for found, true in ((chain.axis[0], truth.axis[0]), (chain.gravity, truth.gravity)):
-        angle = np.arccos(found @ true / np.linalg.norm(found) / np.linalg.norm(true))
+    for estimate, true in ((chain.axis[0], truth.axis[0]), (chain.gravity, truth.gravity)):
+        angle = np.arccos(estimate @ true / np.linalg.norm(estimate) / np.linalg.norm(true))
         # The root's accelerometer never turns: its bias of 0.1 m/s^2 tilts gravity by 0.6 deg.
         assert np.degrees(angle) < 1.5
 
@@ -172,7 +170,7 @@ def test_a_motion_from_before_a_module_booted_does_not_count(run: list[Entry]) -
     assert not np.array_equal(with_fresh.imu_home, once.imu_home)
 
 
-def test_an_empty_recording_says_that_nothing_was_recorded() -> None:
+def test_an_empty_recording_is_an_error() -> None:
     with pytest.raises(IdentificationError, match="no rest was recorded"):
         identify(Recording())
 
@@ -197,30 +195,32 @@ def test_a_module_whose_own_estimates_are_lost_is_placed_by_its_feedback(run: li
 
 
 def test_the_result_says_how_surely_every_module_is_mounted_where_and_how(run: list[Entry]) -> None:
-    found = identify(_recorded(run)).result
-    base, tip = found.topology
+    identified = identify(_recorded(run)).result
+    base, tip = identified.topology
     assert (base.serial, base.parent, tip.serial, tip.parent) == (BASE, None, TIP, BASE)
     # One slow motion of the joint beneath is all that tells, and no motion tells more than 1 in 8000.
     assert tip.parent_log_odds is not None
     assert 5.0 < tip.parent_log_odds < 10.0
     assert (base.joint_moved, tip.joint_moved) == (True, True)
-    least = min(m for part in found.topology for m in (part.parent_log_odds, part.reversed_log_odds) if m)
-    assert found.topology_confidence == pytest.approx(1.0 / (1.0 + np.exp(-least)))
+    least = min(
+        m for part in identified.topology for m in (part.parent_log_odds, part.reversed_log_odds) if m
+    )
+    assert identified.topology_confidence == pytest.approx(1.0 / (1.0 + np.exp(-least)))
 
 
-def test_a_module_that_saw_nothing_at_all_is_left_out_and_named(run: list[Entry]) -> None:
+def test_a_module_without_observations_is_excluded_and_named(run: list[Entry]) -> None:
     event = next(e for e in map(_event, run) if e is not None and e.what == "done" and e.step == "rest")
     cut = [
         e
         for e in run
         if not _on(e, Leaf.ESTIMATE, TIP) and not (_on(e, Leaf.FEEDBACK, TIP) and e.t_ns > event.t_ns)
     ]
-    found = identify_kinematics(_recorded(cut))
-    assert found.topology.serials == (BASE,)
-    assert any(TIP in note and "left out" in note for note in found.notes)
+    identified = identify_kinematics(_recorded(cut))
+    assert identified.topology.serials == (BASE,)
+    assert any(TIP in note and "left out" in note for note in identified.notes)
 
 
-def test_a_module_that_never_answered_has_no_clock_and_that_is_said(run: list[Entry]) -> None:
+def test_a_module_without_round_trips_is_an_error_about_its_clock(run: list[Entry]) -> None:
     cut = [e for e in run if e.kind != "request" or parse(e.topic).serial != TIP]
     with pytest.raises(IdentificationError, match="no round trip"):
         identify(_recorded(cut))
@@ -248,7 +248,7 @@ def test_a_hole_in_a_motion_is_named_and_not_filled(run: list[Entry]) -> None:
 
 
 def test_without_dynamic_motions_there_is_no_inertia_and_no_guess_at_it(run: list[Entry]) -> None:
-    found = identify(_recorded(_without(run, lambda e: e.purpose in ("dynamic", "held_out"))))
-    assert found.inertia is None
-    assert found.held_out is None
-    assert found.result.dynamics is None
+    identified = identify(_recorded(_without(run, lambda e: e.purpose in ("dynamic", "held_out"))))
+    assert identified.inertia is None
+    assert identified.held_out is None
+    assert identified.result.dynamics is None

@@ -65,9 +65,9 @@ class Seen(Recording):
         )
 
     def rows(self, serial: str, first: int, end: int) -> np.ndarray:
-        found = np.zeros(end - first, ROW)
-        found["accel_m_s2"] = self._rest.specific_force_m_s2[self._chain.serials.index(serial)]
-        return found
+        result = np.zeros(end - first, ROW)
+        result["accel_m_s2"] = self._rest.specific_force_m_s2[self._chain.serials.index(serial)]
+        return result
 
 
 def forward(robots: Any, seed: int, joints: int) -> tuple[Chain, Any]:
@@ -81,20 +81,21 @@ def forward(robots: Any, seed: int, joints: int) -> tuple[Chain, Any]:
 def test_when_all_joints_have_moved_the_robot_is_the_whole_one(robots: Any, seed: int) -> None:
     chain, types = robots.random(seed, joints=2 + seed)
     recording: Any = Seen(robots, chain, types, chain.serials)
-    found = preview(recording, chain.serials)
-    assert found is not None
-    so_far = found.fit.chain
+    result = preview(recording, chain.serials)
+    assert result is not None
+    partial = result.fit.chain
     parents = {
-        s: so_far.serials[p] if p >= 0 else None for s, p in zip(so_far.serials, so_far.parent, strict=True)
+        s: partial.serials[p] if p >= 0 else None
+        for s, p in zip(partial.serials, partial.parent, strict=True)
     }
     assert parents == {
         s: chain.serials[p] if p >= 0 else None for s, p in zip(chain.serials, chain.parent, strict=True)
     }
-    assert found.adjacent == tuple(p >= 0 for p in so_far.parent)
+    assert result.adjacent == tuple(p >= 0 for p in partial.parent)
     lengths, _ = link_lengths(chain, np.zeros((6 * len(types),) * 2))
-    expected = [lengths[chain.serials.index(s)] for s in so_far.serials]
+    expected = [lengths[chain.serials.index(s)] for s in partial.serials]
     # Work ends when the squares shrink by a thousandth: far below the 0.3 mm that circles are believed to.
-    np.testing.assert_allclose(found.fit.link_length_m, expected, atol=2e-4)
+    np.testing.assert_allclose(result.fit.link_length_m, expected, atol=2e-4)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -104,26 +105,26 @@ def test_a_module_stands_on_the_nearest_joint_that_has_moved_and_moves_it(robots
     for count in range(1, 7):
         explored = [chain.serials[i] for i in order[:count]]
         recording: Any = Seen(robots, chain, types, explored)
-        found = preview(recording, explored)
+        result = preview(recording, explored)
         nearest = {}
         for k, serial in enumerate(chain.serials):
             above = [chain.serials[i] for i in chain.ancestors(chain.carrier(k))]
             moved = [s for s in above if s in explored]
             nearest[serial] = moved[-1] if moved else None
         tied = set(nearest.values()) - {None} | {s for s, p in nearest.items() if p is not None}
-        if found is None:
+        if result is None:
             assert not tied
             continue
-        so_far = found.fit.chain
-        assert set(so_far.serials) == tied
-        for k, serial in enumerate(so_far.serials):
-            on = so_far.serials[so_far.parent[k]] if so_far.parent[k] >= 0 else None
+        partial = result.fit.chain
+        assert set(partial.serials) == tied
+        for k, serial in enumerate(partial.serials):
+            on = partial.serials[partial.parent[k]] if partial.parent[k] >= 0 else None
             assert on == nearest[serial]
-            if found.adjacent[k]:
+            if result.adjacent[k]:
                 assert on == chain.serials[chain.parent[chain.serials.index(serial)]]
 
 
-def test_a_link_is_one_link_only_when_nothing_unexplored_can_lie_on_it(robots: Any) -> None:
+def test_a_module_is_adjacent_only_if_no_unexplored_joint_can_be_in_between(robots: Any) -> None:
     chain, _ = forward(robots, 3, joints=4)
     star = chain._replace(parent=(-1, 0, 0, 0))
     assert adjacent(star, chain.serials[:1]) == (False,) * 4
@@ -137,9 +138,9 @@ def test_bands_grow_narrower_the_more_joints_have_moved(robots: Any) -> None:
     sigmas = []
     for count in range(1, 6):
         recording: Any = Seen(robots, chain, types, chain.serials[:count])
-        found = preview(recording, chain.serials[:count])
-        assert found is not None
-        sigmas.append(float(found.fit.link_length_sigma_m[1]))
+        result = preview(recording, chain.serials[:count])
+        assert result is not None
+        sigmas.append(float(result.fit.link_length_sigma_m[1]))
     assert all(later <= sooner * (1 + 1e-6) for sooner, later in pairwise(sigmas))
 
 
@@ -149,7 +150,7 @@ def test_before_anything_has_moved_there_is_no_robot(robots: Any) -> None:
     assert preview(recording, []) is None
 
 
-def test_a_module_that_has_not_told_its_type_is_named(robots: Any) -> None:
+def test_a_module_without_a_reported_type_is_named(robots: Any) -> None:
     chain, types = robots.random(1, joints=3)
     recording: Any = Seen(robots, chain, types, chain.serials)
     recording.modules[chain.serials[1]].info = None

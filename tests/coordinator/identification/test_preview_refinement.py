@@ -18,20 +18,20 @@ pytestmark = pytest.mark.xdist_group("preview")
 
 
 @pytest.fixture(scope="module")
-def kept() -> list[Path]:
+def sessions() -> list[Path]:
     return []
 
 
 @pytest.fixture
 def recording(
-    kept: list[Path], rigs: Callable[..., Any], quick_plan: Any, tmp_path_factory: pytest.TempPathFactory
+    sessions: list[Path], rigs: Callable[..., Any], quick_plan: Any, tmp_path_factory: pytest.TempPathFactory
 ) -> Recording:
     """A run on an arm of two modules; made once, read anew."""
-    if not kept:
+    if not sessions:
         out = tmp_path_factory.mktemp("preview") / "run"
         rigs("thesis_350_vertical", "lan", 3).session(out, quick_plan)
-        kept.append(out / "session.mcap")
-    return load_recording(kept[0])
+        sessions.append(out / "session.mcap")
+    return load_recording(sessions[0])
 
 
 def until(recording: Recording, explored: Sequence[str]) -> Recording:
@@ -39,23 +39,25 @@ def until(recording: Recording, explored: Sequence[str]) -> Recording:
     recording.journal = [
         e for e in recording.journal if e.purpose not in ("constant", "windowed_sine") or e.serial in explored
     ]
-    recording.estimates = {pair: found for pair, found in recording.estimates.items() if pair[0] in explored}
+    recording.estimates = {
+        pair: estimates for pair, estimates in recording.estimates.items() if pair[0] in explored
+    }
     return recording
 
 
-def sigma(found: Preview | None) -> float:
-    assert found is not None
-    return float(found.fit.link_length_sigma_m[1])
+def sigma(refined: Preview | None) -> float:
+    assert refined is not None
+    return float(refined.fit.link_length_sigma_m[1])
 
 
 def test_one_joint_tells_the_link_beyond_it_within_what_it_claims(recording: Recording) -> None:
-    found = Previewer(until(recording, [BASE])).preview([BASE])
-    assert found is not None
-    assert found.fit.chain.serials == (BASE, TIP)
-    assert found.adjacent == (False, True)
+    refined = Previewer(until(recording, [BASE])).preview([BASE])
+    assert refined is not None
+    assert refined.fit.chain.serials == (BASE, TIP)
+    assert refined.adjacent == (False, True)
     # Three sigma: a thing of 3 in 1000.
-    assert abs(found.fit.link_length_m[1] - TRUE_M) < 3.0 * sigma(found)
-    assert sigma(found) < 0.02
+    assert abs(refined.fit.link_length_m[1] - TRUE_M) < 3.0 * sigma(refined)
+    assert sigma(refined) < 0.02
 
 
 def test_samples_move_the_robot_within_what_the_circles_leave_open(recording: Recording) -> None:
@@ -69,28 +71,28 @@ def test_samples_move_the_robot_within_what_the_circles_leave_open(recording: Re
 
 
 def test_a_robot_of_more_modules_than_are_to_be_refined_is_as_assembled(recording: Recording) -> None:
-    found, assembled = Previewer(recording, max_refined=1).preview([BASE]), preview(recording, [BASE])
-    assert found is not None
+    refined, assembled = Previewer(recording, max_refined=1).preview([BASE]), preview(recording, [BASE])
+    assert refined is not None
     assert assembled is not None
-    np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
+    np.testing.assert_array_equal(refined.fit.chain.imu_home, assembled.fit.chain.imu_home)
 
 
 def test_where_samples_are_missing_the_robot_is_as_assembled(recording: Recording) -> None:
     assembled = preview(recording, [BASE])
     recording.modules[TIP].round_trips.clear()
-    found = Previewer(recording).preview([BASE])
-    assert found is not None
+    refined = Previewer(recording).preview([BASE])
+    assert refined is not None
     assert assembled is not None
-    np.testing.assert_array_equal(found.fit.chain.imu_home, assembled.fit.chain.imu_home)
+    np.testing.assert_array_equal(refined.fit.chain.imu_home, assembled.fit.chain.imu_home)
 
 
-def test_the_same_look_twice_is_the_same_to_the_last_bit(recording: Recording) -> None:
-    looks = Previewer(recording)
-    one, two = (looks.preview([BASE, TIP]) for _ in range(2))
+def test_a_repeated_preview_is_identical(recording: Recording) -> None:
+    previewer = Previewer(recording)
+    one, two = (previewer.preview([BASE, TIP]) for _ in range(2))
     assert one is not None
     assert two is not None
     np.testing.assert_array_equal(one.fit.chain.imu_home, two.fit.chain.imu_home)
 
 
-def test_before_anything_has_moved_there_is_nothing_to_see(recording: Recording) -> None:
+def test_before_any_motion_there_is_no_preview(recording: Recording) -> None:
     assert Previewer(until(recording, [])).preview([]) is None

@@ -19,23 +19,23 @@ pytestmark = pytest.mark.xdist_group("result_parts")
 
 
 @pytest.fixture(scope="module")
-def kept() -> list[tuple[Result, Path]]:
+def results() -> list[tuple[Result, Path]]:
     return []
 
 
 @pytest.fixture
 def run(
-    kept: list[tuple[Result, Path]],
+    results: list[tuple[Result, Path]],
     rigs: Callable[..., Any],
     quick_plan: Any,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Result, Path]:
     """A run on two modules whose axis is along gravity; made once."""
-    if not kept:
+    if not results:
         out = tmp_path_factory.mktemp("result") / "run"
         result = rigs("thesis_171_horizontal", "lan", 3).session(out, quick_plan)
-        kept.append((result, out))
-    return kept[0]
+        results.append((result, out))
+    return results[0]
 
 
 def _pose(place_m: Any, turn_rad: Any) -> np.ndarray:
@@ -84,7 +84,7 @@ def test_the_product_of_exponentials_moves_the_tip_as_the_chain_moves_its_imu(
     np.testing.assert_allclose(np.array(tip.home)[:3, 3], homes[1, :3, :3] @ across + homes[1, :3, 3])
 
 
-def test_what_a_vertical_axis_hides_is_said_as_parameters_of_a_link_and_as_what_would_tell_it(
+def test_unidentifiable_parameters_of_a_vertical_axis_are_named_with_the_remedy(
     run: tuple[Result, Path],
 ) -> None:
     result, out = run

@@ -1,4 +1,4 @@
-"""Holes in a module's rows are asked for, several at once, until there are none."""
+"""Holes in a module's rows are requested for, several at once, until there are none."""
 
 import asyncio
 from types import SimpleNamespace
@@ -14,20 +14,20 @@ from module_agent.wire.row_log import RowLog
 
 
 class Module:
-    """Answers questions for rows, counts how many are under way at once, and keeps what is asked."""
+    """Answers questions for rows, counts how many are under way at once, and keeps what is requested."""
 
-    def __init__(self, wire: SimpleNamespace, log: RowLog, kept_from: int = 0):
-        self.wire, self.log, self.kept_from = wire, log, kept_from
-        self.asked: list[tuple[int, int]] = []
+    def __init__(self, wire: SimpleNamespace, log: RowLog, retained_from: int = 0):
+        self.wire, self.log, self.retained_from = wire, log, retained_from
+        self.requested: list[tuple[int, int]] = []
         self.most, self._now = 0, 0
 
     async def fetch(self, first: int, end: int) -> None:
-        self.asked.append((first, end))
+        self.requested.append((first, end))
         self._now += 1
         self.most = max(self.most, self._now)
         await asyncio.sleep(0)
         self._now -= 1
-        if first < self.kept_from:
+        if first < self.retained_from:
             ack = self.wire.ack(accepted=False).model_copy(update={"reason": Refusal.GONE.value})
             raise Refused("A", Leaf.HISTORY, ack)
         self.log.add(self.wire.feedback(first=first, count=end - first))
@@ -41,27 +41,27 @@ def _with_holes(wire: SimpleNamespace, count: int) -> RowLog:
     return log
 
 
-def test_every_hole_is_asked_for_once_and_not_all_at_once(wire: SimpleNamespace) -> None:
+def test_every_gap_is_requested_once_and_in_small_groups(wire: SimpleNamespace) -> None:
     log = _with_holes(wire, 20)
     module = Module(wire, log)
     completion = RowCompletion(log, module.fetch)
     assert completion.has_gap(205)
     asyncio.run(completion.complete(205))
-    assert module.asked == [(10 * k + 5, 10 * k + 10) for k in range(20)]
+    assert module.requested == [(10 * k + 5, 10 * k + 10) for k in range(20)]
     assert module.most == HOLES_AT_ONCE
     assert not completion.has_gap(205)
 
 
-def test_rows_from_before_the_module_was_met_may_be_forgotten_and_later_ones_not(
+def test_only_rows_from_before_the_session_may_be_unavailable(
     wire: SimpleNamespace,
 ) -> None:
     log = _with_holes(wire, 3)
-    module = Module(wire, log, kept_from=20)
+    module = Module(wire, log, retained_from=20)
     asyncio.run(RowCompletion(log, module.fetch).complete(35))
     assert log.missing(20, 35) == []
     log = RowLog(1)
     log.add(wire.feedback(first=0, count=5))
-    late = Module(wire, log, kept_from=20)
+    late = Module(wire, log, retained_from=20)
     met = RowCompletion(log, late.fetch)
     log.add(wire.feedback(first=10, count=5))
     with pytest.raises(Refused, match="gone"):
@@ -71,15 +71,15 @@ def test_rows_from_before_the_module_was_met_may_be_forgotten_and_later_ones_not
 def test_rows_that_never_come_still_count_as_missing(wire: SimpleNamespace) -> None:
     log = _with_holes(wire, 1)
 
-    async def answered_with_nothing(first: int, end: int) -> None:
+    async def empty_answers(first: int, end: int) -> None:
         pass
 
-    completion = RowCompletion(log, answered_with_nothing)
+    completion = RowCompletion(log, empty_answers)
     asyncio.run(completion.complete(15))
     assert completion.has_gap(15)
 
 
-def test_what_is_done_together_is_done_to_its_end_though_some_of_it_fails() -> None:
+def test_gather_all_runs_everything_to_its_end_before_it_raises() -> None:
     done: list[int] = []
 
     async def work(number: int) -> Any:

@@ -1,4 +1,4 @@
-"""A network is judged before anything moves: by what it can carry, and not by its worst moment."""
+"""The network is checked before anything moves, by its rates and round trips and not by a short outage."""
 
 import asyncio
 from collections.abc import Callable
@@ -42,29 +42,29 @@ def test_a_bad_network_that_carries_keep_alives_is_fit(rigs: Callable[..., Any],
     assert len(_checked(rigs(ARM, "bad", seed), SECOND_S)) == 2
 
 
-def test_trips_of_which_too_many_are_slow_are_unfit_by_name_and_number(rigs: Callable[..., Any]) -> None:
+def test_too_many_slow_trips_are_unfit_with_name_and_number(rigs: Callable[..., Any]) -> None:
     with pytest.raises(UnfitLink, match=rf"to module {BASE} one in five takes more than 30\d ms"):
         _checked(rigs(ARM, NetworkProfile(name="slow", delay_ms=150.0)))
 
 
-def test_a_module_whose_rows_come_slower_than_it_says_is_unfit(rigs: Callable[..., Any]) -> None:
+def test_a_module_slower_than_its_feedback_rate_is_unfit(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     _, recording, group = rig.group()
 
     async def work() -> None:
         await asyncio.sleep(0.2)
         await group.meet((BASE, TIP))
-        # As from a module on a machine that is too slow for what it was told to do.
-        told = recording.modules[TIP].info
-        recording.modules[TIP].info = told.model_copy(update={"feedback_rate_hz": 1000.0})
+        # As from a module on a machine that is too slow for its feedback rate.
+        info = recording.modules[TIP].info
+        recording.modules[TIP].info = info.model_copy(update={"feedback_rate_hz": 1000.0})
         await check_link(group, lambda: rig.loop.now_ns, MEASUREMENT_S, lambda note: None)
 
     with pytest.raises(UnfitLink, match=rf"unfit: module {TIP} delivers 2\d\d rows/s of 1000"):
         rig.run(work())
 
 
-def test_a_bad_moment_is_looked_past(rigs: Callable[..., Any]) -> None:
-    # Cut off for most of the first look, and for none of the two that follow.
+def test_a_short_outage_is_measured_again(rigs: Callable[..., Any]) -> None:
+    # Partitioned during most of the first measurement only.
     parted = profile("lan").model_copy(update={"partitions": ((0.25, 0.55),)})
     rig = rigs(ARM, parted)
     assert len(_checked(rig)) == 2

@@ -19,7 +19,7 @@ from sim.virtual_time.network import VirtualEndpoint, VirtualNetwork
 
 
 class Bench:
-    """A radio, and a module `A` that answers what the test tells it to."""
+    """A messenger, and a module `A` that answers as the test sets."""
 
     def __init__(self, wire: SimpleNamespace):
         self.wire = wire
@@ -39,10 +39,10 @@ class Bench:
     def _record(self, entry: Entry) -> Message | None:
         self.entries.append(entry)
         try:
-            found = self.recording.add(entry)
+            message = self.recording.add(entry)
         except WireError:
             return None
-        return found if isinstance(found, Message) else None
+        return message if isinstance(message, Message) else None
 
     def serve(self, leaf: Leaf, answer: Callable[[Request], bytes | None]) -> None:
         def on_request(event: Any) -> None:
@@ -67,19 +67,19 @@ def bench(wire: SimpleNamespace) -> Iterator[Bench]:
     made.loop.close()
 
 
-def test_question_and_answer_are_recorded_as_they_pass(bench: Bench) -> None:
+def test_requests_and_replies_are_recorded(bench: Bench) -> None:
     wire = bench.wire
     bench.serve(Leaf.STATUS, lambda _: encode(wire.status(re=1, t_ns=9)))
-    found = bench.run(bench.messenger.ask("A", Leaf.STATUS, wire.ask(seq=1)))
-    assert found == wire.status(re=1, t_ns=9)
+    message = bench.run(bench.messenger.ask("A", Leaf.STATUS, wire.ask(seq=1)))
+    assert message == wire.status(re=1, t_ns=9)
     assert [(e.kind, e.payload) for e in bench.entries] == [
         ("request", encode(wire.ask(seq=1))),
-        ("reply", encode(found)),
+        ("reply", encode(message)),
     ]
     assert len(bench.recording.modules["A"].round_trips) == 1
 
 
-def test_answers_find_their_own_questions_in_whatever_order_they_come(bench: Bench) -> None:
+def test_replies_in_any_order_match_their_requests(bench: Bench) -> None:
     wire = bench.wire
 
     def later(event: Any) -> None:
@@ -97,7 +97,7 @@ def test_answers_find_their_own_questions_in_whatever_order_they_come(bench: Ben
     assert [status.re for status in bench.run(work())] == [0, 1, 2, 3, 4]
 
 
-def test_silence_is_an_error_that_names_module_and_question_when_the_time_is_up(bench: Bench) -> None:
+def test_a_missing_answer_is_an_error_with_module_and_key(bench: Bench) -> None:
     bench.serve(Leaf.STATUS, lambda _: None)
     with pytest.raises(NoAnswer, match="module A did not answer on status: Timeout"):
         bench.run(bench.messenger.ask("A", Leaf.STATUS, bench.wire.ask(), timeout_s=0.25))
@@ -135,7 +135,7 @@ def test_an_accepted_command_returns_its_acknowledgement(bench: Bench) -> None:
     assert bench.run(bench.stop()) == bench.wire.ack(re=1)
 
 
-def test_tokens_tell_who_is_there(bench: Bench) -> None:
+def test_liveliness_tokens_give_the_modules_present(bench: Bench) -> None:
     bench.messenger.start()
     token = bench.module.declare_alive(key(bench.wire.robot, "A", Leaf.ALIVE))
     bench.module.declare_alive(key(bench.wire.robot, "B", Leaf.ALIVE))
@@ -150,7 +150,7 @@ def test_tokens_tell_who_is_there(bench: Bench) -> None:
     assert bench.messenger.alive == set()
 
 
-def test_a_burst_larger_than_one_turn_of_the_loop_is_heard_to_the_end_and_in_order(bench: Bench) -> None:
+def test_a_large_burst_is_received_completely_and_in_order(bench: Bench) -> None:
     wire = bench.wire
     bench.messenger.start()
     topic = key(wire.robot, "A", Leaf.STATUS)
@@ -164,7 +164,7 @@ def test_a_burst_larger_than_one_turn_of_the_loop_is_heard_to_the_end_and_in_ord
     assert bench.messenger.dropped == 0
 
 
-def test_what_a_loop_that_hangs_cannot_take_is_counted(bench: Bench) -> None:
+def test_events_beyond_the_inbox_capacity_are_counted(bench: Bench) -> None:
     wire, posted = bench.wire, []
     messenger = Messenger(bench.network.endpoint("slow"), wire.robot, lambda: 0, posted.append, bench._record)
     messenger.start()
@@ -176,12 +176,12 @@ def test_what_a_loop_that_hangs_cannot_take_is_counted(bench: Bench) -> None:
     assert len(posted) == 1  # one call is under way however many events wait
 
 
-def test_numbers_grow(bench: Bench) -> None:
+def test_sequence_numbers_increase(bench: Bench) -> None:
     numbers = [bench.messenger.next_seq() for _ in range(5)]
     assert numbers == sorted(set(numbers))
 
 
-def test_after_closing_nothing_is_heard_and_nothing_can_be_asked(bench: Bench) -> None:
+def test_a_closed_messenger_neither_receives_nor_sends_requests(bench: Bench) -> None:
     bench.messenger.start()
     bench.messenger.close()
     bench.module.publish(key(bench.wire.robot, "A", Leaf.STATUS), encode(bench.wire.status()))
@@ -192,7 +192,7 @@ def test_after_closing_nothing_is_heard_and_nothing_can_be_asked(bench: Bench) -
     bench.messenger.close()
 
 
-def test_closing_ends_the_questions_under_way(bench: Bench) -> None:
+def test_closing_ends_pending_requests(bench: Bench) -> None:
     bench.serve(Leaf.STATUS, lambda _: None)
 
     async def work() -> None:

@@ -79,11 +79,11 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
                     interrupted += 1
                     for serial in group.serials:
                         await group.acquire(serial)
-        heard = {serial: recording.modules[serial].rows.end_row for serial in group.serials}
+        end_rows = {serial: recording.modules[serial].rows.end_row for serial in group.serials}
         await group.complete_rows()
         keeper.cancel()
         await group.release_all()
-        return heard
+        return end_rows
 
     for serial, end in rig.run(work()).items():
         rows = recording.modules[serial].rows
@@ -93,7 +93,7 @@ def test_on_a_bad_network_every_motion_is_done_and_every_row_arrives(
     assert abs(rig.world.plant.q_rad[0]) < 0.05
 
 
-def test_when_everything_comes_twice_nothing_is_done_twice(rigs: Callable[..., Any]) -> None:
+def test_duplicated_messages_have_no_second_effect(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, NetworkProfile(name="echo", delay_ms=2.0, jitter_ms=5.0, duplicate=1.0))
     _, recording, group = rig.group()
 
@@ -111,7 +111,7 @@ def test_when_everything_comes_twice_nothing_is_done_twice(rigs: Callable[..., A
     rig.run(work())
 
 
-def test_of_two_commanders_the_second_is_told_who_holds_the_module_and_for_how_long(
+def test_a_second_commander_is_refused_with_holder_and_time_left(
     rigs: Callable[..., Any],
 ) -> None:
     rig = rigs(ARM, "lan")
@@ -154,7 +154,7 @@ def test_a_holder_whose_lease_is_taken_notices(rigs: Callable[..., Any]) -> None
     rig.run(work())
 
 
-def test_a_killed_agent_is_missed_within_a_third_of_a_second_of_its_token(rigs: Callable[..., Any]) -> None:
+def test_a_killed_agent_is_noticed_a_third_of_a_second_after_its_token(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     _, _, group = rig.group()
 
@@ -170,7 +170,7 @@ def test_a_killed_agent_is_missed_within_a_third_of_a_second_of_its_token(rigs: 
     assert 280e6 < rig.run(work()) < 360e6
 
 
-def test_a_frozen_agent_is_missed_by_its_silence_though_its_token_stays(rigs: Callable[..., Any]) -> None:
+def test_a_frozen_agent_is_noticed_by_its_missing_feedback(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     _, _, group = rig.group()
 
@@ -223,7 +223,7 @@ def test_a_motion_is_not_started_unarmed(rigs: Callable[..., Any]) -> None:
     rig.run(work())
 
 
-def test_a_refusal_that_no_repetition_can_mend_is_passed_on_at_once(rigs: Callable[..., Any]) -> None:
+def test_a_permanent_refusal_is_raised_at_once(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "lan")
     _, recording, group = rig.group()
 
@@ -312,7 +312,7 @@ def test_stop_reaches_every_module_and_names_those_that_did_not_confirm(rigs: Ca
     assert rig.state(BASE) == "stopped"
 
 
-def test_what_the_network_drops_of_feedback_and_estimates_is_fetched(rigs: Callable[..., Any]) -> None:
+def test_lost_feedback_and_estimates_are_fetched(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM, "bad", 3, lifetime_ns=PATIENT_NS)
     _, recording, group = rig.group()
 
@@ -329,9 +329,9 @@ def test_what_the_network_drops_of_feedback_and_estimates_is_fetched(rigs: Calla
                 == record.end_row - record.start_row
             )
         moved = await group.run({BASE: ConstantMotion(velocity_rad_s=0.5, duration_s=0.5)})
-        found = await group.estimate(TIP, BASE, moved[BASE].motion_id, 1.0)
-        assert found is not None
-        assert found.moved
+        estimate = await group.estimate(TIP, BASE, moved[BASE].motion_id, 1.0)
+        assert estimate is not None
+        assert estimate.moved
         assert await group.estimate(TIP, BASE, 12345, 0.01) is None
         keeper.cancel()
 
@@ -427,7 +427,7 @@ def test_efforts_for_a_module_without_a_motion_are_refused_before_anything_moves
 
 
 @pytest.mark.parametrize(("delay_ms", "is_poor"), [(5.0, False), (52.0, True)])
-def test_where_renewals_are_slow_motions_are_told_again_and_run_once(
+def test_with_slow_renewals_motions_are_commanded_again_and_run_once(
     rigs: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, delay_ms: float, is_poor: bool
 ) -> None:
     rig = rigs(ARM, NetworkProfile(name="slow", delay_ms=delay_ms))
@@ -482,7 +482,7 @@ def test_a_motion_during_which_another_joint_expires_is_interrupted(
     rig.run(work())
 
 
-def test_many_holes_of_all_modules_are_fetched_together(rigs: Callable[..., Any]) -> None:
+def test_many_gaps_of_all_modules_are_fetched_concurrently(rigs: Callable[..., Any]) -> None:
     """One after the other 40 holes at 60 ms a round trip would take the longer half of a motion."""
     rig = rigs(ARM, NetworkProfile(name="far", delay_ms=30.0))
     _, recording, group = rig.group()

@@ -1,4 +1,4 @@
-"""What a session has heard, by module, boot, joint and observer; and a hash that notices every change."""
+"""What a session has recording, by module, boot, joint and observer; and a hash that notices every change."""
 
 from types import SimpleNamespace
 
@@ -16,68 +16,68 @@ from module_agent.wire.refusal import WireError
 
 
 @pytest.fixture
-def heard() -> Recording:
+def recording() -> Recording:
     return Recording()
 
 
-def test_rows_that_come_out_of_order_and_twice_are_kept_once_in_order(
-    heard: Recording, wire: SimpleNamespace
+def test_rows_out_of_order_and_repeated_are_stored_once_in_order(
+    recording: Recording, wire: SimpleNamespace
 ) -> None:
     for first in (10, 0, 5, 5, 15):
-        heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first)))
-    np.testing.assert_array_equal(heard.rows("A", 3, 18)["position_rad"], np.arange(3, 18))
-    assert heard.modules["A"].rows.missing(0, 20) == []
+        recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first)))
+    np.testing.assert_array_equal(recording.rows("A", 3, 18)["position_rad"], np.arange(3, 18))
+    assert recording.modules["A"].rows.missing(0, 20) == []
 
 
-def test_rows_of_two_boots_of_one_module_are_kept_apart(heard: Recording, wire: SimpleNamespace) -> None:
-    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=1000)))
-    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=8, first=0)))
-    assert heard.modules["A"].boot == 8
-    assert (heard.modules["A"].rows.first_row, heard.modules["A"].rows.end_row) == (0, 5)
-    old = heard.past["A", 7].rows
+def test_rows_of_two_boots_of_one_module_are_separate(recording: Recording, wire: SimpleNamespace) -> None:
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=1000)))
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=8, first=0)))
+    assert recording.modules["A"].boot == 8
+    assert (recording.modules["A"].rows.first_row, recording.modules["A"].rows.end_row) == (0, 5)
+    old = recording.past["A", 7].rows
     assert (old.first_row, old.end_row) == (1000, 1005)
 
 
 def test_a_straggler_of_an_old_boot_does_not_bring_that_boot_back(
-    heard: Recording, wire: SimpleNamespace
+    recording: Recording, wire: SimpleNamespace
 ) -> None:
-    heard.add(wire.publication(Leaf.STATUS, wire.status(boot=7)))
-    heard.add(wire.publication(Leaf.STATUS, wire.status(boot=8)))
-    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=20)))
-    assert heard.modules["A"].boot == 8
+    recording.add(wire.publication(Leaf.STATUS, wire.status(boot=7)))
+    recording.add(wire.publication(Leaf.STATUS, wire.status(boot=8)))
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(boot=7, first=20)))
+    assert recording.modules["A"].boot == 8
     # It belongs to its own boot all the same.
-    assert heard.past["A", 7].rows.end_row == 25
+    assert recording.past["A", 7].rows.end_row == 25
 
 
 def test_a_round_trip_joins_a_question_to_its_answer_by_key_and_number(
-    heard: Recording, wire: SimpleNamespace
+    recording: Recording, wire: SimpleNamespace
 ) -> None:
-    heard.add(wire.request(Leaf.STATUS, wire.ask(seq=3), t_ns=100))
-    heard.add(wire.request(Leaf.STATUS, wire.ask(seq=4), t_ns=200))
-    heard.add(wire.request(Leaf.STATUS, wire.ask("B", seq=5), t_ns=250))
-    heard.add(wire.reply(Leaf.STATUS, wire.status(re=4, t_ns=77), t_ns=300))
-    heard.add(wire.reply(Leaf.STATUS, wire.status(re=4, t_ns=77), t_ns=301))  # a copy is no second trip
-    heard.add(wire.reply(Leaf.STATUS, wire.status(re=9, t_ns=78), t_ns=302))  # nobody asked
-    assert heard.modules["A"].round_trips == [RoundTrip(200, 300, 77)]
-    assert "B" not in heard.modules
+    recording.add(wire.request(Leaf.STATUS, wire.ask(seq=3), t_ns=100))
+    recording.add(wire.request(Leaf.STATUS, wire.ask(seq=4), t_ns=200))
+    recording.add(wire.request(Leaf.STATUS, wire.ask("B", seq=5), t_ns=250))
+    recording.add(wire.reply(Leaf.STATUS, wire.status(re=4, t_ns=77), t_ns=300))
+    recording.add(wire.reply(Leaf.STATUS, wire.status(re=4, t_ns=77), t_ns=301))  # a copy is no second trip
+    recording.add(wire.reply(Leaf.STATUS, wire.status(re=9, t_ns=78), t_ns=302))  # not requested
+    assert recording.modules["A"].round_trips == [RoundTrip(200, 300, 77)]
+    assert "B" not in recording.modules
 
 
-def test_once_it_is_settled_what_is_known_no_later_round_trip_counts(
-    heard: Recording, wire: SimpleNamespace
+def test_round_trips_after_the_settled_event_do_not_count(
+    recording: Recording, wire: SimpleNamespace
 ) -> None:
     def trip(number: int, t_ns: int) -> None:
-        heard.add(wire.request(Leaf.STATUS, wire.ask(seq=number), t_ns=t_ns))
-        heard.add(wire.reply(Leaf.STATUS, wire.status(re=number, t_ns=77), t_ns=t_ns + 10))
+        recording.add(wire.request(Leaf.STATUS, wire.ask(seq=number), t_ns=t_ns))
+        recording.add(wire.reply(Leaf.STATUS, wire.status(re=number, t_ns=77), t_ns=t_ns + 10))
 
     def journal(what: str) -> None:
         event = JournalEvent.model_validate({"t_ns": 500, "what": what})
-        heard.add(Entry("journal", JOURNAL_TOPIC, 500, event.encode()))
+        recording.add(Entry("journal", JOURNAL_TOPIC, 500, event.encode()))
 
     trip(1, 100)
     journal("settled")
     # At the very same time: what counts is the order of the recording.
     trip(2, 490)
-    module = heard.modules["A"]
+    module = recording.modules["A"]
     assert [t.sent_ns for t in module.trips] == [100]
     assert [t.sent_ns for t in module.round_trips] == [100, 490]
     # A session that goes on after a crash settles anew.
@@ -85,19 +85,19 @@ def test_once_it_is_settled_what_is_known_no_later_round_trip_counts(
     assert module.trips == module.round_trips
 
 
-def test_a_published_status_is_no_answer(heard: Recording, wire: SimpleNamespace) -> None:
-    heard.add(wire.request(Leaf.STATUS, wire.ask(seq=0), t_ns=100))
-    heard.add(wire.publication(Leaf.STATUS, wire.status(t_ns=5, re=0), t_ns=120))
-    assert heard.modules["A"].round_trips == []
+def test_a_published_status_is_no_answer(recording: Recording, wire: SimpleNamespace) -> None:
+    recording.add(wire.request(Leaf.STATUS, wire.ask(seq=0), t_ns=100))
+    recording.add(wire.publication(Leaf.STATUS, wire.status(t_ns=5, re=0), t_ns=120))
+    assert recording.modules["A"].round_trips == []
 
 
-def test_a_refusal_in_place_of_an_answer_is_understood(heard: Recording, wire: SimpleNamespace) -> None:
+def test_a_refusal_in_place_of_an_answer_is_understood(recording: Recording, wire: SimpleNamespace) -> None:
     for leaf in (Leaf.HISTORY, Leaf.ESTIMATE, Leaf.INFO, Leaf.STATUS, Leaf.LEASE, Leaf.MOTION):
-        assert isinstance(heard.add(wire.reply(leaf, wire.ack(accepted=False))), Ack)
+        assert isinstance(recording.add(wire.reply(leaf, wire.ack(accepted=False))), Ack)
 
 
-def test_whoever_speaks_on_anothers_key_is_counted_and_not_believed(
-    heard: Recording, wire: SimpleNamespace
+def test_messages_on_another_modules_key_are_counted_and_rejected(
+    recording: Recording, wire: SimpleNamespace
 ) -> None:
     for entry in (
         wire.publication(Leaf.STATUS, wire.status("B"), on="A"),
@@ -105,36 +105,36 @@ def test_whoever_speaks_on_anothers_key_is_counted_and_not_believed(
         wire.reply(Leaf.LEASE, wire.ack("B"), on="A"),
     ):
         with pytest.raises(WireError, match="B speaks on the key of A"):
-            heard.add(entry)
-    assert heard.refused == {"wrong_serial": 3}
-    assert heard.modules == {}
+            recording.add(entry)
+    assert recording.refused == {"wrong_serial": 3}
+    assert recording.modules == {}
 
 
-def test_what_cannot_be_read_is_counted_by_reason(heard: Recording, wire: SimpleNamespace) -> None:
+def test_unreadable_messages_are_counted_by_reason(recording: Recording, wire: SimpleNamespace) -> None:
     topic = key(wire.robot, "A", Leaf.STATUS)
     other_version = encode(wire.status().model_copy(update={"v": 2}))
     for payload in (b"", b"\xc1", other_version):
         with pytest.raises(WireError):
-            heard.add(Entry("publication", topic, 0, payload))
+            recording.add(Entry("publication", topic, 0, payload))
     with pytest.raises(WireError, match="no publication is defined on info"):
-        heard.add(wire.publication(Leaf.INFO, wire.info()))
-    assert heard.refused == {"malformed": 3, "version": 1}
+        recording.add(wire.publication(Leaf.INFO, wire.info()))
+    assert recording.refused == {"malformed": 3, "version": 1}
 
 
-def test_the_newest_time_that_was_heard_never_goes_back(heard: Recording, wire: SimpleNamespace) -> None:
+def test_the_newest_module_time_never_decreases(recording: Recording, wire: SimpleNamespace) -> None:
     for t_ns in (50, 90, 70):
-        heard.add(wire.publication(Leaf.STATUS, wire.status(t_ns=t_ns)))
-    assert heard.modules["A"].newest_ns == 90
-    heard.add(wire.reply(Leaf.LEASE, wire.ack(t_ns=120)))
-    assert heard.modules["A"].newest_ns == 120
+        recording.add(wire.publication(Leaf.STATUS, wire.status(t_ns=t_ns)))
+    assert recording.modules["A"].newest_ns == 90
+    recording.add(wire.reply(Leaf.LEASE, wire.ack(t_ns=120)))
+    assert recording.modules["A"].newest_ns == 120
 
 
-def test_only_published_rows_tell_when_a_module_was_heard_last(
-    heard: Recording, wire: SimpleNamespace
+def test_only_published_rows_set_the_time_of_the_last_feedback(
+    recording: Recording, wire: SimpleNamespace
 ) -> None:
-    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=10), t_ns=1000))
-    heard.add(wire.reply(Leaf.HISTORY, wire.feedback(first=0), t_ns=2000))
-    module = heard.modules["A"]
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=10), t_ns=1000))
+    recording.add(wire.reply(Leaf.HISTORY, wire.feedback(first=0), t_ns=2000))
+    module = recording.modules["A"]
     assert (module.feedback_ns, module.newest_row_ns, module.newest_row_arrival_ns) == (
         1000,
         56_000_000,
@@ -143,21 +143,23 @@ def test_only_published_rows_tell_when_a_module_was_heard_last(
 
 
 def test_late_and_repeated_feedback_does_not_change_when_the_newest_row_arrived(
-    heard: Recording, wire: SimpleNamespace
+    recording: Recording, wire: SimpleNamespace
 ) -> None:
     # Session times and first rows: the third message was overtaken, the fourth is the second again.
     for t_ns, first in ((100, 0), (105, 10), (110, 5), (115, 10)):
-        heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first), t_ns=t_ns))
-    module = heard.modules["A"]
+        recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first), t_ns=t_ns))
+    module = recording.modules["A"]
     assert (module.feedback_ns, module.newest_row_arrival_ns) == (115, 105)
-    heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=20), t_ns=120))
+    recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=20), t_ns=120))
     assert module.newest_row_arrival_ns == 120
 
 
-def test_forgetting_retains_the_newest_rows_and_round_trips(heard: Recording, wire: SimpleNamespace) -> None:
+def test_forgetting_retains_the_newest_rows_and_round_trips(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
     for first in range(0, 100, 5):
-        heard.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first)))
-    module = heard.modules["A"]
+        recording.add(wire.publication(Leaf.FEEDBACK, wire.feedback(first=first)))
+    module = recording.modules["A"]
     module.round_trips.extend(RoundTrip(t, t + 2, t + 1) for t in range(6))
     module.forget(rows=10, round_trips=2)
     assert (module.rows.first_row, module.rows.end_row) == (90, 100)
@@ -166,28 +168,34 @@ def test_forgetting_retains_the_newest_rows_and_round_trips(heard: Recording, wi
     assert module.round_trips == []
 
 
-def test_estimates_are_found_by_joint_observer_and_motion(heard: Recording, wire: SimpleNamespace) -> None:
+def test_estimates_are_indexed_by_joint_observer_and_motion(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
     for joint, observer, ids in (("A", "B", (1,)), ("A", "B", (1, 2)), ("A", "C", (1,)), ("B", "A", (3,))):
-        heard.add(wire.publication(Leaf.ESTIMATE, wire.estimate(joint, observer, ids=ids)))
+        recording.add(wire.publication(Leaf.ESTIMATE, wire.estimate(joint, observer, ids=ids)))
     again = wire.estimate("A", "B", ids=(1, 2), rate_ratio=0.25)
-    heard.add(wire.reply(Leaf.ESTIMATE, again))
-    assert list(heard.estimates) == [("A", "B"), ("A", "C"), ("B", "A")]
-    assert list(heard.estimates["A", "B"]) == [(1,), (1, 2)]
-    assert heard.estimates["A", "B"][1, 2].rate_ratio == 0.25
+    recording.add(wire.reply(Leaf.ESTIMATE, again))
+    assert list(recording.estimates) == [("A", "B"), ("A", "C"), ("B", "A")]
+    assert list(recording.estimates["A", "B"]) == [(1,), (1, 2)]
+    assert recording.estimates["A", "B"][1, 2].rate_ratio == 0.25
 
 
-def test_the_journal_is_kept_but_is_no_part_of_the_trace(heard: Recording, wire: SimpleNamespace) -> None:
-    before = heard.trace_hash
+def test_the_journal_is_stored_but_is_no_part_of_the_trace(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
+    before = recording.trace_hash
     motion = wire.record(5, Rest(duration_s=1.0), 0, 250)
-    heard.add(wire.journal("motion", serial="A", purpose="rest", motion=motion))
-    assert [e.motion for e in heard.journal] == [motion]
-    assert heard.trace_hash == before
+    recording.add(wire.journal("motion", serial="A", purpose="rest", motion=motion))
+    assert [e.motion for e in recording.journal] == [motion]
+    assert recording.trace_hash == before
 
 
-def test_requests_say_what_was_sent_and_make_no_module_known(heard: Recording, wire: SimpleNamespace) -> None:
+def test_requests_say_what_was_sent_and_make_no_module_known(
+    recording: Recording, wire: SimpleNamespace
+) -> None:
     stop = Stop(serial="A", boot=0, seq=1, sender="tester", why="test")
-    assert heard.add(wire.request(Leaf.STOP, stop)) == stop
-    assert heard.modules == {}
+    assert recording.add(wire.request(Leaf.STOP, stop)) == stop
+    assert recording.modules == {}
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -223,9 +231,9 @@ def test_the_trace_hash_changes_with_any_change(
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_a_status_is_decoded_as_it_was_sent(heard: Recording, wire: SimpleNamespace) -> None:
+def test_a_status_is_decoded_as_it_was_sent(recording: Recording, wire: SimpleNamespace) -> None:
     sent = wire.status(refusals={"stale": 3}, note="x" * 512)
-    found = heard.add(wire.publication(Leaf.STATUS, sent))
-    assert isinstance(found, Status)
-    assert found == sent
-    assert heard.modules["A"].status == sent
+    decoded = recording.add(wire.publication(Leaf.STATUS, sent))
+    assert isinstance(decoded, Status)
+    assert decoded == sent
+    assert recording.modules["A"].status == sent

@@ -98,12 +98,10 @@ def test_a_run_that_died_before_it_wrote_anything_can_be_resumed(tmp_path: Path)
     assert list(read_session(aside)) == []
 
 
-def test_loading_leaves_out_what_was_not_understood_and_counts_it(
-    tmp_path: Path, wire: SimpleNamespace
-) -> None:
+def test_loading_leaves_out_and_counts_unreadable_messages(tmp_path: Path, wire: SimpleNamespace) -> None:
     entries = _entries(wire, 4)
     entries.insert(2, Entry("publication", key(wire.robot, "A", Leaf.STATUS), 1, b"noise"))
     _killed(tmp_path / SESSION, entries)
-    found = load_recording(tmp_path / SESSION)
-    assert found.refused == {"malformed": 1}
-    assert found.modules["A"].rows.missing(0, 20) == []
+    recording = load_recording(tmp_path / SESSION)
+    assert recording.refused == {"malformed": 1}
+    assert recording.modules["A"].rows.missing(0, 20) == []

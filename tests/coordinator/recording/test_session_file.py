@@ -18,10 +18,10 @@ PERIOD_NS = 20_000_000
 
 def _entries(wire: SimpleNamespace, count: int) -> list[Entry]:
     """Entries of every kind, 50 a second: five flushes for every 50."""
-    found = [wire.journal("session", robot="robot")]
+    entries = [wire.journal("session", robot="robot")]
     for i in range(1, count):
         t_ns = i * PERIOD_NS
-        found.append(
+        entries.append(
             (
                 wire.publication(Leaf.FEEDBACK, wire.feedback(first=5 * i), t_ns),
                 wire.request(Leaf.STATUS, wire.ask(seq=i), t_ns),
@@ -30,7 +30,7 @@ def _entries(wire: SimpleNamespace, count: int) -> list[Entry]:
                 wire.journal("note", t_ns, text=f"note {i}"),
             )[i % 5]
         )
-    return found
+    return entries
 
 
 def _write(path: Path, entries: list[Entry]) -> SessionWriter:
@@ -56,9 +56,9 @@ def test_without_being_closed_at_most_a_fifth_of_a_second_is_missing(
     crashed = tmp_path / "crashed.mcap"
     crashed.write_bytes((tmp_path / "session.mcap").read_bytes())
     writer.close()
-    found = list(read_session(crashed))
-    assert found == entries[: len(found)]
-    assert len(found) >= len(entries) - 200_000_000 // PERIOD_NS
+    read = list(read_session(crashed))
+    assert read == entries[: len(read)]
+    assert len(read) >= len(entries) - 200_000_000 // PERIOD_NS
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -73,15 +73,15 @@ def test_a_file_cut_at_any_byte_is_read_up_to_the_cut(
     content = whole.read_bytes()
     cut = data.draw(st.integers(0, len(content)))
     (tmp_path / "cut.mcap").write_bytes(content[:cut])
-    found = list(read_session(tmp_path / "cut.mcap"))
-    assert found == entries[: len(found)]
+    read = list(read_session(tmp_path / "cut.mcap"))
+    assert read == entries[: len(read)]
     # Lost are the chunk that the cut goes through, and what comes after it.
     with whole.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
     chunks = [c for c in summary.chunk_indexes if c.chunk_start_offset + c.chunk_length <= cut]
     last_ns = max((c.message_end_time for c in chunks), default=-1)
-    assert len(found) >= sum(entry.t_ns <= last_ns for entry in entries)
+    assert len(read) >= sum(entry.t_ns <= last_ns for entry in entries)
 
 
 @pytest.mark.parametrize("cut", range(12))

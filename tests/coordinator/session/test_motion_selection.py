@@ -30,7 +30,7 @@ def record(pattern: Pattern, rows: tuple[int, int]) -> MotionRecord:
     )
 
 
-class Told(Recording):
+class RecordedJoint(Recording):
     """A recording of joints that hold `rest_nm` at rest and move `inertia`, with level axes."""
 
     def __init__(self, inertia: float, slow: ConstantMotion | None = None, rest_nm: float = 0.5):
@@ -42,32 +42,32 @@ class Told(Recording):
         self._inertia, self._slow, self._rest_nm = inertia, slow, rest_nm
 
     def rows(self, serial: str, first: int, end: int) -> "np.ndarray[Any, Any]":
-        found = np.zeros(end - first, dtype=ROW)
-        found["t_ns"] = 4_000_000 * np.arange(first, end)
-        found["accel_m_s2"] = (9.81, 0.0, 0.0)
-        found["effort_nm"] = self._rest_nm
+        rows = np.zeros(end - first, dtype=ROW)
+        rows["t_ns"] = 4_000_000 * np.arange(first, end)
+        rows["accel_m_s2"] = (9.81, 0.0, 0.0)
+        rows["effort_nm"] = self._rest_nm
         if self._slow is not None and first == SLOW[0]:
             t = np.minimum(0.004 * np.arange(end - first), duration_s(self._slow, 0.0))
             moved = waveform(self._slow, 0.0, t)
-            found["position_rad"] = moved.offset_rad
-            found["effort_nm"] += self._inertia * np.gradient(moved.velocity_rad_s, 0.004)
-        return found
+            rows["position_rad"] = moved.offset_rad
+            rows["effort_nm"] += self._inertia * np.gradient(moved.velocity_rad_s, 0.004)
+        return rows
 
 
-def choice(plan: Plan, told: Told, kind: str = "X5-4") -> MotionChoice:
-    recording: Any = told
+def choice(plan: Plan, recorded: RecordedJoint, kind: str = "X5-4") -> MotionChoice:
+    recording: Any = recorded
     return MotionChoice(plan, recording, lambda: SERIALS, lambda serial: CATALOGUE[kind])
 
 
 def fast_of(inertia: float, plan: Plan) -> WindowedSine:
-    slow = choice(plan, Told(inertia)).slow("A")
-    told = Told(inertia, slow)
-    return choice(plan, told).fast("A", record(slow, SLOW))
+    slow = choice(plan, RecordedJoint(inertia)).slow("A")
+    recorded = RecordedJoint(inertia, slow)
+    return choice(plan, recorded).fast("A", record(slow, SLOW))
 
 
 def test_the_plan_s_own_motions_are_the_thesis() -> None:
     plan = Plan()
-    chosen = choice(plan, Told(0.1))
+    chosen = choice(plan, RecordedJoint(0.1))
     assert chosen.slow("A") == plan.constant()
     assert chosen.fast("A", record(plan.constant(), SLOW)) == plan.sine(CATALOGUE["X5-4"])
     assert chosen.again("A", [record(plan.constant(), SLOW)]) is None
@@ -86,22 +86,22 @@ def test_a_joint_that_carries_more_is_accelerated_less() -> None:
 @pytest.mark.parametrize("joints", [1, 2, 3, 4, 16])
 def test_a_robot_of_any_size_has_the_time_for_designed_motions(joints: int) -> None:
     serials = [chr(ord("A") + k) for k in range(joints)]
-    told = Told(0.1)
-    told.journal = [
+    recorded = RecordedJoint(0.1)
+    recorded.journal = [
         SimpleNamespace(
             what="motion", purpose="rest", serial=s, boot=0, motion=record(Rest(duration_s=1.0), REST)
         )
         for s in serials
     ]
-    recording: Any = told
+    recording: Any = recorded
     plan = Plan(motions="optimised")
     chosen = MotionChoice(plan, recording, lambda: serials, lambda serial: CATALOGUE["X5-4"])
     assert chosen.slow("A") != plan.constant()
 
 
-def test_where_no_designed_motion_fits_into_the_time_the_thesis_has_to_do() -> None:
+def test_without_time_for_a_designed_motion_the_standard_one_is_used() -> None:
     plan = Plan(motions="optimised", joint_s=1.5)
-    chosen = choice(plan, Told(0.1))
+    chosen = choice(plan, RecordedJoint(0.1))
     assert chosen.slow("A") == plan.constant()
     assert chosen.fast("A", record(plan.constant(), SLOW)) == plan.sine(CATALOGUE["X5-4"])
 
@@ -109,8 +109,8 @@ def test_where_no_designed_motion_fits_into_the_time_the_thesis_has_to_do() -> N
 @pytest.mark.parametrize("wanted_mm", [5.0, 0.05])
 def test_motions_are_repeated_until_the_precision_is_reached_or_more_does_not_help(wanted_mm: float) -> None:
     plan = Plan(motions="optimised", imu="calibrated", precision_mm=wanted_mm)
-    slow = choice(plan, Told(0.1)).slow("A")
-    chosen = choice(plan, Told(0.1, slow))
+    slow = choice(plan, RecordedJoint(0.1)).slow("A")
+    chosen = choice(plan, RecordedJoint(0.1, slow))
     done = [record(slow, SLOW), record(chosen.fast("A", record(slow, SLOW)), FAST)]
     first_mm = chosen.predicted_mm("A", done)
     while (more := chosen.again("A", done)) is not None:
@@ -124,10 +124,10 @@ def test_motions_are_repeated_until_the_precision_is_reached_or_more_does_not_he
         assert reached_mm <= wanted_mm or len(done) == 8
 
 
-def test_all_joints_at_once_move_whatever_they_hold() -> None:
+def test_simultaneous_motions_exist_for_any_load() -> None:
     # 2.5 Nm is all that this type has: what holds itself can be moved a little all the same.
-    strained = choice(Plan(mode="simultaneous"), Told(0.1, rest_nm=2.4), "X5-1").simultaneous()
+    strained = choice(Plan(mode="simultaneous"), RecordedJoint(0.1, rest_nm=2.4), "X5-1").simultaneous()
     assert set(strained) == set(SERIALS)
-    easy = choice(Plan(mode="simultaneous"), Told(0.1), "X5-1").simultaneous()
+    easy = choice(Plan(mode="simultaneous"), RecordedJoint(0.1), "X5-1").simultaneous()
     for serial in SERIALS:
         assert strained[serial].sines[1].amplitude_rad <= easy[serial].sines[1].amplitude_rad

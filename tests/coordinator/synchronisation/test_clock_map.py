@@ -34,32 +34,32 @@ def test_offset_and_drift_are_recovered_from_lopsided_round_trips(
     seed: int, offset_ms: int, drift: float
 ) -> None:
     trips = _trips(seed, 60.0, offset_ms * MS, drift)
-    found = map_clock(trips)
+    clock_map = map_clock(trips)
     module = np.array([t.module_ns for t in trips])
     truth = np.rint((module + offset_ms * MS) / (1.0 - drift))
-    error = found.to_session(module) - truth
+    error = clock_map.to_session(module) - truth
     # A trip's middle is wrong by half of how lopsided it is. The quickest are lopsided by 0.1 ms; the weights
     # leave of the others about as much again, and the slope of 400 trips varies by some ppm.
     assert np.abs(error).max() < 0.5 * MS
-    assert abs(found.drift - drift) < 1e-5
+    assert abs(clock_map.drift - drift) < 1e-5
     # The quickest of 400 take 0.6 ms and a little; the line through the trips adds some hundredths.
-    assert 0.29 * MS / np.sqrt(3.0) < found.sigma_ns < 0.6 * MS / np.sqrt(3.0)
-    assert found.drift_sigma < 1e-5
+    assert 0.29 * MS / np.sqrt(3.0) < clock_map.sigma_ns < 0.6 * MS / np.sqrt(3.0)
+    assert clock_map.drift_sigma < 1e-5
 
 
 def test_even_trips_without_jitter_give_the_clock_to_the_nanosecond() -> None:
     trips = [RoundTrip(t, t + 2 * MS, 5 * MS + t) for t in range(0, 20_000 * MS, 500 * MS)]
-    found = map_clock(trips)
-    assert found.to_session(np.array([5 * MS]))[0] == pytest.approx(MS, abs=1)
-    assert abs(found.drift) < 1e-12
-    assert found.sigma_ns == pytest.approx(MS / np.sqrt(3.0))
+    clock_map = map_clock(trips)
+    assert clock_map.to_session(np.array([5 * MS]))[0] == pytest.approx(MS, abs=1)
+    assert abs(clock_map.drift) < 1e-12
+    assert clock_map.sigma_ns == pytest.approx(MS / np.sqrt(3.0))
 
 
 def test_over_a_few_seconds_no_drift_is_read_out_of_jitter() -> None:
-    found = map_clock(_trips(3, 5.0, 50 * MS, 0.0))
-    assert found.drift == 0.0
-    assert found.drift_sigma == 1e-4
-    assert abs(found.to_session(np.array([7_000 * MS - 50 * MS]))[0] - 7_000 * MS) < 0.5 * MS
+    clock_map = map_clock(_trips(3, 5.0, 50 * MS, 0.0))
+    assert clock_map.drift == 0.0
+    assert clock_map.drift_sigma == 1e-4
+    assert abs(clock_map.to_session(np.array([7_000 * MS - 50 * MS]))[0] - 7_000 * MS) < 0.5 * MS
 
 
 def test_a_module_that_has_run_for_years_is_mapped_as_well_as_a_fresh_one() -> None:
@@ -139,13 +139,13 @@ def test_a_way_there_that_is_longer_misleads_by_half_the_difference_and_that_is_
         RoundTrip(trip.sent_ns - round(asymmetry_ms * MS), trip.received_ns, trip.module_ns)
         for trip in _trips(4, 60.0, 50 * MS, 1e-4)
     ]
-    found = map_clock(trips)
+    clock_map = map_clock(trips)
     module = np.array([trip.module_ns for trip in trips])
-    error = found.to_session(module) - np.rint((module + 50 * MS) / (1.0 - 1e-4))
+    error = clock_map.to_session(module) - np.rint((module + 50 * MS) / (1.0 - 1e-4))
     # The trips are lopsided by about a tenth of a millisecond themselves.
     assert abs(error.mean() + 0.5 * asymmetry_ms * MS) < 0.2 * MS
     # All of the quickest trip may have been on the way there: half of it is root three sigmas.
-    assert abs(error.mean()) < 1.8 * found.sigma_ns
+    assert abs(error.mean()) < 1.8 * clock_map.sigma_ns
 
 
 def test_sigmas_of_offset_and_drift_are_those_of_the_errors() -> None:
@@ -158,10 +158,10 @@ def test_sigmas_of_offset_and_drift_are_those_of_the_errors() -> None:
         trips = [
             RoundTrip(int(s), int(s + d + u), int(s + d)) for s, d, u in zip(sent, there, back, strict=True)
         ]
-        found = map_clock(trips)
+        clock_map = map_clock(trips)
         # Without a least delay nothing of sigma is asymmetry.
-        error = float(found.to_session(np.array([found.origin_ns]))[0] - found.origin_ns)
-        normalised.append((error / found.sigma_ns, found.drift / found.drift_sigma))
+        error = float(clock_map.to_session(np.array([clock_map.origin_ns]))[0] - clock_map.origin_ns)
+        normalised.append((error / clock_map.sigma_ns, clock_map.drift / clock_map.drift_sigma))
     scatter = np.sqrt(np.mean(np.square(normalised), axis=0))
     # 60 draws know a standard deviation to 9 %; of 120 moments of unequal weight few count, which costs a
     # third more at most.

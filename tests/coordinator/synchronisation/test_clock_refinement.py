@@ -1,4 +1,4 @@
-"""Clocks from the motion: what round trips leave open is found, and what no motion tells stays open."""
+"""Clocks from the motion: they resolve what round trips leave open, where a common motion does."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from sim.robot.robot_tree import true_chain
 DELAY_S = 2.4e-3
 SPAN_S = 5.6
 GYRO_NOISE_RAD_S = 6e-4
-# Half a round trip of 3.5 ms, and drifts as a minute of a radio network tells them.
+# Half a round trip of 3.5 ms, and drifts as from a minute on a wireless network.
 OFFSET_SIGMA_S, DRIFT_SIGMA = 1e-3, 3e-6
 
 
@@ -81,8 +81,8 @@ class World:
 
     def left_s(self, clocks: dict[str, ClockMap], module: int) -> tuple[float, float]:
         """How wrong a refined map is against the base: at its origin [s], and in drift."""
-        found = clocks[self.chain.serials[module]]
-        removed_s, removed_drift = -1e-9 * found.offset_ns, -found.drift
+        refinement = clocks[self.chain.serials[module]]
+        removed_s, removed_drift = -1e-9 * refinement.offset_ns, -refinement.drift
         origin = np.array([self.origin_s[module]])
         apart = float(self.error_s(module, origin)[0] - self.error_s(0, origin)[0])
         return apart - removed_s, float(self.drift[module]) - removed_drift
@@ -95,13 +95,13 @@ def test_offsets_and_drifts_are_recovered_to_within_what_is_claimed(robot: str) 
         world = World(robot, seed)
         n = len(world.chain.serials)
         motions = [world.motion(6.0 + 8.0 * joint, [joint]) for joint in range(n)]
-        found = refine_clocks(world.chain, world.clocks, motions)
-        assert found.imu_delay_s == pytest.approx(DELAY_S, abs=4.0 * found.imu_delay_sigma_s)
+        refinement = refine_clocks(world.chain, world.clocks, motions)
+        assert refinement.imu_delay_s == pytest.approx(DELAY_S, abs=4.0 * refinement.imu_delay_sigma_s)
         # A tenth of a millisecond is how far IMUs of a kind differ: the mean of them is known no better.
-        assert found.imu_delay_sigma_s < 2.5e-4
+        assert refinement.imu_delay_sigma_s < 2.5e-4
         for module in range(1, n):
-            offset, drift = world.left_s(found.clocks, module)
-            clock = found.clocks[world.chain.serials[module]]
+            offset, drift = world.left_s(refinement.clocks, module)
+            clock = refinement.clocks[world.chain.serials[module]]
             scores += [1e9 * offset / clock.sigma_ns, drift / clock.drift_sigma]
             if module < n - 1:
                 left.append(offset)
@@ -115,24 +115,24 @@ def test_offsets_and_drifts_are_recovered_to_within_what_is_claimed(robot: str) 
 def test_all_joints_moving_at_once_tell_the_clocks_as_well() -> None:
     world = World("arm6", 3)
     motions = [world.motion(20.0, list(range(6))), world.motion(26.0, list(range(6)))]
-    found = refine_clocks(world.chain, world.clocks, motions)
+    refinement = refine_clocks(world.chain, world.clocks, motions)
     for module in range(1, 6):
-        offset, _ = world.left_s(found.clocks, module)
-        assert abs(1e9 * offset) < 4.0 * found.clocks[world.chain.serials[module]].sigma_ns
+        offset, _ = world.left_s(refinement.clocks, module)
+        assert abs(1e9 * offset) < 4.0 * refinement.clocks[world.chain.serials[module]].sigma_ns
         # 1.4 ms against the base before.
-        assert found.clocks[world.chain.serials[module]].sigma_ns < 0.7e6
+        assert refinement.clocks[world.chain.serials[module]].sigma_ns < 0.7e6
 
 
-def test_a_module_that_saw_nothing_and_was_seen_by_nobody_keeps_its_round_trips() -> None:
+def test_a_module_without_common_motion_keeps_its_round_trips() -> None:
     # Against a base whose own round trips leave nothing open.
     world = World("tree_y", 1, base_sigma_s=1e-6, held_rad=0.0)
     chain = world.chain
     tip = next(k for k in reversed(range(len(chain.serials))) if k not in chain.parent)
     moving = [k for k in range(len(chain.serials)) if k in chain.parent and not _carries(chain, k, tip)]
     assert moving
-    found = refine_clocks(chain, world.clocks, [world.motion(6.0, [joint]) for joint in moving])
-    assert found.lags >= len(moving)
-    before, after = world.clocks[chain.serials[tip]], found.clocks[chain.serials[tip]]
+    refinement = refine_clocks(chain, world.clocks, [world.motion(6.0, [joint]) for joint in moving])
+    assert refinement.lags >= len(moving)
+    before, after = world.clocks[chain.serials[tip]], refinement.clocks[chain.serials[tip]]
     assert after.offset_ns == pytest.approx(before.offset_ns, abs=2e3)
     assert after.sigma_ns == pytest.approx(before.sigma_ns, rel=0.01)
     assert after.drift_sigma == pytest.approx(before.drift_sigma, rel=0.01)
@@ -158,21 +158,21 @@ def _carries(chain: Chain, joint: int, module: int) -> bool:
 
 def test_without_any_motion_the_clocks_stay_as_the_round_trips_have_them() -> None:
     world = World("a2085_04", 0)
-    found = refine_clocks(world.chain, world.clocks, [])
-    assert found.lags == 0
+    refinement = refine_clocks(world.chain, world.clocks, [])
+    assert refinement.lags == 0
     for serial, clock in world.clocks.items():
-        assert found.clocks[serial].offset_ns == clock.offset_ns
-        assert found.clocks[serial].drift == clock.drift
+        assert refinement.clocks[serial].offset_ns == clock.offset_ns
+        assert refinement.clocks[serial].drift == clock.drift
     # Against the base, whose own round trips are as uncertain; that itself is not uncertain against itself.
-    sigmas = [found.clocks[serial].sigma_ns for serial in world.chain.serials]
+    sigmas = [refinement.clocks[serial].sigma_ns for serial in world.chain.serials]
     assert sigmas == pytest.approx([0.0, *[np.sqrt(2.0) * 1e9 * OFFSET_SIGMA_S] * 3])
 
 
 def test_the_base_clock_stays_what_it_is() -> None:
     world = World("a2085_04", 2)
-    found = refine_clocks(world.chain, world.clocks, [world.motion(6.0, [0]), world.motion(14.0, [1])])
+    refinement = refine_clocks(world.chain, world.clocks, [world.motion(6.0, [0]), world.motion(14.0, [1])])
     serial = world.chain.serials[0]
-    assert found.clocks[serial] == world.clocks[serial]._replace(sigma_ns=0.0, drift_sigma=0.0)
-    assert found.covariance.shape == (8, 8)
-    assert not found.covariance.flags.writeable
-    assert np.linalg.eigvalsh(found.covariance).min() > -1e-12
+    assert refinement.clocks[serial] == world.clocks[serial]._replace(sigma_ns=0.0, drift_sigma=0.0)
+    assert refinement.covariance.shape == (8, 8)
+    assert not refinement.covariance.flags.writeable
+    assert np.linalg.eigvalsh(refinement.covariance).min() > -1e-12

@@ -60,10 +60,10 @@ def _recording(wire: SimpleNamespace, gap: dict[str, tuple[int, int]] | None = N
     recording = Recording()
     for serial in SERIALS:
         rows = _rows(serial)
-        first_gone, end_gone = (gap or {}).get(serial, (ROWS, ROWS))
+        first_missing, end_missing = (gap or {}).get(serial, (ROWS, ROWS))
         for first in range(0, ROWS, 100):
-            kept = [(first, min(first + 100, first_gone)), (max(first, end_gone), first + 100)]
-            for start, end in kept:
+            blocks = [(first, min(first + 100, first_missing)), (max(first, end_missing), first + 100)]
+            for start, end in blocks:
                 if start < end:
                     block = wire.feedback(serial, first=start, rows=rows[start:end])
                     recording.add(wire.publication(Leaf.FEEDBACK, block))
@@ -78,29 +78,33 @@ def _event(wire: SimpleNamespace, start: int = 400, end: int = 1000) -> JournalE
 CLOCKS = {serial: _clock(serial) for serial in SERIALS}
 
 
-def test_all_modules_are_seen_at_the_same_instants(wire: SimpleNamespace) -> None:
-    found = window(_recording(wire), CLOCKS, SERIALS, _event(wire))
-    t_s = found.t_ns * 1e-9
-    assert (found.t_ns[0], found.t_ns[-1]) == (400 * STEP_NS, 998 * STEP_NS)
+def test_all_modules_are_sampled_at_the_same_times(wire: SimpleNamespace) -> None:
+    resampled = window(_recording(wire), CLOCKS, SERIALS, _event(wire))
+    t_s = resampled.t_ns * 1e-9
+    assert (resampled.t_ns[0], resampled.t_ns[-1]) == (400 * STEP_NS, 998 * STEP_NS)
     for column, serial in enumerate(SERIALS):
         # A cubic spline through a 2 Hz swing at 250 Hz: (2 pi 2 / 250)^4 / 384 = 2e-8 of it; the rows hold
         # positions in double, everything else in single precision.
-        np.testing.assert_allclose(found.q_rad[:, column], _signal(t_s, serial), atol=1e-7)
-        np.testing.assert_allclose(found.tau_nm[:, column], _signal(t_s, serial, 2), atol=2e-5)
+        np.testing.assert_allclose(resampled.q_rad[:, column], _signal(t_s, serial), atol=1e-7)
+        np.testing.assert_allclose(resampled.tau_nm[:, column], _signal(t_s, serial, 2), atol=2e-5)
         # The IMU has its own times; taken for the rows' they would put 1.7 ms * 47 rad/s^2 = 0.08 rad/s here.
-        np.testing.assert_allclose(found.gyro_rad_s[:, column, 1], -2 * _signal(t_s, serial, 1), atol=5e-6)
-        np.testing.assert_allclose(found.accel_m_s2[:, column, 2], -0.3 * _signal(t_s, serial, 2), atol=5e-6)
+        np.testing.assert_allclose(
+            resampled.gyro_rad_s[:, column, 1], -2 * _signal(t_s, serial, 1), atol=5e-6
+        )
+        np.testing.assert_allclose(
+            resampled.accel_m_s2[:, column, 2], -0.3 * _signal(t_s, serial, 2), atol=5e-6
+        )
 
 
 def test_a_clock_that_is_wrong_by_a_millisecond_shows(wire: SimpleNamespace) -> None:
     late = CLOCKS["B"]._replace(offset_ns=CLOCKS["B"].offset_ns + 1e6)
-    found = window(_recording(wire), {**CLOCKS, "B": late}, SERIALS, _event(wire))
-    t_s = found.t_ns * 1e-9
-    np.testing.assert_allclose(found.q_rad[:, 0], _signal(t_s, "A"), atol=1e-7)
-    np.testing.assert_allclose(found.q_rad[:, 1], _signal(t_s - 1e-3, "B"), atol=1e-7)
+    resampled = window(_recording(wire), {**CLOCKS, "B": late}, SERIALS, _event(wire))
+    t_s = resampled.t_ns * 1e-9
+    np.testing.assert_allclose(resampled.q_rad[:, 0], _signal(t_s, "A"), atol=1e-7)
+    np.testing.assert_allclose(resampled.q_rad[:, 1], _signal(t_s - 1e-3, "B"), atol=1e-7)
 
 
-def test_a_margin_reaches_beyond_the_motion_as_far_as_everybody_has_rows(wire: SimpleNamespace) -> None:
+def test_a_margin_extends_the_motion_as_far_as_all_modules_have_rows(wire: SimpleNamespace) -> None:
     recording = _recording(wire)
     inside = window(recording, CLOCKS, SERIALS, _event(wire), margin_s=0.5)
     assert (inside.t_ns[0], inside.t_ns[-1]) == (275 * STEP_NS, 1123 * STEP_NS)
@@ -110,7 +114,7 @@ def test_a_margin_reaches_beyond_the_motion_as_far_as_everybody_has_rows(wire: S
     assert 1499 * STEP_NS - IMU_LATE_NS - STEP_NS <= beyond.t_ns[-1] <= 1499 * STEP_NS - IMU_LATE_NS
 
 
-def test_rows_that_came_twice_and_samples_that_repeat_change_nothing(wire: SimpleNamespace) -> None:
+def test_repeated_rows_and_samples_do_not_change_the_window(wire: SimpleNamespace) -> None:
     recording = _recording(wire)
     once = window(recording, CLOCKS, SERIALS, _event(wire))
     rows = _rows("B")
@@ -137,7 +141,7 @@ def test_filtered_data_is_the_motion_and_its_derivative(wire: SimpleNamespace) -
     data = sensor_data([one, one], cutoff_hz=15.0, keep_every=5)
     samples = data.q_rad.shape[0]
     assert data.gyro_rad_s.shape == data.accel_m_s2.shape == (samples, 3, 3)
-    # What is kept lies inside by two periods of the cut-off, every fifth sample of it, twice.
+    # What is blocks lies inside by two periods of the cut-off, every fifth sample of it, twice.
     edge = int(np.ceil(2 * RATE_HZ / 15.0))
     assert samples == 2 * len(range(edge, len(one.t_ns) - edge, 5))
     half = samples // 2
