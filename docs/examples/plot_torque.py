@@ -12,7 +12,7 @@ signals = run.signals(joint)  # everything the module reported, on one time base
 plt.plot(signals.t_s, signals.effort_nm, label="measured")
 if run.held_out is not None and joint in run.held_out.serials:
     column = run.held_out.serials.index(joint)  # motions that nothing was fitted to
-    plt.plot(run.held_out.t_s, run.held_out.predicted_nm[:, column], ".", label="predicted")
+    plt.plot(run.held_out.t_s, run.held_out.predicted_nm[:, column], ".", markersize=1, label="predicted")
 plt.xlabel("time [s]")
 plt.ylabel(f"torque of {joint} [Nm]")
 plt.legend()
