@@ -17,17 +17,15 @@ are taken at the mean speeds, at which the discrete equations conserve energy.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.read_only import read_only
 from sim.actuator import actuator_kernel as kernel
-from sim.actuator.spring import build_springs
+from sim.actuator.spring import Springs, build_springs
 from sim.geometry.pose import Array
 from sim.imperfections.module_errors import Variation, alike
-from sim.imperfections.noise_profile import NoiseProfile, noise_profile
+from sim.imperfections.noise_profile import NoiseProfile
 from sim.physics.skeleton import Skeleton
 
 BUS_VOLTAGE_V = 24.0
@@ -46,44 +44,25 @@ STOP_LOSS_S = 2e-3
 _MIN_EFFICIENCY = 0.05
 
 
-class Power(NamedTuple):
-    """Where the electrical power went in the last step, (n,) each [W], read-only.
-
-    The rest of it is stored in rotors and springs: see `Actuators.stored_j`.
-    """
-
-    electrical_w: Array
-    output_w: Array
-    copper_w: Array
-    friction_w: Array
-    gear_w: Array
-    spring_w: Array
-
-
 class Actuators:
-    """The motors and springs of n modules, arrays (n,), on m joints; speeds and angles seen at the output.
+    """The motors and springs of n modules on m joints, without a skeleton the modules' own; see `state`.
 
-    Without a skeleton the joints are the modules'. `profile` says which effects act (all modules as
-    catalogued by default), `variation` how the modules differ from their types.
+    `profile` says which effects act, `variation` how the modules differ from their types.
     """
 
     def __init__(
         self,
         types: Sequence[ModuleType],
         dt_s: float,
-        profile: NoiseProfile | None = None,
+        profile: NoiseProfile,
         variation: Variation | None = None,
         skeleton: Skeleton | None = None,
         voltage_v: float = BUS_VOLTAGE_V,
     ):
         n = len(types)
-        profile = noise_profile("ideal") if profile is None else profile
         variation = alike(n) if variation is None else variation
         self.springs = build_springs(types, profile, variation.spring)
-        self._modules = _module_records(types, profile, variation)
-        self._modules["linear_nm_rad"] = self.springs.linear_nm_rad
-        self._modules["cubic_nm_rad3"] = self.springs.cubic_nm_rad3
-        self._modules["half_gap_rad"] = self.springs.gap_rad / 2.0
+        self._modules = _module_records(types, self.springs, profile, variation)
         self._modules["joint"] = range(n) if skeleton is None else skeleton.module
         self._passives = np.zeros(0 if skeleton is None else len(skeleton.passive), kernel.PASSIVE)
         if skeleton is not None:
@@ -97,11 +76,11 @@ class Actuators:
     def reset(self, q_rad: Array, load_nm: Array) -> None:
         """Put the motors to rest where their springs carry the load at the given joint positions."""
         stretch = self.springs.stretch(load_nm)
-        self._state = np.zeros((kernel.ROWS, len(q_rad)))
-        self._state[kernel.MOTOR_RAD] = q_rad + stretch
-        self._state[kernel.TORQUE_NM] = load_nm
-        self._state[kernel.DEFLECTION_RAD] = -self.springs.deflection(stretch)
-        self._state[kernel.ELASTIC_NM] = load_nm
+        self._rows = np.zeros((kernel.ROWS, len(q_rad)))
+        self.state = kernel.ActuatorState(*self._rows)
+        self.state.motor_rad[:] = q_rad + stretch
+        self.state.torque_nm[:] = self.state.elastic_nm[:] = load_nm
+        self.state.deflection_rad[:] = -self.springs.deflection(stretch)
 
     def change_friction(self, module: int, factor: float) -> None:
         """Multiply the Coulomb and viscous friction of one motor and its gear."""
@@ -120,13 +99,13 @@ class Actuators:
         """Advance the motors by one step; return the forces on the joints (m,) [Nm, N] for that step.
 
         `mass` (m, m) and `bias` (m,) are the multibody's at (q, qd); `resistance_factor` (n,) is the
-        resistance of the warm windings over that of cold ones. The current, deflection, torque and power in
-        `self` belong to the instant of q, as does the acceleration that results from the forces.
+        resistance of the warm windings over that of cold ones. The acceleration that results from the forces
+        belongs to the instant of q.
         """
-        force, self._state = kernel.advance(
+        force, self._rows = kernel.advance(
             self._modules,
             self._passives,
-            self._state,
+            self._rows,
             pwm,
             self._cold if resistance_factor is None else resistance_factor,
             self.voltage_v,
@@ -137,71 +116,12 @@ class Actuators:
             q,
             qd,
         )
+        self.state = kernel.ActuatorState(*self._rows)
         return force
-
-    @property
-    def motor_rad(self) -> Array:
-        """The motors' positions after the last step."""
-        return self._row(kernel.MOTOR_RAD)
-
-    @property
-    def motor_rad_s(self) -> Array:
-        """The motors' speeds after the last step, half a step before the positions."""
-        return self._row(kernel.MOTOR_RAD_S)
-
-    @property
-    def motor_rate_rad_s(self) -> Array:
-        """The motors' speeds at the instant of the last step's beginning."""
-        return self._row(kernel.RATE_RAD_S)
-
-    @property
-    def torque_nm(self) -> Array:
-        """The springs' torques on the outputs."""
-        return self._row(kernel.TORQUE_NM)
-
-    @property
-    def elastic_nm(self) -> Array:
-        """The elastic part of `torque_nm`, the springs' own loss left out."""
-        return self._row(kernel.ELASTIC_NM)
-
-    @property
-    def deflection_rad(self) -> Array:
-        """The springs' own deflections, output minus motor; the gear's gap is not in them."""
-        return self._row(kernel.DEFLECTION_RAD)
-
-    @property
-    def duty(self) -> Array:
-        """The duties that the bridges apply."""
-        return self._row(kernel.DUTY)
-
-    @property
-    def current_a(self) -> Array:
-        """The motors' currents."""
-        return self._row(kernel.CURRENT_A)
-
-    @property
-    def copper_w(self) -> Array:
-        """The heat in the windings."""
-        return self._row(kernel.COPPER_W)
-
-    def power(self) -> Power:
-        """Return the powers of the last step."""
-        rows = kernel.ELECTRICAL_W, kernel.OUTPUT_W, kernel.COPPER_W, kernel.FRICTION_W
-        return Power(*(read_only(self._row(r)) for r in (*rows, kernel.GEAR_W, kernel.SPRING_W)))
-
-    def stored_j(self, q_rad: Array) -> Array:
-        """Return the energies of rotors and springs (n,) [J] after the last step, outputs at `q_rad` (n,)."""
-        own = self.springs.deflection(self.motor_rad - q_rad)
-        kinetic: Array = 0.5 * self._modules["rotor_kg_m2"] * self.motor_rad_s**2
-        return read_only(kinetic + self.springs.energy_j(own))
-
-    def _row(self, row: int) -> Array:
-        values: Array = self._state[row]
-        return values
 
 
 def _module_records(
-    types: Sequence[ModuleType], profile: NoiseProfile, variation: Variation
+    types: Sequence[ModuleType], springs: Springs, profile: NoiseProfile, variation: Variation
 ) -> kernel.Records:
     motors = [t.motor for t in types]
     gear = np.array([t.gear_ratio for t in types])
@@ -214,7 +134,8 @@ def _module_records(
     records["coulomb_nm"] = friction * [m.coulomb_nm for m in motors]
     records["viscous_nm_s_rad"] = friction * [m.viscous_nm_s_rad for m in motors]
     records["rotor_kg_m2"] = gear**2 * [m.rotor_inertia_kg_m2 for m in motors]
-    records["spring_loss_s"] = SPRING_LOSS_S
+    records["linear_nm_rad"], records["cubic_nm_rad3"] = springs.linear_nm_rad, springs.cubic_nm_rad3
+    records["half_gap_rad"], records["spring_loss_s"] = springs.gap_rad / 2.0, SPRING_LOSS_S
     ranges = [(-np.inf, np.inf) if t.range_rad is None else t.range_rad for t in types]
     records["min_rad"], records["max_rad"] = np.array(ranges).T
     records["stop_nm_rad"], records["stop_loss_s"] = STOP_NM_RAD, STOP_LOSS_S

@@ -3,7 +3,7 @@
 The equations are those of `sim.actuator.actuator`.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,41 +12,52 @@ from sim.geometry.pose import Array
 
 Records = np.ndarray[Any, np.dtype[np.void]]
 
-MODULE = np.dtype(
-    [
-        ("joint", np.int64),
-        ("resistance_ohm", np.float64),
-        ("per_amp_nm", np.float64),  # motor torque, seen at the output; likewise volts per speed
-        ("loss", np.float64),  # of the gear: 1 - efficiency
-        ("coulomb_nm", np.float64),
-        ("viscous_nm_s_rad", np.float64),
-        ("rotor_kg_m2", np.float64),
-        ("linear_nm_rad", np.float64),
-        ("cubic_nm_rad3", np.float64),
-        ("spring_loss_s", np.float64),
-        ("half_gap_rad", np.float64),
-        ("min_rad", np.float64),  # the end stops; infinite without
-        ("max_rad", np.float64),
-        ("stop_nm_rad", np.float64),
-        ("stop_loss_s", np.float64),
-    ]
+# per_amp_nm: the motor's torque at the output, likewise volts per speed; loss: the gear's, 1 - efficiency;
+# min_rad, max_rad: the end stops, infinite without.
+_CONSTANTS = (
+    *("resistance_ohm", "per_amp_nm", "loss", "coulomb_nm", "viscous_nm_s_rad", "rotor_kg_m2"),
+    *("linear_nm_rad", "cubic_nm_rad3", "spring_loss_s", "half_gap_rad"),
+    *("min_rad", "max_rad", "stop_nm_rad", "stop_loss_s"),
 )
+MODULE = np.dtype([("joint", np.int64), *((name, np.float64) for name in _CONSTANTS)])
 PASSIVE = np.dtype([("joint", np.int64), ("stiffness", np.float64), ("damping", np.float64)])
 
-# Rows of the state.
+
+class ActuatorState(NamedTuple):
+    """The state of n modules after a step, (n,) each; positions, speeds and torques are seen at the output.
+
+    motor_rad and motor_rad_s belong to the end of the step, the speeds half a step before the positions; all
+    others to its beginning, motor_rate_rad_s being the motors' speeds there. torque_nm is what the springs
+    exert on the outputs, elastic_nm that without the springs' own loss. deflection_rad is the springs' own,
+    output minus motor, without the gear's gap; duty what the bridges apply. The powers say where the
+    electrical power went; the rest of it is stored in rotors and springs.
+    """
+
+    motor_rad: Array
+    motor_rad_s: Array
+    torque_nm: Array
+    duty: Array
+    current_a: Array
+    deflection_rad: Array
+    elastic_nm: Array
+    motor_rate_rad_s: Array
+    electrical_w: Array
+    output_w: Array
+    copper_w: Array
+    friction_w: Array
+    gear_w: Array
+    spring_w: Array
+
+
+# Rows of the state, as Numba knows them.
 MOTOR_RAD, MOTOR_RAD_S, TORQUE_NM, DUTY, CURRENT_A, DEFLECTION_RAD, ELASTIC_NM, RATE_RAD_S = range(8)
 ELECTRICAL_W, OUTPUT_W, COPPER_W, FRICTION_W, GEAR_W, SPRING_W = range(8, 14)
-ROWS = 14
+ROWS = len(ActuatorState._fields)
 
 
 @compiled
 def _clamp(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
-
-
-@compiled
-def _clamp_between(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)
 
 
 @compiled
@@ -150,7 +161,7 @@ def advance(
 @compiled
 def _stop(own: Any, q: float, qd: float, dt_s: float) -> tuple[float, float]:
     """Return an end stop's torque on the output at qdd = 0, and by how much it falls with qdd."""
-    beyond = q - _clamp_between(q, own.min_rad, own.max_rad)
+    beyond = q - min(max(q, own.min_rad), own.max_rad)
     # Implicit Euler, as the impact of an unloaded output is shorter than a step: with a rule that conserves
     # energy it would bounce for ever.
     push = own.stop_nm_rad * (beyond + (dt_s + own.stop_loss_s) * qd)

@@ -16,6 +16,13 @@ from module_agent.model.compiled import compiled
 from sim.geometry.pose import Array
 
 Indices = np.ndarray[Any, np.dtype[np.int64]]
+# Of m joints: parent (-1 for the world), whether it slides, and sign of its position along z, (m,) each;
+# rotation (m, 3, 3) and offset (m, 3) of its frame in its parent's.
+Joints = tuple[Indices, Indices, Array, Array, Array]
+# Masses (m,), centres (m, 3) and inertia about them (m, 3, 3), each in its own frame.
+Bodies = tuple[Array, Array, Array]
+# Of n IMUs: the body (-1 for the world) and, in its frame, the offset (n, 3) and rotation (n, 3, 3).
+Imus = tuple[Indices, Array, Array]
 
 
 @compiled
@@ -49,10 +56,9 @@ def _turned(a: Array, b: Array, out: Array) -> None:
 
 
 @compiled
-def _place(
-    parent: Indices, prismatic: Indices, sign: Array, rotation: Array, offset: Array, q: Array
-) -> tuple[Array, Array]:
+def _place(joints: Joints, q: Array) -> tuple[Array, Array]:
     """Return every body's orientation (m, 3, 3) and its offset from its parent in world axes (m, 3)."""
+    parent, prismatic, sign, rotation, offset = joints
     m = len(parent)
     where, arm = np.empty((m, 3, 3)), np.empty((m, 3))
     world, fixed = np.eye(3), np.empty((3, 3))
@@ -73,16 +79,10 @@ def _place(
 
 @compiled
 def _move(
-    parent: Indices,
-    prismatic: Indices,
-    sign: Array,
-    where: Array,
-    arm: Array,
-    qd: Array,
-    qdd: Array,
-    up_m_s2: float,
+    joints: Joints, where: Array, arm: Array, qd: Array, qdd: Array, up_m_s2: float
 ) -> tuple[Array, Array, Array]:
     """Return every body's angular rate and acceleration, and its origin's specific force, (m, 3) each."""
+    parent, prismatic, sign = joints[:3]
     m = len(parent)
     omega, alpha, accel = np.empty((m, 3)), np.empty((m, 3)), np.empty((m, 3))
     still, work, own = np.zeros(3), np.empty((2, 3)), np.empty(3)
@@ -109,23 +109,13 @@ def _move(
 
 @compiled
 def imu_readings(
-    parent: Indices,
-    prismatic: Indices,
-    sign: Array,
-    rotation: Array,
-    offset: Array,
-    q: Array,
-    qd: Array,
-    qdd: Array,
-    up_m_s2: float,
-    body: Indices,
-    imu_offset: Array,
-    imu_rotation: Array,
+    joints: Joints, imus: Imus, q: Array, qd: Array, qdd: Array, up_m_s2: float
 ) -> tuple[Array, Array]:
-    """Return angular rate and specific force (n, 3) in the axes of n IMUs; body -1 is the world."""
+    """Return angular rate and specific force (n, 3) in the axes of n IMUs."""
+    body, imu_offset, imu_rotation = imus
     n = len(body)
-    where, arm = _place(parent, prismatic, sign, rotation, offset, q)
-    omega, alpha, accel = _move(parent, prismatic, sign, where, arm, qd, qdd, up_m_s2)
+    where, arm = _place(joints, q)
+    omega, alpha, accel = _move(joints, where, arm, qd, qdd, up_m_s2)
     gyro, force = np.zeros((n, 3)), np.zeros((n, 3))
     work, r, total, axes = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty((3, 3))
     for i in range(n):
@@ -148,54 +138,34 @@ def imu_readings(
 
 @compiled
 def mass_and_biases(
-    parent: Indices,
-    prismatic: Indices,
-    sign: Array,
-    rotation: Array,
-    offset: Array,
-    mass: Array,
-    com: Array,
-    inertia: Array,
-    q: Array,
-    rates: Array,
-    up_m_s2: float,
+    joints: Joints, bodies: Bodies, q: Array, rates: Array, up_m_s2: float
 ) -> tuple[Array, Array]:
     """Return the mass matrix (m, m), and the bias forces (R, m) of gravity and each of R velocities (R, m).
 
     The matrix is computed by composite rigid bodies, the forces by recursive Newton-Euler.
     """
-    where, arm = _place(parent, prismatic, sign, rotation, offset, q)
-    spin, travel, place = _twists(parent, prismatic, sign, where, arm)
-    lever, central = _bodies(com, inertia, where)
-    matrix = _composite(parent, spin, travel, mass, place + lever, central)
+    parent, mass = joints[0], bodies[0]
+    where, arm = _place(joints, q)
+    twists = _twists(joints, where, arm)
+    lever, central = _masses(bodies, where)
+    matrix = _composite(parent, twists, mass, lever, central)
     biases, still = np.empty(rates.shape), np.zeros(len(q))
     for k in range(len(rates)):
-        motion = _move(parent, prismatic, sign, where, arm, rates[k], still, up_m_s2)
-        loads = _loads(parent, spin, travel, mass, place, lever, central, motion)
+        motion = _move(joints, where, arm, rates[k], still, up_m_s2)
+        loads = _loads(parent, twists, mass, lever, central, motion)
         for i in range(len(q)):
             biases[k, i] = loads[i]
     return matrix, biases
 
 
 @compiled
-def joint_loads(
-    parent: Indices,
-    prismatic: Indices,
-    sign: Array,
-    rotation: Array,
-    offset: Array,
-    q: Array,
-    body: int,
-    point: Array,
-    force: Array,
-    moment: Array,
-) -> Array:
+def joint_loads(joints: Joints, q: Array, body: int, point: Array, force: Array, moment: Array) -> Array:
     """Return the joints' forces or torques (m,) of a wrench w on a body, J^T w.
 
     The force acts at `point` in the body's frame; force and moment are in world axes.
     """
-    where, arm = _place(parent, prismatic, sign, rotation, offset, q)
-    spin, travel, place = _twists(parent, prismatic, sign, where, arm)
+    where, arm = _place(joints, q)
+    spin, travel, place = _twists(joints, where, arm)
     at, about = np.empty(3), np.empty(3)
     _into(where[body], point, at)
     for k in range(3):
@@ -206,15 +176,14 @@ def joint_loads(
     while i >= 0:
         for k in range(3):
             loads[i] += spin[i, k] * (about[k] + moment[k]) + travel[i, k] * force[k]
-        i = parent[i]
+        i = joints[0][i]
     return loads
 
 
 @compiled
-def _twists(
-    parent: Indices, prismatic: Indices, sign: Array, where: Array, arm: Array
-) -> tuple[Array, Array, Array]:
+def _twists(joints: Joints, where: Array, arm: Array) -> tuple[Array, Array, Array]:
     """Return the joints' unit twists, angular and linear at the world's origin, and the bodies' places."""
+    parent, prismatic, sign = joints[:3]
     m = len(parent)
     spin, travel, place = np.zeros((m, 3)), np.empty((m, 3)), np.empty((m, 3))
     for i in range(m):
@@ -229,8 +198,9 @@ def _twists(
 
 
 @compiled
-def _bodies(com: Array, inertia: Array, where: Array) -> tuple[Array, Array]:
+def _masses(bodies: Bodies, where: Array) -> tuple[Array, Array]:
     """Return the centres' arms (m, 3) and the inertia about the centres, R I R^T, in world axes (m, 3, 3)."""
+    _, com, inertia = bodies
     m = len(com)
     lever, central, turned = np.empty((m, 3)), np.empty((m, 3, 3)), np.empty((3, 3))
     for i in range(m):
@@ -242,10 +212,11 @@ def _bodies(com: Array, inertia: Array, where: Array) -> tuple[Array, Array]:
 
 @compiled
 def _composite(
-    parent: Indices, spin: Array, travel: Array, mass: Array, centre: Array, central: Array
+    parent: Indices, twists: tuple[Array, Array, Array], mass: Array, lever: Array, central: Array
 ) -> Array:
     """Return the mass matrix: distal inertia of every joint, projected on the joints' twists."""
-    m = len(parent)
+    spin, travel, place = twists
+    m, centre = len(parent), place + lever
     matrix, total = np.zeros((m, m)), mass.copy()
     first, whole = np.empty((m, 3)), central.copy()
     linear, angular, part = np.empty(3), np.empty(3), np.empty(3)
@@ -283,15 +254,14 @@ def _composite(
 @compiled
 def _loads(
     parent: Indices,
-    spin: Array,
-    travel: Array,
+    twists: tuple[Array, Array, Array],
     mass: Array,
-    place: Array,
     lever: Array,
     central: Array,
     motion: tuple[Array, Array, Array],
 ) -> Array:
     """Return the joints' loads (m,): m a and I alpha + omega x I omega of all that each of them carries."""
+    spin, travel, place = twists
     omega, alpha, accel = motion
     m = len(parent)
     loads, force, moment = np.zeros(m), accel.copy(), np.empty((m, 3))

@@ -46,15 +46,15 @@ class RigidTree:
 
     def mass_and_biases(self, q: Array, rates: Array) -> tuple[Array, Array]:
         """Return the same, with one row of biases (R, m) for each of several velocities (R, m)."""
-        return mass_and_biases(*self._joints, *self._bodies, q, rates, self._gravity_m_s2)
+        return mass_and_biases(self._joints, self._bodies, q, rates, self._gravity_m_s2)
 
     def imu_readings(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
         """Return the angular rates and specific forces (n, 3) in the IMUs' frames [rad/s, m/s^2]."""
-        return imu_readings(*self._joints, q, qd, qdd, self._gravity_m_s2, *self._imus)
+        return imu_readings(self._joints, self._imus, q, qd, qdd, self._gravity_m_s2)
 
     def joint_loads(self, q: Array, body: int, point_m: Array, force_n: Array, moment_nm: Array) -> Array:
         """Return the forces or torques (m,) on the joints of a wrench on one body.
 
         The force acts at `point_m` in the body's frame; force and moment are in world axes, (3,) each.
         """
-        return joint_loads(*self._joints, q, body, point_m, force_n, moment_nm)
+        return joint_loads(self._joints, q, body, point_m, force_n, moment_nm)

@@ -103,8 +103,8 @@ class World:
         self._body = Multibody(robot.name, self._skeleton, TICK_S)
         self._body.place(self._q)
         zero = np.zeros_like(robot.start_rad)
-        q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.motor_rad
-        self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.torque_nm, structure)
+        q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.state.motor_rad
+        self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.state.torque_nm, structure)
         self.modules = tuple(
             WiredModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
         )
@@ -188,7 +188,7 @@ class World:
         """
         u = self._checked(pwm)
         actuators, q, qd = self._actuators, self._q, self._qd
-        motor = actuators.motor_rad
+        motor = actuators.state.motor_rad
         # The integrator is a leapfrog: its velocities live half a tick before its positions, but it takes
         # velocity forces as if they were of the same instant. The difference to the velocity forces at the
         # velocity that the last acceleration predicts for this instant is added.
@@ -197,6 +197,7 @@ class World:
         if self._pushes:
             biases[0] -= self._pushed(q)
         force = actuators.step(u, q, qd, mass, biases[0], self._windings.resistance_factor)
+        drives = actuators.state
         self._q, self._qd = self._body.step((force - biases[0] + biases[1]).tolist())
         # The velocity at this instant is the mean of the two around it, the acceleration their difference.
         rate = (qd + self._qd) * 0.5
@@ -204,11 +205,11 @@ class World:
         change = (self._qd - qd) * (1.0 / TICK_S)
         own = self._joints
         self._plant = (
-            *(self.t_ns, u, actuators.duty, q[own], rate[own], change[own], motor),
-            *(actuators.motor_rate_rad_s, actuators.torque_nm, q[self._passive]),
+            *(self.t_ns, u, drives.duty, q[own], rate[own], change[own], motor),
+            *(drives.motor_rate_rad_s, drives.torque_nm, q[self._passive]),
         )
         samples = self._samples(q, rate, change)
-        self._windings.step(actuators.copper_w)
+        self._windings.step(drives.copper_w)
         self._tick += 1
         return samples
 
@@ -244,7 +245,7 @@ class World:
         self._tree.joint_loads(self._q, 0, *np.zeros((3, 3)))
         actuators = copy(self._actuators)
         actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
-        copy(self._windings).step(actuators.copper_w)
+        copy(self._windings).step(actuators.state.copper_w)
         sensors.read(0, self._instant(self._q, still))
 
     def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:
@@ -253,16 +254,16 @@ class World:
         return self._sensors.read(self._tick, self._instant(q, rate))
 
     def _instant(self, q: Array, rate: Array) -> Instant:
-        actuators = self._actuators
+        drives = self._actuators.state
         return Instant(
             t_ns=self.t_ns,
             q_rad=q[self._joints],
             qd_rad_s=rate[self._joints],
-            motor_rad_s=actuators.motor_rate_rad_s,
-            elastic_nm=actuators.elastic_nm,
-            current_a=actuators.current_a,
+            motor_rad_s=drives.motor_rate_rad_s,
+            elastic_nm=drives.elastic_nm,
+            current_a=drives.current_a,
             winding_c=self._windings.winding_c,
-            voltage_v=actuators.voltage_v,
+            voltage_v=self._actuators.voltage_v,
             gyro_rad_s=self._imu_readings[0],
             specific_force_m_s2=self._imu_readings[1],
         )

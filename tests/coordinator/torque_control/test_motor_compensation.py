@@ -12,6 +12,7 @@ from module_agent.model.chain import Array
 from module_agent.wire.messages import GainSet
 from sim.actuator.actuator import Actuators
 from sim.actuator.thermal import Windings
+from sim.imperfections.noise_profile import NOISE_PROFILES
 
 X5_4, X5_9 = CATALOGUE["X5-4"], CATALOGUE["X5-9"]
 TICK_S = 1e-3
@@ -19,14 +20,14 @@ TICK_S = 1e-3
 
 def spring_torque(kind: ModuleType, pwm: float, speed_rad_s: float, ticks: int = 1500) -> float:
     """What the spring exerts in the end on an output that something immovable turns at a constant speed."""
-    motor = Actuators([kind], TICK_S)
+    motor = Actuators([kind], TICK_S, NOISE_PROFILES["ideal"])
     immovable, nothing = np.array([[1e9]]), np.zeros(1)
     motor.reset(np.zeros(1), np.zeros(1))
     for k in range(ticks):
         motor.step(
             np.array([pwm]), np.array([speed_rad_s * k * TICK_S]), np.array([speed_rad_s]), immovable, nothing
         )
-    return float(motor.torque_nm[0])
+    return float(motor.state.torque_nm[0])
 
 
 @pytest.mark.parametrize("kind", [X5_4, X5_9])

@@ -18,6 +18,7 @@ from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switche
 
 DT = 1e-3
 X5 = ("X5-1", "X5-4", "X5-9")
+IDEAL = noise_profile("ideal")
 
 
 class Bench:
@@ -29,7 +30,7 @@ class Bench:
         inertia: float,
         load: float = 0.0,
         dt: float = DT,
-        profile: NoiseProfile | None = None,
+        profile: NoiseProfile = IDEAL,
     ):
         self.actuator = Actuators([kind], dt, profile)
         self.inertia, self.load, self.dt = inertia, load, dt
@@ -49,7 +50,7 @@ def test_a_blocked_output_feels_the_published_stall_torque(name: str, published_
     bench = Bench(module_type(name), inertia=1e9)
     for pwm in np.append(np.linspace(0.0, 0.5, 1000), np.full(1000, 0.5)):
         bench.run(pwm, DT)
-    assert bench.actuator.torque_nm[0] == pytest.approx(published_nm, rel=0.10)
+    assert bench.actuator.state.torque_nm[0] == pytest.approx(published_nm, rel=0.10)
 
 
 @pytest.mark.parametrize("name", X5)
@@ -69,7 +70,7 @@ def test_half_the_firmwares_pwm_is_full_duty_at_24_volts() -> None:
     half, full = Bench(module_type("X5-4"), 0.1), Bench(module_type("X5-4"), 0.1)
     half.run(0.5, 0.2)
     full.run(1.0, 0.2)
-    assert half.actuator.duty[0] == full.actuator.duty[0] == 1.0
+    assert half.actuator.state.duty[0] == full.actuator.state.duty[0] == 1.0
     assert half.q[0] == full.q[0]
 
 
@@ -84,7 +85,7 @@ def test_a_motor_sticks_until_its_torque_beats_friction(name: str) -> None:
     for share, moves in ((0.97, False), (1.03, True)):
         bench = Bench(kind, inertia=0.01)
         bench.run(share * breakaway / 2.0, 0.3)
-        assert (bench.actuator.motor_rad[0] > 0.0) == moves
+        assert (bench.actuator.state.motor_rad[0] > 0.0) == moves
 
 
 def test_a_gear_at_rest_holds_a_load_between_driving_and_being_driven_back() -> None:
@@ -96,9 +97,9 @@ def test_a_gear_at_rest_holds_a_load_between_driving_and_being_driven_back() -> 
     for share in (0.55, 0.85, 1.10):
         bench = Bench(kind, inertia=0.02, load=share * ideal)
         bench.actuator.reset(bench.q, np.array([bench.load]))
-        before = bench.actuator.motor_rad[0]
+        before = bench.actuator.state.motor_rad[0]
         bench.run(pwm, 0.3)
-        ends.append(float(bench.actuator.motor_rad[0] - before))
+        ends.append(float(bench.actuator.state.motor_rad[0] - before))
     assert ends[0] > 1e-3
     assert abs(ends[1]) < 1e-12
     assert ends[2] < -1e-3
@@ -128,7 +129,7 @@ def test_a_driven_joint_follows_the_continuous_equations(name: str, inertia: flo
         bench, errors = Bench(kind, inertia, dt=dt), []
         for state in exact.T:
             bench.run(1.0, 0.01)
-            errors += [abs(bench.q[0] - state[0]), abs(bench.actuator.motor_rad[0] - state[2])]
+            errors += [abs(bench.q[0] - state[0]), abs(bench.actuator.state.motor_rad[0] - state[2])]
         return max(errors)
 
     # The velocities of a leapfrog live half a tick before the positions, so a voltage that comes in one step
@@ -202,7 +203,7 @@ def test_a_swinging_joint_follows_the_continuous_equations_through_every_reversa
     for row, state in enumerate(found.T):
         for k in range(10 * row, 10 * row + 10):
             bench.run(pwm(k * DT), DT)
-        worst = max(worst, abs(bench.q[0] - state[0]), abs(bench.actuator.motor_rad[0] - state[2]))
+        worst = max(worst, abs(bench.q[0] - state[0]), abs(bench.actuator.state.motor_rad[0] - state[2]))
     assert np.ptp(found[0]) > 0.4
     assert worst < ticks_of_way * DT * np.abs(found[1]).max()
 
@@ -223,7 +224,7 @@ def test_an_unpowered_joint_comes_to_rest_whatever_it_carries(
     bench.qd = np.array([push / np.sqrt(kind.spring_nm_rad * inertia)])
 
     def energy() -> float:
-        stretch = bench.actuator.motor_rad[0] - bench.q[0]
+        stretch = bench.actuator.state.motor_rad[0] - bench.q[0]
         return float(0.5 * inertia * bench.qd[0] ** 2 + 0.5 * kind.spring_nm_rad * stretch**2)
 
     start = energy()

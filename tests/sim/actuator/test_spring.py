@@ -64,15 +64,15 @@ def test_within_the_gap_nothing_is_transmitted_and_beyond_it_the_sensor_sees_the
     torques, deflections, stretches = [], [], []
     # Slowly, a hundredth of the way to full load, against an output that does not move.
     for pwm in np.linspace(0.0, 0.12, 1500):
-        stretches.append(float(actuator.motor_rad[0]))
+        stretches.append(float(actuator.state.motor_rad[0]))
         torque = actuator.step(np.array([pwm]), still, still, heavy, still)
         torques.append(float(torque[0]))
-        deflections.append(float(actuator.deflection_rad[0]))
+        deflections.append(float(actuator.state.deflection_rad[0]))
     inside = np.abs(stretches) <= gap / 2
     assert 50 < inside.sum() < 1450
     assert not np.array(torques)[inside].any()
     assert not np.array(deflections)[inside].any()
     beyond = np.array(stretches)[~inside]
     np.testing.assert_allclose(np.array(deflections)[~inside], -(beyond - gap / 2), atol=1e-12)
-    assert actuator.elastic_nm[0] == pytest.approx(-100.0 * actuator.deflection_rad[0], rel=1e-12)
+    assert actuator.state.elastic_nm[0] == pytest.approx(-100.0 * actuator.state.deflection_rad[0], rel=1e-12)
     assert torques[-1] > 0.1

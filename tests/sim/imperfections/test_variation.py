@@ -63,8 +63,8 @@ def test_a_stalled_motor_draws_less_as_copper_warms_by_0_393_percent_a_kelvin() 
         still, heavy = np.zeros(1), np.array([[1e9]])
         for _ in range(2000):
             actuator.step(np.array([0.2]), still, still, heavy, still, windings.resistance_factor)
-            windings.step(actuator.copper_w)
-        return float(actuator.current_a[0]), float(windings.winding_c[0])
+            windings.step(actuator.state.copper_w)
+        return float(actuator.state.current_a[0]), float(windings.winding_c[0])
 
     cold, ambient = stalled(0.0)
     warm, degrees = stalled(1.0)
