@@ -5,8 +5,8 @@ those of the simple solids named below.
 """
 
 from collections.abc import Sequence
-from math import cos, pi, radians, sin, sqrt
-from typing import Annotated, NamedTuple
+from math import cos, pi, sin, sqrt
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -50,26 +50,6 @@ class PlacedPart(NamedTuple):
     hinge: Hinge | None = None
 
 
-class Bracket(NamedTuple):
-    """A bracket: mass [kg], output position [m] and the angle by which the output is turned about x [rad]."""
-
-    mass_kg: float
-    output_xyz: tuple[float, float, float]
-    turn_rad: float
-
-
-BRACKETS: dict[str, Bracket] = {
-    f"{kind}{hand}{side}": Bracket(mass, (0.0, sign * y, z), -sign * pi / 2)
-    for hand, sign in (("Right", -1.0), ("Left", 1.0))
-    for kind, side, mass, y, z in (
-        ("X5Light", "", 0.100, 0.043, 0.040),
-        ("Heavy", "Outside", 0.215, 0.0375, 0.055),
-        # An inside bracket turns the output as its outside twin does but sets it off to the other side.
-        ("Heavy", "Inside", 0.215, -0.0225, 0.055),
-    )
-}
-
-
 class Strict(BaseModel):
     """A table of a robot file: unknown keys and numbers that are not finite are errors."""
 
@@ -83,39 +63,39 @@ class Tube(Strict):
     twist_rad: Annotated[float, Field(ge=-2 * pi, le=2 * pi)] = 0.0
 
 
-def check_inertia(mass_kg: float, inertia: tuple[float, float, float, float, float, float]) -> None:
-    """Check that a solid of this mass can have this inertia (ixx, iyy, izz, ixy, ixz, iyz) about its centre.
+class Solid(Strict):
+    """A rigid body: its mass, and its centre and inertia about that centre in the table's own frame.
 
-    Raises:
-        ValueError: it cannot; the message gives the principal moments.
-    """
-    moments = np.linalg.eigvalsh(tensor(*inertia))
-    if mass_kg == 0.0 and any(inertia):
-        raise ValueError("an inertia needs a mass_kg")
-    if moments[0] < -1e-15 or moments[0] + moments[1] < moments[2] * (1 - 1e-9):
-        raise ValueError(
-            f"no solid has these moments of inertia: principal {moments.round(9).tolist()} kg m^2; "
-            "each must be at least 0 and at most the sum of the other two"
-        )
-
-
-class FreePose(Strict):
-    """Any rigid part: the pose of its output, and its mass, centre and inertia about that centre.
-
-    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) [kg m^2]; all is in the part's input frame. A part without
-    mass is a transform only.
+    `inertia` is (ixx, iyy, izz, ixy, ixz, iyz) [kg m^2].
     """
 
-    xyz_m: Xyz = (0.0, 0.0, 0.0)
-    rpy_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
     mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
     com_xyz_m: Xyz = (0.0, 0.0, 0.0)
     inertia: tuple[Moment, Moment, Moment, Moment, Moment, Moment] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
-    def _possible_inertia(self) -> "FreePose":
-        check_inertia(self.mass_kg, self.inertia)
+    def _possible_inertia(self) -> Self:
+        moments = np.linalg.eigvalsh(tensor(*self.inertia))
+        if self.mass_kg == 0.0 and any(self.inertia):
+            raise ValueError("an inertia needs a mass_kg")
+        if moments[0] < -1e-15 or moments[0] + moments[1] < moments[2] * (1 - 1e-9):
+            raise ValueError(
+                f"no solid has these moments of inertia: principal {moments.round(9).tolist()} kg m^2; "
+                "each must be at least 0 and at most the sum of the other two"
+            )
         return self
+
+    @property
+    def body(self) -> RigidBody:
+        """The same as a rigid body."""
+        return _body(self.mass_kg, self.com_xyz_m, tensor(*self.inertia))
+
+
+class FreePose(Solid):
+    """Any rigid part: the pose of its output and its body, in its input frame; massless, a transform only."""
+
+    xyz_m: Xyz = (0.0, 0.0, 0.0)
+    rpy_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
 
 
 class Part(Strict):
@@ -126,7 +106,7 @@ class Part(Strict):
     pose: FreePose | None = None
 
     @model_validator(mode="after")
-    def _exactly_one(self) -> "Part":
+    def _exactly_one(self) -> Self:
         if sum(x is not None for x in (self.tube, self.bracket, self.pose)) != 1:
             raise ValueError("a part of a link is exactly one of: tube, bracket, pose")
         return self
@@ -144,10 +124,9 @@ def placed(part: Part) -> PlacedPart:
     if part.tube is not None:
         return _tube(part.tube)
     if part.bracket is not None:
-        return _bracket(BRACKETS[part.bracket])
-    if part.pose is None:
-        raise ValueError("a part of a link is exactly one of: tube, bracket, pose")
-    return _free(part.pose)
+        return BRACKETS[part.bracket]
+    free = part.pose or FreePose()
+    return PlacedPart(pose(free.xyz_m, np.radians(free.rpy_deg)), free.body)
 
 
 def _body(mass_kg: float, com: Sequence[float], inertia: Array) -> RigidBody:
@@ -176,17 +155,23 @@ def _tube_hinge(length_m: float) -> Hinge:
     return Hinge(place, read_only(stiffness), read_only(stiffness * STRUCTURE_LOSS_S))
 
 
-def _bracket(bracket: Bracket) -> PlacedPart:
-    x, y, z = bracket.output_xyz
+def _bracket(mass_kg: float, y: float, z: float, turn_rad: float) -> PlacedPart:
+    """Return a bracket whose output is at y, z [m] and turned about x."""
     # Two square plates of 50 mm at a right angle, half the mass each: one at the input, one at the output.
-    half, side = bracket.mass_kg / 2, 0.05
+    half, side = mass_kg / 2, 0.05
     foot = tensor(half * side**2 / 12, half * side**2 / 12, half * side**2 / 6, 0.0, 0.0, 0.0)
     wall = tensor(half * side**2 / 12, half * side**2 / 6, half * side**2 / 12, 0.0, 0.0, 0.0)
-    plates = (_body(half, (x, y / 2, 0.003), foot), _body(half, (x, y, z * 0.7), wall))
-    return PlacedPart(pose(bracket.output_xyz, (bracket.turn_rad, 0.0, 0.0)), joined(plates))
+    plates = (_body(half, (0.0, y / 2, 0.003), foot), _body(half, (0.0, y, z * 0.7), wall))
+    return PlacedPart(pose((0.0, y, z), (turn_rad, 0.0, 0.0)), joined(plates))
 
 
-def _free(free: FreePose) -> PlacedPart:
-    roll, pitch, yaw = free.rpy_deg
-    output = pose(free.xyz_m, (radians(roll), radians(pitch), radians(yaw)))
-    return PlacedPart(output, _body(free.mass_kg, free.com_xyz_m, tensor(*free.inertia)))
+BRACKETS: dict[str, PlacedPart] = {
+    f"{kind}{hand}{side}": _bracket(mass, sign * y, z, -sign * pi / 2)
+    for hand, sign in (("Right", -1.0), ("Left", 1.0))
+    for kind, side, mass, y, z in (
+        ("X5Light", "", 0.100, 0.043, 0.040),
+        ("Heavy", "Outside", 0.215, 0.0375, 0.055),
+        # An inside bracket turns the output as its outside twin does but sets it off to the other side.
+        ("Heavy", "Inside", 0.215, -0.0225, 0.055),
+    )
+}

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 
 def pose(
-    xyz_m: Sequence[float] | Array = (0.0, 0.0, 0.0), rpy_rad: Sequence[float] = (0.0, 0.0, 0.0)
+    xyz_m: Sequence[float] | Array = (0.0, 0.0, 0.0), rpy_rad: Sequence[float] | Array = (0.0, 0.0, 0.0)
 ) -> Array:
     """Return the 4x4 transform "rotate, then translate"; roll, pitch, yaw about fixed x, y, z as in URDF."""
     matrix = np.eye(4)
@@ -28,9 +28,3 @@ def inverse(transform: Array) -> Array:
     matrix[:3, :3] = rotation
     matrix[:3, 3] = -rotation @ transform[:3, 3]
     return read_only(matrix)
-
-
-def skew(vector: Array) -> Array:
-    """Return the (3, 3) matrix of the cross product: skew(a) @ b == cross(a, b)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

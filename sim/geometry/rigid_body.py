@@ -5,8 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from module_agent.model.perturbation import skew
 from module_agent.model.read_only import read_only
-from sim.geometry.pose import Array, skew
+from sim.geometry.pose import Array
 
 
 class RigidBody(NamedTuple):

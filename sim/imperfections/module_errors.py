@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.model.catalogue import ModuleType
+from module_agent.model.perturbation import skew
 from module_agent.model.read_only import read_only
-from sim.geometry.pose import Array, skew
+from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.imperfections.random_streams import generator
 

@@ -9,11 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.model.read_only import read_only
-from sim.geometry.link_parts import Hinge
 from sim.geometry.pose import Array, inverse, pose
-from sim.geometry.rigid_body import RigidBody, joined, moved, tensor
+from sim.geometry.rigid_body import RigidBody, joined, moved
 from sim.robot.robot_file import BASE, BaseCompliance, Robot
-from sim.robot.robot_tree import RobotTree, Segment, build_tree
+from sim.robot.robot_tree import Segment, build_tree
 
 # Physics engines need a body between two passive joints at one place; its mass is far below all others.
 _LIGHT = RigidBody(1e-6, read_only(np.zeros(3)), read_only(np.eye(3) * 1e-10))
@@ -50,119 +49,105 @@ class Skeleton(NamedTuple):
     gravity_m_s2: float
 
 
+class _Joint(NamedTuple):
+    """A joint and its bodies; frame and bodies in the world, with all joints at 0."""
+
+    name: str
+    parent: int
+    home: Array
+    bodies: list[RigidBody]
+    sign: float = 1.0
+    prismatic: bool = False
+    spring: tuple[float, float] | None = None
+
+
 def build_skeleton(robot: Robot, base_shake: float = 0.0, link_flex: float = 0.0) -> Skeleton:
     """Return the joints of a robot whose base's and links' compliance is multiplied by the given factors.
 
     A factor of 0 means rigid. Damping shrinks with the root of the stiffness, so the damping ratio stays.
     """
     tree = build_tree(robot)
-    frame = _Frame()
+    joints: list[_Joint] = []
     ground = -1
     if robot.base.compliance is not None and base_shake > 0.0:
-        ground = _hang_base(frame, robot.base.compliance, robot.base.world_pose, base_shake)
-    joint: list[int] = []
+        ground = _hang_base(joints, robot.base.compliance, robot.base.world_pose, base_shake)
+    module: list[int] = []
     carrier: list[int] = []
     for i, p in enumerate(tree.parent):
-        held = ground if p < 0 else joint[p]
+        held = ground if p < 0 else module[p]
         for number, segment in enumerate(tree.segments[i]):
-            held = _hang_segment(frame, held, f"{tree.serials[i]}/flex{number}", segment, link_flex)
+            held = _hang_segment(joints, held, f"{tree.serials[i]}/flex{number}", segment, link_flex)
         carrier.append(held)
-        joint.append(frame.add(tree.serials[i], held, tree.home[i], sign=float(tree.axis_sign[i])))
-        frame.pieces[-1].append(tree.moved[i])
-    bodies = [j if back else c for j, c, back in zip(joint, carrier, tree.reversed, strict=True)]
-    return frame.skeleton(tree, joint, bodies)
+        module.append(len(joints))
+        joints.append(
+            _Joint(tree.serials[i], held, tree.output[i], [tree.moved[i]], sign=float(tree.axis_sign[i]))
+        )
+    imu_body = [own if back else c for own, c, back in zip(module, carrier, tree.reversed, strict=True)]
+    imus = zip(imu_body, tree.housing, tree.types, strict=True)
+    springs = [joint.spring for joint in joints if joint.spring is not None]
+
+    def relative_to(body: int, transform: Array) -> Array:
+        return transform if body < 0 else inverse(joints[body].home) @ transform
+
+    return Skeleton(
+        names=tuple(joint.name for joint in joints),
+        parent=tuple(joint.parent for joint in joints),
+        prismatic=tuple(joint.prismatic for joint in joints),
+        axis_sign=read_only(np.array([joint.sign for joint in joints])),
+        origin=read_only(np.array([relative_to(joint.parent, joint.home) for joint in joints])),
+        bodies=tuple(
+            moved(joined(joint.bodies), inverse(joint.home)) if joint.bodies else _LIGHT for joint in joints
+        ),
+        module=tuple(module),
+        passive=tuple(i for i, joint in enumerate(joints) if joint.spring is not None),
+        stiffness=read_only(np.array([stiffness for stiffness, _ in springs])),
+        damping=read_only(np.array([damping for _, damping in springs])),
+        imu_body=tuple(imu_body),
+        imu_pose=read_only(np.array([relative_to(b, h @ pose(kind.imu_xyz)) for b, h, kind in imus])),
+        gravity_m_s2=tree.gravity_m_s2,
+    )
 
 
-def _hang_base(frame: "_Frame", given: BaseCompliance, base: Array, factor: float) -> int:
+def _hang_base(joints: list[_Joint], given: BaseCompliance, base: Array, factor: float) -> int:
+    """Add the directions in which the base gives; return the last one."""
     place = base @ pose(given.pivot_m)
-    last = -1
     directions = (
         (True, "", given.stiffness_n_m, given.damping_n_s_m),
         (False, "r", given.stiffness_nm_rad, given.damping_nm_s_rad),
     )
     for prismatic, prefix, stiffness, damping in directions:
-        for axis in (a for a in range(3) if stiffness[a] > 0.0):
-            name = f"{BASE}/{prefix}{_AXES[axis]}"
-            last = frame.add(name, last, place @ _Z_ALONG[axis], prismatic)
-            frame.add_spring(stiffness[axis], damping[axis], factor)
-    body = RigidBody(given.mass_kg, read_only(np.array(given.com_xyz_m)), tensor(*given.inertia))
-    frame.pieces[last].append(moved(body, base))
-    return last
+        for axis in np.flatnonzero(stiffness):
+            name, spring = f"{BASE}/{prefix}{_AXES[axis]}", _softened(stiffness[axis], damping[axis], factor)
+            home = place @ _Z_ALONG[axis]
+            joints.append(_Joint(name, len(joints) - 1, home, [], prismatic=prismatic, spring=spring))
+    joints[-1].bodies.append(moved(given.body, base))
+    return len(joints) - 1
 
 
-def _hang_segment(frame: "_Frame", held: int, name: str, segment: Segment, factor: float) -> int:
-    if segment.hinge is not None and factor > 0.0:
-        hinge: Hinge = segment.hinge
+def _hang_segment(joints: list[_Joint], held: int, name: str, segment: Segment, factor: float) -> int:
+    """Add the directions in which a segment's hinge gives; return the body that the segment belongs to."""
+    hinge = segment.hinge
+    if hinge is not None and factor > 0.0:
         for axis in np.flatnonzero(hinge.stiffness_nm_rad):
-            held = frame.add(f"{name}-{_AXES[axis]}", held, hinge.pose @ _Z_ALONG[axis])
-            frame.add_spring(hinge.stiffness_nm_rad[axis], hinge.damping_nm_s_rad[axis], factor)
+            spring = _softened(hinge.stiffness_nm_rad[axis], hinge.damping_nm_s_rad[axis], factor)
+            joints.append(
+                _Joint(f"{name}-{_AXES[axis]}", held, hinge.pose @ _Z_ALONG[axis], [], spring=spring)
+            )
+            held = len(joints) - 1
     if held >= 0:
-        frame.pieces[held].append(segment.body)
+        joints[held].bodies.append(segment.body)
     return held
 
 
-def _z_along() -> tuple[Array, Array, Array]:
-    """Return the rotations that take z to x, y and z: cyclic permutations of the axes."""
-    turns = []
-    for axis in range(3):
-        turn = np.eye(4)
-        turn[:3, :3] = np.roll(np.eye(3), axis + 1, axis=0)
-        turns.append(read_only(turn))
-    return turns[0], turns[1], turns[2]
+def _softened(stiffness: float, damping: float, factor: float) -> tuple[float, float]:
+    return stiffness / factor, damping / factor**0.5
 
 
-_Z_ALONG = _z_along()
+def _z_along(axis: int) -> Array:
+    """Return the rotation that takes z to an axis: a cyclic permutation."""
+    turn = np.eye(4)
+    turn[:3, :3] = np.roll(np.eye(3), axis + 1, axis=0)
+    return read_only(turn)
 
 
-class _Frame:
-    """Accumulates the joints of a skeleton; poses and bodies in the world."""
-
-    def __init__(self) -> None:
-        self.names: list[str] = []
-        self.parent: list[int] = []
-        self.prismatic: list[bool] = []
-        self.sign: list[float] = []
-        self.home: list[Array] = []
-        self.pieces: list[list[RigidBody]] = []
-        self.springs: list[tuple[int, float, float]] = []
-
-    def add(self, name: str, parent: int, home: Array, prismatic: bool = False, sign: float = 1.0) -> int:
-        self.names.append(name)
-        self.parent.append(parent)
-        self.prismatic.append(prismatic)
-        self.sign.append(sign)
-        self.home.append(home)
-        self.pieces.append([])
-        return len(self.names) - 1
-
-    def add_spring(self, stiffness: float, damping: float, factor: float) -> None:
-        """Make the last joint a passive spring, softer by `factor`."""
-        self.springs.append((len(self.names) - 1, stiffness / factor, damping / factor**0.5))
-
-    def _relative_to(self, body: int, transform: Array) -> Array:
-        return transform if body < 0 else inverse(self.home[body]) @ transform
-
-    def skeleton(self, tree: RobotTree, module: list[int], imu_body: list[int]) -> Skeleton:
-        passive, stiffness, damping = zip(*self.springs, strict=True) if self.springs else ((), (), ())
-        pairs = zip(self.parent, self.home, strict=True)
-        imus = zip(imu_body, tree.housing, tree.types, strict=True)
-        return Skeleton(
-            names=tuple(self.names),
-            parent=tuple(self.parent),
-            prismatic=tuple(self.prismatic),
-            axis_sign=read_only(np.array(self.sign)),
-            origin=read_only(np.array([self._relative_to(p, home) for p, home in pairs])),
-            bodies=tuple(
-                moved(joined(own), inverse(home)) if own else _LIGHT
-                for own, home in zip(self.pieces, self.home, strict=True)
-            ),
-            module=tuple(module),
-            passive=tuple(passive),
-            stiffness=read_only(np.array(stiffness)),
-            damping=read_only(np.array(damping)),
-            imu_body=tuple(imu_body),
-            imu_pose=read_only(
-                np.array([self._relative_to(b, h @ pose(kind.imu_xyz)) for b, h, kind in imus])
-            ),
-            gravity_m_s2=tree.gravity_m_s2,
-        )
+_Z_ALONG = tuple(map(_z_along, range(3)))

@@ -70,7 +70,7 @@ def joint_loads(robot: Robot) -> tuple[JointLoad, ...]:
     loads = []
     for k in range(len(tree.serials)):
         distal = [i for i in range(len(tree.serials)) if k in _with_ancestors(tree.parent, i)]
-        whole = joined([moved(tree.bodies[i], inverse(tree.home[k]) @ tree.home[i]) for i in distal])
+        whole = joined([moved(tree.bodies[i], inverse(tree.output[k]) @ tree.output[i]) for i in distal])
         arm = float(np.hypot(whole.com_m[0], whole.com_m[1]))
         loads.append(JointLoad(tree.gravity_m_s2 * whole.mass_kg * arm, float(about_origin(whole)[2, 2])))
     return tuple(loads)

@@ -6,7 +6,6 @@ to the proximal frame of the child (its housing; its output if the child is moun
 
 import tomllib
 from functools import partial
-from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -25,7 +24,7 @@ from module_agent.model.errors import RobotError, UsageError
 from module_agent.network_emulation.profile_file import network, network_relative_to
 from module_agent.network_emulation.toml_location import Location, line_of, syntax_error_line
 from module_agent.wire.keys import check_chunk
-from sim.geometry.link_parts import Angle, FreePose, Moment, Part, Strict, Xyz, check_inertia
+from sim.geometry.link_parts import Angle, FreePose, Part, Solid, Strict, Xyz
 from sim.geometry.pose import Array, pose
 from sim.imperfections.noise_profile import DEFAULT_PROFILE, noise_profile
 
@@ -74,17 +73,13 @@ def _check_springs(kind: str, stiffness: Stiffnesses, damping: Dampings) -> None
             )
 
 
-class BaseCompliance(Strict):
+class BaseCompliance(Solid):
     """Compliance of the base: springs and dampers in base axes, in up to six directions.
 
     A stiffness of 0, or none, stands for a rigid direction. The rotations are about `pivot_m`, a point of the
-    base frame. `mass_kg`, `com_xyz_m` (base frame) and `inertia` (ixx, iyy, izz, ixy, ixz, iyz about that
-    centre, base axes) describe the mass that moves with the base in addition to the modules' own parts.
+    base frame. The solid, in the base frame, moves with it in addition to the modules' own parts.
     """
 
-    mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
-    com_xyz_m: Xyz = (0.0, 0.0, 0.0)
-    inertia: tuple[Moment, Moment, Moment, Moment, Moment, Moment] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     pivot_m: Xyz = (0.0, 0.0, 0.0)
     stiffness_n_m: Stiffnesses = _RIGID
     damping_n_s_m: Dampings = _RIGID
@@ -99,11 +94,6 @@ class BaseCompliance(Strict):
             )
         _check_springs("translation along", self.stiffness_n_m, self.damping_n_s_m)
         _check_springs("rotation about", self.stiffness_nm_rad, self.damping_nm_s_rad)
-        return self
-
-    @model_validator(mode="after")
-    def _possible_inertia(self) -> "BaseCompliance":
-        check_inertia(self.mass_kg, self.inertia)
         return self
 
 
@@ -142,8 +132,7 @@ class Base(Strict):
     @property
     def world_pose(self) -> Array:
         """The base frame in the world, (4, 4)."""
-        roll, pitch, yaw = self.rpy_deg or MOUNTS[self.mount or "floor"]
-        return pose((0.0, 0.0, 0.0), (radians(roll), radians(pitch), radians(yaw)))
+        return pose(rpy_rad=np.radians(self.rpy_deg or MOUNTS[self.mount or "floor"]))
 
 
 class Module(Strict):

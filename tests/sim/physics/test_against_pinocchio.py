@@ -51,8 +51,7 @@ class Reference:
         return np.array(pinocchio.rnea(self.model, self.data, *args))[self.rows]
 
     def imu(self, i: int) -> tuple[Any, int]:
-        pose = self.tree.imu_pose[i]
-        body = self.tree.imu_body[i]
+        pose, body = self.skeleton.imu_pose[i], self.skeleton.imu_body[i]
         return pinocchio.SE3(pose[:3, :3], pose[:3, 3]), self.ids[body] if body >= 0 else 0
 
     def felt(self, q: Array, qd: Array, qdd: Array) -> Array:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim.geometry.link_parts import STRUCTURE_LOSS_S, Part, Tube, placed
-from sim.geometry.pose import Array
+from sim.geometry.pose import Array, pose
 from sim.geometry.rigid_body import joined, moved, parameters
 from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import build_skeleton
@@ -38,8 +38,11 @@ def test_a_rigid_skeleton_has_the_modules_joints_and_bodies(name: str) -> None:
     assert skeleton.parent == tree.parent
     assert skeleton.module == tuple(range(len(tree.serials)))
     assert skeleton.passive == ()
-    np.testing.assert_allclose(skeleton.origin, tree.origin, atol=1e-15)
-    np.testing.assert_allclose(skeleton.imu_pose, tree.imu_pose, atol=1e-15)
+    parents = [tree.output[p] if p >= 0 else np.eye(4) for p in tree.parent]
+    np.testing.assert_allclose(skeleton.origin, np.linalg.inv(parents) @ tree.output, atol=1e-15)
+    carriers = [tree.output[b] if b >= 0 else np.eye(4) for b in skeleton.imu_body]
+    imus = tree.housing @ np.array([pose(kind.imu_xyz) for kind in tree.types])
+    np.testing.assert_allclose(skeleton.imu_pose, np.linalg.inv(carriers) @ imus, atol=1e-15)
     for body, wanted in zip(skeleton.bodies, tree.bodies, strict=True):
         np.testing.assert_allclose(parameters(body), parameters(wanted), atol=1e-14)
 
