@@ -79,7 +79,7 @@ def known_folder(tmp_path: Path) -> Callable[..., Path]:
             "serials": known.serials,
             "types": {module.serial: module.type for module in known.modules},
             "topology_confidence": 1.0,
-            "chain": ChainPart.of(true_chain(known)),
+            "chain": ChainPart(**true_chain(known).to_dict()),
             "rank": 1,
             "condition": 1.0,
             "reduced_chi2": 1.0,

@@ -4,19 +4,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart
+from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part
 from module_agent.model.chain import Chain
 from module_agent.model.files import write_json
 
 SCHEMA = 2
-
-
-class Part(BaseModel):
-    """A part of the result: immutable, and without fields that the schema does not name."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class ChainPart(Part):
@@ -29,11 +23,6 @@ class ChainPart(Part):
     point: list[list[float]]
     imu_home: list[list[list[float]]]
     gravity: list[float]
-
-    @classmethod
-    def of(cls, chain: Chain) -> "ChainPart":
-        """Return a chain as lists."""
-        return cls(**chain.to_dict())
 
     def chain(self) -> Chain:
         """Return the chain with arrays.
@@ -69,7 +58,7 @@ class UnresolvedPart(Part):
     modules: list[str]
     summary: str
     resolved_by: str = ""
-    links: list[UnknownPart] = []
+    links: list[UnknownPart] = Field(default_factory=list)
 
 
 class TransformPart(Part):
@@ -248,15 +237,15 @@ class DynamicsPart(Part):
     residual_rms_nm: dict[str, float]
     held_out: HeldOutPart | None
     bodies: BodiesPart | None = None
-    base_parameters: list[BaseParameterPart] = []
-    identifiability: list[IdentifiabilityPart] = []
-    summary: list[str] = []
-    frames: list[list[list[float]]] = []
+    base_parameters: list[BaseParameterPart] = Field(default_factory=list)
+    identifiability: list[IdentifiabilityPart] = Field(default_factory=list)
+    summary: list[str] = Field(default_factory=list)
+    frames: list[list[list[float]]] = Field(default_factory=list)
     motion_source: str = "encoders"
-    noise_nm: dict[str, dict[str, float]] = {}
-    torque_terms: list[TorqueTermPart] = []
+    noise_nm: dict[str, dict[str, float]] = Field(default_factory=dict)
+    torque_terms: list[TorqueTermPart] = Field(default_factory=list)
     gathered_by: Literal["agents", "coordinator", "both"] = "coordinator"
-    by_agents: list[str] = []
+    by_agents: list[str] = Field(default_factory=list)
     gathered_difference: float | None = None
 
 
@@ -271,7 +260,7 @@ class Result(Part):
     serials: list[str]
     types: dict[str, str]
     topology_confidence: float
-    topology: list[MountingPart] = []
+    topology: list[MountingPart] = Field(default_factory=list)
     chain: ChainPart
     rank: int
     condition: float

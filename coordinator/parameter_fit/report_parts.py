@@ -1,5 +1,7 @@
 """Parts that `result.json`, `merged.json` and the report of fit-dynamics share."""
 
+from typing import Any, Self
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
@@ -11,6 +13,15 @@ class Part(BaseModel):
     """A part of a document: immutable, and without fields that the schema does not name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @classmethod
+    def of(cls, source: object, **fields: Any) -> Self:
+        """Return the part with these fields, and of the others those that `source` has, arrays as lists."""
+        own = {
+            name: getattr(source, name) for name in cls.model_fields.keys() - fields if hasattr(source, name)
+        }
+        plain = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in own.items()}
+        return cls(**plain, **fields)
 
 
 class BaseParameterPart(Part):
