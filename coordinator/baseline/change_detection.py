@@ -24,12 +24,12 @@ from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, re
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics
 from coordinator.identification.robot_refinement import KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
-from coordinator.synchronisation.motion_windows import RATE_HZ, Window, sensor_data, window
+from coordinator.synchronisation.motion_windows import Window, sensor_data, window
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import UNCALIBRATED
 from module_agent.model.perturbation import adjoint, perturbation_between
 from module_agent.model.read_only import frozen
-from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, settling_samples
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
 
 # Prior of corrected IMUs: scale and misalignment are the same in both sessions.
 TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5)
@@ -58,12 +58,12 @@ def tied_fits(known: BaselineRobot, later: BaselineRobot) -> TiedFits:
 
 def exploration(run: BaselineRobot, serials: Sequence[str]) -> list[Window]:
     """Return the readings of all modules during the last exploration of every joint, ordered by `serials`."""
-    margin = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
     moving = run.recording.motions(*MOVING)
     # All take part in a motion of the whole robot: it is one stretch of the recording.
     last = {("" if e.purpose == "whole" else e.serial, e.purpose): e for e in moving}
     events = [*last.values(), *run.recording.motions("repeat")]
-    return [window(run.recording, run.kinematics.clocks, serials, e, margin) for e in events]
+    clocks = run.kinematics.clocks
+    return [window(run.recording, clocks, serials, e, REFINEMENT_CUTOFF_HZ) for e in events]
 
 
 def corrected(windows: Sequence[Window], imus: ImuIntrinsics) -> list[Window]:

@@ -17,23 +17,23 @@ from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.torque_prediction import check_held_out
 from coordinator.identification.identified import HeldOutMotion, IdentificationError, Identified, Kinematics
 from coordinator.identification.inertia.agent_information import gathered
-from coordinator.identification.inertia.inertia import Robot, find_inertia, without_terms
-from coordinator.identification.inertia.robot_bodies import RobotBodies, robot_bodies
+from coordinator.identification.inertia.body_motion import Robot
+from coordinator.identification.inertia.inertia import find_inertia, without_terms
+from coordinator.identification.inertia.robot_bodies import robot_bodies
 from coordinator.identification.result_builder import build_result
 from coordinator.identification.robot_refinement import refine_robot
-from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
+from coordinator.identification.topology_observations import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import PairObservation, circle_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circle_observations
 from coordinator.recording.at_rest import rest_observation
-from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules
+from coordinator.recording.journal import JournalEvent, excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
 from coordinator.synchronisation.motion_windows import (
     INDEPENDENT_FRACTION,
-    RATE_HZ,
     Window,
     dynamic_windows,
     joined_motions,
@@ -47,8 +47,7 @@ from module_agent.model.errors import DataError
 from module_agent.model.files import replacing
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, JointMotion, settling_samples
-from module_agent.wire.messages import Estimate
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, JointMotion
 
 # The largest of some 30 IMU errors, in standard deviations, is below this for 99 of 100 IMUs.
 OUTLIER_ABOVE = 3.5
@@ -75,13 +74,12 @@ def identify(
         kinematics = revise(kinematics) if revise is not None else kinematics
     inertia, bodies, held_out = None, None, None
     if recording.latest_motions("dynamic"):
-        chain, serials = kinematics.fit.chain, kinematics.topology.serials
+        chain, serials, clocks = kinematics.fit.chain, kinematics.topology.serials, kinematics.clocks
         types = [recording.module_type(s) for s in serials]
-        floor = base_floor(recording, kinematics.clocks, kinematics.topology)
+        floor = base_floor(recording, clocks, kinematics.topology)
         covariance = kinematics.fit.covariance
         robot = Robot(chain, types, kinematics.refinement, covariance, floor, recording.torque)
-        windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
-        clocks = kinematics.clocks
+        windows = dynamic_windows(recording, clocks, serials, "dynamic")
         inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
         estimate = inertia.instrumental
         bodies = robot_bodies(
@@ -89,10 +87,12 @@ def identify(
         )
         if recording.latest_motions("held_out"):
             means = joined_motions([without_terms(one, estimate) for one in windows]).tau_nm.mean(axis=0)
-            windows = dynamic_windows(recording, kinematics.clocks, serials, "held_out")
+            windows = dynamic_windows(recording, clocks, serials, "held_out")
             motion = joined_motions([without_terms(one, estimate) for one in windows])
             held_out = _held_out(kinematics, motion, estimate.fit.phi, means)
-            bodies = _checked(bodies, kinematics, motion, means)
+            if bodies.fit is not None:
+                check = check_held_out(chain, bodies.fit.phi, motion, means)
+                bodies = bodies._replace(held_out_error=check.error.overall)
     result = build_result(recording, kinematics, inertia, held_out, bodies)
     return Identified(kinematics, inertia, bodies, held_out, result)
 
@@ -133,19 +133,17 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         for estimate in list(estimates.values())
         if estimate.note
     )
-    notes += search.notes
-    notes += _imu_outliers(topology.serials, refined, prior)
+    notes += (*search.notes, *_imu_outliers(topology.serials, refined, prior))
     return Kinematics(topology, first, refined, clocks, notes)
 
 
 def _imu_outliers(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:
     """Return notes on IMUs whose estimated errors are outliers of the prior: the model lacks an effect."""
-    ratio = dict(zip(serials, beyond(refined.intrinsics, prior), strict=True))
     return tuple(
-        f"{serial}: its IMU seems to have {ratio[serial]:.1f} times the error that its kind has. It is poor, "
+        f"{serial}: its IMU seems to have {ratio:.1f} times the error that its kind has. It is poor, "
         "or the robot's base or links give; lengths and axes near it may be worse than claimed"
-        for serial in serials
-        if ratio[serial] > OUTLIER_ABOVE
+        for serial, ratio in zip(serials, beyond(refined.intrinsics, prior), strict=True)
+        if ratio > OUTLIER_ABOVE
     )
 
 
@@ -169,16 +167,6 @@ def _explored(recording: Recording) -> list[str]:
     return rested
 
 
-def _estimate(recording: Recording, joint: str, observer: str, purpose: Purpose) -> Estimate | None:
-    """Return the observer's estimate of the latest motion of a joint with this purpose."""
-    motions = [e for e in recording.latest_motions(purpose) if e.serial == joint]
-    number = motions[-1].motion.motion_id if motions and motions[-1].motion is not None else -1
-    for ids, estimate in list(recording.estimates.get((joint, observer), {}).items()):
-        if ids[-1] == number:
-            return estimate
-    return None
-
-
 def _pairs(
     recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str], windows: Sequence[Window]
 ) -> list[PairObservation]:
@@ -186,19 +174,15 @@ def _pairs(
     whole = simultaneous_motion(recording, serials)
     if whole is not None:
         return circle_observations(serials, respond(recording, clocks, serials, whole))
-    sines = {
-        e.serial: i
-        for i, e in enumerate(_exploration_motions(recording, serials))
-        if e.purpose == "windowed_sine"
-    }
+    explored = zip(_exploration_motions(recording, serials), windows, strict=True)
+    sines = {e.serial: (e.motion, one) for e, one in explored if e.purpose == "windowed_sine"}
     pairs = []
     for joint in [s for s in serials if s in sines]:
-        q_mean = windows[sines[joint]].q_rad.mean(axis=0)
-        for observer in serials:
-            estimate = _estimate(recording, joint, observer, "windowed_sine")
-            if estimate is None or joint == observer:
-                continue
-            pair = circle_observation(estimate, q_mean)
+        motion, one = sines[joint]
+        for observer in [s for s in serials if s != joint and motion is not None]:
+            estimates = list(recording.estimates.get((joint, observer), {}).items())
+            of_motion = [e for ids, e in estimates if motion is not None and ids[-1] == motion.motion_id]
+            pair = circle_observation(of_motion[0], one.q_rad.mean(axis=0)) if of_motion else None
             pairs += [] if pair is None else [pair]
     return pairs
 
@@ -221,8 +205,8 @@ def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[J
 
 
 def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:
-    margin = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
-    return [window(recording, clocks, serials, e, margin) for e in _exploration_motions(recording, serials)]
+    motions = _exploration_motions(recording, serials)
+    return [window(recording, clocks, serials, e, REFINEMENT_CUTOFF_HZ) for e in motions]
 
 
 # ---------------------------------------------------------------------- dynamics
@@ -242,23 +226,9 @@ def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Ar
     )
 
 
-def _checked(bodies: RobotBodies, kinematics: Kinematics, motion: JointMotion, means: Array) -> RobotBodies:
-    """Return the bodies with their held-out torque error."""
-    if bodies.fit is None:
-        return bodies
-    check = check_held_out(kinematics.fit.chain, bodies.fit.phi, motion, means)
-    return bodies._replace(held_out_error=check.error.overall)
-
-
 def write_held_out(path: Path, held_out: HeldOutMotion) -> None:
     """Write the held-out torques as npz, whole or not at all."""
-    arrays: dict[str, Any] = {
-        "serials": np.array(held_out.serials),
-        "t_ns": held_out.module_ns,
-        "session_ns": held_out.session_ns,
-        "q_rad": held_out.q_rad,
-        "tau_measured_nm": held_out.tau_measured_nm,
-        "tau_predicted_nm": held_out.tau_predicted_nm,
-    }
+    names = ("session_ns", "q_rad", "tau_measured_nm", "tau_predicted_nm")
+    arrays: dict[str, Any] = {name: getattr(held_out, name) for name in names}
     with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, serials=np.array(held_out.serials), t_ns=held_out.module_ns, **arrays)

@@ -11,24 +11,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.batch_estimation.estimator import Refinement, refine_chain
+from coordinator.batch_estimation.estimator import refine_chain
 from coordinator.batch_estimation.link_compliance import compliance_jacobian, joined, loads_of
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import PairObservation, circle_observation
 from coordinator.recording.at_rest import rest_observation
-from coordinator.recording.journal import JournalEvent
+from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, window
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import MotionObservation, Topology, likely_topology
-from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import DataError
-from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
-from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, settling_samples
-from module_agent.wire.messages import Estimate
+from module_agent.model.imu_prior import IMU_PRIORS
+from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
+from module_agent.wire.messages import Estimate, MotionRecord
 
 # Least gain of the weighted sum of squares: far less than its noise.
 MIN_GAIN = 1e-3
@@ -65,14 +64,11 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
         return None
     topology = _part(forest, linked)
     rest = rest_observation(recording, topology.serials)
-    pairs = [
-        pair
-        for joint in moved
-        for observer in topology.serials
-        if joint in topology.serials
-        and joint != observer
-        and (pair := _pair(recording, joint, observer, topology, rest.q_rad)) is not None
-    ]
+    pairs = []
+    for joint in [s for s in moved if s in topology.serials]:
+        for observer in [s for s in topology.serials if s != joint]:
+            pair = _pair(recording, joint, observer, topology, rest.q_rad)
+            pairs += [] if pair is None else [pair]
     types = [recording.module_type(s) for s in topology.serials]
     fit = assemble(topology, types, pairs, [rest], MIN_GAIN).estimate
     return Preview(fit, tuple(moved), adjacent(fit.chain, moved))
@@ -98,9 +94,7 @@ def _observation(recording: Recording, joint: str, observer: str) -> MotionObser
     estimates = list(recording.estimates.get((joint, observer), {}).values())
     if not estimates:
         return None
-    slow_ids = {
-        e.motion.motion_id for e in _motions(recording, joint) if e.purpose == "constant" and e.motion
-    }
+    slow_ids = {motion.motion_id for purpose, motion in _motions(recording, joint) if purpose == "constant"}
     slow = [e for e in estimates if e.motion_ids[-1] in slow_ids]
     estimate, turned = (slow or estimates)[-1], _circle(estimates)
     axis = np.array(turned.circle.axis) if turned is not None and turned.circle is not None else None
@@ -125,17 +119,16 @@ def _pair(
     return circle_observation(estimate, at)
 
 
-def _motions(recording: Recording, serial: str) -> list[JournalEvent]:
-    return [
-        e for e in recording.journal if e.what == "motion" and e.serial == serial and e.motion is not None
-    ]
+def _motions(recording: Recording, serial: str) -> list[tuple[Purpose, MotionRecord]]:
+    events = [e for e in recording.journal if e.what == "motion" and e.serial == serial]
+    return [(e.purpose, e.motion) for e in events if e.motion is not None]
 
 
 def _mean_position(recording: Recording, joint: str, motion_ids: Sequence[int]) -> float:
     rows = [
-        recording.rows(joint, e.motion.start_row, e.motion.end_row)["position_rad"]
-        for e in _motions(recording, joint)
-        if e.motion is not None and e.motion.end_row is not None and e.motion.motion_id == motion_ids[-1]
+        recording.rows(joint, motion.start_row, motion.end_row)["position_rad"]
+        for _, motion in _motions(recording, joint)
+        if motion.end_row is not None and motion.motion_id == motion_ids[-1]
     ]
     if not rows or not len(rows[-1]):
         raise DataError(f"no rows of the motion of joint {joint} that was estimated")
@@ -178,9 +171,9 @@ class Previewer:
     second, and the cost grows with the square of their number.
     """
 
-    def __init__(self, recording: Recording, max_refined: int | None = None):
+    def __init__(self, recording: Recording, max_refined: float | None = None):
         self._recording = recording
-        self._max_refined = max_refined
+        self._max_refined = np.inf if max_refined is None else max_refined
         self._parts: dict[tuple[str, int, tuple[str, ...]], SensorData] = {}
 
     def preview(self, explored: Collection[str]) -> Preview | None:
@@ -192,26 +185,29 @@ class Previewer:
             DataError: see `preview`.
         """
         assembled = preview(self._recording, explored)
-        if assembled is None or not self._is_refined(assembled):
+        if assembled is None or len(assembled.adjacent) > self._max_refined:
             return assembled
         try:
-            return _refined(assembled, self._kinds(assembled), self._parts_of(assembled), self._prior)
+            return self._refined(assembled)
         except (DataError, np.linalg.LinAlgError):
             return assembled
 
-    def _is_refined(self, assembled: Preview) -> bool:
-        return self._max_refined is None or len(assembled.fit.chain.serials) <= self._max_refined
+    def _refined(self, assembled: Preview) -> Preview:
+        """Refine the rigid chain, then again with compliant links."""
+        chain, prior = assembled.fit.chain, IMU_PRIORS[self._recording.imu]
+        kinds = [self._recording.module_type(s) for s in chain.serials]
+        parts = self._parts_of(chain.serials)
+        data = thinned(parts, FITTED_EVERY)
+        rigid = refine_chain(chain, data, prior)
+        loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / RETAINED_EVERY), FITTED_EVERY)
+        refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(rigid.chain, data.joints, loads))
+        off = refined.chain.imu_home[:, :3, 3] - chain.imu_home[:, :3, 3]
+        # Of numbers that are not finite, too.
+        diverged = not np.linalg.norm(off, axis=1).max() < MAX_SHIFT_M
+        return assembled if diverged else assembled._replace(fit=refined.estimate)
 
-    @property
-    def _prior(self) -> ImuPrior:
-        return IMU_PRIORS[self._recording.imu]
-
-    def _kinds(self, assembled: Preview) -> list[ModuleType]:
-        return [self._recording.module_type(s) for s in assembled.fit.chain.serials]
-
-    def _parts_of(self, assembled: Preview) -> list[SensorData]:
-        """Return the samples of every slow and fast motion so far, modules as in the chain."""
-        serials = assembled.fit.chain.serials
+    def _parts_of(self, serials: Sequence[str]) -> list[SensorData]:
+        """Return the samples of every slow and fast motion of these modules so far."""
         events: dict[tuple[str, str], JournalEvent] = {}
         for event in self._recording.journal:
             if event.what == "motion" and event.purpose in ("constant", "windowed_sine"):
@@ -228,31 +224,12 @@ class Previewer:
         key = (event.serial, event.motion.motion_id, serials)
         if key not in self._parts:
             clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
-            margin_s = settling_samples(RATE_HZ, REFINEMENT_CUTOFF_HZ) / RATE_HZ
-            whole = filtered(window(self._recording, clocks, serials, event, margin_s), REFINEMENT_CUTOFF_HZ)
-            self._parts[key] = thinned([whole], RETAINED_EVERY)
+            one = window(self._recording, clocks, serials, event, REFINEMENT_CUTOFF_HZ)
+            self._parts[key] = thinned([filtered(one, REFINEMENT_CUTOFF_HZ)], RETAINED_EVERY)
         return self._parts[key]
 
 
-def _columns(part: SensorData, order: Sequence[int]) -> SensorData:
+def _columns(part: SensorData, at: Sequence[int]) -> SensorData:
     """Return the columns of some modules, in another order."""
-    at = np.array(order)
-    rates = None if part.imu_rates is None else part.imu_rates[:, at]
-    joints = (part.q_rad[:, at], part.qd_rad_s[:, at], part.qdd_rad_s2[:, at])
-    return SensorData(*joints, part.gyro_rad_s[:, at], part.accel_m_s2[:, at], rates)
-
-
-def _refined(
-    assembled: Preview, kinds: Sequence[ModuleType], parts: Sequence[SensorData], prior: ImuPrior
-) -> Preview:
-    """Refine the rigid chain, then again with compliant links."""
-    data = thinned(parts, FITTED_EVERY)
-    rigid = refine_chain(assembled.fit.chain, data, prior)
-    loads = joined(loads_of(rigid.chain, kinds, parts, RATE_HZ / RETAINED_EVERY), FITTED_EVERY)
-    refined = refine_chain(rigid.chain, data, prior, compliance_jacobian(rigid.chain, data.joints, loads))
-    return assembled if _has_diverged(assembled, refined) else assembled._replace(fit=refined.estimate)
-
-
-def _has_diverged(assembled: Preview, refined: Refinement) -> bool:
-    off = refined.chain.imu_home[:, :3, 3] - assembled.fit.chain.imu_home[:, :3, 3]
-    return not bool(np.linalg.norm(off, axis=1).max() < MAX_SHIFT_M)
+    q, qd, qdd, gyro, accel = (signal[:, at] for signal in part[:5])
+    return SensorData(q, qd, qdd, gyro, accel, None if part.imu_rates is None else part.imu_rates[:, at])

@@ -1,4 +1,5 @@
-"""Observations of which joint moved which IMU, from every slow motion of every joint in a recording.
+"""Observations of which joint moved which IMU, from every slow motion of every joint in a recording, and from
+a motion of all joints at once.
 
 Slow motions decide: near a resonance of the held joints a fast motion shakes modules that it does not carry,
 and leaves others at rest that it does. The feedback of all modules together is more informative than each
@@ -11,6 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.kinematics.simultaneous_motion import (
+    SimultaneousMotion,
+    SimultaneousResponse,
+    StillReading,
+    simultaneous_response,
+)
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, window
@@ -25,8 +32,9 @@ from coordinator.topology.topology import (
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import TOPOLOGY_CUTOFF_HZ, filtered_signals, settling_samples
-from module_agent.wire.messages import Estimate, MotionRecord
+from module_agent.signals.filtering import SIMULTANEOUS_CUTOFF_HZ, TOPOLOGY_CUTOFF_HZ, filtered_signals
+from module_agent.wire.feedback_rows import Rows
+from module_agent.wire.messages import Estimate
 
 KEEP_EVERY = 5
 # Up to this rotation of the joints in between, an axis counts as unchanged: the residual is some tenths of it
@@ -34,6 +42,44 @@ KEEP_EVERY = 5
 TURNED_RAD = 0.3
 # Sigma of a module's own rate ratio, which does not account for held joints that give by 20 to 30 %.
 OWN_SIGMA = 0.2
+
+
+def simultaneous_motion(recording: Recording, serials: Sequence[str]) -> JournalEvent | None:
+    """Return the latest motion of all these joints at once, as the event of the first of them.
+
+    None if not all took part, or if all were moved one by one as well: those motions are more informative.
+    """
+    latest = {e.serial: e for e in recording.motions("whole")}
+    alone = {e.serial for e in recording.motions("windowed_sine")}
+    if all(s in alone for s in serials):
+        return None
+    return latest[serials[0]] if serials and all(s in latest for s in serials) else None
+
+
+def respond(
+    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str], event: JournalEvent
+) -> SimultaneousResponse:
+    """Regress all IMUs' readings on all joints' motions; columns in the order of `serials`.
+
+    Raises:
+        DataError: see `simultaneous_response`; also a hole in the recording, or no rest.
+    """
+    one = window(recording, clocks, serials, event, SIMULTANEOUS_CUTOFF_HZ)
+    others = [one.gyro_rad_s, one.accel_m_s2]
+    signals = filtered_signals(one.q_rad, others, RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
+    rests = [recording.rest_rows(serial) for serial in serials]
+    missing = [serial for serial, rows in zip(serials, rests, strict=True) if not len(rows)]
+    if missing:
+        raise DataError(
+            f"no rest of {', '.join(missing)} was recorded: the offsets of its gyro are not known"
+        )
+    fields = ("gyro_rad_s", "accel_m_s2")
+    still = StillReading(*(np.array([_mean(rows, field) for rows in rests]) for field in fields))
+    motion = SimultaneousMotion(*signals.settled())
+    return simultaneous_response(motion, still, RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
+
+
+# ---------------------------------------------------------------------- motions of one joint
 
 
 class ObservedMotions(NamedTuple):
@@ -57,10 +103,17 @@ def observe(recording: Recording, serials: Sequence[str]) -> ObservedMotions:
     """
     sources = [s for s in serials if recording.modules[s].round_trips and recording.modules[s].rows.end_row]
     clocks = map_clocks({s: recording.modules[s].round_trips for s in sources}) if sources else {}
-    source = _Source(recording, clocks, {s: _gyro_offset(recording, s) for s in sources})
-    motions = {joint: _slow_feedback(source, joint) for joint in serials}
+    rests = {s: recording.rest_rows(s) for s in sources}
+    offsets = {s: _mean(rows, "gyro_rad_s") if len(rows) else np.zeros(3) for s, rows in rests.items()}
+    source = _Source(recording, clocks, offsets)
+    # A motion without the feedback of its own joint has no observers.
+    motions = {joint: [_of_motion(source, e) for e in slow_motions(recording, joint)] for joint in serials}
     first, _ = _evaluate(recording, serials, motions, None)
-    certain = {pair: _axis(one) for pair, one in first.items() if abs(one.log_odds) > DOUBTFUL_BELOW}
+    certain = {
+        pair: one.axis if one.moved else np.zeros(3)
+        for pair, one in first.items()
+        if abs(one.log_odds) > DOUBTFUL_BELOW
+    }
     axes = Axes(certain, _usual_pose(motions))
     observations, unmoved = _evaluate(recording, serials, motions, axes)
     observing = {observer for _, observer in observations}
@@ -74,11 +127,6 @@ def _usual_pose(motions: Mapping[str, Sequence["MotionFeedback"]]) -> dict[str, 
         for serial, q in zip(feedback.observers, feedback.q_mean_rad, strict=True):
             places.setdefault(serial, []).append(float(q))
     return {serial: float(np.median(positions)) for serial, positions in places.items()}
-
-
-def _axis(observation: MotionObservation) -> Array | None:
-    """Return the axis of a joint in the frame of an IMU, zero if it does not carry it."""
-    return observation.axis if observation.moved else np.zeros(3)
 
 
 def slow_motions(recording: Recording, joint: str) -> list[JournalEvent]:
@@ -115,17 +163,11 @@ class MotionFeedback(NamedTuple):
     offset_rad_s: Array
 
 
-def _slow_feedback(source: _Source, joint: str) -> list[MotionFeedback]:
-    """Return the slow motions of a joint; one whose own feedback is missing has no observers."""
-    return [_of_motion(source, event) for event in slow_motions(source.recording, joint)]
-
-
 def _of_motion(source: _Source, event: JournalEvent) -> MotionFeedback:
     observers = _observers(source, event)
     if event.serial not in observers:
         return MotionFeedback(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
-    edge = settling_samples(RATE_HZ, TOPOLOGY_CUTOFF_HZ)
-    one = window(source.recording, source.clocks, observers, event, edge / RATE_HZ)
+    one = window(source.recording, source.clocks, observers, event, TOPOLOGY_CUTOFF_HZ)
     signals = filtered_signals(one.q_rad, [one.gyro_rad_s], RATE_HZ, TOPOLOGY_CUTOFF_HZ, KEEP_EVERY)
     q, qd, _, gyro = signals.settled()
     offset = np.array([source.offsets[s] for s in observers])
@@ -179,14 +221,15 @@ def _of_joint(
     observed: dict[str, list[MotionObservation]] = {}
     why = "it was never commanded to move, or did not complete its motion"
     for feedback in motions:
-        assert feedback.event.motion is not None
+        motion = feedback.event.motion
+        assert motion is not None
         try:
             by_observer = by_feedback(feedback, axes)
         except NotMoved as error:
             why = str(error)
             continue
         for observer in serials:
-            own = _own_estimate(recording, feedback.event.motion, feedback.event.serial, observer)
+            own = recording.estimates.get((feedback.event.serial, observer), {}).get((motion.motion_id,))
             observation = _compared(by_observer.get(observer), own)
             if observation is not None:
                 observed.setdefault(observer, []).append(observation)
@@ -218,13 +261,12 @@ def _observers(source: _Source, event: JournalEvent) -> list[str]:
 
 
 def _covered(source: _Source, serials: Sequence[str], event: JournalEvent) -> bool:
-    margin_s = settling_samples(RATE_HZ, TOPOLOGY_CUTOFF_HZ) / RATE_HZ
     try:
-        joint_window = window(source.recording, source.clocks, serials, event, margin_s)
+        joint_window = window(source.recording, source.clocks, serials, event, TOPOLOGY_CUTOFF_HZ)
     except DataError:
         return False
     # A window is cut to the rows of all modules: one that stopped sending must not shorten the others'.
-    whole = window(source.recording, source.clocks, [event.serial], event, margin_s)
+    whole = window(source.recording, source.clocks, [event.serial], event, TOPOLOGY_CUTOFF_HZ)
     return len(joint_window.t_ns) > 0.9 * len(whole.t_ns)
 
 
@@ -235,15 +277,9 @@ def _observation(evidence: MotionEvidence, k: int) -> MotionObservation:
     return MotionObservation(moved, ratio, axis, float(evidence.ratio_sigma[k]), float(evidence.give[k]))
 
 
-def _own_estimate(recording: Recording, motion: MotionRecord, joint: str, observer: str) -> Estimate | None:
-    """Return a module's own estimate of one slow motion, if it has a valid one."""
-    estimate = recording.estimates.get((joint, observer), {}).get((motion.motion_id,))
-    return estimate if estimate is not None and not estimate.note else None
-
-
 def _compared(observed: MotionObservation | None, own: Estimate | None) -> MotionObservation | None:
-    """Return the observation from feedback, less certain if the module's own estimate differs."""
-    if own is None:
+    """Return the observation from feedback, less certain if the module's own valid estimate differs."""
+    if own is None or own.note:
         return observed
     if observed is None:
         return MotionObservation(own.moved, own.rate_ratio, None, OWN_SIGMA)
@@ -251,7 +287,5 @@ def _compared(observed: MotionObservation | None, own: Estimate | None) -> Motio
     return observed._replace(sigma=float(np.hypot(observed.sigma, max(0.0, apart - observed.sigma))))
 
 
-def _gyro_offset(recording: Recording, serial: str) -> Array:
-    """Average the gyro over the module's last rest; zero if there is none."""
-    rows = recording.rest_rows(serial)
-    return np.asarray(rows["gyro_rad_s"].astype(float).mean(axis=0)) if len(rows) else np.zeros(3)
+def _mean(rows: Rows, field: str) -> Array:
+    return np.asarray(rows[field].astype(float).mean(axis=0))

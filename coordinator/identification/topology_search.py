@@ -3,8 +3,13 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from coordinator.identification.simultaneous_exploration import respond, simultaneous_motion
-from coordinator.identification.topology_observations import ObservedMotions, observe, slow_motions
+from coordinator.identification.topology_observations import (
+    ObservedMotions,
+    observe,
+    respond,
+    simultaneous_motion,
+    slow_motions,
+)
 from coordinator.kinematics.simultaneous_motion import motion_observations
 from coordinator.recording.journal import excluded_modules
 from coordinator.recording.recording import Recording
@@ -39,7 +44,10 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
     """
     observed = _observed_motions(recording, serials)
     if not observed.observations:
-        raise TopologyError(_no_observations(observed), tuple(serials))
+        reasons = "; ".join(f"joint {serial}: {why}" for serial, why in observed.unmoved.items())
+        raise TopologyError(
+            f"no module observed any motion: the topology cannot be identified. {reasons}", tuple(serials)
+        )
     topology = find_topology(*_usable(observed))
     excluded = [f"{s} took no part: {why}" for s, why in excluded_modules(recording.journal).items()]
     return TopologyFound(topology, (*excluded, *_notes(observed, topology)))
@@ -62,7 +70,7 @@ def _observed_motions(recording: Recording, serials: Sequence[str]) -> ObservedM
     """Return the observations of the slow motions combined with those of a motion of all joints at once.
 
     Raises:
-        DataError: the motion of all joints cannot be evaluated; see `simultaneous_exploration.respond`.
+        DataError: the motion of all joints cannot be evaluated; see `respond`.
     """
     slow, whole = observe(recording, serials), simultaneous_motion(recording, serials)
     if whole is None:
@@ -78,11 +86,6 @@ def _usable(observed: ObservedMotions) -> tuple[dict[tuple[str, str], MotionObse
     """Return the observations of modules that are not silent, and the joints that did not move."""
     left = {p: o for p, o in observed.observations.items() if p[0] not in observed.silent}
     return left, [s for s in observed.unmoved if s not in observed.silent]
-
-
-def _no_observations(observed: ObservedMotions) -> str:
-    reasons = "; ".join(f"joint {serial}: {why}" for serial, why in observed.unmoved.items())
-    return f"no module observed any motion: the topology cannot be identified. {reasons}"
 
 
 def _notes(observed: ObservedMotions, topology: Topology) -> list[str]:

@@ -50,16 +50,17 @@ def window(
     clocks: Mapping[str, ClockMap],
     serials: Sequence[str],
     event: JournalEvent,
-    margin_s: float = 0.0,
+    cutoff_hz: float | None = None,
 ) -> Window:
-    """Resample all modules over one motion, at 250 Hz of session time, with a margin on either side.
+    """Resample all modules over one motion, at 250 Hz of session time.
 
-    The window is cut to what all modules have recorded.
+    The margins on either side are those in which a low-pass of `cutoff_hz` settles; None for none. The window
+    is cut to what all modules have recorded.
 
     Raises:
         DataError: a hole in the recording, with the module or its column.
     """
-    start_ns, end_ns = span(recording, clocks, event, margin_s)
+    start_ns, end_ns = span(recording, clocks, event, cutoff_hz)
     tracks = [_track(recording, clocks[s], s, event, start_ns, end_ns) for s in serials]
     start_ns = max(start_ns, *(int(t[0]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
     end_ns = min(end_ns, *(int(t[-1]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
@@ -103,9 +104,9 @@ def _step(position: Array) -> float:
 
 
 def span(
-    recording: Recording, clocks: Mapping[str, ClockMap], event: JournalEvent, margin_s: float
+    recording: Recording, clocks: Mapping[str, ClockMap], event: JournalEvent, cutoff_hz: float | None
 ) -> tuple[int, int]:
-    """Return start and end of a motion in session time, with a margin on either side.
+    """Return start and end of a motion in session time, with margins as those of `window`.
 
     Raises:
         DataError: no row of the motion is recorded.
@@ -117,7 +118,7 @@ def span(
     if not len(rows):
         raise DataError(_no_row(event.serial, event))
     session = clocks[event.serial].to_session(rows["t_ns"][[0, -1]].astype(np.int64))
-    margin_ns = round(margin_s * 1e9)
+    margin_ns = round(settling_samples(RATE_HZ, cutoff_hz) / RATE_HZ * 1e9) if cutoff_hz else 0
     return int(session[0]) - margin_ns, int(session[1]) + margin_ns
 
 
@@ -226,8 +227,7 @@ def dynamic_windows(
     steps = {event.step: event for event in recording.motions(*purposes)}
     if not steps:
         raise DataError(f"the recording holds no motion for {' or '.join(purposes)}")
-    margin = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
-    return [window(recording, clocks, serials, event, margin) for event in steps.values()]
+    return [window(recording, clocks, serials, event, DYNAMIC_CUTOFF_HZ) for event in steps.values()]
 
 
 def dynamic_motion(

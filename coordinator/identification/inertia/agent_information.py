@@ -11,13 +11,13 @@ import numpy as np
 
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import ModuleRecord, Recording
-from coordinator.synchronisation.motion_windows import RATE_HZ, STEP_NS, span, window
+from coordinator.synchronisation.motion_windows import STEP_NS, span, window
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.chain import Chain
 from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import DYNAMIC_CUTOFF_HZ, settling_samples
+from module_agent.signals.filtering import DYNAMIC_CUTOFF_HZ
 from module_agent.torque_information.serialisation import chain_of, chain_part, clock_part, clocks_of, unpack
 from module_agent.wire.information_messages import MAX_MODULES, InformationRequest, RowRange, SpanPart
 
@@ -27,7 +27,6 @@ SAME_CHAIN, SAME_CLOCK_NS = 1e-9, 2.0
 AGREES_BELOW = 1e-10
 # Rows around the motion that are kept too: the clock maps are not final yet.
 _SPARE_NS = 100_000_000
-_MARGIN_S = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ) / RATE_HZ
 
 
 class AgentInformation(NamedTuple):
@@ -45,9 +44,7 @@ class AgentInformation(NamedTuple):
 
 
 def dynamic_steps(recording: Recording) -> list[JournalEvent]:
-    """Return the motions that inertia is identified from: of every step the latest, as in
-    `dynamic_motion`.
-    """
+    """Return the motions that inertia is identified from: of every step the latest, as `dynamic_windows`."""
     return list({event.step: event for event in recording.motions("dynamic")}.values())
 
 
@@ -58,16 +55,17 @@ def rows_to_keep(recording: Recording, serials: Sequence[str], event: JournalEve
         DataError: a module has no rows of it, or no round trip by which to tell when it was.
     """
     clocks = map_clocks({s: recording.modules[s].trips for s in serials})
-    start_ns, end_ns = span(recording, clocks, event, _MARGIN_S)
-    ranges = []
-    for serial in serials:
+    start_ns, end_ns = span(recording, clocks, event, DYNAMIC_CUTOFF_HZ)
+
+    def around(serial: str) -> RowRange:
         record = recording.modules[serial]
-        around = clocks[serial].module_span(start_ns - _SPARE_NS, end_ns + _SPARE_NS, STEP_NS)
-        first, end = record.rows.range_between(*around)
+        times = clocks[serial].module_span(start_ns - _SPARE_NS, end_ns + _SPARE_NS, STEP_NS)
+        first, end = record.rows.range_between(*times)
         if first == end or record.rows.missing(first, end):
             raise DataError(f"rows of {serial} in the motion of {event.step} are missing")
-        ranges.append(RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end))
-    return tuple(ranges)
+        return RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end)
+
+    return tuple(around(serial) for serial in serials)
 
 
 def question(
@@ -98,8 +96,8 @@ def _span_part(
     recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap], event: JournalEvent
 ) -> SpanPart:
     assert event.motion is not None
-    start_ns, end_ns = span(recording, clocks, event, _MARGIN_S)
-    t_ns = window(recording, clocks, chain.serials, event, _MARGIN_S).t_ns
+    start_ns, end_ns = span(recording, clocks, event, DYNAMIC_CUTOFF_HZ)
+    t_ns = window(recording, clocks, chain.serials, event, DYNAMIC_CUTOFF_HZ).t_ns
     return SpanPart(
         motion_id=event.motion.motion_id,
         start_ns=start_ns,
@@ -165,14 +163,11 @@ def _asked(recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap]) -
     """Return the latest request with this chain, these clocks and these motions, or why there is none."""
     if not recording.questions:
         return None, ""
+    motions = {e.motion.motion_id for e in dynamic_steps(recording) if e.motion is not None}
     for digest, asked in reversed(recording.questions.items()):
-        if _is_same(asked, chain, clocks) and _is_of(asked, dynamic_steps(recording)):
+        if _is_same(asked, chain, clocks) and {m.motion_id for m in asked.motions} == motions:
             return digest, ""
     return None, "the agents were asked with another chain, other clocks or other motions"
-
-
-def _is_of(asked: InformationRequest, steps: Sequence[JournalEvent]) -> bool:
-    return {m.motion_id for m in asked.motions} == {e.motion.motion_id for e in steps if e.motion is not None}
 
 
 def _is_same(asked: InformationRequest, chain: Chain, clocks: Mapping[str, ClockMap]) -> bool:
@@ -183,17 +178,13 @@ def _is_same(asked: InformationRequest, chain: Chain, clocks: Mapping[str, Clock
     ends = np.array([t for motion in asked.motions for t in (motion.start_ns, motion.end_ns)])
     late = [
         np.abs(there.to_module(ends) - clocks[serial].to_module(ends)).max()
-        for serial, there in zip(chain_asked.serials, clocks_of(asked.clocks), strict=True)
+        for serial, there in zip(chain.serials, clocks_of(asked.clocks), strict=True)
     ]
     return off <= SAME_CHAIN and float(max(late)) <= SAME_CLOCK_NS
 
 
 def _answer(module: ModuleRecord, digest: bytes) -> JointInformation:
-    """Put the parts of an answer together.
-
-    Raises:
-        DataError: it is not whole, or not information.
-    """
+    """Put the parts of an answer together; a DataError says that it is not whole, or not information."""
     parts = module.information.get(digest, {})
     block = b"".join(parts[offset].part for offset in sorted(parts))
     total = next(iter(parts.values())).total_bytes if parts else 0

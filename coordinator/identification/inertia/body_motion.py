@@ -20,10 +20,10 @@ from coordinator.batch_estimation.imu_prediction import (
     given,
 )
 from coordinator.batch_estimation.link_compliance import link_loads, turns_under, with_hinges_moved
-from coordinator.batch_estimation.sensor_data import BaseMotion, NoiseFloor, outstanding
+from coordinator.batch_estimation.sensor_data import BaseMotion, NoiseFloor, SensorData, outstanding
 from coordinator.dynamics.body_regressor import BodyTrack, body_tracks
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window
-from module_agent.model.catalogue import ModuleType
+from module_agent.model.catalogue import ModuleType, TorqueKind
 from module_agent.model.chain import Array, Chain
 from module_agent.model.perturbation import cross
 from module_agent.signals.filtering import differentiate, filtered_signals
@@ -34,21 +34,24 @@ MotionSource = Literal["encoders", "structure", "imus"]
 _ROUNDS = 2
 
 
-class Readings(NamedTuple):
-    """One stretch of time through a single low-pass: joints (m, n), and IMUs (m, n, 3).
+class Robot(NamedTuple):
+    """The robot whose inertia is to be identified.
 
-    The IMUs are corrected for their estimated errors and delays.
+    chain: n joints. kinds: (n,) their modules' types. refined: the refinement of links and IMUs. covariance:
+    (6 n, 6 n) of the chain's perturbation. floor: noise at rest of the IMU on the base, None without one.
+    torque: whether the torque sensors are calibrated.
     """
 
-    q_rad: Array
-    qd_rad_s: Array
-    qdd_rad_s2: Array
-    gyro_rad_s: Array
-    accel_m_s2: Array
+    chain: Chain
+    kinds: Sequence[ModuleType]
+    refined: Refinement
+    covariance: Array
+    floor: NoiseFloor | None
+    torque: TorqueKind = "uncalibrated"
 
 
-def readings(one: Window, refined: Refinement, cutoff_hz: float) -> Readings:
-    """Filter a window as `filtered_motion` does, and correct its IMUs for their estimated errors."""
+def readings(one: Window, refined: Refinement, cutoff_hz: float) -> SensorData:
+    """Filter a window as `filtered_motion` does; correct its IMUs for their estimated errors and delays."""
     others = [one.gyro_rad_s, one.accel_m_s2]
     q, qd, qdd, (gyro, accel), kept = filtered_signals(one.q_rad, others, RATE_HZ, cutoff_hz)
     imus = refined.intrinsics
@@ -57,37 +60,28 @@ def readings(one: Window, refined: Refinement, cutoff_hz: float) -> Readings:
     force = _undone(imus.accel_matrix, accel - imus.accel_bias_m_s2)
     from_acceleration = np.einsum("nij,mnj->mni", imus.g_sensitivity_s_m, force)
     rate = _undone(imus.gyro_matrix, gyro - imus.gyro_bias_rad_s - from_acceleration)
-    return Readings(*(signal[kept] for signal in (q, qd, qdd, rate, force)))
+    q, qd, qdd, rate, force = (signal[kept] for signal in (q, qd, qdd, rate, force))
+    return SensorData(q, qd, qdd, rate, force)
 
 
-def body_motion_tracks(
-    chain: Chain,
-    kinds: Sequence[ModuleType],
-    refined: Refinement,
-    floor: NoiseFloor | None,
-    measured: Readings,
-    imus: bool,
-) -> list[BodyTrack]:
+def body_motion_tracks(robot: Robot, measured: SensorData, imus: bool) -> list[BodyTrack]:
     """Return the motion of all bodies.
 
     Args:
-        chain: n joints. kinds: their modules' types.
-        refined: the refinement of this robot: links, hinges and IMUs.
-        floor: noise of the IMU on the base; None without one.
+        robot: n joints, with the refinement of links, hinges and IMUs.
         measured: one stretch of time without a gap.
         imus: whether the residuals of the IMUs are used too.
     """
-    joints = measured.q_rad, measured.qd_rad_s, measured.qdd_rad_s2
-    base = None if floor is None else _base(measured, floor)
-    turns = _turns(chain, kinds, refined, joints, base)
-    bodies = body_motions(chain, *joints, base, turns)
-    tracks = body_tracks(chain, measured.q_rad, bodies, turns)
+    base = None if robot.floor is None else _base(measured, robot.floor)
+    turns = _turns(robot, measured, base)
+    bodies = body_motions(robot.chain, *measured.joints, base, turns)
+    tracks = body_tracks(robot.chain, measured.q_rad, bodies, turns)
     if not imus:
         return tracks
+    # Of several IMUs on a body the first counts.
+    riders = {robot.chain.carrier(k): k for k in reversed(range(len(tracks)))}
     return [
-        track
-        if (rider := _rider(chain, i)) is None
-        else _corrected(chain=chain, bodies=bodies, turns=turns, measured=measured, track=track, rider=rider)
+        _corrected(robot.chain, bodies, turns, measured, track, riders[i]) if i in riders else track
         for i, track in enumerate(tracks)
     ]
 
@@ -96,44 +90,31 @@ def _undone(matrix: Array, read: Array) -> Array:
     return np.asarray(np.einsum("nij,mnj->mni", np.linalg.inv(matrix), read))
 
 
-def _base(measured: Readings, floor: NoiseFloor) -> BaseMotion:
+def _base(measured: SensorData, floor: NoiseFloor) -> BaseMotion:
     omega = outstanding(measured.gyro_rad_s[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
     force = outstanding(measured.accel_m_s2[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
     return BaseMotion(omega, differentiate(omega, RATE_HZ), force)
 
 
-def _turns(
-    chain: Chain,
-    kinds: Sequence[ModuleType],
-    refined: Refinement,
-    joints: tuple[Array, Array, Array],
-    base: BaseMotion | None,
-) -> LinkTurns:
+def _turns(robot: Robot, measured: SensorData, base: BaseMotion | None) -> LinkTurns:
     """Return how links turn; none if the refinement did not estimate compliance."""
-    links = list(chain.linked)
+    links = list(robot.chain.linked)
     turns: LinkTurns = {}
-    if len(refined.compliance) != 5 * len(links):
+    if len(robot.refined.compliance) != 5 * len(links):
         return turns
-    compliance, hinges = np.split(refined.compliance, [2 * len(links)])
+    compliance, hinges = np.split(robot.refined.compliance, [2 * len(links)])
     for _ in range(_ROUNDS):
-        bodies = body_motions(chain, *joints, base, turns)
-        loads = link_loads(
-            chain=chain, kinds=kinds, bodies=bodies, q_rad=joints[0], rate_hz=RATE_HZ, turns=turns
-        )
+        bodies = body_motions(robot.chain, *measured.joints, base, turns)
+        loads = link_loads(robot.chain, robot.kinds, bodies, measured.q_rad, RATE_HZ, turns)
         turns = turns_under(with_hinges_moved([loads], links, hinges)[0], links, compliance)
     return turns
-
-
-def _rider(chain: Chain, body: int) -> int | None:
-    """Return the module whose IMU is on a body, None if there is none."""
-    return next((k for k in range(len(chain.serials)) if chain.carrier(k) == body), None)
 
 
 def _corrected(
     chain: Chain,
     bodies: Sequence[BodyMotion],
     turns: LinkTurns,
-    measured: Readings,
+    measured: SensorData,
     track: BodyTrack,
     rider: int,
 ) -> BodyTrack:

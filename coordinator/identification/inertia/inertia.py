@@ -6,19 +6,19 @@ residual is used.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from typing import NamedTuple, get_args
 
 import numpy as np
 
-from coordinator.batch_estimation.estimator import Refinement
-from coordinator.batch_estimation.sensor_data import NoiseFloor
+from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.dynamics.body_regressor import track_regressor
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.inertia.agent_information import AgentInformation
 from coordinator.identification.inertia.body_motion import (
     MotionSource,
-    Readings,
+    Robot,
     body_motion_tracks,
     readings,
 )
@@ -36,8 +36,7 @@ from coordinator.synchronisation.motion_windows import (
     Window,
     filtered_window,
 )
-from module_agent.model.catalogue import ModuleType, TorqueKind
-from module_agent.model.chain import Array, Chain
+from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress, merge
 from module_agent.model.regressor import torque_regressor
 from module_agent.signals.filtering import DYNAMIC_CUTOFF_HZ, JointMotion
@@ -52,36 +51,15 @@ _SOURCE_NAMES: dict[MotionSource, str] = {
     "structure": "encoders, base motion and link compliance",
     "imus": "encoders, base motion, link compliance and IMUs",
 }
-_NAMES: dict[Term, str] = {
-    "lag": "a lag",
-    "offset": "an offset",
-    "viscous": "viscous friction",
-    "coulomb": "Coulomb friction",
-}
-_SHOWN: dict[Term, tuple[str, float]] = {
-    "lag": ("ms", 1e3),
-    "offset": ("mNm", 1e3),
-    "viscous": ("Nm s/rad", 1.0),
-    "coulomb": ("Nm", 1.0),
+# How terms are shown: their name, their unit, and the factor to it from SI units.
+_SHOWN: dict[Term, tuple[str, str, float]] = {
+    "lag": ("a lag", "ms", 1e3),
+    "offset": ("an offset", "mNm", 1e3),
+    "viscous": ("viscous friction", "Nm s/rad", 1.0),
+    "coulomb": ("Coulomb friction", "Nm", 1.0),
 }
 
 Agents = Callable[[tuple[JointInformation, ...]], AgentInformation]
-
-
-class Robot(NamedTuple):
-    """The robot whose inertia is to be identified.
-
-    chain: n joints. kinds: (n,) their modules' types. refined: the refinement of links and IMUs. covariance:
-    (6 n, 6 n) of the chain's perturbation. floor: noise at rest of the IMU on the base, None without one.
-    torque: whether the torque sensors are calibrated.
-    """
-
-    chain: Chain
-    kinds: Sequence[ModuleType]
-    refined: Refinement
-    covariance: Array
-    floor: NoiseFloor | None
-    torque: TorqueKind = "uncalibrated"
 
 
 class Inertia(NamedTuple):
@@ -109,11 +87,9 @@ class Inertia(NamedTuple):
         for k, term in enumerate(READING_TERMS):
             used = terms.used[:, k]
             if used.any():
-                unit, size = _SHOWN[term]
+                name, unit, size = _SHOWN[term]
                 values = ", ".join(f"{size * value:.3g}" for value in terms.value[used, k])
-                lines.append(
-                    f"torque readings of {int(used.sum())} joints have {_NAMES[term]}: {values} {unit}"
-                )
+                lines.append(f"torque readings of {int(used.sum())} joints have {name}: {values} {unit}")
         return lines
 
     @property
@@ -140,15 +116,12 @@ def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None 
     shared: AgentInformation | None = None
     gathered: tuple[JointInformation, ...] = ()
     for source in MOTION_SOURCES:
-        total = pieces[0][source]
-        for piece in pieces[1:]:
-            total = merge(total, piece[source])
+        total = reduce(merge, (piece[source] for piece in pieces))
         if source == "encoders":
             shared = agents(total) if agents is not None else None
             gathered = total = shared.joints if shared is not None else total
-        fits[source] = solve_instrumental_variables(
-            total, prior, INDEPENDENT_FRACTION, SCALE_SIGMA[robot.torque]
-        )
+        scale_sigma = SCALE_SIGMA[robot.torque]
+        fits[source] = solve_instrumental_variables(total, prior, INDEPENDENT_FRACTION, scale_sigma)
     noise = {source: fit.fit.torque_sigma_nm for source, fit in fits.items()}
     best: MotionSource = "encoders"
     for source in MOTION_SOURCES[1:]:
@@ -167,17 +140,21 @@ def without_terms(one: Window, fit: InstrumentalFit) -> JointMotion:
     return motion._replace(tau_nm=torque)
 
 
-def _information(robot: Robot, one: Window) -> dict[MotionSource, tuple[JointInformation, ...]]:
+def _encoder_rows(robot: Robot, one: Window) -> tuple[JointMotion, Array, Array]:
+    """Return a window's motion, its rigid-body regressor, and this with the columns of the torque terms."""
     motion = filtered_window(one)
     rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     terms = term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)
-    information: dict[MotionSource, tuple[JointInformation, ...]] = {
-        "encoders": compress(np.concatenate([rigid, terms], axis=2), motion.tau_nm)
-    }
+    return motion, rigid, np.concatenate([rigid, terms], axis=2)
+
+
+def _information(robot: Robot, one: Window) -> dict[MotionSource, tuple[JointInformation, ...]]:
+    motion, rigid, rows = _encoder_rows(robot, one)
+    information = {MOTION_SOURCES[0]: compress(rows, motion.tau_nm)}
     read = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
     for source in MOTION_SOURCES[1:]:
         apart = _regressor(robot, read, source) - rigid
-        information[source] = compress(np.concatenate([rigid, terms, apart], axis=2), motion.tau_nm)
+        information[source] = compress(np.concatenate([rows, apart], axis=2), motion.tau_nm)
     return information
 
 
@@ -194,14 +171,12 @@ def _considered(
     the range of the rows.
     """
     size = fit.informed_phi.size
-    offsets_nm = _offsets_nm(robot, fit)
+    offsets_nm = np.diag(_offsets_nm(robot, fit))
     joints = [ProjectedRows(scaled(piece, one)) for piece, one in zip(gathered, fit.scale.value, strict=True)]
     for one in windows:
-        motion = filtered_window(one)
-        rigid = torque_regressor(robot.chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
-        rows = np.concatenate([rigid, term_columns(motion, RATE_HZ, DYNAMIC_CUTOFF_HZ)], axis=2)
+        motion, rigid, rows = _encoder_rows(robot, one)
         effects = chain_effects(robot.chain, robot.covariance, fit.informed_phi, motion)
-        omitted = np.broadcast_to(np.diag(offsets_nm), (len(motion.t_ns), *np.diag(offsets_nm).shape))
+        omitted = np.broadcast_to(offsets_nm, (len(motion.t_ns), *offsets_nm.shape))
         effects = np.concatenate([effects, omitted], axis=2)
         departure = np.zeros_like(motion.tau_nm)
         if source != "encoders":
@@ -230,16 +205,8 @@ def _offsets_nm(robot: Robot, fit: InstrumentalFit) -> Array:
     return np.where(fit.terms.used[:, offset] | (likely == 0.0), 0.0, either)
 
 
-def _regressor(robot: Robot, seen: Readings, source: MotionSource) -> Array:
-    tracks = body_motion_tracks(
-        chain=robot.chain,
-        kinds=robot.kinds,
-        refined=robot.refined,
-        floor=robot.floor,
-        measured=seen,
-        imus=source == "imus",
-    )
-    return track_regressor(tracks)
+def _regressor(robot: Robot, seen: SensorData, source: MotionSource) -> Array:
+    return track_regressor(body_motion_tracks(robot, seen, imus=source == "imus"))
 
 
 def _level(noise_nm: Array) -> float:

@@ -102,39 +102,16 @@ def robot_bodies(
         common_errors=common,
         tolerance=ESTIMATED_CHAIN_TOLERANCE,
     )
-    fit, note = None, ""
+    fit, note, bodies = None, "", tuple[Body, ...]()
+    informed: tuple[Array, Array] | tuple[()] = ()
     try:
         prior = module_prior(chain, types)
-        fit = fit_physical(
-            information,
-            prior,
-            least_squares,
-            independent_fraction,
-            effects=effects,
-        )
+        fit = fit_physical(information, prior, least_squares, independent_fraction, effects=effects)
     except NotSolvedError as error:
         note = f"{error}; the files have the consistent bodies nearest to the least-squares parameters"
-    if fit is None:
-        results = identifiabilities(base, inertial_units(joints))
-        return RobotBodies(
-            serials=chain.serials,
-            frames=frames,
-            base=base,
-            identifiabilities=results,
-            fit=None,
-            bodies=(),
-            note=note,
-        )
-    into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
-    informed_sigma = np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
-    results = identifiabilities(base, inertial_units(joints), into @ fit.phi, informed_sigma)
-    bodies = bodies_in_frames(fit.pseudo, link_homes(chain))
-    return RobotBodies(
-        serials=chain.serials,
-        frames=frames,
-        base=base,
-        identifiabilities=results,
-        fit=fit,
-        bodies=bodies,
-        note=note,
-    )
+    if fit is not None:
+        into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in frames))
+        informed = into @ fit.phi, np.sqrt(np.diagonal(into @ fit.covariance @ into.T))
+        bodies = bodies_in_frames(fit.pseudo, link_homes(chain))
+    results = identifiabilities(base, inertial_units(joints), *informed)
+    return RobotBodies(chain.serials, frames, base, results, fit, bodies, note)

@@ -19,7 +19,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Identified
 from coordinator.identification.identify import base_floor, identify
 from coordinator.identification.inertia.body_motion import MotionSource
-from coordinator.identification.inertia.inertia import Robot as MeasuredRobot
+from coordinator.identification.inertia.body_motion import Robot as MeasuredRobot
 from coordinator.identification.inertia.inertia import find_inertia
 from coordinator.parameter_fit.base_parameters import joint_frames
 from coordinator.parameter_fit.least_squares import solve_information

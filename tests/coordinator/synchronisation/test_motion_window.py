@@ -106,9 +106,9 @@ def test_a_clock_that_is_wrong_by_a_millisecond_shows(wire: SimpleNamespace) -> 
 
 def test_a_margin_extends_the_motion_as_far_as_all_modules_have_rows(wire: SimpleNamespace) -> None:
     recording = _recording(wire)
-    inside = window(recording, CLOCKS, SERIALS, _event(wire), margin_s=0.5)
+    inside = window(recording, CLOCKS, SERIALS, _event(wire), cutoff_hz=4.0)  # half a second
     assert (inside.t_ns[0], inside.t_ns[-1]) == (275 * STEP_NS, 1123 * STEP_NS)
-    beyond = window(recording, CLOCKS, SERIALS, _event(wire), margin_s=60.0)
+    beyond = window(recording, CLOCKS, SERIALS, _event(wire), cutoff_hz=1.0 / 30.0)  # a minute
     # The last module to begin has its first row at 0.4 ms; the first to end its last IMU sample 1.7 ms early.
     assert beyond.t_ns[0] == 400_000
     assert 1499 * STEP_NS - IMU_LATE_NS - STEP_NS <= beyond.t_ns[-1] <= 1499 * STEP_NS - IMU_LATE_NS
@@ -137,7 +137,7 @@ def test_a_module_without_any_row_in_the_motion_is_named(wire: SimpleNamespace) 
 
 
 def test_filtered_data_is_the_motion_and_its_derivative(wire: SimpleNamespace) -> None:
-    one = window(_recording(wire), CLOCKS, SERIALS, _event(wire), margin_s=0.3)
+    one = window(_recording(wire), CLOCKS, SERIALS, _event(wire), cutoff_hz=20.0 / 3.0)
     data = sensor_data([one, one], cutoff_hz=15.0, keep_every=5)
     samples = data.q_rad.shape[0]
     assert data.gyro_rad_s.shape == data.accel_m_s2.shape == (samples, 3, 3)
