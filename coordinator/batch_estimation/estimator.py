@@ -14,13 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.batch_estimation.imu_intrinsics import (
-    ImuIntrinsics,
-    mixing,
-    perfect,
-    read,
-    slopes,
-)
+from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, mixing, perfect, read, slopes
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian, rigid
@@ -46,6 +40,7 @@ MIN_RMS = 1e-6
 MAX_LAG = 100
 
 Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 
 class Refinement(NamedTuple):
@@ -74,6 +69,19 @@ class Refinement(NamedTuple):
         return self.estimate.chain
 
 
+class _Problem(NamedTuple):
+    """The samples, and what is known before of the IMUs' errors and of the links' compliances."""
+
+    data: SensorData
+    prior: ImuPrior
+    flex: ComplianceJacobian
+
+    @property
+    def free(self) -> Mask:
+        """Which of an IMU's errors are estimated."""
+        return self.prior.sigmas > 0.0
+
+
 class _State(NamedTuple):
     chain: Chain
     imus: ImuIntrinsics
@@ -81,12 +89,12 @@ class _State(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """Predictions of a chain for the joints' motion: its bodies' motions, and the readings of ideal IMUs."""
+    """Predictions for the joints' motion: the bodies' (also with that of the base), ideal IMUs, residuals."""
 
     bodies: list[BodyMotion]
-    ideal: ImuReadings
     shaken: list[BodyMotion] | None
-    carried: ImuReadings
+    ideal: ImuReadings
+    residuals: tuple[Array, Array]
 
 
 class _Normal(NamedTuple):
@@ -119,52 +127,43 @@ def refine_chain(
     count = len(chain.serials)
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
-    flex = flex if flex is not None else rigid(count, len(data.q_rad))
-    state = _State(chain, perfect(count), np.zeros(len(flex.links)))
+    problem = _Problem(data, prior, flex if flex is not None else rigid(count, len(data.q_rad)))
+    state = _State(chain, perfect(count), np.zeros(len(problem.flex.links)))
     shape = (len(data.motions), count)
-    sigmas = np.full(shape, 0.01), np.full(shape, 0.1)
+    sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
     used = 0
     for used in range(1, ITERATIONS + 1):
-        expected = _expected(state, data, flex)
-        gyro, accel = _residuals(state, data, expected)
+        expected = _expected(problem, state)
         if used > 1:
-            sigmas = _spread(data, gyro), _spread(data, accel)
-        normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), sigmas)
-        step, nuisance, spectrum = _solve(normal)
+            sigmas = [_spread(data, residual) for residual in expected.residuals]
+        step, nuisance, spectrum = _solve(_normal_equations(problem, state, expected, sigmas))
         if expected.shaken is not None:
-            seen = expected._replace(bodies=expected.shaken)
-            shaken = _normal_equations(state, data, prior, flex, seen, (gyro, accel), sigmas)
-            step += _along_unknown(shaken, spectrum)
-        state = _moved(state, step, nuisance, prior)
+            shaken = expected._replace(bodies=expected.shaken)
+            step += _along_unknown(_normal_equations(problem, state, shaken, sigmas), spectrum)
+        state = _moved(problem, state, step, nuisance)
         if used > 2 and float(np.abs(step).max()) < CONVERGED:
             break
-    expected = _expected(state, data, flex)
-    gyro, accel = _residuals(state, data, expected)
+    expected = _expected(problem, state)
+    white = [_spread(data, residual) for residual in expected.residuals]
     # Systematic errors repeat with the motion: their samples are not independent.
-    believed = _believed(data, gyro), _believed(data, accel)
-    normal = _normal_equations(state, data, prior, flex, expected, (gyro, accel), believed)
-    _, _, spectrum = _solve(normal)
-    white = _spread(data, gyro), _spread(data, accel)
-    by_noise = _normal_equations(state, data, prior, flex, expected, (gyro, accel), white)
-    return _report(state, spectrum, _reduced(by_noise)[0], _rms(gyro), _rms(accel), used)
+    believed = [
+        spread * _repeats(data, residual) for spread, residual in zip(white, expected.residuals, strict=True)
+    ]
+    spectrum = _solve(_normal_equations(problem, state, expected, believed))[2]
+    by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
+    return _report(state, spectrum, by_noise, [_rms(residual) for residual in expected.residuals], used)
 
 
-def _expected(state: _State, data: SensorData, flex: ComplianceJacobian) -> _Expected:
-    chain = state.chain
+def _expected(problem: _Problem, state: _State) -> _Expected:
+    data, chain, base = problem.data, state.chain, problem.data.base
     bodies = body_motions(chain, *data.smooth)
-    ideal = readings_on(chain, bodies)
-    base = data.base
-    motions = None if base is None else body_motions(chain, *data.smooth, base)
+    shaken = None if base is None else body_motions(chain, *data.smooth, base)
     carried = readings_on(chain, body_motions(chain, *data.joints, base))
-    given = np.tensordot(state.compliance, flex.slopes, axes=1).transpose(1, 2, 0)
-    carried = ImuReadings(carried.gyro_rad_s + given[..., :3], carried.accel_m_s2 + given[..., 3:])
-    return _Expected(bodies, ideal, motions, carried)
-
-
-def _residuals(state: _State, data: SensorData, expected: _Expected) -> tuple[Array, Array]:
-    ideal = expected.carried
-    gyro, accel = read(state.imus, ideal.gyro_rad_s, ideal.accel_m_s2, data.imu_rates)
-    return data.gyro_rad_s - gyro, data.accel_m_s2 - accel
+    given = np.tensordot(state.compliance, problem.flex.slopes, axes=1).transpose(1, 2, 0)
+    true = carried.gyro_rad_s + given[..., :3], carried.accel_m_s2 + given[..., 3:]
+    gyro, accel = read(state.imus, *true, data.imu_rates)
+    residuals = data.gyro_rad_s - gyro, data.accel_m_s2 - accel
+    return _Expected(bodies, shaken, readings_on(chain, bodies), residuals)
 
 
 def _rms(residual: Array) -> Array:
@@ -177,56 +176,47 @@ def _spread(data: SensorData, residual: Array) -> Array:
     return np.stack([_rms(residual[samples]) for samples in data.motions])
 
 
-def _believed(data: SensorData, residual: Array) -> Array:
-    """Return the spread of every motion, (motions, n), widened for the correlation of its samples."""
+def _repeats(data: SensorData, residual: Array) -> Array:
+    """Return the factor (motions, n) by which the correlation of a motion's samples widens their spread."""
     parts = [residual[samples] for samples in data.motions]
-    return np.stack([_rms(part) * np.sqrt(samples_per_independent(part, MAX_LAG, MIN_RMS)) for part in parts])
+    return np.stack([np.sqrt(samples_per_independent(part, MAX_LAG, MIN_RMS)) for part in parts])
 
 
 def _normal_equations(
-    state: _State,
-    data: SensorData,
-    prior: ImuPrior,
-    flex: ComplianceJacobian,
-    expected: _Expected,
-    residuals: tuple[Array, Array],
-    sigmas: tuple[Array, Array],
+    problem: _Problem, state: _State, expected: _Expected, sigmas: Sequence[Array]
 ) -> _Normal:
     """Build the weighted normal equations, IMU by IMU; the root stays."""
+    data, flex, free, ideal = problem.data, problem.flex, problem.free, expected.ideal
     count, samples = len(state.chain.serials), len(data.q_rad)
-    poses, free = 6 * count, prior.sigmas > 0.0
-    information, rhs = _before(state, prior, flex)
-    bodies, ideal, _, _ = expected
+    poses = 6 * count
+    information, rhs = _before(problem, state)
     motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
     for k in range(count):
-        jacobian = imu_jacobian(state.chain, bodies, *data.smooth[:2], k)
+        jacobian = imu_jacobian(state.chain, expected.bodies, *data.smooth[:2], k)
         true = mixing(state.imus, k) @ np.concatenate([jacobian.poses, jacobian.gravity, flex.slopes[..., k]])
         rates = None if data.imu_rates is None else data.imu_rates[:, k]
         own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
         weight = 1.0 / np.repeat([sigma[:, k] for sigma in sigmas], 3, axis=0)[:, motion]
         rows = (np.concatenate([true, own]) * weight).reshape(-1, 6 * samples)
-        target = (np.concatenate([part[:, k] for part in residuals], axis=1).T * weight).ravel()
+        target = (np.concatenate([part[:, k] for part in expected.residuals], axis=1).T * weight).ravel()
         at = _places(jacobian.modules, k, count, len(flex.links), int(free.sum()))
         information[np.ix_(at, at)] += rows @ rows.T
         rhs[at] += rows @ target
+    nuisance = information[poses:, poses:]
     return _Normal(
-        information[6:poses, 6:poses],
-        information[6:poses, poses:],
-        information[poses:, poses:],
-        rhs[6:poses],
-        rhs[poses:],
+        information[6:poses, 6:poses], information[6:poses, poses:], nuisance, rhs[6:poses], rhs[poses:]
     )
 
 
-def _before(state: _State, prior: ImuPrior, flex: ComplianceJacobian) -> tuple[Array, Array]:
+def _before(problem: _Problem, state: _State) -> tuple[Array, Array]:
     """Return the information on [perturbations (6 n), gravity (3), free IMU errors], and its right-hand side.
 
     These are the priors of the IMUs' errors, of the links' compliances, and of the magnitude of gravity,
     which makes the accelerometers' scales observable.
     """
-    count, free = len(state.chain.serials), prior.sigmas > 0.0
+    count, free, flex = len(state.chain.serials), problem.free, problem.flex
     nothing = np.zeros(6 * count + 3)
-    known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(prior.sigmas[free] ** -2.0, count)])
+    known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(problem.prior.sigmas[free] ** -2.0, count)])
     held = np.concatenate([nothing, state.compliance + flex.taken, state.imus.errors[:, free].ravel()])
     information, rhs = np.diag(known), -known * held
     size = float(np.linalg.norm(state.chain.gravity))
@@ -251,7 +241,7 @@ class _Spectrum(NamedTuple):
     sigmas: Array
 
     @property
-    def known(self) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+    def known(self) -> Mask:
         return self.sigmas <= UNKNOWN_ABOVE
 
 
@@ -285,25 +275,20 @@ def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
     return np.concatenate([np.zeros(6), unknown @ np.clip(step, -MAX_STEP, MAX_STEP)])
 
 
-def _moved(state: _State, step: Array, nuisance: Array, prior: ImuPrior) -> _State:
-    chain, free = apply_perturbation(state.chain, step), prior.sigmas > 0.0
+def _moved(problem: _Problem, state: _State, step: Array, nuisance: Array) -> _State:
     change = np.zeros_like(state.imus.errors)
     links = 3 + len(state.compliance)
-    change[:, free] = nuisance[links:].reshape(len(change), -1)
+    change[:, problem.free] = nuisance[links:].reshape(len(change), -1)
+    chain = apply_perturbation(state.chain, step)
     return _State(
         chain._replace(gravity=frozen(chain.gravity + nuisance[:3])),
-        state.imus.moved(change),
+        ImuIntrinsics(state.imus.errors + change),
         state.compliance + nuisance[3:links],
     )
 
 
 def _report(
-    state: _State,
-    spectrum: _Spectrum,
-    by_noise: Array,
-    sigma_gyro: Array,
-    sigma_accel: Array,
-    iterations: int,
+    state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[Array], iterations: int
 ) -> Refinement:
     known = spectrum.known
     kept = spectrum.vectors[:, known]
@@ -323,8 +308,8 @@ def _report(
             condition=float(sigmas.max() / sigmas.min()) if sigmas.size else float("inf"),
         ),
         noise_covariance=frozen(noise),
-        residual_gyro_rad_s=frozen(sigma_gyro),
-        residual_accel_m_s2=frozen(sigma_accel),
+        residual_gyro_rad_s=frozen(rms[0]),
+        residual_accel_m_s2=frozen(rms[1]),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
         compliance=frozen(state.compliance),
         iterations=iterations,

@@ -50,10 +50,6 @@ class ImuIntrinsics(NamedTuple):
         """What a specific force adds to the gyros' rates, (n, 3, 3) [rad/s per m/s^2]."""
         return self.errors[:, _FORCE].reshape(-1, 3, 3)
 
-    def moved(self, change: Array) -> "ImuIntrinsics":
-        """Return these errors changed by (n, 34)."""
-        return ImuIntrinsics(self.errors + change)
-
 
 def beyond(intrinsics: ImuIntrinsics, prior: ImuPrior) -> Array:
     """Return the largest error of every IMU (n,) in standard deviations of the prior."""

@@ -56,16 +56,15 @@ def rows_to_keep(recording: Recording, serials: Sequence[str], event: JournalEve
     """
     clocks = map_clocks({s: recording.modules[s].trips for s in serials})
     start_ns, end_ns = span(recording, clocks, event, DYNAMIC_CUTOFF_HZ)
-
-    def around(serial: str) -> RowRange:
+    ranges = []
+    for serial in serials:
         record = recording.modules[serial]
-        times = clocks[serial].module_span(start_ns - _SPARE_NS, end_ns + _SPARE_NS, STEP_NS)
-        first, end = record.rows.range_between(*times)
+        around = clocks[serial].module_span(start_ns - _SPARE_NS, end_ns + _SPARE_NS, STEP_NS)
+        first, end = record.rows.range_between(*around)
         if first == end or record.rows.missing(first, end):
             raise DataError(f"rows of {serial} in the motion of {event.step} are missing")
-        return RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end)
-
-    return tuple(around(serial) for serial in serials)
+        ranges.append(RowRange(serial=serial, boot=record.boot, first_row=first, end_row=end))
+    return tuple(ranges)
 
 
 def question(
