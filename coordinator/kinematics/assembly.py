@@ -38,22 +38,14 @@ STILL = 1e-13
 
 
 class ChainFit(NamedTuple):
-    """An assembled chain and how well it fits; arrays read-only.
+    """An assembled chain: the rank counts 6 (n - 1) unknowns of poses and two of the direction of gravity.
 
-    estimate: its rank is that of the weighted Jacobian over `unknowns` = 6 (n - 1) + 2 parameters, the last
-        two for the direction of gravity.
-    singular_values: (unknowns,) of the Jacobian, largest first: each is 1 / sigma of a direction.
     reduced_chi2: weighted squared residuals over degrees of freedom; about 1 if the sigmas are right, NaN
         without a degree of freedom.
-    misfit_sigma: rms of the four weighted residuals of each pair observation, in the order given; NaN for
-        observations of a module's own joint, which are not used.
     """
 
     estimate: ChainEstimate
-    unknowns: int
-    singular_values: Array
     reduced_chi2: float
-    misfit_sigma: Array
 
     @property
     def chain(self) -> Chain:
@@ -91,7 +83,7 @@ def assemble(
     size = float(np.mean([np.linalg.norm(r.specific_force_m_s2, axis=1).mean() for r in rests]))
     chain = _refine(initial_chain(topology, types, observations, size), observations, min_gain)
     _check_directions(chain, observations)
-    return _describe(chain, observations, pairs)
+    return _describe(chain, observations)
 
 
 class _Solved(NamedTuple):
@@ -162,10 +154,7 @@ def _check_directions(chain: Chain, observations: ChainObservations) -> None:
     along = np.sum(predict(chain, observations).axis * observations.axis, axis=1)
     if along.size and along.min() <= 0.0:
         worst = int(np.argmin(along))
-        joint, observer = (
-            chain.serials[observations.joint[worst]],
-            chain.serials[observations.observer[worst]],
-        )
+        joint, observer = (chain.serials[of[worst]] for of in (observations.joint, observations.observer))
         raise AssemblyError(
             f"{observer} saw the axis of joint {joint} {np.degrees(np.arccos(along[worst])):.0f} degrees "
             f"away from where the fit puts it: what {observer} saw of the joints further up does not fit one "
@@ -173,35 +162,16 @@ def _check_directions(chain: Chain, observations: ChainObservations) -> None:
         )
 
 
-def _describe(chain: Chain, observations: ChainObservations, pairs: Sequence[PairObservation]) -> ChainFit:
+def _describe(chain: Chain, observations: ChainObservations) -> ChainFit:
     parts = _solve(chain, observations)
     rest = residuals(chain, observations)
     poses = 6 * (len(chain.serials) - 1)
     resolved = parts.vt[: parts.rank, :poses] / parts.s[: parts.rank, None]
     covariance = np.zeros((poses + 6, poses + 6))
     covariance[6:, 6:] = resolved.T @ resolved
-    null_basis = _null_basis(parts.vt[parts.rank :, :poses])
+    basis, _ = np.linalg.qr(parts.vt[parts.rank :, :poses].T)
+    null_basis = frozen(np.concatenate([np.zeros((6, basis.shape[1])), basis]))
     freedom = observations.rows - parts.rank
     condition = float(parts.s[0] / parts.s[parts.rank - 1]) if parts.rank else float("nan")
-    return ChainFit(
-        estimate=ChainEstimate(chain, frozen(covariance), null_basis, parts.rank, condition),
-        unknowns=parts.s.size,
-        singular_values=frozen(parts.s),
-        reduced_chi2=float(rest @ rest) / freedom if freedom > 0 else float("nan"),
-        misfit_sigma=_misfit(rest, pairs),
-    )
-
-
-def _null_basis(null_rows: Array) -> Array:
-    """Return orthonormal columns (6 n, k), the first root's rows zero, of null vectors (k, 6 (n - 1))."""
-    basis, _ = np.linalg.qr(null_rows.T)
-    return frozen(np.concatenate([np.zeros((6, basis.shape[1])), basis]))
-
-
-def _misfit(rest: Array, pairs: Sequence[PairObservation]) -> Array:
-    used = np.array([p.joint != p.observer for p in pairs], dtype=bool)
-    count = int(np.count_nonzero(used))
-    axis, place = rest[: 4 * count].reshape(2, count, 2)
-    misfit = np.full(len(pairs), np.nan)
-    misfit[used] = np.sqrt(np.mean(np.concatenate([axis, place], axis=1) ** 2, axis=1))
-    return frozen(misfit)
+    estimate = ChainEstimate(chain, frozen(covariance), null_basis, parts.rank, condition)
+    return ChainFit(estimate, float(rest @ rest) / freedom if freedom > 0 else float("nan"))

@@ -138,7 +138,12 @@ def predict(chain: Chain, observations: ChainObservations) -> Prediction:
 
 def residuals(chain: Chain, observations: ChainObservations) -> Array:
     """Return the weighted residuals (rows,), of unit variance: axes, then radial vectors, then gravity."""
-    return _weigh(predict(chain, observations), observations)
+    predicted, across = predict(chain, observations), observations.pair_across
+    axis = _into(across, predicted.axis) / observations.sigma_axis_rad[:, None]
+    off = predicted.radial_m - observations.radial_m
+    place = _into(across, off) / observations.sigma_radial_m[:, None]
+    gravity = _into(observations.gravity_across, predicted.gravity) / observations.sigma_gravity_rad[:, None]
+    return np.concatenate([axis.ravel(), place.ravel(), gravity.ravel()])
 
 
 def jacobian(chain: Chain, observations: ChainObservations) -> Array:
@@ -189,15 +194,16 @@ class _Geometry:
         home = np.swapaxes(self.rest[:, :3, :3], 1, 2)
         gravity = home @ skew(self.up) @ rest[:, :3]
         tilt = -home @ skew(self.up)
-        pieces = _weigh_slopes(axis, radial, gravity, observations)
         slopes = np.zeros((observations.rows, width + 3))
-        slopes[:, :width] = pieces
-        tilts = (
-            np.swapaxes(observations.gravity_across, 1, 2)
-            @ tilt
-            / observations.sigma_gravity_rad[:, None, None]
+        slopes[:, :width] = np.concatenate(
+            [
+                _weighted(observations.pair_across, axis, observations.sigma_axis_rad),
+                _weighted(observations.pair_across, radial, observations.sigma_radial_m),
+                _weighted(observations.gravity_across, gravity, observations.sigma_gravity_rad),
+            ]
         )
-        slopes[4 * observations.joint.size :, width:] = tilts.reshape(-1, 3)
+        tilts = _weighted(observations.gravity_across, tilt, observations.sigma_gravity_rad)
+        slopes[4 * observations.joint.size :, width:] = tilts
         return slopes
 
     def _imu(self, pose: Index, module: Index) -> Array:
@@ -240,41 +246,22 @@ class _Geometry:
         return home @ d_axis, home @ d_radial
 
 
-def _weigh(predicted: Prediction, observations: ChainObservations) -> Array:
-    axis = _into(observations.pair_across, predicted.axis) / observations.sigma_axis_rad[:, None]
-    place = (
-        _into(observations.pair_across, predicted.radial_m - observations.radial_m)
-        / observations.sigma_radial_m[:, None]
-    )
-    gravity = _into(observations.gravity_across, predicted.gravity) / observations.sigma_gravity_rad[:, None]
-    return np.concatenate([axis.ravel(), place.ravel(), gravity.ravel()])
-
-
-def _weigh_slopes(axis: Array, radial: Array, gravity: Array, observations: ChainObservations) -> Array:
-    pair = np.swapaxes(observations.pair_across, 1, 2)
-    blocks = (
-        pair @ axis / observations.sigma_axis_rad[:, None, None],
-        pair @ radial / observations.sigma_radial_m[:, None, None],
-        np.swapaxes(observations.gravity_across, 1, 2)
-        @ gravity
-        / observations.sigma_gravity_rad[:, None, None],
-    )
-    return np.concatenate([block.reshape(-1, axis.shape[2]) for block in blocks])
+def _weighted(across: Array, slopes: Array, sigma: Array) -> Array:
+    """Return the slopes (p, 3, k) of directions `across` (p, 3, 2), in sigmas (p,), as rows (2 p, k)."""
+    return np.asarray(np.swapaxes(across, 1, 2) @ slopes / sigma[:, None, None]).reshape(-1, slopes.shape[2])
 
 
 def _check(index: dict[str, int], pairs: Sequence[PairObservation], rests: Sequence[RestObservation]) -> None:
-    for pair in pairs:
-        for serial in (pair.joint, pair.observer):
-            if serial not in index:
-                raise ValueError(f"{serial} is not in the topology, which knows {', '.join(index)}")
+    for serial in (serial for pair in pairs for serial in (pair.joint, pair.observer)):
+        if serial not in index:
+            raise ValueError(f"{serial} is not in the topology, which knows {', '.join(index)}")
     for q_rad in [p.q_rad for p in pairs] + [r.q_rad for r in rests]:
         if np.shape(q_rad) != (len(index),):
             raise ValueError(f"q_rad has shape {np.shape(q_rad)}, ({len(index)},) is needed")
-    for rest in rests:
-        if np.shape(rest.specific_force_m_s2) != (len(index), 3):
+    for shape in (np.shape(rest.specific_force_m_s2) for rest in rests):
+        if shape != (len(index), 3):
             raise ValueError(
-                f"specific forces have shape {np.shape(rest.specific_force_m_s2)}, "
-                f"({len(index)}, 3) is needed: one row for every module"
+                f"specific forces have shape {shape}, ({len(index)}, 3) is needed: one row for every module"
             )
 
 

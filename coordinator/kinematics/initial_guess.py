@@ -47,8 +47,7 @@ def initial_chain(
         evidence = _evidence(chain, k, observations)
         turn, place = _neutral(chain, k, types)
         turn = _align(evidence, turn)
-        place = _locate(evidence, turn, place)
-        chain = _placed(chain, k, types[k], turn, place)
+        chain = _placed(chain, k, types[k], turn, _locate(evidence, turn, place))
     return chain
 
 
@@ -73,8 +72,8 @@ def _placed(chain: Chain, k: int, kind: ModuleType, turn: Array, place: Array) -
     """Return the chain with module k's IMU at a pose, and with it the axis that the catalogue ties to it."""
     home, axis, point = chain.imu_home.copy(), chain.axis.copy(), chain.point.copy()
     home[k, :3, :3], home[k, :3, 3] = turn, place
-    axis[k], point[k] = own_line(kind, chain.reversed[k])
-    axis[k], point[k] = turn @ axis[k], turn @ point[k] + place
+    direction, on_axis = own_line(kind, chain.reversed[k])
+    axis[k], point[k] = turn @ direction, turn @ on_axis + place
     return chain._replace(axis=frozen(axis), point=frozen(point), imu_home=frozen(home))
 
 
@@ -107,9 +106,8 @@ def _own_motion(chain: Chain, k: int, positions: Array) -> Array:
 def _evidence(chain: Chain, k: int, observations: ChainObservations) -> _Evidence:
     pairs = np.flatnonzero(observations.observer == k)
     rests = np.flatnonzero(observations.rest_module == k)
-    positions = observations.positions[
-        np.concatenate([observations.pair_pose[pairs], observations.rest_pose[rests]])
-    ]
+    poses = np.concatenate([observations.pair_pose[pairs], observations.rest_pose[rests]])
+    positions = observations.positions[poses]
     body = np.tile(np.eye(4), (len(positions), len(chain.serials) + 1, 1, 1))
     body[:, :-1] = body_displacements(chain, positions)  # of the ancestors; the others are not placed yet
     back = np.linalg.inv(body[:, chain.parent[k]])
@@ -118,14 +116,12 @@ def _evidence(chain: Chain, k: int, observations: ChainObservations) -> _Evidenc
     axes = np.einsum("pij,pj->pi", line[:, :3, :3], chain.axis[joints])
     up = back[pairs.size :, :3, :3] @ (chain.gravity / np.linalg.norm(chain.gravity))
     own = _own_motion(chain, k, positions)
-    here = np.einsum(
-        "vij,vj->vi", own[:, :3, :3], np.concatenate([observations.axis[pairs], observations.gravity[rests]])
-    )
+    seen = np.concatenate([observations.axis[pairs], observations.gravity[rests]])
     sigma = np.concatenate([observations.sigma_axis_rad[pairs], observations.sigma_gravity_rad[rests]])
     return _Evidence(
         own=own,
         there=np.concatenate([axes, up]),
-        here=here,
+        here=np.einsum("vij,vj->vi", own[:, :3, :3], seen),
         weight=sigma**-2,
         points=np.einsum("pij,pj->pi", line[:, :3, :3], chain.point[joints]) + line[:, :3, 3],
         radial_m=observations.radial_m[pairs],
@@ -141,8 +137,7 @@ def _neutral(chain: Chain, k: int, types: Sequence[ModuleType]) -> tuple[Array, 
     turn = chain.imu_home[parent, :3, :3]
     face = np.zeros(3) if chain.reversed[parent] else np.array(types[parent].output_xyz)
     place = turn @ (face - np.array(types[parent].imu_xyz)) + chain.imu_home[parent, :3, 3]
-    # A link joins output to housing without turning the axis; output to output, or housing to housing, turn
-    # it.
+    # A link that joins output to output, or housing to housing, turns the axis.
     if chain.reversed[k] != chain.reversed[parent]:
         turn = turn @ np.diag([1.0, -1.0, -1.0])
     return turn, place
@@ -164,8 +159,7 @@ def _locate(evidence: _Evidence, turn: Array, neutral: Array) -> Array:
     axis, own = evidence.there[:count], evidence.own[:count]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     radial = np.einsum("ij,pjk,pk->pi", turn, own[:, :3, :3], evidence.radial_m)
-    # The IMU stands at place + turn @ (own motion's shift); its distance across the axis is the radial
-    # vector.
+    # The IMU is at place + turn @ (own motion's shift); its distance across the axis is the radial vector.
     aim = np.einsum("pij,pj->pi", across, evidence.points - own[:, :3, 3] @ turn.T + radial)
     rows = (across * evidence.radial_weight[:, None, None]).reshape(-1, 3)
     goal = (aim * evidence.radial_weight[:, None]).ravel()

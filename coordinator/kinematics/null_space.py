@@ -59,72 +59,47 @@ def _hidden(item: Unresolved, null_basis: Array) -> bool:
 def _candidates(chain: Chain) -> Iterator[Unresolved]:
     # Branch by branch: no observation ties two children of one joint, so each has its own freedom.
     for child in chain.linked:
-        joint = chain.parent[child]
-        yield _offset(chain, joint, child)
-        yield _rotation(chain, joint, child)
-    for root in chain.roots[1:]:
-        yield _position(chain, root)
-        yield _heading(chain, root)
-
-
-def _offset(chain: Chain, joint: int, child: int) -> Unresolved:
-    name, further = chain.serials[joint], chain.ancestors(joint)[:-1]
-    beyond = chain.descendants(child)
-    text = f"offset of {_branch(chain, child)} along {name}'s axis"
-    if not further:
-        text += ": not observable from inertial sensors on a fixed base"
-        cure = "nothing: no joint further up moves it; measure it, or take it from the drawing"
-    else:
-        text += f": every joint further up ({_names(chain, further)}) is parallel to it"
-        cure = f"moving a joint further up while {name}'s axis is not parallel to it"
-    return _item(chain, "offset_along_axis", joint, beyond, text, cure, np.r_[np.zeros(3), chain.axis[joint]])
-
-
-def _rotation(chain: Chain, joint: int, child: int) -> Unresolved:
-    name, further = chain.serials[joint], chain.ancestors(joint)[:-1]
-    beyond = chain.descendants(child)
-    text = f"rotation of {_branch(chain, child)} about {name}'s axis at {name}'s zero"
-    text += (
-        f": the axis is parallel to gravity and to every joint further up ({_names(chain, further)})"
-        if further
-        else " (base yaw): the axis is parallel to gravity and no joint further up moves it"
-    )
-    cure = (
-        f"resting, or moving a joint further up, while {name}'s axis is not parallel to it"
-        if further
-        else "tilting the base; on a level base nothing does"
-    )
-    axis, point = chain.axis[joint], chain.point[joint]
-    return _item(chain, "rotation_about_axis", joint, beyond, text, cure, np.r_[axis, np.cross(point, axis)])
-
-
-def _position(chain: Chain, root: int) -> Unresolved:
-    tree, name = chain.descendants(root), chain.serials[root]
-    twists = np.concatenate([np.zeros((3, 3)), np.eye(3)])
-    text = f"position of {name}'s tree relative to {chain.serials[0]}: nothing moves both"
-    return _item(chain, "position", None, tree, text, "nothing: both stand on the base; measure it", twists)
-
-
-def _heading(chain: Chain, root: int) -> Unresolved:
-    tree, name = chain.descendants(root), chain.serials[root]
+        yield from _along_and_about(chain, chain.parent[child], child)
     up = chain.gravity / np.linalg.norm(chain.gravity)
-    twist = np.r_[up, np.cross(chain.imu_home[root, :3, 3], up)]
-    text = f"heading of {name}'s tree relative to {chain.serials[0]}: gravity does not tell it"
-    return _item(
-        chain,
-        "rotation_about_gravity",
-        None,
-        tree,
-        text,
-        "nothing: both stand on the base; measure it",
-        twist,
-    )
+    cure = "nothing: both stand on the base; measure it"
+    for root in chain.roots[1:]:
+        tree = chain.descendants(root)
+        apart = f"of {chain.serials[root]}'s tree relative to {chain.serials[0]}"
+        twists = np.concatenate([np.zeros((3, 3)), np.eye(3)])
+        yield _item(chain, "position", "", tree, f"position {apart}: nothing moves both", cure, twists)
+        twist = np.r_[up, np.cross(chain.imu_home[root, :3, 3], up)]
+        text = f"heading {apart}: gravity does not tell it"
+        yield _item(chain, "rotation_about_gravity", "", tree, text, cure, twist)
+
+
+def _along_and_about(chain: Chain, joint: int, child: int) -> Iterator[Unresolved]:
+    """Yield the offset of a branch along a joint's axis, and its rotation about it."""
+    name, further, beyond = chain.serials[joint], chain.ancestors(joint)[:-1], chain.descendants(child)
+    branch = chain.serials[child] + (" and everything beyond it" if len(beyond) > 1 else "")
+    axis, point = chain.axis[joint], chain.point[joint]
+    if further:
+        others = f"every joint further up ({_names(chain, further)})"
+        why = f": {others} is parallel to it"
+        cure = f"moving a joint further up while {name}'s axis is not parallel to it"
+    else:
+        why = ": not observable from inertial sensors on a fixed base"
+        cure = "nothing: no joint further up moves it; measure it, or take it from the drawing"
+    text = f"offset of {branch} along {name}'s axis{why}"
+    yield _item(chain, "offset_along_axis", name, beyond, text, cure, np.r_[np.zeros(3), axis])
+    if further:
+        why = f": the axis is parallel to gravity and to {others}"
+        cure = f"resting, or moving a joint further up, while {name}'s axis is not parallel to it"
+    else:
+        why = " (base yaw): the axis is parallel to gravity and no joint further up moves it"
+        cure = "tilting the base; on a level base nothing does"
+    text = f"rotation of {branch} about {name}'s axis at {name}'s zero{why}"
+    yield _item(chain, "rotation_about_axis", name, beyond, text, cure, np.r_[axis, np.cross(point, axis)])
 
 
 def _item(
     chain: Chain,
     kind: Kind,
-    joint: int | None,
+    joint: str,
     modules: tuple[int, ...],
     text: str,
     resolved_by: str,
@@ -133,32 +108,18 @@ def _item(
     columns = np.atleast_2d(twists.T).T.reshape(6, -1)
     directions = np.zeros((len(chain.serials), 6, columns.shape[1]))
     directions[list(modules)] = columns
-    return Unresolved(
-        kind=kind,
-        joint="" if joint is None else chain.serials[joint],
-        modules=tuple(chain.serials[k] for k in modules),
-        text=text,
-        resolved_by=resolved_by,
-        directions=frozen(directions.reshape(-1, columns.shape[1])),
-    )
+    serials = tuple(chain.serials[k] for k in modules)
+    flat = frozen(directions.reshape(-1, columns.shape[1]))
+    return Unresolved(kind, joint, serials, text, resolved_by, flat)
 
 
 def _combination(chain: Chain, direction: Array) -> Unresolved:
     size = np.linalg.norm(direction.reshape(-1, 6), axis=1)
     moved = tuple(int(k) for k in np.flatnonzero(size > 0.1 * size.max()))
-    return Unresolved(
-        kind="combination",
-        joint="",
-        modules=tuple(chain.serials[k] for k in moved),
-        text=f"a combination of the poses of {_names(chain, moved)} that no observation tells apart",
-        resolved_by="motions of the joints further up at other positions of the joints between",
-        directions=frozen(direction[:, None]),
-    )
-
-
-def _branch(chain: Chain, child: int) -> str:
-    name = chain.serials[child]
-    return name if len(chain.descendants(child)) == 1 else f"{name} and everything beyond it"
+    text = f"a combination of the poses of {_names(chain, moved)} that no observation tells apart"
+    cure = "motions of the joints further up at other positions of the joints between"
+    serials = tuple(chain.serials[k] for k in moved)
+    return Unresolved("combination", "", serials, text, cure, frozen(direction[:, None]))
 
 
 def _names(chain: Chain, modules: tuple[int, ...]) -> str:

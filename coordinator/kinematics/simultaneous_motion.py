@@ -14,6 +14,7 @@ move: the regression includes that to first order; terms of second order are lef
 """
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -94,21 +95,24 @@ def simultaneous_response(
     independent = min(1.0, 2.0 * bandwidth_hz / rate_hz)
     samples, count = data.q_rad.shape
     gyro = data.gyro_rad_s - still.gyro_rad_s
-    swing = data.q_rad - data.q_rad.mean(axis=0)
-    tilted = _tilted(swing, data.qd_rad_s)
-    axis, sigma_axis = _regressed(
-        np.column_stack([data.qd_rad_s, np.ones(samples), tilted]), gyro, independent
-    )
+    q, qd, one = data.q_rad, data.qd_rad_s, np.ones(samples)
+    swing = q - q.mean(axis=0)
+    # A joint's place times another's rate: the one tilts the other's axis.
+    place, rate = np.nonzero(~np.eye(count, dtype=bool))
+    terms = np.column_stack([qd, one, swing[:, place] * qd[:, rate]])
+    axis, sigma_axis = _regressed(terms, gyro, independent)
     force = data.accel_m_s2 - _gravity(gyro, still.force_m_s2, rate_hz)
-    terms = [data.qdd_rad_s2, swing, np.ones(samples), _products(data.qd_rad_s)]
-    tangential, sigma_tangential = _regressed(np.column_stack(terms), force, independent)
+    # Products of two rates: what centripetal and Coriolis accelerations are made of.
+    first, second = np.triu_indices(count)
+    terms = np.column_stack([data.qdd_rad_s2, swing, one, qd[:, first] * qd[:, second]])
+    tangential, sigma_tangential = _regressed(terms, force, independent)
     return SimultaneousResponse(
         frozen(axis[:count]),
         frozen(tangential[:count]),
         frozen(sigma_axis[:count]),
         frozen(sigma_tangential[:count]),
         frozen(np.mean(swing**2, axis=0)),
-        frozen(data.q_rad.mean(axis=0)),
+        frozen(q.mean(axis=0)),
     )
 
 
@@ -117,47 +121,36 @@ def motion_observations(
 ) -> dict[tuple[str, str], MotionObservation]:
     """Return {(joint, observer): MotionObservation}; the columns are named by `serials`."""
     seen: dict[tuple[str, str], MotionObservation] = {}
-    for i, joint in enumerate(serials):
-        for k, observer in enumerate(serials):
-            size = float(np.linalg.norm(response.axis[i, k]))
-            moved = response.moved(i, k)
-            seen[joint, observer] = MotionObservation(
-                moved, size, response.axis[i, k] / size if moved else None
-            )
+    for (i, joint), (k, observer) in product(enumerate(serials), repeat=2):
+        size, moved = float(np.linalg.norm(response.axis[i, k])), response.moved(i, k)
+        axis = response.axis[i, k] / size if moved else None
+        seen[joint, observer] = MotionObservation(moved, size, axis)
     return seen
 
 
 def circle_observations(serials: Sequence[str], response: SimultaneousResponse) -> list[PairObservation]:
     """Return the circle of every joint in every other IMU that it carries; `serials` name the columns."""
     tilt = TILT_PER_SWING2 * float(response.swing2_rad2.sum())
-    return [
-        _circle(serials[i], serials[k], response, i, k, tilt)
-        for i in range(len(serials))
-        for k in range(len(serials))
-        if i != k and response.moved(i, k)
-    ]
-
-
-def _circle(
-    joint: str, observer: str, response: SimultaneousResponse, i: int, k: int, tilt: float
-) -> PairObservation:
-    axis = response.axis[i, k] / np.linalg.norm(response.axis[i, k])
-    radial = np.cross(response.tangential_m[i, k], axis)
-    longest = max(
-        float(np.linalg.norm(response.tangential_m[other, k]))
-        for other in range(len(response.axis))
-        if response.moved(other, k)
-    )
-    floor = np.hypot(RADIUS_FLOOR_M, CROSSTALK_SHARE * longest)
-    return PairObservation(
-        joint,
-        observer,
-        axis,
-        radial,
-        float(np.hypot(response.sigma_axis[i, k], tilt)),
-        float(np.hypot(response.sigma_tangential_m[i, k], floor)),
-        response.q_mean_rad,
-    )
+    pairs = []
+    for i, k in product(range(len(serials)), repeat=2):
+        if i == k or not response.moved(i, k):
+            continue
+        axis = response.axis[i, k] / np.linalg.norm(response.axis[i, k])
+        movers = [j for j in range(len(serials)) if response.moved(j, k)]
+        longest = max(float(np.linalg.norm(response.tangential_m[j, k])) for j in movers)
+        floor = np.hypot(RADIUS_FLOOR_M, CROSSTALK_SHARE * longest)
+        pairs.append(
+            PairObservation(
+                serials[i],
+                serials[k],
+                axis,
+                np.cross(response.tangential_m[i, k], axis),
+                float(np.hypot(response.sigma_axis[i, k], tilt)),
+                float(np.hypot(response.sigma_tangential_m[i, k], floor)),
+                response.q_mean_rad,
+            )
+        )
+    return pairs
 
 
 def _check_told_apart(qd_rad_s: Array) -> None:
@@ -180,24 +173,13 @@ def _regressed(terms: Array, signals: Array, independent: float) -> tuple[Array,
     """Return coefficients (p, n, 3) of signals (m, n, 3) on terms (m, p), and their sigmas (p, n)."""
     samples, count, _ = signals.shape
     scale = np.maximum(np.sqrt(np.mean(terms**2, axis=0)), np.finfo(float).tiny)
-    solution, *_ = np.linalg.lstsq(terms / scale, signals.reshape(samples, -1), rcond=1e-10)
-    residual = signals.reshape(samples, -1) - (terms / scale) @ solution
-    scatter = np.sqrt(np.mean(residual.reshape(samples, count, 3) ** 2, axis=(0, 2)) / independent)
-    spread = np.sqrt(np.diag(np.linalg.pinv((terms / scale).T @ (terms / scale))))
+    terms, flat = terms / scale, signals.reshape(samples, -1)
+    solution, *_ = np.linalg.lstsq(terms, flat, rcond=1e-10)
+    residual = (flat - terms @ solution).reshape(samples, count, 3)
+    scatter = np.sqrt(np.mean(residual**2, axis=(0, 2)) / independent)
+    spread = np.sqrt(np.diag(np.linalg.pinv(terms.T @ terms)))
     coefficients = (solution / scale[:, None]).reshape(len(scale), count, 3)
     return coefficients, np.outer(spread / scale, scatter)
-
-
-def _products(qd_rad_s: Array) -> Array:
-    """Return all products of two rates: what centripetal and Coriolis accelerations are made of."""
-    first, second = np.triu_indices(qd_rad_s.shape[1])
-    return np.asarray(qd_rad_s[:, first] * qd_rad_s[:, second])
-
-
-def _tilted(swing_rad: Array, qd_rad_s: Array) -> Array:
-    """Return all products of a joint's place and another's rate: the one tilts the other's axis."""
-    first, second = np.nonzero(~np.eye(swing_rad.shape[1], dtype=bool))
-    return np.asarray(swing_rad[:, first] * qd_rad_s[:, second])
 
 
 def _gravity(gyro_rad_s: Array, force_m_s2: Array, rate_hz: float) -> Array:
