@@ -9,22 +9,27 @@ npz: `position_rad` (m, n); `torque` or `torque_nm` (m, n); `sample_rate_hz` () 
 
 import csv
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.ndimage import binary_opening
 
 from module_agent.model.chain import Array
 from module_agent.model.errors import UsageError
-from module_agent.model.read_only import frozen, make_read_only
-from module_agent.signals.filtering import NS_PER_S, resample
+from module_agent.model.read_only import frozen
 
 # Of a sampling interval; a fiftieth at 0.1 of the sampling rate is 1.3 % of the amplitude, between samples.
 _JITTER = 0.02
-# Longer gaps than this, in usual intervals, are not interpolated: the motion in between is unknown.
+# Longer gaps than this, in usual intervals, are not interpolated: the recording is split there.
 _BRIDGED = 5.0
+_MAX_REPEATED = 3
+# Share of positions that stay between samples: the encoder's resolution shows.
+_COARSE = 0.1
 
 
 class DataFileError(UsageError):
@@ -36,7 +41,8 @@ class JointLog(NamedTuple):
 
     rate_hz: sampling rate. q_rad: (m, n) joint positions. qd_rad_s: (m, n) joint velocities, None if they
     were not measured. tau_nm: (m, n) joint torques. resampled: whether the times of the file were not
-    uniform.
+    uniform. breaks: samples before which there is a hole, or where another recording begins. repeated: rows
+    like the one before, left out.
     """
 
     rate_hz: float
@@ -44,11 +50,26 @@ class JointLog(NamedTuple):
     qd_rad_s: Array | None
     tau_nm: Array
     resampled: bool = False
+    breaks: tuple[int, ...] = ()
+    repeated: int = 0
 
     @property
     def duration_s(self) -> float:
-        """The time from the first sample to the last [s]."""
-        return (len(self.q_rad) - 1) / self.rate_hz
+        """The time that was recorded, without holes [s]."""
+        return (len(self.q_rad) - 1 - len(self.breaks)) / self.rate_hz
+
+    def pieces(self) -> tuple["JointLog", ...]:
+        """Return the parts between the breaks."""
+        ends = (0, *self.breaks, len(self.q_rad))
+        return tuple(
+            self._replace(
+                q_rad=self.q_rad[a:b],
+                qd_rad_s=None if self.qd_rad_s is None else self.qd_rad_s[a:b],
+                tau_nm=self.tau_nm[a:b],
+                breaks=(),
+            )
+            for a, b in pairwise(ends)
+        )
 
 
 class _Table(NamedTuple):
@@ -59,33 +80,47 @@ class _Table(NamedTuple):
     row: Callable[[int], str]
 
 
+def joined(logs: Sequence[JointLog]) -> JointLog:
+    """Return recordings of one rate as one, with breaks between them; velocities only if all have them."""
+    velocities = [log.qd_rad_s for log in logs if log.qd_rad_s is not None]
+    starts = np.cumsum([0, *(len(log.q_rad) for log in logs)])
+    breaks = [int(start) + b for start, log in zip(starts, logs, strict=False) for b in (0, *log.breaks)]
+    return JointLog(
+        logs[0].rate_hz,
+        frozen(np.concatenate([log.q_rad for log in logs])),
+        frozen(np.concatenate(velocities)) if len(velocities) == len(logs) else None,
+        frozen(np.concatenate([log.tau_nm for log in logs])),
+        any(log.resampled for log in logs),
+        tuple(breaks[1:]),
+        sum(log.repeated for log in logs),
+    )
+
+
 def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
     """Return two recordings of the same motion at the same times with independent noise.
 
     One is every other sample. The other is interpolated from the rest to the times of the first, which is
     accurate for frequencies well below the sampling rate.
     """
+    pairs = [_piece_in_two(piece) for piece in log.pieces()]
+    return joined([one for one, _ in pairs]), joined([other for _, other in pairs])
+
+
+def _piece_in_two(log: JointLog) -> tuple[JointLog, JointLog]:
     count = (len(log.q_rad) - 1) // 2
-    step_ns = NS_PER_S / log.rate_hz
-    odd_ns = np.round(np.arange(0, 2 * count + 1, 2) * step_ns).astype(np.int64)
-    even_ns = np.round(np.arange(1, 2 * count, 2) * step_ns).astype(np.int64)
-    signals = [log.q_rad, log.tau_nm, *([] if log.qd_rad_s is None else [log.qd_rad_s])]
-    first = [frozen(signal[1 : 2 * count : 2]) for signal in signals]
-    gap_ns = int(np.ceil(3.0 * step_ns))
-    others = [
-        frozen(resample([odd_ns], [signal[0 : 2 * count + 1 : 2]], even_ns, max_gap_ns=gap_ns)[:, 0])
-        for signal in signals
-    ]
-    return _half(log, first), _half(log, others)
+    odd, even = (np.arange(first, 2 * count + 1, 2) / log.rate_hz for first in (0, 1))
 
+    def half(of: Callable[[Array], Array]) -> JointLog:
+        velocity = None if log.qd_rad_s is None else of(log.qd_rad_s)
+        return JointLog(0.5 * log.rate_hz, of(log.q_rad), velocity, of(log.tau_nm), log.resampled)
 
-def _half(log: JointLog, signals: Sequence[Array]) -> JointLog:
-    velocity = signals[2] if len(signals) > 2 else None
-    return JointLog(0.5 * log.rate_hz, signals[0], velocity, signals[1], log.resampled)
+    return half(lambda signal: frozen(signal[1 : 2 * count : 2])), half(
+        lambda signal: _even(odd, signal[0 : 2 * count + 1 : 2], even)
+    )
 
 
 def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
-    """Return the recording in a CSV or npz file, positions and torques (m, n) at uniform times.
+    """Return the recording in a CSV or npz file, positions and torques (m, n), split at holes (`breaks`).
 
     CSV: a line of names and a line per sample; `t_s` [s], and per joint `q_<joint>_rad`, `tau_<joint>_nm` and
     optionally `qd_<joint>_rad_s`. npz: `position_rad` (m, n), `torque_nm` (m, n), `t_s` (m,) or
@@ -98,8 +133,8 @@ def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
 
     Raises:
         DataFileError: neither CSV nor npz, columns or arrays that are missing or do not fit the joints, a
-            value that is not a finite number, or times that do not increase or have a gap; the message
-            names file, column and row.
+            value that is not a finite number, or times that do not increase; the message names
+            file, column and row.
         OSError: the file cannot be read.
     """
     path = Path(path)
@@ -239,37 +274,60 @@ def _npz_order(arrays: dict[str, NDArray[np.generic]], joints: Sequence[str]) ->
 
 
 def _log(table: _Table) -> JointLog:
-    times = table.t_s
     # An identification needs thousands; four are what a spline needs.
-    if times.size < 4:
-        _refuse(f"{times.size} samples are no recording; at least 4 are needed")
+    if table.t_s.size < 4:
+        _refuse(f"{table.t_s.size} samples are no recording; at least 4 are needed")
+    table, repeated = _without_repeated(table)
+    times = table.t_s
     steps = np.diff(times)
     if (steps <= 0.0).any():
         row = int(np.argmax(steps <= 0.0)) + 1
         _refuse(f"{table.row(row)}: its time {times[row]} s is not after that of the sample before it")
-    usual = float(np.median(steps))
-    if steps.max() > _BRIDGED * usual:
-        row = int(np.argmax(steps)) + 1
-        _refuse(
-            f"{table.row(row)}: a gap of {steps.max():.4g} s before it; samples come every {usual:.4g} s "
-            f"and at most {_BRIDGED:.0f} intervals are bridged"
-        )
-    rate_hz = (times.size - 1) / float(times[-1] - times[0])
-    even = np.arange(times.size) / rate_hz
-    uneven = bool(np.abs(times - times[0] - even).max() > _JITTER / rate_hz)
-    even_signals = {
-        key: _even(times, values, even) if uneven else values for key, values in table.signals.items()
+    ends = (0, *(np.flatnonzero(steps > _BRIDGED * np.median(steps)) + 1).tolist(), times.size)
+    parts = [slice(a, b) for a, b in pairwise(ends) if b - a >= 4]
+    if not parts:
+        _refuse(f"{len(ends) - 2} holes in {times.size} samples leave no 4 in a row")
+    spans = np.array([times[part.stop - 1] - times[part.start] for part in parts])
+    rate_hz = float(np.round(spans / np.median(steps)).sum() / spans.sum())
+    return joined([_uniform(table, part, rate_hz) for part in parts])._replace(repeated=repeated)
+
+
+def _without_repeated(table: _Table) -> tuple[_Table, int]:
+    """Leave out rows that repeat the one before, up to three in a row (more are a rest); return how many.
+
+    A logger that is faster than its source writes a reading again in the place of the next: the step after
+    it is twice as long, and the other rows keep their times. If that step is a usual one, rows were inserted;
+    the others move up if the times went on. (Where an encoder's resolution makes steps alike, they do not.)
+    """
+    values = np.column_stack(list(table.signals.values()))
+    same = np.concatenate([[False], (np.diff(values, axis=0) == 0.0).all(axis=1)])
+    repeated = same & ~binary_opening(same, np.ones(_MAX_REPEATED + 1))
+    kept = np.flatnonzero(~repeated)
+    times, last = table.t_s[kept], np.flatnonzero(repeated[:-2] & ~same[1:-1])
+    after, usual = (
+        np.abs(table.signals["q"][last + k] - table.signals["q"][last + k - 1]).sum() for k in (1, 2)
+    )
+    coarse = (np.diff(table.signals["q"][kept], axis=0) == 0.0).mean() > _COARSE
+    if not coarse and after < 1.5 * usual and (table.t_s[last] > table.t_s[last - 1]).all():
+        times = table.t_s[: kept.size]
+    signals = {key: signal[kept] for key, signal in table.signals.items()}
+    return _Table(times, signals, lambda row: table.row(int(kept[row]))), int(repeated.sum())
+
+
+def _uniform(table: _Table, part: slice, rate_hz: float) -> JointLog:
+    times = table.t_s[part] - table.t_s[part.start]
+    even = np.arange(round(float(times[-1]) * rate_hz) + 1) / rate_hz
+    uneven = even.size != times.size or bool(np.abs(times - even).max() > _JITTER / rate_hz)
+    signals = {
+        key: _even(times, values[part], even) if uneven else values[part]
+        for key, values in table.signals.items()
     }
-    make_read_only(even_signals.values())
-    return JointLog(rate_hz, even_signals["q"], even_signals.get("qd"), even_signals["tau"], uneven)
+    return JointLog(rate_hz, signals["q"], signals.get("qd"), signals["tau"], uneven)
 
 
 def _even(times: Array, values: Array, even: Array) -> Array:
     """Interpolate (m, n) to even times from the first sample to the last."""
-    known_ns = np.round((times - times[0]) * NS_PER_S).astype(np.int64)
-    common_ns = np.minimum(np.round(even * NS_PER_S).astype(np.int64), known_ns[-1])
-    gap_ns = int(np.diff(known_ns).max())
-    return resample([known_ns], [values], common_ns, max_gap_ns=gap_ns)[:, 0].copy()
+    return np.asarray(make_interp_spline(times, values, k=3)(np.clip(even, times[0], times[-1])))
 
 
 def _refuse(text: str) -> NoReturn:

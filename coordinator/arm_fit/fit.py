@@ -1,6 +1,6 @@
 """Fit a recording, test the fit on held-out samples and put everything into the report."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,10 +25,12 @@ from coordinator.arm_fit.cross_validation import (
     length_curve,
     mean_torque,
 )
+from coordinator.arm_fit.cutoff import CutoffPoint
 from coordinator.arm_fit.data_file import JointLog
 from coordinator.arm_fit.problem import Problem, joined
 from coordinator.arm_fit.report import (
     ArmParameterPart,
+    CutoffPart,
     DataPart,
     ErrorPart,
     FitPart,
@@ -78,6 +80,7 @@ class Elsewhere(NamedTuple):
 def fit_and_test(
     problem: Problem,
     log: JointLog,
+    curve: Sequence[CutoffPoint],
     *,
     urdf_name: str,
     data_name: str,
@@ -88,7 +91,8 @@ def fit_and_test(
     """Fit a recording, and test the fit on samples that were held out.
 
     Args:
-        problem: the recording as a least-squares problem. log: the same as recorded.
+        problem: the recording as a least-squares problem. log: the same as recorded. curve: of the choice of
+            the low-pass, empty if it was given.
         urdf_name, data_name: names of the files for the report.
         step: is called with a sentence before each of the steps.
         trust: weight of the URDF's inertias for the consistent bodies (`consistent_bodies`).
@@ -118,7 +122,7 @@ def fit_and_test(
         urdf=urdf_name,
         data=data_name,
         held_out_data=None if elsewhere is None else elsewhere.data,
-        recording=_data_part(log, problem),
+        recording=_data_part(log, curve, problem),
         held_out=held_out,
         lengths=lengths,
         gains=gains,
@@ -179,12 +183,18 @@ def _error_part(model: Model, tested: HeldOutError) -> ErrorPart:
     )
 
 
-def _data_part(log: JointLog, problem: Problem) -> DataPart:
+def _data_part(log: JointLog, curve: Sequence[CutoffPoint], problem: Problem) -> DataPart:
     return DataPart(
         joints=list(problem.robot.chain.serials),
         duration_s=log.duration_s,
         recorded_hz=log.rate_hz,
         resampled=log.resampled,
+        repeated_rows=log.repeated,
+        pieces=len(log.breaks) + 1,
+        dropped_s=problem.log.dropped_s,
+        cutoff_curve=[
+            CutoffPart(cutoff_hz=point.cutoff_hz, filtered=point.filtered, raw=point.raw) for point in curve
+        ],
         cutoff_hz=problem.log.cutoff_hz,
         kept_hz=problem.log.rate_hz,
         samples=len(problem.log.tau_nm),

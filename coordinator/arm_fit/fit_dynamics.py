@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
+from coordinator.arm_fit.cutoff import chosen_cutoff_hz, cutoff_curve
 from coordinator.arm_fit.data_file import JointLog, in_two, read_log
-from coordinator.arm_fit.filtered_log import filtered_log, max_samples, usual_cutoff_hz
+from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.report import FitReport
@@ -83,7 +84,8 @@ def fit_dynamics(
             friction fades and samples are masked.
         instruments: fit by instrumental variables, every other sample against the rest, so that the noise of
             the encoders does not bias the inertias; needs twice as many samples.
-        cutoff_hz: low-pass over motion and torque; by default five times the highest frequency of the motion.
+        cutoff_hz: low-pass over motion and torque; by default that with which halves predict each other's raw
+            torques best (`cutoff_curve`).
         gravity: (3,) specific force at rest in the root link's frame [m/s^2], upwards. Ignored if `urdf` is a
             robot, whose chain has its own.
         trust: weight of the URDF's inertias for the bodies.
@@ -99,12 +101,14 @@ def fit_dynamics(
     progress(f"read {_name(urdf)} and {_name(data)}")
     robot = urdf if isinstance(urdf, UrdfRobot) else read_urdf(urdf, gravity)
     log = _log(data, robot)
-    progress("low-pass, and the regressor of every sample")
-    posed = _posed(robot, log, choice, cutoff_hz, instruments)
+    progress("choose the low-pass")
+    curve = cutoff_curve(robot, log, choice) if cutoff_hz is None else ()
+    posed = _posed(robot, log, choice, cutoff_hz or chosen_cutoff_hz(curve), instruments)
     elsewhere = None if held_out is None else Elsewhere(_name(held_out), _posed_like(posed, held_out))
     result = fit_and_test(
         posed,
         log,
+        curve,
         urdf_name=_name(urdf),
         data_name=_name(data),
         step=progress,
@@ -138,10 +142,7 @@ def _log(data: str | Path | JointLog, robot: UrdfRobot) -> JointLog:
     return data
 
 
-def _posed(
-    robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff_hz: float | None, instruments: bool
-) -> Problem:
-    cutoff = usual_cutoff_hz(log) if cutoff_hz is None else cutoff_hz
+def _posed(robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff: float, instruments: bool) -> Problem:
     count = max_samples(len(robot.bodies))
     if not instruments:
         return problem(robot, filtered_log(log, cutoff, count), choice)

@@ -161,7 +161,8 @@ def _signals(drives: Sequence[DriveColumn], log: FilteredLog, slow_rad_s: Array)
     """Return the drives' signals (m, k) low-passed as the torques are."""
     signals = drive_signals(drives, log.qd_rad_s, log.qdd_rad_s2, slow_rad_s).copy()
     at = [k for k, drive in enumerate(drives) if not TERM_KINDS[drive.term].linear]
-    fine = drive_signals([drives[k] for k in at], log.fine_qd_rad_s, log.fine_qdd_rad_s2, slow_rad_s)
     if at:
-        signals[:, at] = log.low_passed(fine)
+        some = [drives[k] for k in at]
+        motions = zip(log.fine_qd_rad_s, log.fine_qdd_rad_s2, strict=True)
+        signals[:, at] = log.low_passed([drive_signals(some, *motion, slow_rad_s) for motion in motions])
     return signals

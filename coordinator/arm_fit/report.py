@@ -13,9 +13,19 @@ SCHEMA = 2
 Model = Literal["fitted", "bodies", "urdf", "drives_only", "mean"]
 
 
+class CutoffPart(Part):
+    """The held-out errors, both ways together, all samples, behind a low-pass: filtered and raw torque."""
+
+    cutoff_hz: float
+    filtered: float
+    raw: float
+
+
 class DataPart(Part):
     """The recording, and how it was filtered.
 
+    repeated_rows: rows like the one before, left out. pieces: parts between holes; dropped_s: time in those
+    that are too short for the low-pass. cutoff_curve: what the low-pass was chosen by, empty if it was given.
     noise: |raw - filtered| / |raw| of the torque, which no model of this bandwidth can predict. mask_rad_s:
     per joint the speed below which a sample is masked, and not fitted to.
     """
@@ -24,6 +34,10 @@ class DataPart(Part):
     duration_s: float
     recorded_hz: float
     resampled: bool
+    repeated_rows: int
+    pieces: int
+    dropped_s: float
+    cutoff_curve: list[CutoffPart]
     cutoff_hz: float
     kept_hz: float
     samples: int

@@ -59,7 +59,9 @@ _Instruments = Annotated[
 ]
 _Cutoff = Annotated[
     float | None,
-    typer.Option(help="Low-pass over motion and torque [Hz]; by default from the spectrum of the motion."),
+    typer.Option(
+        help="Low-pass over motion and torque [Hz]; by default that of the least raw error between halves."
+    ),
 ]
 _Gravity = Annotated[
     str, typer.Option(help="Specific force at rest in the root link's frame [m/s^2], upwards.")

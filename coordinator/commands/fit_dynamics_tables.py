@@ -36,6 +36,13 @@ def notes(report: FitReport) -> Iterator[str]:
         f"{data.duration_s:.2f} s at {data.recorded_hz:.6g} Hz{evened}; low-pass at {data.cutoff_hz:.3g} Hz, "
         f"{data.samples} samples kept at {data.kept_hz:.4g} Hz"
     )
+    if data.repeated_rows:
+        yield f"{data.repeated_rows} rows repeat the one before them and were left out"
+    if data.pieces > 1:
+        yield f"split at {data.pieces - 1} holes; pieces too short for the low-pass: {data.dropped_s:.2f} s"
+    if data.cutoff_curve:
+        curve = ", ".join(f"{p.cutoff_hz:.3g} Hz {_percent(p.raw)} %" for p in data.cutoff_curve)
+        yield f"low-pass chosen by the raw error of halves predicted by each other: {curve}"
     yield (
         f"the low-pass takes {_percent(data.noise)} % of the torque away, which is in every error called raw"
     )

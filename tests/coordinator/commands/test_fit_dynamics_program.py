@@ -199,6 +199,6 @@ def test_a_file_that_is_broken_is_named_with_the_line(tmp_path: Path) -> None:
 
 
 def test_a_recording_too_short_for_its_parameters_is_a_failure(tmp_path: Path) -> None:
-    done = called(*write_files(tmp_path, seconds=1.9), "--cutoff", "6")
+    done = called(*write_files(tmp_path, seconds=1.1), "--cutoff", "6")
     assert done.exit_code == 1, done.output
     assert "nothing is left to estimate the noise from" in done.output
