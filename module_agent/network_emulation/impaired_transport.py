@@ -7,6 +7,7 @@ replies to this endpoint's queries. Messages that this endpoint sends pass uncha
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from module_agent.network_emulation.channel import Channel, OrderedFlow
 from module_agent.network_emulation.partition import OwnToken, WatchedTokens
 from module_agent.network_emulation.profile import NetworkProfile, Receiver
 from module_agent.network_emulation.scheduler import Scheduler, TimerThread
+from module_agent.transport.handles import Answer, Declaration, Question
 from module_agent.transport.transport import (
     CLOSED,
     LEASE_S,
@@ -42,68 +44,6 @@ class DropCounts(NamedTuple):
     requests: int
     replies: int
     sent: int
-
-
-class _Declaration:
-    """A declaration of the inner transport; events still on their way end with it."""
-
-    def __init__(self, sink: Sink, forget: Callable[["_Declaration"], None] = lambda declaration: None):
-        self._sink: Sink | None = sink
-        self._forget = forget
-        self._inner: Undeclare | None = None
-
-    def hold(self, inner: Undeclare) -> "_Declaration":
-        self._inner = inner
-        return self
-
-    def deliver(self, event: Event) -> None:
-        sink = self._sink
-        if sink is not None:
-            sink(event)
-
-    def undeclare(self) -> None:
-        self._sink = None
-        self._forget(self)
-        inner, self._inner = self._inner, None
-        if inner is not None:
-            inner.undeclare()
-
-
-class _Question:
-    """A query under way; its one reply is the answer or the time-out, whichever comes first."""
-
-    def __init__(self, tag: int, key: str, sink: Sink):
-        self.tag = tag
-        self.key = key
-        self._sink: Sink | None = sink
-        self._lock = threading.Lock()
-
-    def withdraw(self) -> Sink | None:
-        with self._lock:
-            sink, self._sink = self._sink, None
-        return sink
-
-    def finish(self, reply: Reply) -> None:
-        sink = self.withdraw()
-        if sink is not None:
-            sink(reply)
-
-
-class _Once:
-    """The reply function of a request that may arrive twice: only the first answer goes out."""
-
-    def __init__(
-        self, reply: Callable[[bytes], None], send: Callable[[Callable[[bytes], None], bytes], None]
-    ):
-        self._reply: Callable[[bytes], None] | None = reply
-        self._send = send
-        self._lock = threading.Lock()
-
-    def __call__(self, payload: bytes) -> None:
-        with self._lock:
-            reply, self._reply = self._reply, None
-        if reply is not None:
-            self._send(reply, payload)
 
 
 class ImpairedTransport:
@@ -140,14 +80,14 @@ class ImpairedTransport:
         self._lock = threading.Lock()
         self._closed = False
         self._flows: dict[tuple[str, str], OrderedFlow] = {}
-        self._questions: dict[_Question, None] = {}
+        self._questions: dict[Question, None] = {}
         self._dropped = {"sample": 0, "request": 0, "reply": 0, "sent": 0}
         # Guards what follows; taken before the other, never after it.
         self._parting = threading.Lock()
         self._parted = False
         self._partition = 0
         self._own_tokens: dict[OwnToken, None] = {}
-        self._watched: dict[_Declaration, WatchedTokens] = {}
+        self._watched: dict[Declaration, WatchedTokens] = {}
         for start_s, end_s in profile.partitions if receiver == "coordinator" else ():
             scheduler.call_later(start_s, self.partition)
             scheduler.call_later(end_s, self.heal)
@@ -165,7 +105,7 @@ class ImpairedTransport:
 
     def subscribe(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver samples late, not at all, out of order or twice."""
-        declaration = _Declaration(sink)
+        declaration = Declaration(sink)
 
         def on_sample(event: Event) -> None:
             assert isinstance(event, Sample)
@@ -175,11 +115,11 @@ class ImpairedTransport:
 
     def serve(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver requests late, not at all, out of order or twice; answers go out unless cut off."""
-        declaration = _Declaration(sink)
+        declaration = Declaration(sink)
 
         def on_request(event: Event) -> None:
             assert isinstance(event, Request)
-            request = event._replace(reply=_Once(event.reply, self._answer))
+            request = event._replace(reply=Answer(partial(self._answer, event.reply)))
             arrives = self._impair("request", event.key, lambda: declaration.deliver(request))
             if not arrives:
                 self._scheduler.call_later(_LOST_REQUEST_S, lambda: _release(event.reply))
@@ -188,7 +128,7 @@ class ImpairedTransport:
 
     def query(self, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
         """Ask; the answer comes late or, if it is lost or too late, as the error "Timeout"."""
-        question = _Question(tag, key, sink)
+        question = Question(key, tag, sink, self._forget_question)
         with self._lock:
             if self._closed:
                 raise TransportError(f"cannot query {key}: {CLOSED}")
@@ -197,11 +137,10 @@ class ImpairedTransport:
             if not self._is_cut_off():
                 self._inner.query(key, payload, timeout_s, lambda event: self._on_reply(question, event), tag)
         except TransportError:
-            self._forget(question)
             # A concurrent close has answered it.
-            if question.withdraw() is not None:
+            if question.withdraw():
                 raise
-        self._scheduler.call_later(timeout_s, lambda: self._finish(question, Reply(tag, key, None, TIMEOUT)))
+        self._scheduler.call_later(timeout_s, lambda: question.finish(None, TIMEOUT))
 
     def declare_alive(self, key: str) -> Undeclare:
         """Hold a liveliness token while this session lives; the others see it unless cut off for long."""
@@ -215,10 +154,10 @@ class ImpairedTransport:
 
     def watch_alive(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver changes of matching tokens late, in order, never lost."""
-        declaration = _Declaration(sink, self._forget_watch)
+        declaration = Declaration(sink, self._forget_watch)
 
         def report(event: Liveness) -> None:
-            self._delay("liveness", event.key, lambda: declaration.deliver(event))
+            self._impair("liveness", event.key, lambda: declaration.deliver(event))
 
         watched = WatchedTokens(report)
 
@@ -241,7 +180,7 @@ class ImpairedTransport:
             questions, self._questions = list(self._questions), {}
         self._inner.close()
         for question in questions:
-            question.finish(Reply(question.tag, question.key, None, CLOSED))
+            question.finish(None, CLOSED)
 
     # ------------------------------------------------------------------ partition
 
@@ -297,46 +236,29 @@ class ImpairedTransport:
         with self._parting:
             self._own_tokens.pop(token, None)
 
-    def _forget_watch(self, declaration: _Declaration) -> None:
+    def _forget_watch(self, declaration: Declaration) -> None:
         with self._parting:
             self._watched.pop(declaration, None)
 
     # ------------------------------------------------------------------ what comes in
 
-    def _on_reply(self, question: _Question, event: Event) -> None:
+    def _on_reply(self, question: Question, event: Event) -> None:
         assert isinstance(event, Reply)
         if event.payload is None:
-            self._finish(question, event)
+            question.finish(None, event.error)
         else:
-            self._impair("reply", event.key, lambda: self._finish(question, event))
+            self._impair("reply", event.key, lambda: question.finish(event.payload))
 
-    def _finish(self, question: _Question, reply: Reply) -> None:
-        self._forget(question)
-        question.finish(reply)
-
-    def _forget(self, question: _Question) -> None:
+    def _forget_question(self, question: Question) -> None:
         with self._lock:
             self._questions.pop(question, None)
-
-    def _delay(self, kind: str, key: str, deliver: Callable[[], None]) -> None:
-        with self._lock:
-            if self._closed:
-                return
-            channel = self._channel
-            if channel is not None:
-                delay_s = channel.fate(self._scheduler.now_s - self._start_s).delay_s
-                deliver = self._enter(kind, key, deliver)
-        if channel is None:
-            deliver()
-        else:
-            self._scheduler.call_later(delay_s, deliver)
 
     def _impair(self, kind: str, key: str, deliver: Callable[[], None]) -> bool:
         """Deliver a message by its fate; return False if it is lost."""
         with self._lock:
             if self._closed:
                 return False
-            if self._parted:
+            if self._parted and kind != "liveness":
                 self._dropped[kind] += 1
                 return False
             calls = self._calls(kind, key, deliver)
@@ -354,6 +276,8 @@ class ImpairedTransport:
         if self._channel is None:
             return None
         fate = self._channel.fate(self._scheduler.now_s - self._start_s)
+        if kind == "liveness":
+            return [(fate.delay_s, self._enter(kind, key, deliver))]
         if fate.lost:
             self._dropped[kind] += 1
             return []

@@ -55,7 +55,8 @@ class WatchedTokens:
         if parted:
             self._held.append(event)
         else:
-            self._report_change(event)
+            self._note(event)
+            self._report(event)
 
     def lapse(self) -> None:
         """Report all tokens as vanished: the partition has lasted longer than the lease."""
@@ -67,18 +68,13 @@ class WatchedTokens:
         """Report the changes meanwhile, after a lapse all tokens that exist."""
         held, self._held = self._held, []
         lapsed, self._lapsed = self._lapsed, False
-        if not lapsed:
-            for event in held:
-                self._report_change(event)
-            return
         for event in held:
             self._note(event)
-        for key in self._present:
-            self._report(Liveness(key, True))
-
-    def _report_change(self, event: Liveness) -> None:
-        self._note(event)
-        self._report(event)
+            if not lapsed:
+                self._report(event)
+        if lapsed:
+            for key in self._present:
+                self._report(Liveness(key, True))
 
     def _note(self, event: Liveness) -> None:
         if event.alive:

@@ -19,22 +19,22 @@ peer      at once         no (peers are not relayed since 1.9)   0.3 s after the
 import json
 import threading
 from collections.abc import Callable
-from typing import Literal, Protocol, Self
+from functools import partial
+from typing import Literal, Self
 
 import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
 from module_agent.model.errors import UsageError
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from module_agent.transport.handles import Answer, Declaration, Question
 from module_agent.transport.transport import (
     CLOSED,
     LEASE_S,
     NO_ANSWER,
     EndpointInUse,
-    Event,
     Liveness,
     NoHub,
-    Reply,
     Request,
     Sample,
     Sink,
@@ -70,90 +70,6 @@ class ZenohConfig(BaseModel):
         return cls(connect=(endpoint,))
 
 
-class _Declared(Protocol):
-    def undeclare(self) -> None: ...
-
-
-class _Pending:
-    """A query under way: the first to finish it delivers the one reply."""
-
-    def __init__(self, key: str, tag: int, sink: Sink, forget: Callable[["_Pending"], None]):
-        self._key = key
-        self._tag = tag
-        self._sink = sink
-        self._forget = forget
-        self._lock = threading.Lock()
-        self._open = True
-
-    def withdraw(self) -> bool:
-        """End without a reply; False when the reply has been delivered."""
-        with self._lock:
-            first, self._open = self._open, False
-        self._forget(self)
-        return first
-
-    def finish(self, payload: bytes | None, error: str = "") -> None:
-        if self.withdraw():
-            self._sink(Reply(self._tag, self._key, payload, error))
-
-    def on_reply(self, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            self.finish(reply.ok.payload.to_bytes())
-        elif reply.err is not None:
-            self.finish(None, reply.err.payload.to_bytes().decode("utf-8", "replace") or NO_ANSWER)
-
-    def on_end(self) -> None:
-        self.finish(None, NO_ANSWER)
-
-
-class _Answer:
-    """Holds a Zenoh query until it is answered, from any thread; Zenoh ends it when it is dropped."""
-
-    def __init__(self, query: zenoh.Query, key: str):
-        self._query: zenoh.Query | None = query
-        self._key = key
-        self._lock = threading.Lock()
-
-    def __call__(self, payload: bytes) -> None:
-        with self._lock:
-            query, self._query = self._query, None
-        if query is None:
-            return
-        try:
-            query.reply(self._key, payload)
-        except zenoh.ZError as error:
-            # A session that closed meanwhile has already ended the query at the asker.
-            if "closed" not in str(error):
-                raise TransportError(f"cannot answer the query on {query.key_expr}: {error}") from error
-        finally:
-            query.drop()  # type: ignore[no-untyped-call]
-
-
-class _Declaration:
-    """A declaration whose events end with `undeclare`, also those that Zenoh has in its hands already."""
-
-    def __init__(self, sink: Sink | None, forget: Callable[["_Declaration"], None]):
-        self._sink = sink
-        self._forget = forget
-        self._handle: _Declared | None = None
-
-    def hold(self, handle: _Declared) -> "_Declaration":
-        self._handle = handle
-        return self
-
-    def deliver(self, event: Event) -> None:
-        sink = self._sink
-        if sink is not None:
-            sink(event)
-
-    def undeclare(self) -> None:
-        self._sink = None
-        handle, self._handle = self._handle, None
-        if handle is not None:
-            self._forget(self)
-            handle.undeclare()
-
-
 class ZenohTransport:
     """A `Transport` over one Zenoh session; made by `open_zenoh`."""
 
@@ -162,8 +78,8 @@ class ZenohTransport:
         self._lock = threading.Lock()
         self._closed = False
         # Dictionaries as ordered sets: what was declared last is undeclared last.
-        self._declarations: dict[_Declaration, None] = {}
-        self._pending: dict[_Pending, None] = {}
+        self._declarations: dict[Declaration, None] = {}
+        self._questions: dict[Question, None] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
 
     def publish(self, key: str, payload: bytes) -> None:
@@ -180,69 +96,61 @@ class ZenohTransport:
         A foreign client may publish on an expression such as `x5/**`. Subscribers to one key receive that as
         their key; subscribers to many do not receive it, as it names none of them.
         """
-        declaration = _Declaration(sink, self._forget_declaration)
+        declaration = Declaration(sink, self._forget_declaration)
 
         def on_sample(sample: zenoh.Sample) -> None:
             key = _one_key(str(sample.key_expr), key_expr)
             if key is not None:
                 declaration.deliver(Sample(key, sample.payload.to_bytes()))
 
-        return self._declare(
-            declaration,
-            f"subscribe to {key_expr}",
-            lambda: self._session.declare_subscriber(key_expr, on_sample),
-        )
+        declare = self._session.declare_subscriber
+        return self._declare(declaration, f"subscribe to {key_expr}", lambda: declare(key_expr, on_sample))
 
     def serve(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver a `Request` for every query on a matching key; an unanswered one times out at its asker.
 
         Queries on an expression are taken as samples on one are (see `subscribe`).
         """
-        declaration = _Declaration(sink, self._forget_declaration)
+        declaration = Declaration(sink, self._forget_declaration)
 
         def on_query(query: zenoh.Query) -> None:
             payload = b"" if query.payload is None else query.payload.to_bytes()
             key = _one_key(str(query.key_expr), key_expr)
             if key is not None:
-                declaration.deliver(Request(key, payload, _Answer(query, key)))
+                declaration.deliver(Request(key, payload, Answer(partial(_reply, query, key))))
 
-        return self._declare(
-            declaration, f"serve {key_expr}", lambda: self._session.declare_queryable(key_expr, on_query)
-        )
+        declare = self._session.declare_queryable
+        return self._declare(declaration, f"serve {key_expr}", lambda: declare(key_expr, on_query))
 
     def query(self, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
         """Ask; the first answer wins. Without any, the one `Reply` carries the reason as `error`."""
-        pending = _Pending(key, tag, sink, self._forget_pending)
+        question = Question(key, tag, sink, self._forget_question)
         with self._lock:
             self._check_open(f"query {key}")
-            self._pending[pending] = None
+            self._questions[question] = None
         try:
             # Without consolidation NONE the first answer would wait for the last queryable. DROP, as Zenoh's
             # default lets a full link block the caller for seconds.
             self._session.get(
                 key,
-                zenoh.handlers.Callback(pending.on_reply, pending.on_end),
+                zenoh.handlers.Callback(partial(_finish, question), lambda: question.finish(None, NO_ANSWER)),
                 payload=payload,
                 timeout=timeout_s,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
         except zenoh.ZError as error:
-            if pending.withdraw():
+            if question.withdraw():
                 raise self._error(f"query {key}", error) from error
 
     def declare_alive(self, key: str) -> Undeclare:
         """Hold a liveliness token while this session lives."""
-        declaration = _Declaration(None, self._forget_declaration)
-        return self._declare(
-            declaration,
-            f"declare {key} alive",
-            lambda: self._session.liveliness().declare_token(key),
-        )
+        declaration, declare = Declaration(None, self._forget_declaration), self._session.liveliness()
+        return self._declare(declaration, f"declare {key} alive", lambda: declare.declare_token(key))
 
     def watch_alive(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver a `Liveness` for every present and future change of a matching token."""
-        declaration = _Declaration(sink, self._forget_declaration)
+        declaration = Declaration(sink, self._forget_declaration)
 
         def on_token(sample: zenoh.Sample) -> None:
             declaration.deliver(Liveness(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
@@ -259,10 +167,10 @@ class ZenohTransport:
             if self._closed:
                 return
             self._closed = True
-            declarations, pending = list(self._declarations), list(self._pending)
+            declarations, questions = list(self._declarations), list(self._questions)
             publishers, self._publishers = list(self._publishers.values()), {}
-        for query in pending:
-            query.finish(None, CLOSED)
+        for question in questions:
+            question.finish(None, CLOSED)
         # A session that closes under a live callback can hang the interpreter at exit: undeclare all first.
         for declaration in declarations:
             declaration.undeclare()
@@ -282,7 +190,7 @@ class ZenohTransport:
                     raise self._error(f"publish on {key}", error) from error
             return self._publishers[key]
 
-    def _declare(self, declaration: _Declaration, what: str, make: Callable[[], _Declared]) -> _Declaration:
+    def _declare(self, declaration: Declaration, what: str, make: Callable[[], Undeclare]) -> Declaration:
         with self._lock:
             self._check_open(what)
         # Not under the lock: Zenoh may run the callback, and so the sink, before it returns the handle.
@@ -304,13 +212,31 @@ class ZenohTransport:
     def _error(self, what: str, error: zenoh.ZError) -> TransportError:
         return TransportError(f"cannot {what}: {CLOSED if self._closed else _first_line(error)}")
 
-    def _forget_declaration(self, declaration: _Declaration) -> None:
+    def _forget_declaration(self, declaration: Declaration) -> None:
         with self._lock:
             self._declarations.pop(declaration, None)
 
-    def _forget_pending(self, pending: _Pending) -> None:
+    def _forget_question(self, question: Question) -> None:
         with self._lock:
-            self._pending.pop(pending, None)
+            self._questions.pop(question, None)
+
+
+def _finish(question: Question, reply: zenoh.Reply) -> None:
+    if reply.ok is not None:
+        question.finish(reply.ok.payload.to_bytes())
+    elif reply.err is not None:
+        question.finish(None, reply.err.payload.to_bytes().decode("utf-8", "replace") or NO_ANSWER)
+
+
+def _reply(query: zenoh.Query, key: str, payload: bytes) -> None:
+    try:
+        query.reply(key, payload)
+    except zenoh.ZError as error:
+        # A session that closed meanwhile has already ended the query at the asker.
+        if "closed" not in str(error):
+            raise TransportError(f"cannot answer the query on {query.key_expr}: {error}") from error
+    finally:
+        query.drop()  # type: ignore[no-untyped-call]
 
 
 def _one_key(said: str, declared: str) -> str | None:
