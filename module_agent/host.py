@@ -5,12 +5,12 @@ virtual time inside the simulator; only hardware, transport and worker differ.
 """
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from module_agent.control.controller import Command
 from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
-from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing
+from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, acknowledgement
 from module_agent.hardware.hardware import Modules, ModuleSample
 from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
@@ -63,10 +63,9 @@ class InlineWorker:
 class HostedModule:
     """One module of this process: its firmware, its observer, and their inboxes."""
 
-    def __init__(self, robot: str, config: FirmwareConfig, modules: Modules, index: int, shared: "Shared"):
-        self.robot = robot
-        self._shared = shared
-        self._information = InformationService(config.serial, shared.collection, shared.worker)
+    def __init__(self, robot: str, config: FirmwareConfig, modules: Modules, index: int, host: "AgentHost"):
+        self._host = host
+        self._information = InformationService(config.serial, host.collection, host.worker)
         self.serial = config.serial
         self.firmware = Firmware(config, modules, index)
         self.observer = Observer(config.serial, config.boot)
@@ -135,92 +134,34 @@ class HostedModule:
             # A result that is not ready yet is requested again; that is no fault of the sender's.
             if error.reason is not Refusal.BUSY:
                 self.firmware.admission.count(error.reason)
-            return encode(self._ack(False, 0, error.reason.value, error.detail[:512]))
+            return encode(self._ack(0, error))
 
     def _answer_message(self, request: Message) -> Message:
         match request:
             case EstimateRequest():
-                return self._answer_estimate(request)
+                finding = self.observer.findings.get(request.joint)
+                if finding is None:
+                    raise WireError(Refusal.GONE, f"{self.serial} has no estimate of joint {request.joint}")
+                return self.estimate(finding)
             case CollectRequest():
-                return self._answer_collect(request)
+                self._information.collect(request, self._host.own_rows, self._host.now_ns)
+                return self._ack(request.seq)
             case InformationRequest():
-                return self._answer_information(request)
+                answer = self._information.answer(request)
+                return Information(**self._head(), **answer._asdict())
             case _:
                 raise WireError(Refusal.MALFORMED, f"{type(request).__name__} is not answered by the host")
 
-    def _answer_estimate(self, request: EstimateRequest) -> Estimate:
-        finding = self.observer.findings.get(request.joint)
-        if finding is None:
-            raise WireError(Refusal.GONE, f"{self.serial} has no estimate of joint {request.joint}")
-        return self.estimate(finding)
-
-    def _answer_collect(self, request: CollectRequest) -> Ack:
-        shared = self._shared
-        self._information.collect(request, shared.own_rows, shared.clock_ns())
-        return self._ack(True, request.seq)
-
-    def _answer_information(self, request: InformationRequest) -> Information:
-        answer = self._information.answer(request)
-        return Information(
-            serial=self.serial, boot=self.firmware.config.boot, seq=self._next_seq(), **answer._asdict()
-        )
-
-    def _next_seq(self) -> int:
+    def _head(self) -> dict[str, Any]:
         self._seq += 1
-        return self._seq
+        return {"serial": self.serial, "boot": self.firmware.config.boot, "seq": self._seq}
 
-    def _ack(self, accepted: bool, re: int, reason: str = "", detail: str = "") -> Ack:
-        lease = self.firmware.lease
-        return Ack(
-            serial=self.serial,
-            boot=self.firmware.config.boot,
-            seq=self._next_seq(),
-            re=re,
-            accepted=accepted,
-            reason=reason,
-            detail=detail,
-            t_ns=self.now_ns,
-            holder=lease.holder,
-            lease_left_ns=lease.left_ns(self.now_ns),
-            token=lease.token,
-        )
+    def _ack(self, re: int, refused: WireError | None = None) -> Ack:
+        return acknowledgement(self._head(), self.firmware.lease, self.now_ns, re, refused)
 
     def estimate(self, finding: Finding) -> Estimate:
         """Return the message that publishes a finding."""
-        return Estimate(
-            serial=self.serial,
-            boot=self.firmware.config.boot,
-            seq=self._next_seq(),
-            joint=finding.joint,
-            motion_ids=finding.motion_ids,
-            moved=finding.moved,
-            rate_ratio=finding.rate_ratio,
-            gravity_m_s2=finding.gravity_m_s2,
-            circle=finding.circle,
-            regression=finding.regression,
-            note=finding.note,
-        )
-
-
-class Shared:
-    """State that the modules of one process share."""
-
-    def __init__(self, worker: Worker) -> None:
-        self.worker = worker
-        self.collection = MotionCollection()
-        self.modules: list[HostedModule] = []
-
-    @property
-    def own_rows(self) -> dict[str, OwnRows]:
-        """The rows of the process's own modules."""
-        return {
-            module.serial: OwnRows(module.firmware.config.boot, module.firmware.history)
-            for module in self.modules
-        }
-
-    def clock_ns(self) -> int:
-        """Return the time of one steady clock of the process: that of its first module."""
-        return self.modules[0].now_ns
+        return Estimate(**self._head(), **finding._asdict())
 
 
 class AgentHost:
@@ -234,15 +175,14 @@ class AgentHost:
         configs: Sequence[FirmwareConfig],
         worker: Worker,
     ):
-        self._shared = Shared(worker)
-        self.modules = self._shared.modules
-        self.modules += [
-            HostedModule(robot, config, modules, index, self._shared) for index, config in enumerate(configs)
+        self.worker = worker
+        self.collection = MotionCollection()
+        self.modules = [
+            HostedModule(robot, config, modules, index, self) for index, config in enumerate(configs)
         ]
         self._robot = robot
         self._hardware = modules
         self._transport = transport
-        self._worker = worker
         self._motion_listener = MotionListener()
         self._from_others = Inbox(capacity=4096)
         self._findings: list[tuple[HostedModule, Finding]] = []
@@ -252,6 +192,19 @@ class AgentHost:
         self._tag = 0
         self._seq = 0
         self._declare()
+
+    @property
+    def own_rows(self) -> dict[str, OwnRows]:
+        """The rows of the process's own modules."""
+        return {
+            module.serial: OwnRows(module.firmware.config.boot, module.firmware.history)
+            for module in self.modules
+        }
+
+    @property
+    def now_ns(self) -> int:
+        """The time of one steady clock of the process: that of its first module."""
+        return self.modules[0].now_ns
 
     def _declare(self) -> None:
         transport = self._transport
@@ -285,10 +238,10 @@ class AgentHost:
                 self._send(module, outgoing)
         if self._motion_listener.has_work:
             self._attend_to_motions()
-        if self._shared.collection.has_work:
-            for wanted in self._shared.collection.poll(self.modules[0].now_ns):
+        if self.collection.has_work:
+            for wanted in self.collection.poll(self.now_ns):
                 self._ask_history(wanted)
-        self._worker.check()
+        self.worker.check()
         if self._findings:
             self._publish_findings()
 
@@ -300,20 +253,16 @@ class AgentHost:
 
     # ------------------------------------------------------------------ the other modules
 
-    def _clocks(self) -> dict[str, int]:
-        return {module.serial: module.now_ns for module in self.modules}
-
     def _read_others(self) -> None:
-        clocks = self._clocks()
-        now_ns = self.modules[0].now_ns
+        clocks = {module.serial: module.now_ns for module in self.modules}
         for event in self._from_others.drain(limit=512):
             try:
-                self._on_event(event, now_ns, clocks)
+                self._on_event(event, clocks)
             except WireError as error:
                 for module in self.modules:
                     module.firmware.admission.count(error.reason)
 
-    def _on_event(self, event: Event, now_ns: int, clocks: dict[str, int]) -> None:
+    def _on_event(self, event: Event, clocks: dict[str, int]) -> None:
         if isinstance(event, Liveness | Request):
             return
         if isinstance(event, Reply):
@@ -321,16 +270,13 @@ class AgentHost:
             if event.payload is not None and asked is not None:
                 self._on_history(asked, event.payload, clocks)
             return
-        parts = parse(event.key)
-        if parts.leaf is Leaf.STATUS:
-            status = _of(
-                parts.serial, decode(Status, event.payload, TOPICS[Leaf.STATUS].max_bytes_from_module)
-            )
-            self._motion_listener.on_status(status, now_ns, clocks)
+        _, serial, leaf = parse(event.key)
+        max_bytes = TOPICS[leaf].max_bytes_from_module
+        if leaf is Leaf.STATUS:
+            status = _of(serial, decode(Status, event.payload, max_bytes))
+            self._motion_listener.on_status(status, self.now_ns, clocks)
         else:
-            feedback = _of(
-                parts.serial, decode(Feedback, event.payload, TOPICS[Leaf.FEEDBACK].max_bytes_from_module)
-            )
+            feedback = _of(serial, decode(Feedback, event.payload, max_bytes))
             self._motion_listener.on_feedback(feedback, clocks)
 
     def _on_history(self, asked: AskHistory, payload: bytes, clocks: dict[str, int]) -> None:
@@ -340,14 +286,13 @@ class AgentHost:
             # An answer too; anything else is malformed.
             refused = _of(asked.serial, decode(Ack, payload))
             if refused.reason in (Refusal.GONE.value, Refusal.WRONG_BOOT.value):
-                self._shared.collection.on_lost(asked)
+                self.collection.on_lost(asked)
             return
         self._motion_listener.on_feedback(feedback, clocks, live=False)
-        self._shared.collection.on_feedback(feedback)
+        self.collection.on_feedback(feedback)
 
     def _attend_to_motions(self) -> None:
-        now_ns = self.modules[0].now_ns
-        requests, motions = self._motion_listener.poll(now_ns)
+        requests, motions = self._motion_listener.poll(self.now_ns)
         for wanted in requests:
             if isinstance(wanted, Listen):
                 self._listen(wanted)
@@ -365,7 +310,7 @@ class AgentHost:
 
     def _submit(self, module: HostedModule, motion: JointMotion) -> None:
         job = module.observer.job(motion, module.firmware.history, module.firmware.last_rest)
-        self._worker.submit(job, lambda finding: self._findings.append((module, finding)))
+        self.worker.submit(job, lambda finding: self._findings.append((module, finding)))
 
     def _listen(self, wanted: Listen) -> None:
         subscription = self._listening.pop(wanted.serial, None)

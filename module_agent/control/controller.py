@@ -13,6 +13,7 @@ verified on a real log, and tau R / (48 Kt N efficiency) for an effort.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from module_agent.control.pid import Pid
@@ -37,7 +38,6 @@ class Command(NamedTuple):
 
 MOTOR_OFF = Command(math.nan, math.nan, math.nan)
 BRAKE = Command(math.nan, 0.0, math.nan, brake=True)
-
 
 Law = Callable[[Command, float, float, float], float]
 
@@ -67,7 +67,7 @@ class Controller:
             Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s(kind)),
             Pid(gains.effort, dt_s, 1.0 / torque_at_full_pwm_nm(kind)),
         )
-        self.update: Law = _LAWS[gains.strategy](*self._loops)
+        self.update: Law = partial(_LAWS[gains.strategy], *self._loops)
 
     def reset(self) -> None:
         """Forget all loops' past."""
@@ -75,56 +75,45 @@ class Controller:
             loop.reset()
 
 
-def _off(position: Pid, velocity: Pid, effort: Pid) -> Law:
-    return lambda command, position_rad, velocity_rad_s, effort_nm: 0.0
+# The laws: from the loops of position, velocity and effort, the command and the three measured values to the
+# PWM. A loop that is off contributes 0; a NaN is the only number that is not equal to itself.
 
 
-def _direct_pwm(position: Pid, velocity: Pid, effort: Pid) -> Law:
-    return lambda command, position_rad, velocity_rad_s, effort_nm: (
-        0.0 if command.effort_nm != command.effort_nm else _clip(command.effort_nm)
-    )
+def _direct_pwm(p: Pid, v: Pid, e: Pid, command: Command, q_rad: float, qd_rad_s: float, tau: float) -> float:
+    return 0.0 if command.effort_nm != command.effort_nm else _clip(command.effort_nm)
 
 
-# In the following a loop that is off contributes 0; a NaN is the only number that is not equal to itself.
+def _all_through_effort(
+    p: Pid, v: Pid, e: Pid, command: Command, q_rad: float, qd_rad_s: float, tau: float
+) -> float:
+    p_target, v_target, target, _ = command
+    off = p_target != p_target and v_target != v_target and target != target
+    through = p.follow(p_target, q_rad) + v.follow(v_target, qd_rad_s)
+    if target == target:
+        through += target
+    return _clip(e.follow(math.nan if off else through, tau))
 
 
-def _all_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
-    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
-        p_target, v_target, target, _ = command
-        off = p_target != p_target and v_target != v_target and target != target
-        through = position.follow(p_target, position_rad) + velocity.follow(v_target, velocity_rad_s)
-        if target == target:
-            through += target
-        return _clip(effort.follow(math.nan if off else through, effort_nm))
-
-    return law
+def _side_by_side(
+    p: Pid, v: Pid, e: Pid, command: Command, q_rad: float, qd_rad_s: float, tau: float
+) -> float:
+    p_target, v_target, target, _ = command
+    return _clip(p.follow(p_target, q_rad) + v.follow(v_target, qd_rad_s) + e.follow(target, tau))
 
 
-def _side_by_side(position: Pid, velocity: Pid, effort: Pid) -> Law:
-    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
-        p_target, v_target, target, _ = command
-        p = position.follow(p_target, position_rad)
-        v = velocity.follow(v_target, velocity_rad_s)
-        return _clip(p + v + effort.follow(target, effort_nm))
-
-    return law
-
-
-def _position_through_effort(position: Pid, velocity: Pid, effort: Pid) -> Law:
-    def law(command: Command, position_rad: float, velocity_rad_s: float, effort_nm: float) -> float:
-        p_target, v_target, target, _ = command
-        off = p_target != p_target and target != target
-        through = position.follow(p_target, position_rad)
-        v = velocity.follow(v_target, velocity_rad_s)
-        if target == target:
-            through += target
-        return _clip(v + effort.follow(math.nan if off else through, effort_nm))
-
-    return law
+def _position_through_effort(
+    p: Pid, v: Pid, e: Pid, command: Command, q_rad: float, qd_rad_s: float, tau: float
+) -> float:
+    p_target, v_target, target, _ = command
+    off = p_target != p_target and target != target
+    through = p.follow(p_target, q_rad)
+    if target == target:
+        through += target
+    return _clip(v.follow(v_target, qd_rad_s) + e.follow(math.nan if off else through, tau))
 
 
-_LAWS: dict[int, Callable[[Pid, Pid, Pid], Law]] = {
-    0: _off,
+_LAWS: dict[int, Callable[..., float]] = {
+    0: lambda *_: 0.0,
     1: _direct_pwm,
     2: _all_through_effort,
     3: _side_by_side,

@@ -13,6 +13,14 @@ from module_agent.control.waveform import duration_s, waveform
 from module_agent.wire.messages import EffortProfile, Limits, Pattern, Setpoint
 from module_agent.wire.refusal import Refusal, WireError
 
+# A motion is sampled when it starts; a minute takes 3 ms.
+MAX_MOTION_S = 60.0
+# The thesis commands up to 9 times the maximum speed, to show how the module saturates.
+ABSURD_SPEED = 10.0
+# How finely a motion is sampled. Its command holds from one sample to the next, in the module's time and
+# however far apart the ticks are.
+STEP_NS = 1_000_000
+
 SAMPLE = np.dtype("<f4")
 # What `EffortProfile` takes.
 MAX_SAMPLES = 800
@@ -61,17 +69,6 @@ def effort_at(profile: EffortProfile, t_s: NDArray[np.float64]) -> NDArray[np.fl
     return efforts
 
 
-# A motion is sampled when it starts; a minute takes 3 ms.
-MAX_MOTION_S = 60.0
-# The thesis commands up to 9 times the maximum speed, to show how the module saturates.
-ABSURD_SPEED = 10.0
-
-
-# How finely a motion is sampled. Its command holds from one sample to the next, in the module's time and
-# however far apart the ticks are.
-STEP_NS = 1_000_000
-
-
 class Motion:
     """A pattern sampled every millisecond at its start (0.3 ms for 6 s), so that a tick only looks it up.
 
@@ -85,22 +82,8 @@ class Motion:
         WireError: TYPES or NOT_FINITE, the efforts are no finite numbers.
     """
 
-    __slots__ = (
-        "_effort",
-        "_end_ns",
-        "_position",
-        "_start_ns",
-        "_velocity",
-        "last_effort_nm",
-        "last_position_rad",
-    )
-
     def __init__(
-        self,
-        pattern: Pattern,
-        origin_rad: float,
-        start_ns: int,
-        effort: EffortProfile | None = None,
+        self, pattern: Pattern, origin_rad: float, start_ns: int, effort: EffortProfile | None = None
     ):
         total_s = duration_s(pattern, origin_rad)
         steps = max(1, round(total_s * 1e9 / STEP_NS))
@@ -146,34 +129,17 @@ def check_duration(pattern: Pattern, origin_rad: float) -> None:
         )
 
 
-def check_speed(speed_rad_s: float, limits: Limits) -> None:
-    """Reject speeds above ABSURD_SPEED times the module's maximum: probably a unit error.
-
-    The loops clamp slower ones to what the motor can follow.
-
-    Raises:
-        WireError: LIMIT, with the speed.
-    """
-    if speed_rad_s > ABSURD_SPEED * limits.max_speed_rad_s:
-        raise WireError(
-            Refusal.LIMIT,
-            f"{speed_rad_s:.1f} rad/s is over {ABSURD_SPEED:.0f} times what this module can do, "
-            f"{limits.max_speed_rad_s:.2f} rad/s",
-        )
-
-
 def check_setpoint(setpoint: Setpoint, limits: Limits) -> None:
     """Check that a setpoint is within the position limits and is not absurdly fast.
 
     Raises:
         WireError: LIMIT, with the position and the range that is allowed, or the speed.
     """
-    check_speed(abs(setpoint.velocity_rad_s or 0.0), limits)
-    position, low, high = setpoint.position_rad, limits.min_position_rad, limits.max_position_rad
-    if position is not None and (
-        (low is not None and position < low) or (high is not None and position > high)
-    ):
-        raise WireError(Refusal.LIMIT, f"position {position:.3f} rad is outside {low} .. {high} rad")
+    _check_speed(abs(setpoint.velocity_rad_s or 0.0), limits)
+    position = setpoint.position_rad
+    if position is not None and not _within(position, position, limits):
+        allowed = f"{limits.min_position_rad} .. {limits.max_position_rad} rad"
+        raise WireError(Refusal.LIMIT, f"position {position:.3f} rad is outside {allowed}")
 
 
 def check_motion(motion: Motion, limits: Limits) -> None:
@@ -182,13 +148,23 @@ def check_motion(motion: Motion, limits: Limits) -> None:
     Raises:
         WireError: LIMIT, with the range that the motion needs and the one that is allowed, or its speed.
     """
-    check_speed(motion.top_speed_rad_s, limits)
+    _check_speed(motion.top_speed_rad_s, limits)
     low, high = motion.range_rad
-    if (limits.min_position_rad is not None and low < limits.min_position_rad) or (
-        limits.max_position_rad is not None and high > limits.max_position_rad
-    ):
+    if not _within(low, high, limits):
+        allowed = f"{limits.min_position_rad} .. {limits.max_position_rad} rad"
+        raise WireError(Refusal.LIMIT, f"the motion needs {low:.3f} .. {high:.3f} rad, allowed are {allowed}")
+
+
+def _check_speed(speed_rad_s: float, limits: Limits) -> None:
+    """Refuse what is probably a unit error; the loops clamp slower speeds to what the motor can follow."""
+    if speed_rad_s > ABSURD_SPEED * limits.max_speed_rad_s:
         raise WireError(
             Refusal.LIMIT,
-            f"the motion needs {low:.3f} .. {high:.3f} rad, "
-            f"allowed are {limits.min_position_rad} .. {limits.max_position_rad} rad",
+            f"{speed_rad_s:.1f} rad/s is over {ABSURD_SPEED:.0f} times what this module can do, "
+            f"{limits.max_speed_rad_s:.2f} rad/s",
         )
+
+
+def _within(low_rad: float, high_rad: float, limits: Limits) -> bool:
+    least, most = limits.min_position_rad, limits.max_position_rad
+    return (least is None or low_rad >= least) and (most is None or high_rad <= most)

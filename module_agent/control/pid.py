@@ -10,24 +10,6 @@ from module_agent.wire.messages import PidGains
 class Pid:
     """The state of one loop; `update` advances it by one tick of `dt_s`."""
 
-    __slots__ = (
-        "_dt",
-        "_error",
-        "_ff",
-        "_g",
-        "_integral",
-        "_kp",
-        "_lowpass",
-        "_max_output",
-        "_max_target",
-        "_measured",
-        "_min_output",
-        "_min_target",
-        "_output",
-        "_plain",
-        "_target",
-    )
-
     def __init__(self, gains: PidGains, dt_s: float, feed_forward_scale: float = 1.0):
         """`feed_forward_scale` turns the target's unit into the output's (PWM per rad/s, or per Nm)."""
         self._g = gains
@@ -46,8 +28,7 @@ class Pid:
     def reset(self) -> None:
         """Forget the past, as a loop does whose target is NaN."""
         self._target: float | None = None
-        self._error: float | None = None
-        self._measured: float | None = None
+        self._last: tuple[float, float] | None = None
         self._integral = 0.0
         self._output: float | None = None
 
@@ -99,9 +80,8 @@ class Pid:
         return output
 
     def _derivative(self, error: float, measured: float) -> float:
-        last_error, last_measured = self._error, self._measured
-        self._error, self._measured = error, measured
-        if last_error is None or last_measured is None:
+        last, self._last = self._last, (error, measured)
+        if last is None:
             return 0.0
-        change = error - last_error if self._g.d_on_error else last_measured - measured
+        change = error - last[0] if self._g.d_on_error else last[1] - measured
         return change / self._dt

@@ -22,9 +22,8 @@ from module_agent.wire.messages import (
 
 Array = NDArray[np.float64]
 
-# The window is cut at +-Tm, where the Gaussian is not yet zero (2 % at Tm = 2.8 s, Ts = 1 s). This share of
-# the duration at either end carries it to exactly zero: a step there would put a spike into the
-# acceleration.
+# A Gaussian cut at +-Tm is not yet zero there (2 % at Tm = 2.8 s, Ts = 1 s), and a step would be a spike of
+# acceleration: this share of the duration at either end carries it to exactly zero.
 TAPER_SHARE = 0.15
 MIN_GOTO_S = 0.2
 # Peak speed over mean speed of a minimum-jerk path: 15/8.
@@ -111,13 +110,17 @@ def taper(t_s: Array, total_s: float) -> tuple[Array, Array]:
     return 0.5 * (1.0 - np.cos(phase)), np.where(inside, sign * 0.5 * np.pi / rise * np.sin(phase), 0.0)
 
 
+def _window(t_s: Array, half_s: float, sigma_s: float) -> tuple[Array, Array]:
+    """Return a Gaussian about the middle of 2 `half_s`, tapered to zero at the ends, and its derivative."""
+    s = t_s - half_s
+    edge, edge_rate = taper(t_s, 2.0 * half_s)
+    window = np.exp(-(s**2) / (2.0 * sigma_s**2))
+    return window * edge, window * (-s / sigma_s**2) * edge + window * edge_rate
+
+
 def _windowed_sine(pattern: WindowedSine, t_s: Array) -> Waveform:
     omega = 2.0 * np.pi * pattern.frequency_hz
-    rel = t_s - pattern.centre_s
-    edge, edge_rate = taper(t_s, 2.0 * pattern.centre_s)
-    window = np.exp(-(rel**2) / (2.0 * pattern.sigma_s**2))
-    window_rate = window * (-rel / pattern.sigma_s**2) * edge + window * edge_rate
-    window = window * edge
+    window, window_rate = _window(t_s, pattern.centre_s, pattern.sigma_s)
     wave = pattern.amplitude * window * np.sin(omega * t_s)
     if pattern.of == "velocity":
         steps = 0.5 * (wave[1:] + wave[:-1]) * np.diff(t_s)
@@ -133,10 +136,7 @@ def _dynamic(pattern: DynamicPattern, t_s: Array) -> Waveform:
     s = inside - pattern.half_width_s
     sign = np.where(count % 2 == 1, -1.0, 1.0) if pattern.alternate else 1.0
     omega = 2.0 * np.pi * pattern.frequency_hz
-    edge, edge_rate = taper(inside, width)
-    window = np.exp(-(s**2) / (2.0 * pattern.sigma_s**2))
-    window_rate = window * (-s / pattern.sigma_s**2) * edge + window * edge_rate
-    window = window * edge
+    window, window_rate = _window(inside, pattern.half_width_s, pattern.sigma_s)
     scale = sign * pattern.amplitude_rad
     return Waveform(
         scale * window * np.sin(omega * s),

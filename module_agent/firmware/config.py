@@ -5,9 +5,7 @@ from typing import Any, NamedTuple
 from module_agent.hardware.hardware import ModuleInformation
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.errors import UsageError
-from module_agent.wire.messages import ExpiryAction, GainSet, Info, Limits
-
-FIRMWARE_NAME = "x5-agent 0.1"
+from module_agent.wire.messages import ExpiryAction, Limits
 
 
 class FirmwareConfig(NamedTuple):
@@ -66,26 +64,4 @@ def check_config(config: FirmwareConfig) -> FirmwareConfig:
         raise UsageError(f"feedback rate {config.feedback_rate_hz} Hz: it must be 1 to 1000 Hz")
     if not 1 <= config.batch_rows <= 64:
         raise UsageError(f"{config.batch_rows} rows a batch: it must be 1 to 64")
-    module_type(config.kind.name)
     return config
-
-
-def describe(config: FirmwareConfig, gains: GainSet, seq: int, t_ns: int) -> Info:
-    """Return the information message of a module with these settings and gains, at a module time."""
-    return Info(
-        serial=config.serial,
-        boot=config.boot,
-        seq=seq,
-        module_type=config.kind.name,
-        firmware=FIRMWARE_NAME,
-        feedback_rate_hz=config.feedback_rate_hz,
-        batch_rows=config.batch_rows,
-        history_rows=config.history_rows,
-        tick_ns=config.tick_ns,
-        imu_period_ns=config.imu_period_ns,
-        lifetime_ns=config.lifetime_ns,
-        expiry_action=config.expiry_action,
-        limits=config.limits,
-        gains=gains,
-        t_ns=t_ns,
-    )

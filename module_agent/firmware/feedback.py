@@ -3,8 +3,6 @@
 The history lets a receiver ask again for rows that the network has dropped.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from module_agent.control.controller import NOMINAL_VOLTAGE_V, Command
@@ -13,8 +11,6 @@ from module_agent.hardware.hardware import SensorSample
 from module_agent.wire.feedback_rows import ROW, STATE_NAMES, Rows, pack_row
 from module_agent.wire.messages import State
 from module_agent.wire.refusal import Refusal, WireError
-
-MAX_ROWS_PER_ANSWER = 256
 
 
 class History:
@@ -84,14 +80,6 @@ class History:
 _STATE_INDEX = {name: index for index, name in enumerate(STATE_NAMES)}
 
 
-class Batch(NamedTuple):
-    """Consecutive rows to be published: the number of the first, one past the last, and their bytes."""
-
-    first_row: int
-    end_row: int
-    block: bytes
-
-
 class FeedbackStream:
     """The feedback rows of one module, at its feedback rate and never twice with one IMU sample if slower.
 
@@ -125,8 +113,8 @@ class FeedbackStream:
 
     def append(
         self, sample: SensorSample, motion_id: int, state: State, command: Command, pwm: float
-    ) -> Batch | None:
-        """Add the row of a tick; return the batch that is complete with it."""
+    ) -> tuple[int, int] | None:
+        """Add the row of a tick; return the batch complete with it: its first row, one past its last."""
         voltage_v = sample.voltage_v
         duty = pwm * NOMINAL_VOLTAGE_V / voltage_v if voltage_v else 0.0
         history = self.history
@@ -149,4 +137,4 @@ class FeedbackStream:
         if end - first < self._batch_rows:
             return None
         self._sent_row = end
-        return Batch(first, end, history.block(first, end))
+        return first, end

@@ -10,14 +10,14 @@ The firmware decides by the lease, by how fresh commands are and by its motions.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
 from module_agent.control.gains import default_gains
 from module_agent.control.motion import Motion, check_duration, check_motion, check_setpoint
 from module_agent.firmware.admission import Admission
-from module_agent.firmware.config import FirmwareConfig, check_config, describe
-from module_agent.firmware.feedback import MAX_ROWS_PER_ANSWER, Batch, FeedbackStream
+from module_agent.firmware.config import FirmwareConfig, check_config
+from module_agent.firmware.feedback import FeedbackStream
 from module_agent.firmware.lease import Lease
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
 from module_agent.hardware.hardware import Modules, ModuleSample, SensorSample
@@ -41,6 +41,8 @@ from module_agent.wire.messages import (
 )
 from module_agent.wire.refusal import Refusal, WireError
 
+FIRMWARE_NAME = "x5-agent 0.1"
+MAX_ROWS_PER_ANSWER = 256
 STATUS_PERIOD_NS = 400_000_000
 # A fault at the temperature at which a module has no PWM left, and armed again only when it has cooled.
 WINDING_LIMIT_C = 154.0
@@ -184,7 +186,7 @@ class Firmware:
     # ------------------------------------------------------------------ states
 
     def _enter(self, trigger: Trigger, note: str = "") -> None:
-        target = TRANSITIONS.get((self.state, trigger))
+        target = TRANSITIONS[self.state].get(trigger)
         if target is None:
             raise WireError(Refusal.NOT_ARMED, f"{trigger} is not possible while {self.state}: acquire first")
         self.state = target
@@ -240,7 +242,7 @@ class Firmware:
             answer = self._dispatch(incoming)
         except WireError as error:
             self.admission.count(error.reason)
-            answer = encode(self._ack(False, 0, error.reason.value, error.detail))
+            answer = encode(self._ack(0, error))
         if incoming.request is not None:
             self._out.append(Answer(incoming.request, answer))
 
@@ -254,7 +256,8 @@ class Firmware:
             case Ask():
                 return encode(self._status(message.seq))
             case HistoryRequest():
-                return self._answer_history(message)
+                end = min(message.end_row, message.first_row + MAX_ROWS_PER_ANSWER)
+                return encode(self._feedback(message.first_row, end))
             case Stop():
                 self._stop(f"stopped by {message.sender}: {message.why}"[:512])
             case LeaseRequest():
@@ -267,7 +270,7 @@ class Firmware:
                 self._set_gains(message)
             case _:
                 raise WireError(Refusal.MALFORMED, f"{incoming.leaf.value} is not answered by the firmware")
-        return encode(self._ack(True, message.seq))
+        return encode(self._ack(message.seq))
 
     def _act_lease(self, request: LeaseRequest) -> None:
         if request.action == "renew":
@@ -351,59 +354,33 @@ class Firmware:
         self._apply_gains(command.gains)
         self._refresh(command.echo_ns)
 
-    def _answer_history(self, request: HistoryRequest) -> bytes:
-        end = min(request.end_row, request.first_row + MAX_ROWS_PER_ANSWER)
-        block = self.history.block(request.first_row, end)
-        return encode(self._feedback(Batch(request.first_row, end, block)))
-
     # ------------------------------------------------------------------ what it publishes
 
     def _append_row(self, sample: SensorSample, pwm: float, out: list[Outgoing]) -> None:
         motion = self._record.motion_id if self._motion is not None and self._record is not None else 0
         batch = self._rows.append(sample, motion, self.state, self._command, pwm)
         if batch is not None:
-            out.append(Publication(Leaf.FEEDBACK, encode(self._feedback(batch))))
+            out.append(Publication(Leaf.FEEDBACK, encode(self._feedback(*batch))))
 
-    def _next_seq(self) -> int:
+    def _head(self) -> dict[str, Any]:
+        """Return what every message begins with."""
         self._seq += 1
-        return self._seq
+        return {"serial": self.config.serial, "boot": self.config.boot, "seq": self._seq}
 
-    def _feedback(self, batch: Batch) -> Feedback:
-        return Feedback(
-            serial=self.config.serial,
-            boot=self.config.boot,
-            seq=self._next_seq(),
-            first_row=batch.first_row,
-            count=batch.end_row - batch.first_row,
-            rows=batch.block,
-        )
+    def _feedback(self, first: int, end: int) -> Feedback:
+        rows = self.history.block(first, end)
+        return Feedback(**self._head(), first_row=first, count=end - first, rows=rows)
 
-    def _ack(self, accepted: bool, re: int, reason: str = "", detail: str = "") -> Ack:
-        return Ack(
-            serial=self.config.serial,
-            boot=self.config.boot,
-            seq=self._next_seq(),
-            re=re,
-            accepted=accepted,
-            reason=reason,
-            detail=detail[:512],
-            t_ns=self._now_ns,
-            holder=self.lease.holder,
-            lease_left_ns=self.lease.left_ns(self._now_ns),
-            token=self.lease.token,
-        )
+    def _ack(self, re: int, refused: WireError | None = None) -> Ack:
+        return acknowledgement(self._head(), self.lease, self._now_ns, re, refused)
 
     def _status(self, re: int) -> Status:
         return Status(
-            serial=self.config.serial,
-            boot=self.config.boot,
-            seq=self._next_seq(),
+            **self._head(),
+            **self.lease.state(self._now_ns),
             re=re,
             t_ns=self._now_ns,
             state=self.state,
-            holder=self.lease.holder,
-            lease_left_ns=self.lease.left_ns(self._now_ns),
-            token=self.lease.token,
             next_row=self.history.next_row,
             motion=self._record,
             refusals=dict(self.admission.refusals),
@@ -413,7 +390,26 @@ class Firmware:
         )
 
     def _info(self) -> Info:
-        return describe(self.config, self._gains, self._next_seq(), self._now_ns)
+        # Of the settings a message takes the fields that it has.
+        return Info(
+            **self.config._asdict() | self._head(),
+            module_type=self.config.kind.name,
+            firmware=FIRMWARE_NAME,
+            history_rows=self.config.history_rows,
+            gains=self._gains,
+            t_ns=self._now_ns,
+        )
+
+
+def acknowledgement(
+    head: dict[str, Any], lease: Lease, now_ns: int, re: int, refused: WireError | None
+) -> Ack:
+    """Return the answer to command number `re`; `head` is what every message begins with."""
+    reason, detail = ("", "") if refused is None else (refused.reason.value, refused.detail[:512])
+    accepted = refused is None
+    return Ack(
+        **head, **lease.state(now_ns), re=re, accepted=accepted, reason=reason, detail=detail, t_ns=now_ns
+    )
 
 
 def _or_nan(target: float | None) -> float:

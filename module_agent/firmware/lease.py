@@ -1,5 +1,7 @@
 """The lease of a joint: one sender may command it at a time, under a token that grows with every grant."""
 
+from typing import Any
+
 from module_agent.wire.messages import LeaseRequest
 from module_agent.wire.refusal import Refusal, WireError
 
@@ -17,6 +19,10 @@ class Lease:
         self.token = 0
         self._until_ns = 0
         self._granted: dict[str, tuple[int, int]] = {}
+
+    def state(self, now_ns: int) -> dict[str, Any]:
+        """Return the fields of a message that describe the lease."""
+        return {"holder": self.holder, "lease_left_ns": self.left_ns(now_ns), "token": self.token}
 
     def left_ns(self, now_ns: int) -> int:
         """Return the time until the lease lapses, 0 when it has no holder."""

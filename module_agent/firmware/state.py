@@ -17,41 +17,17 @@ from module_agent.wire.messages import State
 
 Trigger = Literal["acquire", "release", "motion", "motion_done", "setpoint", "expire", "stop", "fault"]
 
-TRANSITIONS: dict[tuple[State, Trigger], State] = {
-    ("idle", "acquire"): "armed",
-    ("idle", "stop"): "stopped",
-    ("idle", "fault"): "fault",
-    ("armed", "acquire"): "armed",
-    ("armed", "release"): "idle",
-    ("armed", "motion"): "moving",
-    ("armed", "setpoint"): "streaming",
-    ("armed", "expire"): "expired",
-    ("armed", "stop"): "stopped",
-    ("armed", "fault"): "fault",
-    ("moving", "acquire"): "armed",
-    ("moving", "release"): "idle",
-    ("moving", "motion_done"): "armed",
-    ("moving", "expire"): "expired",
-    ("moving", "stop"): "stopped",
-    ("moving", "fault"): "fault",
-    ("streaming", "acquire"): "armed",
-    ("streaming", "release"): "idle",
-    ("streaming", "motion"): "moving",
-    ("streaming", "setpoint"): "streaming",
-    ("streaming", "expire"): "expired",
-    ("streaming", "stop"): "stopped",
-    ("streaming", "fault"): "fault",
-    ("expired", "acquire"): "armed",
-    ("expired", "release"): "expired",
-    ("expired", "stop"): "stopped",
-    ("expired", "fault"): "fault",
-    ("stopped", "acquire"): "armed",
-    ("stopped", "release"): "stopped",
-    ("stopped", "stop"): "stopped",
-    ("stopped", "fault"): "fault",
-    ("fault", "acquire"): "armed",
-    ("fault", "release"): "fault",
-    ("fault", "stop"): "fault",
+_ALWAYS: dict[Trigger, State] = {"acquire": "armed", "stop": "stopped", "fault": "fault"}
+_LEASED: dict[Trigger, State] = {**_ALWAYS, "release": "idle", "expire": "expired"}
+
+TRANSITIONS: dict[State, dict[Trigger, State]] = {
+    "idle": _ALWAYS,
+    "armed": {**_LEASED, "motion": "moving", "setpoint": "streaming"},
+    "moving": {**_LEASED, "motion_done": "armed"},
+    "streaming": {**_LEASED, "motion": "moving", "setpoint": "streaming"},
+    "expired": {**_ALWAYS, "release": "expired"},
+    "stopped": {**_ALWAYS, "release": "stopped"},
+    "fault": {"acquire": "armed", "release": "fault", "stop": "fault"},
 }
 
 # States in which the motor follows commands, whose sender must renew them within the lifetime.

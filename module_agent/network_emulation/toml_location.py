@@ -1,7 +1,15 @@
-"""On which line of a TOML text a key stands; `tomllib` keeps no lines, and an error should name one."""
+"""TOML files checked by a pydantic model: an error names file, line and key.
+
+`tomllib` keeps no lines, so they are searched for in the text.
+"""
 
 import re
 import tomllib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
 
 Location = tuple[int | str, ...]
 
@@ -10,12 +18,36 @@ _KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
 _AT_LINE = re.compile(r"\(at line (\d+), column \d+\)")
 
 
-def syntax_error_line(error: tomllib.TOMLDecodeError, text: str) -> tuple[int, str]:
-    """Return the line (from 1) and the reason of a syntax error."""
-    match = _AT_LINE.search(str(error))
-    if match is None:
-        return max(1, len(text.splitlines())), str(error)
-    return int(match.group(1)), _AT_LINE.sub("", str(error)).strip()
+def parse_toml(text: str, name: str, error: Callable[[str], Exception]) -> dict[str, Any]:
+    """Parse the text of the file `name`.
+
+    Raises:
+        Exception: what `error` makes of the message, which names file and line.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as fault:
+        match = _AT_LINE.search(str(fault))
+        line = int(match.group(1)) if match else max(1, len(text.splitlines()))
+        raise error(f"{name}:{line}: not TOML: {_AT_LINE.sub('', str(fault)).strip()}") from fault
+
+
+def faults_of(error: ValidationError) -> list[tuple[Location, str]]:
+    """Return where a document does not fit its model, and why."""
+    plain = {"extra_forbidden": "unknown key", "missing": "is missing"}
+    return [
+        (tuple(e["loc"]), plain.get(e["type"], str(e["msg"]).removeprefix("Value error, ")))
+        for e in error.errors(include_url=False)
+    ]
+
+
+def fault_lines(faults: Iterable[tuple[Location, str]], text: str, name: str | Path) -> str:
+    """Return one line for every fault, with file, line and key."""
+    lines = []
+    for location, reason in faults:
+        key = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in location).lstrip(".")
+        lines.append(f"{name}:{line_of(text, location)}: {key + ': ' if key else ''}{reason}")
+    return "\n".join(lines)
 
 
 def line_of(text: str, location: Location) -> int:
@@ -57,11 +89,8 @@ def _table(names: list[str], repeated: bool, counts: dict[Location, int]) -> Loc
 
 def _within(text: str, known: dict[Location, int], parent: Location, rest: Location) -> int:
     """Follow the remaining names through the lines of a value that spans several."""
-    start = known[parent]
-    ends = [n for n in known.values() if n > start]
-    end = min(ends, default=len(text.splitlines()) + 1)
-    lines = text.splitlines()
-    line = start
+    lines, line = text.splitlines(), known[parent]
+    end = min((n for n in known.values() if n > line), default=len(lines) + 1)
     for name in (k for k in rest if isinstance(k, str)):
         for number in range(line, end):
             if re.search(rf"(?<![A-Za-z0-9_-]){re.escape(name)}\s*=", lines[number - 1]):

@@ -4,7 +4,6 @@ A link leads from the distal frame of the parent (its output; its housing if the
 to the proximal frame of the child (its housing; its output if the child is mounted reversed).
 """
 
-import tomllib
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -22,7 +21,7 @@ from pydantic import (
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import RobotError, UsageError
 from module_agent.network_emulation.profile_file import network, network_relative_to
-from module_agent.network_emulation.toml_location import Location, line_of, syntax_error_line
+from module_agent.network_emulation.toml_location import Location, fault_lines, faults_of, parse_toml
 from module_agent.wire.keys import check_chunk
 from sim.geometry.link_parts import Angle, FreePose, Part, Solid, Strict, Xyz
 from sim.geometry.pose import Array, pose
@@ -241,36 +240,15 @@ def parse_robot(text: str, name: str) -> Robot:
     Raises:
         RobotFileError: as `load_robot`.
     """
-    try:
-        data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        line, reason = syntax_error_line(error, text)
-        raise RobotFileError(f"{name}:{line}: not TOML: {reason}") from error
+    data = parse_toml(text, name, RobotFileError)
     try:
         robot = Robot.model_validate(data, context={"folder": Path(name).parent})
     except ValidationError as error:
-        faults = [_Fault(tuple(e["loc"]), _reason(dict(e))) for e in error.errors(include_url=False)]
-        raise _error(name, text, faults) from error
+        raise RobotFileError(fault_lines(faults_of(error), text, name)) from error
     faults = _tree_faults(robot.modules)
     if faults:
-        raise _error(name, text, faults)
+        raise RobotFileError(fault_lines(faults, text, name))
     return robot.model_copy(update={"modules": _depth_first(robot.modules)})
-
-
-def _reason(error: dict[str, Any]) -> str:
-    if error["type"] == "extra_forbidden":
-        return "unknown key"
-    if error["type"] == "missing":
-        return "is missing"
-    return str(error["msg"]).removeprefix("Value error, ")
-
-
-def _error(name: str, text: str, faults: list[_Fault]) -> RobotFileError:
-    lines = []
-    for fault in faults:
-        key = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in fault.location).lstrip(".")
-        lines.append(f"{name}:{line_of(text, fault.location)}: {key + ': ' if key else ''}{fault.reason}")
-    return RobotFileError("\n".join(lines))
 
 
 def _tree_faults(modules: tuple[Module, ...]) -> list[_Fault]:
