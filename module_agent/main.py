@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from module_agent.firmware.config import FirmwareConfig, config_of
+from module_agent.firmware.config import config_of
 from module_agent.hardware.bus_client import BusClient
-from module_agent.hardware.hardware import HardwareLost, ModuleInformation
+from module_agent.hardware.hardware import HardwareLost
 from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
 from module_agent.network_emulation.impaired_transport import inject
@@ -23,7 +23,6 @@ from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from module_agent.transport.transport import NoHub, Transport
 from module_agent.transport.zenoh_transport import ZenohConfig, open_zenoh
 from module_agent.wire.keys import check_chunk
-from module_agent.wire.messages import ExpiryAction
 from module_agent.worker import ThreadWorker
 
 if TYPE_CHECKING:
@@ -50,19 +49,6 @@ def _stop(number: int, _frame: FrameType | None) -> None:
     raise Stopped(0 if number == signal.SIGTERM else 130)
 
 
-def _config(
-    module: ModuleInformation, rate_hz: float, lifetime_ms: float, expiry: ExpiryAction, strategy: int
-) -> FirmwareConfig:
-    return config_of(
-        module,
-        secrets.randbits(64),
-        feedback_rate_hz=rate_hz,
-        lifetime_ns=round(lifetime_ms * 1e6),
-        expiry_action=expiry,
-        strategy=strategy,
-    )
-
-
 def _transport(connect: list[str], listen: list[str], network: NetworkProfile, seed: int) -> Transport:
     """Open the session, waiting for the hub as long as it takes; a signal ends the waiting.
 
@@ -72,16 +58,14 @@ def _transport(connect: list[str], listen: list[str], network: NetworkProfile, s
     config = ZenohConfig(
         mode="client", connect=tuple(connect), listen=tuple(listen), connect_timeout_s=CONNECT_ATTEMPT_S
     )
-    transport: Transport | None = None
     reported = False
-    while transport is None:
+    while True:
         try:
-            transport = open_zenoh(config)
+            return inject(open_zenoh(config), network, seed, "module")
         except NoHub as error:
             if not reported:
                 reported = True
                 typer.echo(f"x5-agent: waiting for the network: {error}", err=True)
-    return inject(transport, network, seed, "module")
 
 
 @app.command()
@@ -119,7 +103,6 @@ def main(
             injected = network_named(network)
             if expiry not in ("motor_off", "hold", "damping"):
                 raise UsageError(f"--expiry {expiry}: it must be motor_off, hold or damping")
-            action: ExpiryAction = expiry  # type: ignore[assignment]
             transport = _transport(connect or [DEFAULT_ENDPOINT], listen or [], injected, seed)
             opened.callback(transport.close)
             # A full collection of what the imports have left takes 38 ms, in which no tick would run: it is
@@ -129,7 +112,17 @@ def main(
             # The world waits for every agent on its bus, so the bus comes last.
             modules = LoopInside(BusClient(bus, serial))
             opened.callback(modules.close)
-            configs = [_config(m, feedback_rate, lifetime_ms, action, strategy) for m in modules.information]
+            configs = [
+                config_of(
+                    module,
+                    secrets.randbits(64),
+                    feedback_rate_hz=feedback_rate,
+                    lifetime_ns=round(lifetime_ms * 1e6),
+                    expiry_action=expiry,
+                    strategy=strategy,
+                )
+                for module in modules.information
+            ]
             host = AgentHost(robot, modules, transport, configs, worker := ThreadWorker())
         except (RobotError, OSError) as error:
             typer.echo(f"x5-agent: {error}", err=True)

@@ -14,7 +14,7 @@ from coordinator.live_robot.messenger import Messenger
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
 from coordinator.session.run import Run, RunConfig
-from module_agent.network_emulation.profile import NetworkProfile, profile
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.transport.transport import Event, Reply, Request, Sample, Transport, Undeclare
 from module_agent.wire.messages import Message
 from module_agent.wire.refusal import WireError
@@ -103,7 +103,7 @@ class Rig(VirtualRobot):
         self.cut = False
         loop = VirtualLoop() if beside is None else beside.loop
         shared = VirtualNetwork(loop, tap) if beside is None else beside.network
-        impaired = profile(network) if isinstance(network, str) else network
+        impaired = PROFILES[network] if isinstance(network, str) else network
         super().__init__(VirtualSettings(load_robot(robot), impaired, seed, noise), loop, shared, **firmware)
         self.start()
 

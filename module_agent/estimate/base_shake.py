@@ -1,11 +1,8 @@
 """The shake of a joint's base, measured by the IMU of the joint's own module, and whether it is significant.
 
-The module that turns the joint sits on the base or on other links, whose motion both its IMU and the child's
-IMU measure. It samples on the encoder's clock, so its readings are first turned by the joint's angle, into
-axes that turn with the child, and then low-passed.
-
-The IMU of a turning joint also measures the vibration of its gears. So its readings are used only if they
-exceed that noise: if they correlate with the joint's rate and acceleration.
+Both its IMU and the child's measure the motion of what carries the joint. It samples on the encoder's clock,
+so its readings are first turned into axes that turn with the child, and then low-passed. They hold the
+vibration of the gears too, and so are used only if they correlate with the joint's rate and acceleration.
 """
 
 from copy import copy
@@ -45,11 +42,8 @@ class BaseMotion:
     """
 
     def __init__(self, joint: JointWindow, imu: ImuWindow, still: Array, smooth_s: float = SMOOTH_S):
-        angle = np.asarray(
-            CubicSpline(1e-9 * (joint.t_ns - joint.t_ns[0]), joint.position_rad)(
-                1e-9 * (imu.t_ns - joint.t_ns[0])
-            )
-        )
+        since_s = 1e-9 * (joint.t_ns - joint.t_ns[0])
+        angle = np.asarray(CubicSpline(since_s, joint.position_rad)(1e-9 * (imu.t_ns - joint.t_ns[0])))
         readings = np.hstack([imu.accel_m_s2, imu.gyro_rad_s]) - np.concatenate([still[3:], still[:3]])
         turned = np.hstack([_turned_back(readings[:, :3], angle), _turned_back(readings[:, 3:], angle)])
         t_ns, smooth = low_passed(imu.t_ns, turned, smooth_s)
@@ -73,8 +67,7 @@ class BaseMotion:
     def about_the_axis(self) -> "BaseMotion":
         """Return the parts without a direction across the axis: the swing about it and the push along it."""
         reduced = copy(self)
-        reduced._known = np.zeros(15)
-        reduced._known[[2, 5, 8, 11, 14]] = 1.0
+        reduced._known = np.tile([0.0, 0.0, 1.0], 5)
         return reduced
 
 

@@ -1,7 +1,6 @@
 """The thesis' circle point analysis of one joint in one IMU's frame (chapters 4.3.2 to 4.3.5 and 6.2.1).
 
-The estimator is that of the thesis, with its known biases (only alpha is filtered, so that d comes out 0.77 %
-long at 2 Hz and 250 Hz), but with one sign convention throughout:
+The estimator is that of the thesis, with its known biases (docs/theory.md), but with one sign convention:
 
     j   direction about which the IMU's body turns when the joint's position grows
     r   points from the joint's axis to the IMU (the thesis' points back to the joint)
@@ -10,10 +9,9 @@ long at 2 Hz and 250 Hz), but with one sign convention throughout:
 For these, eq. 24 reads r = d (n x j) as in the thesis.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
@@ -21,9 +19,7 @@ from module_agent.estimate.windows import AlignedMotion, Array, ImuWindow
 from module_agent.model.errors import DataError
 from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import autocovariance
-from module_agent.wire.messages import CircleEstimate, Vector3
-
-Mask = NDArray[np.bool_]
+from module_agent.wire.messages import CircleEstimate
 
 MIN_SAMPLES = 3 * TAPS
 MIN_RATE_RAD_S = 0.02  # 15 times the gyro's noise; slower motions say nothing about an axis
@@ -91,8 +87,7 @@ def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
     """Find the joint's axis in frame u from the constant motion: eq. 15 on the gyro less its offset (eq. 30).
 
     Samples of less than half the top speed are dropped. Every sample counts with the sign of the encoder's
-    rate, so that j does not depend on the direction of the motion; a motion forth and back cancels the gyro
-    offset.
+    rate: a motion forth and back cancels the gyro offset.
 
     Raises:
         DataError: too few samples, no motion of the joint, or none of the IMU.
@@ -122,24 +117,17 @@ def joint_axis(constant: AlignedMotion, rest: RestReading) -> JointAxis:
 
 
 def circle_point_analysis(
-    rest: ImuWindow,
-    constant: AlignedMotion,
-    sine: AlignedMotion,
-    quiet_s: float = REST_S,
-    taps: int = TAPS,
+    rest: ImuWindow, constant: AlignedMotion, sine: AlignedMotion, taps: int = TAPS
 ) -> CircleFit:
     """Run eqs. 12 to 24 and 30: axis from the constant motion, radial vector from the windowed sine motion.
 
-    The initial gravity of eq. 16 is the mean over the first `quiet_s` of the sine motion instead of its first
-    sample alone: one sample's noise (0.03 m/s^2, 3 mrad of tilt) would move d by 0.2 mm.
+    The initial gravity of eq. 16 is a mean: one sample's noise (0.03 m/s^2, 3 mrad) would move d by 0.2 mm.
 
     Args:
         rest: about 2 s of the IMU at rest.
         constant: the CM, on one time axis (`windows.align`).
-        sine: the WSM, likewise, beginning with at least `quiet_s` of near rest.
-        quiet_s: length of that near rest [s].
-        taps: of the filter of alpha; 1 is none, as in the thesis' comparison (6.2.1.2), and gives d too
-            short.
+        sine: the WSM, likewise, beginning with at least `REST_S` of near rest.
+        taps: of the filter of alpha; 1 is none, as in the thesis' comparison (6.2.1.2); d is then too short.
 
     Returns:
         The fit. An IMU on the axis has a distance near zero and a sigma no smaller than its noise
@@ -152,9 +140,13 @@ def circle_point_analysis(
     at_rest = rest_reading(rest)
     joint = joint_axis(constant, at_rest)
     alpha = angular_acceleration(sine, taps)
-    quiet = sine.t_s <= quiet_s
-    turns = _turns(joint.axis, sine, quiet)
-    dynamic = _dynamic_acceleration(sine, turns, quiet)
+    quiet = sine.t_s <= REST_S
+    # Eq. 16: the body turns by +phi about j, so the world turns by -phi as seen from it.
+    phi = sine.position_rad - sine.position_rad[quiet].mean()
+    turns = np.asarray(Rotation.from_rotvec(np.outer(-phi, joint.axis)).as_matrix())
+    # Eqs. 16 to 18: the specific force less the turned initial gravity, less its mean.
+    dynamic = sine.accel_m_s2 - turns @ sine.accel_m_s2[quiet].mean(axis=0)
+    dynamic = np.asarray(dynamic - dynamic.mean(axis=0))
     _, spread, basis = np.linalg.svd(dynamic, full_matrices=False)  # eq. 20
     tangent = basis[0]  # eq. 21; its sign follows from d >= 0
     power = float(alpha @ alpha)
@@ -198,33 +190,16 @@ def angular_acceleration(motion: AlignedMotion, taps: int = TAPS) -> Array:
 
 def circle_estimate(fit: CircleFit, delay_s: float) -> CircleEstimate:
     """Return the fit as the part of a message that carries it."""
-    return CircleEstimate(
-        axis=_vector(fit.axis),
-        tangent=_vector(fit.tangent),
-        radial_m=_vector(fit.radial_m),
-        distance_m=fit.distance_m,
-        sigma_axis_rad=min(fit.sigma_axis_rad, 10.0),
-        sigma_distance_m=min(fit.sigma_distance_m, 1e3),
-        residual_rms_m_s2=fit.residual_rms_m_s2,
-        singular_values=_vector(fit.singular_values),
-        delay_s=delay_s,
-        samples=fit.samples,
-    )
+    return CircleEstimate(**message_fields(fit), delay_s=delay_s)
 
 
-def _turns(axis: Array, sine: AlignedMotion, quiet: Mask) -> Array:
-    """Return (n, 3, 3): the rotations in frame u of a vector fixed in the world, from the start to sample n.
-
-    The body turns by +phi about j, so the world turns by -phi as seen from it: eq. 16 with this sign.
-    """
-    phi = sine.position_rad - sine.position_rad[quiet].mean()
-    return np.asarray(Rotation.from_rotvec(np.outer(-phi, axis)).as_matrix())
-
-
-def _dynamic_acceleration(sine: AlignedMotion, turns: Array, quiet: Mask) -> Array:
-    """Return eqs. 16 to 18: the specific force less the turned initial gravity, less its mean; (n, 3)."""
-    dynamic = sine.accel_m_s2 - turns @ sine.accel_m_s2[quiet].mean(axis=0)
-    return np.asarray(dynamic - dynamic.mean(axis=0))
+def message_fields(estimate: Any) -> dict[str, Any]:
+    """Return the fields of an estimate as in its message: vectors as tuples, sigmas within its limits."""
+    fields = estimate._asdict()
+    fields |= {name: tuple(v.tolist()) for name, v in fields.items() if isinstance(v, np.ndarray)}
+    fields["sigma_axis_rad"] = min(estimate.sigma_axis_rad, 10.0)
+    fields["sigma_distance_m"] = min(estimate.sigma_distance_m, 1e3)
+    return dict(fields)
 
 
 def _gravity_variance(alpha: Array, turns: Array, tangent: Array, rest: RestReading, quiet: int) -> float:
@@ -241,12 +216,10 @@ def _tilt_variance(alpha: Array, position: Array, rest: RestReading, sigma_axis_
 
 
 def _widening(residual: Array, regressor: Array) -> float:
-    """Return by how much correlated residuals widen the variance of a regression coefficient: 1 + 2 sum rho
-    kappa.
+    """Return by how much correlated residuals widen a coefficient's variance: 1 + 2 sum rho kappa >= 1.
 
-    rho and kappa are the autocorrelations of residual and regressor: what counts is the residual's power
-    where the regressor has its own. The sum ends where rho first has a pair that is not positive (Geyer 1992,
-    initial positive sequence), and never narrows the variance below that of white noise.
+    rho and kappa are the autocorrelations of residual and regressor. The sum ends where rho first has a pair
+    that is not positive (Geyer 1992, initial positive sequence).
     """
     rho, kappa = _autocorrelation(residual), _autocorrelation(regressor)
     even = 2 * ((rho.size - 1) // 2) + 1
@@ -258,9 +231,7 @@ def _widening(residual: Array, regressor: Array) -> float:
 def _autocorrelation(series: Array) -> Array:
     """Return the biased autocorrelation at lags 0 to n - 1; all zero for a series that is zero."""
     power = float(series @ series)
-    if power <= 0.0:
-        return np.zeros_like(series)
-    return autocovariance(series) / power
+    return autocovariance(series) / power if power > 0.0 else np.zeros_like(series)
 
 
 def _variance_of_mean(series: Array) -> float:
@@ -272,7 +243,3 @@ def _variance_of_mean(series: Array) -> float:
 def _enough(samples: int, what: str) -> None:
     if samples < MIN_SAMPLES:
         raise DataError(f"{samples} samples of the {what}: at least {MIN_SAMPLES} are needed")
-
-
-def _vector(values: Array) -> Vector3:
-    return float(values[0]), float(values[1]), float(values[2])

@@ -38,9 +38,7 @@ class ClockDelay(NamedTuple):
     determined: bool
 
 
-def clock_delay(
-    imu: ImuWindow, joint: JointWindow, rough_offset_ns: int, search_s: float = SEARCH_S
-) -> ClockDelay:
+def clock_delay(imu: ImuWindow, joint: JointWindow, rough_offset_ns: int) -> ClockDelay:
     """Refine the offset between the joint's clock and the IMU's from one motion.
 
     Both windows should hold the whole motion and a little rest about it. The offset is taken as constant: 100
@@ -49,39 +47,29 @@ def clock_delay(
     Raises:
         DataError: fewer than 3 filter lengths of samples, or windows that do not overlap by as much.
     """
-    rate = _RateSpline(joint)
+    if joint.t_ns.size < 3 * TAPS:
+        raise DataError(f"{joint.t_ns.size} joint samples; {3 * TAPS} are needed to find a clock's delay")
+    knots = 1e-9 * (joint.t_ns - int(joint.t_ns[0]))
+    end_s = float(knots[-1])
+    # Smoothed as the gyro is: its noise would prefer delays between samples, where interpolation averages it.
+    rate = CubicSpline(knots, gaussian_filter(joint.velocity_rad_s))
     t_s = 1e-9 * (imu.t_ns - rough_offset_ns - int(joint.t_ns[0]))
-    inside = (t_s >= search_s) & (t_s <= rate.end_s - search_s)
+    inside = (t_s >= SEARCH_S) & (t_s <= end_s - SEARCH_S)
     if np.count_nonzero(inside) < 3 * TAPS:
         raise DataError(
-            f"only {np.count_nonzero(inside)} IMU samples lie {search_s} s inside the joint's window of "
-            f"{rate.end_s:.2f} s; {3 * TAPS} are needed"
+            f"only {np.count_nonzero(inside)} IMU samples lie {SEARCH_S} s inside the joint's window of "
+            f"{end_s:.2f} s; {3 * TAPS} are needed"
         )
     gyro: Array = gaussian_filter(imu.gyro_rad_s)[inside]
     at: Array = t_s[inside].astype(np.float64)
-    grid = np.arange(-search_s, search_s + 0.5 * GRID_S, GRID_S)
-    scores = np.array([_explained(gyro, rate.spline(at - delay)) for delay in grid])
-    delay, sigma = _refine(gyro, at, rate.spline, float(grid[np.argmax(scores)]))
-    delay = min(max(delay, -search_s), search_s)
-    explained = _explained(gyro, rate.spline(at - delay))
+    grid = np.arange(-SEARCH_S, SEARCH_S + 0.5 * GRID_S, GRID_S)
+    scores = np.array([_explained(gyro, rate(at - delay)) for delay in grid])
+    delay, sigma = _refine(gyro, at, rate, float(grid[np.argmax(scores)]))
+    delay = min(max(delay, -SEARCH_S), SEARCH_S)
+    explained = _explained(gyro, rate(at - delay))
     if explained < MIN_EXPLAINED:
         return ClockDelay(rough_offset_ns, 0.0, float("inf"), explained, determined=False)
     return ClockDelay(rough_offset_ns + round(1e9 * delay), delay, sigma, explained, determined=True)
-
-
-class _RateSpline:
-    """The joint's rate over seconds from its first sample, smoothed by the same filter as the gyro.
-
-    The smoothing keeps the noise of the rate from preferring delays between samples, where interpolation
-    would average it away.
-    """
-
-    def __init__(self, joint: JointWindow):
-        if joint.t_ns.size < 3 * TAPS:
-            raise DataError(f"{joint.t_ns.size} joint samples; {3 * TAPS} are needed to find a clock's delay")
-        knots = 1e-9 * (joint.t_ns - int(joint.t_ns[0]))
-        self.spline = CubicSpline(knots, gaussian_filter(joint.velocity_rad_s))
-        self.end_s = float(knots[-1])
 
 
 def _explained(gyro: Array, rate: Array) -> float:

@@ -40,18 +40,6 @@ def gaussian_filter(
     half = taps // 2
     if values.shape[0] <= half:
         raise DataError(f"{values.shape[0]} samples: a filter of {taps} taps needs at least {half + 1}")
-    if half == 0:
-        smooth = values.copy()
-    else:
-        widths = [(half, half)] + [(0, 0)] * (values.ndim - 1)
-        padded = np.pad(values, widths, mode="reflect", reflect_type="odd")
-        smooth = convolve1d(padded, weights, axis=0)[half:-half]
-    return read_only(smooth)
-
-
-def passes(
-    frequency_hz: float, rate_hz: float, taps: int = TAPS, sigma_samples: float = SIGMA_SAMPLES
-) -> float:
-    """Return the gain of the filter at a frequency: 0.9924 at 2 Hz and 250 Hz with the thesis' figures."""
-    phase = 2 * np.pi * frequency_hz / rate_hz * (np.arange(taps) - taps // 2)
-    return float(kernel(taps, sigma_samples) @ np.cos(phase))
+    widths = [(half, half)] + [(0, 0)] * (values.ndim - 1)
+    padded = np.pad(values, widths, mode="reflect", reflect_type="odd")
+    return read_only(convolve1d(padded, weights, axis=0)[half : half + len(values)])

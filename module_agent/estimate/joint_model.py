@@ -9,7 +9,7 @@ zero-phase low-pass (`smooth_motion`),
     g(phi) = (g . j) j + (g - (g . j) j) cos phi - (j x g) sin phi
 
 In a sine of one frequency the tangential term a (j x r) is nearly collinear with gravity's sin phi; slow
-motion, where the tangential term vanishes, separates them, so that gravity is estimated and not assumed.
+motion separates them.
 
 A link bends quasi-statically under the load L = q'' + (pull of gravity along the tangent) / d of what it
 carries: phi = q - c L, w = q' - c L', a = q'' - c L'', with c its inertia over its stiffness. The gyro
@@ -18,9 +18,7 @@ bend is away from the joint's axis by the share h of the distance d, the tangent
 
 The readings are late by a delay of their own in each motion, that of the clocks and of the IMU's low-pass. k
 is the axis as the gyro reads it, G the gyro's sensitivity to specific force, E (3 x 3, its columns across j)
-the accelerometer's scale and misalignment. Their priors are near the ideal values (`ImuPrior`). The known
-magnitude of gravity calibrates E in the plane in which the joint turns it; elsewhere the covariance of r
-keeps the prior uncertainty.
+the accelerometer's scale and misalignment; their priors are in `ImuPrior`.
 """
 
 from typing import NamedTuple
@@ -79,9 +77,8 @@ def predict(motion: Motion, t_s: Array, p: Array, delay: int) -> tuple[Array, Ar
     steps = _STEPS
     if shake is not None:
         steps = _STEPS | _BASE_STEPS
-        jacobian[:, :, BASE_DELAY] = (readings(values, after, p) - readings(values, before, p)) / (
-            2.0 * _STEP_S
-        )
+        change = readings(values, after, p) - readings(values, before, p)
+        jacobian[:, :, BASE_DELAY] = change / (2.0 * _STEP_S)
     for column, step in steps.items():
         up, down = p.copy(), p.copy()
         up[column] += step
@@ -104,7 +101,7 @@ def readings(values: Array, shake: Array | None, p: Array) -> Array:
     """
     rate, *carried = _carried(values, shake, p)
     force = _force_across(carried, p)
-    turning = rate[:, None] * (p[GYRO_AXIS] + _AXIS)
+    turning = rate[:, None] * (p[GYRO_AXIS] + (0.0, 0.0, 1.0))
     along = np.full(len(values), p[GRAVITY_ALONG])
     if shake is not None:
         across, turn, twist, push = _base_across(values, shake, p)
@@ -145,9 +142,6 @@ def g_sensitivity_columns(force: Array) -> Array:
     for row in range(3):
         columns[:, row, 2 * row : 2 * row + 2] = force
     return columns
-
-
-_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def _carried(values: Array, shake: Array | None, p: Array) -> list[Array]:
@@ -248,15 +242,11 @@ _DELAY_S = 0.02
 _PIVOT_SIGMA_M, _HEIGHT_M, _HEIGHT_SIGMA_M = 0.03, 0.05, 0.1
 
 
-class ParameterPriors(NamedTuple):
-    """Prior means of all parameters and their weights 1 / sigma^2, zero without a prior."""
+def parameter_priors(knowledge: ImuPrior, motions: int) -> tuple[Array, Array]:
+    """Return the prior means of all parameters and their weights 1 / sigma^2, zero without a prior.
 
-    mean: Array
-    weight: Array
-
-
-def parameter_priors(knowledge: ImuPrior, motions: int) -> ParameterPriors:
-    """Return the priors of all parameters for a number of motions, each with its own delay."""
+    Each of the motions has a delay of its own.
+    """
     sigma = np.full(DELAY + motions, np.inf)
     scale, turn = knowledge.scale, knowledge.misalignment_rad
     # The scale error times gravity along the axis is indistinguishable from a bias.
@@ -272,4 +262,4 @@ def parameter_priors(knowledge: ImuPrior, motions: int) -> ParameterPriors:
     sigma[DELAY:] = _DELAY_S
     mean = np.zeros_like(sigma)
     mean[HINGE], mean[BASE_DELAY], mean[HEIGHT] = HINGE_SHARE, DELAY_S, _HEIGHT_M
-    return ParameterPriors(mean, 1.0 / sigma**2)
+    return mean, 1.0 / sigma**2

@@ -1,8 +1,7 @@
 """The estimate of one joint in one IMU's frame: least squares over rest, slow and fast motion together.
 
-The model is that of `joint_model`. In a sine of one frequency the tangential acceleration is collinear with
-gravity's sine, and the gyro's scale with the link's bending; slow motion separates them. What no motion of
-this joint determines keeps its prior uncertainty (`ImuPrior`), which enters the covariance of the result.
+The model is that of `joint_model`. What no motion of this joint determines keeps its prior uncertainty
+(`ImuPrior`), which enters the covariance of the result.
 """
 
 from collections.abc import Sequence
@@ -11,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from module_agent.estimate.circle_point_analysis import RestReading
+from module_agent.estimate.circle_point_analysis import RestReading, message_fields
 from module_agent.estimate.joint_model import (
     ACCEL_BIAS,
     BASE_HEADING,
@@ -25,7 +24,6 @@ from module_agent.estimate.joint_model import (
     RADIAL,
     TURN,
     Motion,
-    ParameterPriors,
     g_sensitivity_columns,
     parameter_priors,
     predict,
@@ -37,7 +35,7 @@ from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import CALIBRATED, GYRO_BIAS_DRIFT_RAD_S, ImuPrior
 from module_agent.model.read_only import frozen
-from module_agent.wire.messages import RegressionEstimate, Vector3
+from module_agent.wire.messages import RegressionEstimate
 
 # The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.
 STRIDE = 7
@@ -76,21 +74,9 @@ class JointRegression(NamedTuple):
 
 def regression_estimate(regression: JointRegression, delay_s: float) -> RegressionEstimate:
     """Return the result as the part of a message that carries it; `delay_s` is that of its last motion."""
-    upper = regression.covariance[np.triu_indices(6)]
+    upper = np.clip(regression.covariance[np.triu_indices(6)], -1e6, 1e6)
     return RegressionEstimate(
-        axis=_vector(regression.axis),
-        radial_m=_vector(regression.radial_m),
-        distance_m=regression.distance_m,
-        sigma_axis_rad=min(regression.sigma_axis_rad, 10.0),
-        sigma_distance_m=min(regression.sigma_distance_m, 1e3),
-        covariance=tuple(float(np.clip(value, -1e6, 1e6)) for value in upper),
-        gravity_m_s2=_vector(regression.gravity_m_s2),
-        gyro_bias_rad_s=_vector(regression.gyro_bias_rad_s),
-        accel_bias_m_s2=_vector(regression.accel_bias_m_s2),
-        compliance_s2=regression.compliance_s2,
-        delay_s=delay_s,
-        base_shakes=regression.base_shakes,
-        samples=regression.samples,
+        **message_fields(regression) | {"covariance": tuple(upper.tolist())}, delay_s=delay_s
     )
 
 
@@ -115,19 +101,16 @@ class _Rows(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """The data of the fit; `unresolved_m` is how much shake of unknown direction may change d."""
+    """The data of the fit; `unresolved_m` is how much shake of unknown direction may change d.
+
+    mean, weight: of the `parameter_priors`.
+    """
 
     rows: tuple[_Rows, ...]
-    priors: ParameterPriors
+    mean: Array
+    weight: Array
     rest: RestReading | None
     unresolved_m: float
-
-
-class _Optimum(NamedTuple):
-    """The optimum of the fit, and the covariance of the parameters."""
-
-    state: _State
-    covariance: Array
 
 
 class _Equations(NamedTuple):
@@ -152,8 +135,7 @@ def regress_joint(
         DataError: no motion, too few samples of one, or an IMU that did not move with the joint.
     """
     problem, guess = _problem(motions, rest, knowledge)
-    best = _minimise(problem, guess)
-    return _result(best, problem)
+    return _result(*_minimise(problem, guess), problem)
 
 
 def distance_bound_m(
@@ -165,23 +147,22 @@ def distance_bound_m(
     """Return the Cramer-Rao bound of the radial distance for white noise of gyro and accelerometer [SI].
 
     Every other parameter of `regress_joint` is unknown here too, except the place of a bent link's hinge. The
-    bound is evaluated at the optimum of the fit, for the motions as given: smooth them as little as the
-    encoder's noise allows to get the bound of a recording.
+    motions are taken as given: smooth them as little as the encoder's noise allows.
 
     Raises:
         DataError: as `regress_joint`.
     """
     problem, guess = _problem(motions, rest, knowledge)
-    best = _minimise(problem, guess)
-    normal = _equations(problem, best.state, np.array(noise)).normal
+    state, _ = _minimise(problem, guess)
+    normal = _equations(problem, state, np.array(noise)).normal
     known = np.arange(len(normal)) != HINGE
     covariance = np.zeros_like(normal)
-    covariance[np.ix_(known, known)] = _inverse(normal[np.ix_(known, known)])
-    bound = _result(best._replace(covariance=covariance), problem._replace(unresolved_m=0.0))
-    return bound.sigma_distance_m
+    covariance[np.ix_(known, known)] = np.linalg.inv(normal[np.ix_(known, known)])
+    return _result(state, covariance, problem._replace(unresolved_m=0.0)).sigma_distance_m
 
 
-def _minimise(problem: _Problem, state: _State) -> _Optimum:
+def _minimise(problem: _Problem, state: _State) -> tuple[_State, Array]:
+    """Return the optimum of the fit, and the covariance of the parameters."""
     noise = np.array([1e-3, 2e-2])
     for _ in range(ITERATIONS):
         at = _equations(problem, state, noise)
@@ -190,15 +171,8 @@ def _minimise(problem: _Problem, state: _State) -> _Optimum:
         if np.all(np.abs(step) <= SETTLED / np.sqrt(np.diag(at.normal))):
             break
     end = _equations(problem, state, noise)
-    inverse = _inverse(end.normal)
-    return _Optimum(state, inverse @ end.scatter @ inverse.T)
-
-
-def _inverse(normal: Array) -> Array:
-    return np.asarray(np.linalg.inv(normal), dtype=np.float64)
-
-
-# ---------------------------------------------------------------------- the data
+    inverse = np.linalg.inv(end.normal)
+    return state, inverse @ end.scatter @ inverse.T
 
 
 def _problem(
@@ -208,8 +182,8 @@ def _problem(
     if not motions:
         raise DataError("no motion of the joint: at least one is needed")
     rows = [_rows(motion) for motion in motions]
-    priors = parameter_priors(knowledge, len(motions))
-    guess = _first_guess(rows, priors)
+    mean, weight = parameter_priors(knowledge, len(motions))
+    guess = _first_guess(rows, mean)
     bases = [motion.base for motion in motions if motion.base is not None]
     unresolved_m = 0.0
     if len(bases) == len(motions) and any(base.shakes for base in bases):
@@ -220,12 +194,12 @@ def _problem(
             bases = [base.about_the_axis() for base in bases]
             # The base's heading then turns only the pivot, whose prior is the same in all directions. Left
             # free it makes the steps oscillate about the optimum.
-            priors.weight[BASE_HEADING] = PINNED
+            weight[BASE_HEADING] = PINNED
         else:
             guess.values[BASE_HEADING] = np.arctan2(across[1], across[0]) - np.arctan2(housing[1], housing[0])
-            priors.mean[BASE_HEADING] = guess.values[BASE_HEADING]
+            mean[BASE_HEADING] = guess.values[BASE_HEADING]
         rows = [r._replace(motion=Motion(r.motion.joint, b)) for r, b in zip(rows, bases, strict=True)]
-    return _Problem(tuple(rows), priors, rest, float(unresolved_m)), guess
+    return _Problem(tuple(rows), mean, weight, rest, float(unresolved_m)), guess
 
 
 def _rows(observed: ObservedMotion) -> _Rows:
@@ -242,7 +216,7 @@ def _rows(observed: ObservedMotion) -> _Rows:
     return _Rows(Motion(observed.joint, None), readings, t_s[inside], white, observed.instrument)
 
 
-def _first_guess(rows: Sequence[_Rows], priors: ParameterPriors) -> _State:
+def _first_guess(rows: Sequence[_Rows], mean: Array) -> _State:
     """Solve the model without compliance, delay and sensor errors, where it is linear."""
     values = np.concatenate([row.motion.joint.values(row.t_s) for row in rows])
     readings = np.concatenate([row.readings for row in rows])
@@ -262,7 +236,7 @@ def _first_guess(rows: Sequence[_Rows], priors: ParameterPriors) -> _State:
     # Across the axis, from the cosine's and the sine's coefficients alike.
     gravity = 0.5 * (force[1] + np.cross(axis, force[2]))
     frame = _frame(axis)
-    guess = priors.mean.copy()
+    guess = mean.copy()
     guess[RADIAL], guess[GRAVITY] = (frame.T @ radial)[:2], frame.T @ gravity
     guess[GRAVITY_ALONG] = axis @ force[0]
     guess[GYRO_BIAS] = frame.T @ gyro[1]
@@ -275,13 +249,10 @@ def _frame(axis: Array) -> Array:
     return np.stack([across, np.cross(axis, across), axis], axis=1)
 
 
-# ---------------------------------------------------------------------- the model
-
-
 def _equations(problem: _Problem, state: _State, noise: Array) -> _Equations:
     """Set up the normal equations at a state, for noise of one sample (gyro, accel)."""
-    normal = np.diag(problem.priors.weight)
-    gradient = problem.priors.weight * (problem.priors.mean - state.values)
+    normal = np.diag(problem.weight)
+    gradient = problem.weight * (problem.mean - state.values)
     _add_gravity(normal, gradient, state)
     if problem.rest is not None:
         _add_rest(normal, gradient, problem.rest, state)
@@ -313,10 +284,9 @@ def _flat(slopes: Array) -> Array:
 
 
 def _slow(residual: Array) -> Array:
-    """Return residuals (n, k) behind a low-pass that takes no motion away, and most of what is faster.
+    """Return residuals (n, k) through a binomial low-pass, nearly a Gaussian, that takes no motion away.
 
-    What counts is the residuals' power where the motion has its own; beyond are rounded encoder counts and
-    links that ring. The binomial of four has the spread of one step, so the whole is nearly a Gaussian.
+    Beyond the motion's frequencies are rounded encoder counts and links that ring.
     """
     padded = np.pad(residual, ((2, 2), (0, 0)), mode="reflect")
     return np.asarray(
@@ -358,8 +328,8 @@ def _moved(state: _State, step: Array) -> _State:
     return _State(state.frame @ Rotation.from_rotvec(turn).as_matrix(), values)
 
 
-def _result(best: _Optimum, problem: _Problem) -> JointRegression:
-    p, frame = best.state.values, best.state.frame
+def _result(state: _State, covariance: Array, problem: _Problem) -> JointRegression:
+    p, frame = state.values, state.frame
     r1, r2 = p[RADIAL]
     distance = float(np.hypot(r1, r2))
     # The axis turns by u x j and carries the radial vector along by u x r.
@@ -367,7 +337,7 @@ def _result(best: _Optimum, problem: _Problem) -> JointRegression:
     gain[:3, :2] = np.stack([-frame[:, 1], frame[:, 0]], axis=1)
     gain[3:, :2] = np.outer(frame[:, 2], [r2, -r1])
     gain[3:, RADIAL] = frame[:, :2]
-    six = gain @ best.covariance @ gain.T
+    six = gain @ covariance @ gain.T
     six[3:, 3:] += problem.unresolved_m**2 * frame[:, :2] @ frame[:, :2].T
     radial = frame[:, :2] @ p[RADIAL]
     along = radial / max(distance, 1e-6)
@@ -386,7 +356,3 @@ def _result(best: _Optimum, problem: _Problem) -> JointRegression:
         samples=sum(len(row.t_s) for row in problem.rows),
         base_shakes=any(row.motion.base is not None for row in problem.rows),
     )
-
-
-def _vector(values: Array) -> Vector3:
-    return float(values[0]), float(values[1]), float(values[2])

@@ -1,8 +1,7 @@
 """Decide whether an IMU moves with a joint, by the regression of its gyro on the joint's rate.
 
-An IMU that is rigidly carried reads gyro = j v, with |j| = 1; one that is not reads its own noise, the
-shaking of the structure, and the compliance of held joints (20-30 % of the rate). The energy of the gyro
-would count all shaking; the regression coefficient on the joint's rate counts only what follows the joint.
+An IMU that is rigidly carried reads gyro = j v, with |j| = 1; one that is not reads noise, the shaking of the
+structure, and the compliance of held joints (20-30 % of the rate), little of which follows the joint's rate.
 """
 
 from collections.abc import Sequence

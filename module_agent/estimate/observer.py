@@ -9,12 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.estimate.circle_point_analysis import (
-    RestReading,
-    circle_estimate,
-    circle_point_analysis,
-    rest_reading,
-)
+from module_agent.estimate.circle_point_analysis import circle_estimate, circle_point_analysis, rest_reading
 from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.joint_regression import regress_joint, regression_estimate
 from module_agent.estimate.motion_detection import detect_motion
@@ -39,14 +34,6 @@ class Finding(NamedTuple):
     moved: bool
     rate_ratio: float
     gravity_m_s2: Vector3
-    circle: CircleEstimate | None
-    regression: RegressionEstimate | None
-    note: str
-
-
-class _Local(NamedTuple):
-    """Both estimates of one joint, and the reason if there is no regression."""
-
     circle: CircleEstimate | None
     regression: RegressionEstimate | None
     note: str
@@ -92,56 +79,39 @@ class Observer:
         return self._rest[1]
 
     def _analyse(self, motion: JointMotion, own: ImuWindow, rest: ImuWindow) -> Finding:
-        numbers: tuple[int, ...] = (motion.record.motion_id,)
-        gravity: Vector3 = (0.0, 0.0, 0.0)
-        moved, ratio, local = False, 0.0, None
+        number = motion.record.motion_id
+        found = Finding(motion.serial, (number,), False, 0.0, (0.0, 0.0, 0.0), None, None, "")
         try:
             still = rest_reading(rest)
-            x, y, z = (float(value) for value in still.specific_force_m_s2)
-            gravity = (x, y, z)
+            x, y, z = still.specific_force_m_s2.tolist()
+            found = found._replace(gravity_m_s2=(x, y, z))
             joint = joint_window(motion.rows)
-            rough = motion.rough_offset_ns.get(self.serial, 0)
-            delay = clock_delay(own, joint, rough)
+            delay = clock_delay(own, joint, motion.rough_offset_ns.get(self.serial, 0))
             aligned = align(own, joint, delay.offset_ns)
             windows = MotionWindows(own, joint, imu_window(motion.rows), delay.offset_ns)
-            detection = detect_motion([aligned], still.gyro_offset_rad_s)
-            moved, ratio = detection.moved, detection.rate_ratio
+            moved, ratio, *_ = detect_motion([aligned], still.gyro_offset_rad_s)
+            found = found._replace(moved=moved, rate_ratio=ratio)
             if motion.record.pattern.kind == "constant":
-                self._constant[motion.serial] = _Constant(
-                    motion.boot, motion.record.motion_id, aligned, windows, moved
-                )
-            else:
-                # Slow motion decides: near a resonance of the held joints the windowed sine shakes modules
-                # that the joint does not carry, and keeps others still that it does carry.
-                constant = self._constant_of(motion)
-                numbers, moved = (constant.motion_id, *numbers), constant.moved
-                if moved:
-                    fit = circle_point_analysis(rest, constant.motion, aligned)
-                    circle = circle_estimate(fit, delay.delay_s)
-                    local = self._regress(circle, [constant.windows, windows], still)
-            note = "" if local is None else local.note
+                self._constant[motion.serial] = _Constant(motion.boot, number, aligned, windows, moved)
+                return found
+            # Slow motion decides: near a resonance of the held joints the windowed sine shakes modules that
+            # the joint does not carry, and keeps others still that it does carry.
+            constant = self._constant.get(motion.serial)
+            if constant is None or constant.boot != motion.boot:
+                raise DataError(f"no constant motion of {motion.serial} was seen: its axis is not known")
+            found = found._replace(motion_ids=(constant.motion_id, number), moved=constant.moved)
+            if found.moved:
+                fit = circle_point_analysis(rest, constant.motion, aligned)
+                found = found._replace(circle=circle_estimate(fit, delay.delay_s))
+                motions = observed_motions([constant.windows, windows])
+                regression = regress_joint(motions, still, self.knowledge)
+                delay_s = delay.delay_s + regression.delays_s[-1]
+                found = found._replace(regression=regression_estimate(regression, delay_s))
         except (DataError, np.linalg.LinAlgError) as error:
             # Published as a finding: it explains why there is no estimate.
-            note = str(error)
-        if local is None:
-            local = _Local(None, None, note)
-        return Finding(
-            motion.serial, numbers, moved, ratio, gravity, local.circle, local.regression, note[:512]
-        )
-
-    def _regress(self, circle: CircleEstimate, windows: list[MotionWindows], still: RestReading) -> _Local:
-        try:
-            regression = regress_joint(observed_motions(windows), still, self.knowledge)
-        except (DataError, np.linalg.LinAlgError) as error:
-            return _Local(circle, None, f"no joint regression: {error}")
-        delay_s = circle.delay_s + regression.delays_s[-1]
-        return _Local(circle, regression_estimate(regression, delay_s), "")
-
-    def _constant_of(self, motion: JointMotion) -> _Constant:
-        constant = self._constant.get(motion.serial)
-        if constant is None or constant.boot != motion.boot:
-            raise DataError(f"no constant motion of {motion.serial} was seen: its axis is not known")
-        return constant
+            why = str(error) if found.circle is None else f"no joint regression: {error}"
+            found = found._replace(note=why[:512])
+        return found
 
 
 def _own_rows(history: History, motion: JointMotion, offset_ns: int) -> Rows:

@@ -1,9 +1,8 @@
 """Motions and their time derivatives through one Gaussian low-pass, the same for all compared signals.
 
-The low-pass h of a signal x commutes with its derivatives, so that (d/dt)^m (h * x) is x convolved with the
-m-th derivative of the kernel: nothing is ever differentiated by differences. What is not linear in the
-encoder's angle (its cosine, its squared rate) is formed first and filtered afterwards, as the IMU's chip and
-this filter do to the truth.
+(d/dt)^m (h * x) is x convolved with the m-th derivative of the kernel h: nothing is differentiated by
+differences. What is not linear in the encoder's angle (its cosine, its squared rate) is formed first and
+filtered afterwards, as the IMU's chip and this filter do to the truth.
 """
 
 from math import factorial
@@ -53,11 +52,11 @@ class SmoothMotion:
         rate = _filtered(q, step_s, BRIEF_S, 1) - 0.5 * BRIEF_S**2 * _filtered(q, step_s, BRIEF_S, 3)
         squared = _filtered(rate**2, step_s, smooth_s, 0)
         # Two filters reach farther than one: all columns end where the shortest does.
-        spare = (q.size - squared.size) // 2 - _reach(step_s, smooth_s)
+        first = (q.size - squared.size) // 2
+        spare = first - _reach(step_s, smooth_s)
         columns = [_filtered(q, step_s, smooth_s, order) for order in range(1, DERIVATIVES + 1)]
         columns += [_filtered(np.cos(q), step_s, smooth_s, 0), _filtered(np.sin(q), step_s, smooth_s, 0)]
         trimmed = [column[spare : column.size - spare] for column in columns]
-        first = (q.size - squared.size) // 2
         self.origin_ns = int(joint.t_ns[0])
         knots = 1e-9 * (joint.t_ns[first : first + squared.size] - self.origin_ns)
         self._spline = CubicSpline(knots, np.stack([*trimmed, squared], axis=1))
@@ -110,8 +109,7 @@ def derivative_kernel(step_s: float, smooth_s: float, order: int) -> Array:
     reach = _reach(step_s, smooth_s)
     t = step_s / smooth_s * np.arange(-reach, reach + 1)
     window = np.exp(-0.5 * t**2)
-    # That derivative is the window times a Hermite polynomial: the one that passes t^order and, on these
-    # samples, no lower power.
+    # The window times the polynomial (Hermite's) that passes t^order and, on these samples, no lower power.
     powers = t[:, None] ** np.arange(order % 2, order + 1, 2)
     wanted = np.zeros(powers.shape[1])
     wanted[-1] = factorial(order) / smooth_s**order

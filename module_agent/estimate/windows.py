@@ -44,18 +44,17 @@ def imu_window(rows: Rows) -> ImuWindow:
 
     Rows may be more frequent than IMU samples, or repeated after a gap: every IMU time counts once.
     """
-    t_ns, first = np.unique(rows["imu_t_ns"].astype(np.int64), return_index=True)
-    return ImuWindow(
-        t_ns, rows["gyro_rad_s"][first].astype(np.float64), rows["accel_m_s2"][first].astype(np.float64)
-    )
+    return ImuWindow(*_columns(rows, "imu_t_ns", "gyro_rad_s", "accel_m_s2"))
 
 
 def joint_window(rows: Rows) -> JointWindow:
     """Take the joint's samples out of feedback rows (`feedback_rows.ROW`); every row time counts once."""
-    t_ns, first = np.unique(rows["t_ns"].astype(np.int64), return_index=True)
-    return JointWindow(
-        t_ns, rows["position_rad"][first].astype(np.float64), rows["velocity_rad_s"][first].astype(np.float64)
-    )
+    return JointWindow(*_columns(rows, "t_ns", "position_rad", "velocity_rad_s"))
+
+
+def _columns(rows: Rows, time: str, one: str, other: str) -> tuple[Times, Array, Array]:
+    t_ns, first = np.unique(rows[time].astype(np.int64), return_index=True)
+    return t_ns, rows[one][first].astype(np.float64), rows[other][first].astype(np.float64)
 
 
 def align(imu: ImuWindow, joint: JointWindow, offset_ns: int) -> AlignedMotion:

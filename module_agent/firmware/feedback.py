@@ -34,11 +34,7 @@ class History:
         self.next_row += 1
 
     def rows(self, first: int, end: int) -> Rows:
-        """Return a copy of rows `first` up to and without `end`, shape (end - first,).
-
-        Raises:
-            WireError: GONE, a row is overwritten or not yet there; the message has the range available.
-        """
+        """Return a copy of rows `first` up to and without `end`, shape (end - first,); see `block`."""
         return np.frombuffer(self.block(first, end), dtype=ROW)
 
     def block(self, first: int, end: int) -> bytes:
@@ -61,20 +57,10 @@ class History:
 
     def between(self, start_ns: int, end_ns: int) -> Rows:
         """Return a copy of the available rows whose module time is within a span, both ends included."""
-        first, end = self._row_from(start_ns), self._row_from(end_ns + 1)
-        return self.rows(first, max(first, end))
-
-    def _row_from(self, t_ns: int) -> int:
-        """Return the first available row at or after a module time; rows are in the order of their time."""
-        low, high = self.first_row, self.next_row
-        stamps = self._ring["t_ns"]
-        while low < high:
-            middle = (low + high) // 2
-            if stamps[middle % self.capacity] < t_ns:
-                low = middle + 1
-            else:
-                high = middle
-        return low
+        kept = np.arange(self.first_row, self.next_row)
+        t_ns = self._ring["t_ns"][kept % self.capacity]
+        first, end = self.first_row + np.searchsorted(t_ns, (start_ns, end_ns + 1))
+        return self.rows(int(first), int(max(first, end)))
 
 
 _STATE_INDEX = {name: index for index, name in enumerate(STATE_NAMES)}

@@ -103,7 +103,6 @@ class Modules(Protocol):
         HEBI: a lookup of the serials and `request_info`. Its tick is the period of feedback that the driver
         has set, its clock `hardware_transmit_time`.
         """
-        ...
 
     def receive(self) -> Sequence[ModuleSample]:
         """Wait for the next tick and return one sample per module.
@@ -116,7 +115,6 @@ class Modules(Protocol):
         Raises:
             HardwareLost: no further tick will come.
         """
-        ...
 
     def send(self, commands: Sequence[Command]) -> Sequence[float]:
         """Hand over one command per module; return the PWM of each, as the module's feedback would show it.
@@ -129,14 +127,12 @@ class Modules(Protocol):
         Raises:
             ValueError: not one command per module, or there was no sample yet.
         """
-        ...
 
     def set_gains(self, index: int, gains: GainSet) -> None:
         """Replace the gains and the control strategy of a module; its loops forget their past.
 
         HEBI: a command with gains; they are not saved, so that a power cycle brings back the owner's.
         """
-        ...
 
     def set_lifetime(self, index: int, lifetime_ns: int) -> None:
         """Set how long a module follows a command when no other comes: then its motor is off.
@@ -149,15 +145,12 @@ class Modules(Protocol):
         Raises:
             ValueError: a lifetime that is not positive.
         """
-        ...
 
     def identify(self, index: int, on: bool) -> None:
         """Show on a module which one it is, or show it no longer. HEBI: the colour of its LED."""
-        ...
 
     def close(self) -> None:
         """Release the modules; their motors then are off. May be called twice.
 
         HEBI: a last command without targets.
         """
-        ...

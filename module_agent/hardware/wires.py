@@ -24,7 +24,6 @@ class Wires(Protocol):
     @property
     def modules(self) -> Sequence[WiredModule]:
         """The modules served, in the order of `exchange`."""
-        ...
 
     def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
         """Hand over one PWM per module, wait for the next tick, return one sample per module.
@@ -36,8 +35,6 @@ class Wires(Protocol):
             HardwareLost: no further tick will come.
             ValueError: not one PWM per module.
         """
-        ...
 
     def close(self) -> None:
         """Release the modules; their motors then get zero PWM. May be called twice."""
-        ...

@@ -4,7 +4,6 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from module_agent.model.errors import UsageError
 from module_agent.network_emulation.trace import NetworkTrace
 
 # The receiver of a message; each direction has its own path.
@@ -174,14 +173,3 @@ PROFILES: dict[str, NetworkProfile] = {
         ),
     )
 }
-
-
-def profile(name: str) -> NetworkProfile:
-    """Look up a profile by name; `profile_file.network` accepts files as well.
-
-    Raises:
-        UsageError: unknown profile; the message lists the known ones.
-    """
-    if name not in PROFILES:
-        raise UsageError(f"unknown network profile {name!r}; known are {', '.join(PROFILES)}")
-    return PROFILES[name]

@@ -14,11 +14,9 @@ class Scheduler(Protocol):
     @property
     def now_s(self) -> float:
         """The time from any origin [s]; it never decreases."""
-        ...
 
     def call_later(self, delay_s: float, call: Callable[[], None]) -> None:
         """Call `call` after `delay_s`; calls due at the same time run in the order of scheduling."""
-        ...
 
 
 class TimerThread:

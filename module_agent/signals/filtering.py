@@ -1,13 +1,11 @@
 """Positions, velocities, accelerations and torques on one time base, all through the same low-pass.
 
 The regressor needs accelerations, and they come by differentiation (thesis section 5.1), which needs a
-low-pass. Whatever the low-pass takes from the motion it must take from the torque too: a filter on the
-acceleration alone makes every inertia come out too large. So one linear filter goes over torque and motion
-alike, forward and backward, which leaves no delay.
+low-pass: the same linear filter over torque and motion, or every inertia would come out too large.
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,8 +36,6 @@ SIMULTANEOUS_CUTOFF_HZ = 15.0
 CLOCK_CUTOFF_HZ = 15.0
 
 NS_PER_S = 1_000_000_000
-
-Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class JointMotion(NamedTuple):
@@ -73,18 +69,14 @@ def resample(
     t_ns: Sequence[ArrayLike],
     signals: Sequence[ArrayLike],
     t_common_ns: ArrayLike,
-    kind: Literal["linear", "cubic"] = "cubic",
     max_gap_ns: int = 40_000_000,
 ) -> Array:
-    """Interpolate the signal of every module onto one time base.
-
-    At 250 Hz a straight line between samples is up to 0.8 % off at 10 Hz, the cubic spline 0.005 %.
+    """Interpolate the signal of every module onto one time base, by a cubic spline (0.005 % off at 10 Hz).
 
     Args:
         t_ns: per module the times (m_i,) of its samples, increasing, already mapped into one clock.
         signals: per module the values (m_i,), or (m_i, k) of k signals that were sampled together.
         t_common_ns: (m,) times to interpolate to.
-        kind: order of the spline through the samples.
         max_gap_ns: the longest hole between samples that is bridged (10 samples at 250 Hz by default).
 
     Returns:
@@ -104,9 +96,7 @@ def resample(
         known = np.asarray(times, dtype=np.int64)
         _check_times(column, known, common, max_gap_ns)
         # Nanoseconds since an epoch need more digits than a float has: subtract first.
-        spline = make_interp_spline(
-            (known - known[0]) / NS_PER_S, np.asarray(values, dtype=float), k=1 if kind == "linear" else 3
-        )
+        spline = make_interp_spline((known - known[0]) / NS_PER_S, np.asarray(values, dtype=float))
         resampled[:, column] = spline((common - known[0]) / NS_PER_S)
     return read_only(resampled)
 
@@ -145,8 +135,7 @@ def differentiate(signal: ArrayLike, rate_hz: float) -> Array:
     """
     values = np.asarray(signal, dtype=float)
     t = np.arange(values.shape[0]) / rate_hz
-    derivative: Array = np.asarray(CubicSpline(t, values, axis=0)(t, 1))
-    return read_only(derivative)
+    return read_only(np.asarray(CubicSpline(t, values, axis=0)(t, 1)))
 
 
 def filtered_signals(
@@ -187,13 +176,11 @@ def filtered_motion(
     rate_hz: float,
     cutoff_hz: float,
 ) -> JointMotion:
-    """Return what the regressor and the least squares need, through one and the same low-pass.
+    """Return what the regressor and the least squares need, through one low-pass.
 
     Args:
         t_ns: (m,) uniform times at `rate_hz`.
-        q_rad, qd_rad_s, tau_nm: (m, n) as measured; without velocities the positions are differentiated
-        twice.
-        rate_hz: sampling rate.
+        q_rad, qd_rad_s, tau_nm: (m, n) as measured; without velocities positions are differentiated twice.
         cutoff_hz: of `zero_phase_low_pass`; at least three times the motion's highest frequency.
 
     Returns:
@@ -210,7 +197,13 @@ def filtered_motion(
             raise DataError(
                 f"a signal has shape {signal.shape}; ({times.size}, joints) is needed for all alike"
             )
-    _check_uniform(times, rate_hz)
+    # Integer nanoseconds round by up to one; a drifting module clock is the business of `resample`.
+    off = np.abs(np.diff(times) - NS_PER_S / rate_hz)
+    if off.size and off.max() > 1.0:
+        raise DataError(
+            f"t_ns is not uniform at {rate_hz} Hz: sample {int(np.argmax(off)) + 1} is "
+            f"{off.max() / 1e3:.1f} us off; resample first"
+        )
     filtered = [zero_phase_low_pass(signal, rate_hz, cutoff_hz) for signal in signals]
     velocity = filtered[2] if qd_rad_s is not None else differentiate(filtered[0], rate_hz)
     edge = settling_samples(rate_hz, cutoff_hz)
@@ -240,15 +233,4 @@ def _check_times(column: int, known: NDArray[np.int64], common: NDArray[np.int64
         raise DataError(
             f"column {column} has a hole of {steps.max() / 1e6:.1f} ms before sample {row}; "
             f"at most {max_gap_ns / 1e6:.1f} ms are bridged"
-        )
-
-
-def _check_uniform(times: NDArray[np.int64], rate_hz: float) -> None:
-    off = np.abs(np.diff(times) - NS_PER_S / rate_hz)
-    # Integer nanoseconds round by up to one; a drifting module clock is the business of `resample`.
-    if off.size and off.max() > 1.0:
-        sample = int(np.argmax(off)) + 1
-        raise DataError(
-            f"t_ns is not uniform at {rate_hz} Hz: sample {sample} is {off.max() / 1e3:.1f} us off; "
-            "resample first"
         )

@@ -16,11 +16,9 @@ class Worker(Protocol):
 
     def submit(self, job: Callable[[], T], done: Callable[[T], None]) -> None:
         """Run a job and hand its result to `done`, from any thread."""
-        ...
 
     def check(self) -> None:
         """Raise the exception of a failed job."""
-        ...
 
 
 class Answer(NamedTuple):
@@ -33,13 +31,6 @@ class Answer(NamedTuple):
     part: bytes
 
 
-class _Result(NamedTuple):
-    """The result for a request: the packed information, or the reason why there is none."""
-
-    block: bytes
-    why: str
-
-
 class InformationService:
     """Answers for one module. The latest result is kept, so that all its parts are from one computation."""
 
@@ -48,7 +39,8 @@ class InformationService:
         self._collection = collection
         self._worker = worker
         self._asked: bytes | None = None
-        self._result: _Result | None = None
+        # The packed information, or the reason why there is none.
+        self._result: bytes | str | None = None
 
     def collect(self, request: CollectRequest, own: Mapping[str, OwnRows], now_ns: int) -> None:
         """Begin to keep the rows of a motion.
@@ -73,12 +65,12 @@ class InformationService:
         result = self._result
         if result is None:
             raise WireError(Refusal.BUSY, f"what the torques of {self._serial} say is being computed")
-        if not result.block:
-            raise WireError(Refusal.UNFIT, result.why)
-        total = len(result.block)
+        if isinstance(result, str):
+            raise WireError(Refusal.UNFIT, result)
+        total = len(result)
         if request.offset >= total:
             raise WireError(Refusal.RANGE, f"a part from byte {request.offset} on, there are {total}")
-        part = result.block[request.offset : request.offset + MAX_PART_BYTES]
+        part = result[request.offset : request.offset + MAX_PART_BYTES]
         numbers = tuple(sorted({motion.motion_id for motion in request.motions}))
         return Answer(digest, numbers, total, request.offset, part)
 
@@ -89,22 +81,24 @@ class InformationService:
         self._asked, self._result = digest, None
         self._worker.submit(lambda: _compute(self._serial, request, tracks), self._keep)
 
-    def _keep(self, result: _Result) -> None:
+    def _keep(self, result: bytes | str) -> None:
         self._result = result
 
 
-def _compute(serial: str, request: InformationRequest, tracks: Mapping[int, Mapping[str, Track]]) -> _Result:
+def _compute(
+    serial: str, request: InformationRequest, tracks: Mapping[int, Mapping[str, Track]]
+) -> bytes | str:
     # Imported here because loading takes half a second, which would delay the start of every agent.
     from module_agent.torque_information.module_information import own_information
     from module_agent.torque_information.serialisation import pack
 
     try:
-        return _Result(pack(own_information(serial, request, tracks)), "")
+        return pack(own_information(serial, request, tracks))
     except KeyError as error:
-        return _Result(b"", f"no rows of {error.args[0]} were kept for a motion")
+        return f"no rows of {error.args[0]} were kept for a motion"
     except RobotError as error:
         # The reason is the answer to the request.
-        return _Result(b"", str(error))
+        return str(error)
     except Exception as error:
         # A defect, but caused by a message: it must not end the modules of the process.
-        return _Result(b"", f"{serial} cannot compute this, {type(error).__name__}: {error}")
+        return f"{serial} cannot compute this, {type(error).__name__}: {error}"

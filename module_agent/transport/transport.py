@@ -68,7 +68,6 @@ class Undeclare(Protocol):
 
     def undeclare(self) -> None:
         """End the declaration. May be called twice."""
-        ...
 
 
 class Transport(Protocol):
@@ -76,31 +75,24 @@ class Transport(Protocol):
 
     def publish(self, key: str, payload: bytes) -> None:
         """Send to all subscribers; dropped under congestion, never blocking."""
-        ...
 
     def subscribe(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver a `Sample` for everything published on a matching key from now on."""
-        ...
 
     def serve(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver a `Request` for every query on a matching key."""
-        ...
 
     def query(self, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
         """Ask; exactly one `Reply` with this tag comes to the sink, within about `timeout_s`."""
-        ...
 
     def declare_alive(self, key: str) -> Undeclare:
         """Hold a liveliness token while this session lives."""
-        ...
 
     def watch_alive(self, key_expr: str, sink: Sink) -> Undeclare:
         """Deliver a `Liveness` for every present and future change of a matching token."""
-        ...
 
     def close(self) -> None:
         """End all declarations and the session. May be called twice."""
-        ...
 
 
 TIMEOUT = "Timeout"

@@ -17,7 +17,7 @@ from module_agent.hardware.hardware import HardwareLost
 from module_agent.main import app
 from module_agent.model.errors import EXIT_LOST, UsageError
 from module_agent.network_emulation.impaired_transport import ImpairedTransport, inject
-from module_agent.network_emulation.profile import NetworkProfile, PathProfile, profile
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile, PathProfile
 from module_agent.transport.endpoint import check_endpoint
 from module_agent.worker import ThreadWorker
 
@@ -94,8 +94,8 @@ def test_no_network_is_injected_where_none_is_asked_for() -> None:
         """A transport that is not used."""
 
     transport = Nothing()
-    assert inject(transport, profile("none"), 0, "module") is transport  # type: ignore[arg-type]
-    injected = inject(transport, profile("wifi"), 0, "module")  # type: ignore[arg-type]
+    assert inject(transport, PROFILES["none"], 0, "module") is transport  # type: ignore[arg-type]
+    injected = inject(transport, PROFILES["wifi"], 0, "module")  # type: ignore[arg-type]
     assert isinstance(injected, ImpairedTransport)
     only_parted = NetworkProfile(name="parted", partitions=((1.0, 2.0),))
     assert inject(transport, only_parted, 0, "module") is transport  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from coordinator.excitation.plan import Plan
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.recording.run_folder import load_recording
-from module_agent.network_emulation.profile import NetworkProfile, Stall, profile
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile, Stall
 from module_agent.network_emulation.profile_file import network
 from module_agent.transport.transport import LEASE_S
 from sim.main import app
@@ -36,7 +36,7 @@ def test_modules_whose_clocks_the_round_trips_map_wrongly_are_put_together_right
     rigs: Rigs, quick_plan: Plan, tmp_path: Path, seed: int
 ) -> None:
     """The estimates map the clocks by the motion itself, so that an asymmetry costs them nothing."""
-    rigs(ARM, profile("asymmetric"), seed).session(tmp_path / "run", quick_plan)
+    rigs(ARM, PROFILES["asymmetric"], seed).session(tmp_path / "run", quick_plan)
     _right(tmp_path / "run")
 
 
@@ -55,7 +55,7 @@ def test_stalls_of_tens_of_milliseconds_interrupt_nothing(
 def test_a_partition_of_the_schedule_interrupts_a_motion_that_is_then_done_again(
     rigs: Rigs, quick_plan: Plan, tmp_path: Path
 ) -> None:
-    parted = profile("lan").model_copy(update={"partitions": ((4.0, 4.6), (6.5, 7.0))})
+    parted = PROFILES["lan"].model_copy(update={"partitions": ((4.0, 4.6), (6.5, 7.0))})
     rig = rigs(ARM, parted, 1)
     rig.session(tmp_path / "run", quick_plan)
     _right(tmp_path / "run")
@@ -67,7 +67,7 @@ def test_a_partition_of_the_schedule_interrupts_a_motion_that_is_then_done_again
 def test_a_partition_longer_than_the_lease_ends_the_run_by_name_and_everything_is_stopped(
     rigs: Rigs, quick_plan: Plan, tmp_path: Path
 ) -> None:
-    parted = profile("lan").model_copy(update={"partitions": ((4.0, 30.0),)})
+    parted = PROFILES["lan"].model_copy(update={"partitions": ((4.0, 30.0),)})
     rig = rigs(ARM, parted, 1)
     with pytest.raises(ModuleLost, match=r"module X-000(09|10) is lost: "):
         rig.session(tmp_path / "run", quick_plan)

@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.live_robot.errors import UnfitLink
 from coordinator.live_robot.link_check import MAX_MEASUREMENTS, check_link
-from module_agent.network_emulation.profile import NetworkProfile, profile
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
@@ -65,7 +65,7 @@ def test_a_module_slower_than_its_feedback_rate_is_unfit(rigs: Callable[..., Any
 
 def test_a_short_outage_is_measured_again(rigs: Callable[..., Any]) -> None:
     # Partitioned during most of the first measurement only.
-    parted = profile("lan").model_copy(update={"partitions": ((0.25, 0.55),)})
+    parted = PROFILES["lan"].model_copy(update={"partitions": ((0.25, 0.55),)})
     rig = rigs(ARM, parted)
     assert len(_checked(rig)) == 2
     assert 0.2 + MEASUREMENT_S < rig.loop.time() < 0.4 + (MAX_MEASUREMENTS + 1) * MEASUREMENT_S

@@ -15,7 +15,7 @@ from coordinator.identification.result import write_result
 from coordinator.recording.run_folder import RESULT
 from coordinator.torque_control.gravity_model import gravity_model
 from module_agent.model.regressor import inverse_dynamics
-from module_agent.network_emulation.profile import profile
+from module_agent.network_emulation.profile import PROFILES
 from sim.robot.robot_file import load_robot
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
@@ -26,7 +26,7 @@ def identified() -> Identified:
     """Return what a short session on an upright arm finds out."""
     plan = Plan(imu="calibrated", sine_centre_s=1.4, sine_sigma_s=0.5, rest_s=1.0, dynamic_repeats=2)
     robot = load_robot("thesis_484_vertical")
-    return identify(record_session(VirtualSettings(robot, profile("lan"), 3), plan))
+    return identify(record_session(VirtualSettings(robot, PROFILES["lan"], 3), plan))
 
 
 def written(folder: Path, **changes: object) -> Path:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
-from module_agent.network_emulation.profile import NetworkProfile, PathProfile, Receiver, Stall, profile
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile, PathProfile, Receiver, Stall
 from module_agent.network_emulation.trace import NetworkTrace, TraceRow
 from module_agent.transport.transport import CLOSED, LEASE_S, TIMEOUT, Event, Liveness, Reply, Request, Sample
 from sim.virtual_time.loop import LoopScheduler, VirtualLoop
@@ -97,7 +97,7 @@ def test_a_clock_mapped_by_round_trips_over_the_asymmetric_network_is_wrong_by_h
     """The module's clock is the true one here: what the mapping is off by is the network's doing alone."""
     errors_ms = []
     for seed in range(20):
-        pair = pairs(profile("asymmetric"), seed)
+        pair = pairs(PROFILES["asymmetric"], seed)
         pair.module.serve("q", lambda event, loop=pair.loop: event.reply(str(loop.time()).encode()))
         for i in range(50):
             pair.at(0.1 * i, lambda pair=pair, i=i: ask(pair, "reply", tag=i))
@@ -321,7 +321,7 @@ def test_a_token_that_is_declared_while_cut_off_is_seen_at_the_end(pairs) -> Non
 
 def test_the_same_seed_gives_the_same_arrivals_and_another_seed_others(pairs) -> None:
     def arrivals(seed: int) -> list[tuple[float, Event]]:
-        pair = pairs(profile("wifi").model_copy(update={"partitions": ((0.5, 0.7),)}), seed)
+        pair = pairs(PROFILES["wifi"].model_copy(update={"partitions": ((0.5, 0.7),)}), seed)
         pair.coordinator.subscribe("up", pair.note("up"))
         for i in range(1000):
             pair.at(4e-3 * i, lambda i=i: pair.module.publish("up", str(i).encode()))

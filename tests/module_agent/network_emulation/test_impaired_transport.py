@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
-from module_agent.network_emulation.profile import NetworkProfile, profile
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.network_emulation.scheduler import TimerThread
 from module_agent.transport.transport import (
     CLOSED,
@@ -174,7 +174,7 @@ def test_the_same_seed_gives_the_same_deliveries(found, seed, sent) -> None:
 
 def test_another_seed_gives_other_deliveries() -> None:
     sent = [(0.01, 0)] * 20
-    assert deliveries(profile("wifi"), 1, sent) != deliveries(profile("wifi"), 2, sent)
+    assert deliveries(PROFILES["wifi"], 1, sent) != deliveries(PROFILES["wifi"], 2, sent)
 
 
 @settings(deadline=None)
@@ -289,7 +289,7 @@ def test_reordering_overtakes() -> None:
 
 
 def test_over_a_perfect_network_everything_arrives_at_once() -> None:
-    transport, inner, _ = make(profile("none"))
+    transport, inner, _ = make(PROFILES["none"])
     got: list[Event] = []
     transport.subscribe("**", got.append)
     transport.watch_alive("**", got.append)
@@ -338,7 +338,7 @@ def test_closing_answers_queries_once_and_later_ones_are_refused() -> None:
 def test_many_threads_lose_nothing_and_keep_their_order() -> None:
     timer = TimerThread()
     inner = Bare()
-    transport = ImpairedTransport(inner, profile("lan"), np.random.default_rng(0), timer, receiver="module")
+    transport = ImpairedTransport(inner, PROFILES["lan"], np.random.default_rng(0), timer, receiver="module")
     got: list[Event] = []
     all_there = threading.Event()
 

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from module_agent.model.errors import UsageError
 from module_agent.network_emulation.channel import Channel
 from module_agent.network_emulation.profile import (
     PROFILES,
@@ -15,7 +14,6 @@ from module_agent.network_emulation.profile import (
     PathProfile,
     Receiver,
     Stall,
-    profile,
 )
 
 RECEIVERS: tuple[Receiver, ...] = ("module", "coordinator")
@@ -156,7 +154,7 @@ def mean_loss(path: PathProfile) -> float:
     ],
 )
 def test_a_named_profile_delays_and_loses_as_much_as_is_known_of_it(name, round_trip_ms, loss) -> None:
-    paths = [profile(name).path(receiver) for receiver in RECEIVERS]
+    paths = [PROFILES[name].path(receiver) for receiver in RECEIVERS]
     assert sum(mean_delay_ms(path) for path in paths) == pytest.approx(round_trip_ms, abs=0.05)
     assert np.mean([mean_loss(path) for path in paths]) == pytest.approx(loss, abs=0.001)
 
@@ -165,7 +163,7 @@ def test_what_is_computed_of_a_profile_is_what_its_channels_do() -> None:
     number = 100_000
     for name in ("wifi", "bad", "asymmetric"):
         for receiver in RECEIVERS:
-            path = profile(name).path(receiver)
+            path = PROFILES[name].path(receiver)
             found = []
             for seed in range(20):
                 channel = Channel(path, np.random.default_rng(seed))
@@ -178,8 +176,3 @@ def test_what_is_computed_of_a_profile_is_what_its_channels_do() -> None:
             expected = mean_loss(path)
             lost = np.mean([fate.lost for fate in found])
             assert abs(lost - expected) <= 5 * np.sqrt(expected / number)
-
-
-def test_an_unknown_name_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(UsageError, match=f"'pigeons'; known are {', '.join(PROFILES)}"):
-        profile("pigeons")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
-from module_agent.network_emulation.profile import profile
+from module_agent.network_emulation.profile import PROFILES
 from module_agent.network_emulation.scheduler import Scheduler, TimerThread
 from module_agent.transport.transport import (
     CLOSED,
@@ -90,7 +90,9 @@ def free_endpoint() -> str:
 
 
 def impaired(inner: Transport, scheduler: Scheduler, seed: int) -> Transport:
-    return ImpairedTransport(inner, profile("lan"), np.random.default_rng(seed), scheduler, receiver="module")
+    return ImpairedTransport(
+        inner, PROFILES["lan"], np.random.default_rng(seed), scheduler, receiver="module"
+    )
 
 
 @pytest.fixture(params=["zenoh", "zenoh-lan", "virtual", "virtual-lan"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from module_agent.model.errors import UsageError
-from module_agent.network_emulation.profile import NetworkProfile, PathProfile, profile
+from module_agent.network_emulation.profile import PROFILES, NetworkProfile, PathProfile
 from sim.processes.link_emulator import counts_by_address, host
 from sim.processes.packet_switch import PacketSwitch
 
@@ -30,14 +30,14 @@ def passed(switch: PacketSwitch) -> list[tuple[float, int, bytes]]:
 
 
 def test_a_packet_goes_to_the_host_that_it_is_for_and_nowhere_else() -> None:
-    switch = PacketSwitch(HOSTS, profile("none"), 0)
+    switch = PacketSwitch(HOSTS, PROFILES["none"], 0)
     switch.take(1.0, HUB, packet(HUB, HOSTS[TWO], b"a"))
     switch.take(1.0, TWO, packet(TWO, HOSTS[ONE], b"b"))
     assert passed(switch) == [(1.0, TWO, b"a"), (1.0, ONE, b"b")]
 
 
 def test_what_is_for_nobody_or_is_no_ipv4_is_dropped() -> None:
-    switch = PacketSwitch(HOSTS, profile("none"), 0)
+    switch = PacketSwitch(HOSTS, PROFILES["none"], 0)
     multicast_v6 = b"\x60" + bytes(39)
     for each in (packet(HUB, IPv4Address("10.77.0.9")), packet(HUB, HOSTS[HUB]), multicast_v6, b"", b"\x45"):
         switch.take(1.0, HUB, each)
@@ -104,7 +104,7 @@ def test_in_a_partition_nothing_passes_to_or_from_the_coordinator() -> None:
 
 def test_links_have_draws_of_their_own_and_the_seed_decides_them() -> None:
     def arrivals(seed: int) -> dict[int, list[float]]:
-        switch = PacketSwitch(HOSTS, profile("wifi"), seed)
+        switch = PacketSwitch(HOSTS, PROFILES["wifi"], seed)
         found: dict[int, list[float]] = {ONE: [], TWO: []}
         for source in (ONE, TWO):
             for i in range(100):
@@ -119,7 +119,7 @@ def test_links_have_draws_of_their_own_and_the_seed_decides_them() -> None:
 
 
 def test_counts_are_told_by_the_addresses() -> None:
-    switch = PacketSwitch(HOSTS[:2], profile("none"), 0)
+    switch = PacketSwitch(HOSTS[:2], PROFILES["none"], 0)
     switch.take(0.0, ONE, packet(ONE, HOSTS[HUB]))
     told = counts_by_address(switch.counts, HOSTS)
     assert set(told) == {"10.77.0.1 > 10.77.0.2", "10.77.0.2 > 10.77.0.1"}

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
-from module_agent.network_emulation.profile import profile
+from module_agent.network_emulation.profile import PROFILES
 from module_agent.transport.transport import (
     NO_ANSWER,
     TIMEOUT,
@@ -209,7 +209,7 @@ def trace_hash(seed: int) -> str:
     ends = {
         name: ImpairedTransport(
             network.endpoint(name),
-            profile("bad"),
+            PROFILES["bad"],
             rng.spawn(1)[0],
             LoopScheduler(loop),
             receiver="module",
