@@ -13,7 +13,7 @@ from module_agent.model.errors import UsageError
 from sim.commands.options import WorldOptions, load
 from sim.robot.robot_file import RobotFileError
 from sim.world.bus_server import BusServer
-from sim.world.truth import LoggedWorld, write_truth
+from sim.world.truth import TruthLog, write_truth
 from sim.world.world import World
 
 # How long the world waits for an agent's command on a busy machine before it steps without it. A late step is
@@ -41,8 +41,8 @@ def world(
     signal.signal(signal.SIGTERM, stop)
     try:
         plant = World(robot, settings.seed, noise.of(robot), pushes=pushes)
-        logged = LoggedWorld(plant)
-        server = BusServer(bus, logged, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
+        log = TruthLog(plant)
+        server = BusServer(bus, log, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
     except (RobotFileError, OSError) as error:
         raise UsageError(str(error)) from error
     typer.echo(f"{robot.name}: {len(plant.modules)} modules on {bus}", err=True)
@@ -55,5 +55,5 @@ def world(
     if truth is not None:
         truth.mkdir(parents=True, exist_ok=True)
         write_truth(truth / "truth.json", robot, plant)
-        logged.log.save(truth / "truth.npz")
+        log.save(truth / "truth.npz")
     plant.close()

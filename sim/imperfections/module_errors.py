@@ -10,7 +10,7 @@ import numpy as np
 
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.perturbation import skew
-from module_agent.model.read_only import read_only
+from module_agent.model.read_only import make_read_only, read_only
 from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.imperfections.random_streams import generator
@@ -69,36 +69,25 @@ def draw_sensor_errors(
     seed: int, serials: Sequence[str], types: Sequence[ModuleType], profile: NoiseProfile
 ) -> SensorErrors:
     """Draw the errors of modules of the given types: normal, with the standard deviations of the profile."""
-    effort = _normals(seed, serials, "torque calibration", (2,))
+
+    def normals(purpose: str, *shape: int) -> Array:
+        return np.array([generator(seed, serial, purpose).standard_normal(shape) for serial in serials])
+
+    effort = normals("torque calibration", 2)
     limit = np.array([t.max_effort_nm for t in types])
-    turn = profile.imu_misalignment_rad * _normals(seed, serials, "imu misalignment", (2, 3))
-    oblique = profile.imu_skew_rad * _normals(seed, serials, "imu skew", (2, 3))
-    return SensorErrors(
-        imu_bias=read_only(
-            per_axis(profile.gyro_bias_rad_s, profile.accel_bias_m_s2)
-            * _normals(seed, serials, "imu bias", (6,))
-        ),
-        imu_scale=read_only(
-            per_axis(profile.gyro_scale, profile.accel_scale) * _normals(seed, serials, "imu scale", (6,))
-        ),
-        misalignment=read_only(
-            np.array(
-                [
-                    [_axes(t, s) for t, s in zip(*both, strict=True)]
-                    for both in zip(turn, oblique, strict=True)
-                ]
-            )
-        ),
-        g_sensitivity=read_only(
-            profile.gyro_g_sensitivity_s_m * _normals(seed, serials, "g sensitivity", (3, 3))
-        ),
-        effort_offset_nm=read_only(profile.effort_offset_fraction * limit * effort[:, 0]),
-        effort_scale=read_only(profile.effort_scale * effort[:, 1]),
+    turn = profile.imu_misalignment_rad * normals("imu misalignment", 2, 3)
+    oblique = profile.imu_skew_rad * normals("imu skew", 2, 3)
+    axes = [_axes(t, s) for t, s in zip(turn.reshape(-1, 3), oblique.reshape(-1, 3), strict=True)]
+    errors = SensorErrors(
+        imu_bias=per_axis(profile.gyro_bias_rad_s, profile.accel_bias_m_s2) * normals("imu bias", 6),
+        imu_scale=per_axis(profile.gyro_scale, profile.accel_scale) * normals("imu scale", 6),
+        misalignment=np.reshape(axes, (-1, 2, 3, 3)),
+        g_sensitivity=profile.gyro_g_sensitivity_s_m * normals("g sensitivity", 3, 3),
+        effort_offset_nm=profile.effort_offset_fraction * limit * effort[:, 0],
+        effort_scale=profile.effort_scale * effort[:, 1],
     )
-
-
-def _normals(seed: int, serials: Sequence[str], purpose: str, shape: tuple[int, ...]) -> Array:
-    return np.array([generator(seed, serial, purpose).standard_normal(shape) for serial in serials])
+    make_read_only(errors)
+    return errors
 
 
 def per_axis(gyro: float, accel: float) -> Array:

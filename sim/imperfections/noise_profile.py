@@ -7,10 +7,11 @@ effects, with their sources and their switches on the command line.
 from math import pi, radians
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.errors import UsageError
+from sim.geometry.link_parts import Strict
 from sim.imperfections.effects import EFFECTS, Effect
 
 Amount = Annotated[float, Field(ge=0.0, le=1e4)]
@@ -18,7 +19,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 STANDARD_GRAVITY_M_S2 = 9.80665
 
 
-class NoiseProfile(BaseModel):
+class NoiseProfile(Strict):
     """The sizes of all imperfections: standard deviations unless noted, constants drawn per module.
 
     Sensors: the IMU's white noise is that of an output rate of 250 Hz and grows with the square root of the
@@ -36,8 +37,6 @@ class NoiseProfile(BaseModel):
     Structure: base_shake and link_flex multiply the compliance of the robot's base and links (1 = as
     described by the robot file, 0 = rigid).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     # IMU
@@ -154,8 +153,7 @@ def switched(profile: NoiseProfile, on: tuple[str, ...] = (), off: tuple[str, ..
     An effect that the profile has already keeps its size there.
 
     Raises:
-        UsageError: unknown effect; the message lists the known ones.
-        UsageError: an effect is switched both on and off.
+        UsageError: unknown effect, or one that is switched both on and off.
     """
     if both := [name for name in on if name in off]:
         raise UsageError(f"effect {both[0]!r} is switched both on and off")
@@ -176,8 +174,5 @@ def _effect(name: str) -> Effect:
 
 def imu_kind(noise: NoiseProfile) -> ImuKind:
     """Return the kind of IMU prior that fits a profile."""
-    return (
-        "uncalibrated"
-        if noise.accel_scale or noise.gyro_scale or noise.imu_misalignment_rad
-        else "calibrated"
-    )
+    wrong = noise.accel_scale or noise.gyro_scale or noise.imu_misalignment_rad
+    return "uncalibrated" if wrong else "calibrated"

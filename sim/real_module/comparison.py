@@ -26,7 +26,7 @@ from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.real_module.real_log import RealLog
 from sim.robot.robot_file import Robot, parse_robot
-from sim.world.world import TICK_S, World, WorldWires
+from sim.world.world import TICK_S, World
 
 SERIAL = "X-LOG"
 SENDER = "log"
@@ -154,7 +154,7 @@ class _Bench:
     """One module in a world of its own, commanded by the log."""
 
     def __init__(self, world: World):
-        self._hardware = LoopInside(WorldWires(world))
+        self._hardware = LoopInside(world)
         self._firmware = Firmware(config_of(self._hardware.information[0], BOOT), self._hardware)
         self._sample_ns = 0
         self._seq = 0

@@ -59,7 +59,6 @@ class Imus:
         tick_s: float,
         period_s: float,
     ):
-        n = len(types)
         self.every_tick = profile.imu_bandwidth_hz > 0.0 or profile.sampling_jitter_s > 0.0
         self._filter = butterworth(profile.imu_bandwidth_hz, tick_s)
         self._jitter_ticks = profile.sampling_jitter_s / tick_s
@@ -86,13 +85,15 @@ class Imus:
         # In units of its own deviation, which it has from the beginning.
         self._drift = self._drifting.draw().copy()
         # The filter's output of this tick and the last one, and its two memories.
-        self._filtered = np.zeros((4, n, 6))
-        self._started = False
+        self._filtered = np.zeros((0, len(types), 6))
 
     def advance(self, gyro_rad_s: Array, specific_force_m_s2: Array) -> None:
         """Advance the low-pass by one tick; both (n, 3) in IMU axes."""
-        if not self._started:
-            self._start(np.hstack((gyro_rad_s, specific_force_m_s2)))
+        if not len(self._filtered):
+            # The steady state under this input.
+            b0, _, b2, _, a2 = self._filter
+            steady = np.hstack((gyro_rad_s, specific_force_m_s2))
+            self._filtered = np.array((steady, steady, (1.0 - b0) * steady, (b2 - a2) * steady))
         _low_pass(self._filter, gyro_rad_s, specific_force_m_s2, self._filtered)
 
     def read(self, motor_rad_s: Array) -> Array:
@@ -117,12 +118,6 @@ class Imus:
         )
         self._drift = self._keep * self._drift + sqrt(1.0 - self._keep**2) * self._drifting.draw()
         return values
-
-    def _start(self, filtered: Array) -> None:
-        """Set the filter to its steady state under this input."""
-        b0, _, b2, _, a2 = self._filter
-        self._filtered[:] = filtered, filtered, (1.0 - b0) * filtered, (b2 - a2) * filtered
-        self._started = True
 
 
 @compiled

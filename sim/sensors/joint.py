@@ -73,16 +73,20 @@ class JointSensors:
         self._noise = StandardNormals(seed, serials, "joint", 2)
         self._jitter = StandardNormals(seed, serials, "joint jitter", 1)
         # Columns: encoder reading, velocity, motor speed, torque, inner friction.
-        self._memory = np.empty((len(types), 5))
-        self._started = False
+        self._memory = np.zeros((0, 5))
 
     def read(self, q_rad: Array, qd_rad_s: Array, motor_rad_s: Array, elastic_nm: Array) -> Array:
         """Return a reading (n, 5): position, velocity, effort, deflection, motor speed seen at the output.
 
         All arguments are (n,) and true; elastic_nm is the springs' torque on the outputs.
         """
-        if not self._started:
-            self._start(q_rad, qd_rad_s, motor_rad_s, elastic_nm)
+        if not len(self._memory):
+            # The steady state of this speed and torque.
+            tick_s, step = self._settings[:2]
+            before = q_rad - qd_rad_s * tick_s
+            counted = np.rint(before / step) * step if step else before
+            still = np.zeros_like(q_rad)
+            self._memory = np.column_stack((counted, qd_rad_s, motor_rad_s, elastic_nm, still))
         return _read(
             self._settings,
             self._fixed,
@@ -94,14 +98,6 @@ class JointSensors:
             elastic_nm,
             self._memory,
         )
-
-    def _start(self, q_rad: Array, qd_rad_s: Array, motor_rad_s: Array, elastic_nm: Array) -> None:
-        """Set the memory to the steady state of this speed and torque."""
-        tick_s, step = self._settings[:2]
-        before = q_rad - qd_rad_s * tick_s
-        counted = np.rint(before / step) * step if step else before
-        self._memory = np.column_stack((counted, qd_rad_s, motor_rad_s, elastic_nm, np.zeros_like(q_rad)))
-        self._started = True
 
 
 def _share(bandwidth_hz: float, tick_s: float) -> float:
@@ -154,9 +150,6 @@ def _read(
         memory[i, 4] = _dahl(memory[i, 4], change, fixed[i, 4], fixed[i, 5])
         torque = elastic[i] + change * (off_s / tick_s) - memory[i, 4]
         effort = fixed[i, 1] * torque + fixed[i, 2] + fixed[i, 3] * noise[i, 1]
-        values[i, 0] = angle
-        values[i, 1] = velocity + velocity_white * noise[i, 0]
-        values[i, 2] = effort
-        values[i, 3] = effort / -fixed[i, 0]
-        values[i, 4] = memory[i, 2]
+        values[i, 0], values[i, 1] = angle, velocity + velocity_white * noise[i, 0]
+        values[i, 2], values[i, 3], values[i, 4] = effort, effort / -fixed[i, 0], memory[i, 2]
     return values

@@ -22,12 +22,6 @@ def module_time(clock: ModuleClock, world_ns: int) -> int:
     return clock.offset_ns + world_ns + world_ns * clock.drift_ppb // 1_000_000_000
 
 
-def world_time(clock: ModuleClock, module_ns: int) -> int:
-    """Return the world time [ns] at which the clock reads `module_ns`, to 1 ns."""
-    elapsed = module_ns - clock.offset_ns
-    return -(-elapsed * 1_000_000_000 // (1_000_000_000 + clock.drift_ppb))
-
-
 def draw_clock(rng: np.random.Generator, noise: NoiseProfile) -> ModuleClock:
     """Draw a clock: offset uniform within the profile's bounds, drift normal."""
     offset_s = rng.uniform(noise.clock_offset_min_s, noise.clock_offset_max_s)

@@ -62,25 +62,10 @@ class Sensors:
         self._imu_ticks = imu_ticks
         self._gear = np.array([t.gear_ratio for t in types])
         noise = seed if noise_seed is None else noise_seed
-        self._joints = JointSensors(
-            seed=noise, serials=serials, types=types, profile=profile, errors=self.errors, tick_s=tick_s
-        )
-        self._imus = Imus(
-            seed=noise,
-            serials=serials,
-            types=types,
-            profile=profile,
-            errors=self.errors,
-            tick_s=tick_s,
-            period_s=imu_ticks * tick_s,
-        )
+        self._joints = JointSensors(noise, serials, types, profile, self.errors, tick_s)
+        self._imus = Imus(noise, serials, types, profile, self.errors, tick_s, imu_ticks * tick_s)
         self._imu_values = np.zeros((len(types), 6))
         self._imu_ns = [0] * len(types)
-
-    @property
-    def imu_bias(self) -> Array:
-        """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
-        return self.errors.imu_bias
 
     def imu_due(self, tick: int) -> bool:
         """Whether `read` at this tick needs the IMU's truth of this instant."""
@@ -98,9 +83,7 @@ class Sensors:
         values = np.empty((len(joint), 14))
         values[:, :5] = joint
         values[:, 4] *= self._gear
-        values[:, 5] = truth.current_a
-        values[:, 6] = truth.winding_c
-        values[:, 7] = truth.voltage_v
+        values[:, 5], values[:, 6], values[:, 7] = truth.current_a, truth.winding_c, truth.voltage_v
         values[:, 8:] = self._imu_values
         rows = values.tolist()
         return [SensorSample(t, imu, *row) for t, imu, row in zip(now, self._imu_ns, rows, strict=True)]

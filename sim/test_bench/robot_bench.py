@@ -23,7 +23,7 @@ from sim.geometry.pose import Array
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
 from sim.test_bench.module_bench import ModuleBench
-from sim.world.world import TICK_NS, World, WorldWires
+from sim.world.world import TICK_NS, World
 
 T = TypeVar("T")
 
@@ -101,7 +101,7 @@ class BenchRobot:
         self, robot: Robot, seed: int, noise: str | NoiseProfile | None = None, noise_seed: int | None = None
     ):
         self.world = World(robot, seed, noise, noise_seed=noise_seed)
-        self._hardware = LoopInside(WorldWires(self.world))
+        self._hardware = LoopInside(self.world)
         self.modules = tuple(
             ModuleBench(Firmware(config_of(module, index + 1), self._hardware, index))
             for index, module in enumerate(self._hardware.information)

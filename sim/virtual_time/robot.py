@@ -134,8 +134,7 @@ class VirtualRobot:
     def _tick(self) -> None:
         if not self._running:
             return
-        self.samples = self.world.step(self.pwm)
-        self.truth.record()
+        self.samples = self.truth.step(self.pwm)
         for serial, host in list(self.hosts.items()):
             host.cycle()
             (self.pwm[self.serials.index(serial)],) = self._loops[serial].pwm

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from module_agent.hardware.hardware import SensorSample
-from module_agent.hardware.wires import WiredModule
 from module_agent.model.chain import Chain
 from module_agent.model.errors import DataError
 from module_agent.model.files import replacing, write_json
@@ -65,27 +64,24 @@ def truth_of(robot: Robot, world: World | None = None) -> Truth:
         module_types=tuple(m.type for m in robot.modules),
         chain=true_chain(robot),
         inertia=true_inertia(robot),
-        clocks=None if world is None else world.clocks,
-        imu_bias=None if world is None else world.imu_bias,
-        sensor_errors=None if world is None else world.sensor_errors,
+        clocks=None if world is None else world.sensors.clocks,
+        imu_bias=None if world is None else world.sensors.errors.imu_bias,
+        sensor_errors=None if world is None else world.sensors.errors,
     )
 
 
 def write_truth(path: Path, robot: Robot, world: World | None = None) -> None:
     """Write `truth_of` as JSON, atomically."""
     truth = truth_of(robot, world)
-    errors = truth.sensor_errors
-    document = {
-        "version": VERSION,
-        "robot": truth.robot,
-        "module_types": list(truth.module_types),
+    clocks, bias, errors = truth.clocks, truth.imu_bias, truth.sensor_errors
+    document = truth._asdict() | {
         "chain": truth.chain.to_dict(),
         "inertia": truth.inertia.tolist(),
-        "clocks": None if truth.clocks is None else [clock._asdict() for clock in truth.clocks],
-        "imu_bias": None if truth.imu_bias is None else truth.imu_bias.tolist(),
+        "clocks": None if clocks is None else [clock._asdict() for clock in clocks],
+        "imu_bias": None if bias is None else bias.tolist(),
         "sensor_errors": None if errors is None else {k: v.tolist() for k, v in errors._asdict().items()},
     }
-    write_json(path, document)
+    write_json(path, {"version": VERSION} | document)
 
 
 def read_truth(path: Path) -> Truth:
@@ -113,30 +109,33 @@ def read_truth(path: Path) -> Truth:
 
 
 class TruthLog:
-    """Records the true motion of a world, every `every` ticks; call `record` after every step."""
+    """Steps a world and records its true motion, every `every` ticks."""
 
     def __init__(self, world: World, every: int = 4):
         if every < 1:
             raise DataError(f"every {every} ticks: at least 1")
+        self.modules = world.modules
         self._world = world
         self._every = every
         self._ticks = 0
         self._t_ns: list[int] = []
         self._rows: list[tuple[Array, Array, Array]] = []
 
-    def record(self) -> None:
-        """Record the instant of the last samples if it is due."""
+    def step(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
+        """Step the world, record the instant of its samples if it is due, and return them."""
+        samples = self._world.step(pwm)
         if self._ticks % self._every == 0:
             plant = self._world.plant
             self._t_ns.append(plant.t_ns)
             self._rows.append((plant.q_rad, plant.qd_rad_s, plant.spring_torque_nm))
         self._ticks += 1
+        return samples
 
     def motion(self) -> Motion:
         """Return what has been recorded."""
         n = len(self._world.modules)
         stamps = np.array(self._t_ns, dtype=np.int64)
-        clocks = [[module_time(clock, t) for clock in self._world.clocks] for t in self._t_ns]
+        clocks = [[module_time(clock, t) for clock in self._world.sensors.clocks] for t in self._t_ns]
         clock_ns = np.array(clocks, dtype=np.int64).reshape(-1, n)
         columns = np.array(self._rows, dtype=np.float64).reshape(-1, 3, n)
         make_read_only((stamps, clock_ns, columns))
@@ -158,22 +157,3 @@ def read_motion(path: Path) -> Motion:
     serials = tuple(str(s) for s in arrays.pop("serials"))
     make_read_only(arrays.values())
     return Motion(serials, **arrays)
-
-
-class LoggedWorld:
-    """Steps a world and records its truth in `log`; to be served on the bus."""
-
-    def __init__(self, world: World):
-        self._world = world
-        self.log = TruthLog(world)
-
-    @property
-    def modules(self) -> Sequence[WiredModule]:
-        """The modules, in the order of `step`."""
-        return self._world.modules
-
-    def step(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
-        """Advance by one tick and return one sample per module."""
-        samples = self._world.step(pwm)
-        self.log.record()
-        return samples

@@ -9,24 +9,25 @@ import numpy as np
 
 from module_agent.hardware.hardware import HardwareLost, SensorSample
 from module_agent.hardware.wires import WiredModule
+from module_agent.model.catalogue import module_type
 from module_agent.model.read_only import read_only
 from sim.actuator.actuator import BUS_VOLTAGE_V, Actuators
 from sim.actuator.thermal import Windings
 from sim.geometry.pose import Array
-from sim.imperfections.module_errors import SensorErrors, draw_variation
+from sim.imperfections.module_errors import draw_variation
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.physics.equilibrium import equilibrium
 from sim.physics.multibody import Multibody
 from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import build_skeleton
 from sim.robot.robot_file import Robot
-from sim.robot.robot_tree import build_tree
-from sim.sensors.module_clock import ModuleClock
 from sim.sensors.sensors import Instant, Sensors
 from sim.world.external_force import Push, check_pushed
 
 TICK_NS = 1_000_000
 TICK_S = 1e-3
+# Its IMU is read at 250 Hz.
+IMU_TICKS = 4
 
 
 class Plant(NamedTuple):
@@ -53,6 +54,8 @@ class Plant(NamedTuple):
 class World:
     """A robot that lives in virtual time; the same seed and PWM give the same samples, bit by bit.
 
+    It is `Wires` to modules in the same process. `sensors` has their clocks and constant errors.
+
     Position, velocity, effort and IMU of a sample belong to one instant, the beginning of the tick: `t_ns` is
     that instant on the module's clock, and so is `imu_t_ns` in the ticks in which the IMU is read. In between
     the last IMU values are repeated with their own time.
@@ -62,9 +65,8 @@ class World:
     another day; the modules' parameters depend on `seed` alone. `pushes` are external wrenches.
 
     Raises:
-        ValueError: `imu_rate_hz` is not 1000 Hz divided by a whole number, a push is on no module, or the
-            robot's base or links are too soft to carry it.
-        KeyError: unknown noise profile.
+        UsageError: a push is on no module, the robot's base or links are too soft to carry it, or there is no
+            such noise profile.
     """
 
     def __init__(
@@ -72,32 +74,29 @@ class World:
         robot: Robot,
         seed: int,
         noise: str | NoiseProfile | None = None,
-        imu_rate_hz: float = 250.0,
         voltage_v: float = BUS_VOLTAGE_V,
         noise_seed: int | None = None,
         pushes: Sequence[Push] = (),
     ):
         self.robot = robot
-        wanted = robot.noise if noise is None else noise
-        self.profile = noise_profile(wanted) if isinstance(wanted, str) else wanted
-        tree = build_tree(robot)
-        imu_ticks = _whole_ticks(imu_rate_hz)
-        drawn = seed, robot.serials, tree.types, self.profile, imu_ticks, TICK_S, noise_seed
-        self._sensors = Sensors(*drawn)
+        self.profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or robot.noise)
+        types = tuple(module_type(m.type) for m in robot.modules)
+        drawn = seed, robot.serials, types, self.profile, IMU_TICKS, TICK_S, noise_seed
+        self.sensors = Sensors(*drawn)
         self._skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
         self._joints = np.array(self._skeleton.module)
         self._passive = np.array(self._skeleton.passive, dtype=np.int64)
         self._tree = RigidTree(self._skeleton)
-        self._windings = Windings(len(tree.types), TICK_S, self.profile.heat)
+        self._windings = Windings(len(types), TICK_S, self.profile.heat)
         variation = draw_variation(seed, robot.serials, self.profile)
-        self._actuators = Actuators(tree.types, TICK_S, self.profile, variation, self._skeleton, voltage_v)
+        self._actuators = Actuators(types, TICK_S, self.profile, variation, self._skeleton, voltage_v)
         self._tick = 0
         self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
         self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
         self._rates = np.zeros((2, len(self._q)))
         self._pushes: list[Push] = []
-        for push in pushes:
-            self.push(push)
+        for one in pushes:
+            self.push(one)
         self._actuators.reset(robot.start_rad, load)
         self._rehearse(Sensors(*drawn))
         self._body = Multibody(robot.name, self._skeleton, TICK_S)
@@ -106,7 +105,7 @@ class World:
         q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.state.motor_rad
         self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.state.torque_nm, structure)
         self.modules = tuple(
-            WiredModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
+            WiredModule(m.serial, m.type, TICK_NS, IMU_TICKS * TICK_NS) for m in robot.modules
         )
 
     @property
@@ -119,21 +118,6 @@ class World:
         """The true state at the instant of the last samples; at the start before the first tick."""
         t_ns, *arrays = self._plant
         return Plant(t_ns, *(read_only(a.copy()) for a in arrays))
-
-    @property
-    def clocks(self) -> tuple[ModuleClock, ...]:
-        """The modules' clocks."""
-        return self._sensors.clocks
-
-    @property
-    def imu_bias(self) -> Array:
-        """The constant errors of the IMUs: gyro [rad/s], accelerometer [m/s^2], (n, 6), read-only."""
-        return self._sensors.imu_bias
-
-    @property
-    def sensor_errors(self) -> SensorErrors:
-        """The constant errors of all sensors, read-only."""
-        return self._sensors.errors
 
     def warm(self, above_ambient_k: Array) -> None:
         """Set the modules' temperatures above the ambient: rows winding, housing, body, (3, n) [K]."""
@@ -208,10 +192,14 @@ class World:
             *(self.t_ns, u, drives.duty, q[own], rate[own], change[own], motor),
             *(drives.motor_rate_rad_s, drives.torque_nm, q[self._passive]),
         )
-        samples = self._samples(q, rate, change)
+        if self.sensors.imu_due(self._tick):
+            self._imu_readings = self._tree.imu_readings(q, rate, change)
+        samples = self.sensors.read(self._tick, self._instant(q, rate))
         self._windings.step(drives.copper_w)
         self._tick += 1
         return samples
+
+    exchange = step
 
     def close(self) -> None:
         """End the world. May be called twice."""
@@ -248,11 +236,6 @@ class World:
         copy(self._windings).step(actuators.state.copper_w)
         sensors.read(0, self._instant(self._q, still))
 
-    def _samples(self, q: Array, rate: Array, change: Array) -> list[SensorSample]:
-        if self._sensors.imu_due(self._tick):
-            self._imu_readings = self._tree.imu_readings(q, rate, change)
-        return self._sensors.read(self._tick, self._instant(q, rate))
-
     def _instant(self, q: Array, rate: Array) -> Instant:
         drives = self._actuators.state
         return Instant(
@@ -267,37 +250,3 @@ class World:
             gyro_rad_s=self._imu_readings[0],
             specific_force_m_s2=self._imu_readings[1],
         )
-
-
-class WorldWires:
-    """The wires to the modules of a world in the same process; closing them does not close the world."""
-
-    def __init__(self, world: World):
-        self._world = world
-        self._open = True
-
-    @property
-    def modules(self) -> Sequence[WiredModule]:
-        """All modules of the world."""
-        return self._world.modules
-
-    def exchange(self, pwm: Sequence[float]) -> Sequence[SensorSample]:
-        """Step the world.
-
-        Raises:
-            HardwareLost: this or the world is closed.
-        """
-        if not self._open:
-            raise HardwareLost("these wires have been closed")
-        return self._world.step(pwm)
-
-    def close(self) -> None:
-        """Let no further tick pass; may be called twice."""
-        self._open = False
-
-
-def _whole_ticks(imu_rate_hz: float) -> int:
-    ticks = round(1.0 / (TICK_S * imu_rate_hz)) if imu_rate_hz > 0.0 else 0
-    if ticks < 1 or not math.isclose(ticks * TICK_S * imu_rate_hz, 1.0, rel_tol=1e-9):
-        raise ValueError(f"imu_rate_hz {imu_rate_hz} is not 1000 Hz divided by a whole number")
-    return ticks

@@ -86,7 +86,7 @@ def network_trial(
         return begun._replace(why=failure.text)
     world = World(described, seed, profile)
     try:
-        clocks = dict(zip(described.serials, world.clocks, strict=True))
+        clocks = dict(zip(described.serials, world.sensors.clocks, strict=True))
     finally:
         world.close()
     return scored(begun, described, clocks, recording, kinematics)

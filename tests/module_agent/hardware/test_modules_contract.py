@@ -19,7 +19,7 @@ from module_agent.hardware.loop_inside import LoopInside
 from module_agent.model.catalogue import module_type
 from sim.robot.robot_file import load_robot
 from sim.world.bus_server import BusServer
-from sim.world.world import World, WorldWires
+from sim.world.world import World
 
 LIMIT_S = 20.0
 # Two modules whose gears hold them still without current: when an agent attaches matters to no test.
@@ -32,7 +32,7 @@ LAST = 1
 def modules(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Modules]:
     world = World(load_robot(ROBOT), seed=1, noise="ideal")
     if request.param == "in process":
-        yield LoopInside(WorldWires(world))
+        yield LoopInside(world)
         world.close()
         return
     path = str(tmp_path / "bus")

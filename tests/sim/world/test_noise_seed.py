@@ -18,9 +18,9 @@ def _trace(noise_seed: int | None, ticks: int = 80) -> np.ndarray:
 
 def test_another_day_the_modules_have_the_same_errors_and_clocks() -> None:
     first, second = (World(load_robot("a2085_03"), 7, "poor", noise_seed=day) for day in (1, 2))
-    for name, value in first.sensor_errors._asdict().items():
-        assert np.array_equal(value, getattr(second.sensor_errors, name)), name
-    assert first.clocks == second.clocks
+    for name, value in first.sensors.errors._asdict().items():
+        assert np.array_equal(value, getattr(second.sensors.errors, name)), name
+    assert first.sensors.clocks == second.sensors.clocks
     first.close()
     second.close()
 

@@ -29,9 +29,9 @@ def test_truth_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
     truth = read_truth(tmp_path / "truth.json")
     _assert_same(truth, truth_of(robot, world))
     assert truth.imu_bias is not None
-    np.testing.assert_array_equal(truth.imu_bias, world.imu_bias)
+    np.testing.assert_array_equal(truth.imu_bias, world.sensors.errors.imu_bias)
     assert truth.sensor_errors is not None
-    for read, drawn in zip(truth.sensor_errors, world.sensor_errors, strict=True):
+    for read, drawn in zip(truth.sensor_errors, world.sensors.errors, strict=True):
         np.testing.assert_array_equal(read, drawn)
         assert not read.flags.writeable
     assert truth.sensor_errors.misalignment.shape == (6, 2, 3, 3)
@@ -87,9 +87,8 @@ def test_the_log_records_every_fourth_instant_of_the_true_motion(tmp_path: Path)
     log = TruthLog(world)
     q, samples = [], []
     for k in range(42):
-        samples.append(world.step([0.1, 0.2 * np.sin(0.1 * k), -0.1]))
+        samples.append(log.step([0.1, 0.2 * np.sin(0.1 * k), -0.1]))
         q.append(world.plant.q_rad)
-        log.record()
     log.save(tmp_path / "truth.npz")
     motion = read_motion(tmp_path / "truth.npz")
     assert motion.serials == ("shoulder-yaw", "shoulder-lift", "elbow")
@@ -97,7 +96,7 @@ def test_the_log_records_every_fourth_instant_of_the_true_motion(tmp_path: Path)
     np.testing.assert_array_equal(motion.q_rad, q[::4])
     # On a module's own clock the truth stands where its samples do.
     np.testing.assert_array_equal(motion.clock_ns, [[s.t_ns for s in row] for row in samples[::4]])
-    assert motion.clock_ns[-1, 2] == module_time(world.clocks[2], 40_000_000)
+    assert motion.clock_ns[-1, 2] == module_time(world.sensors.clocks[2], 40_000_000)
     assert not motion.qd_rad_s.flags.writeable
 
 

@@ -10,7 +10,7 @@ from module_agent.model.errors import UsageError
 from sim.robot.robot_file import Robot, load_robot, parse_robot
 from sim.robot.robot_tree import true_chain
 from sim.sensors.module_clock import module_time
-from sim.world.world import World, WorldWires
+from sim.world.world import World
 
 IDEAL_ARM = "a2085_03"
 
@@ -55,24 +55,11 @@ def test_the_imu_is_read_every_fourth_tick_at_the_instant_of_the_position() -> N
     for k, samples in enumerate(trace):
         for i, sample in enumerate(samples):
             read = trace[k - k % 4][i]
-            assert sample.t_ns == module_time(world.clocks[i], k * 1_000_000)
+            assert sample.t_ns == module_time(world.sensors.clocks[i], k * 1_000_000)
             assert sample.imu_t_ns == read.t_ns
             assert sample[-6:] == read[-6:]
     assert world.modules[0].imu_period_ns == 4_000_000
     assert world.t_ns == 12_000_000
-
-
-@pytest.mark.parametrize("rate_hz", [1000.0, 500.0, 100.0])
-def test_the_imu_rate_can_be_chosen(rate_hz: float) -> None:
-    world = World(load_robot(IDEAL_ARM), seed=1, imu_rate_hz=rate_hz)
-    stamps = [samples[0].imu_t_ns for samples in _waving(world, 100)]
-    assert len(dict.fromkeys(stamps)) == rate_hz / 10
-
-
-@pytest.mark.parametrize("rate_hz", [0.0, -250.0, 300.0, 2000.0])
-def test_an_imu_rate_that_misses_the_ticks_is_refused(rate_hz: float) -> None:
-    with pytest.raises(ValueError, match="whole number"):
-        World(load_robot(IDEAL_ARM), seed=1, imu_rate_hz=rate_hz)
 
 
 @pytest.mark.parametrize("name", ["thesis_484_horizontal", "thesis_350_vertical", "arm6", "snake16"])
@@ -179,9 +166,8 @@ def test_one_pwm_per_module_is_needed() -> None:
         World(load_robot("a2085_04"), seed=1).step([0.0] * 3)
 
 
-def test_wires_in_process_step_the_world_until_it_is_closed() -> None:
-    world = World(load_robot(IDEAL_ARM), seed=1)
-    wires: Wires = WorldWires(world)
+def test_a_world_is_wires_in_process_until_it_is_closed() -> None:
+    wires: Wires = (world := World(load_robot(IDEAL_ARM), seed=1))
     assert [m.serial for m in wires.modules] == ["shoulder-yaw", "shoulder-lift", "elbow"]
     wires.exchange([0.1] * 3)
     assert world.t_ns == 1_000_000
@@ -189,22 +175,15 @@ def test_wires_in_process_step_the_world_until_it_is_closed() -> None:
     wires.close()
     with pytest.raises(HardwareLost):
         wires.exchange([0.1] * 3)
-    world.step([0.0] * 3)
-
-
-def test_a_closed_world_is_lost_hardware() -> None:
-    world = World(load_robot(IDEAL_ARM), seed=1)
-    world.close()
-    world.close()
     with pytest.raises(HardwareLost, match="closed"):
-        WorldWires(world).exchange([0.0] * 3)
+        world.step([0.0] * 3)
 
 
 def test_a_world_takes_the_robots_own_noise_unless_told_otherwise() -> None:
     robot: Robot = load_robot(IDEAL_ARM)
-    assert any(World(robot, seed=1).imu_bias.ravel())
+    assert any(World(robot, seed=1).sensors.errors.imu_bias.ravel())
     ideal = World(robot, seed=1, noise="ideal")
-    assert not any(ideal.imu_bias.ravel())
-    assert [c.offset_ns for c in ideal.clocks] == [0, 0, 0]
+    assert not any(ideal.sensors.errors.imu_bias.ravel())
+    assert [c.offset_ns for c in ideal.sensors.clocks] == [0, 0, 0]
     with pytest.raises(UsageError, match="known are ideal, x5"):
         World(robot, seed=1, noise="quiet")
