@@ -15,8 +15,7 @@ from coordinator.live_robot.connection import Place, open_connection, sender_nam
 from coordinator.live_robot.messenger import Messenger
 from coordinator.monitoring.live import RETAINED_ROWS, UPDATE_S, LiveMonitor
 from coordinator.monitoring.monitor import Monitor
-from coordinator.monitoring.reference import build_reference
-from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
+from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
 from coordinator.recording.session_file import SessionFileError, read_session

@@ -12,16 +12,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from module_agent.model.chain import Array
+from coordinator.monitoring.momentum_observer import MomentumObserver
+from coordinator.monitoring.segments import Block
+from coordinator.synchronisation.motion_windows import RATE_HZ
+from module_agent.model.chain import Array, Chain
 
 # What lasts longer than that is no blow.
 LASTING_S = 0.8
+_KEEP = float(np.exp(-1.0 / (LASTING_S * RATE_HZ)))
 # Of the largest that the known run has: another motion may be a little worse for the model.
 MARGIN = 1.5
 # Samples of 4 ms in a row: one alone is noise.
 IN_A_ROW = 2
 # It is over when all joints have been below the level for so long.
 OVER_S = 0.25
+# After a gap nothing is detected before the filters have settled.
+_SETTLING_NS = 800_000_000
+_RETAINED_NS = 20_000_000_000
+# Share of an earlier load by which the changed model may be wrong, and for how long loads are remembered.
+_LOADED_SHARE = 0.2
+_REMEMBER_S = 10.0
 
 
 class ContactModel(NamedTuple):
@@ -60,8 +70,7 @@ class Contact(NamedTuple):
 class FastPart:
     """The fast part of signals (m, n), sample by sample."""
 
-    def __init__(self, rate_hz: float):
-        self._keep = float(np.exp(-1.0 / (LASTING_S * rate_hz)))
+    def __init__(self) -> None:
         self._slow: Array | None = None
 
     def reset(self) -> None:
@@ -72,45 +81,33 @@ class FastPart:
         """Return the fast part of the next samples."""
         if self._slow is None:
             self._slow = signal[0].copy()
-        share = 1.0 - self._keep
-        slow, end = lfilter([share], [1.0, -self._keep], signal, axis=0, zi=(self._keep * self._slow)[None])
-        self._slow = end[0] / self._keep
+        slow, end = lfilter([1.0 - _KEEP], [1.0, -_KEEP], signal, axis=0, zi=(_KEEP * self._slow)[None])
+        self._slow = end[0] / _KEEP
         return np.asarray(signal - slow)
 
 
-def fast_part(signal: Array, rate_hz: float) -> Array:
-    """Return the fast part of a whole signal."""
-    return FastPart(rate_hz).advance(signal)
-
-
-def contact_model(fast_nm: Array, rate_hz: float = 250.0) -> ContactModel:
+def contact_model(fast_nm: Array) -> ContactModel:
     """Fit the model to the fast part (m, n) [Nm] of a run without contacts."""
-    settled = fast_nm[round(LASTING_S * rate_hz) :]
+    settled = fast_nm[round(LASTING_S * RATE_HZ) :]
     sigma = settled.std(axis=0)
     upward = (settled[:-1] < 0.0) & (settled[1:] >= 0.0)
-    crossings = upward.sum(axis=0) * rate_hz / max(len(settled), 1)
+    crossings = upward.sum(axis=0) * RATE_HZ / max(len(settled), 1)
     return ContactModel(sigma, np.abs(settled).max(axis=0), np.maximum(crossings, 0.1))
 
 
 class ContactDetector:
-    """Detects contacts in the fast part of the external torques, block by block."""
+    """Detects contacts in the fast part of the external torques, block by block; `now` is one that lasts."""
 
     def __init__(self, level_nm: Array):
         self.level_nm = level_nm
         self._above = np.zeros(len(level_nm), dtype=np.int64)
-        self._now: Contact | None = None
+        self.now: Contact | None = None
         self._quiet_ns = 0
 
-    def reset(self) -> Contact | None:
-        """Begin anew; return the contact that this cuts off."""
-        cut, self._now = self._now, None
+    def reset(self) -> None:
+        """Begin anew."""
+        self.now = None
         self._above[:] = 0
-        return cut
-
-    @property
-    def now(self) -> Contact | None:
-        """The contact that lasts."""
-        return self._now
 
     def advance(self, t_ns: NDArray[np.int64], fast_nm: Array) -> list[Contact]:
         """Take the next samples, (m,) and (m, n); return contacts that begin or end in them."""
@@ -119,19 +116,18 @@ class ContactDetector:
             at = int(at_ns)
             share = np.abs(sample) / self.level_nm
             self._above = np.where(share > 1.0, self._above + 1, 0)
-            if self._now is None:
+            if self.now is None:
                 if (self._above >= IN_A_ROW).any():
-                    self._now = Contact(at, None, (), np.zeros_like(sample))
-                    self._now = self._grown(self._now, sample)
-                    findings.append(self._now)
+                    self.now = self._grown(Contact(at, None, (), np.zeros_like(sample)), sample)
+                    findings.append(self.now)
                     self._quiet_ns = at
                 continue
-            self._now = self._grown(self._now, sample)
+            self.now = self._grown(self.now, sample)
             if (share > 1.0).any():
                 self._quiet_ns = at
             elif at - self._quiet_ns > OVER_S * 1e9:
-                findings.append(self._now._replace(end_ns=self._quiet_ns))
-                self._now = None
+                findings.append(self.now._replace(end_ns=self._quiet_ns))
+                self.now = None
         return findings
 
     def _grown(self, contact: Contact, sample: Array) -> Contact:
@@ -139,3 +135,53 @@ class ContactDetector:
         peak = np.where(larger, sample, contact.peak_nm)
         felt = tuple(int(k) for k in np.flatnonzero(np.abs(peak) > self.level_nm))
         return contact._replace(joints=felt, peak_nm=peak)
+
+
+class CollisionDetector:
+    """Detects `contacts` of the last 20 s by momentum observer, high-pass and levels (n,) [Nm]."""
+
+    def __init__(self, chain: Chain, phi: Array, level_nm: Array):
+        self.contacts: list[Contact] = []
+        self.outside_nm: Array | None = None
+        self._chain = chain
+        self._observer = MomentumObserver(chain, phi)
+        self._fast = FastPart()
+        self._level_nm = level_nm
+        self._detector = ContactDetector(level_nm)
+        # The largest of late, (n,).
+        self._largest_nm = np.zeros_like(level_nm)
+        self._settled_ns: int | None = None
+
+    def reset(self) -> None:
+        """Begin anew, after a hole."""
+        self._observer.reset()
+        self._fast.reset()
+        self._detector.reset()
+        self._settled_ns = None
+        self.contacts = [c for c in self.contacts if c.end_ns is not None]
+
+    def adapt(self, phi: Array) -> None:
+        """Go on with other inertial parameters; a contact under way ends with that.
+
+        The levels rise by a share of what the robot was loaded with when it was judged by the former ones.
+        """
+        self._observer = MomentumObserver(self._chain, phi)
+        self._detector = ContactDetector(self._level_nm + _LOADED_SHARE * self._largest_nm)
+        self.reset()
+
+    def advance(self, block: Block) -> list[Contact]:
+        """Return contacts that begin or end in a block."""
+        outside = self._observer.advance(block.q_rad, block.qd_rad_s, block.tau_nm)
+        self.outside_nm = outside[-1]
+        forget = 1.0 - len(outside) / (RATE_HZ * _REMEMBER_S)
+        self._largest_nm = np.maximum(np.abs(outside).max(axis=0), forget * self._largest_nm)
+        fast = self._fast.advance(outside)
+        if self._settled_ns is None:
+            self._settled_ns = int(block.t_ns[0]) + _SETTLING_NS
+        kept = block.t_ns >= self._settled_ns
+        findings = self._detector.advance(block.t_ns[kept], fast[kept])
+        for contact in findings:
+            self.contacts = [*(c for c in self.contacts if c.start_ns != contact.start_ns), contact]
+        oldest = int(block.t_ns[-1]) - _RETAINED_NS
+        self.contacts = [c for c in self.contacts if c.end_ns is None or c.end_ns > oldest]
+        return findings

@@ -5,14 +5,17 @@ that have changed are a payload's if one body explains them.
 """
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
+from coordinator.monitoring.contact import Contact
+from coordinator.monitoring.findings import Detection
 from coordinator.monitoring.likelihood_ratio import Change, WhitenedRows, joined, without_own
-from coordinator.monitoring.reference import Reference
+from coordinator.monitoring.reference import Reference, Thresholds
 from coordinator.monitoring.residual_tests import (
     UNIT_PAYLOAD_KG,
     displacement,
@@ -23,8 +26,7 @@ from coordinator.monitoring.residual_tests import (
     whitened_drive_rows,
 )
 from coordinator.monitoring.segments import DataSegment
-from coordinator.monitoring.thresholds import Thresholds
-from coordinator.parameter_fit.payload import Payload, find_payload
+from coordinator.parameter_fit.payload import find_payload
 from coordinator.parameter_fit.physically_consistent import NotSolvedError
 from module_agent.model.chain import Array
 from module_agent.model.forward_kinematics import places_on_axes
@@ -33,12 +35,14 @@ from module_agent.model.regressor import PER_BODY
 
 # Smaller displacements are no finding: IMUs move with their boards, and links bend, by as much.
 MIN_SHIFT_M, MIN_TURN_RAD = 3e-3, 3e-3
-# Under a payload links give by more than they did; what that is taken for is below.
+# The same under a payload, under which links give by more.
 LOADED_SHIFT_M, LOADED_TURN_RAD = 6e-3, 6e-3
 # Friction changes by more than that with the weather.
 MIN_FRICTION = 0.1
 # A payload leaves no more of the misfit than chance does in one window of so many.
 ONE_IN = 1e4
+# A mass that is not known to this many standard deviations is not said to be there.
+MIN_SIGMAS = 5.0
 
 
 class SegmentInformation(NamedTuple):
@@ -51,25 +55,6 @@ class SegmentInformation(NamedTuple):
     drives: tuple[WhitenedRows | None, ...]
 
 
-class LinkShift(NamedTuple):
-    """A link that is displaced: index of its module, length [m] with its sigma, turn [rad], gain."""
-
-    child: int
-    shift_m: float
-    sigma_m: float
-    turn_rad: float
-    gain: float
-
-
-class DriveShift(NamedTuple):
-    """A drive whose friction changed: index, its friction at half speed relative to before, sigma, gain."""
-
-    joint: int
-    change: float
-    sigma: float
-    gain: float
-
-
 class LoadShift(NamedTuple):
     """Torques that have changed: index of the body that explains most of it, gain, what it leaves, and by
     how much the body's parameters (10,) change then."""
@@ -79,17 +64,12 @@ class LoadShift(NamedTuple):
     left: float
     change: Array
 
-    @property
-    def taken_off(self) -> bool:
-        """Whether the body has become lighter."""
-        return bool(self.change[0] < 0.0)
-
 
 class Diagnosis(NamedTuple):
     """What a window shows; None of what has not changed."""
 
-    drives: tuple[DriveShift, ...]
-    link: LinkShift | None
+    drives: tuple[Detection, ...]
+    link: Detection | None
     load: LoadShift | None
 
 
@@ -110,9 +90,9 @@ def segment_information(reference: Reference, segment: DataSegment) -> SegmentIn
 def diagnose(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool = False
 ) -> Diagnosis:
-    """Judge a window of one piece at least, of stretches in which no blow met the robot.
+    """Judge a window of one segment at least, all without collisions.
 
-    laden: whether the robot is known to carry a payload.
+    loaded: whether the robot is known to carry a payload.
     """
     return Diagnosis(
         _drives(reference, thresholds, window),
@@ -121,84 +101,65 @@ def diagnose(
     )
 
 
-def information_in(window: Sequence[SegmentInformation]) -> tuple[JointInformation, ...]:
-    """Return what all pieces say of the inertial parameters."""
-    whole = window[0].information
-    for segment in window[1:]:
-        whole = merge(whole, segment.information)
-    return whole
-
-
-def weigh_payload(
-    reference: Reference, window: Sequence[SegmentInformation], load: LoadShift
-) -> Payload | None:
-    """Return a payload that can exist on the body that carries it, or has lost it; None if there is none."""
-    later, before = information_in(window), reference.information
-    if load.taken_off:
-        later, before = before, later
-    try:
-        return find_payload(
-            before,
-            later,
-            places_on_axes(reference.chain),
-            reference.torque_sigma_nm * np.sqrt(reference.torque.inflation),
-            carriers=[load.carrier],
-        )
-    except NotSolvedError:
-        return None
+def _merged(window: Sequence[SegmentInformation]) -> tuple[JointInformation, ...]:
+    return reduce(merge, [segment.information for segment in window])
 
 
 def _drives(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation]
-) -> tuple[DriveShift, ...]:
+) -> tuple[Detection, ...]:
     found = []
     for joint, (model, known) in enumerate(zip(reference.drive_models, reference.drives, strict=True)):
-        parts = [segment.drives[joint] for segment in window]
-        told = [part for part in parts if part is not None]
-        if known is None or not told:
+        parts = [rows for segment in window if (rows := segment.drives[joint]) is not None]
+        if known is None or not parts:
             continue
-        change = known.test(drive_window(told)).changes[0]
-        slope = np.array([1.0, model.typical_rad_s]) / model.friction_nm(model.typical_rad_s)
-        scaled = model.change_of(np.ones(2)) * slope
+        change = known.test(drive_window(parts)).changes[0]
+        scaled = model.relative_friction
         sigma, more = float(np.sqrt(scaled @ change.covariance @ scaled)), float(scaled @ change.size)
         if change.gain > thresholds.drive and abs(more) > MIN_FRICTION + 3.0 * sigma:
-            found.append(DriveShift(joint, more, sigma, change.gain))
+            serial = reference.chain.serials[joint]
+            summary = (
+                f"the drive of {serial} has {abs(100.0 * more):.0f} +- {100.0 * sigma:.0f} % "
+                f"{'more' if more > 0.0 else 'less'} friction at half its speed"
+            )
+            found.append(
+                Detection(
+                    "friction", serial, 100.0 * more, 100.0 * sigma, change.gain, thresholds.drive, summary
+                )
+            )
     return tuple(found)
 
 
 def _link(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], loaded: bool
-) -> LinkShift | None:
-    children = reference.chain.linked
-    if not children:
+) -> Detection | None:
+    chain = reference.chain
+    if not chain.linked:
         return None
     later = without_own(joined([segment.imu for segment in window]), reference.imu_model.own_sigma)
     found = reference.imu.test(later)
-    best = found.changes[found.best]
+    best, child = found.changes[found.best], chain.linked[found.best]
     if best.gain < thresholds.link:
         return None
-    child = children[found.best]
-    shift_m, sigma_m, turn_rad = _length(reference, child, best)
-    least = (LOADED_SHIFT_M, LOADED_TURN_RAD) if loaded else (MIN_SHIFT_M, MIN_TURN_RAD)
-    if shift_m < least[0] + 2.0 * sigma_m and turn_rad < least[1]:
-        return None
-    return LinkShift(child, shift_m, sigma_m, turn_rad, best.gain)
-
-
-def _length(reference: Reference, child: int, change: Change) -> tuple[float, float, float]:
-    turn, shift = displacement(reference.chain, child, change.size)
+    turn, shift = displacement(chain, child, best.size)
     length = float(np.linalg.norm(shift))
-    along = shift / max(length, 1e-9)
-    unit = np.eye(change.size.size)
-    slope = np.array([along @ displacement(reference.chain, child, column)[1] for column in unit])
-    return length, float(np.sqrt(slope @ change.covariance @ slope)), float(np.linalg.norm(turn))
+    slope = np.array([shift / max(length, 1e-9) @ displacement(chain, child, unit)[1] for unit in np.eye(6)])
+    sigma, angle = float(np.sqrt(slope @ best.covariance @ slope)), float(np.linalg.norm(turn))
+    min_shift, min_turn = (LOADED_SHIFT_M, LOADED_TURN_RAD) if loaded else (MIN_SHIFT_M, MIN_TURN_RAD)
+    if length < min_shift + 2.0 * sigma and angle < min_turn:
+        return None
+    serial, parent = chain.serials[child], chain.serials[chain.parent[child]]
+    summary = (
+        f"the link from {parent} to {serial} is displaced by {1e3 * length:.1f} +- {1e3 * sigma:.1f} mm "
+        f"and turned by {1e3 * angle:.1f} mrad; `x5-coordinator check` measures it"
+    )
+    return Detection("wear", serial, 1e3 * length, 1e3 * sigma, best.gain, thresholds.link, summary)
 
 
 def _load(
     reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation]
 ) -> LoadShift | None:
-    later = torque_rows(information_in(window), reference.phi, reference.torque_sigma_nm)
-    found = reference.torque.test(later)
+    found = reference.torque.test(torque_rows(_merged(window), reference.phi, reference.torque_sigma_nm))
     best: Change = found.changes[found.best]
     if best.gain < thresholds.payload:
         return None
@@ -210,3 +171,49 @@ def explains(reference: Reference, load: LoadShift) -> bool:
     """Return whether a payload on one body is all that has changed of the torques."""
     freedom = PER_BODY * max(len(reference.chain.serials) - 1, 1)
     return load.left < float(chi2.isf(1.0 / ONE_IN, freedom)) + 0.1 * load.gain
+
+
+def weighed(
+    reference: Reference, thresholds: Thresholds, window: Sequence[SegmentInformation], load: LoadShift
+) -> Detection | None:
+    """Weigh what was added to a body or removed from it; None if no payload that can exist explains it."""
+    before, later, sign, verb = reference.information, _merged(window), 1.0, "added to"
+    if load.change[0] < 0.0:
+        before, later, sign, verb = later, before, -1.0, "removed from"
+    sigma_nm = reference.torque_sigma_nm * np.sqrt(reference.torque.inflation)
+    try:
+        payload = find_payload(
+            before, later, places_on_axes(reference.chain), sigma_nm, carriers=[load.carrier]
+        )
+    except NotSolvedError:
+        return None
+    mass, sigma, serial = payload.mass_kg, payload.mass_sigma_kg, reference.chain.serials[load.carrier]
+    if not payload.explains or mass < MIN_SIGMAS * sigma:
+        return None
+    summary = f"{mass:.3f} +- {sigma:.3f} kg {verb} the body that {serial} turns"
+    return Detection("payload", serial, sign * mass, sigma, load.gain, thresholds.payload, summary)
+
+
+def unexplained(reference: Reference, thresholds: Thresholds, load: LoadShift) -> Detection:
+    """Return torques that no payload on one body explains."""
+    summary = (
+        "the torques have changed in a way that no payload on one body explains: something holds the robot, "
+        "several things were added, or a joint's torque sensor is off"
+    )
+    serial = reference.chain.serials[load.carrier]
+    return Detection("unexplained", serial, 0.0, 0.0, load.gain, thresholds.payload, summary)
+
+
+def collision(reference: Reference, thresholds: Thresholds, contact: Contact) -> Detection:
+    """Return a collision, with the joints that measured it."""
+    strongest, strength = int(np.argmax(np.abs(contact.peak_nm))), contact.strength(thresholds.contact_nm)
+    measured = [reference.chain.serials[k] for k in contact.joints or (strongest,)]
+    peak_nm, sigma_nm = float(np.abs(contact.peak_nm).max()), float(reference.contact.sigma_nm[strongest])
+    lasted = (
+        "ongoing" if contact.end_ns is None else f"for {1e-6 * (contact.end_ns - contact.start_ns):.0f} ms"
+    )
+    summary = (
+        f"external force on the body that {measured[-1]} turns, or beyond it, {lasted}: "
+        f"measured by {', '.join(measured)}, up to {peak_nm:.2f} Nm, {strength:.1f} times the threshold"
+    )
+    return Detection("collision", measured[-1], peak_nm, sigma_nm, strength, 1.0, summary)

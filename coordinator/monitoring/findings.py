@@ -1,15 +1,14 @@
-"""What the watch found: of which kind, where, since when, how large and how sure.
+"""Findings of the monitor: kind, place, time, size, certainty and a sentence; and the log of those held.
 
-What the watch holds to be so: each finding once, said again when there is more to say, and ended.
+The log reports a finding once, again when it has changed by enough, and when it ends.
 """
 
 from collections.abc import Iterable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict
 
 Kind = Literal["collision", "payload", "friction", "wear", "unexplained"]
-KINDS: tuple[Kind, ...] = ("collision", "payload", "friction", "wear", "unexplained")
 # By what each kind's size is measured.
 UNITS: dict[Kind, str] = {
     "collision": "Nm",
@@ -18,6 +17,7 @@ UNITS: dict[Kind, str] = {
     "wear": "mm",
     "unexplained": "Nm",
 }
+KINDS = tuple(UNITS)
 
 
 class Finding(BaseModel):
@@ -60,6 +60,23 @@ class Finding(BaseModel):
                 return "structure", 0
             case _:
                 return "load", 0
+
+
+class Detection(NamedTuple):
+    """What a test detects, a `Finding` without its times; size and sigma in the kind's unit."""
+
+    kind: Kind
+    serial: str
+    size: float
+    sigma: float
+    gain: float
+    level: float
+    summary: str
+
+    def finding(self, since_ns: int, now_ns: int, until_ns: int | None = None) -> Finding:
+        """Return the finding as reported first."""
+        times = {"since_ns": since_ns, "detected_ns": now_ns, "reported_ns": now_ns, "until_ns": until_ns}
+        return Finding.model_validate(self._asdict() | times | {"unit": UNITS[self.kind]})
 
 
 Key = tuple[str, str | int]
@@ -126,12 +143,10 @@ class FindingLog:
         self.withdraw([key])
 
 
-def _news(findings: Finding | None, finding: Finding) -> bool:
-    if findings is None or (findings.kind, findings.serial) != (finding.kind, finding.serial):
+def _news(reported: Finding | None, finding: Finding) -> bool:
+    if reported is None or (reported.kind, reported.serial) != (finding.kind, finding.serial):
         return True
-    if (findings.until_ns is None) != (finding.until_ns is None):
+    if (reported.until_ns is None) != (finding.until_ns is None):
         return True
-    moved = abs(finding.size - findings.size)
-    return finding.kind != "collision" and moved > max(
-        REPORTED_CHANGE * abs(findings.size), 2.0 * findings.sigma
-    )
+    least = max(REPORTED_CHANGE * abs(reported.size), 2.0 * reported.sigma)
+    return finding.kind != "collision" and abs(finding.size - reported.size) > least

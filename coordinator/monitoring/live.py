@@ -62,22 +62,18 @@ class LiveMonitor:
                     self._map_clocks()
                     mapped_ns = self._clock()
                 if self._clocks is not None:
-                    self.look()
+                    self._look(self._clocks)
         finally:
             asking.cancel()
             await asyncio.gather(asking, return_exceptions=True)
 
-    def look(self) -> None:
-        """Look at what was heard since the last look."""
-        if self._clocks is None:
-            return
-        update = self._monitor.advance(self.recording, self._clocks)
+    def _look(self, clocks: Mapping[str, ClockMap]) -> None:
+        """Look at what was received since the last look."""
+        update = self._monitor.advance(self.recording, clocks)
         if any(update):
             self._report(update)
-        for serial in self._serials:
-            record = self.recording.modules.get(serial)
-            if record is not None:
-                record.forget(RETAINED_ROWS, MAX_TRIPS)
+        for record in self.recording.modules.values():
+            record.forget(RETAINED_ROWS, MAX_TRIPS)
         for found in self.recording.estimates.values():
             found.clear()
 
@@ -96,23 +92,22 @@ class LiveMonitor:
             return  # one of many; who is gone is noticed by its token and its silence
 
     def _map_clocks(self) -> None:
-        records = [self.recording.modules.get(serial) for serial in self._serials]
-        if any(record is None or len(record.round_trips) < MIN_TRIPS for record in records):
+        records = {s: self.recording.modules[s] for s in self._serials if s in self.recording.modules}
+        trips = {serial: record.round_trips for serial, record in records.items()}
+        if len(trips) < len(self._serials) or any(len(own) < MIN_TRIPS for own in trips.values()):
             return
-        known = [record for record in records if record is not None]
-        boots = {record.serial: record.boot for record in known}
-        notes = [f"module {s} has booted anew" for s, b in boots.items() if self._boots.get(s, b) != b]
+        boots = {serial: record.boot for serial, record in records.items()}
+        self._note([f"module {s} has booted anew" for s, b in boots.items() if self._boots.get(s, b) != b])
         self._boots = boots
-        self._clocks = map_clocks({record.serial: record.round_trips for record in known})
-        if notes:
-            self._report(MonitorUpdate((), (), tuple(notes)))
+        self._clocks = map_clocks(trips)
 
     def _note_presence(self, messenger: Messenger) -> None:
         # Only of those that were there: at the beginning all are on their way.
         left = tuple(s for s in self._serials if s in self.recording.modules and s not in messenger.alive)
-        if left == self._left:
-            return
-        notes = [f"module {s} has left the network" for s in left if s not in self._left]
-        notes += [f"module {s} is back" for s in self._left if s not in left]
-        self._left = left
-        self._report(MonitorUpdate((), (), tuple(notes)))
+        before, self._left = self._left, left
+        notes = [f"module {s} has left the network" for s in left if s not in before]
+        self._note([*notes, *(f"module {s} is back" for s in before if s not in left)])
+
+    def _note(self, notes: Sequence[str]) -> None:
+        if notes:
+            self._report(MonitorUpdate((), (), tuple(notes)))

@@ -16,12 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal import lfilter
 
+from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.chain import Array, Chain
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 
 # Of 8 Hz: two thirds of a blow's torque are there after 20 ms.
 GAIN_HZ = 50.0
+_STEP_S = 1.0 / RATE_HZ
 # Over which M' is a difference [s].
 _AHEAD_S = 1e-3
 
@@ -35,11 +37,10 @@ class _State(NamedTuple):
 class MomentumObserver:
     """Turns joint motion and torque, sample by sample, into the torques (m, n) [Nm] from outside."""
 
-    def __init__(self, chain: Chain, phi: ArrayLike, rate_hz: float, gain_hz: float = GAIN_HZ):
+    def __init__(self, chain: Chain, phi: ArrayLike):
         self._chain = chain
         self._weightless = chain._replace(gravity=np.zeros(3))
         self._phi = np.asarray(phi, dtype=float)
-        self._dt_s, self._gain_hz = 1.0 / rate_hz, gain_hz
         self._state: _State | None = None
 
     def reset(self) -> None:
@@ -48,26 +49,22 @@ class MomentumObserver:
 
     def advance(self, q_rad: Array, qd_rad_s: Array, tau_nm: Array) -> Array:
         """Return what acts from outside at the next samples, (m, n) each, read-only."""
-        momentum = self._momentum(q_rad, qd_rad_s)
+        momentum = inverse_dynamics(self._weightless, self._phi, q_rad, np.zeros_like(q_rad), qd_rad_s)
         drive = tau_nm + self._carried(q_rad, qd_rad_s)
-        decay = 1.0 - self._gain_hz * self._dt_s
         begins = self._state is None
         if self._state is None:
             self._state = _State(momentum[0], drive[0], np.zeros(q_rad.shape[1]))
         before = self._state
-        along = np.vstack([before.momentum, momentum]), np.vstack([before.drive, drive])
-        pushed = np.diff(along[0], axis=0) - 0.5 * self._dt_s * (along[1][1:] + along[1][:-1])
+        moved = np.diff(np.vstack([before.momentum, momentum]), axis=0)
+        drives = np.vstack([before.drive, drive])
+        pushed = moved - 0.5 * _STEP_S * (drives[1:] + drives[:-1])
         if begins:
             pushed[0] = 0.0
-        found, filtered = lfilter(
-            [1.0], [1.0, -decay], self._gain_hz * pushed, axis=0, zi=before.filtered[None]
+        outside, filtered = lfilter(
+            [1.0], [1.0, -(1.0 - GAIN_HZ * _STEP_S)], GAIN_HZ * pushed, axis=0, zi=before.filtered[None]
         )
         self._state = _State(momentum[-1], drive[-1], filtered[0])
-        found = np.asarray(found)
-        return read_only(found)
-
-    def _momentum(self, q: Array, qd: Array) -> Array:
-        return inverse_dynamics(self._weightless, self._phi, q, np.zeros_like(q), qd)
+        return read_only(np.asarray(outside))
 
     def _carried(self, q: Array, qd: Array) -> Array:
         """Return C^T qd - g."""

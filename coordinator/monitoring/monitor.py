@@ -8,27 +8,20 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from coordinator.monitoring.collision_detector import CollisionDetector
-from coordinator.monitoring.contact import Contact
+from coordinator.monitoring.contact import CollisionDetector, Contact
 from coordinator.monitoring.diagnosis import (
     Diagnosis,
     SegmentInformation,
+    collision,
     diagnose,
     explains,
     segment_information,
-    weigh_payload,
-)
-from coordinator.monitoring.finding_text import (
-    collision_finding,
-    friction_finding,
-    load_finding,
-    unexplained_finding,
-    wear_finding,
+    unexplained,
+    weighed,
 )
 from coordinator.monitoring.findings import Finding, FindingLog, Key
-from coordinator.monitoring.reference import Reference
+from coordinator.monitoring.reference import ALARMS_PER_HOUR, SPANS, Reference, Thresholds, thresholds
 from coordinator.monitoring.segments import Alignment, Block, Gap, Segmenter
-from coordinator.monitoring.thresholds import ALARMS_PER_HOUR, SPANS, Thresholds, thresholds
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.chain import Array
@@ -48,8 +41,6 @@ WORST_CLOCK_NS = 1e6
 BEGAN_WITHIN_NS = 4_000_000_000
 # A change is called by what explains it after so many stretches in a row; if nothing does, after more.
 CONFIRMED, UNEXPLAINED_AFTER = 2, 10
-# A mass that is not known to this many standard deviations is not said to be there.
-MIN_SIGMAS = 5.0
 # A payload that is held for longer is weighed as seldom.
 SETTLED_AFTER = 12
 # Stretches since a change after which contacts are judged by the changed robot: at once, and for good.
@@ -57,28 +48,30 @@ ADAPT_AFTER = (CONFIRMED, 8)
 
 
 class MonitorUpdate(NamedTuple):
-    """What is to be said: findings, each new or in place of an earlier one with its key; what is no longer
-    held, by key; and notes on what hinders the watch."""
+    """What is to be reported: findings, each new or in place of an earlier one with its key; the keys of
+    those that no longer hold; and notes on what hinders monitoring."""
 
     findings: tuple[Finding, ...]
     withdrawn: tuple[Key, ...]
     notes: tuple[str, ...]
 
 
+_Diagnosed = Sequence[tuple[Diagnosis, Sequence[SegmentInformation]]]
+
+
 class _Hypothesis(NamedTuple):
-    """What the newest windows show: the kind of change and the module it is at, by what, and since when."""
+    """What the newest windows show: the kind of change, the module that it is at, and by what."""
 
     kind: str
-    where: int
+    serial: str
     diagnosis: Diagnosis
     window: Sequence[SegmentInformation]
-    since_ns: int
 
 
 class Monitor:
     """Compares one robot with its reference.
 
-    ledger: what it holds to be so. looked_s: how long all modules were heard together.
+    finding_log: what it holds to be so. monitored_s: how long all modules were received together.
     """
 
     def __init__(self, reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR):
@@ -88,9 +81,9 @@ class Monitor:
         self.monitored_s = 0.0
         self._alignment = Alignment(reference.chain.serials)
         self._segmenter = Segmenter()
-        self._collisions = CollisionDetector(reference, self.thresholds.contact_nm)
+        self._collisions = CollisionDetector(reference.chain, reference.phi, self.thresholds.contact_nm)
         self._pieces: deque[SegmentInformation] = deque(maxlen=max(SPANS))
-        self._agreed: tuple[str, int] | None = None
+        self._agreed: tuple[str, str] | None = None
         self._agreed_for = 0
         self._since_ns = 0
         self._silent: tuple[str, ...] = ()
@@ -125,80 +118,68 @@ class Monitor:
         self.monitored_s += len(block.t_ns) / RATE_HZ
         for contact in self._collisions.advance(block):
             if not self._untimed:
-                findings += self.finding_log.put(
-                    collision_finding(self.reference, self.thresholds, contact, now_ns)
-                )
+                detection = collision(self.reference, self.thresholds, contact)
+                findings += self.finding_log.put(detection.finding(contact.start_ns, now_ns, contact.end_ns))
         for segment in self._segmenter.add(block):
             self._pieces.append(segment_information(self.reference, segment))
-            diagnosis = self._diagnosed()
-            findings += self._drives(diagnosis, now_ns)
+            diagnosed = self._diagnosed()
+            findings += self._drives(diagnosed, now_ns)
             if self._untimed:
                 continue
-            hypothesis = self._hypothesis(diagnosis)
-            findings += self._change(hypothesis, now_ns)
+            hypothesis = self._hypothesis(diagnosed)
+            if hypothesis is not None:
+                findings += self._change(hypothesis, now_ns)
             withdrawn += self._withdrawn(findings, now_ns)
-            withdrawn += self._adapted(hypothesis, now_ns)
+            if hypothesis is not None:
+                withdrawn += self._adapted(hypothesis, now_ns)
             findings += self._ended(now_ns)
         return findings, withdrawn
 
+    def _held(self, *kinds: str) -> bool:
+        return any(finding.kind in kinds for finding in self.finding_log.held.values())
+
     # ------------------------------------------------------------------ judging
 
-    def _calm(self) -> list[SegmentInformation]:
-        """Return the pieces into which no blow falls."""
-        collisions = [_collision_span(start, end) for start, end in _together(self._collisions.contacts)]
-        return [p for p in self._pieces if not any(p.start_ns < b and a < p.end_ns for a, b in collisions)]
-
-    def _diagnosed(self) -> list[tuple[Diagnosis, Sequence[SegmentInformation]]]:
-        calm = self._calm()
-        newest = self._pieces[-1]
+    def _diagnosed(self) -> _Diagnosed:
+        """Diagnose the newest windows without the segments into which a collision falls."""
+        spans = _collision_spans(self._collisions.contacts)
+        calm = [p for p in self._pieces if not any(p.start_ns < b and a < p.end_ns for a, b in spans)]
         # A judgement that has been made already is not made again.
-        if not calm or calm[-1] is not newest:
+        if not calm or calm[-1] is not self._pieces[-1]:
             return []
         windows = [calm[-span:] for span in SPANS if len(calm) >= span]
         since = [p for p in calm if p.start_ns >= self._since_ns] if self._agreed is not None else []
         if len(since) >= CONFIRMED:
             windows.append(since)
-        loaded = any(finding.kind == "payload" for finding in self.finding_log.held.values())
+        loaded = self._held("payload")
         return [(diagnose(self.reference, self.thresholds, window, loaded), window) for window in windows]
 
-    def _drives(
-        self, diagnosis: Sequence[tuple[Diagnosis, Sequence[SegmentInformation]]], now_ns: int
-    ) -> list[Finding]:
+    def _drives(self, diagnosed: _Diagnosed, now_ns: int) -> list[Finding]:
         # Friction is in no hurry, and in a short window other things pass for it.
-        long = [(one, window) for one, window in diagnosis if len(window) >= max(SPANS)]
-        found = {d.joint: (d, window[0].start_ns) for one, window in long for d in one.drives}
-        return [
-            findings
-            for shift, since_ns in found.values()
-            for findings in self.finding_log.put(
-                friction_finding(self.reference, self.thresholds, shift, since_ns, now_ns)
-            )
-        ]
+        long = [(one, window) for one, window in diagnosed if len(window) >= max(SPANS)]
+        latest = {d.serial: d.finding(window[0].start_ns, now_ns) for one, window in long for d in one.drives}
+        return [news for finding in latest.values() for news in self.finding_log.put(finding)]
 
-    def _hypothesis(
-        self, diagnosis: Sequence[tuple[Diagnosis, Sequence[SegmentInformation]]]
-    ) -> _Hypothesis | None:
+    def _hypothesis(self, diagnosed: _Diagnosed) -> _Hypothesis | None:
         """Return what explains the newest windows; those since the change began come first."""
-        found = None
-        for one, window in reversed(diagnosis):
-            load = one.load
+        found, serials = None, self.reference.chain.serials
+        for one, window in reversed(diagnosed):
             if one.link is not None:
-                found = _Hypothesis("wear", one.link.child, one, window, 0)
-            elif load is not None and explains(self.reference, load) and found is None:
-                found = _Hypothesis("payload", load.carrier, one, window, 0)
-            if found is not None and found.kind == "wear":
+                found = _Hypothesis("wear", one.link.serial, one, window)
                 break
+            if found is None and one.load is not None and explains(self.reference, one.load):
+                found = _Hypothesis("payload", serials[one.load.carrier], one, window)
         if found is None:
-            # What the newest stretches do not show any more was a blow too weak to be felt as one.
-            if not diagnosis or diagnosis[0][0].load is None:
+            # What the newest segments do not show any more was too weak a blow to be detected as one.
+            if not diagnosed or diagnosed[0][0].load is None:
                 self._agreed, self._agreed_for = None, 0
                 return None
-            found = _Hypothesis("unexplained", 0, *diagnosis[0], 0)
+            found = _Hypothesis("unexplained", "", *diagnosed[0])
         if self._agreed is None:
             self._since_ns = self._began(found.window[0].start_ns)
-        same = self._agreed == (found.kind, found.where)
-        self._agreed, self._agreed_for = (found.kind, found.where), self._agreed_for + 1 if same else 1
-        return found._replace(since_ns=self._since_ns)
+        same = self._agreed == (found.kind, found.serial)
+        self._agreed, self._agreed_for = (found.kind, found.serial), self._agreed_for + 1 if same else 1
+        return found
 
     def _began(self, seen_ns: int) -> int:
         """Return when a change began that was seen first in a window that begins at a time."""
@@ -207,48 +188,36 @@ class Monitor:
         ]
         return min(starts, default=seen_ns)
 
-    # ------------------------------------------------------------------ saying
+    # ------------------------------------------------------------------ reporting
 
-    def _change(self, hypothesis: _Hypothesis | None, now_ns: int) -> list[Finding]:
-        if hypothesis is None:
+    def _change(self, hypothesis: _Hypothesis, now_ns: int) -> list[Finding]:
+        kind, log = hypothesis.kind, self.finding_log
+        if self._agreed_for < (UNEXPLAINED_AFTER if kind == "unexplained" else CONFIRMED):
             return []
-        needed = UNEXPLAINED_AFTER if hypothesis.kind == "unexplained" else CONFIRMED
-        if self._agreed_for < needed:
+        if kind != "wear" and self._held("wear"):
             return []
-        if hypothesis.kind != "wear" and any(f.kind == "wear" for f in self.finding_log.held.values()):
-            return []
-        held = self.finding_log.held.get(("load", 0))
-        settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == hypothesis.kind
-        if settled and hypothesis.kind == "payload" and self._agreed_for % SETTLED_AFTER:
+        held = log.held.get(("load", 0))
+        settled = self._agreed_for > SETTLED_AFTER and held is not None and held.kind == kind
+        if settled and kind == "payload" and self._agreed_for % SETTLED_AFTER:
             # It takes a while to weigh it, and it will not be another.
-            self.finding_log.observe(("load", 0), now_ns)
+            log.observe(("load", 0), now_ns)
             return []
-        finding = self._finding(hypothesis, now_ns)
-        return [] if finding is None else self.finding_log.put(finding)
+        detection, load = hypothesis.diagnosis.link, hypothesis.diagnosis.load
+        if load is not None and kind == "unexplained":
+            detection = unexplained(self.reference, self.thresholds, load)
+        elif load is not None and kind == "payload":
+            detection = weighed(self.reference, self.thresholds, hypothesis.window, load)
+        return [] if detection is None else log.put(detection.finding(self._since_ns, now_ns))
 
-    def _finding(self, hypothesis: _Hypothesis, now_ns: int) -> Finding | None:
-        reference, link, load = self.reference, hypothesis.diagnosis.link, hypothesis.diagnosis.load
-        if hypothesis.kind == "wear" and link is not None:
-            return wear_finding(reference, self.thresholds, link, hypothesis.since_ns, now_ns)
-        if load is None:
-            return None
-        if hypothesis.kind == "unexplained":
-            return unexplained_finding(reference, self.thresholds, load, hypothesis.since_ns, now_ns)
-        found = weigh_payload(reference, hypothesis.window, load)
-        if found is None or not found.explains or found.mass_kg < MIN_SIGMAS * found.mass_sigma_kg:
-            return None
-        return load_finding(reference, self.thresholds, load, found, hypothesis.since_ns, now_ns)
-
-    def _adapted(self, hypothesis: _Hypothesis | None, now_ns: int) -> list[Key]:
-        """Tell contacts from torques as they are since a change; take back those that were told otherwise."""
-        if hypothesis is None or hypothesis.diagnosis.load is None or self._agreed_for not in ADAPT_AFTER:
+    def _adapted(self, hypothesis: _Hypothesis, now_ns: int) -> list[Key]:
+        """Detect contacts by the changed robot from now on; withdraw those that the change explains."""
+        load = hypothesis.diagnosis.load
+        if load is None or self._agreed_for not in ADAPT_AFTER or not self._held("payload", "wear"):
             return []
-        if not any(finding.kind in ("payload", "wear") for finding in self.finding_log.held.values()):
-            return []
-        load, phi = hypothesis.diagnosis.load, self.reference.phi.copy()
+        phi = self.reference.phi.copy()
         phi[PER_BODY * load.carrier : PER_BODY * (load.carrier + 1)] += load.change
         self._collisions.adapt(phi)
-        return self._without_collisions(hypothesis.since_ns, now_ns)
+        return self._without_collisions(self._since_ns, now_ns)
 
     def _without_collisions(self, since_ns: int, now_ns: int) -> list[Key]:
         return self.finding_log.withdraw(
@@ -260,11 +229,10 @@ class Monitor:
         )
 
     def _withdrawn(self, findings: Sequence[Finding], now_ns: int) -> list[Key]:
-        """Take back what a change explains: loads if a link is displaced, contacts of its beginning."""
+        """Withdraw what a change explains: loads if a link is displaced, contacts of its beginning."""
         lasting = [f for f in findings if f.kind in ("payload", "wear", "unexplained")]
-        withdrawn: list[Key] = []
-        if any(f.kind == "wear" for f in lasting):
-            withdrawn += self.finding_log.withdraw([("load", 0)])
+        wear = any(f.kind == "wear" for f in lasting)
+        withdrawn = self.finding_log.withdraw([("load", 0)] if wear else [])
         for change in lasting:
             withdrawn += self._without_collisions(change.since_ns, now_ns)
         return withdrawn
@@ -279,17 +247,17 @@ class Monitor:
 
     def _timed(self, clocks: Mapping[str, ClockMap]) -> list[str]:
         """Note whose clock is not known well enough to compare its samples with those of the others."""
-        poor = tuple(s for s in self.reference.chain.serials if _is_poor(clocks.get(s)))
+        sigmas = {s: clocks[s].sigma_ns for s in self.reference.chain.serials if s in clocks}
+        poor = tuple(serial for serial, sigma_ns in sigmas.items() if sigma_ns > WORST_CLOCK_NS)
         if poor == self._untimed:
             return []
         self._untimed = poor
         if not poor:
             return ["all clocks are accurate again: all tests are active"]
-        worst = max(clocks[s].sigma_ns for s in poor)
         return [
             f"the network is slow: when {', '.join(poor)} read what they say is known to "
-            f"{1e-6 * worst:.1f} ms only, and {1e-6 * WORST_CLOCK_NS:.1f} ms are needed; only friction is "
-            "watched, each drive by itself"
+            f"{1e-6 * max(sigmas.values()):.1f} ms only, and {1e-6 * WORST_CLOCK_NS:.1f} ms are needed; only "
+            "friction is watched, each drive by itself"
         ]
 
     def _hindered(self, gaps: Sequence[Gap], silent: tuple[str, ...]) -> list[str]:
@@ -303,23 +271,16 @@ class Monitor:
             self._collisions.reset()
             self._pieces.clear()
             self._agreed, self._agreed_for = None, 0
-        if silent != self._silent:
-            notes += [
-                f"module {s} sends no feedback: the tests are suspended"
-                for s in silent
-                if s not in self._silent
-            ]
-            notes += [f"module {s} sends feedback again" for s in self._silent if s not in silent]
-            self._silent = silent
-        return notes
+        before, self._silent = self._silent, silent
+        return [
+            *notes,
+            *(f"module {s} sends no feedback: the tests are suspended" for s in silent if s not in before),
+            *(f"module {s} sends feedback again" for s in before if s not in silent),
+        ]
 
 
-def _is_poor(clock: ClockMap | None) -> bool:
-    return clock is not None and clock.sigma_ns > WORST_CLOCK_NS
-
-
-def _together(contacts: Sequence[Contact]) -> list[tuple[int, int]]:
-    """Return from when to when something touched the robot, contacts soon after each other as one."""
+def _collision_spans(contacts: Sequence[Contact]) -> list[tuple[int, int]]:
+    """Return when nothing is to be taken for a change; contacts soon after each other are one."""
     found: list[tuple[int, int]] = []
     for contact in sorted(contacts, key=lambda c: c.start_ns):
         end = contact.end_ns if contact.end_ns is not None else contact.start_ns + MAX_COLLISION_NS
@@ -327,11 +288,8 @@ def _together(contacts: Sequence[Contact]) -> list[tuple[int, int]]:
             found[-1] = found[-1][0], max(end, found[-1][1])
         else:
             found.append((contact.start_ns, end))
-    return found
-
-
-def _collision_span(start_ns: int, end_ns: int) -> tuple[int, int]:
-    """Return from when to when nothing is to be taken for a change."""
     # What lasts is more than a blow; only its beginning is left out.
-    end = start_ns if end_ns - start_ns > MAX_COLLISION_NS else end_ns
-    return start_ns - BEFORE_NS, end + AFTER_NS
+    return [
+        (start - BEFORE_NS, (start if end - start > MAX_COLLISION_NS else end) + AFTER_NS)
+        for start, end in found
+    ]

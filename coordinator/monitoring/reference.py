@@ -6,14 +6,23 @@ is what they find in a robot that has not changed; by that their noise is inflat
 """
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
 from coordinator.baseline.baseline_robot import BaselineRobot
-from coordinator.monitoring.contact import ContactModel, contact_model, fast_part
-from coordinator.monitoring.likelihood_ratio import ChangeTest, WhitenedRows, find_change, joined, without_own
+from coordinator.batch_estimation.imu_intrinsics import DELAY, ImuIntrinsics
+from coordinator.monitoring.contact import ContactModel, FastPart, contact_model
+from coordinator.monitoring.likelihood_ratio import (
+    ChangeTest,
+    WhitenedRows,
+    find_change,
+    gain_above,
+    joined,
+    without_own,
+)
 from coordinator.monitoring.momentum_observer import MomentumObserver
 from coordinator.monitoring.residual_tests import (
     PRIOR_KG,
@@ -31,9 +40,15 @@ from coordinator.monitoring.residual_tests import (
     torque_residual,
     torque_rows,
     whitened_drive_rows,
-    without_delay,
 )
-from coordinator.monitoring.segments import Alignment, Block, DataSegment, Segmenter, noise_level, part_of
+from coordinator.monitoring.segments import (
+    SEGMENT_S,
+    Alignment,
+    DataSegment,
+    Segmenter,
+    noise_level,
+    part_of,
+)
 from coordinator.parameter_fit.least_squares import solve_weighted
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ, dynamic_motion
 from module_agent.model.catalogue import ModuleType
@@ -41,6 +56,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError, UsageError
 from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.model.information import JointInformation, gather, merge
+from module_agent.model.regressor import PER_BODY
 
 # How long a window of the watch is, in stretches.
 WINDOW = 10
@@ -102,7 +118,7 @@ def build_reference(known: BaselineRobot) -> Reference:
     """Learn what is normal from a run of the robot.
 
     Raises:
-        NoReference: the run has no motions for inertia, or is too short.
+        UnsuitableBaseline: the run has no motions for inertia, or is too short.
     """
     chain, recording = known.chain, known.recording
     if not recording.motions("dynamic"):
@@ -127,7 +143,8 @@ def build_reference(known: BaselineRobot) -> Reference:
         )
     sigma, information, torque = _torque(chain, phi, segments)
     model, imu = _imu(known, segments)
-    models, drives = _drives(types, segments)
+    drives = [_drive(kind, segments, joint) for joint, kind in enumerate(types)]
+    outside = MomentumObserver(chain, phi).advance(block.q_rad, block.qd_rad_s, block.tau_nm)
     return Reference(
         name=known.name,
         chain=chain,
@@ -138,9 +155,9 @@ def build_reference(known: BaselineRobot) -> Reference:
         torque=torque,
         imu_model=model,
         imu=imu,
-        drive_models=models,
-        drives=drives,
-        contact=_contact(chain, phi, block),
+        drive_models=tuple(drive for drive, _ in drives),
+        drives=tuple(test for _, test in drives),
+        contact=contact_model(FastPart().advance(outside)),
     )
 
 
@@ -149,90 +166,98 @@ def _torque(
 ) -> tuple[Array, tuple[JointInformation, ...], BaselineTest]:
     sigma, counted = noise_level([torque_residual(chain, phi, one) for one in segments])
     independent = np.maximum(sigma, 1e-6) * np.sqrt(counted)
-    windows = []
-    for part in _window_segments(segments):
-        whole: tuple[JointInformation, ...] = ()
-        for one in part:
-            found = information_of(chain, one)
-            whole = merge(whole, found) if whole else found
-        windows.append(whole)
-    total = windows[0]
-    for more in windows[1:]:
-        total = merge(total, more)
+    windows = [reduce(merge, [information_of(chain, one) for one in window]) for window in _windows(segments)]
     evidence = [torque_rows(window, phi, independent) for window in windows]
-    count = len(chain.serials)
-    prior = np.full(phi.size, PRIOR_KG)
-    return independent, total, _calibrated(evidence, prior, payload_changes(count))
+    test = _calibrated(evidence, np.full(phi.size, PRIOR_KG), payload_changes(len(chain.serials)))
+    return independent, reduce(merge, windows), test
 
 
 def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuModel, BaselineTest]:
-    chain, refinement = known.chain, known.kinematics.refinement
-    count = len(chain.serials)
-    rough = ImuModel(
-        chain, without_delay(refinement.intrinsics), IMU_PRIORS[known.imu], np.full((count, 6), 0.05)
-    )
+    chain, count = known.chain, len(known.chain.serials)
+    # Delays are each segment's own.
+    errors = known.kinematics.refinement.intrinsics.errors.copy()
+    errors[:, DELAY] = 0.0
+    rough = ImuModel(chain, ImuIntrinsics(errors), IMU_PRIORS[known.imu], np.full((count, 6), 0.05))
     sigma, counted = noise_level(lasting_residual(rough, segments))
     model = rough._replace(sigma=np.maximum(sigma * np.sqrt(counted), 1e-5).reshape(count, 6))
     evidence = [
-        without_own(joined([imu_rows(model, one) for one in part]), model.own_sigma)
-        for part in _window_segments(segments)
+        without_own(joined([imu_rows(model, one) for one in window]), model.own_sigma)
+        for window in _windows(segments)
     ]
     return model, _calibrated(evidence, model.prior_sigma, link_changes(chain))
 
 
-def _drives(
-    types: Sequence[ModuleType], segments: Sequence[DataSegment]
-) -> tuple[tuple[DriveModel, ...], tuple[BaselineTest | None, ...]]:
-    models, found = [], []
-    for joint, kind in enumerate(types):
-        parts = [drive_rows(kind, one, joint) for one in segments]
-        rows = np.concatenate([part[0] for part in parts])
-        torque = np.concatenate([part[1] for part in parts])
-        theta = fitted_drive(kind, rows, torque) if len(rows) else catalogued_drive(kind)
-        if len(rows) > RATE_HZ:
-            sigma, counted = noise_level([(torque - rows @ theta)[:, None]])
-            noise = float(max(sigma[0], 1e-6) * np.sqrt(counted[0]))
-        else:
-            noise = kind.max_effort_nm
-        models.append(DriveModel(kind, theta, noise))
-        found.append(_drive(models[-1], segments, joint))
-    return tuple(models), tuple(found)
-
-
-def _drive(model: DriveModel, segments: Sequence[DataSegment], joint: int) -> BaselineTest | None:
-    evidence = []
-    for part in _window_segments(segments):
-        window = [e for one in part if (e := whitened_drive_rows(model, one, joint)) is not None]
-        if window:
-            evidence.append(drive_window(window))
-    if len(evidence) < MIN_WINDOWS:
-        return None
-    return _calibrated(evidence, model.prior_sigma, (model.change,))
+def _drive(
+    kind: ModuleType, segments: Sequence[DataSegment], joint: int
+) -> tuple[DriveModel, BaselineTest | None]:
+    parts = [drive_rows(kind, one, joint) for one in segments]
+    rows, torque = (np.concatenate(column) for column in zip(*parts, strict=True))
+    theta, noise = catalogued_drive(kind), kind.max_effort_nm
+    if len(rows):
+        theta = fitted_drive(kind, rows, torque)
+    if len(rows) > RATE_HZ:
+        sigma, counted = noise_level([(torque - rows @ theta)[:, None]])
+        noise = float(max(sigma[0], 1e-6) * np.sqrt(counted[0]))
+    model = DriveModel(kind, theta, noise)
+    windows = [
+        [e for one in window if (e := whitened_drive_rows(model, one, joint)) is not None]
+        for window in _windows(segments)
+    ]
+    evidence = [drive_window(window) for window in windows if window]
+    known = len(evidence) >= MIN_WINDOWS
+    return model, _calibrated(evidence, model.prior_sigma, (model.change,)) if known else None
 
 
 def _calibrated(
     windows: Sequence[WhitenedRows], prior_sigma: Array, changes: tuple[Array, ...]
 ) -> BaselineTest:
     """Return what all windows say, and by how much the tests of each against the others exceed chance."""
-    exceeding = []
+    # The median of the largest gain that chance makes in as many tests.
+    expected = [chi2.isf(0.5 / (len(windows) * len(changes)), change.shape[1]) for change in changes]
+    largest = 1.0
     for k, window in enumerate(windows):
-        others = joined([*windows[:k], *windows[k + 1 :]])
-        found = find_change(others, window, prior_sigma, changes)
-        exceeding += [
-            (change.gain, columns.shape[1]) for change, columns in zip(found.changes, changes, strict=True)
-        ]
-    # The largest that chance makes of so many, of which every second window's largest is below.
-    expected = [chi2.isf(0.5 / len(exceeding), freedom) for _, freedom in exceeding]
-    largest = max([1.0, *(gain / level for (gain, _), level in zip(exceeding, expected, strict=True))])
+        found = find_change(joined([*windows[:k], *windows[k + 1 :]]), window, prior_sigma, changes)
+        gains = [change.gain / level for change, level in zip(found.changes, expected, strict=True)]
+        largest = max([largest, *gains])
     return BaselineTest(joined(windows), prior_sigma, changes, MARGIN * largest)
 
 
-def _window_segments(segments: Sequence[DataSegment]) -> list[Sequence[DataSegment]]:
-    whole = len(segments) // WINDOW
-    return [segments[WINDOW * k : WINDOW * (k + 1)] for k in range(whole)]
+def _windows(segments: Sequence[DataSegment]) -> list[Sequence[DataSegment]]:
+    return [segments[WINDOW * k : WINDOW * (k + 1)] for k in range(len(segments) // WINDOW)]
 
 
-def _contact(chain: Chain, phi: Array, block: Block) -> ContactModel:
-    observer = MomentumObserver(chain, phi, RATE_HZ)
-    outside = observer.advance(block.q_rad, block.qd_rad_s, block.tau_nm)
-    return contact_model(fast_part(outside, RATE_HZ))
+# Allowed false alarms, of all tests together.
+ALARMS_PER_HOUR = 0.1
+# A push of less than this share of a joint's largest torque is none.
+MIN_CONTACT = 0.01
+# Windows of the last so many segments are tested: short ones for what is large, long ones for what is small.
+SPANS = (3, WINDOW)
+_DRIVE_FREEDOM, _LINK_FREEDOM = 2, 6
+
+
+class Thresholds(NamedTuple):
+    """Gains, and torques (n,) of a contact [Nm], that chance exceeds as seldom as asked for."""
+
+    payload: float
+    link: float
+    drive: float
+    contact_nm: Array
+
+
+def thresholds(reference: Reference, alarms_per_hour: float = ALARMS_PER_HOUR) -> Thresholds:
+    """Share the allowed rate among contacts, payloads, links and drives, and that of each among its tests.
+
+    Raises:
+        UsageError: a rate that is not positive.
+    """
+    if not (np.isfinite(alarms_per_hour) and alarms_per_hour > 0.0):
+        raise UsageError(f"{alarms_per_hour} false alarms an hour cannot be asked for; it must be above 0")
+    each, count = alarms_per_hour / 4.0, len(reference.chain.serials)
+    effort = np.array([kind.max_effort_nm for kind in reference.types])
+    looks = len(SPANS) * 3600.0 / SEGMENT_S
+    return Thresholds(
+        gain_above(PER_BODY, looks * count, each),
+        gain_above(_LINK_FREEDOM, looks * max(len(reference.chain.linked), 1), each),
+        gain_above(_DRIVE_FREEDOM, looks * count, each),
+        np.maximum(reference.contact.level_nm(each), MIN_CONTACT * effort),
+    )

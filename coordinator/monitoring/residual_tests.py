@@ -24,16 +24,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.batch_estimation.imu_intrinsics import (
-    DELAY,
-    SIZE,
-    ImuIntrinsics,
-    mixing,
-    read,
-    slopes,
-)
+from coordinator.batch_estimation.imu_intrinsics import DELAY, SIZE, ImuIntrinsics, mixing, read, slopes
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
-from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
+from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.likelihood_ratio import WhitenedRows, compressed, joined, without_own
 from coordinator.monitoring.segments import DataSegment
@@ -114,20 +107,12 @@ class ImuModel(NamedTuple):
         )
 
 
-def without_delay(intrinsics: ImuIntrinsics) -> ImuIntrinsics:
-    """Return the errors without delays, which are each stretch's own."""
-    errors = intrinsics.errors.copy()
-    errors[:, DELAY] = 0.0
-    return ImuIntrinsics(errors)
-
-
-def imu_residual(model: ImuModel, segment: DataSegment) -> Array:
-    """Return what the model leaves of the readings, (m, n, 6): rates, then specific forces."""
-    at = _thinned(segment)
+def _predicted(model: ImuModel, at: DataSegment) -> tuple[list[BodyMotion], ImuReadings, Array]:
+    """Return the bodies' motions, ideal readings, and what the model leaves of the real ones, (m, n, 6)."""
     bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
     ideal = readings_on(model.chain, bodies)
     gyro, accel = read(model.intrinsics, ideal.gyro_rad_s, ideal.accel_m_s2, None)
-    return np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
+    return bodies, ideal, np.concatenate([at.gyro_rad_s - gyro, at.accel_m_s2 - accel], axis=2)
 
 
 def lasting_residual(model: ImuModel, segments: Sequence[DataSegment]) -> list[Array]:
@@ -135,7 +120,7 @@ def lasting_residual(model: ImuModel, segments: Sequence[DataSegment]) -> list[A
 
     Per stretch (m, 6 n).
     """
-    left = [imu_residual(model, one) for one in segments]
+    left = [_predicted(model, _thinned(one))[2] for one in segments]
     rates = [-one.imu_rates[::KEEP_EVERY] for one in segments]
     whole, late = np.concatenate(left), np.concatenate(rates)
     whole, late = whole - whole.mean(axis=0), late - late.mean(axis=0)
@@ -150,9 +135,7 @@ def lasting_residual(model: ImuModel, segments: Sequence[DataSegment]) -> list[A
 def imu_rows(model: ImuModel, segment: DataSegment) -> WhitenedRows:
     """Return the evidence (k, p): own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
     at, count = _thinned(segment), len(model.chain.serials)
-    bodies = body_motions(model.chain, at.q_rad, at.qd_rad_s, at.qdd_rad_s2)
-    ideal = readings_on(model.chain, bodies)
-    residual = imu_residual(model, segment)
+    bodies, ideal, residual = _predicted(model, at)
     samples, own = len(at.q_rad), len(_OWN) * count
     rows = np.zeros((count, samples, 6, own + len(model.prior_sigma)))
     free = np.ones(SIZE, dtype=bool)
@@ -179,12 +162,10 @@ def link_changes(chain: Chain) -> tuple[Array, ...]:
     """Return the hypotheses, one for every module but those on the base: all beyond its link is displaced."""
     count = len(chain.serials)
     total = _PER_TWIST * count + 3 + len(_LASTING) * count
-    found = []
-    for child in chain.linked:
-        change = np.zeros((total, _PER_TWIST))
+    found = np.zeros((len(chain.linked), total, _PER_TWIST))
+    for change, child in zip(found, chain.linked, strict=True):
         for module in chain.descendants(child):
             change[_PER_TWIST * module : _PER_TWIST * (module + 1)] = LARGE * np.eye(_PER_TWIST)
-        found.append(change)
     return tuple(found)
 
 
@@ -198,20 +179,13 @@ def displacement(chain: Chain, child: int, size: Array) -> tuple[Array, Array]:
 
 
 def _thinned(segment: DataSegment) -> DataSegment:
-    kept = slice(None, None, KEEP_EVERY)
-    return segment._replace(
-        q_rad=segment.q_rad[kept],
-        qd_rad_s=segment.qd_rad_s[kept],
-        qdd_rad_s2=segment.qdd_rad_s2[kept],
-        gyro_rad_s=segment.gyro_rad_s[kept],
-        accel_m_s2=segment.accel_m_s2[kept],
-        imu_rates=segment.imu_rates[kept],
-    )
+    thin = (signal[::KEEP_EVERY] for signal in segment[2:])
+    return DataSegment(segment.raw, segment.t_ns[::KEEP_EVERY], *thin)
 
 
 # c, l, Fc, Fv, J, offset: Fc and Fv are what changes.
 TERMS = 6
-_COULOMB, _VISCOUS = 2, 3
+_FRICTION = slice(2, 4)
 # Of the largest speed; below, a motor may stick within its tick.
 SLOW_SHARE = 0.04
 # Of the low-pass: what is farther has no say.
@@ -228,41 +202,27 @@ class DriveModel(NamedTuple):
     theta: Array
     sigma_nm: float
 
-    def friction_nm(self, speed_rad_s: float, change: Array | None = None) -> float:
-        """Return the friction at a speed, of this drive or of one that has changed by (2,)."""
-        coulomb, viscous = self.theta[[_COULOMB, _VISCOUS]] + (0.0 if change is None else change)
-        return float(coulomb + viscous * speed_rad_s)
-
-    @property
-    def typical_rad_s(self) -> float:
-        """Half of the largest speed."""
-        return 0.5 * self.kind.max_speed_rad_s
-
     @property
     def prior_sigma(self) -> Array:
         """How far its parameters may be from where they are (6,): gears and motors of a type are alike."""
-        motor = self.kind.motor
-        return np.array(
-            [
-                *(0.05, 0.1),
-                max(motor.coulomb_nm, 0.01) * 2.0,
-                max(motor.viscous_nm_s_rad, 0.01) * 2.0,
-                motor.rotor_inertia_kg_m2 * self.kind.gear_ratio**2,
-                0.05 * self.kind.max_effort_nm,
-            ]
-        )
+        usual = catalogued_drive(self.kind)
+        friction = np.maximum(usual[_FRICTION], 0.01) * 2.0
+        return np.array([0.05, 0.1, *friction, usual[4], 0.05 * self.kind.max_effort_nm])
 
     @property
     def change(self) -> Array:
         """The hypothesis: Coulomb and viscous friction change, by as much as the catalogue has them."""
         found = np.zeros((TERMS, 2))
-        found[_COULOMB, 0] = self.kind.motor.coulomb_nm
-        found[_VISCOUS, 1] = self.kind.motor.viscous_nm_s_rad
+        found[_FRICTION] = np.diag(catalogued_drive(self.kind)[_FRICTION])
         return found
 
-    def change_of(self, size: Array) -> Array:
-        """Return the change (2,) of Coulomb [Nm] and viscous friction [Nm s/rad], of a `Change`'s size."""
-        return np.asarray(size * [self.kind.motor.coulomb_nm, self.kind.motor.viscous_nm_s_rad])
+    @property
+    def relative_friction(self) -> Array:
+        """The change of friction at half the largest speed, over what it is, by a `Change` of 1 in each."""
+        speed = 0.5 * self.kind.max_speed_rad_s
+        coulomb, viscous = self.theta[_FRICTION]
+        slope = np.array([1.0, speed]) / float(coulomb + viscous * speed)
+        return np.asarray(catalogued_drive(self.kind)[_FRICTION] * slope)
 
 
 def drive_rows(kind: ModuleType, segment: DataSegment, joint: int) -> tuple[Array, Array]:
@@ -308,9 +268,7 @@ def fitted_drive(kind: ModuleType, rows: Array, torque_nm: Array) -> Array:
     prior = DriveModel(kind, expected, sigma).prior_sigma
     stacked = np.vstack([rows / sigma, np.diag(1.0 / prior)])
     target = np.concatenate([(torque_nm - rows @ expected) / sigma, np.zeros(TERMS)])
-    change = np.linalg.lstsq(stacked, target, rcond=None)[0]
-    found: Array = expected + change
-    return read_only(found)
+    return read_only(expected + np.linalg.lstsq(stacked, target, rcond=None)[0])
 
 
 def catalogued_drive(kind: ModuleType) -> Array:

@@ -32,13 +32,7 @@ Times = NDArray[np.int64]
 MAX_GAP_NS = 48_000_000
 # Who is behind the others by so much is silent.
 SILENT_NS = 500_000_000
-_JOINT = (
-    "position_rad",
-    "velocity_rad_s",
-    "effort_nm",
-    "motor_velocity_rad_s",
-    "motor_current_a",
-)
+_JOINT = ("position_rad", "velocity_rad_s", "effort_nm", "motor_velocity_rad_s", "motor_current_a")
 _ROWS_AROUND = 3
 
 
@@ -90,12 +84,12 @@ class Alignment:
 
     def advance(self, recording: Recording, clocks: Mapping[str, ClockMap]) -> Aligned:
         """Return the samples that all modules have since the last call."""
-        if any(s not in recording.modules or s not in clocks for s in self._serials):
-            return Aligned(None, (), self._missing(recording, clocks))
-        spans = [self._span(recording, clocks[s], s) for s in self._serials]
-        if None in spans:
-            return Aligned(None, (), self._missing(recording, clocks))
+        spans = [self._span(recording, clocks, s) for s in self._serials]
         known = [span for span in spans if span is not None]
+        if len(known) < len(spans):
+            logs = {s: recording.modules[s].rows for s in self._serials if s in recording.modules}
+            missing = tuple(s for s in self._serials if s not in logs or not logs[s].end_row)
+            return Aligned(None, (), missing)
         newest = max(last for _, last in known)
         silent = tuple(
             s for s, (_, last) in zip(self._serials, known, strict=True) if newest - last > SILENT_NS
@@ -106,8 +100,8 @@ class Alignment:
         tracks = [_track(recording, clocks[s], s, self._next_ns, end) for s in self._serials]
         gaps = tuple(
             gap
-            for s, track in zip(self._serials, tracks, strict=True)
-            if track is not None and (gap := _gap(s, track, self._next_ns)) is not None
+            for serial, track in zip(self._serials, tracks, strict=True)
+            if track is not None and (gap := _gap(serial, track, self._next_ns)) is not None
         )
         if gaps:
             # What lies before the last hole is given up: it is shorter than what any test looks at.
@@ -124,20 +118,19 @@ class Alignment:
         self._next_ns = int(grid[-1]) + STEP_NS
         return Aligned(_block(grid, whole), (), silent)
 
-    def _span(self, recording: Recording, clock: ClockMap, serial: str) -> tuple[int, int] | None:
+    def _span(
+        self, recording: Recording, clocks: Mapping[str, ClockMap], serial: str
+    ) -> tuple[int, int] | None:
+        """Return the session times of the rows; None without rows or clock."""
+        if serial not in recording.modules or serial not in clocks:
+            return None
         log = recording.modules[serial].rows
         # The newest is always there; the oldest only matters while the grid has not begun.
-        first = log.first_row if self._next_ns is None else log.end_row - 1
-        rows = log.rows(first, log.end_row)
+        rows = log.rows(log.first_row if self._next_ns is None else log.end_row - 1, log.end_row)
         if not len(rows):
             return None
-        begin, end = clock.to_session(rows["t_ns"][[0, -1]].astype(np.int64))
+        begin, end = clocks[serial].to_session(rows["t_ns"][[0, -1]].astype(np.int64))
         return int(begin), int(end)
-
-    def _missing(self, recording: Recording, clocks: Mapping[str, ClockMap]) -> tuple[str, ...]:
-        return tuple(
-            s for s in self._serials if s not in recording.modules or not recording.modules[s].rows.end_row
-        )
 
 
 def _on_grid(t_ns: int) -> int:
@@ -182,11 +175,10 @@ def _cubic(t_ns: Times, values: Array, at_ns: Times) -> Array:
     index = first[:, None] + np.arange(min(4, len(t_ns)))
     known = 1e-9 * (t_ns[index] - at_ns[:, None])
     found = np.zeros((len(at_ns), values.shape[1]))
-    for k in range(index.shape[1]):
+    for k, own in enumerate(known.T):
         weight = np.ones(len(at_ns))
-        for j in range(index.shape[1]):
-            if j != k:
-                weight *= known[:, j] / (known[:, j] - known[:, k])
+        for other in np.delete(known, k, axis=1).T:
+            weight *= other / (other - own)
         found += weight[:, None] * values[index[:, k]]
     return found
 
@@ -208,13 +200,14 @@ _EDGE = settling_samples(RATE_HZ, DYNAMIC_CUTOFF_HZ)
 
 
 class DataSegment(NamedTuple):
-    """m samples of n modules; all but `raw` went through the same low-pass.
+    """m samples of n modules; all but `raw`, the same samples, went through the same low-pass.
 
     t_ns: (m,). q_rad, qd_rad_s, qdd_rad_s2, tau_nm: (m, n). gyro_rad_s, accel_m_s2: (m, n, 3), and how fast
     both change, (m, n, 6). drive: (m, n, 6) currents of motors that drive, of motors that are driven back,
-    sign(w) |tau|, sign(w), w and w' with w the motor's speed. raw: the same samples, unfiltered.
+    sign(w) |tau|, sign(w), w and w' with w the motor's speed.
     """
 
+    raw: Block
     t_ns: NDArray[np.int64]
     q_rad: Array
     qd_rad_s: Array
@@ -224,11 +217,10 @@ class DataSegment(NamedTuple):
     accel_m_s2: Array
     imu_rates: Array
     drive: Array
-    raw: Block
 
 
 class Segmenter:
-    """Cuts blocks that follow on each other into stretches, a sixth of a second late for the filter."""
+    """Cuts blocks that follow on each other into segments, a sixth of a second late for the filter."""
 
     def __init__(self) -> None:
         self._held: list[Block] = []
@@ -238,17 +230,14 @@ class Segmenter:
         self._held.clear()
 
     def add(self, block: Block) -> list[DataSegment]:
-        """Take the next block; return the stretches that are complete with it."""
-        self._held.append(block)
-        if sum(len(part.t_ns) for part in self._held) < SEGMENT_SAMPLES + 2 * _EDGE:
-            return []
-        whole = joined_blocks(self._held)
-        found, begin = [], 0
-        while begin + SEGMENT_SAMPLES + 2 * _EDGE <= len(whole.t_ns):
-            found.append(_segment(part_of(whole, begin, begin + SEGMENT_SAMPLES + 2 * _EDGE)))
+        """Take the next block; return the segments that are complete with it."""
+        whole, begin, reach = joined_blocks([*self._held, block]), 0, SEGMENT_SAMPLES + 2 * _EDGE
+        segments = []
+        while begin + reach <= len(whole.t_ns):
+            segments.append(_segment(part_of(whole, begin, begin + reach)))
             begin += SEGMENT_SAMPLES
         self._held = [part_of(whole, begin, len(whole.t_ns))]
-        return found
+        return segments
 
 
 def _segment(block: Block) -> DataSegment:
@@ -256,6 +245,7 @@ def _segment(block: Block) -> DataSegment:
     q, qd, qdd, (tau, gyro, accel), kept = filtered_signals(block.q_rad, others, RATE_HZ, DYNAMIC_CUTOFF_HZ)
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
     return DataSegment(
+        raw=part_of(block, kept.start, kept.stop),
         t_ns=block.t_ns[kept],
         q_rad=q[kept],
         qd_rad_s=qd[kept],
@@ -265,7 +255,6 @@ def _segment(block: Block) -> DataSegment:
         accel_m_s2=accel[kept],
         imu_rates=rates[kept],
         drive=_drive(block)[kept],
-        raw=part_of(block, kept.start, kept.stop),
     )
 
 

@@ -19,8 +19,7 @@ from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.identify import identify_kinematics
 from coordinator.monitoring.findings import Finding
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from coordinator.monitoring.reference import Reference, build_reference
-from coordinator.monitoring.thresholds import ALARMS_PER_HOUR
+from coordinator.monitoring.reference import ALARMS_PER_HOUR, Reference, build_reference
 from module_agent.model.chain import Chain
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.benchmark.case import Case, Summary, Trial

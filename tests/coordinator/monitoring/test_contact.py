@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from coordinator.monitoring.contact import ContactDetector, ContactModel, FastPart, contact_model, fast_part
+from coordinator.monitoring.contact import ContactDetector, ContactModel, FastPart, contact_model
 from coordinator.monitoring.momentum_observer import GAIN_HZ, MomentumObserver
 from coordinator.monitoring.segments import noise_level
 from module_agent.model.regressor import inverse_dynamics
@@ -27,7 +27,7 @@ def test_the_momentum_shows_a_push_through_the_low_pass_that_it_is_said_to_be() 
     push = np.zeros_like(q)
     push[400:450] = [0.5, -1.0, 0.3]
     torque = inverse_dynamics(CHAIN, PHI, q, qd, qdd) - push
-    found = MomentumObserver(CHAIN, PHI, RATE_HZ).advance(q, qd, torque)
+    found = MomentumObserver(CHAIN, PHI).advance(q, qd, torque)
     share = GAIN_HZ / RATE_HZ
     mean = 0.5 * (push + np.vstack([push[:1], push[:-1]]))
     expected = lfilter([share], [1.0, share - 1.0], mean, axis=0)
@@ -38,20 +38,20 @@ def test_the_momentum_shows_a_push_through_the_low_pass_that_it_is_said_to_be() 
 def test_it_does_not_matter_how_samples_come_in_blocks() -> None:
     q, qd, qdd = swing(1.0)
     torque = inverse_dynamics(CHAIN, PHI, q, qd, qdd) + 0.2
-    whole = MomentumObserver(CHAIN, PHI, RATE_HZ).advance(q, qd, torque)
-    piecemeal, fast = MomentumObserver(CHAIN, PHI, RATE_HZ), FastPart(RATE_HZ)
+    whole = MomentumObserver(CHAIN, PHI).advance(q, qd, torque)
+    piecemeal, fast = MomentumObserver(CHAIN, PHI), FastPart()
     parts = [slice(k, k + 7) for k in range(0, len(q), 7)]
     found = [piecemeal.advance(q[p], qd[p], torque[p]) for p in parts]
     np.testing.assert_allclose(np.vstack(found), whole, atol=1e-12)
     np.testing.assert_allclose(
-        np.vstack([fast.advance(one) for one in found]), fast_part(whole, RATE_HZ), atol=1e-12
+        np.vstack([fast.advance(one) for one in found]), FastPart().advance(whole), atol=1e-12
     )
 
 
 def test_what_lasts_is_no_blow() -> None:
     step = np.ones((2500, 1))
     step[:500] = 0.0
-    fast = fast_part(step, RATE_HZ)
+    fast = FastPart().advance(step)
     assert fast[500, 0] > 0.99
     # After nine seconds of a time constant of 0.8 s.
     assert abs(fast[-1, 0]) < 1e-4
@@ -62,7 +62,7 @@ def test_noise_crosses_its_level_as_often_as_rice_says() -> None:
     # A second-order low-pass of white noise has a finite rate of crossings.
     noise = lfilter([1.0], np.convolve([1.0, -0.8], [1.0, -0.8]), rng.normal(size=(400_000, 1)), axis=0)
     noise /= noise.std()
-    model = contact_model(noise, RATE_HZ)._replace(largest_nm=np.zeros(1))
+    model = contact_model(noise)._replace(largest_nm=np.zeros(1))
     asked = 3600.0 * 0.5
     level = model.level_nm(asked)[0]
     beyond = np.abs(noise[:, 0]) > level
