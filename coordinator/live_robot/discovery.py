@@ -3,18 +3,22 @@
 import asyncio
 import queue
 import time
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NamedTuple, TypeVar
 
 from coordinator.live_robot.messenger import Clock, Messenger
 from module_agent.transport.transport import Event, Liveness, Reply, Transport
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf, every, key, parse
-from module_agent.wire.messages import Ack, Ask, Status, Stop
+from module_agent.wire.messages import Ack, Ask, Message, Status, Stop
 from module_agent.wire.refusal import WireError
 
 ANSWER_S = 1.0
 POLL_S = 0.02
+
+Request = Callable[[str], Message]
+M = TypeVar("M", bound=Message)
 
 
 class Search(NamedTuple):
@@ -75,55 +79,43 @@ def _present(transport: Transport, robot: str, search: Search) -> list[str]:
 
 
 def _ask_all(
-    transport: Transport, robot: str, leaf: Leaf, requests: Sequence[tuple[str, bytes]]
-) -> dict[str, bytes]:
+    transport: Transport, robot: str, search: Search, leaf: Leaf, request: Request, expected: type[M]
+) -> tuple[list[str], dict[str, M]]:
+    """Return the serials present, and their answers as far as readable. Closes the transport."""
     events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-    for tag, (serial, payload) in enumerate(requests):
-        transport.query(key(robot, serial, leaf), payload, ANSWER_S, events.put, tag)
-    answers: dict[str, bytes] = {}
-    for _ in requests:
-        event = events.get(timeout=ANSWER_S + 5.0)
-        if isinstance(event, Reply) and event.payload is not None:
-            answers[parse(event.key).serial] = event.payload
-    return answers
+    answers: dict[str, M] = {}
+    try:
+        serials = _present(transport, robot, search)
+        for tag, serial in enumerate(serials):
+            transport.query(key(robot, serial, leaf), encode(request(serial)), ANSWER_S, events.put, tag)
+        for _ in serials:
+            event = events.get(timeout=ANSWER_S + 5.0)
+            if isinstance(event, Reply) and event.payload is not None:
+                with suppress(WireError):
+                    answers[parse(event.key).serial] = decode(expected, event.payload)
+    finally:
+        transport.close()
+    return serials, answers
 
 
 def listed(transport: Transport, robot: str, search: Search) -> tuple[list[Status], list[str]]:
     """Return the statuses, and the serials without a readable answer. Closes the transport."""
-    try:
-        serials = _present(transport, robot, search)
-        requests = [(s, encode(Ask(serial=s, boot=0, seq=1, sender="list"))) for s in serials]
-        answers = _ask_all(transport, robot, Leaf.STATUS, requests)
-    finally:
-        transport.close()
-    statuses = [status for s in serials if s in answers if (status := _status(answers[s])) is not None]
+
+    def request(serial: str) -> Ask:
+        return Ask(serial=serial, boot=0, seq=1, sender="list")
+
+    serials, answers = _ask_all(transport, robot, search, Leaf.STATUS, request, Status)
+    statuses = [answers[s] for s in serials if s in answers]
     known = [status.serial for status in statuses]
     return statuses, [s for s in serials if s not in known]
 
 
-def _status(payload: bytes) -> Status | None:
-    try:
-        return decode(Status, payload)
-    except WireError:
-        return None  # its serial is then among those without a readable answer
-
-
 def stop_robot(transport: Transport, robot: str, sender: str, search: Search) -> tuple[list[str], list[str]]:
     """Stop every module; return the serials that confirmed and those that did not. Closes the transport."""
-    try:
-        serials = _present(transport, robot, search)
-        requests = [
-            (s, encode(Stop(serial=s, boot=0, seq=1, sender=sender, why="stop command"))) for s in serials
-        ]
-        answers = _ask_all(transport, robot, Leaf.STOP, requests)
-        stopped = [s for s in serials if s in answers and _accepted(answers[s])]
-        return stopped, [s for s in serials if s not in stopped]
-    finally:
-        transport.close()
 
+    def request(serial: str) -> Stop:
+        return Stop(serial=serial, boot=0, seq=1, sender=sender, why="stop command")
 
-def _accepted(payload: bytes) -> bool:
-    try:
-        return decode(Ack, payload).accepted
-    except WireError:
-        return False
+    serials, answers = _ask_all(transport, robot, search, Leaf.STOP, request, Ack)
+    stopped = [s for s in serials if s in answers and answers[s].accepted]
+    return stopped, [s for s in serials if s not in stopped]

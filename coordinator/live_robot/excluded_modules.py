@@ -37,14 +37,11 @@ class ExcludedModules:
             except NoAnswer as error:
                 self._exclude(serial, str(error))
         self._group.serials = tuple(met)
-        await self._group.wait(lambda: not self._without_feedback(), FEEDBACK_WAIT_S)
-        silent = self._without_feedback()
+        await self._group.wait(lambda: not self._group.without_feedback(), FEEDBACK_WAIT_S)
+        silent = self._group.without_feedback()
         self._group.serials = tuple(s for s in met if s not in silent)
         for serial in silent:
             self._exclude(serial, f"module {serial} answers, but sends no feedback")
-
-    def _without_feedback(self) -> list[str]:
-        return [s for s in self._group.serials if self._group.module(s).feedback_ns is None]
 
     def without(self, error: Refused | MotionInterrupted) -> bool:
         """Exclude the module of an error if repeating cannot help; return whether it was excluded.

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Container, Coroutine, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from coordinator.live_robot.backfill import RowCompletion
 from coordinator.live_robot.errors import ModuleLost, MotionInterrupted, RobotStopped
@@ -24,6 +24,7 @@ from module_agent.wire.messages import (
     HistoryRequest,
     Info,
     LeaseRequest,
+    Message,
     MotionCommand,
     MotionRecord,
     Pattern,
@@ -50,6 +51,7 @@ PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
 UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.value)
 
 T = TypeVar("T")
+M = TypeVar("M", bound=Message)
 
 
 class _Started(NamedTuple):
@@ -103,27 +105,48 @@ class ModuleGroup:
     async def meet(self, serials: Sequence[str]) -> None:
         """Request every module's description, and note its boot."""
         for serial in serials:
-            info = await self._ask_info(serial)
-            if not isinstance(info, Info):
-                raise NoAnswer(serial, Leaf.INFO, f"its answer is {type(info).__name__}")
+            info = await self._ask(serial, Leaf.INFO, Info)
             self._boots[serial] = info.boot
             log = self.module(serial).rows
             self._rows[serial] = RowCompletion(log, partial(self._fetch, serial))
         self.serials = tuple(serials)
 
-    async def _ask_info(self, serial: str) -> object:
-        return await self._persist(serial, lambda: self._ask(serial, Leaf.INFO))
+    def without_feedback(self) -> list[str]:
+        """Return the serials of the modules whose feedback has not been received yet."""
+        return [serial for serial in self.serials if self.module(serial).feedback_ns is None]
 
     async def ask_status(self, serial: str) -> Status:
         """Return the present status of a module; also one round trip for its clock."""
-        status = await self._persist(serial, lambda: self._ask(serial, Leaf.STATUS))
-        if not isinstance(status, Status):
-            raise NoAnswer(serial, Leaf.STATUS, f"its answer is {type(status).__name__}")
-        return status
+        return await self._ask(serial, Leaf.STATUS, Status)
 
-    async def _ask(self, serial: str, leaf: Leaf) -> object:
-        ask = Ask(serial=serial, boot=0, seq=self._messenger.next_seq(), sender=self.sender)
-        return await self._messenger.ask(serial, leaf, ask)
+    async def _ask(self, serial: str, leaf: Leaf, expected: type[M]) -> M:
+        answer = await self._persist(
+            serial, lambda: self._messenger.ask(serial, leaf, self._request(Ask, serial))
+        )
+        if not isinstance(answer, expected):
+            raise NoAnswer(serial, leaf, f"its answer is {type(answer).__name__}")
+        return answer
+
+    def _request(self, kind: type[M], serial: str, **fields: Any) -> M:
+        """Return a message that needs no lease, by default to whatever boot of the module is there."""
+        head = {"serial": serial, "boot": 0, "seq": self._messenger.next_seq(), "sender": self.sender}
+        return kind.model_validate(head | fields)
+
+    def _command(self, kind: type[M], serial: str, **fields: Any) -> M:
+        """Return a command under the lease; it echoes the newest module time."""
+        head = {
+            "boot": self._boots[serial],
+            "token": self._tokens.get(serial, 0),
+            "echo_ns": self.module(serial).newest_ns,
+        }
+        return self._request(kind, serial, **head, **fields)
+
+    def _lease(self, serial: str, action: str) -> LeaseRequest:
+        return self._command(LeaseRequest, serial, action=action, duration_ns=LEASE_NS)
+
+    async def _achieve(self, serial: str, leaf: Leaf, command: Callable[[], Message]) -> Ack:
+        """Send commands, each made anew, until one is acknowledged."""
+        return await self._persist(serial, lambda: self._messenger.command(serial, leaf, command()))
 
     async def _persist(self, serial: str, attempt: Callable[[], Awaitable[T]]) -> T:
         """Try until answered; a network may lose requests and answers."""
@@ -161,11 +184,15 @@ class ModuleGroup:
                 raise ModuleLost(serial, f"no feedback for {silent_ns / 1e9:.1f} s")
             if serial in self._taken_by:
                 raise ModuleLost(serial, f"its lease was taken: {self._taken_by[serial]}")
-            status = record.status
-            # A status from before the lease was taken may report an earlier stop.
-            fresh = status is not None and serial in self._tokens and status.t_ns > self._armed_ns[serial]
-            if fresh and status is not None and status.state == "stopped":
+            status = self._status_under_lease(serial)
+            if status is not None and status.state == "stopped":
                 raise RobotStopped(serial, status.note)
+
+    def _status_under_lease(self, serial: str) -> Status | None:
+        """Return the status; None before the lease, as it may report an earlier stop or expiry."""
+        status = self.module(serial).status
+        fresh = status is not None and serial in self._tokens and status.t_ns > self._armed_ns[serial]
+        return status if fresh else None
 
     async def check_now(self) -> None:
         """Request every module's status, then `check`."""
@@ -200,29 +227,11 @@ class ModuleGroup:
         Raises:
             Refused: another sender holds it; the message names the holder and the time left.
         """
-
-        async def attempt() -> Ack:
-            return await self._messenger.command(serial, Leaf.LEASE, self._lease(serial, "acquire"))
-
         self._running.pop(serial, None)
-        ack = await self._persist(serial, attempt)
+        ack = await self._achieve(serial, Leaf.LEASE, lambda: self._lease(serial, "acquire"))
         self._tokens[serial], self._armed_ns[serial] = ack.token, ack.t_ns
         # Its lifetime counts from the echo in the request: on a slow network little of it is left.
         self._send(self._renew(serial))
-
-    def _lease(self, serial: str, action: str) -> LeaseRequest:
-        return LeaseRequest.model_validate({**self._head(serial), "action": action, "duration_ns": LEASE_NS})
-
-    def _head(self, serial: str) -> dict[str, object]:
-        """Return the fields that every command carries."""
-        return {
-            "serial": serial,
-            "boot": self._boots[serial],
-            "seq": self._messenger.next_seq(),
-            "sender": self.sender,
-            "token": self._tokens.get(serial, 0),
-            "echo_ns": self.module(serial).newest_ns,
-        }
 
     async def keep_alive(self) -> None:
         """Renew all leases until cancelled; a late answer does not hold up the next renewal.
@@ -267,21 +276,17 @@ class ModuleGroup:
         running = self._running.get(serial)
         if running is None:
             return
-        motion = self._motion(serial, running)
         # Lost or refused: the next renewal follows.
         with contextlib.suppress(NoAnswer, Refused):
-            await self._messenger.command(serial, Leaf.MOTION, motion, timeout_s=0.3)
+            await self._messenger.command(serial, Leaf.MOTION, self._motion(serial, running), timeout_s=0.3)
 
     async def release_all(self) -> None:
         """Release all modules; their motors are off then."""
         await asyncio.gather(*(self._release(serial) for serial in list(self._tokens)))
 
     async def _release(self, serial: str) -> None:
-        async def attempt() -> Ack:
-            return await self._messenger.command(serial, Leaf.LEASE, self._lease(serial, "release"))
-
         try:
-            await self._persist(serial, attempt)
+            await self._achieve(serial, Leaf.LEASE, lambda: self._lease(serial, "release"))
         except Refused as refused:
             # The first answer may have been lost: then there is nothing left to release.
             if refused.ack.reason not in (Refusal.NO_LEASE.value, Refusal.HELD.value):
@@ -298,7 +303,7 @@ class ModuleGroup:
 
     async def _stop(self, serial: str, why: str) -> None:
         for left in reversed(range(3)):
-            stop = Stop(serial=serial, boot=0, seq=self._messenger.next_seq(), sender=self.sender, why=why)
+            stop = self._request(Stop, serial, why=why)
             try:
                 await self._messenger.command(serial, Leaf.STOP, stop, timeout_s=0.3)
                 return
@@ -310,12 +315,7 @@ class ModuleGroup:
 
     async def set_gains(self, serial: str, gains: GainSet) -> None:
         """Replace a module's gains."""
-
-        async def attempt() -> Ack:
-            command = GainsCommand.model_validate({**self._head(serial), "gains": gains})
-            return await self._messenger.command(serial, Leaf.GAINS, command)
-
-        await self._persist(serial, attempt)
+        await self._achieve(serial, Leaf.GAINS, lambda: self._command(GainsCommand, serial, gains=gains))
 
     def stream(
         self,
@@ -326,9 +326,7 @@ class ModuleGroup:
     ) -> None:
         """Send one set-point, which is not acknowledged; None switches a loop off."""
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}
-        self._messenger.publish(
-            serial, Leaf.SETPOINT, Setpoint.model_validate({**self._head(serial), **point})
-        )
+        self._messenger.publish(serial, Leaf.SETPOINT, self._command(Setpoint, serial, **point))
 
     def _next_id(self) -> int:
         # Numbers grow from one coordinator to the next, so that none repeats.
@@ -356,29 +354,27 @@ class ModuleGroup:
                 f"efforts for {idle[0]}, which has no motion; of those that have one: {', '.join(patterns)}"
             )
         started = {s: _Started(self._next_id(), pattern, fed.get(s)) for s, pattern in patterns.items()}
-        numbers = {serial: motion.number for serial, motion in started.items()}
         await gather_all(self._start(serial, motion) for serial, motion in started.items())
         longest = max(duration_s(pattern, self._origin(serial)) for serial, pattern in patterns.items())
         ended = await self.wait(
             lambda: (
-                all(self._ended(serial, number) for serial, number in numbers.items())
-                or self._expired(numbers) is not None
+                all(self._ended(serial, motion.number) for serial, motion in started.items())
+                or self._expired(started) is not None
             ),
             longest + 3.0,
         )
         if self.is_poor:
             # The status of a module that expired may itself be lost.
             await gather_all(self.ask_status(serial) for serial in self._tokens)
-        expired = self._expired(numbers)
-        if expired is not None:
+        if (expired := self._expired(started)) is not None:
             raise MotionInterrupted(
                 next(iter(patterns)), f"interrupted: module {expired} expired and released its joint"
             )
         records: dict[str, MotionRecord] = {}
-        for serial, number in numbers.items():
+        for serial in started:
             status = self.module(serial).status if ended else await self.ask_status(serial)
             motion = status.motion if status is not None else None
-            if motion is None or motion.motion_id != number or motion.outcome != "done":
+            if motion is None or motion.motion_id != started[serial].number or motion.outcome != "done":
                 raise MotionInterrupted(serial, motion.outcome if motion is not None else "lost")
             records[serial] = motion
         return records
@@ -386,9 +382,8 @@ class ModuleGroup:
     def _expired(self, moved: Container[str]) -> str | None:
         """Return a held module without a motion that has expired meanwhile."""
         for serial in self._tokens:
-            status = self.module(serial).status
-            fresh = status is not None and status.t_ns > self._armed_ns[serial]
-            if serial not in moved and fresh and status is not None and status.state == "expired":
+            status = self._status_under_lease(serial)
+            if serial not in moved and status is not None and status.state == "expired":
                 return serial
         return None
 
@@ -407,15 +402,12 @@ class ModuleGroup:
 
     def _motion(self, serial: str, motion: _Started) -> MotionCommand:
         what = {"motion_id": motion.number, "pattern": motion.pattern, "effort": motion.effort}
-        return MotionCommand.model_validate({**self._head(serial), **what})
+        return self._command(MotionCommand, serial, **what)
 
     async def _start(self, serial: str, motion: _Started) -> None:
-        async def attempt() -> Ack:
-            return await self._messenger.command(serial, Leaf.MOTION, self._motion(serial, motion))
-
         self._running.pop(serial, None)
         try:
-            await self._persist(serial, attempt)
+            await self._achieve(serial, Leaf.MOTION, lambda: self._motion(serial, motion))
             self._running[serial] = motion
         except Refused as refused:
             if refused.ack.reason in UNSTARTED:
@@ -446,39 +438,30 @@ class ModuleGroup:
 
     async def _fetch(self, serial: str, first: int, end: int) -> None:
         """Request rows until they, or a refusal, have come."""
-        await self._persist(serial, lambda: self._ask_history(serial, first, end))
+        what = {"boot": self._boots[serial], "first_row": first, "end_row": end}
 
-    async def _ask_history(self, serial: str, first: int, end: int) -> object:
-        request = HistoryRequest(
-            serial=serial,
-            boot=self._boots[serial],
-            seq=self._messenger.next_seq(),
-            sender=self.sender,
-            first_row=first,
-            end_row=end,
-        )
-        answer = await self._messenger.ask(serial, Leaf.HISTORY, request)
-        if isinstance(answer, Ack):
-            raise Refused(serial, Leaf.HISTORY, answer)
-        return answer
+        async def attempt() -> None:
+            request = self._request(HistoryRequest, serial, **what)
+            answer = await self._messenger.ask(serial, Leaf.HISTORY, request)
+            if isinstance(answer, Ack):
+                raise Refused(serial, Leaf.HISTORY, answer)
+
+        await self._persist(serial, attempt)
 
     async def estimate(self, observer: str, joint: str, motion_id: int, timeout_s: float) -> Estimate | None:
         """Wait for the observer's estimate of a motion, requested again if lost; None if there is none."""
 
         def received() -> Estimate | None:
-            for ids, estimate in self._recording.estimates.get((joint, observer), {}).items():
-                if motion_id in ids:
-                    return estimate
-            return None
+            of_joint = self._recording.estimates.get((joint, observer), {})
+            return next((one for ids, one in of_joint.items() if motion_id in ids), None)
 
         if await self.wait(lambda: received() is not None, timeout_s):
             return received()
         for _ in range(ATTEMPTS):
-            request = EstimateRequest(
-                serial=observer, boot=0, seq=self._messenger.next_seq(), sender=self.sender, joint=joint
-            )
             try:
-                await self._messenger.ask(observer, Leaf.ESTIMATE, request)
+                await self._messenger.ask(
+                    observer, Leaf.ESTIMATE, self._request(EstimateRequest, observer, joint=joint)
+                )
             except NoAnswer:
                 self.check()
             if await self.wait(lambda: received() is not None, 0.3):

@@ -12,19 +12,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from module_agent.control.motion import effort_profile, profile_period_ns
-from module_agent.control.waveform import MINIMUM_JERK_PEAK, duration_s, waveform
+from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.chain import Array, Chain
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.filtering import differentiate
-from module_agent.wire.messages import EffortProfile, GoTo, Pattern, Rest
+from module_agent.wire.messages import EffortProfile, Pattern
 
 # The modules' own tick: a reference at its rate is what a module itself samples of a pattern.
 RATE_HZ = 1000.0
 # Patterns that end within half a tick of one another end together.
 _TOGETHER_S = 5e-4
-# A joint that is nearer to its target does not move.
-_THERE_RAD, _MIN_RAD_S = 1e-4, 1e-6
 
 
 class Reference(NamedTuple):
@@ -69,29 +67,6 @@ def joint_reference(
             q[:, column] += samples.offset_rad
             qd[:, column] = samples.velocity_rad_s
     return Reference(*(read_only(array) for array in (t_s, q, qd, differentiate(qd, rate_hz))))
-
-
-def paths_together(
-    origins_rad: Mapping[str, float], targets_rad: Mapping[str, float], max_speed_rad_s: float
-) -> dict[str, Pattern]:
-    """Return paths of all joints with a target that end at the same time, the longest at the given speed.
-
-    Raises:
-        ValueError: no joint has a target.
-        KeyError: a joint has a target and no origin.
-    """
-    if not targets_rad:
-        raise ValueError("no joint has a target")
-    ways = {serial: abs(target - origins_rad[serial]) for serial, target in targets_rad.items()}
-    longest = max(ways, key=lambda serial: ways[serial])
-    last = GoTo(target_rad=targets_rad[longest], max_speed_rad_s=max_speed_rad_s)
-    total_s = duration_s(last, origins_rad[longest])
-    found: dict[str, Pattern] = {}
-    for serial, way in ways.items():
-        speed = max(MINIMUM_JERK_PEAK * way / total_s, _MIN_RAD_S)
-        own = GoTo(target_rad=targets_rad[serial], max_speed_rad_s=speed)
-        found[serial] = own if way >= _THERE_RAD else Rest(duration_s=total_s)
-    return found
 
 
 def standing(reference: Reference, row: int, length_s: float, rate_hz: float = RATE_HZ) -> Reference:

@@ -11,8 +11,8 @@ STRATEGY = 2
 # Stiffness relative to the factory's position loop, which is soft under this strategy, since it has to exert
 # the weight too. Measured: at 16 times, arms of four and six joints ring.
 HOLDING_TIMES = 6.0
-# Largest damping relative to the factory's velocity loop of this strategy. Measured: at 10 times, an X5-1 in
-# the wrist of an arm of six joints rings.
+# Largest damping, and that of holding, relative to the factory's velocity loop of this strategy. Measured: at
+# 10 times, an X5-1 in the wrist of an arm of six joints rings.
 MAX_DAMPING_TIMES = HOLDING_TIMES
 
 
@@ -32,16 +32,12 @@ def compensation_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
         raise UsageError(
             f"damping of {damping_nm_s_rad} Nm s/rad: module type {kind.name} takes 0 to {most:g} Nm s/rad"
         )
-    return _torque_gains(kind, damping_nm_s_rad)
-
-
-def holding_gains(kind: ModuleType) -> GainSet:
-    """Return the gains of holding while gravity is compensated."""
-    return _torque_gains(kind, HOLDING_TIMES * default_gains(kind, STRATEGY).velocity.kp)
-
-
-def _torque_gains(kind: ModuleType, damping_nm_s_rad: float) -> GainSet:
     factory = default_gains(kind, STRATEGY).model_dump()
     factory["velocity"] |= {"kp": damping_nm_s_rad, "ki": 0.0, "kd": 0.0, "feed_forward": 0.0}
     factory["position"]["kp"] *= HOLDING_TIMES
     return GainSet.model_validate(factory)
+
+
+def holding_gains(kind: ModuleType) -> GainSet:
+    """Return the gains of holding while gravity is compensated."""
+    return compensation_gains(kind, max_damping_nm_s_rad(kind))

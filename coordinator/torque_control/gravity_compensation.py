@@ -21,12 +21,13 @@ larger than offsets and scale errors explain. A joint that sinks during the rele
 an argument, and nothing is sent from here.
 """
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from coordinator.torque_control.gravity_model import GravityModel
-from coordinator.torque_control.minimum_jerk import Way
+from module_agent.control.waveform import minimum_jerk, minimum_jerk_duration_s
 from module_agent.model.chain import Array
 from module_agent.model.errors import LostError, RobotError
 from module_agent.wire.messages import Limits
@@ -103,6 +104,20 @@ class Targets(NamedTuple):
     effort_nm: Array
 
 
+class _Way(NamedTuple):
+    """Minimum-jerk paths from `start_rad` to `end_rad`, (n,), that begin and end together."""
+
+    start_rad: Array
+    end_rad: Array
+    total_s: float
+
+    def at(self, t_s: float) -> tuple[Array, Array]:
+        """Return positions [rad] and velocities [rad/s], (n,) each, at a time from the beginning."""
+        travel = self.end_rad - self.start_rad
+        share, rate = minimum_jerk(1.0, self.total_s, t_s)
+        return self.start_rad + share * travel, rate * travel
+
+
 class GravityCompensator:
     """The state machine of gravity compensation; `step` is called at the rate of the set-points.
 
@@ -121,7 +136,7 @@ class GravityCompensator:
         self._high = _ends([one.max_position_rad for one in limits], np.inf) - settings.margin_rad
         self._since_s = 0.0
         self._place: Array | None = None
-        self._way: Way | None = None
+        self._way: _Way | None = None
         # The stiffness share at the beginning of holding: 1 if the position loops were not released.
         self._stiffness_share = 1.0
         self._held_share: float | None = None
@@ -154,7 +169,7 @@ class GravityCompensator:
         reason = (
             self._overload(weight_nm)
             or self._at_an_end(reading.q_rad)
-            or self._unexplained_offset(reading.effort_nm, reading.effort_nm - weight_nm)
+            or self._unexplained_offset(reading.effort_nm, weight_nm)
         )
         if reason:
             raise CompensationRefused(reason)
@@ -185,7 +200,7 @@ class GravityCompensator:
         self._initial_nm = self._asked = reading.effort_nm.copy()
         if self._aborted_nm is not None:
             self._aborted_nm = self._initial_nm
-        elif unknown := self._unexplained_offset(reading.effort_nm, reading.effort_nm - weight_nm):
+        elif unknown := self._unexplained_offset(reading.effort_nm, weight_nm):
             self._fault(t_s, reading, unknown)
 
     def _effort(self, t_s: float, weight_nm: Array) -> Array:
@@ -231,7 +246,8 @@ class GravityCompensator:
         """Move to positions (n,). Only from `held`."""
         if self.phase == "held":
             speed = min(BACK_RAD_S, BACK_SHARE * self._settings.max_speed_rad_s)
-            self._way = Way(self.place_rad, target_rad, speed)
+            farthest_rad = float(np.abs(target_rad - self.place_rad).max())
+            self._way = _Way(self.place_rad, target_rad, minimum_jerk_duration_s(farthest_rad, speed))
             self._enter("returning", t_s)
 
     def _enter(self, phase: Phase, t_s: float) -> None:
@@ -260,15 +276,16 @@ class GravityCompensator:
     # ------------------------------------------------------------------ transitions
 
     def _go_on(self, t_s: float, reading: Reading) -> None:
-        self._arrive(t_s)
+        if self._way is not None and t_s - self._since_s >= self._way.total_s:
+            self._place, self._way = self._way.end_rad, None
+            self._enter("held", t_s)
         settings = self._settings
         length_s = settings.hold_s if self.phase == "holding" else settings.ramp_s
         if self._share(t_s, length_s) < 1.0:
             return
         if self.phase == "loading":
             offset = np.mean(self._offsets, axis=0)
-            unknown = self._unexplained_offset(reading.effort_nm, offset)
-            if unknown:
+            if unknown := self._unexplained_offset(reading.effort_nm, reading.effort_nm - offset):
                 self._fault(t_s, reading, unknown)
             else:
                 # Stiffer gains follow, and must not pull back a joint that has yielded meanwhile.
@@ -277,11 +294,6 @@ class GravityCompensator:
         elif self.phase == "releasing":
             self._enter("compensating", t_s)
         elif self.phase == "holding":
-            self._enter("held", t_s)
-
-    def _arrive(self, t_s: float) -> None:
-        if self._way is not None and t_s - self._since_s >= self._way.total_s:
-            self._place, self._way = self._way.end_rad, None
             self._enter("held", t_s)
 
     def _guard(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
@@ -317,60 +329,55 @@ class GravityCompensator:
         if age_s[worst] > self._settings.stale_s:
             raise StaleFeedback(self._serials[worst], float(age_s[worst]), self._settings.stale_s)
 
+    def _exceeded(self, excess: Array, text: Callable[[int], str]) -> str:
+        """Return the text on the joint with the largest excess (n,), empty if none is above zero."""
+        k = int(np.argmax(excess))
+        return "" if excess[k] <= 0.0 else f"joint {self._serials[k]}: {text(k)}"
+
     def _overload(self, weight_nm: Array) -> str:
-        over = np.abs(weight_nm) - self._max_effort_nm
-        worst = int(np.argmax(over))
-        if over[worst] <= 0.0:
-            return ""
-        return (
-            f"joint {self._serials[worst]}: this pose needs {weight_nm[worst]:.2f} Nm, the limit is "
-            f"{self._max_effort_nm[worst]:.2f} Nm. Move the arm to a pose with less load."
+        most = self._max_effort_nm
+        return self._exceeded(
+            np.abs(weight_nm) - most,
+            lambda k: (
+                f"this pose needs {weight_nm[k]:.2f} Nm, the limit is {most[k]:.2f} Nm. Move the arm to a "
+                "pose with less load."
+            ),
         )
 
-    def _unexplained_offset(self, effort_nm: Array, offset_nm: Array) -> str:
-        weight_nm = effort_nm - offset_nm
-        over = (
-            np.abs(offset_nm)
-            - MAX_OFFSET_OF_WEIGHT * np.abs(weight_nm)
-            - MAX_OFFSET_OF_EFFORT * self._max_effort_nm
-        )
-        worst = int(np.argmax(over))
-        if over[worst] <= 0.0:
-            return ""
-        return (
-            f"joint {self._serials[worst]}: measured {effort_nm[worst]:.2f} Nm, model predicts "
-            f"{weight_nm[worst]:.2f} Nm. Remove any payload or contact, or identify the robot again (base "
-            "orientation changed?)."
+    def _unexplained_offset(self, effort_nm: Array, weight_nm: Array) -> str:
+        explained = MAX_OFFSET_OF_WEIGHT * np.abs(weight_nm) + MAX_OFFSET_OF_EFFORT * self._max_effort_nm
+        return self._exceeded(
+            np.abs(effort_nm - weight_nm) - explained,
+            lambda k: (
+                f"measured {effort_nm[k]:.2f} Nm, model predicts {weight_nm[k]:.2f} Nm. Remove any payload "
+                "or contact, or identify the robot again (base orientation changed?)."
+            ),
         )
 
     def _astray(self, away_rad: Array, max_rad: float, how: str) -> str:
-        worst = int(np.argmax(np.abs(away_rad)))
-        if abs(away_rad[worst]) <= max_rad:
-            return ""
-        return (
-            f"joint {self._serials[worst]}: {np.degrees(abs(away_rad[worst])):.1f} degrees {how}, at most "
-            f"{np.degrees(max_rad):.1f} are allowed. Remove obstacles; identify again if the load changed."
+        return self._exceeded(
+            np.abs(away_rad) - max_rad,
+            lambda k: (
+                f"{np.degrees(abs(away_rad[k])):.1f} degrees {how}, at most {np.degrees(max_rad):.1f} are "
+                "allowed. Remove obstacles; identify again if the load changed."
+            ),
         )
 
     def _too_fast(self, rate_rad_s: Array) -> str:
-        worst = int(np.argmax(np.abs(rate_rad_s)))
-        if abs(rate_rad_s[worst]) <= self._settings.max_speed_rad_s:
-            return ""
-        return (
-            f"joint {self._serials[worst]}: moved at {abs(rate_rad_s[worst]):.2f} rad/s, at most "
-            f"{self._settings.max_speed_rad_s:.2f} rad/s are allowed (--max-speed)"
+        speed, most = np.abs(rate_rad_s), self._settings.max_speed_rad_s
+        return self._exceeded(
+            speed - most,
+            lambda k: f"moved at {speed[k]:.2f} rad/s, at most {most:.2f} rad/s are allowed (--max-speed)",
         )
 
     def _at_an_end(self, q_rad: Array) -> str:
-        beyond = np.maximum(q_rad - self._high, self._low - q_rad)
-        worst = int(np.argmax(beyond))
-        if beyond[worst] <= 0.0:
-            return ""
         margin = self._settings.margin_rad
-        low, high = self._low[worst] - margin, self._high[worst] + margin
-        return (
-            f"joint {self._serials[worst]}: position {q_rad[worst]:.2f} rad is within {margin:.2f} rad of "
-            f"the end of its range, {low:.2f} to {high:.2f} rad"
+        return self._exceeded(
+            np.maximum(q_rad - self._high, self._low - q_rad),
+            lambda k: (
+                f"position {q_rad[k]:.2f} rad is within {margin:.2f} rad of the end of its range, "
+                f"{self._low[k] - margin:.2f} to {self._high[k] + margin:.2f} rad"
+            ),
         )
 
 

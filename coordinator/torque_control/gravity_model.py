@@ -13,6 +13,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_transform
 from coordinator.identification.result import BodiesPart, ModuleBodyPart, Result
 from coordinator.recording.run_folder import RESULT
 from module_agent.model.chain import Array, Chain
+from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
 
 
@@ -31,8 +32,7 @@ class GravityModel(NamedTuple):
         """
         q = np.asarray(q_rad, dtype=float)[None]
         rate = np.asarray(qd_rad_s, dtype=float)[None]
-        found: Array = inverse_dynamics(self.chain, self.phi, q, rate, np.zeros_like(q))[0]
-        return found
+        return np.asarray(inverse_dynamics(self.chain, self.phi, q, rate, np.zeros_like(q))[0])
 
 
 def gravity_model(folder: Path) -> GravityModel:
@@ -71,8 +71,7 @@ def gravity_model_of_result(result: Result) -> GravityModel:
         raise ValueError("a result without dynamics has no inertial parameters")
     chain = result.chain.chain()
     phi = np.array(dynamics.phi) if dynamics.bodies is None else _phi(chain, dynamics.bodies)
-    phi.flags.writeable = False
-    return GravityModel(result.robot, tuple(result.types[s] for s in chain.serials), chain, phi)
+    return GravityModel(result.robot, tuple(result.types[s] for s in chain.serials), chain, read_only(phi))
 
 
 def _phi(chain: Chain, part: BodiesPart) -> Array:

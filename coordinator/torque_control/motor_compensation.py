@@ -19,6 +19,7 @@ manufacturer's.
 """
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,12 +27,20 @@ from coordinator.torque_control.feed_forward import RATE_HZ, SetPoints
 from module_agent.control.controller import NOMINAL_VOLTAGE_V, pwm_per_rad_s, torque_at_full_pwm_nm
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array
+from module_agent.model.read_only import read_only
 from module_agent.model.thermal import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W
 from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import GainSet
 
+Temperature = TypeVar("Temperature", float, Array)
+
 _WINDING_J_K, _HOUSING_J_K, _ = CAPACITIES_J_K
 _WINDING_K_W, _HOUSING_K_W, _ = RESISTANCES_K_W
+# The sign of friction is smoothed within this speed, since it is undefined at rest.
+_SLOW_RAD_S = 0.02
+# The winding's temperature is computed at every tenth tick: it changes by far less within that time.
+_WARMING_TICKS = 10
+_STRATEGIES_WITH_EFFORT = (2, 3, 4)
 
 
 def winding_c(cold_w: Array, step_s: float, start_c: float) -> Array:
@@ -44,29 +53,19 @@ def winding_c(cold_w: Array, step_s: float, start_c: float) -> Array:
     """
     found = np.empty(len(cold_w))
     winding = start_c
-    warm_w = float(cold_w[0]) * _growth(winding)
+    warm_w = float(cold_w[0]) * resistance_factor(winding)
     body = housing = max(AMBIENT_C, winding - _WINDING_K_W * warm_w)
     for k, watt in enumerate(cold_w.tolist()):
         found[k] = winding
         into_housing_w = (winding - housing) / _WINDING_K_W
-        winding += step_s * (watt * _growth(winding) - into_housing_w) / _WINDING_J_K
+        winding += step_s * (watt * resistance_factor(winding) - into_housing_w) / _WINDING_J_K
         housing += step_s * (into_housing_w - (housing - body) / _HOUSING_K_W) / _HOUSING_J_K
     return found
 
 
-def resistance_factor(temperature_c: Array) -> Array:
-    """Return a winding's resistance over that at the ambient temperature, (m,)."""
-    found: Array = 1.0 + COPPER_PER_K * (temperature_c - AMBIENT_C)
-    return found
-
-
-def _growth(temperature_c: float) -> float:
+def resistance_factor(temperature_c: Temperature) -> Temperature:
+    """Return a winding's resistance over that at the ambient temperature."""
     return 1.0 + COPPER_PER_K * (temperature_c - AMBIENT_C)
-
-
-# The sign of friction is smoothed within this speed, since it is undefined at rest.
-_SLOW_RAD_S = 0.02
-_WARMING_TICKS = 10
 
 
 def with_motor_compensation(
@@ -87,7 +86,7 @@ def with_motor_compensation(
     start_c = [AMBIENT_C] * len(kinds) if winding_start_c is None else winding_start_c
     for column, (kind, own, begin_c) in enumerate(zip(kinds, gains, start_c, strict=True)):
         integrates = own.position.ki or own.velocity.ki or own.effort.ki
-        if integrates or own.strategy not in _WITH_EFFORT:
+        if integrates or own.strategy not in _STRATEGIES_WITH_EFFORT:
             continue
         rate = points.reference.qd_rad_s[:, column]
         tau = points.effort_nm[:, column]
@@ -97,11 +96,7 @@ def with_motor_compensation(
         missing = motor_pwm(kind, tau, rate, begin_c) - known
         answer = own.effort.kp + own.effort.feed_forward / torque_at_full_pwm_nm(kind)
         effort[:, column] += missing / answer
-    effort.flags.writeable = False
-    return SetPoints(points.reference, effort)
-
-
-_WITH_EFFORT = (2, 3, 4)
+    return SetPoints(points.reference, read_only(effort))
 
 
 def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array, winding_start_c: float = AMBIENT_C) -> Array:
@@ -117,15 +112,8 @@ def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array, winding_start_c:
     gross = net * (1.0 + drives * (1.0 / motor.efficiency - 1.0))
     per_amp = motor.back_emf_v_s_rad * kind.gear_ratio
     ampere = gross / per_amp
-    ohm = motor.resistance_ohm * resistance_factor(
-        _warmth_c(motor.resistance_ohm * ampere**2, winding_start_c)
-    )
-    found: Array = (ohm * ampere + per_amp * speed) / NOMINAL_VOLTAGE_V
-    return found
-
-
-def _warmth_c(cold_w: Array, start_c: float) -> Array:
-    """Return the winding's temperature (m,) at 1 kHz; it changes by far less within the steps it takes."""
-    ticks = np.arange(len(cold_w))
-    coarse = winding_c(cold_w[::_WARMING_TICKS], _WARMING_TICKS / RATE_HZ, start_c)
-    return np.interp(ticks, ticks[::_WARMING_TICKS], coarse)
+    ticks = np.arange(len(ampere))
+    cold_w = motor.resistance_ohm * ampere[::_WARMING_TICKS] ** 2
+    coarse_c = winding_c(cold_w, _WARMING_TICKS / RATE_HZ, winding_start_c)
+    ohm = motor.resistance_ohm * resistance_factor(np.interp(ticks, ticks[::_WARMING_TICKS], coarse_c))
+    return np.asarray((ohm * ampere + per_amp * speed) / NOMINAL_VOLTAGE_V)

@@ -1,7 +1,6 @@
 """Preconditions of gravity compensation: the modelled robot is there, in the modelled orientation."""
 
 import asyncio
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,13 +25,6 @@ MAX_TILT_RAD = float(np.radians(12.0))
 
 class RobotMismatch(RobotError):
     """The robot is not the modelled one, or oriented differently; the message names the module."""
-
-
-class RestReading(NamedTuple):
-    """Mean feedback of n modules at rest: joint positions (n,) and specific forces (n, 3) [m/s^2]."""
-
-    q_rad: Array
-    accel_m_s2: Array
 
 
 async def find_robot(group: ModuleGroup, messenger: Messenger, model: GravityModel, clock: Clock) -> None:
@@ -65,20 +57,20 @@ async def find_robot(group: ModuleGroup, messenger: Messenger, model: GravityMod
         reported = group.info(serial).module_type
         if reported != kind:
             raise RobotMismatch(f"module {serial} is of type {reported}, in the model it is {kind}")
-    if not await group.wait(lambda: not _without_feedback(group), FEEDBACK_S):
-        raise RobotMismatch(f"module {_without_feedback(group)[0]} answers, but sends no feedback")
+    if not await group.wait(lambda: not group.without_feedback(), FEEDBACK_S):
+        raise RobotMismatch(f"module {group.without_feedback()[0]} answers, but sends no feedback")
 
 
-def check_gravity(chain: Chain, rest: RestReading) -> None:
-    """Check the direction of gravity that every IMU measures against the model.
+def check_gravity(chain: Chain, q_rad: Array, accel_m_s2: Array) -> None:
+    """Check the direction of gravity that every IMU measures at rest, (n, 3), against the model.
 
     Raises:
         RobotMismatch: one deviates: the base is oriented differently, or a joint has lost its zero.
     """
-    poses = imu_poses(chain, rest.q_rad[None])[0]
+    poses = imu_poses(chain, q_rad[None])[0]
     wanted = np.swapaxes(poses[:, :3, :3], 1, 2) @ chain.gravity
-    across = np.linalg.norm(np.cross(rest.accel_m_s2, wanted), axis=1)
-    tilt = np.arctan2(across, np.sum(rest.accel_m_s2 * wanted, axis=1))
+    across = np.linalg.norm(np.cross(accel_m_s2, wanted), axis=1)
+    tilt = np.arctan2(across, np.sum(accel_m_s2 * wanted, axis=1))
     worst = int(np.argmax(tilt))
     if tilt[worst] > MAX_TILT_RAD:
         raise RobotMismatch(
@@ -86,7 +78,3 @@ def check_gravity(chain: Chain, rest: RestReading) -> None:
             f"from the model, at most {np.degrees(MAX_TILT_RAD):.0f} deg are accepted: the base is oriented "
             "differently, or a joint has lost its zero; identify the robot again"
         )
-
-
-def _without_feedback(group: ModuleGroup) -> list[str]:
-    return [serial for serial in group.serials if group.module(serial).feedback_ns is None]

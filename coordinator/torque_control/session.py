@@ -24,7 +24,7 @@ from coordinator.torque_control.gravity_compensation import (
     Targets,
 )
 from coordinator.torque_control.gravity_model import GravityModel
-from coordinator.torque_control.preconditions import RestReading, check_gravity, find_robot
+from coordinator.torque_control.preconditions import check_gravity, find_robot
 from coordinator.torque_control.summary import CompensationSummary, CompensationTally
 from module_agent.model.chain import Array
 from module_agent.transport.transport import Transport
@@ -40,7 +40,6 @@ _REST_ROWS = 25
 # Retained rows; older ones are dropped at this interval.
 _RETAINED_ROWS, _FORGET_EVERY_S = 250, 2.0
 _RELEASED_STATES = ("idle", "expired", "stopped", "fault")
-_READ = ("position_rad", "velocity_rad_s", "effort_nm")
 
 
 class CompensationPlan(NamedTuple):
@@ -107,6 +106,7 @@ class CompensationSession:
         self._end_requests = self._end_requests_seen = 0
         self._held_all = False
         self._is_under_torque = False
+        self._streaming: asyncio.Task[None] | None = None
 
     @property
     def is_asked_to_end(self) -> bool:
@@ -152,33 +152,35 @@ class CompensationSession:
             compensator.check_start(stood)
         except CompensationRefused:
             # Another orientation of the base changes the weight too, and explains more.
-            check_gravity(self._model.chain, self._rest_reading())
+            self._check_gravity()
             raise
         if self._asked:
             return self._tally.summary(self._asked, is_fault=False)
-        streaming: asyncio.Task[None] | None = None
         try:
             await gather_all(self._group.acquire(serial) for serial in self._serials)
-            streaming = asyncio.create_task(self._stream(compensator))
-            await self._compensate(compensator, streaming)
-            await self._return(compensator, stood.q_rad, streaming)
-            await _cancelled(streaming)
+            self._streaming = asyncio.create_task(self._stream(compensator))
+            await self._compensate(compensator)
+            await self._return(compensator, stood.q_rad)
+            await _cancelled(self._streaming)
             await self._release_all()
         except BaseException as error:
-            if streaming is not None:
-                await _cancelled(streaming)
-            await self._abandon(error)
+            if self._streaming is not None:
+                await _cancelled(self._streaming)
+            why = str(error) or type(error).__name__
+            unconfirmed = await self._group.stop_all(why[:200])
+            missing = f"; no confirmation from {', '.join(unconfirmed)}" if unconfirmed else ""
+            self._screen.note(f"stopped: {why}{missing}")
             raise
         return self._tally.summary(compensator.why, compensator.is_fault)
 
     # ------------------------------------------------------------------ compensating
 
-    async def _compensate(self, compensator: GravityCompensator, streaming: "asyncio.Task[None]") -> None:
+    async def _compensate(self, compensator: GravityCompensator) -> None:
         """Release the robot once its motors exert its weight, and hold it at the end."""
-        await self._until(lambda: not compensator.is_in("loading") or bool(self._asked), streaming)
+        await self._until(lambda: not compensator.is_in("loading") or bool(self._asked))
         if compensator.is_in("loaded") and not self._asked:
             # Only while it is held: an IMU in free fall measures no gravity.
-            check_gravity(self._model.chain, self._rest_reading())
+            self._check_gravity()
             damping = self._plan.settings.damping_nm_s_rad
             await gather_all(
                 self._group.set_gains(s, compensation_gains(self._group.kind(s), damping))
@@ -186,14 +188,14 @@ class CompensationSession:
             )
             self._is_under_torque = True
             compensator.release(self._now_s())
-            await self._until(lambda: not compensator.is_in("releasing") or bool(self._asked), streaming)
+            await self._until(lambda: not compensator.is_in("releasing") or bool(self._asked))
             if compensator.is_in("compensating"):
                 self._screen.note("gravity is compensated: lead the robot by hand")
-            await self._until(lambda: self._is_over(compensator), streaming)
+            await self._until(lambda: self._is_over(compensator))
         self._end_requests_seen = self._end_requests
         compensator.hold(self._now_s(), self._asked or "the time is over")
         self._screen.note(f"holding: {compensator.why}")
-        await self._until(lambda: compensator.is_in("held"), streaming)
+        await self._until(lambda: compensator.is_in("held"))
         if self._is_under_torque:
             await gather_all(
                 self._group.set_gains(s, holding_gains(self._group.kind(s))) for s in self._serials
@@ -203,10 +205,10 @@ class CompensationSession:
         over = self._plan.for_s is not None and self._tally.compensated_s >= self._plan.for_s
         return over or bool(self._asked) or not compensator.is_in("compensating")
 
-    async def _until(self, condition: Callable[[], bool], streaming: "asyncio.Task[None]") -> None:
+    async def _until(self, condition: Callable[[], bool]) -> None:
         while not condition():
-            if streaming.done():
-                streaming.result()
+            if self._streaming is not None and self._streaming.done():
+                self._streaming.result()
             self._group.check()
             await asyncio.sleep(POLL_S)
 
@@ -235,9 +237,9 @@ class CompensationSession:
         reading = self._reading()
         targets = compensator.step(now_s, reading)
         self._send(targets)
-        if compensator.phase == "compensating":
-            self._tally.add(now_s, reading.q_rad, reading.qd_rad_s, targets.effort_nm)
         tally = self._tally
+        if compensator.phase == "compensating":
+            tally.add(now_s, reading.q_rad, reading.qd_rad_s, targets.effort_nm)
         self._screen.moment(
             Moment(compensator.phase, tally.compensated_s, tally.missed, reading, targets.effort_nm)
         )
@@ -267,22 +269,19 @@ class CompensationSession:
 
     # ------------------------------------------------------------------ the end
 
-    async def _return(
-        self, compensator: GravityCompensator, stood_rad: Array, streaming: "asyncio.Task[None]"
-    ) -> None:
+    async def _return(self, compensator: GravityCompensator, stood_rad: Array) -> None:
         """Hold the robot still, then return to its start position, where it stood with its motors off.
 
         After an exceeded limit it stays: it may have hit a person, and the way back may be blocked.
         """
-        await self._hold_still(streaming)
+        await self._hold_still()
         if not (self._plan.returns and self._is_under_torque):
             return
         if not compensator.is_fault and self._end_requests == self._end_requests_seen:
             self._screen.note("returning to the start position")
             compensator.return_to(self._now_s(), stood_rad)
             await self._until(
-                lambda: not compensator.is_in("returning") or self._end_requests > self._end_requests_seen,
-                streaming,
+                lambda: not compensator.is_in("returning") or self._end_requests > self._end_requests_seen
             )
             if compensator.is_in("held"):
                 return
@@ -290,13 +289,13 @@ class CompensationSession:
             self._screen.note(
                 f"holding on the way back: {compensator.why if compensator.is_fault else self._asked}"
             )
-            await self._until(lambda: compensator.is_in("held"), streaming)
-            await self._hold_still(streaming)
+            await self._until(lambda: compensator.is_in("held"))
+            await self._hold_still()
         self._screen.note("released at its position without returning: support the arm")
 
-    async def _hold_still(self, streaming: "asyncio.Task[None]") -> None:
+    async def _hold_still(self) -> None:
         end_s = self._now_s() + self._plan.final_hold_s
-        await self._until(lambda: self._now_s() >= end_s, streaming)
+        await self._until(lambda: self._now_s() >= end_s)
 
     async def _release_all(self) -> None:
         keeper = asyncio.create_task(self._group.keep_alive())
@@ -304,13 +303,6 @@ class CompensationSession:
             await self._group.release_all()
         finally:
             await _cancelled(keeper)
-
-    async def _abandon(self, error: BaseException) -> None:
-        why = str(error) or type(error).__name__
-        unconfirmed = await self._group.stop_all(why[:200])
-        self._screen.note(
-            f"stopped: {why}" + (f"; no confirmation from {', '.join(unconfirmed)}" if unconfirmed else "")
-        )
 
     # ------------------------------------------------------------------ feedback
 
@@ -324,19 +316,15 @@ class CompensationSession:
     def _reading(self, count: int = 1) -> Reading:
         """Return the mean of the newest `count` rows of each module."""
         now_ns = self._clock()
-        ages = [
-            1e-9 * (now_ns - self._group.module(serial).newest_row_arrival_ns) for serial in self._serials
-        ]
-        rows = [self._newest(serial, count) for serial in self._serials]
-        means = ([row[name].mean(dtype=float) for row in rows] for name in _READ)
-        return Reading(np.array(ages), *(np.array(values) for values in means))
+        ages = [1e-9 * (now_ns - self._group.module(s).newest_row_arrival_ns) for s in self._serials]
+        return Reading(np.array(ages), *self._means(count, "position_rad", "velocity_rad_s", "effort_nm"))
 
-    def _rest_reading(self) -> RestReading:
-        rows = [self._newest(serial, _REST_ROWS) for serial in self._serials]
-        q = [float(row["position_rad"].mean()) for row in rows]
-        return RestReading(
-            np.array(q), np.array([row["accel_m_s2"].astype(float).mean(axis=0) for row in rows])
-        )
+    def _means(self, count: int, *names: str) -> list[Array]:
+        rows = [self._newest(serial, count) for serial in self._serials]
+        return [np.array([row[name].mean(axis=0, dtype=float) for row in rows]) for name in names]
+
+    def _check_gravity(self) -> None:
+        check_gravity(self._model.chain, *self._means(_REST_ROWS, "position_rad", "accel_m_s2"))
 
     def _forget(self) -> None:
         for serial in self._serials:

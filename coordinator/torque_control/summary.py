@@ -39,23 +39,24 @@ class CompensationTally:
 
     def __init__(self, serials: tuple[str, ...]):
         self._serials = serials
-        self._began: tuple[float, Array] | None = None
-        self._last: tuple[float, Array] = 0.0, np.zeros(len(serials))
-        self._farthest, self._fastest, self._squares, self._most = np.zeros((4, len(serials)))
+        self._start_s = self._end_s = 0.0
+        self._start, self._end, self._farthest, self._fastest, self._squares, self._most = np.zeros(
+            (6, len(serials))
+        )
         self._count = 0
         self.sent = self.missed = 0
 
     @property
     def compensated_s(self) -> float:
         """How long gravity has been compensated so far."""
-        return 0.0 if self._began is None else self._last[0] - self._began[0]
+        return self._end_s - self._start_s
 
     def add(self, t_s: float, q_rad: Array, qd_rad_s: Array, effort_nm: Array) -> None:
         """Add a moment of compensation, (n,) each."""
-        if self._began is None:
-            self._began = t_s, q_rad
-        self._last = t_s, q_rad
-        self._farthest = np.maximum(self._farthest, np.abs(q_rad - self._began[1]))
+        if not self._count:
+            self._start_s, self._start = t_s, q_rad
+        self._end_s, self._end = t_s, q_rad
+        self._farthest = np.maximum(self._farthest, np.abs(q_rad - self._start))
         self._fastest = np.maximum(self._fastest, np.abs(qd_rad_s))
         self._most = np.maximum(self._most, np.abs(effort_nm))
         self._squares = self._squares + effort_nm**2
@@ -63,18 +64,8 @@ class CompensationTally:
 
     def summary(self, why: str, is_fault: bool) -> CompensationSummary:
         """Return the summary."""
-        if self._began is None:
-            return CompensationSummary(why, is_fault, 0.0, self.sent, self.missed, ())
-        columns = (
-            self._began[1],
-            self._last[1],
-            self._farthest,
-            self._fastest,
-            np.sqrt(self._squares / self._count),
-            self._most,
-        )
-        joints = tuple(
-            JointSummary(serial, *(float(column[k]) for column in columns))
-            for k, serial in enumerate(self._serials)
-        )
+        rms = np.sqrt(self._squares / max(self._count, 1))
+        rows = np.column_stack([self._start, self._end, self._farthest, self._fastest, rms, self._most])
+        pairs = zip(self._serials, rows.tolist(), strict=True)
+        joints = tuple(JointSummary(serial, *row) for serial, row in pairs) if self._count else ()
         return CompensationSummary(why, is_fault, self.compensated_s, self.sent, self.missed, joints)

@@ -7,7 +7,6 @@ from coordinator.torque_control.feed_forward import (
     feed_forward,
     joint_reference,
     on_module,
-    paths_together,
     standing,
 )
 from module_agent.control.motion import effort_at
@@ -109,24 +108,3 @@ def test_a_motion_without_efforts_to_calculate_is_refused_in_words(
 def test_a_joint_of_unknown_place_is_refused() -> None:
     with pytest.raises(KeyError, match="joint J1 has no origin"):
         joint_reference(("J0", "J1"), {"J0": SWING}, {"J0": 0.0})
-
-
-# --------------------------------------------------------------------------- together to another pose
-
-
-def test_paths_to_another_pose_end_together_there_and_the_longest_is_as_fast_as_it_may_be() -> None:
-    origins = {"J0": 0.3, "J1": -1.0, "J2": 0.7, "J3": 2.0}
-    targets = {"J0": 0.35, "J1": 1.0, "J2": 0.7, "J3": 2.0 + 5e-5}
-    paths = paths_together(origins, targets, 0.5)
-    reference = joint_reference(tuple(origins), paths, origins)
-    # 2 rad at a peak of 0.5 rad/s, which is 15/8 of the mean.
-    assert reference.t_s[-1] == pytest.approx(7.5, abs=1e-3)
-    np.testing.assert_allclose(reference.q_rad[-1], list(targets.values()), atol=1e-4)
-    np.testing.assert_allclose(np.abs(reference.qd_rad_s).max(axis=0), [0.0125, 0.5, 0.0, 0.0], atol=1e-6)
-
-
-def test_a_pose_that_is_there_already_is_stood_in_for_a_moment() -> None:
-    paths = paths_together({"J0": 0.3}, {"J0": 0.3}, 0.5)
-    assert [path.kind for path in paths.values()] == ["rest"]
-    with pytest.raises(ValueError, match="no joint has a target"):
-        paths_together({"J0": 0.3}, {}, 0.5)
