@@ -15,10 +15,11 @@ from coordinator.arm_fit.fit import Elsewhere, fit_and_test
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.report import FitReport
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
-from coordinator.description.urdf_update import fitted_urdf_text, friction_of, write_fitted_urdf
+from coordinator.description.urdf_update import fitted_urdf_text, friction_of
 from coordinator.dynamics.pseudo_inertia import Body
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError, UsageError
+from module_agent.model.files import write_text
 
 _USUAL = ModelChoice()
 
@@ -54,7 +55,7 @@ class ArmFit(NamedTuple):
                 f"{path}: not written, there are no physically consistent bodies: "
                 f"{self.report.fit.bodies_note}"
             )
-        write_fitted_urdf(Path(path), self.urdf)
+        write_text(Path(path), self.urdf)
 
 
 def fit_dynamics(

@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from module_agent.model.chain import Array, Chain
 from module_agent.model.read_only import frozen
@@ -55,55 +54,20 @@ def dh_path(chain: Chain, leaf: int, parallel_below_rad: float = PARALLEL_BELOW_
     frame = _frame(chain.axis[first], _x_axis_across(chain.axis[first]), chain.point[first])
     base, rows = frozen(frame), []
     for joint, following in pairwise(path):
-        row, frame = _step(
-            chain.serials[joint], frame, chain.axis[following], chain.point[following], parallel_below_rad
+        x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
+        axis = chain.axis[following]
+        normal, foot, along = _common_normal(frame, axis, chain.point[following], parallel_below_rad)
+        row = DhRow(
+            serial=chain.serials[joint],
+            theta_rad=_angle(x, normal, z),
+            d_m=float((foot - origin) @ z),
+            a_m=float((along - foot) @ normal),
+            alpha_rad=_angle(z, axis, normal),
         )
         rows.append(row)
+        frame = _frame(axis, normal, along)
     rows.append(DhRow(chain.serials[path[-1]], 0.0, 0.0, 0.0, 0.0))
     return DhPath(base, tuple(rows))
-
-
-def dh_transform(theta_rad: ArrayLike, d_m: float, a_m: float, alpha_rad: float) -> Array:
-    """Return eq. 2 for (m,) joint angles: (m, 4, 4) poses of frame i in frame i - 1."""
-    theta = np.atleast_1d(np.asarray(theta_rad, dtype=float))
-    c, s, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha_rad), np.sin(alpha_rad)
-    poses = np.zeros((theta.size, 4, 4))
-    poses[:, 0] = np.stack([c, -s * ca, s * sa, a_m * c], axis=1)
-    poses[:, 1] = np.stack([s, c * ca, -c * sa, a_m * s], axis=1)
-    poses[:, 2] = [0.0, sa, ca, d_m]
-    poses[:, 3, 3] = 1.0
-    return poses
-
-
-def dh_poses(path: DhPath, q_rad: ArrayLike) -> Array:
-    """Return the pose of the last frame in the root frame, (m, 4, 4), for `q_rad` (m, joints of the path).
-
-    Raises:
-        ValueError: wrong shape.
-    """
-    q = np.asarray(q_rad, dtype=float)
-    if q.ndim != 2 or q.shape[1] != len(path.rows):
-        raise ValueError(f"q_rad has shape {q.shape}; (samples, {len(path.rows)}) is needed for this path")
-    pose = np.broadcast_to(path.base, (q.shape[0], 4, 4))
-    for i, row in enumerate(path.rows):
-        pose = pose @ dh_transform(row.theta_rad + q[:, i], row.d_m, row.a_m, row.alpha_rad)
-    return frozen(pose)
-
-
-def _step(
-    serial: str, frame: Array, axis: Array, point: Array, parallel_below_rad: float
-) -> tuple[DhRow, Array]:
-    """Return the row that leads from a frame to the next axis, and the frame there."""
-    x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
-    normal, foot, along = _common_normal(frame, axis, point, parallel_below_rad)
-    row = DhRow(
-        serial=serial,
-        theta_rad=_angle(x, normal, z),
-        d_m=float((foot - origin) @ z),
-        a_m=float((along - foot) @ normal),
-        alpha_rad=_angle(z, axis, normal),
-    )
-    return row, _frame(axis, normal, along)
 
 
 def _common_normal(

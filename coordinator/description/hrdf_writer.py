@@ -12,23 +12,29 @@ The base frame has z up; the degrees of freedom are in the order of the file, wh
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, indent
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.description.urdf_writer import link_homes, upright_pose
+from coordinator.description.urdf_writer import (
+    INERTIA,
+    comment,
+    inertia_attributes,
+    link_homes,
+    numbers,
+    upright_pose,
+    write_xml,
+)
 from coordinator.dynamics.pseudo_inertia import body, is_consistent, nearest_consistent, pseudo_inertia
 from coordinator.kinematics.frames import distal_homes, housing_homes
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import BASE, Array, Chain
-from module_agent.model.files import replacing
 from module_agent.model.regressor import PER_BODY, check_phi
 
 VERSION = "1.6.0"
 # Two frames, or a joint's axis and its module's, are the same below this (m, and rad at a metre).
 SAME_BELOW = 1e-11
-_INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 class _Robot(NamedTuple):
@@ -68,10 +74,7 @@ def write_hrdf(
         ValueError: `phi` or `types` do not fit the chain.
         OSError: the file cannot be written.
     """
-    robot = hrdf_element(chain, types, phi, name)
-    indent(robot, space="  ")
-    with replacing(path) as temporary:
-        ElementTree(robot).write(temporary, encoding="utf-8", xml_declaration=True)
+    write_xml(path, hrdf_element(chain, types, phi, name))
 
 
 def hrdf_element(
@@ -79,14 +82,14 @@ def hrdf_element(
 ) -> Element:
     """Return the `robot` element; for the arguments and errors see `write_hrdf`."""
     written = _prepared(chain, types, phi)
-    rot = _numbers(upright_pose(chain.gravity)[:3, :3])
+    rot = numbers(upright_pose(chain.gravity)[:3, :3])
     robot = Element("robot", version=VERSION, rot=rot, description=name)
     order = ", ".join(chain.serials[k] for k in joint_order(chain))
-    _comment(robot, f"Lengths in m. The order of the degrees of freedom: {order}.")
+    comment(robot, f"Lengths in m. The order of the degrees of freedom: {order}.")
     if phi is None:
-        _comment(robot, "Masses of links are not identified: only the actuators have their types' mass.")
+        comment(robot, "Masses of links are not identified: only the actuators have their types' mass.")
     else:
-        _comment(robot, "The modules' own masses are part of the identified bodies.")
+        comment(robot, "The modules' own masses are part of the identified bodies.")
     _follow(robot, written, BASE, np.eye(4))
     return robot
 
@@ -149,7 +152,7 @@ def _joint(parent: Element, robot: _Robot, k: int) -> Array:
     if made is None:
         SubElement(parent, "joint", {"axis": "rz", "tag": serial})
     else:
-        none = {} if robot.bodies is None else dict.fromkeys(("mass", *_INERTIA), "0")
+        none = {} if robot.bodies is None else dict.fromkeys(("mass", *INERTIA), "0")
         SubElement(parent, "actuator", {"type": made, "tag": serial} | none)
     return np.asarray(robot.leave[k])
 
@@ -169,25 +172,16 @@ def _mass(parent: Element, robot: _Robot, carrier: int, frame: Array) -> dict[st
     into = np.linalg.inv(frame)
     pseudo = into @ pseudo_inertia(robot.bodies[carrier]) @ into.T
     if not is_consistent(pseudo):
-        remark = (
-            "The identified parameters of the next body are no real body's; this is the nearest real one."
+        comment(
+            parent,
+            "The identified parameters of the next body are no real body's; this is the nearest real one. "
+            "For torques use those in result.json.",
         )
-        _comment(parent, f"{remark} For torques use those in result.json.")
         pseudo = nearest_consistent(pseudo)
     real = body(pseudo)
-    values = real.inertia_kg_m2[np.triu_indices(3)]
-    inertia = {key: _numbers(value) for key, value in zip(_INERTIA, values, strict=True)}
-    return {"mass": _numbers(real.mass_kg), "com_trans": _numbers(real.com_m)} | inertia
+    mass = {"mass": numbers(real.mass_kg), "com_trans": numbers(real.com_m)}
+    return mass | inertia_attributes(real, numbers)
 
 
 def _pose(pose: Array, prefix: str) -> dict[str, str]:
-    return {f"{prefix}trans": _numbers(pose[:3, 3]), f"{prefix}rot": _numbers(pose[:3, :3])}
-
-
-def _comment(parent: Element, text: str) -> None:
-    parent.append(Comment(f" {text.replace('--', '- -')} "))
-
-
-def _numbers(values: ArrayLike) -> str:
-    # 15 digits: what survives a round trip through decimal in every reader. Adding 0 makes no zero negative.
-    return " ".join(f"{float(value) + 0.0:.15g}" for value in np.asarray(values, dtype=float).ravel())
+    return {f"{prefix}trans": numbers(pose[:3, 3]), f"{prefix}rot": numbers(pose[:3, :3])}

@@ -11,7 +11,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import RigidTransform
 
 from coordinator.kinematics.frames import distal_homes
 from module_agent.model.catalogue import ModuleType
@@ -72,40 +71,22 @@ def screw_model(chain: Chain, types: Sequence[ModuleType], covariance: ArrayLike
         serials=chain.serials,
         screws=screws,
         covariance=frozen(slope @ own @ np.swapaxes(slope, 1, 2)),
-        tips=tuple(_tip(chain, leaf, homes[leaf], own[leaf]) for leaf in chain.leaves),
+        tips=tuple(
+            Tip(
+                serial=chain.serials[leaf],
+                frame="housing" if chain.reversed[leaf] else "output",
+                joints=tuple(chain.serials[k] for k in chain.ancestors(leaf)),
+                home=frozen(homes[leaf]),
+                covariance=frozen(own[leaf]),
+            )
+            for leaf in chain.leaves
+        ),
     )
 
 
 def screw_axes(chain: Chain) -> Array:
     """Return the (n, 6) screw axes of the joints at q = 0 in the root frame, read-only."""
     return frozen(np.concatenate([chain.axis, np.cross(chain.point, chain.axis)], axis=1))
-
-
-def tip_poses(model: ScrewModel, tip: Tip, q_rad: ArrayLike) -> Array:
-    """Return the tip's pose (m, 4, 4) in the space frame, read-only, at `q_rad` (m, n) in `model.serials`.
-
-    Raises:
-        ValueError: wrong shape.
-    """
-    q = np.asarray(q_rad, dtype=float)
-    if q.ndim != 2 or q.shape[1] != len(model.serials):
-        raise ValueError(f"q_rad has shape {q.shape}; (samples, {len(model.serials)}) is needed")
-    pose = np.broadcast_to(np.eye(4), (q.shape[0], 4, 4))
-    for serial in tip.joints:
-        joint = model.serials.index(serial)
-        twists = q[:, joint, None] * model.screws[joint]
-        pose = pose @ RigidTransform.from_exp_coords(twists).as_matrix()
-    return frozen(pose @ tip.home)
-
-
-def _tip(chain: Chain, leaf: int, home: Array, covariance: Array) -> Tip:
-    return Tip(
-        serial=chain.serials[leaf],
-        frame="housing" if chain.reversed[leaf] else "output",
-        joints=tuple(chain.serials[i] for i in chain.ancestors(leaf)),
-        home=frozen(home),
-        covariance=frozen(covariance),
-    )
 
 
 def _ad(twists: Array) -> Array:

@@ -6,13 +6,14 @@ root link do not move and are left out. A body's own frame is that of the link r
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 from xml.etree.ElementTree import Element, ParseError, parse
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from coordinator.description.urdf_writer import INERTIA
 from coordinator.dynamics.pseudo_inertia import parameters, pseudo_inertia
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import UsageError
@@ -90,125 +91,105 @@ def read_urdf(path: str | Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRo
 def _robot(root: Element, gravity: Array) -> UrdfRobot:
     links = {_name(link): link for link in root.findall("link")}
     joints = [_joint(element, links) for element in root.findall("joint")]
-    ordered = _ordered(joints, _base(joints, links))
-    moving = [joint for joint in ordered if joint.moves]
+    root_link = _root_link(joints, links)
+    moving, placed = _placed(joints, root_link)
     if not moving:
-        _refuse("it has no moving joint")
-    placed = _placed(ordered)
+        raise UrdfError("it has no moving joint")
     homes = np.array([placed[joint.child].pose for joint in moving])
     axis = np.array([home[:3, :3] @ j.axis for home, j in zip(homes, moving, strict=True)])
     point = homes[:, :3, 3].copy()
     make_read_only((homes, axis, point, gravity))
     chain = Chain(
         serials=tuple(joint.name for joint in moving),
-        parent=tuple(_body(placed, joint.parent) for joint in moving),
+        parent=tuple(placed[joint.parent].body for joint in moving),
         reversed=(False,) * len(moving),
         axis=axis,
         point=point,
         imu_home=homes,
         gravity=gravity,
     )
+    carried = {link: place for link, place in placed.items() if place.body != BASE}
     return UrdfRobot(
         chain,
         tuple(joint.child for joint in moving),
         homes,
-        frozenset(link for link, (_, body) in placed.items() if body != BASE),
-        _inertias(links, placed, len(moving)),
+        frozenset(carried),
+        _inertias(links, carried, len(moving)),
     )
 
 
 def _joint(element: Element, links: dict[str, Element]) -> _Joint:
     name, kind = _name(element), element.get("type", "")
     if kind not in (*_MOVING, _FIXED):
-        _refuse(f"joint {name!r} is {kind or 'of no type'}; revolute, continuous and fixed joints are known")
+        raise UrdfError(
+            f"joint {name!r} is {kind or 'of no type'}; revolute, continuous and fixed joints are known"
+        )
     if element.find("mimic") is not None:
-        _refuse(f"joint {name!r} mimics another; only joints that move by themselves are known")
-    ends = [_end(element, name, end, links) for end in ("parent", "child")]
+        raise UrdfError(f"joint {name!r} mimics another; only joints that move by themselves are known")
+    ends = []
+    for end in ("parent", "child"):
+        end_element = element.find(end)
+        link = None if end_element is None else end_element.get("link")
+        if link is None or link not in links:
+            raise UrdfError(f"joint {name!r} has {end} {link!r}, and no link has that name")
+        ends.append(link)
     axis_element = element.find("axis")
-    axis = (
-        np.array([1.0, 0.0, 0.0])
-        if axis_element is None
-        else _three(axis_element, "xyz", f"axis of joint {name!r}")
-    )
+    axis = np.array([1.0, 0.0, 0.0])
+    if axis_element is not None:
+        axis = _three(axis_element, "xyz", f"axis of joint {name!r}")
     length = float(np.linalg.norm(axis))
     if kind in _MOVING and not length > 1e-9:
-        _refuse(f"axis of joint {name!r} is zero; it must be a direction")
+        raise UrdfError(f"axis of joint {name!r} is zero; it must be a direction")
     pose = _pose(element.find("origin"), f"origin of joint {name!r}")
     return _Joint(name, ends[0], ends[1], kind in _MOVING, pose, axis / max(length, 1e-9))
 
 
-def _end(element: Element, name: str, end: str, links: dict[str, Element]) -> str:
-    end_element = element.find(end)
-    link = None if end_element is None else end_element.get("link")
-    if link is None or link not in links:
-        _refuse(f"joint {name!r} has {end} {link!r}, and no link has that name")
-    return link
-
-
-def _base(joints: Sequence[_Joint], links: dict[str, Element]) -> str:
+def _root_link(joints: Sequence[_Joint], links: dict[str, Element]) -> str:
     children = [joint.child for joint in joints]
-    for joint in joints:
-        if children.count(joint.child) > 1:
-            _refuse(f"link {joint.child!r} is the child of several joints; a tree is needed")
+    if twice := [link for link in children if children.count(link) > 1]:
+        raise UrdfError(f"link {twice[0]!r} is the child of several joints; a tree is needed")
     roots = [link for link in links if link not in children]
     if len(roots) != 1:
-        _refuse(f"its root links are {', '.join(roots) or 'none'}; a tree has one, every other is a child")
+        raise UrdfError(
+            f"its root links are {', '.join(roots) or 'none'}; a tree has one, every other is a child"
+        )
     return roots[0]
 
 
-def _ordered(joints: Sequence[_Joint], base: str) -> list[_Joint]:
-    """Return the joints in the file's order, but parents before children."""
-    reached, waiting, ordered = {base}, list(joints), list[_Joint]()
+def _placed(joints: Sequence[_Joint], root_link: str) -> tuple[list[_Joint], dict[str, _Placed]]:
+    """Return the moving joints in the file's order, but parents before children, and all links' places."""
+    placed, waiting, moving = {root_link: _Placed(np.eye(4), BASE)}, list(joints), list[_Joint]()
     while waiting:
-        following = next((joint for joint in waiting if joint.parent in reached), None)
-        if following is None:
-            _refuse(f"joint {waiting[0].name!r} is part of a ring; a tree is needed")
-        waiting.remove(following)
-        reached.add(following.child)
-        ordered.append(following)
-    return ordered
+        joint = next((one for one in waiting if one.parent in placed), None)
+        if joint is None:
+            raise UrdfError(f"joint {waiting[0].name!r} is part of a ring; a tree is needed")
+        waiting.remove(joint)
+        below = placed[joint.parent]
+        placed[joint.child] = _Placed(below.pose @ joint.pose, len(moving) if joint.moves else below.body)
+        if joint.moves:
+            moving.append(joint)
+    return moving, placed
 
 
-def _placed(ordered: Sequence[_Joint]) -> dict[str, _Placed]:
-    """Place every link that some joint carries, fixed or moving."""
-    placed: dict[str, _Placed] = {}
-    bodies = 0
-    for joint in ordered:
-        below = placed.get(joint.parent, _Placed(np.eye(4), BASE))
-        placed[joint.child] = _Placed(below.pose @ joint.pose, bodies if joint.moves else below.body)
-        bodies += joint.moves
-    return placed
-
-
-def _body(placed: dict[str, _Placed], link: str) -> int:
-    return placed[link].body if link in placed else BASE
-
-
-def _inertias(links: dict[str, Element], placed: dict[str, _Placed], joints: int) -> Array | None:
+def _inertias(links: dict[str, Element], carried: dict[str, _Placed], joints: int) -> Array | None:
     total = np.zeros((joints, 4, 4))
     claimed = False
-    for name, (pose, body) in placed.items():
-        inertial = links[name].find("inertial")
-        if inertial is None or body == BASE:
-            continue
-        claimed = True
-        total[body] += pose @ _link_inertia(inertial, f"inertial of link {name!r}") @ pose.T
-    if not claimed:
-        return None
-    phi = np.concatenate([parameters(pseudo) for pseudo in total])
-    return read_only(phi)
+    for name, (pose, body) in carried.items():
+        if (inertial := links[name].find("inertial")) is not None:
+            claimed = True
+            total[body] += pose @ _link_inertia(inertial, f"inertial of link {name!r}") @ pose.T
+    return read_only(np.concatenate([parameters(pseudo) for pseudo in total])) if claimed else None
 
 
 def _link_inertia(inertial: Element, where: str) -> Array:
     """Return the pseudo-inertia in the link's frame."""
     mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
-        _refuse(f"{where} lacks <mass> or <inertia>")
-    about_centre = [_number(inertia, key, where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")]
-    phi = np.array([_number(mass, "value", where), 0.0, 0.0, 0.0, *about_centre])
+        raise UrdfError(f"{where} lacks <mass> or <inertia>")
+    about_centre = [_float(inertia.get(key, ""), key, where) for key in INERTIA]
+    phi = np.array([_float(mass.get("value", ""), "value", where), 0.0, 0.0, 0.0, *about_centre])
     pose = _pose(inertial.find("origin"), where)
-    in_link: Array = pose @ pseudo_inertia(phi) @ pose.T
-    return in_link
+    return np.asarray(pose @ pseudo_inertia(phi) @ pose.T)
 
 
 def _pose(origin: Element | None, where: str) -> Array:
@@ -223,12 +204,8 @@ def _pose(origin: Element | None, where: str) -> Array:
 def _three(element: Element, key: str, where: str, default: str = "") -> Array:
     numbers = element.get(key, default).split()
     if len(numbers) != 3:
-        _refuse(f"{where}: {key}={element.get(key)!r}; three numbers are needed")
+        raise UrdfError(f"{where}: {key}={element.get(key)!r}; three numbers are needed")
     return np.array([_float(word, key, where) for word in numbers])
-
-
-def _number(element: Element, key: str, where: str) -> float:
-    return _float(element.get(key, ""), key, where)
 
 
 def _float(word: str, key: str, where: str) -> float:
@@ -237,16 +214,12 @@ def _float(word: str, key: str, where: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        _refuse(f"{where}: {key} holds {word!r}; a finite number is needed")
+        raise UrdfError(f"{where}: {key} holds {word!r}; a finite number is needed")
     return value
 
 
 def _name(element: Element) -> str:
     name = element.get("name")
     if not name:
-        _refuse(f"a <{element.tag}> has no name")
+        raise UrdfError(f"a <{element.tag}> has no name")
     return name
-
-
-def _refuse(text: str) -> NoReturn:
-    raise UrdfError(text)

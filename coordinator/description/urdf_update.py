@@ -1,7 +1,6 @@
 """Put fitted bodies and friction into a robot's own URDF, whose other contents stay."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from xml.etree.ElementTree import (
     Comment,
     Element,
@@ -17,10 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.description.urdf_reader import UrdfRobot
+from coordinator.description.urdf_writer import inertial_element
 from coordinator.dynamics.drive_model import DriveColumn
 from coordinator.dynamics.pseudo_inertia import Body
 from module_agent.model.chain import Array
-from module_agent.model.files import write_text
+from module_agent.model.read_only import read_only
 
 
 def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLike) -> str:
@@ -43,7 +43,7 @@ def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLi
             for old in link.findall("inertial"):
                 link.remove(old)
         if name in heads:
-            link.insert(0, _inertial(heads[name]))
+            link.insert(0, inertial_element(heads[name], _exact))
     drives = dict(zip(robot.chain.serials, np.asarray(friction).tolist(), strict=True))
     for joint in root.findall("joint"):
         if joint.get("name", "") in drives:
@@ -51,15 +51,6 @@ def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLi
     indent(root)
     root.insert(0, Comment(" Inertias and friction were identified from torques. "))
     return str(tostring(root, encoding="utf-8", xml_declaration=True), "utf-8")
-
-
-def write_fitted_urdf(path: Path, text: str) -> None:
-    """Write the text of a URDF; the file is the complete old or the complete new one.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    write_text(path, text)
 
 
 def friction_of(drives: Sequence[DriveColumn], values: Sequence[float], joints: int) -> Array:
@@ -71,25 +62,14 @@ def friction_of(drives: Sequence[DriveColumn], values: Sequence[float], joints: 
     for drive, value in zip(drives, values, strict=True):
         if len(drive.joints) == 1 and drive.term in ("viscous", "coulomb"):
             friction[drive.joints[0], ("viscous", "coulomb").index(drive.term)] = max(0.0, float(value))
-    friction.flags.writeable = False
-    return friction
-
-
-def _inertial(body: Body) -> Element:
-    element = Element("inertial")
-    SubElement(element, "origin", xyz=" ".join(_text(x) for x in body.com_m), rpy="0 0 0")
-    SubElement(element, "mass", value=_text(body.mass_kg))
-    i = body.inertia_kg_m2
-    entries = zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), i[np.triu_indices(3)], strict=True)
-    SubElement(element, "inertia", {key: _text(value) for key, value in entries})
-    return element
+    return read_only(friction)
 
 
 def _set_friction(joint: Element, damping: float, friction: float) -> None:
     for old in joint.findall("dynamics"):
         joint.remove(old)
-    SubElement(joint, "dynamics", damping=_text(damping), friction=_text(friction))
+    SubElement(joint, "dynamics", damping=_exact(damping), friction=_exact(friction))
 
 
-def _text(value: float) -> str:
-    return repr(float(value))
+def _exact(values: ArrayLike) -> str:
+    return " ".join(repr(float(value)) for value in np.asarray(values).ravel())

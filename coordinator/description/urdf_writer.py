@@ -5,7 +5,7 @@ root frame. Body i is the link `body_<serial>` with z on its joint's axis at q =
 `joint_<serial>`; `imu_<serial>` is a link fixed to the body that carries the IMU.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, indent
 
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from coordinator.dynamics.pseudo_inertia import (
+    Body,
     body,
     is_consistent,
     nearest_consistent,
@@ -25,6 +26,8 @@ from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.files import replacing
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, check_phi
+
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def write_urdf(
@@ -49,10 +52,7 @@ def write_urdf(
         ValueError: `phi` or `module_types` do not fit the chain.
         OSError: the file cannot be written.
     """
-    robot = robot_element(chain, phi, name, module_types)
-    indent(robot, space="  ")
-    with replacing(path) as temporary:
-        ElementTree(robot).write(temporary, encoding="utf-8", xml_declaration=True)
+    write_xml(path, robot_element(chain, phi, name, module_types))
 
 
 def robot_element(
@@ -67,33 +67,28 @@ def robot_element(
         raise ValueError(f"{len(module_types)} module types for a chain of {joints} joints")
     bodies = None if phi is None else check_phi(chain, phi).reshape(joints, PER_BODY)
     homes = link_homes(chain)
+    names = {BASE: "base"} | {k: f"body_{serial}" for k, serial in enumerate(chain.serials)}
     robot = Element("robot", name=name)
-    _comment(robot, "Joint positions are the modules' own; every frame is where it is at q = 0. SI units.")
+    comment(robot, "Joint positions are the modules' own; every frame is where it is at q = 0. SI units.")
     SubElement(robot, "link", name="world")
     SubElement(robot, "link", name="base")
     _joint(robot, "world_to_base", "fixed", "world", "base", upright_pose(chain.gravity))
     for i, serial in enumerate(chain.serials):
-        link = SubElement(robot, "link", name=f"body_{serial}")
+        link = SubElement(robot, "link", name=names[i])
         if bodies is not None:
             _inertial(link, bodies[i], homes[i])
         parent = chain.parent[i]
-        joint = _joint(
-            robot,
-            f"joint_{serial}",
-            "continuous",
-            _link_name(chain, parent),
-            f"body_{serial}",
-            _relative(homes, parent, homes[i]),
-        )
+        pose = _relative(homes, parent, homes[i])
+        joint = _joint(robot, f"joint_{serial}", "continuous", names[parent], names[i], pose)
         SubElement(joint, "axis", xyz="0 0 1")
         if module_types is not None:
-            kind = module_types[i]
-            SubElement(joint, "limit", effort=_text(kind.max_effort_nm), velocity=_text(kind.max_speed_rad_s))
+            effort, velocity = module_types[i].max_effort_nm, module_types[i].max_speed_rad_s
+            SubElement(joint, "limit", effort=numbers(effort), velocity=numbers(velocity))
     for k, serial in enumerate(chain.serials):
         on = chain.carrier(k)
         SubElement(robot, "link", name=f"imu_{serial}")
         pose = _relative(homes, on, chain.imu_home[k])
-        _joint(robot, f"imu_mount_{serial}", "fixed", _link_name(chain, on), f"imu_{serial}", pose)
+        _joint(robot, f"imu_mount_{serial}", "fixed", names[on], f"imu_{serial}", pose)
     return robot
 
 
@@ -111,8 +106,7 @@ def link_homes(chain: Chain) -> Array:
 
 
 def _shortest_turn(from_direction: Array, to_direction: Array) -> Array:
-    rotation: Array = Rotation.align_vectors([to_direction], [from_direction])[0].as_matrix()
-    return rotation
+    return np.asarray(Rotation.align_vectors([to_direction], [from_direction])[0].as_matrix())
 
 
 def upright_pose(gravity: Array) -> Array:
@@ -124,13 +118,8 @@ def upright_pose(gravity: Array) -> Array:
     return pose
 
 
-def _link_name(chain: Chain, body_index: int) -> str:
-    return "base" if body_index == BASE else f"body_{chain.serials[body_index]}"
-
-
 def _relative(homes: Array, parent: int, pose: Array) -> Array:
-    relative: Array = pose if parent == BASE else np.linalg.solve(homes[parent], pose)
-    return relative
+    return pose if parent == BASE else np.asarray(np.linalg.solve(homes[parent], pose))
 
 
 def _joint(robot: Element, name: str, kind: str, parent: str, child: str, pose: Array) -> Element:
@@ -140,7 +129,7 @@ def _joint(robot: Element, name: str, kind: str, parent: str, child: str, pose: 
     # URDF turns about the fixed x, y and z in this order. At a pitch of 90 degrees roll and yaw are one
     # angle: any split of it is right, so the warning is suppressed.
     rpy = Rotation.from_matrix(pose[:3, :3]).as_euler("xyz", suppress_warnings=True)
-    SubElement(joint, "origin", xyz=_texts(pose[:3, 3]), rpy=_texts(rpy))
+    SubElement(joint, "origin", xyz=numbers(pose[:3, 3]), rpy=numbers(rpy))
     return joint
 
 
@@ -149,30 +138,47 @@ def _inertial(link: Element, phi: Array, home: Array) -> None:
     into_link = np.linalg.inv(home)
     pseudo = into_link @ pseudo_inertia(phi) @ into_link.T
     if not is_consistent(pseudo):
-        _comment(
+        comment(
             link,
             f"The identified parameters of this link are no real body's (mass {phi[0]:.4g} kg, smallest "
             f"eigenvalue of the pseudo-inertia {smallest_eigenvalue(pseudo):.3g} kg): torques do not show "
             "all of them. This is the nearest real body; for torques use the parameters in result.json.",
         )
         pseudo = nearest_consistent(pseudo)
-    real = body(pseudo)
-    block = SubElement(link, "inertial")
-    SubElement(block, "origin", xyz=_texts(real.com_m), rpy="0 0 0")
-    SubElement(block, "mass", value=_text(real.mass_kg))
-    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    values = real.inertia_kg_m2[np.triu_indices(3)]
-    SubElement(block, "inertia", {key: _text(value) for key, value in zip(names, values, strict=True)})
+    link.append(inertial_element(body(pseudo), numbers))
 
 
-def _comment(parent: Element, text: str) -> None:
-    parent.append(Comment(f" {text} "))
+def inertial_element(real: Body, text: Callable[[ArrayLike], str]) -> Element:
+    """Return the inertial block of a body in its link's frame, with numbers as `text` writes them."""
+    block = Element("inertial")
+    SubElement(block, "origin", xyz=text(real.com_m), rpy="0 0 0")
+    SubElement(block, "mass", value=text(real.mass_kg))
+    SubElement(block, "inertia", inertia_attributes(real, text))
+    return block
 
 
-def _text(value: float) -> str:
-    # 15 digits: what survives a round trip through decimal in every reader.
-    return f"{float(value):.15g}"
+def inertia_attributes(real: Body, text: Callable[[ArrayLike], str]) -> dict[str, str]:
+    """Return the six entries of a body's inertia about its centre by their names."""
+    entries = zip(INERTIA, real.inertia_kg_m2[np.triu_indices(3)], strict=True)
+    return {key: text(value) for key, value in entries}
 
 
-def _texts(values: ArrayLike) -> str:
-    return " ".join(_text(value) for value in np.asarray(values, dtype=float))
+def comment(parent: Element, text: str) -> None:
+    """Add a comment, in which XML allows no double hyphen."""
+    parent.append(Comment(f" {text.replace('--', '- -')} "))
+
+
+def numbers(values: ArrayLike) -> str:
+    """Return numbers as text, with the 15 digits that survive a round trip in every reader; no zero is -0."""
+    return " ".join(f"{float(value) + 0.0:.15g}" for value in np.asarray(values, dtype=float).ravel())
+
+
+def write_xml(path: Path, root: Element) -> None:
+    """Write an XML file; it is the complete old or the complete new one.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    indent(root, space="  ")
+    with replacing(path) as temporary:
+        ElementTree(root).write(temporary, encoding="utf-8", xml_declaration=True)

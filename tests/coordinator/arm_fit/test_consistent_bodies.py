@@ -25,7 +25,7 @@ from coordinator.arm_fit.data_file import read_log
 from coordinator.arm_fit.filtered_log import filtered_log
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.description.urdf_reader import read_urdf
-from coordinator.description.urdf_update import fitted_urdf_text, friction_of, write_fitted_urdf
+from coordinator.description.urdf_update import fitted_urdf_text, friction_of
 from coordinator.dynamics.drive_model import DriveColumn
 from coordinator.dynamics.pseudo_inertia import is_consistent, pseudo_inertia
 
@@ -77,7 +77,7 @@ def test_the_fitted_urdf_gives_another_program_the_same_torques(
     posed, found = found_in(wrong, recording.npz)
     out = tmp_path / "fitted.urdf"
     friction = friction_of(posed.drives, found.drives.tolist(), 3)
-    write_fitted_urdf(out, fitted_urdf_text(posed.robot, found.bodies, friction))
+    out.write_text(fitted_urdf_text(posed.robot, found.bodies, friction), encoding="utf-8")
     model = pin.buildModelFromUrdf(str(out))
     data = model.createData()
     log = posed.log
