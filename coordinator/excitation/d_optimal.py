@@ -57,15 +57,11 @@ class Excitation(NamedTuple):
 
     rank: number of base parameters that any candidate excites. log_det: of the information of those, per
     kg^-2.
-    condition: of the stacked regressor within them. refused: candidates that came too near to the robot
-        itself or exceeded a motor's torque, even when made smaller.
     """
 
     segments: tuple[Segment, ...]
     rank: int
     log_det: float
-    condition: float
-    refused: int
 
 
 def design_excitation(
@@ -92,18 +88,13 @@ def design_excitation(
             f"{len(kept)} of {candidates} motions within {task.reach_rad:.2f} rad of home are possible, "
             f"{task.segments} are needed; most were refused for {worst}: begin elsewhere, or reach less far"
         )
-    base = _base_directions(pieces)
+    # The directions that all candidates together excite.
+    values, vectors = np.linalg.eigh(np.sum(pieces, axis=0))
+    base = vectors[:, values > BASE_TOLERANCE * values[-1]]
     within = np.array([base.T @ piece @ base for piece in pieces])
     chosen = _exchanged(within, _greedy(within, task.segments))
-    total = within[chosen].sum(axis=0)
-    values = np.linalg.eigvalsh(total)
-    return Excitation(
-        tuple(kept[k] for k in chosen),
-        base.shape[1],
-        float(np.linalg.slogdet(total)[1]),
-        float(np.sqrt(values[-1] / max(values[0], np.finfo(float).tiny))),
-        sum(reasons.values()),
-    )
+    log_det = float(np.linalg.slogdet(within[chosen].sum(axis=0))[1])
+    return Excitation(tuple(kept[k] for k in chosen), base.shape[1], log_det)
 
 
 def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | str:
@@ -113,13 +104,11 @@ def draw_possible(task: ExcitationTask, rng: np.random.Generator) -> Segment | s
         NoExcitation: a joint has no room at all.
     """
     drawn = draw_segment(rng, task.limits, task.home_rad, task.reach_rad, task.segment_s)
-    reason = ""
     for share in SHRINK:
         segment = smaller(drawn, task.home_rad, share)
-        refused = _refused(task, segment)
-        if refused is None:
+        reason = _reason_against(task, segment)
+        if not reason:
             return segment
-        reason = refused
     return reason
 
 
@@ -131,7 +120,7 @@ def information(task: ExcitationTask, motion: SampledMotion) -> Array:
     return np.asarray(rows.T @ rows)
 
 
-def _refused(task: ExcitationTask, segment: Segment) -> str | None:
+def _reason_against(task: ExcitationTask, segment: Segment) -> str:
     motion = sampled(segment, RATE_HZ)
     torque = inverse_dynamics(task.chain, task.phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
     if (np.abs(torque) > TORQUE_SHARE * task.max_effort_nm).any():
@@ -141,13 +130,7 @@ def _refused(task: ExcitationTask, segment: Segment) -> str | None:
     ways = [way(*pair, task.travel_speed_rad_s, RATE_HZ) for pair in (ends, ends[::-1])]
     if clearance_m(task.chain, np.vstack([motion.q_rad, *ways]), task.home_rad).min() < CLEARANCE_M:
         return "the robot's own links"
-    return None
-
-
-def _base_directions(pieces: Sequence[Array]) -> Array:
-    """Return the directions that all candidates together excite, (10 n, rank), orthonormal."""
-    values, vectors = np.linalg.eigh(np.sum(pieces, axis=0))
-    return np.asarray(vectors[:, values > BASE_TOLERANCE * values[-1]])
+    return ""
 
 
 def _log_det(total: Array) -> float:
@@ -160,9 +143,8 @@ def _greedy(within: Array, count: int) -> list[int]:
     total = np.zeros(within.shape[1:])
     for _ in range(count):
         left = [k for k in range(len(within)) if k not in chosen]
-        best = max(left, key=lambda k: _log_det(total + within[k]))
-        chosen.append(best)
-        total = total + within[best]
+        chosen.append(max(left, key=lambda k: _log_det(total + within[k])))
+        total = total + within[chosen[-1]]
     return chosen
 
 

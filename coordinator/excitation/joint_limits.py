@@ -53,6 +53,11 @@ class JointLimits(NamedTuple):
         """Return how far a motion about `home_rad` may go to either side."""
         return min(self.high_rad - home_rad, home_rad - self.low_rad)
 
+    def fitting_scale(self, pattern: Pattern, share: float = 1.0) -> float:
+        """Return by how much a motion has to be smaller to take that share of speed and acceleration."""
+        speed, accel = motion_peaks(pattern)
+        return min(1.0, share * self.speed_rad_s / speed, share * self.accel_rad_s2 / accel)
+
 
 def continuous_torque_nm(kind: ModuleType) -> float:
     """Return the torque that a module holds for ever: its winding's losses i^2 R warm it by 130 K."""

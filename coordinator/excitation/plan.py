@@ -135,12 +135,9 @@ def load_plan(path: Path) -> Plan:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise PlanFileError(f"{path} is not TOML: {error}") from error
     except ValidationError as error:
-        raise PlanFileError(f"{path}: {_first_fault(error)}") from error
-
-
-def _first_fault(error: ValidationError) -> str:
-    first = error.errors()[0]
-    name = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        return f"unknown setting {name}; known are {', '.join(Plan.model_fields)}"
-    return f"{name} = {first['input']!r}: {first['msg']}"
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        fault = f"{name} = {first['input']!r}: {first['msg']}"
+        if first["type"] == "extra_forbidden":
+            fault = f"unknown setting {name}; known are {', '.join(Plan.model_fields)}"
+        raise PlanFileError(f"{path}: {fault}") from error

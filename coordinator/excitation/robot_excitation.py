@@ -48,15 +48,14 @@ def robot_excitation(
     for _ in range(DRAWS):
         held_out = draw_possible(task, rng)
         if isinstance(held_out, Segment):
-            return tuple(_by_serial(chain, segment) for segment in (*chosen, held_out))
+            return tuple(
+                RobotMotion(
+                    dict(zip(chain.serials, segment.pose_rad.tolist(), strict=True)),
+                    dict(zip(chain.serials, segment.patterns, strict=True)),
+                )
+                for segment in (*chosen, held_out)
+            )
     raise NoExcitation(f"of {DRAWS} motions none was possible that could be held out")
-
-
-def _by_serial(chain: Chain, segment: Segment) -> RobotMotion:
-    poses = [float(q) for q in segment.pose_rad]
-    return RobotMotion(
-        dict(zip(chain.serials, poses, strict=True)), dict(zip(chain.serials, segment.patterns, strict=True))
-    )
 
 
 def excitation_task(chain: Chain, modules: Sequence[RobotModule], plan: Plan) -> ExcitationTask:

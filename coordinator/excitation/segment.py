@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.excitation.joint_limits import JointLimits, NoExcitation, motion_peaks
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation
+from coordinator.excitation.multisine import scaled
 from module_agent.control.waveform import duration_s, waveform
 from module_agent.model.chain import Array
 from module_agent.model.read_only import make_read_only, read_only
@@ -67,9 +68,7 @@ def draw_segment(
         away = float(rng.uniform(-0.8, 0.8)) * room
         patterns.append(_draw_sines(rng, limit, room - abs(away), duration_s))
         poses.append(float(home) + away)
-    pose = np.array(poses)
-    pose.flags.writeable = False
-    return Segment(pose, tuple(patterns))
+    return Segment(read_only(np.array(poses)), tuple(patterns))
 
 
 def _draw_sines(
@@ -80,27 +79,16 @@ def _draw_sines(
     omega = 2.0 * np.pi * frequency
     share = rng.dirichlet(np.ones(SINES))
     amplitude = np.maximum(share * room_rad / np.maximum(1.0, omega / omega.min()), 1e-4)
-    pattern = MultiSine(
-        sines=tuple(
-            Sine(amplitude_rad=float(a), frequency_hz=float(f))
-            for a, f in zip(amplitude, frequency, strict=True)
-        ),
-        duration_s=duration_s,
-    )
-    speed, accel = motion_peaks(pattern)
-    return _scaled(pattern, min(1.0, SHARE * limit.speed_rad_s / speed, SHARE * limit.accel_rad_s2 / accel))
+    pairs = zip(amplitude.tolist(), frequency.tolist(), strict=True)
+    sines = tuple(Sine(amplitude_rad=a, frequency_hz=f) for a, f in pairs)
+    pattern = MultiSine(sines=sines, duration_s=duration_s)
+    return scaled(pattern, limit.fitting_scale(pattern, SHARE))
 
 
 def smaller(segment: Segment, home_rad: Array, share: float) -> Segment:
     """Return the segment with pose and motion that much nearer to home, 0 < share <= 1."""
     pose = home_rad + share * (segment.pose_rad - home_rad)
-    pose.flags.writeable = False
-    return Segment(pose, tuple(_scaled(pattern, share) for pattern in segment.patterns))
-
-
-def _scaled(pattern: MultiSine, share: float) -> MultiSine:
-    sines = tuple(s.model_copy(update={"amplitude_rad": share * s.amplitude_rad}) for s in pattern.sines)
-    return pattern.model_copy(update={"sines": sines})
+    return Segment(read_only(pose), tuple(scaled(pattern, share) for pattern in segment.patterns))
 
 
 def way(from_rad: Array, to_rad: Array, max_speed_rad_s: float, rate_hz: float) -> Array:
@@ -108,20 +96,14 @@ def way(from_rad: Array, to_rad: Array, max_speed_rad_s: float, rate_hz: float) 
     goals = [GoTo(target_rad=float(q), max_speed_rad_s=max_speed_rad_s) for q in to_rad]
     lasting = [duration_s(goal, float(q)) for goal, q in zip(goals, from_rad, strict=True)]
     t_s = np.arange(int(max(lasting) * rate_hz) + 2) / rate_hz
-    positions = np.stack(
-        [
-            q + waveform(goal, float(q), np.minimum(t_s, end)).offset_rad
-            for goal, q, end in zip(goals, from_rad, lasting, strict=True)
-        ],
-        axis=1,
-    )
-    return read_only(positions)
+    joints = zip(goals, from_rad, lasting, strict=True)
+    columns = [q + waveform(goal, float(q), np.minimum(t_s, end)).offset_rad for goal, q, end in joints]
+    return read_only(np.stack(columns, axis=1))
 
 
 def sampled(segment: Segment, rate_hz: float) -> SampledMotion:
     """Return the motion as commanded, at a rate, ends included."""
-    count = int(segment.patterns[0].duration_s * rate_hz) + 1
-    t_s = np.arange(count) / rate_hz
+    t_s = np.arange(int(segment.patterns[0].duration_s * rate_hz) + 1) / rate_hz
     waves = [waveform(pattern, 0.0, t_s) for pattern in segment.patterns]
     q = segment.pose_rad + np.stack([wave.offset_rad for wave in waves], axis=1)
     qd = np.stack([wave.velocity_rad_s for wave in waves], axis=1)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.excitation.fisher_information import CircleSetting, JointPath, SensorNoise, circle_covariance
-from coordinator.excitation.joint_limits import JointLimits, NoExcitation, motion_peaks
+from coordinator.excitation.joint_limits import JointLimits, NoExcitation
 from module_agent.control.waveform import duration_s, minimum_jerk_duration_s, waveform
 from module_agent.model.catalogue import GRAVITY_M_S2
 from module_agent.model.imu_prior import ImuPrior
@@ -84,7 +84,15 @@ def design_joint(task: JointTask, constant: ConstantMotion | None = None) -> Joi
     """
     slow = [constant] if constant is not None else _sweeps(task)
     candidates = [
-        _judged(task, one, sine) for one in slow for sine in _sines(task, task.budget_s - _other_s(task, one))
+        JointMotions(
+            one,
+            sine,
+            _other_s(task, one) + 2.0 * sine.centre_s,
+            predicted_sigma_m(task, [one, sine]),
+            task.radius_m * (sine.frequency_hz / GIVE_HZ) ** 2,
+        )
+        for one in slow
+        for sine in _sines(task, task.budget_s - _other_s(task, one))
     ]
     if not candidates:
         raise NoExcitation(
@@ -96,7 +104,7 @@ def design_joint(task: JointTask, constant: ConstantMotion | None = None) -> Joi
 
 def next_sine(task: JointTask, done: Sequence[Pattern], lasting_s: float) -> WindowedSine | None:
     """Return the fast motion that adds most information to those done; None if none fits."""
-    candidates = list(_sines(task, lasting_s))
+    candidates = _sines(task, lasting_s)
     return min(candidates, key=lambda sine: predicted_sigma_m(task, [*done, sine]), default=None)
 
 
@@ -106,9 +114,8 @@ def predicted_sigma_m(task: JointTask, patterns: Sequence[Pattern]) -> float:
     Where on its circle gravity finds the IMU is not known: the mean variance of two places a quarter apart.
     """
     paths = [_path(pattern) for pattern in patterns]
-    noise = SensorNoise()
     fewer = np.sqrt(RATE_HZ / SENSOR_RATE_HZ)
-    noise = SensorNoise(noise.gyro_rad_s * fewer, noise.accel_m_s2 * fewer)
+    noise = SensorNoise(*(sigma * fewer for sigma in SensorNoise()))
     variances = [circle_covariance(s, paths, noise, task.prior)[0, 0] for s in _settings(task)]
     return float(np.sqrt(np.mean(variances)))
 
@@ -135,27 +142,16 @@ def _path(pattern: Pattern) -> JointPath:
 
 
 def _sweeps(task: JointTask) -> list[ConstantMotion]:
-    return [one for sweep in SWEEPS_RAD if (one := _sweep(task, sweep)) is not None]
-
-
-def _sines(task: JointTask, lasting_s: float) -> list[WindowedSine]:
-    max_s = min(lasting_s, MAX_SINE_S)
-    return [one for f in FREQUENCIES_HZ if (one := _sine(task, f, max_s)) is not None]
-
-
-def _sweep(task: JointTask, sweep_rad: float) -> ConstantMotion | None:
-    if sweep_rad > task.limits.room_rad(task.home_rad):
-        return None
-    speed = min(
-        SWEEP_SPEED_RAD_S,
-        task.limits.speed_rad_s,
-        task.limits.accel_rad_s2 * RAMP_S,
-        2.0 * sweep_rad / (RAMP_S + MIN_LEVEL_S),
-    )
-    if speed <= 0.0:
-        return None
-    level_s = 2.0 * sweep_rad / speed - RAMP_S
-    return ConstantMotion(velocity_rad_s=speed, duration_s=level_s, ramp_s=RAMP_S) if level_s < 60.0 else None
+    limits, sweeps = task.limits, []
+    for sweep_rad in SWEEPS_RAD:
+        longest = 2.0 * sweep_rad / (RAMP_S + MIN_LEVEL_S)
+        speed = min(SWEEP_SPEED_RAD_S, limits.speed_rad_s, limits.accel_rad_s2 * RAMP_S, longest)
+        if sweep_rad > limits.room_rad(task.home_rad) or speed <= 0.0:
+            continue
+        level_s = 2.0 * sweep_rad / speed - RAMP_S
+        if level_s < 60.0:
+            sweeps.append(ConstantMotion(velocity_rad_s=speed, duration_s=level_s, ramp_s=RAMP_S))
+    return sweeps
 
 
 def _other_s(task: JointTask, constant: ConstantMotion) -> float:
@@ -165,26 +161,19 @@ def _other_s(task: JointTask, constant: ConstantMotion) -> float:
     return duration_s(constant, 0.0) + 2.0 * (journey_s + task.settle_s)
 
 
-def _sine(task: JointTask, frequency_hz: float, lasting_s: float) -> WindowedSine | None:
-    room = task.limits.room_rad(task.home_rad)
-    if lasting_s < MIN_PERIODS / frequency_hz or room <= 0.0:
-        return None
-    full = WindowedSine(
-        amplitude=min(SINE_RAD, room),
-        frequency_hz=frequency_hz,
-        centre_s=0.5 * lasting_s,
-        sigma_s=0.5 * lasting_s * SIGMA_SHARE,
-    )
-    speed, accel = motion_peaks(full)
-    scale = min(1.0, task.limits.speed_rad_s / speed, task.limits.accel_rad_s2 / accel)
-    return full.model_copy(update={"amplitude": scale * full.amplitude}) if scale > 0.0 else None
-
-
-def _judged(task: JointTask, constant: ConstantMotion, sine: WindowedSine) -> JointMotions:
-    return JointMotions(
-        constant,
-        sine,
-        _other_s(task, constant) + 2.0 * sine.centre_s,
-        predicted_sigma_m(task, [constant, sine]),
-        task.radius_m * (sine.frequency_hz / GIVE_HZ) ** 2,
-    )
+def _sines(task: JointTask, lasting_s: float) -> list[WindowedSine]:
+    room, half_s = task.limits.room_rad(task.home_rad), 0.5 * min(lasting_s, MAX_SINE_S)
+    sines = []
+    for frequency_hz in FREQUENCIES_HZ:
+        if 2.0 * half_s < MIN_PERIODS / frequency_hz or room <= 0.0:
+            continue
+        full = WindowedSine(
+            amplitude=min(SINE_RAD, room),
+            frequency_hz=frequency_hz,
+            centre_s=half_s,
+            sigma_s=half_s * SIGMA_SHARE,
+        )
+        scale = task.limits.fitting_scale(full)
+        if scale > 0.0:
+            sines.append(full.model_copy(update={"amplitude": scale * full.amplitude}))
+    return sines

@@ -12,7 +12,7 @@ from coordinator.excitation.joint_limits import (
     likely_inertia_kg_m2,
     measured_load,
 )
-from coordinator.excitation.multisine import JointSetting, simultaneous_patterns
+from coordinator.excitation.multisine import simultaneous_patterns
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.single_joint import (
     LIKELY_RADIUS_M,
@@ -87,9 +87,8 @@ class MotionChoice:
 
     def simultaneous(self) -> dict[str, MultiSine]:
         """Return the motions of all joints at once."""
-        home = self._plan.home_rad
-        settings = {s: JointSetting(self._unmoved_limits(s), home) for s in self._serials()}
-        return simultaneous_patterns(settings, self._plan.simultaneous_duration_s)
+        limits = {s: self._unmoved_limits(s) for s in self._serials()}
+        return simultaneous_patterns(limits, self._plan.home_rad, self._plan.simultaneous_duration_s)
 
     # ------------------------------------------------------------------ what is known
 

@@ -13,7 +13,7 @@ from coordinator.excitation.joint_limits import (
     least_accel_rad_s2,
     likely_inertia_kg_m2,
 )
-from coordinator.excitation.multisine import JointSetting, simultaneous_duration_s, simultaneous_patterns
+from coordinator.excitation.multisine import simultaneous_duration_s, simultaneous_patterns
 from module_agent.control.gains import catalogue_limits
 from module_agent.control.motion import Motion, check_motion
 from module_agent.control.waveform import duration_s, waveform
@@ -24,13 +24,8 @@ TYPES = list(CATALOGUE.values())
 STEP_S = 2e-3
 
 
-def settings_of(
-    kinds: list[ModuleType], inertia: float, rest_torque_nm: float, home: float = 0.0
-) -> dict[str, JointSetting]:
-    return {
-        f"M{k:02d}": JointSetting(joint_limits(kind, rest_torque_nm, inertia), home)
-        for k, kind in enumerate(kinds)
-    }
+def limits_of(kinds: list[ModuleType], inertia: float, rest_torque_nm: float) -> dict[str, JointLimits]:
+    return {f"M{k:02d}": joint_limits(kind, rest_torque_nm, inertia) for k, kind in enumerate(kinds)}
 
 
 def sampled(pattern: MultiSine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -49,14 +44,16 @@ def sampled(pattern: MultiSine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_no_joint_is_asked_for_more_speed_torque_or_room_than_it_has(
     kinds: list[ModuleType], inertia: float, torque: float, home: float
 ) -> None:
-    asked = settings_of(kinds, inertia, torque, home)
-    if any(s.limits.accel_rad_s2 <= 0.0 for s in asked.values()):
+    asked = limits_of(kinds, inertia, torque)
+    if any(one.accel_rad_s2 <= 0.0 for one in asked.values()):
         with pytest.raises(NoExcitation, match="cannot move about"):
-            simultaneous_patterns(asked)
+            simultaneous_patterns(asked, home)
         return
-    for kind, (serial, pattern) in zip(kinds, sorted(simultaneous_patterns(asked).items()), strict=True):
+    for kind, (serial, pattern) in zip(
+        kinds, sorted(simultaneous_patterns(asked, home).items()), strict=True
+    ):
         offset, velocity, acceleration = sampled(pattern)
-        limits = asked[serial].limits
+        limits = asked[serial]
         assert np.abs(velocity).max() <= 1.001 * limits.speed_rad_s < 0.75 * kind.max_speed_rad_s
         # Samples miss the peaks by a thousandth at most.
         assert np.abs(acceleration).max() <= 1.001 * limits.accel_rad_s2
@@ -68,7 +65,7 @@ def test_no_joint_is_asked_for_more_speed_torque_or_room_than_it_has(
 @pytest.mark.parametrize("count", [2, 6, 7, 16])
 def test_the_rates_of_any_two_joints_are_nearly_orthogonal(count: int) -> None:
     kinds = [TYPES[k % len(TYPES)] for k in range(count)]
-    patterns = simultaneous_patterns(settings_of(kinds, likely_inertia_kg_m2(kinds), 0.0))
+    patterns = simultaneous_patterns(limits_of(kinds, likely_inertia_kg_m2(kinds), 0.0), 0.0)
     rates = np.array([sampled(p)[1] for p in patterns.values()])
     alike = np.abs(rates @ rates.T) / np.outer(*[np.linalg.norm(rates, axis=1)] * 2)
     np.fill_diagonal(alike, 0.0)
@@ -83,7 +80,7 @@ def test_the_rates_of_any_two_joints_are_nearly_orthogonal(count: int) -> None:
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.name)
 def test_the_motion_begins_and_ends_at_rest_where_it_began(kind: ModuleType) -> None:
-    (pattern,) = simultaneous_patterns(settings_of([kind], 0.1, 0.0)).values()
+    (pattern,) = simultaneous_patterns(limits_of([kind], 0.1, 0.0), 0.0).values()
     ends = waveform(pattern, 0.0, np.array([0.0, pattern.duration_s]))
     assert ends.offset_rad == pytest.approx([0.0, 0.0], abs=1e-12)
     assert ends.velocity_rad_s == pytest.approx([0.0, 0.0], abs=1e-12)
@@ -95,9 +92,9 @@ def test_six_joints_take_eleven_seconds_and_sixteen_somewhat_longer() -> None:
 
 
 def test_a_joint_at_its_end_stop_is_named() -> None:
-    asked = settings_of([CATALOGUE["SEA-snake"]], 0.1, 0.0, home=1.5)
+    asked = limits_of([CATALOGUE["SEA-snake"]], 0.1, 0.0)
     with pytest.raises(NoExcitation, match=r"M00 cannot move about 1\.50 rad: its range is -1\.41 "):
-        simultaneous_patterns(asked)
+        simultaneous_patterns(asked, 1.5)
 
 
 def test_a_motion_never_takes_the_torque_that_holds_the_arm() -> None:
@@ -130,8 +127,8 @@ def test_an_arm_that_holds_itself_level_can_always_move_a_little(count: int) -> 
     assert least_accel_rad_s2(count) * inertia == pytest.approx(0.05 * level_nm)
     # Fast enough for the slow sine's rate to stand out of a gyro's errors of some mrad/s.
     limits = JointLimits(1.0, least_accel_rad_s2(count), -3.0, 3.0)
-    asked = {f"M{k:02d}": JointSetting(limits, 0.0) for k in range(count)}
-    for pattern in simultaneous_patterns(asked).values():
+    asked = {f"M{k:02d}": limits for k in range(count)}
+    for pattern in simultaneous_patterns(asked, 0.0).values():
         assert np.sqrt(np.mean(sampled(pattern)[1] ** 2)) > 0.02
 
 
