@@ -9,10 +9,11 @@ from rich.table import Table
 from coordinator.commands.options import AsJson
 from coordinator.merge.information_file import read_information
 from coordinator.merge.merge_runs import merge_runs
-from coordinator.merge.report import MERGED, MergeReport, merge_report, write_report
+from coordinator.merge.report import MERGED, MergeReport, merge_report
 from coordinator.recording.run_folder import INFORMATION
 from coordinator.runtime.terminal import print_table
 from module_agent.model.errors import UsageError
+from module_agent.model.files import write_json
 
 # Above this the robot was not the same in all runs, or the covariance of a chain is too small.
 INCONSISTENT_ABOVE = 5.0
@@ -32,7 +33,7 @@ def merge(
         raise UsageError("give two or more runs: the parameters of a single one are in its result.json")
     report = merge_report(merge_runs([read_information(run / INFORMATION) for run in runs]))
     out.mkdir(parents=True, exist_ok=True)
-    write_report(out / MERGED, report)
+    write_json(out / MERGED, report)
     if as_json:
         typer.echo(report.model_dump_json(indent=1))
         return

@@ -28,7 +28,6 @@ from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import PairObservation, circle_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circle_observations
-from coordinator.recording.at_rest import rest_observation
 from coordinator.recording.journal import JournalEvent, excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
@@ -117,7 +116,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
             topology,
             types,
             _pairs(recording, clocks, topology.serials, windows),
-            [rest_observation(recording, topology.serials, MIN_REST_ROWS)],
+            [recording.rest_observation(topology.serials, MIN_REST_ROWS)],
         )
         clocks |= refine_clocks(first.chain, clocks, windows).clocks
         windows = _exploration(recording, clocks, topology.serials)

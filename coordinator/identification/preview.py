@@ -17,7 +17,6 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import PairObservation, circle_observation
-from coordinator.recording.at_rest import rest_observation
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, window
@@ -63,7 +62,7 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     if not linked:
         return None
     topology = _part(forest, linked)
-    rest = rest_observation(recording, topology.serials)
+    rest = recording.rest_observation(topology.serials)
     pairs = []
     for joint in [s for s in moved if s in topology.serials]:
         for observer in [s for s in topology.serials if s != joint]:

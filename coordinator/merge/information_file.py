@@ -13,6 +13,7 @@ from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 
 VERSION = 2
+_ARRAYS = ("sigma_nm", "independent_fraction", "phi_parts", "directions", "scale", "scale_sigma")
 
 
 class RunInformation(NamedTuple):
@@ -52,12 +53,7 @@ def write_information(path: Path, run: RunInformation) -> None:
         "version": VERSION,
         "session": run.session,
         **{name: np.array(values) for name, values in run.chain.to_dict().items()},
-        "sigma_nm": run.sigma_nm,
-        "independent_fraction": run.independent_fraction,
-        "phi_parts": run.phi_parts,
-        "directions": run.directions,
-        "scale": run.scale,
-        "scale_sigma": run.scale_sigma,
+        **{name: getattr(run, name) for name in _ARRAYS},
         "rest_nm2": np.array([joint.rest for joint in run.joints]),
         "samples": np.array([joint.samples for joint in run.joints], dtype=np.int64),
     }
@@ -91,34 +87,33 @@ def read_information(path: Path) -> RunInformation:
 
 def _run(name: str, arrays: dict[str, Any]) -> RunInformation:
     make_read_only(arrays.values())
-    joints = len(arrays["serials"])
-    rest, samples = _checked(arrays["rest_nm2"], (joints,)), arrays["samples"]
-    information = tuple(
-        JointInformation(
-            _checked(arrays[f"r{k}"], (len(arrays[f"z{k}"]), 10 * joints)),
-            _checked(arrays[f"z{k}"], (len(arrays[f"z{k}"]),)),
-            float(rest[k]),
-            int(samples[k]),
-        )
-        for k in range(joints)
-    )
-    count = arrays["directions"].shape[-1]
+
+    def finite(key: str, *shape: int) -> Array:
+        array = arrays[key]
+        if array.shape != shape or not np.isfinite(array).all():
+            raise DataError(f"an array of shape {array.shape}, finite {shape} is needed")
+        return np.asarray(array, dtype=float)
+
+    joints, count = len(arrays["serials"]), arrays["directions"].shape[-1]
+    rest, rows = finite("rest_nm2", joints), [len(arrays[f"z{k}"]) for k in range(joints)]
     return RunInformation(
         name=name,
         session=str(arrays["session"]),
         chain=Chain.from_dict(arrays),
-        joints=information,
-        sigma_nm=_checked(arrays["sigma_nm"], (joints,)),
+        joints=tuple(
+            JointInformation(
+                finite(f"r{k}", size, 10 * joints),
+                finite(f"z{k}", size),
+                float(rest[k]),
+                int(arrays["samples"][k]),
+            )
+            for k, size in enumerate(rows)
+        ),
+        sigma_nm=finite("sigma_nm", joints),
         independent_fraction=float(arrays["independent_fraction"]),
-        phi_parts=_checked(arrays["phi_parts"], (20 * joints,)),
-        directions=_checked(arrays["directions"], (6 * joints, count)),
-        effects=tuple(_checked(arrays[f"effects{k}"], (len(arrays[f"z{k}"]), count)) for k in range(joints)),
-        scale=_checked(arrays["scale"], (joints,)),
-        scale_sigma=float(_checked(arrays["scale_sigma"], ())),
+        phi_parts=finite("phi_parts", 20 * joints),
+        directions=finite("directions", 6 * joints, count),
+        effects=tuple(finite(f"effects{k}", size, count) for k, size in enumerate(rows)),
+        scale=finite("scale", joints),
+        scale_sigma=float(finite("scale_sigma")),
     )
-
-
-def _checked(array: Any, shape: tuple[int, ...]) -> Array:
-    if array.shape != shape or not np.isfinite(array).all():
-        raise DataError(f"an array of shape {array.shape}, finite {shape} is needed")
-    return np.asarray(array, dtype=float)

@@ -22,6 +22,7 @@ from coordinator.parameter_fit.spectrum import ESTIMATED_CHAIN_TOLERANCE, MAX_SI
 from coordinator.parameter_fit.systematic_errors import body_shifts, whitened_effects
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
+from module_agent.model.read_only import read_only
 
 # Simulated torques without noise would have infinite weight.
 _MIN_SIGMA_NM = 1e-9
@@ -87,7 +88,13 @@ def merge_runs(
     shares = []
     for run, one in zip(runs, rows, strict=True):
         own = _without_scales([one], len(scales))
-        shares.append(_share(run, _base(*own, columns, tolerance), own, merged))
+        base = _base(*own, columns, tolerance)
+        _, sigma_alone = _combinations(base, *own)
+        value, sigma_merged = _combinations(base, *merged)
+        inconsistency_sigma = float(np.sqrt(np.mean(((value - base.value) / base.sigma) ** 2)))
+        shares.append(
+            RunShare(run.name, run.chain.serials, base, sigma_alone, sigma_merged, inconsistency_sigma)
+        )
     return MergedInformation(parts, _base(*merged, columns, tolerance), tuple(shares))
 
 
@@ -115,11 +122,6 @@ def _scale_sigmas(runs: Sequence[RunInformation]) -> dict[str, float]:
     return dict(sorted(sigmas.items()))
 
 
-def _of_rows(run: RunInformation, of_joints: Array) -> Array:
-    """Repeat the values of joints (n,) for the rows of each."""
-    return np.asarray(np.repeat(of_joints, [len(piece.z) for piece in run.joints]))
-
-
 def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float]) -> Array:
     """Return a run's whitened rows [scales | parts | target]; scales are in standard deviations.
 
@@ -131,15 +133,15 @@ def _rows(run: RunInformation, parts: Sequence[Part], scales: Mapping[str, float
     rows, target = whitened(run.joints, sigma, run.independent_fraction)
     of_chain = whitened_effects(run.effects, sigma, run.independent_fraction)
     of_chain = of_chain + rows @ body_shifts(run.chain, run.directions, run.phi_parts)
+    counts = [len(joint.z) for joint in run.joints]
+    scale, serials = np.repeat(run.scale, counts), np.repeat(run.chain.serials, counts)
     own = rows @ (bodies_from_parts(run.chain, parts_of([run.chain])) @ run.phi_parts)
-    shown = own / (1.0 + _of_rows(run, run.scale))
+    shown = own / (1.0 + scale)
     known = np.diag(list(scales.values()))
     place = {serial: k for k, serial in enumerate(scales)}
-    of_scale = (
-        -shown[:, None] * known[[place[serial] for serial in _of_rows(run, np.array(run.chain.serials))]]
-    )
+    of_scale = -shown[:, None] * known[[place[serial] for serial in serials]]
     over_parts = rows @ bodies_from_parts(run.chain, parts)
-    target = target - _of_rows(run, run.scale) * shown
+    target = target - scale * shown
     return _without(np.column_stack([of_chain, of_scale, over_parts, target]), of_chain.shape[1])
 
 
@@ -164,23 +166,6 @@ def _base(rows: Array, target: Array, columns: Columns, tolerance: float) -> Bas
     return base_parameters(rows, target, columns, max_sigma=MAX_SIGMA_KG, tolerance=tolerance)
 
 
-def _share(
-    run: RunInformation, own: BaseParameters, alone: tuple[Array, Array], merged: tuple[Array, Array]
-) -> RunShare:
-    """Compare a run's base parameters by its own rows and target with those of all runs."""
-    _, sigma_alone = _combinations(own, *alone)
-    value, sigma_merged = _combinations(own, *merged)
-    inconsistency_sigma = float(np.sqrt(np.mean(((value - own.value) / own.sigma) ** 2)))
-    return RunShare(
-        name=run.name,
-        serials=run.chain.serials,
-        base=own,
-        sigma_alone=sigma_alone,
-        sigma_merged=sigma_merged,
-        inconsistency_sigma=inconsistency_sigma,
-    )
-
-
 def _combinations(base: BaseParameters, rows: Array, target: Array) -> tuple[Array, Array]:
     """Return values and standard deviations (r,) of the combinations in base parameters by other rows.
 
@@ -191,5 +176,4 @@ def _combinations(base: BaseParameters, rows: Array, target: Array) -> tuple[Arr
     along = (base.grouping * base.columns.scale) @ whole.directions.T
     square = whole.values**2 + MAX_SIGMA_KG**-2
     sigma = np.linalg.norm(along / np.sqrt(square), axis=1)
-    sigma.flags.writeable = False
-    return along @ (whole.values / square * (whole.left.T @ target)), sigma
+    return along @ (whole.values / square * (whole.left.T @ target)), read_only(sigma)

@@ -1,13 +1,10 @@
 """`merged.json`: the base parameters of module parts that several runs determine together."""
 
-from pathlib import Path
-
 import numpy as np
 
 from coordinator.merge.merge_runs import MergedInformation, RunShare
 from coordinator.parameter_fit.identifiability import WEAK_ABOVE
 from coordinator.parameter_fit.report_parts import BaseParameterPart, Part, base_parameter_parts
-from module_agent.model.files import write_json
 
 SCHEMA = 2
 MERGED = "merged.json"
@@ -69,8 +66,3 @@ def _run(run: RunShare) -> RunPart:
         gain=run.gain,
         inconsistency_sigma=run.inconsistency_sigma,
     )
-
-
-def write_report(path: Path, report: MergeReport) -> None:
-    """Write the report, whole or not at all."""
-    write_json(path, report)

@@ -6,10 +6,12 @@ results. The recording's hash is the trace hash of the run.
 
 import hashlib
 import struct
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from coordinator.kinematics.chain_observations import RestObservation
 from coordinator.recording.journal import JournalEvent, Purpose
 from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind, module_type
 from module_agent.model.errors import DataError
@@ -71,16 +73,6 @@ class ModuleRecord:
     def trips(self) -> list[RoundTrip]:
         """The round trips for mapping clocks: all up to the journal's `settled` event."""
         return self.round_trips[: self.settled_trips]
-
-    def note_time(self, t_ns: int) -> None:
-        """Note a module time that was received."""
-        self.newest_ns = max(self.newest_ns, t_ns)
-
-    def note_feedback(self, session_ns: int, row_ns: int) -> None:
-        """Note that feedback was published whose newest row has this module time."""
-        self.feedback_ns = session_ns
-        if row_ns > self.newest_row_ns:
-            self.newest_row_ns, self.newest_row_arrival_ns = row_ns, session_ns
 
     def forget(self, rows: int, round_trips: int) -> None:
         """Drop all but the newest rows and round trips, for sessions that go on for long."""
@@ -158,44 +150,41 @@ class Recording:
             case Feedback():
                 rows = module.rows.add(message)
                 if len(rows):
-                    newest = int(rows["t_ns"][-1])
-                    module.note_time(newest)
+                    row_ns = int(rows["t_ns"][-1])
+                    module.newest_ns = max(module.newest_ns, row_ns)
                     if entry.kind == "publication":
-                        module.note_feedback(entry.t_ns, newest)
-            case Status():
-                module.status = message
-                module.note_time(message.t_ns)
-                self._note_round_trip(module, entry, message.re, message.t_ns)
-            case Ack():
-                module.note_time(message.t_ns)
-                self._note_round_trip(module, entry, message.re, message.t_ns)
+                        module.feedback_ns = entry.t_ns
+                        if row_ns > module.newest_row_ns:
+                            module.newest_row_ns, module.newest_row_arrival_ns = row_ns, entry.t_ns
+            case Status() | Ack():
+                module.newest_ns = max(module.newest_ns, message.t_ns)
+                if isinstance(message, Status):
+                    module.status = message
+                sent_ns = self._sent.pop((entry.topic, message.re), None)
+                if entry.kind == "reply" and sent_ns is not None:
+                    module.round_trips.append(RoundTrip(sent_ns, entry.t_ns, message.t_ns))
             case Info():
                 module.info = message
-                module.note_time(message.t_ns)
+                module.newest_ns = max(module.newest_ns, message.t_ns)
             case Estimate():
                 estimates = self.estimates.setdefault((message.joint, message.serial), {})
                 estimates[message.motion_ids] = message
             case Information():
                 module.information.setdefault(message.digest, {})[message.offset] = message
-            case _:
-                pass
 
-    def _note_round_trip(self, module: ModuleRecord, entry: Entry, re: int, module_ns: int) -> None:
-        sent_ns = self._sent.pop((entry.topic, re), None)
-        if entry.kind == "reply" and sent_ns is not None:
-            module.round_trips.append(RoundTrip(sent_ns, entry.t_ns, module_ns))
+    def _session_event(self) -> JournalEvent:
+        sessions = [event for event in list(self.journal) if event.what == "session"]
+        return sessions[-1] if sessions else JournalEvent(t_ns=0, what="session")
 
     @property
     def imu(self) -> ImuKind:
         """The prior of the IMUs, as of the latest session event."""
-        kinds = [event.imu for event in list(self.journal) if event.what == "session"]
-        return kinds[-1] if kinds else "uncalibrated"
+        return self._session_event().imu
 
     @property
     def torque(self) -> TorqueKind:
         """The prior of the torque sensors' scales, as of the latest session event."""
-        kinds = [event.torque for event in list(self.journal) if event.what == "session"]
-        return kinds[-1] if kinds else "uncalibrated"
+        return self._session_event().torque
 
     def motions(self, *purposes: Purpose) -> list[JournalEvent]:
         """Return the motions of these purposes whose rows are those of their module's latest boot.
@@ -215,10 +204,7 @@ class Recording:
 
     def latest_motions(self, *purposes: Purpose) -> list[JournalEvent]:
         """Return the last of `motions` of every module and purpose, in the order of the journal."""
-        latest: dict[tuple[str, str], JournalEvent] = {}
-        for event in self.motions(*purposes):
-            latest[event.serial, event.purpose] = event
-        return list(latest.values())
+        return list({(event.serial, event.purpose): event for event in self.motions(*purposes)}.values())
 
     def rows(self, serial: str, first: int, end: int) -> Rows:
         """Return the rows of a range of the latest boot of a module that have arrived."""
@@ -230,6 +216,22 @@ class Recording:
         if not rests or rests[-1].end_row is None:
             return np.zeros(0, ROW)
         return self.rows(serial, rests[-1].start_row, rests[-1].end_row)
+
+    def rest_observation(self, serials: Sequence[str], min_rows: int = 1) -> RestObservation:
+        """Average every IMU and encoder over its module's last rest.
+
+        Raises:
+            DataError: a module has fewer than `min_rows` rows at rest.
+        """
+        rows = [self.rest_rows(serial) for serial in serials]
+        for serial, resting in zip(serials, rows, strict=True):
+            if len(resting) < min_rows:
+                raise DataError(f"module {serial} has {len(resting)} rows at rest, {min_rows} are needed")
+        accel = [resting["accel_m_s2"].astype(float) for resting in rows]
+        force = np.array([one.mean(axis=0) for one in accel])
+        scatter = [float(one.std(axis=0).max()) / np.sqrt(len(one)) for one in accel]
+        position = np.array([float(resting["position_rad"].mean()) for resting in rows])
+        return RestObservation(force, max(scatter), position)
 
     def module_type(self, serial: str) -> ModuleType:
         """Return a module's type, as it reported it.

@@ -1,6 +1,7 @@
 """The folder of one run: recording, view, result and the robot as URDF and HRDF."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -67,7 +68,13 @@ def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path 
     # After a crash while resuming, the recording set aside is complete, unless the new file, which begins
     # with a copy of it, is longer.
     older = aside.exists() and (not session.exists() or session.stat().st_size < aside.stat().st_size)
-    _check_robot(aside if older else session, robot)
+    journal = _journal(aside if older else session)
+    resumed = next((event.robot for event in journal if event.what == "session"), None)
+    if None not in (resumed, robot) and resumed != robot:
+        raise RunFolderError(
+            f"{path} holds a run of robot {resumed!r}, not of {robot!r}: give --robot {resumed}, or the "
+            f"--out of a run of {robot!r}"
+        )
     if not older:
         session.replace(aside)
     return aside
@@ -89,21 +96,10 @@ def _has_begun(session: Path) -> bool:
         return True
 
 
-def _check_robot(session: Path, robot: str | None) -> None:
-    started = next((event for event in _journal(session) if event.what == "session"), None)
-    if started is not None and robot is not None and started.robot != robot:
-        raise RunFolderError(
-            f"{session.parent} holds a run of robot {started.robot!r}, not of {robot!r}: give --robot "
-            f"{started.robot}, or the --out of a run of {robot!r}"
-        )
-
-
 def load_recording(path: Path) -> Recording:
     """Read a recording; messages that could not be decoded are left out, as in the live session."""
     recording = Recording()
     for entry in read_session(path):
-        try:
+        with suppress(WireError):  # counted in `recording.refused`
             recording.add(entry)
-        except WireError:
-            continue  # counted in `recording.refused`
     return recording

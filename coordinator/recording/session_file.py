@@ -20,7 +20,7 @@ from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Entry, Kind
 from module_agent.model.errors import RobotError
 from module_agent.wire.keys import parse
-from module_agent.wire.messages import Ack, Message
+from module_agent.wire.messages import Ack
 from module_agent.wire.topics import TOPICS
 
 CHUNK_BYTES = 64 * 1024
@@ -31,12 +31,6 @@ KINDS: tuple[Kind, ...] = ("publication", "request", "reply", "journal")
 
 class SessionFileError(RobotError):
     """The file is not a recording of a session; the message names it."""
-
-
-def _message_type(kind: Kind, topic: str) -> type[Message] | type[JournalEvent]:
-    if kind == "journal":
-        return JournalEvent
-    return TOPICS[parse(topic).leaf].message(kind) or Ack
 
 
 class SessionWriter:
@@ -66,7 +60,7 @@ class SessionWriter:
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def _register(self, kind: Kind, topic: str) -> int:
-        message_type = _message_type(kind, topic)
+        message_type = JournalEvent if kind == "journal" else TOPICS[parse(topic).leaf].message(kind) or Ack
         name = f"x5.{message_type.__name__}"
         if name not in self._schemas:
             schema = json.dumps(message_type.model_json_schema()).encode()

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from coordinator.kinematics.assembly import AssemblyError, assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import PairObservation, circle_observation
-from coordinator.recording.at_rest import rest_observation
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from coordinator.topology.topology import Topology
@@ -28,7 +27,7 @@ def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | No
         DataError: the type of a module is not recorded, or no rest.
     """
     types = [recording.module_type(serial) for serial in topology.serials]
-    rest = rest_observation(recording, topology.serials)
+    rest = recording.rest_observation(topology.serials)
     pairs = _pairs(recording, topology.serials, rest.q_rad)
     if not pairs:
         return None
