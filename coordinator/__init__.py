@@ -8,22 +8,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coordinator.api import (
-        connect,
-        denavit_hartenberg,
-        export_hrdf,
-        export_urdf,
-        forward_kinematics,
-        load_recording,
-        load_run,
-    )
-    from coordinator.arm_fit.data_file import read_log
-    from coordinator.arm_fit.fit_dynamics import fit_dynamics
-    from coordinator.batch_estimation.imu_prediction import imu_readings
-    from coordinator.description.urdf_reader import read_urdf
-    from coordinator.identification.identify import identify
-    from coordinator.kinematics.imu_links import link_from_imus, link_from_joint
-    from module_agent.model.regressor import inverse_dynamics, torque_regressor
+    from coordinator.api import connect as connect
+    from coordinator.api import denavit_hartenberg as denavit_hartenberg
+    from coordinator.api import export_hrdf as export_hrdf
+    from coordinator.api import export_urdf as export_urdf
+    from coordinator.api import forward_kinematics as forward_kinematics
+    from coordinator.api import load_recording as load_recording
+    from coordinator.api import load_run as load_run
+    from coordinator.arm_fit.data_file import read_log as read_log
+    from coordinator.arm_fit.fit_dynamics import fit_dynamics as fit_dynamics
+    from coordinator.batch_estimation.imu_prediction import imu_readings as imu_readings
+    from coordinator.description.urdf_reader import read_urdf as read_urdf
+    from coordinator.identification.identify import identify as identify
+    from coordinator.kinematics.imu_links import link_from_imus as link_from_imus
+    from coordinator.kinematics.imu_links import link_from_joint as link_from_joint
+    from module_agent.model.regressor import inverse_dynamics as inverse_dynamics
+    from module_agent.model.regressor import torque_regressor as torque_regressor
 
 _HOMES = {
     "connect": "coordinator.api",
@@ -43,25 +43,7 @@ _HOMES = {
     "read_urdf": "coordinator.description.urdf_reader",
     "torque_regressor": "module_agent.model.regressor",
 }
-
-__all__ = [
-    "connect",
-    "denavit_hartenberg",
-    "export_hrdf",
-    "export_urdf",
-    "fit_dynamics",
-    "forward_kinematics",
-    "identify",
-    "imu_readings",
-    "inverse_dynamics",
-    "link_from_imus",
-    "link_from_joint",
-    "load_recording",
-    "load_run",
-    "read_log",
-    "read_urdf",
-    "torque_regressor",
-]
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> object:
@@ -71,4 +53,4 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

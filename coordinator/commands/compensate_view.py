@@ -8,7 +8,7 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.table import Table
 
-from coordinator.runtime.terminal import print_table
+from coordinator.runtime.terminal import new_table, print_table
 from coordinator.torque_control.session import Moment
 from coordinator.torque_control.summary import CompensationSummary
 
@@ -98,8 +98,10 @@ def moment_line(serials: tuple[str, ...], now: Moment) -> str:
 
 def moment_table(serials: tuple[str, ...], now: Moment) -> RenderableType:
     """Return a moment as a table."""
-    titles = "joint", "position [deg]", "speed [deg/s]", "commanded [Nm]", "measured [Nm]", "age [ms]"
-    shown = Table(*titles, title=f"{now.phase}, {now.compensated_s:.1f} s, {now.missed} set-points missed")
+    shown = new_table(
+        f"{now.phase}, {now.compensated_s:.1f} s, {now.missed} set-points missed",
+        "joint | position [deg] | speed [deg/s] | commanded [Nm] | measured [Nm] | age [ms]",
+    )
     reading = now.reading
     for k, serial in enumerate(serials):
         shown.add_row(
@@ -120,16 +122,10 @@ def summary_fields(found: CompensationSummary) -> dict[str, object]:
 
 def summary_table(found: CompensationSummary) -> Table:
     """Return a summary as a table."""
-    titles = (
-        "joint",
-        "moved [deg]",
-        "farthest [deg]",
-        "top speed [deg/s]",
-        "torque, rms [Nm]",
-        "max [Nm]",
+    shown = new_table(
+        f"compensated for {found.compensated_s:.1f} s: {found.why}; {found.missed} set-points missed",
+        "joint | moved [deg] | farthest [deg] | top speed [deg/s] | torque, rms [Nm] | max [Nm]",
     )
-    title = f"compensated for {found.compensated_s:.1f} s: {found.why}; {found.missed} set-points missed"
-    shown = Table(*titles, title=title)
     for joint in found.joints:
         shown.add_row(
             joint.serial,

@@ -1,13 +1,12 @@
-"""`x5-coordinator list`: the modules on the network, without moving or holding them."""
+"""`x5-coordinator list` and `stop`: the modules on the network, without a lease."""
 
 import typer
-from rich.table import Table
 
 from coordinator.commands.options import AsJson, ConnectOptions, Expect
-from coordinator.live_robot.connection import Place, open_connection
-from coordinator.live_robot.discovery import AS_HUB_S, Search, listed
+from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.live_robot.discovery import AS_HUB_S, Search, listed, stop_robot
 from coordinator.runtime.command_line import with_options
-from coordinator.runtime.terminal import Terminal
+from coordinator.runtime.terminal import Terminal, new_table
 from module_agent.model.errors import RobotError
 from module_agent.transport.transport import Transport
 
@@ -19,38 +18,44 @@ def list_modules(at: ConnectOptions, expect: Expect = None, as_json: AsJson = Fa
     Exit codes: 0 all answer, 1 a module does not answer or too few do, 2 wrong usage.
     """
     place = at.place()
-    transport, search = open_search(place, at.quiet, expect)
+    transport, search = _open_search(place, at.quiet, expect)
     statuses, silent = listed(transport, place.robot, search)
     if as_json:
         typer.echo("[" + ",\n ".join(status.model_dump_json() for status in statuses) + "]")
     else:
-        table = Table("serial", "state", "holder", "expiries", "refused", title=place.robot)
+        table = new_table(place.robot, "serial | state | holder | expiries | refused")
         for status in statuses:
+            refused = ", ".join(f"{k} {v}" for k, v in status.refusals.items())
             table.add_row(
-                status.serial,
-                status.state,
-                status.holder or "-",
-                str(status.expiries),
-                ", ".join(f"{k} {v}" for k, v in status.refusals.items()) or "-",
+                status.serial, status.state, status.holder or "-", str(status.expiries), refused or "-"
             )
         Terminal().console.print(table)
-    if silent:
-        raise RobotError(f"no status from {', '.join(silent)}")
-    check_count(place.robot, len(statuses), expect)
+    _check(place.robot, len(statuses), expect, "status", silent)
 
 
-def open_search(place: Place, quiet: bool, expect: int | None) -> tuple[Transport, Search]:
+@with_options
+def stop(at: ConnectOptions, expect: Expect = None) -> None:
+    """Stop every module of a robot at once, whichever program holds its lease.
+
+    Exit codes: 0 all have confirmed, 1 a module has not or too few have, 2 wrong usage.
+    """
+    place = at.place()
+    transport, search = _open_search(place, at.quiet, expect)
+    stopped, silent = stop_robot(transport, place.robot, sender_name(), search)
+    Terminal(at.quiet).note(f"stopped: {', '.join(stopped) or 'none'}")
+    _check(place.robot, len(stopped), expect, "confirmation", silent)
+
+
+def _open_search(place: Place, quiet: bool, expect: int | None) -> tuple[Transport, Search]:
     """Join a robot's network to look for its modules; as its hub, wait for the agents to connect."""
     connection = open_connection(place, Terminal(quiet).note)
     return connection.transport, Search(min_s=AS_HUB_S if connection.is_hub else 0.0, expect=expect)
 
 
-def check_count(robot: str, answering: int, expect: int | None) -> None:
-    """Check how many modules answered.
-
-    Raises:
-        RobotError: none, or fewer than expected.
-    """
+def _check(robot: str, answering: int, expect: int | None, answer: str, silent: list[str]) -> None:
+    """Check which modules gave their answer, and how many."""
+    if silent:
+        raise RobotError(f"no {answer} from {', '.join(silent)}")
     if not answering:
         raise RobotError(f"no module of robot {robot!r} answers")
     if expect is not None and answering < expect:

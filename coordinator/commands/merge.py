@@ -11,7 +11,7 @@ from coordinator.merge.information_file import read_information
 from coordinator.merge.merge_runs import merge_runs
 from coordinator.merge.report import MERGED, MergeReport, merge_report
 from coordinator.recording.run_folder import INFORMATION
-from coordinator.runtime.terminal import print_table
+from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_json
 
@@ -49,16 +49,10 @@ def merge(
 
 def _table(report: MergeReport) -> Table:
     """Return one row per run."""
-    title = f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts"
-    table = Table(
-        "run",
-        "modules",
-        "rank",
-        "below 10 %",
-        "below 10 %, merged",
-        "sigma merged / alone",
+    table = new_table(
+        f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts",
+        "run | modules | rank | below 10 % | below 10 %, merged | sigma merged / alone | "
         "inconsistency [sigma]",
-        title=title,
     )
     for run in report.runs:
         table.add_row(

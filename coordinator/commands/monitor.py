@@ -18,9 +18,9 @@ from coordinator.monitoring.monitor import Monitor
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
-from coordinator.recording.session_file import SessionFileError, read_session
-from coordinator.runtime.command_line import with_options
-from coordinator.runtime.event_loop import SIGNALS, ScaledLoop, check_speed
+from coordinator.recording.session_file import read_session
+from coordinator.runtime.command_line import in_a_folder, with_options
+from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.model.errors import EXIT_FINDING, DataError, RobotError, UsageError
@@ -44,7 +44,10 @@ def monitor_robot(
         float, typer.Option(min=1e-6, max=1e3, help="Accepted rate of false alarms [1/h].")
     ] = ALARMS_PER_HOUR,
     json_file: Annotated[
-        Path | None, typer.Option("--json", help="File to write findings to, one JSON object a line.")
+        Path | None,
+        typer.Option(
+            "--json", help="File to write findings to, one JSON object a line.", callback=in_a_folder
+        ),
     ] = None,
     speed: Speed = 1.0,
 ) -> None:
@@ -52,8 +55,6 @@ def monitor_robot(
 
     Sends no commands and takes no lease. Exit codes: 0 no findings, 4 findings, others as of `run`.
     """
-    if json_file is not None and not json_file.parent.is_dir():
-        raise UsageError(f"{json_file}: there is no folder {json_file.parent}")
     if recording is not None and not recording.is_file():
         raise UsageError(f"{recording}: there is no such file; give the session.mcap of a run")
     reference = build_reference(load_baseline(baseline))
@@ -66,7 +67,7 @@ def monitor_robot(
         if recording is not None:
             _monitor_file(monitor, screen, recording)
         else:
-            _monitor_live(monitor, screen, at.place(reference.name), for_s, check_speed(speed))
+            _monitor_live(monitor, screen, at.place(reference.name), for_s, speed)
         screen.show_summary()
     if monitor.finding_log.all:
         raise typer.Exit(EXIT_FINDING)
@@ -75,28 +76,25 @@ def monitor_robot(
 def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
     """Monitor a recorded session as if it were live."""
     serials = monitor.reference.chain.serials
-    try:
-        whole = load_recording(path)
-        missing = [s for s in serials if s not in whole.modules or not whole.modules[s].round_trips]
-        if missing:
-            raise DataError(f"{path} has no feedback or no round trips of {', '.join(missing)}")
-        clocks = map_clocks({s: whole.modules[s].round_trips for s in serials})
-        looked_ns, recording = 0, Recording()
-        for entry in read_session(path):
-            if not screen.start_ns:
-                screen.start_ns = entry.t_ns
-            try:
-                recording.add(entry)
-            except WireError:
-                continue  # counted by the recording, by reason
-            if entry.t_ns - looked_ns > UPDATE_S * 1e9:
-                looked_ns = entry.t_ns
-                screen.report(monitor.advance(recording, clocks))
-                for module in recording.modules.values():
-                    module.rows.forget_before(module.rows.end_row - RETAINED_ROWS)
-        screen.report(monitor.advance(recording, clocks))
-    except SessionFileError as error:
-        raise DataError(str(error)) from error
+    whole = load_recording(path)
+    missing = [s for s in serials if s not in whole.modules or not whole.modules[s].round_trips]
+    if missing:
+        raise DataError(f"{path} has no feedback or no round trips of {', '.join(missing)}")
+    clocks = map_clocks({s: whole.modules[s].round_trips for s in serials})
+    looked_ns, recording = 0, Recording()
+    for entry in read_session(path):
+        if not screen.start_ns:
+            screen.start_ns = entry.t_ns
+        try:
+            recording.add(entry)
+        except WireError:
+            continue  # counted by the recording, by reason
+        if entry.t_ns - looked_ns > UPDATE_S * 1e9:
+            looked_ns = entry.t_ns
+            screen.report(monitor.advance(recording, clocks))
+            for module in recording.modules.values():
+                module.rows.forget_before(module.rows.end_row - RETAINED_ROWS)
+    screen.report(monitor.advance(recording, clocks))
 
 
 def _monitor_live(
@@ -105,18 +103,12 @@ def _monitor_live(
     """Monitor until the time is up, or a signal comes."""
     transport = open_connection(place, Terminal().note).transport
     loop = ScaledLoop(speed)
-    try:
-        screen.start_ns = loop.clock_ns()
-        live = LiveMonitor(monitor, loop.clock_ns, sender_name(), screen.report)
-        messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
-        task = loop.create_task(_attend(live, messenger, monitor, for_s, loop.clock_ns))
-        for number in SIGNALS:
-            loop.add_signal_handler(number, task.cancel)
-        # A signal cancels the task; the summary of the findings follows.
-        with contextlib.suppress(asyncio.CancelledError):
-            loop.run_until_complete(task)
-    finally:
-        loop.close()
+    screen.start_ns = loop.clock_ns()
+    live = LiveMonitor(monitor, loop.clock_ns, sender_name(), screen.report)
+    messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
+    # A signal cancels the task; the summary of the findings follows.
+    with contextlib.suppress(asyncio.CancelledError):
+        attend(loop, _attend(live, messenger, monitor, for_s, loop.clock_ns))
     if not monitor.monitored_s:
         serials = ", ".join(monitor.reference.chain.serials)
         raise RobotError(

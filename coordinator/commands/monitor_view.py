@@ -1,18 +1,16 @@
 """Findings of the monitor: a live table on a terminal, lines in a pipe; and a JSON file."""
 
 import json
-from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import TextIO
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from coordinator.monitoring.findings import Finding, Key
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
+from coordinator.runtime.terminal import new_table
 
 _NOTES = 6
 
@@ -35,9 +33,7 @@ class MonitorScreen:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._live is not None:
             self._live.stop()
         if self._file is not None:
@@ -58,12 +54,8 @@ class MonitorScreen:
     def show_summary(self) -> None:
         """Show all that was found, as it is held at the end."""
         found, monitor = self._monitor.finding_log.all, self._monitor
-        self._write(
-            {
-                "monitored_s": round(monitor.monitored_s, 3),
-                "findings": [finding.model_dump() for finding in found],
-            }
-        )
+        all_findings = [finding.model_dump() for finding in found]
+        self._write({"monitored_s": round(monitor.monitored_s, 3), "findings": all_findings})
         if self._live is not None:
             self._live.refresh()
             return
@@ -93,17 +85,14 @@ class MonitorScreen:
 
     def _shown(self) -> Group:
         monitor, outside = self._monitor, self._monitor.outside_nm
-        table = Table(
-            "joint", "external torque [Nm]", "threshold [Nm]", title=f"{monitor.monitored_s:.0f} s monitored"
+        table = new_table(
+            f"{monitor.monitored_s:.0f} s monitored", "joint | external torque [Nm] | threshold [Nm]"
         )
         for k, serial in enumerate(monitor.reference.chain.serials):
             now = "-" if outside is None else f"{outside[k]:+.2f}"
             table.add_row(serial, now, f"{monitor.thresholds.contact_nm[k]:.2f}")
-        return Group(table, *_lines(self.sentence(f) for f in monitor.finding_log.all), *_lines(self._notes))
-
-
-def _lines(texts: Iterable[str]) -> list[Text]:
-    return [Text(text) for text in texts]
+        findings = [self.sentence(finding) for finding in monitor.finding_log.all]
+        return Group(table, *map(Text, [*findings, *self._notes]))
 
 
 def _named(key: Key, start_ns: int) -> str:

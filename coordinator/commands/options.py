@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 from pydantic import ValidationError
 
-from coordinator.excitation.plan import Excitation, Mode, Motions, Plan, PlanFileError, load_plan
+from coordinator.excitation.plan import Excitation, Mode, Motions, Plan, load_plan
 from coordinator.live_robot.connection import Place
+from coordinator.runtime.event_loop import check_speed
 from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.model.errors import UsageError
 from module_agent.network_emulation.profile import PROFILES
@@ -21,12 +22,13 @@ BaselineFolder = Annotated[Path, typer.Argument(help="Folder of an earlier run o
 DynamicsFolder = Annotated[
     Path, typer.Argument(help="Folder of an earlier run of this robot with dynamics, its baseline.")
 ]
-Measured = Annotated[Path | None, typer.Option(help="Compare with this finished run; needs no robot.")]
 PlanFile = Annotated[Path | None, typer.Option("--plan", help="TOML file with settings of the motions.")]
 Expect = Annotated[
     int | None, typer.Option(min=1, help="Wait until this many modules answer; fewer are a failure.")
 ]
-Speed = Annotated[float, typer.Option(help="Speed of a simulated world, relative to real time.")]
+Speed = Annotated[
+    float, typer.Option(help="Speed of a simulated world, relative to real time.", callback=check_speed)
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
 
@@ -63,6 +65,19 @@ class ConnectOptions:
 
 
 @dataclass(frozen=True)
+class AgainOptions:
+    """How the robot of a baseline is measured again: by a short run, or as a finished run measured it."""
+
+    out: Annotated[Path | None, typer.Option(help="New folder for a short run, and the report.")] = None
+    measured: Annotated[Path | None, typer.Option(help="Compare with this finished run; needs no robot.")] = (
+        None
+    )
+    expect: Expect = None
+    plan: PlanFile = None
+    speed: Speed = 1.0
+
+
+@dataclass(frozen=True)
 class PlanOptions:
     """How a robot is identified: a plan's file, and settings that take precedence over it."""
 
@@ -91,17 +106,9 @@ class PlanOptions:
 
     def chosen(self) -> Plan:
         """Return the plan with these settings; see `planned`."""
-        return planned(
-            self.plan,
-            dynamics=self.dynamics,
-            sine_amplitude_rad=self.amplitude,
-            home_rad=self.home,
-            imu=self.imu,
-            torque=self.torque,
-            mode=self.mode,
-            motions=self.motions,
-            excitation=self.excitation,
-        )
+        given = dataclasses.asdict(self)
+        path, amplitude, home = (given.pop(name) for name in ("plan", "amplitude", "home"))
+        return planned(path, sine_amplitude_rad=amplitude, home_rad=home, **given)
 
     def arguments(self) -> tuple[str, ...]:
         """Return these options as a command line has them."""
@@ -124,8 +131,6 @@ def planned(path: Path | None, **given: object) -> Plan:
         base = load_plan(path) if path is not None else Plan()
         # Validated again: an option can be out of range as well.
         return Plan.model_validate({**base.model_dump(), **{k: v for k, v in given.items() if v is not None}})
-    except PlanFileError as error:
-        raise UsageError(str(error)) from error
     except ValidationError as error:
         first = error.errors()[0]
         raise UsageError(f"{first['loc'][0]} = {first['input']}: {first['msg']}") from error

@@ -9,15 +9,10 @@ import typer
 from coordinator.baseline.baseline_robot import baseline_within
 from coordinator.baseline.update import updated
 from coordinator.commands.run import print_result
-from coordinator.identification.identified import IdentificationError
 from coordinator.identification.identify import identify
-from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import load_recording
-from coordinator.recording.session_file import SessionFileError
 from coordinator.runtime.terminal import Terminal
 from coordinator.session.run import write_outputs
-from module_agent.model.catalogue import UnknownModuleType
-from module_agent.model.errors import DataError
 
 
 def replay(
@@ -26,12 +21,9 @@ def replay(
 ) -> None:
     """Compute the result of a run again from its recording, without a robot."""
     folder = out if out is not None else session.parent
-    try:
-        recording: Recording = load_recording(session)
-        before = baseline_within(session.parent)
-        identified = identify(recording, partial(updated, before) if before is not None else None)
-    except (SessionFileError, IdentificationError, UnknownModuleType) as error:
-        raise DataError(str(error)) from error
+    recording = load_recording(session)
+    before = baseline_within(session.parent)
+    identified = identify(recording, partial(updated, before) if before is not None else None)
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, identified)
     print_result(identified.result, Terminal())

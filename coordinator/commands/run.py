@@ -5,15 +5,13 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from coordinator.commands.attended_run import run_attended
 from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed
 from coordinator.identification.result import DynamicsPart, Result
 from coordinator.live_robot.connection import sender_name
 from coordinator.runtime.command_line import with_options
-from coordinator.runtime.event_loop import check_speed
-from coordinator.runtime.terminal import Terminal
+from coordinator.runtime.terminal import Terminal, new_table
 from coordinator.session.run import RunConfig
 from coordinator.viewer.targets import viewer_choice
 
@@ -47,8 +45,7 @@ def run(
 
     Exit codes: 0 identified; 1 the run failed; 2 wrong usage; 3 a module was lost; 130 interrupted.
     """
-    place, speed = at.place(), check_speed(speed)
-    shown = viewer_choice(viewer)
+    place = at.place()
     config = RunConfig(
         robot=place.robot,
         out=out,
@@ -56,9 +53,7 @@ def run(
         plan=settings.chosen(),
         expect=expect,
         resume=resume,
-        spawn_viewer=shown.spawn,
-        connect_viewer=shown.connect,
-        serve_viewer=serve_port if shown.serve else None,
+        viewer=viewer_choice(viewer, serve_port),
         baseline=baseline,
     )
     advice = f"to resume: {resuming(context)}" if advise else ""
@@ -87,7 +82,7 @@ def resuming(context: typer.Context) -> str:
 
 def print_result(result: Result, terminal: Terminal) -> None:
     """Print the links, what is not identifiable, and how well the inertial parameters predict."""
-    table = Table("parent", "child", "link length [mm]", "+-", title=f"{result.robot}: links")
+    table = new_table(f"{result.robot}: links", "parent | child | link length [mm] | +-")
     for link in result.links:
         table.add_row(
             link.parent, link.child, f"{link.link_length_mm:.1f}", f"{link.link_length_sigma_mm:.1f}"

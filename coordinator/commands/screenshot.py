@@ -5,9 +5,7 @@ from typing import Annotated
 
 import typer
 
-from coordinator.runtime.command_line import fail
 from coordinator.viewer.screenshot import screenshot as picture
-from module_agent.model.errors import EXIT_FAILED
 
 
 def screenshot(
@@ -16,7 +14,4 @@ def screenshot(
     tab: Annotated[str | None, typer.Option(help="Tab to show.")] = None,
 ) -> None:
     """Render a recording as the viewer shows it, without a screen."""
-    try:
-        picture(recording, out, tab)
-    except OSError as error:
-        fail(error, EXIT_FAILED)
+    picture(recording, out, tab)

@@ -1,24 +1,21 @@
 """Command lines: commands imported on demand, options declared once, errors as exit codes."""
 
+import asyncio
 import dataclasses
 import inspect
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any, NamedTuple, NoReturn, get_type_hints
+from pathlib import Path
+from typing import Any, NoReturn, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from module_agent.model.errors import RobotError
+from module_agent.model.errors import EXIT_INTERRUPTED, RobotError, UsageError
 
-
-class LazyCommand(NamedTuple):
-    """A command by the place of its function (or of its group, a `typer.Typer`), and a line of help."""
-
-    module: str
-    attribute: str
-    help: str
+# How a command may end early; everything else is a programming error.
+ENDINGS = (RobotError, asyncio.CancelledError, KeyboardInterrupt)
 
 
 class CommandFailed(RobotError):
@@ -34,12 +31,34 @@ def fail(text: object, exit_code: int) -> NoReturn:
     raise CommandFailed(str(text), exit_code)
 
 
-def lazy_app(program: str, help_text: str, table: Mapping[str, LazyCommand]) -> typer.Typer:
+def ending(error: BaseException) -> RobotError:
+    """Return the text and the exit code of a `RobotError` or an interruption, one of `ENDINGS`."""
+    return error if isinstance(error, RobotError) else CommandFailed("interrupted", EXIT_INTERRUPTED)
+
+
+def in_a_folder(file: Path | None) -> Path | None:
+    """Check before the work that a file can be written at its end; for options that name one.
+
+    Raises:
+        UsageError: its folder does not exist.
+    """
+    if file is not None and not file.parent.is_dir():
+        raise UsageError(f"{file}: there is no folder {file.parent}")
+    return file
+
+
+def lazy_app(program: str, help_text: str, package: str, table: Mapping[str, tuple[str, str]]) -> typer.Typer:
     """Return a program of these commands; the module of a command is imported when the command is called.
 
     Modules of commands import the estimators and take seconds to load; `--help` of the program lists the
-    lines of the table instead. A `RobotError` that leaves a command is printed on standard error and ends the
-    program with its exit code.
+    lines of the table instead. A `RobotError`, an interruption, or a file that cannot be used ends the
+    program with a line on standard error and an exit code.
+
+    Args:
+        program: its name.
+        help_text: what it does.
+        package: where the modules of the commands are.
+        table: by command, the place of its function (or group, a `typer.Typer`) in the package, and its help.
     """
 
     class Commands(TyperGroup):
@@ -52,18 +71,23 @@ def lazy_app(program: str, help_text: str, table: Mapping[str, LazyCommand]) -> 
             return list(table)
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
-            return _loaded(cmd_name, table[cmd_name]) if cmd_name in table else None
+            return _loaded(cmd_name, f"{package}.{table[cmd_name][0]}") if cmd_name in table else None
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             with formatter.section("Commands"):
-                formatter.write_dl([(name, command.help) for name, command in table.items()])
+                formatter.write_dl([(name, line) for name, (_, line) in table.items()])
 
         def invoke(self, ctx: Any) -> Any:
             try:
                 return super().invoke(ctx)
-            except RobotError as error:
-                typer.echo(f"{program}: {error}", err=True)
-                raise typer.Exit(error.exit_code) from error
+            except ENDINGS as error:
+                end = ending(error)
+            except OSError as error:
+                if error.filename is None:
+                    raise
+                end = RobotError(f"cannot use {error.filename}: {error.strerror}")
+            typer.echo(f"{program}: {end}", err=True)
+            raise typer.Exit(end.exit_code)
 
     app = typer.Typer(
         name=program,
@@ -75,16 +99,13 @@ def lazy_app(program: str, help_text: str, table: Mapping[str, LazyCommand]) -> 
         help=help_text,
     )
     # Without a callback typer takes a program for a single command.
-    app.callback()(_no_callback)
+    app.callback()(lambda: None)
     return app
 
 
-def _no_callback() -> None:
-    pass
-
-
-def _loaded(name: str, command: LazyCommand) -> Any:
-    loaded = getattr(import_module(command.module), command.attribute)
+def _loaded(name: str, place: str) -> Any:
+    module, _, function = place.rpartition(".")
+    loaded = getattr(import_module(module), function)
     if not isinstance(loaded, typer.Typer):
         single = typer.Typer(add_completion=False, rich_markup_mode=None)
         single.command(name)(loaded)
@@ -99,8 +120,12 @@ def with_options(function: Callable[..., None]) -> Callable[..., None]:
     with instances of the dataclasses.
     """
     signature = inspect.signature(function)
-    kinds = {p.name: p.annotation for p in signature.parameters.values() if _is_options(p.annotation)}
-    parameters = []
+    kinds = {
+        p.name: p.annotation
+        for p in signature.parameters.values()
+        if isinstance(p.annotation, type) and dataclasses.is_dataclass(p.annotation)
+    }
+    parameters: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
         if parameter.name in kinds:
             parameters += _fields(kinds[parameter.name])
@@ -117,10 +142,6 @@ def with_options(function: Callable[..., None]) -> Callable[..., None]:
     command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
-
-
-def _is_options(annotation: object) -> bool:
-    return isinstance(annotation, type) and dataclasses.is_dataclass(annotation)
 
 
 def _fields(kind: Any) -> list[inspect.Parameter]:

@@ -5,7 +5,8 @@ import math
 import selectors
 import signal
 import time
-from typing import TypeVar
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
 from module_agent.model.errors import UsageError
 
@@ -56,7 +57,6 @@ class ScaledLoop(asyncio.SelectorEventLoop):
 
 T = TypeVar("T")
 
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -88,10 +88,30 @@ def run_to_end(loop: asyncio.AbstractEventLoop, task: "asyncio.Task[T]") -> T:
         return loop.run_until_complete(task)
     finally:
         remaining = sorted(asyncio.all_tasks(loop), key=lambda each: each.get_name())
-        loop.run_until_complete(_end(remaining))
+        for each in remaining:
+            each.cancel()
+        if remaining:
+            loop.run_until_complete(asyncio.gather(*remaining, return_exceptions=True))
 
 
-async def _end(tasks: "list[asyncio.Task[object]]") -> None:
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+def attend(
+    loop: asyncio.AbstractEventLoop, work: Coroutine[Any, Any, T], ends: Callable[[], bool] = lambda: False
+) -> T:
+    """Run work to its end, and close the loop; a signal cancels the work, unless `ends` ends it in order."""
+    task = loop.create_task(work)
+    interruption = Interruption(loop, task)
+
+    def on_signal() -> None:
+        if not ends():
+            interruption()
+
+    for number in SIGNALS:
+        loop.add_signal_handler(number, on_signal)
+    try:
+        return run_to_end(loop, task)
+    finally:
+        loop.run_until_complete(loop.shutdown_default_executor())
+        # Closing hands the signals back to Python.
+        loop.close()
+        if interruption.requested:
+            ignore_signals()

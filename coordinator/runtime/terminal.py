@@ -1,12 +1,25 @@
 """Terminal output of a run: a progress line with notes above it; plain lines in a pipe."""
 
 import time
+from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 _PIPE_WIDTH = 140
+
+
+def new_table(title: str | None, columns: str, **appearance: Any) -> Table:
+    """Return a table without rows; `columns` are separated by bars, `>` aligns one to the right.
+
+    Units may stand in brackets, which are markup to rich.
+    """
+    table = Table(title=escape(title) if title else None, **appearance)
+    for name in columns.split(" | "):
+        table.add_column(escape(name.lstrip(">")), justify="right" if name.startswith(">") else "left")
+    return table
 
 
 def print_table(table: Table) -> None:

@@ -134,8 +134,7 @@ class MotionChoice:
         return max(circles, default=LIKELY_RADIUS_M)
 
     def _unmoved_limits(self, serial: str) -> JointLimits:
-        inertia = likely_inertia_kg_m2([self._kind(s) for s in self._serials()])
-        return self._limits(serial, inertia)
+        return self._limits(serial, likely_inertia_kg_m2([self._kind(s) for s in self._serials()]))
 
     def _moved_limits(self, serial: str, slow: MotionRecord) -> JointLimits:
         rows = self._recording.rows(serial, slow.start_row, slow.end_row or slow.start_row)
@@ -144,10 +143,7 @@ class MotionChoice:
         return self._limits(serial, load.at_most_kg_m2)
 
     def _limits(self, serial: str, inertia_kg_m2: float) -> JointLimits:
-        limits = joint_limits(self._kind(serial), self._rest_torque_nm(serial), inertia_kg_m2)
+        rest_torque_nm = float(self._recording.rest_rows(serial)["effort_nm"].astype(float).mean())
+        limits = joint_limits(self._kind(serial), rest_torque_nm, inertia_kg_m2)
         least = least_accel_rad_s2(len(self._serials()))
         return limits._replace(accel_rad_s2=max(limits.accel_rad_s2, least))
-
-    def _rest_torque_nm(self, serial: str) -> float:
-        """Return a joint's mean torque at rest in the home position."""
-        return float(self._recording.rest_rows(serial)["effort_nm"].astype(float).mean())

@@ -78,9 +78,7 @@ class RunConfig(NamedTuple):
     plan: Plan = Plan()
     expect: int | None = None
     resume: bool = False
-    spawn_viewer: bool = False
-    connect_viewer: str | None = None
-    serve_viewer: int | None = None
+    viewer: ViewerTargets = ViewerTargets()
     inline: bool = False
     refined_previews: int | None = None
     baseline: Path | None = None
@@ -123,9 +121,7 @@ class Run:
         self._started_s = time.monotonic()
         self.recording = Recording()
         self._writer = SessionWriter(config.out / SESSION)
-        targets = ViewerTargets(
-            config.out / VIEW, config.spawn_viewer, config.connect_viewer, config.serve_viewer
-        )
+        targets = config.viewer._replace(rrd=config.out / VIEW)
         viewer = Viewer(config.robot, config.out.name, targets, waits=config.inline)
         self._feed = ViewerFeed(viewer, self.recording, overlay)
         self._previewer = Previewer(self.recording, config.refined_previews)
@@ -156,17 +152,17 @@ class Run:
             message = self.recording.add(entry)
         except RobotError:
             return None  # counted by the recording, by reason
-        if isinstance(message, Message):
-            self._feed.on_message(entry, message)
-            return message
-        return None
+        if not isinstance(message, Message):
+            return None
+        self._feed.on_message(entry, message)
+        return message
 
     def _journal(self, event: JournalEvent) -> None:
         entry = Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode())
         self._writer.write(entry)
         self.recording.add(entry)
         if event.what == "session":
-            self._feed.since_start(event.t_ns)
+            self._feed.begin(event.t_ns)
         if event.what == "failed":
             self._feed.step(event.t_ns, event.text)
 
@@ -203,7 +199,6 @@ class Run:
         except (DataError, KeyError) as error:
             logger.info("no preview of the robot: %s", error)
         except Exception:
-            # A run must not end for lack of a picture.
             logger.exception("the preview of the robot failed")
         return None
 
@@ -225,7 +220,7 @@ class Run:
     async def explored(self) -> None:
         """Identify topology and chain, and show them."""
         await self._await_preview()
-        kinematics = await self._compute(lambda: self._with_baseline(identify_kinematics(self.recording)))
+        kinematics = await self._kinematics()
         self._chain = kinematics.fit.chain
         self._feed.chain(self._clock(), kinematics.fit)
         for line in kinematics.summary():
@@ -252,6 +247,9 @@ class Run:
             self._screen.note(line)
         return joints_to_explore(kinematics.topology, changes)
 
+    async def _kinematics(self) -> Kinematics:
+        return await self._compute(lambda: self._with_baseline(identify_kinematics(self.recording)))
+
     def _with_baseline(self, kinematics: Kinematics) -> Kinematics:
         return updated(self._baseline, kinematics) if self._baseline is not None else kinematics
 
@@ -271,7 +269,6 @@ class Run:
                     torque=config.plan.torque,
                 )
             )
-            single_joints = self._single_joints if self._baseline is not None else None
             session = Session(
                 self._group,
                 self._messenger,
@@ -280,7 +277,7 @@ class Run:
                 self._clock,
                 self._journal,
                 self,
-                single_joints,
+                self._single_joints if self._baseline is not None else None,
                 lambda: self._requests.collect(self._group.serials),
             )
             await session.run(config.expect)
@@ -297,7 +294,11 @@ class Run:
             identified = await self._compute(
                 lambda: identify(self.recording, self._with_baseline, kinematics)
             )
-            self._write(identified)
+            write_outputs(config.out, identified)
+            self._feed.chain(self._clock(), identified.kinematics.fit)
+            if identified.held_out is not None:
+                self._feed.held_out(identified.held_out)
+            self._feed.step(self._clock(), "done")
             self._identified = identified
             for line in identified.inertia.summary() if identified.inertia is not None else ():
                 self._screen.note(line)
@@ -323,7 +324,7 @@ class Run:
             return None
         self._journal(JournalEvent(t_ns=self._clock(), what="settled"))
         try:
-            kinematics = await self._compute(lambda: self._with_baseline(identify_kinematics(self.recording)))
+            kinematics = await self._kinematics()
         except IdentificationError:
             return None  # reported when everything is identified from the complete recording
         await self._requests.ask(kinematics.fit.chain, kinematics.clocks)
@@ -346,14 +347,6 @@ class Run:
         if self._config.inline:
             return work()
         return await asyncio.to_thread(work)
-
-    def _write(self, identified: Identified) -> None:
-        out = self._config.out
-        write_outputs(out, identified)
-        self._feed.chain(self._clock(), identified.kinematics.fit)
-        if identified.held_out is not None:
-            self._feed.held_out(identified.held_out)
-        self._feed.step(self._clock(), "done")
 
 
 def write_outputs(out: Path, identified: Identified) -> None:

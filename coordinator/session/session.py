@@ -21,6 +21,8 @@ from coordinator.recording.journal import JournalEvent, Purpose, exclusion_event
 from coordinator.recording.recording import Recording
 from coordinator.session.motion_selection import MotionChoice
 from coordinator.topology.next_motion import MAX_REPEATS, NextMotion
+from coordinator.viewer.feed import Screen
+from module_agent.model.catalogue import ModuleType
 from module_agent.model.errors import RobotError
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
 
@@ -33,16 +35,8 @@ POOR_RETRIES = 4
 SIMULTANEOUS_REST_S = 1.0
 
 
-class Reporter(Protocol):
+class Reporter(Screen, Protocol):
     """Receives the progress of the session, and designs motions; implemented by `Run`."""
-
-    def step(self, index: int, total: int, text: str) -> None:
-        """Report that a step begins."""
-        ...
-
-    def note(self, text: str) -> None:
-        """Report a line of text."""
-        ...
 
     def estimates(self, joint: str) -> None:
         """Report that all estimates of the motions of a joint have arrived."""
@@ -118,16 +112,18 @@ class Session:
         self._invalidate_steps_before_boot()
         starts = {s: self._position(s) for s in serials}
         try:
-            await self._take()
+            # The keep-alives first: a lease must not expire while the next module is slow to answer.
+            self._keeper = asyncio.create_task(self.group.keep_alive())
+            await self._arm()
             await self._step_unless_excluded("home", "all joints to their home position", self._home)
             await self._step("rest", "listening at rest", self._rest)
             if self._plan.mode == "simultaneous":
                 await self._step("explore", "exploring all joints at once", self._explore_all)
-                await self._explore_single()
+                single = await self._single_joints() if self._single_joints is not None else ()
+                self._total += len(single)
+                await self._explore_each(single)
             else:
-                for serial in serials:
-                    text = f"exploring joint {serial}"
-                    await self._step_unless_excluded(f"explore/{serial}", text, self._explore, serial)
+                await self._explore_each(serials)
                 if self._plan.motions == "optimised" and not self._plan.topology_only:
                     await self._step("explore", "exploring all joints at once", self._explore_all)
             await self._settle_doubts()
@@ -176,11 +172,6 @@ class Session:
         if self._done:
             self._reporter.note(f"resuming: {len(self._done)} steps are done already")
 
-    async def _take(self) -> None:
-        # The keep-alives first: a lease must not expire while the next module is slow to answer.
-        self._keeper = asyncio.create_task(self.group.keep_alive())
-        await self._arm()
-
     async def _arm(self) -> None:
         """Acquire every module, and set the plan's gains if they are not the factory's."""
         # Concurrently: a module that is armed without a motion expires sooner.
@@ -192,10 +183,6 @@ class Session:
             strategy = self.group.info(serial).gains.strategy
             gains = self._plan.exploring_gains(self.group.kind(serial), strategy)
             await self.group.set_gains(serial, gains)
-
-    def _retries(self) -> int:
-        """Return how often an interrupted step is repeated."""
-        return self._plan.retries * (POOR_RETRIES if self.group.is_poor else 1)
 
     async def _step(
         self, name: str, text: str, work: Callable[..., Awaitable[None]], *arguments: str
@@ -212,7 +199,7 @@ class Session:
                 break
             except MotionInterrupted as error:
                 await self.group.check_now()
-                if attempt >= self._retries():
+                if attempt >= self._plan.retries * (POOR_RETRIES if self.group.is_poor else 1):
                     raise
                 self._reporter.note(f"{error}; re-arming and trying again")
                 self._journal(JournalEvent(t_ns=self._clock(), what="note", step=name, text=str(error)))
@@ -271,11 +258,7 @@ class Session:
     # ------------------------------------------------------------------ the steps
 
     async def _home(self) -> None:
-        speed, home = self._plan.travel_speed_rad_s, self._plan.home_rad
-        await self.group.run(
-            {s: GoTo(target_rad=home, max_speed_rad_s=speed) for s in self._excluded.movers()}
-        )
-        await asyncio.sleep(self._plan.settle_s)
+        await self._go_all(dict.fromkeys(self._excluded.movers(), self._plan.home_rad))
 
     async def _rest(self) -> None:
         longest_s = SIMULTANEOUS_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
@@ -308,10 +291,7 @@ class Session:
                 f"of radius by the sensors, {self._plan.precision_mm:.2f} mm asked for"
             )
 
-    async def _explore_single(self) -> None:
-        """Explore one by one the joints of `single_joints`, after a motion of all joints at once."""
-        serials = await self._single_joints() if self._single_joints is not None else ()
-        self._total += len(serials)
+    async def _explore_each(self, serials: Sequence[str]) -> None:
         for serial in serials:
             text = f"exploring joint {serial}"
             await self._step_unless_excluded(f"explore/{serial}", text, self._explore, serial)
@@ -372,10 +352,12 @@ class Session:
             await self._step(f"{purpose}/{number}", text, work)
             await self._share_information()
         for serial in serials:
-            await self._step(f"excite/{serial}", f"exciting joint {serial}", self._excite, serial)
+            work = partial(self._excite, "dynamic", self._plan.dynamic)
+            await self._step(f"excite/{serial}", f"exciting joint {serial}", work, serial)
             await self._share_information()
         for serial in serials:
-            await self._step(f"held_out/{serial}", f"held-out motion of {serial}", self._hold_out, serial)
+            work = partial(self._excite, "held_out", self._plan.held_out)
+            await self._step(f"held_out/{serial}", f"held-out motion of {serial}", work, serial)
 
     async def _share_information(self) -> None:
         if self._share is not None:
@@ -400,14 +382,9 @@ class Session:
             self._note_motion(step, serial, record, purpose)
         await self._go_all(dict.fromkeys(motion.pose_rad, self._plan.home_rad))
 
-    async def _excite(self, serial: str) -> None:
-        pattern = self._plan.dynamic(self.group.kind(serial))
-        await self._move(f"excite/{serial}", serial, pattern, "dynamic")
-        await self._go(serial, self._plan.home_rad)
-
-    async def _hold_out(self, serial: str) -> None:
-        pattern = self._plan.held_out(self.group.kind(serial))
-        await self._move(f"held_out/{serial}", serial, pattern, "held_out")
+    async def _excite(self, purpose: Purpose, motion: Callable[[ModuleType], Pattern], serial: str) -> None:
+        step = "held_out" if purpose == "held_out" else "excite"
+        await self._move(f"{step}/{serial}", serial, motion(self.group.kind(serial)), purpose)
         await self._go(serial, self._plan.home_rad)
 
     # ------------------------------------------------------------------ pieces

@@ -1,6 +1,6 @@
 """What a run shows in its viewer: the messages as they are recorded, and the results of its steps."""
 
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from coordinator.kinematics.frames import axis_angles
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.recording.recording import Entry, ModuleRecord, Recording
 from coordinator.synchronisation.round_trips import map_clock
-from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH
+from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Estimate
 from coordinator.viewer.scene.robot_geometry import side_by_side
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.chain import BASE, Array, Chain
@@ -54,16 +54,6 @@ class Screen(Protocol):
         ...
 
 
-class _Shown(NamedTuple):
-    """An estimate on the screen, which is valid until there is a newer one."""
-
-    name: str
-    serial: str
-    value: float
-    sigma: float
-    units: str = "mm"
-
-
 class ViewerFeed:
     """Feeds one viewer from one recording; the viewer's time is zero at the beginning of the session.
 
@@ -81,8 +71,9 @@ class ViewerFeed:
         self._pose_ns = 0
         self._network_ns: dict[str, int] = {}
         self._known: tuple[str, ...] = ()
-        self._origin_ns: int | None = None
-        self._shown: dict[tuple[str, str], _Shown] = {}
+        self._origin_ns = 0
+        # The newest estimates, each valid until there is a newer one.
+        self._shown: dict[tuple[str, str], Estimate] = {}
         self._shown_ns = 0
 
     def on_message(self, entry: Entry, message: Message) -> None:
@@ -99,15 +90,9 @@ class ViewerFeed:
         if entry.t_ns - self._shown_ns >= ESTIMATES_PERIOD_NS:
             self._show_again(entry.t_ns)
 
-    def since_start(self, session_ns: int) -> int:
-        """Return the time that the viewer shows for a session time."""
-        return session_ns - self._start_ns(session_ns)
-
-    def _start_ns(self, session_ns: int) -> int:
-        """Return the beginning of the session: the time of the first call."""
-        if self._origin_ns is None:
-            self._origin_ns = session_ns
-        return self._origin_ns
+    def begin(self, session_ns: int) -> None:
+        """Set the beginning of the session, from which the viewer's time counts."""
+        self._origin_ns = session_ns
 
     def _gather(self, feedback: Feedback) -> None:
         """Note which rows were received; the rows themselves are in the recording."""
@@ -127,7 +112,7 @@ class ViewerFeed:
             if clock is not None:
                 rows = np.concatenate([record.rows.rows(first, end) for first, end in spans])
                 session_ns = clock.to_session(rows["t_ns"].astype(np.int64))
-                self._viewer.rows(serial, session_ns - self._start_ns(now_ns), rows)
+                self._viewer.rows(serial, session_ns - self._origin_ns, rows)
         self._pending.clear()
 
     def _map(self, record: ModuleRecord, now_ns: int) -> ClockMap | None:
@@ -142,7 +127,7 @@ class ViewerFeed:
         if not self._drawn or now_ns - self._pose_ns < POSE_PERIOD_NS:
             return
         self._pose_ns = now_ns
-        self._viewer.poses([self.since_start(now_ns)], [self._positions()], self._known)
+        self._viewer.poses([now_ns - self._origin_ns], [self._positions()], self._known)
 
     def close(self) -> None:
         """Show the rows that are left, and close the viewer. May be called twice."""
@@ -168,7 +153,7 @@ class ViewerFeed:
         refused = sum(status.refusals.values())
         round_trip_ms = (trip.received_ns - trip.sent_ns) / 1e6
         self._viewer.network(
-            status.serial, self.since_start(entry.t_ns), round_trip_ms, age_ns / 1e6, refused
+            status.serial, entry.t_ns - self._origin_ns, round_trip_ms, age_ns / 1e6, refused
         )
 
     def connected(self, types: dict[str, str], session_ns: int) -> None:
@@ -177,20 +162,20 @@ class ViewerFeed:
             self._known = tuple(types)
             self._viewer.modules(self._known, types)
             if self._overlay is not None:
-                self._overlay.connected(self._viewer, self.since_start(session_ns))
+                self._overlay.connected(self._viewer, session_ns - self._origin_ns)
                 self._drawn = True
 
     def step(self, session_ns: int, text: str) -> None:
         """Show that a step begins, and the present estimates again, so that their lines reach this step."""
-        self._viewer.phase(self.since_start(session_ns), text)
+        self._viewer.phase(session_ns - self._origin_ns, text)
         self._show_again(session_ns)
 
     def _show_again(self, session_ns: int) -> None:
         self._shown_ns = session_ns
         for shown in self._shown.values():
-            self._show(self.since_start(session_ns), shown)
+            self._show(session_ns - self._origin_ns, shown)
 
-    def _show(self, now_ns: int, shown: _Shown) -> None:
+    def _show(self, now_ns: int, shown: Estimate) -> None:
         self._shown[shown.name, shown.serial] = shown
         self._viewer.estimate(shown.name, shown.serial, now_ns, shown.value, shown.sigma, shown.units)
 
@@ -202,8 +187,9 @@ class ViewerFeed:
                 continue
             known = self._shown.get((OWN_DISTANCE, observer))
             if known is None or 1e3 * circle.distance_m <= known.value:
-                shown = _Shown(OWN_DISTANCE, observer, 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m)
-                self._show(self.since_start(session_ns), shown)
+                distance_mm, sigma_mm = 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m
+                shown = Estimate(OWN_DISTANCE, observer, distance_mm, sigma_mm, "mm")
+                self._show(session_ns - self._origin_ns, shown)
 
     def preview(self, session_ns: int, preview: Preview) -> None:
         """Show the robot as far as it is known, and the links that are final: between adjacent modules."""
@@ -216,7 +202,7 @@ class ViewerFeed:
         self._show_links(session_ns, fit, tuple(parent != BASE for parent in fit.chain.parent))
 
     def _draw(self, session_ns: int, fit: ChainEstimate) -> None:
-        chain, now_ns = side_by_side(fit.chain), self.since_start(session_ns)
+        chain, now_ns = side_by_side(fit.chain), session_ns - self._origin_ns
         if self._overlay is not None:
             self._overlay.chain(self._viewer, now_ns, chain, fit.unresolved)
         self._viewer.topology(now_ns, chain.serials, chain.parent, chain.reversed)
@@ -225,17 +211,17 @@ class ViewerFeed:
         self._drawn = True
 
     def _show_links(self, session_ns: int, fit: ChainEstimate, shown: tuple[bool, ...]) -> None:
-        now_ns = self.since_start(session_ns)
+        now_ns = session_ns - self._origin_ns
         angle, spread = (np.degrees(value) for value in axis_angles(fit.chain, fit.covariance))
         for k, serial in enumerate(fit.chain.serials):
             if shown[k]:
                 length, sigma = 1e3 * float(fit.link_length_m[k]), 1e3 * float(fit.link_length_sigma_m[k])
-                self._show(now_ns, _Shown(LINK_LENGTH, serial, length, sigma))
-                self._show(now_ns, _Shown(AXIS_ANGLE, serial, float(angle[k]), float(spread[k]), "deg"))
+                self._show(now_ns, Estimate(LINK_LENGTH, serial, length, sigma, "mm"))
+                self._show(now_ns, Estimate(AXIS_ANGLE, serial, float(angle[k]), float(spread[k]), "deg"))
 
     def held_out(self, motion: HeldOutMotion) -> None:
         """Show measured and predicted torques of the held-out motions."""
-        t_ns = motion.session_ns - (self._origin_ns or 0)
+        t_ns = motion.session_ns - self._origin_ns
         for index, serial in enumerate(motion.serials):
             measured, predicted = motion.tau_measured_nm[:, index], motion.tau_predicted_nm[:, index]
             self._viewer.residuals(serial, t_ns, measured, predicted)

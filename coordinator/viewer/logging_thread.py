@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 
 
 class LoggingThread:
-    """Runs jobs in the order of submission; drops and counts them when there are too many."""
+    """Runs jobs in the order of submission; `dropped` counts those that did not fit into the queue."""
 
     def __init__(
         self,
@@ -37,17 +37,12 @@ class LoggingThread:
         self._length = length
         self._on_idle = on_idle
         self._on_end = on_end
-        self._dropped = 0
+        self.dropped = 0
         self._failures: dict[str, int] = {}
         self._closed = False
         # A daemon, so that a process that fails before `close` can end.
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
-
-    @property
-    def dropped(self) -> int:
-        """How many jobs were dropped because the queue was full."""
-        return self._dropped
 
     @property
     def failed(self) -> int:
@@ -62,13 +57,12 @@ class LoggingThread:
         if self._waits:
             self._jobs.put(job)
             return True
-        if not essential and self._jobs.qsize() >= self._length:
-            self._dropped += 1
-            return False
         try:
+            if not essential and self._jobs.qsize() >= self._length:
+                raise queue.Full
             self._jobs.put_nowait(job)
         except queue.Full:
-            self._dropped += 1
+            self.dropped += 1
             return False
         return True
 

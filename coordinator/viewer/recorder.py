@@ -74,10 +74,6 @@ class Recorder:
         self._types.update(types)
         self._register(serials)
 
-    def name_types(self, types: Mapping[str, str]) -> None:
-        """Set the types of modules whose types are not known yet."""
-        self._types = {**types, **self._types}
-
     def rows(self, serial: str, t_ns: IntArray, rows: Rows) -> None:
         """Log `rows` (m,), taken at `t_ns` (m,)."""
         self._register([serial])
@@ -121,7 +117,8 @@ class Recorder:
         """Log the tree of modules."""
         self._register(topology.serials)
         progress.set_time(self._stream, t_ns)
-        for drawn in graphs.graph(topology, self._types, self._colours(topology.serials)):
+        colours = {serial: self._palette[serial] for serial in topology.serials}
+        for drawn in graphs.graph(topology, self._types, colours):
             self._stream.log(entity_paths.TOPOLOGY, drawn)
         self._contents = self._contents._replace(topology=topology)
         self.show_if_new()
@@ -133,7 +130,7 @@ class Recorder:
         """
         key = (estimate.name, estimate.serial)
         truth, previous = self._truths.get(key), self._estimates.get(key)
-        colour = self._palette.colour(estimate.serial)
+        colour = self._palette[estimate.serial]
         if previous is None:
             progress.log_interval_style(self._stream, *key, colour)
         if estimate != previous:
@@ -155,12 +152,24 @@ class Recorder:
             progress.set_time(self._stream, t)
             progress.log_truth(self._stream, name, serial, value)
 
-    def chain(self, t_ns: int, chain: Chain, sigma_m: Sequence[float] | None, world: str) -> None:
-        """Draw the robot of a world from now on, in its latest posture; at q = 0 before the first pose."""
+    def chain(
+        self,
+        t_ns: int,
+        chain: Chain,
+        sigma_m: Sequence[float] | None,
+        world: str,
+        types: Mapping[str, str] | None = None,
+    ) -> None:
+        """Draw the robot of a world from now on, in its latest posture; at q = 0 before the first pose.
+
+        `types` are those of modules that have not been registered with theirs.
+        """
+        self._types = {**(types or {}), **self._types}
         self._register(chain.serials)
         self._log_poses()  # of the previous chain
         style = STYLES[world]
-        scene = robot_scene.build_scene(chain, self._types, self._colours(chain.serials), sigma_m, style)
+        colours = {serial: self._palette[serial] for serial in chain.serials}
+        scene = robot_scene.build_scene(chain, self._types, colours, sigma_m, style)
         progress.set_time(self._stream, t_ns)
         before = self._scenes.get(world)
         if before is not None:
@@ -170,20 +179,11 @@ class Recorder:
         self._contents = self._contents._replace(truth=entity_paths.TRUE_WORLD in self._scenes)
         self._frame(chain)
 
-    def poses(self, t_ns: IntArray, q_rad: Array, serials: Sequence[str] | None) -> None:
-        """Turn the robots that are drawn at `t_ns` (k,); `q_rad` (k, n) of `serials`.
-
-        Without `serials` it is in the order of the identified chain. Other joints stay as they are.
-        """
-        first = self._scenes.get(entity_paths.ESTIMATED_WORLD, self._scenes.get(entity_paths.TRUE_WORLD))
-        if first is None and serials is None:
-            return  # before there is a robot there is nothing to turn
-        named = tuple(serials or ()) if first is None or serials is not None else first.chain.serials
-        if q_rad.shape != (t_ns.size, len(named)):
-            raise ValueError(f"{t_ns.size} poses of shape {q_rad.shape} for a robot of {len(named)} joints")
-        if named != self._posed:
+    def poses(self, t_ns: IntArray, q_rad: Array, serials: tuple[str, ...]) -> None:
+        """Turn the joints `serials` of the robots that are drawn to `q_rad` (k, n) at `t_ns` (k,)."""
+        if serials != self._posed:
             self._log_poses()
-            self._posed = named
+            self._posed = serials
         self._poses.append((t_ns, q_rad))
         if t_ns[-1] - self._poses[0][0][0] >= self._pace.period_ns:
             self._log_poses()
@@ -211,7 +211,7 @@ class Recorder:
         if not new:
             return
         for serial in new:
-            time_series.log_module_styles(self._stream, serial, serial, self._palette.colour(serial))
+            time_series.log_module_styles(self._stream, serial, self._palette[serial])
         self._contents = self._contents._replace(serials=(*self._contents.serials, *new))
         self._show()
 
@@ -226,9 +226,6 @@ class Recorder:
 
     def _posture(self, chain: Chain) -> Array:
         return np.array([self._q_rad.get(serial, 0.0) for serial in chain.serials])
-
-    def _colours(self, serials: Sequence[str]) -> dict[str, entity_paths.Colour]:
-        return {serial: self._palette.colour(serial) for serial in serials}
 
     def show_if_new(self) -> None:
         """Send the layout if its views differ from those that are shown, and this stream follows the run."""

@@ -4,7 +4,7 @@ Needs Vulkan in software, on Debian the packages `mesa-vulkan-drivers` and `libv
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,55 +27,35 @@ class ScreenshotFailed(RobotError):
     """No picture could be taken; the message says what to do."""
 
 
-def screenshot(
-    rrd: Path,
-    out: Path,
-    tab: str | None = None,
-    t_s: float | None = None,
-    size: tuple[int, int] = (1600, 900),
-) -> None:
+def screenshot(rrd: Path, out: Path, tab: str | None = None, size: tuple[int, int] = (1600, 900)) -> None:
     """Write one picture of a recording as a PNG.
 
     Args:
         rrd: the recording.
         out: the PNG.
         tab: one of `blueprint.TABS`; the tab that the recording opens with if left out.
-        t_s: session time to show [s]; the end of the recording if left out.
         size: width and height [pixels].
 
     Raises:
-        FileNotFoundError: there is no such recording.
+        OSError: the recording cannot be read, or the picture not be written.
         ScreenshotFailed: no software Vulkan, not a recording of a run, or the viewer did not settle.
         UsageError: there is no such tab.
     """
-    screenshots(rrd, [(tab, out)], t_s, size)
-
-
-def screenshots(
-    rrd: Path,
-    pictures: Sequence[tuple[str | None, Path]],
-    t_s: float | None = None,
-    size: tuple[int, int] = (1600, 900),
-) -> None:
-    """Write several pictures, as (tab, PNG), with one start of the viewer. See `screenshot`."""
-    for tab, _ in pictures:
-        if tab is not None and tab not in TABS:
-            raise UsageError(f"no tab {tab!r}; there are {', '.join(TABS)}")
-    if not rrd.is_file():
-        raise FileNotFoundError(f"no recording at {rrd}")
+    if tab is not None and tab not in TABS:
+        raise UsageError(f"no tab {tab!r}; there are {', '.join(TABS)}")
     if not is_recording(rrd):
         raise ScreenshotFailed(f"{rrd} is not a Rerun recording: it does not begin with {MAGIC.decode()!r}")
     port = viewer_process.free_port()
     viewer = _start(port, size)
     try:
         client = ViewerClient.connect(proxy_url(port))
-        _open(client, rrd, t_s)
-        for tab, out in pictures:
-            if tab is not None:
-                _turn_to(client, tab)
-            _settle(client)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            out.write_bytes(client.take_screenshot())
+        _open(client, rrd)
+        if tab is not None:
+            layout = client.get_blueprint("recording").blueprint
+            client.set_blueprint(with_active_tab(layout, tab), "recording")
+        _settle(client)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_bytes(client.take_screenshot())
     except ConnectionError as failure:
         # It listens before it draws, so without Vulkan it starts, and ends at the first picture.
         raise ScreenshotFailed(_advice(viewer.output_tail())) from failure
@@ -98,7 +78,8 @@ def _advice(output: str) -> str:
     )
 
 
-def _open(client: ViewerClient, rrd: Path, t_s: float | None) -> None:
+def _open(client: ViewerClient, rrd: Path) -> None:
+    """Open a recording, and show its end."""
     client.open(str(rrd.resolve()))
     deadline = time.monotonic() + SETTLE_SECONDS
     while True:
@@ -116,13 +97,7 @@ def _open(client: ViewerClient, rrd: Path, t_s: float | None) -> None:
                 f"{rrd} has no timeline {entity_paths.TIMELINE!r}: it is not the recording of a run"
             )
         time.sleep(_POLL_SECONDS)
-    t_ns = ends[0] if t_s is None else round(1e9 * t_s)
-    client.set_time(entity_paths.TIMELINE, duration=np.timedelta64(t_ns, "ns"), play_state="paused")
-
-
-def _turn_to(client: ViewerClient, tab: str) -> None:
-    blueprint = client.get_blueprint("recording").blueprint
-    client.set_blueprint(with_active_tab(blueprint, tab), "recording")
+    client.set_time(entity_paths.TIMELINE, duration=np.timedelta64(ends[0], "ns"), play_state="paused")
 
 
 def with_active_tab(blueprint: Mapping[str, Any], tab: str) -> dict[str, Any]:

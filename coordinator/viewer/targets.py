@@ -1,7 +1,7 @@
 """Where a recording goes: a file, a viewer on this machine, a viewer elsewhere, a web page."""
 
 import logging
-import socket
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote, urlsplit
@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     import rerun as rr
 
 NATIVE_PORT = 9876
-# Attaching a sink blocks for seconds if nothing listens there, so every address is tried first.
-PROBE_SECONDS = 0.5
 WEB_MEMORY = "256MB"
 SCHEMES = ("rerun", "rerun+http", "rerun+https")
 # Rows that are logged one by one, such as estimates, share a chunk of a file for this long.
@@ -39,28 +37,20 @@ class ViewerTargets(NamedTuple):
     serve_port: int | None = None
 
 
-class ViewerChoice(NamedTuple):
-    """A native viewer to start, a web page to serve, or the address of a viewer that is open already."""
-
-    spawn: bool = False
-    serve: bool = False
-    connect: str | None = None
-
-
-def viewer_choice(text: str) -> ViewerChoice:
-    """Parse `none`, `spawn`, `serve` or an address.
+def viewer_choice(text: str, serve_port: int | None = None) -> ViewerTargets:
+    """Parse `none`, `spawn`, `serve` (on a port) or an address.
 
     Raises:
         UsageError: none of these; the message lists what is allowed.
     """
     if text in ("none", "spawn", "serve"):
-        return ViewerChoice(text == "spawn", text == "serve")
+        return ViewerTargets(spawn=text == "spawn", serve_port=serve_port if text == "serve" else None)
     scheme, separator, rest = text.partition("://")
     if scheme not in SCHEMES or not separator or not rest:
         raise UsageError(
             f"--viewer {text}: it must be none, spawn, serve or an address like {proxy_url(NATIVE_PORT)}"
         )
-    return ViewerChoice(connect=text)
+    return ViewerTargets(connect=text)
 
 
 class Opened(NamedTuple):
@@ -92,9 +82,18 @@ def open_targets(run_id: str, targets: ViewerTargets) -> Opened:
         batching = rr.ChunkBatcherConfig(flush_tick=FILE_TICK_SECONDS)
         file = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id, batcher_config=batching)
         file.set_sinks(rr.FileSink(str(targets.rrd)))
-    web_server = _serve(targets.serve_port)
-    urls = [url for url in (_native(targets.spawn), targets.connect, _web_url(web_server, targets)) if url]
-    reached = [url for url in dict.fromkeys(urls) if _reachable(url)]
+    urls, web_server, port = [targets.connect], None, targets.serve_port
+    if targets.spawn:
+        native = viewer_process.listens("127.0.0.1", NATIVE_PORT) or _started("native", [], NATIVE_PORT)
+        urls.insert(0, proxy_url(NATIVE_PORT) if native else None)
+    if port is not None:
+        options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
+        web_server = _started("web", options, port + 1)
+    if port is not None and web_server is not None:
+        urls.append(proxy_url(port + 1))
+        page = quote(proxy_url(port + 1), safe="")
+        logger.info("open http://127.0.0.1:%d?url=%s in a browser", port, page)
+    reached = [url for url in dict.fromkeys(urls) if url is not None and _reachable(url)]
     if reached:
         live = rr.RecordingStream(entity_paths.APPLICATION_ID, recording_id=run_id)
         live.set_sinks(*(rr.GrpcSink(url) for url in reached))
@@ -106,52 +105,22 @@ def proxy_url(port: int) -> str:
     return f"rerun+http://127.0.0.1:{port}/proxy"
 
 
-def listens(host: str, port: int) -> bool:
-    """Return whether connections are accepted there."""
-    try:
-        socket.create_connection((host, port), timeout=PROBE_SECONDS).close()
-    except OSError:
-        return False
-    return True
-
-
 def _reachable(url: str) -> bool:
     parts = urlsplit(url)
     if parts.scheme not in SCHEMES or parts.hostname is None:
         logger.warning("%r is no viewer's address; one looks like %r", url, proxy_url(NATIVE_PORT))
         return False
-    if listens(parts.hostname, parts.port or NATIVE_PORT):
+    # Attaching a sink blocks for seconds if nothing listens there.
+    if viewer_process.listens(parts.hostname, parts.port or NATIVE_PORT):
         return True
     logger.warning("no viewer listens at %s, so the run is not shown there", url)
     return False
 
 
-def _native(wanted: bool) -> str | None:
-    if not wanted:
-        return None
-    if not listens("127.0.0.1", NATIVE_PORT):
-        try:
-            viewer_process.start([], NATIVE_PORT, detached=True)
-        except viewer_process.ViewerNotStarted as failure:
-            logger.warning("the native viewer did not start, so the run is not shown: %s", failure)
-            return None
-    return proxy_url(NATIVE_PORT)
-
-
-def _serve(port: int | None) -> viewer_process.ViewerProcess | None:
-    if port is None:
-        return None
-    options = ["--serve-web", "--web-viewer-port", str(port), "--server-memory-limit", WEB_MEMORY]
+def _started(which: str, options: Sequence[str], port: int) -> viewer_process.ViewerProcess | None:
+    """Start a viewer; only the native one outlives this process."""
     try:
-        return viewer_process.start(options, port + 1, detached=False)
+        return viewer_process.start(options, port, detached=which == "native")
     except viewer_process.ViewerNotStarted as failure:
-        logger.warning("the web viewer did not start, so the run is not served: %s", failure)
+        logger.warning("the %s viewer did not start, so the run is not shown there: %s", which, failure)
         return None
-
-
-def _web_url(server: viewer_process.ViewerProcess | None, targets: ViewerTargets) -> str | None:
-    if server is None or targets.serve_port is None:
-        return None
-    url = proxy_url(targets.serve_port + 1)
-    logger.info("open http://127.0.0.1:%d?url=%s in a browser", targets.serve_port, quote(url, safe=""))
-    return url

@@ -23,7 +23,6 @@ from module_agent.wire.feedback_rows import Rows
 if TYPE_CHECKING:
     from coordinator.viewer.recorder import Recorder
 
-POSE_PERIOD_NS = 33_333_333
 FLUSH_SECONDS = 5.0
 
 logger = logging.getLogger(__name__)
@@ -55,7 +54,6 @@ class Viewer:
         self._opened = open_targets(run_id, targets)
         self._thread: LoggingThread | None = None
         self._recorders: tuple[Recorder, ...] = ()
-        self._next_pose_ns: int | None = None
         self._closed = False
         if self._opened.file is None and self._opened.live is None:
             return
@@ -137,37 +135,23 @@ class Viewer:
         sigma = None if sigma_m is None else tuple(float(s) for s in sigma_m)
         self._submit(lambda recorder: recorder.chain(t_ns, chain, sigma, entity_paths.ESTIMATED_WORLD))
 
-    def true_chain(self, t_ns: int, chain: Chain, types: Mapping[str, str] | None = None) -> None:
-        """Draw the true robot in grey; known to the simulator's tools only.
+    def true_chain(self, t_ns: int, chain: Chain, types: Mapping[str, str]) -> None:
+        """Draw the true robot, of modules of these types, in grey; known to the simulator's tools only."""
+        named = dict(types)
+        self._submit(lambda recorder: recorder.chain(t_ns, chain, None, entity_paths.TRUE_WORLD, named))
 
-        `types` are the module types of those that were not registered by `modules`.
-        """
-        if types is not None:
-            type_by_serial = dict(types)
-            self._submit(lambda recorder: recorder.name_types(type_by_serial))
-        self._submit(lambda recorder: recorder.chain(t_ns, chain, None, entity_paths.TRUE_WORLD))
-
-    def pose(self, t_ns: int, q_rad: ArrayLike) -> None:
-        """Turn the robot to `q_rad` (n,), in the order of the chain; at most 30 times a second are shown."""
-        if self._next_pose_ns is not None and 0 < self._next_pose_ns - t_ns <= POSE_PERIOD_NS:
-            return
-        self._next_pose_ns = t_ns + POSE_PERIOD_NS
-        self.poses([t_ns], np.array(q_rad, dtype=float)[None])
-
-    def poses(self, t_ns: ArrayLike, q_rad: ArrayLike, serials: Sequence[str] | None = None) -> None:
-        """Turn the robot to `q_rad` (k, n) at `t_ns` (k,), all of which are shown.
-
-        The columns are those of `serials`, or of the identified chain if left out.
+    def poses(self, t_ns: ArrayLike, q_rad: ArrayLike, serials: Sequence[str]) -> None:
+        """Turn the robot to `q_rad` (k, n) of `serials` (n) at `t_ns` (k,), all of which are shown.
 
         Raises:
             ValueError: there is not one time per pose, or one serial per column.
         """
         times, postures = np.array(t_ns, dtype=np.int64), np.array(q_rad, dtype=float)
-        if times.shape != postures.shape[:1]:
-            raise ValueError(f"times of shape {times.shape} for poses of shape {postures.shape}")
-        if serials is not None and postures.shape[1:] != (len(serials),):
-            raise ValueError(f"poses of shape {postures.shape} for {len(serials)} serials")
-        named = None if serials is None else tuple(serials)
+        named = tuple(serials)
+        if postures.shape != (*times.shape, len(named)):
+            raise ValueError(
+                f"times of shape {times.shape} and {len(named)} serials for poses of shape {postures.shape}"
+            )
         self._submit(lambda recorder: recorder.poses(times, postures, named), essential=False)
 
     def residuals(

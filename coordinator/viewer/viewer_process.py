@@ -19,7 +19,7 @@ from typing import IO, NamedTuple
 from module_agent.model.errors import RobotError
 
 START_SECONDS = 15.0
-_POLL_SECONDS = 0.05
+_POLL_SECONDS, _PROBE_SECONDS = 0.05, 0.5
 MERGE_SECONDS = 120.0
 MAGIC = b"RRF"
 # The reason of a failure is at the end of the output.
@@ -109,13 +109,19 @@ def free_port() -> int:
 def _wait_until_ready(process: subprocess.Popen[bytes], port: int) -> bool:
     deadline = time.monotonic() + START_SECONDS
     while process.poll() is None and time.monotonic() < deadline:
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=_POLL_SECONDS).close()
-        except OSError:
-            time.sleep(_POLL_SECONDS)
-        else:
+        if listens("127.0.0.1", port):
             return True
+        time.sleep(_POLL_SECONDS)
     return False
+
+
+def listens(host: str, port: int) -> bool:
+    """Return whether connections are accepted there."""
+    try:
+        socket.create_connection((host, port), timeout=_PROBE_SECONDS).close()
+    except OSError:
+        return False
+    return True
 
 
 class MergeFailed(RobotError):

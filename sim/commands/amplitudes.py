@@ -7,20 +7,11 @@ from typing import Annotated, TypeVar
 import typer
 from rich.table import Table
 
-from coordinator.runtime.command_line import fail
-from coordinator.runtime.terminal import print_table
-from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE
+from coordinator.runtime.command_line import with_options
+from coordinator.runtime.terminal import new_table, print_table
+from module_agent.model.errors import UsageError
 from sim.benchmark.case import Trial
-from sim.commands.experiment import (
-    ProfileName,
-    WorkerCount,
-    chosen_profile,
-    experiment,
-    profile_settings,
-    trial_results,
-)
-from sim.commands.options import Seed, With, Without
-from sim.robot.noise_choice import NoiseChoice
+from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, trial_results
 from sim.thesis.amplitude_report import Repeats, plot, repeats, write_results
 from sim.thesis.amplitude_sweep import AmplitudeTrial, Series, repeat_series, run_series, sweep_series
 from sim.thesis.published import AMPLITUDES_RAD, LENGTHS_MM, TRIALS
@@ -31,14 +22,12 @@ _MAX_AMPLITUDE_RAD = 0.5
 _TRIAL_COST_S = 0.6
 
 
+@with_options
 def amplitudes(
+    modules: ModuleOptions,
     out: Annotated[Path, typer.Option(help="Folder for amplitudes.json, .csv and .png.")] = Path(
         "runs/amplitudes"
     ),
-    seed: Seed = 0,
-    noise: ProfileName = "x5",
-    with_effects: With = None,
-    without_effects: Without = None,
     lengths: Annotated[str, typer.Option(help="Lengths of the arms [mm], separated by commas.")] = ",".join(
         map(str, LENGTHS_MM)
     ),
@@ -55,9 +44,10 @@ def amplitudes(
     processes: WorkerCount = None,
 ) -> None:
     """Estimate link lengths over amplitudes as the thesis did (chapter 6.2), on simulated modules."""
-    chosen_profile(noise, with_effects, without_effects)
-    choice = NoiseChoice(noise, tuple(with_effects or ()), tuple(without_effects or ()))
-    arms = _numbers(lengths, "--lengths", int, lambda value: value in LENGTHS_MM, _one_of(LENGTHS_MM))
+    modules.profile()
+    choice = modules.choice()
+    known = "one of " + ", ".join(map(str, LENGTHS_MM))
+    arms = _numbers(lengths, "--lengths", int, lambda value: value in LENGTHS_MM, known)
     sizes = _numbers(
         amplitudes,
         "--amplitudes",
@@ -65,16 +55,12 @@ def amplitudes(
         lambda value: 0.0 < value <= _MAX_AMPLITUDE_RAD,
         f"more than 0 and at most {_MAX_AMPLITUDE_RAD} rad",
     )
-    series = sweep_series(arms, sizes, rigs, seed, choice)
+    series = sweep_series(arms, sizes, rigs, modules.seed, choice)
     if trials:
-        series += repeat_series(arms, trials, seed, choice)
+        series += repeat_series(arms, trials, modules.seed, choice)
     measured = _run(series, processes)
-    settings = {"seed": seed, "rigs": rigs} | profile_settings(noise, with_effects, without_effects)
-    try:
-        write_results(out, settings, measured)
-        plot(measured, out / "amplitudes.png", _title(series[0]))
-    except OSError as error:
-        fail(f"cannot write to {out}: {error.strerror or error}", EXIT_FAILED)
+    write_results(out, {"rigs": rigs, **modules.settings()}, measured)
+    plot(measured, out / "amplitudes.png", _title(series[0]))
     if trials:
         print_table(table(repeats(measured, filtered), filtered))
     typer.echo(str(out / "amplitudes.png"))
@@ -98,33 +84,29 @@ def _title(series: Series) -> str:
     )
 
 
-def _one_of(values: tuple[int, ...]) -> str:
-    return "one of " + ", ".join(map(str, values))
-
-
 def _numbers(
     text: str, option: str, kind: Callable[[str], T], fits: Callable[[T], bool], right: str
 ) -> list[T]:
-    """Read numbers separated by commas, each once and in their order, or end the command."""
+    """Read numbers separated by commas, each once and in their order."""
     values = []
     for word in text.split(","):
         try:
             value = kind(word)
         except ValueError:
-            fail(f"{option} {text}: {word!r} is no number", EXIT_USAGE)
+            raise UsageError(f"{option} {text}: {word!r} is no number") from None
         if not fits(value):
-            fail(f"{option} {text}: {word} must be {right}", EXIT_USAGE)
+            raise UsageError(f"{option} {text}: {word} must be {right}")
         values.append(value)
     return list(dict.fromkeys(values))
 
 
 def table(summaries: Sequence[Repeats], filtered: bool = True) -> Table:
     """Return tables 4 and 5 of the thesis with the simulated figures."""
-    how = "" if filtered else ", without the filter"
-    shown = Table(title=f"Repeated trials at the thesis' amplitudes{how}")
-    columns = ("arm", "A [rad]", "trials", "mean [mm]", "error [mm]", "error [%]", "scatter [mm]")
-    for name in (*columns, "thesis' mean [mm]", "its error [%]"):
-        shown.add_column(name, justify="left" if name == "arm" else "right")
+    shown = new_table(
+        "Repeated trials at the thesis' amplitudes" + ("" if filtered else ", without the filter"),
+        "arm | >A [rad] | >trials | >mean [mm] | >error [mm] | >error [%] | >scatter [mm] | "
+        ">thesis' mean [mm] | >its error [%]",
+    )
     for row in summaries:
         thesis = row.thesis
         shown.add_row(

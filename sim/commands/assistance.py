@@ -8,21 +8,10 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.runtime.command_line import fail
-from coordinator.runtime.terminal import print_table
-from module_agent.model.errors import EXIT_FAILED, UsageError
+from coordinator.runtime.command_line import in_a_folder, with_options
+from coordinator.runtime.terminal import new_table, print_table
 from sim.benchmark.case import Trial
-from sim.commands.experiment import (
-    JsonFile,
-    ProfileName,
-    WorkerCount,
-    check_writable,
-    chosen_profile,
-    experiment,
-    profile_settings,
-    trial_results,
-)
-from sim.commands.options import Seed, With, Without
+from sim.commands.experiment import JsonFile, ModuleOptions, WorkerCount, experiment, trial_results
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.thesis.torque_assistance import MODES, Follow, Model, identified_model, standing_robot
 from sim.thesis.torque_assistance_cases import Case, Combination, cases, robots_of, try_case
@@ -32,36 +21,30 @@ _IDENTIFY_S = 15.0
 _CASE_S = 1.2 * len(MODES)
 
 
+@with_options
 def assistance(
-    seed: Seed = 0,
-    noise: ProfileName = "x5",
-    with_effects: With = None,
-    without_effects: Without = None,
+    modules: ModuleOptions,
     quick: Annotated[
         bool, typer.Option("--quick", help="Only the thesis' figures, and one arm of six joints.")
     ] = False,
     processes: WorkerCount = None,
     json_file: JsonFile = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", help="Draw figures 52 to 61 (PNG, SVG or PDF).")
+        Path | None,
+        typer.Option("--picture", help="Draw figures 52 to 61 (PNG, SVG or PDF).", callback=in_a_folder),
     ] = None,
 ) -> None:
     """Track motions by position, position and velocity, and with calculated torque too (thesis 6.3)."""
-    profile = chosen_profile(noise, with_effects, without_effects)
-    check_writable(json_file, picture)
-    combinations = _run(cases(quick), profile, seed, processes)
+    profile = modules.profile()
+    combinations = _run(cases(quick), profile, modules.seed, processes)
     print_table(assistance_table(combinations))
     for line in bar_lines(bars(combinations)):
         typer.echo(line)
-    settings = {"seed": seed} | profile_settings(noise, with_effects, without_effects) | {"quick": quick}
-    try:
-        if json_file is not None:
-            write_assistance(json_file, settings, combinations)
-        if picture is not None:
-            title = f"Torque assistance: profile {profile.name}, seed {seed}; * unstable"
-            plot_assistance(combinations, picture, title)
-    except (UsageError, OSError) as error:
-        fail(f"cannot write: {error}", EXIT_FAILED)
+    if json_file is not None:
+        write_assistance(json_file, {**modules.settings(), "quick": quick}, combinations)
+    if picture is not None:
+        title = f"Torque assistance: profile {profile.name}, seed {modules.seed}; * unstable"
+        plot_assistance(combinations, picture, title)
 
 
 def identify_robot(name: str, profile: NoiseProfile, seed: int) -> Model:
@@ -85,19 +68,10 @@ def _run(
 
 def assistance_table(combinations: Sequence[Combination]) -> Table:
     """Return the combinations as a table, a section for each robot; * marks what is unstable."""
-    titles = (
-        "robot",
-        "gains",
-        "read",
-        "motion",
-        "set-points",
-        "commanded",
-        "mode 1",
-        "mode 2",
-        "mode 3",
-        "2 / 3",
+    shown = new_table(
+        "Rms tracking error by input mode in mrad, * unstable",
+        "robot | gains | read | motion | set-points | commanded | mode 1 | mode 2 | mode 3 | 2 / 3",
     )
-    shown = Table(*titles, title="Rms tracking error by input mode in mrad, * unstable")
     for each, following in zip(combinations, [*combinations[1:], None], strict=True):
         case = each.case
         shown.add_row(

@@ -12,8 +12,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from coordinator.excitation.plan import Motions
-from coordinator.runtime.command_line import fail
-from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, UsageError
+from coordinator.runtime.command_line import in_a_folder
+from coordinator.runtime.terminal import new_table
+from module_agent.model.errors import EXIT_FINDING, UsageError
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.cases.staubli_tx40 import MOTION, URDF
 from sim.benchmark.cases.suites import (
@@ -31,10 +32,8 @@ from sim.benchmark.cases.suites import (
 from sim.benchmark.report import Results, gathered, plot, write_results
 from sim.benchmark.row import Limit, Row
 from sim.benchmark.workers import run_cases
-from sim.commands.experiment import JsonFile, WorkerCount, check_writable, experiment, worker_count
+from sim.commands.experiment import JsonFile, WorkerCount, experiment, worker_count
 from sim.commands.options import Seed
-
-EXIT_MISSED = 4
 
 app = typer.Typer(
     add_completion=False,
@@ -42,7 +41,6 @@ app = typer.Typer(
     rich_markup_mode=None,
     help="Measure the whole system on simulated robots against its bars.",
 )
-
 
 Only = Annotated[str, typer.Option(help="Cases whose name contains this; * and ? are wildcards.")]
 
@@ -69,21 +67,21 @@ def dynamics(
 
     Exit codes as of `kinematics`.
     """
-    if quick and trials is not None:
-        fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
+    _check_trials(quick, trials)
     effort = QUICK_DYNAMICS if quick else full_dynamics(trials or DYNAMIC_TRIALS)
     settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only} | effort._asdict()
     for name in (URDF, MOTION):
         if tx40 is not None and not (tx40 / name).is_file():
-            fail(f"--tx40 {tx40}: there is no {name} in it", EXIT_USAGE)
-    cases = dynamic_cases(effort, seed, tx40)
-    _benchmark("dynamics", cases, settings, only=only, processes=processes, json_file=json_file)
+            raise UsageError(f"--tx40 {tx40}: there is no {name} in it")
+    _benchmark("dynamics", dynamic_cases(effort, seed, tx40), settings, processes, json_file)
 
 
 @app.command()
 def kinematics(
     json_file: JsonFile = None,
-    plot_file: Annotated[Path | None, typer.Option("--plot", help="Picture to write: PNG, SVG, PDF.")] = None,
+    plot_file: Annotated[
+        Path | None, typer.Option("--plot", help="Picture to write: PNG, SVG, PDF.", callback=in_a_folder)
+    ] = None,
     quick: Annotated[
         bool,
         typer.Option(
@@ -108,43 +106,38 @@ def kinematics(
     Exit code 0 if all bars are met, 4 if one is missed, 1 if a file cannot be written, 2 for wrong usage,
     130 if interrupted; nothing is written then.
     """
-    if quick and trials is not None:
-        fail("--quick has its own number of trials: leave out --trials", EXIT_USAGE)
+    _check_trials(quick, trials)
     effort = QUICK_KINEMATICS if quick else full_kinematics(trials or KINEMATIC_TRIALS)
     settings: dict[str, object] = {"quick": quick, "seed": seed, "only": only, "motions": motions}
     settings |= effort._asdict()
     cases = kinematic_cases(effort, seed, motions)
-    _benchmark(
-        "kinematics",
-        cases,
-        settings,
-        only=only,
-        processes=processes,
-        json_file=json_file,
-        plot_file=plot_file,
-    )
+    _benchmark("kinematics", cases, settings, processes, json_file, plot_file)
+
+
+def _check_trials(quick: bool, trials: int | None) -> None:
+    if quick and trials is not None:
+        raise UsageError("--quick has its own number of trials: leave out --trials")
 
 
 def _benchmark(
     name: str,
     cases: list[Case],
     settings: dict[str, object],
-    only: str,
     processes: int | None,
     json_file: Path | None,
     plot_file: Path | None = None,
 ) -> None:
-    """Run the selected cases, report, and exit with `EXIT_MISSED` if a bar is missed."""
-    check_writable(json_file, plot_file)
+    """Run the selected cases, report, and exit with `EXIT_FINDING` if a bar is missed."""
+    only = str(settings["only"])
     selected = chosen(cases, only)
     if not selected:
-        fail(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases), EXIT_USAGE)
+        raise UsageError(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases))
     started_s = time.monotonic()
     measured = _run(selected, worker_count(processes))
     results = gathered(name, settings, measured, over_all(measured), time.monotonic() - started_s)
     _report(results, json_file, plot_file)
     if results.missed:
-        raise typer.Exit(EXIT_MISSED)
+        raise typer.Exit(EXIT_FINDING)
 
 
 def _run(cases: list[Case], processes: int) -> list[CaseResult]:
@@ -169,15 +162,10 @@ def _report(results: Results, json_file: Path | None, plot_file: Path | None) ->
     held = sum(row.holds is True for row in results.rows)
     cost = f"{results.wall_time_s:.0f} s, of processors {results.cpu_time_s:.0f} s"
     typer.echo(f"{held} bars met, {len(results.missed)} missed; {cost}")
-    try:
-        if json_file is not None:
-            write_results(json_file, results)
-        if plot_file is not None:
-            plot(results.rows, plot_file)
-    except OSError as error:
-        fail(f"cannot write {error.filename}: {error.strerror}", EXIT_FAILED)
-    except UsageError as error:
-        fail(f"cannot draw {plot_file}: {error}", EXIT_FAILED)
+    if json_file is not None:
+        write_results(json_file, results)
+    if plot_file is not None:
+        plot(results.rows, plot_file)
 
 
 # A pipe has no width; a table cut short in it would be of no use.
@@ -186,9 +174,8 @@ _MIN_WIDTH = 150
 
 def table(rows: Sequence[Row], title: str) -> Table:
     """Return the rows, every case with its name once."""
-    shown = Table(title=title, title_justify="left")
-    for name in ("case", "figure", "thesis", "ours", "bound", "bar", ""):
-        shown.add_column(name, justify="left" if name in ("case", "figure", "") else "right")
+    columns = "case | figure | >thesis | >ours | >bound | >bar | "
+    shown = new_table(title, columns, title_justify="left")
     before = ""
     for row in rows:
         if before and row.case != before:

@@ -1,13 +1,13 @@
 """`x5-sim effects`: the table of effects, also as the page `docs/effects.md`."""
 
 import json
+from collections.abc import Iterable
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from coordinator.commands.options import AsJson
-from coordinator.runtime.terminal import print_table
+from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.catalogue import module_type
 from module_agent.network_emulation.profile import PROFILES
 from sim.actuator.actuator import BUS_VOLTAGE_V, SPRING_LOSS_S, STOP_NM_RAD
@@ -23,9 +23,11 @@ _UNITS = (
     ("_hz", "Hz", False),
     ("_ppm", "ppm", False),
     ("_s", "s", True),
+    ("_fraction", "% of the largest", False),
+    ("_spread", "%", False),
+    ("_scale", "%", False),
 )
 OFF = "off"
-_PERCENT = ("_fraction", "_spread", "_scale")
 
 _HEAD = f"""# Imperfections of the simulated module
 
@@ -50,7 +52,7 @@ def effects(
         rows = [effect._asdict() | {"profiles": profiles_with(effect)} for effect in EFFECTS.values()]
         typer.echo(json.dumps(rows, indent=2))
     else:
-        table = Table("effect", "part", "model", "size", "in the profiles", show_lines=True)
+        table = new_table(None, "effect | part | model | size | in the profiles", show_lines=True)
         for name, effect in EFFECTS.items():
             profiles = ", ".join(profiles_with(effect))
             table.add_row(name, effect.part, effect.model, default_size(effect), profiles)
@@ -75,47 +77,23 @@ def profiles_with(effect: Effect) -> list[str]:
 
 
 def _always() -> str:
+    rotor = module_type("X5-1").motor.rotor_inertia_kg_m2
     rows = (
-        (
-            "reflected inertia",
-            "the rotor's, times the gear ratio squared",
-            f"{module_type('X5-1').motor.rotor_inertia_kg_m2:.2g} kg m² at the rotor",
-            "real X5-1 log: the first step",
-        ),
-        (
-            "spring loss",
-            "damping over stiffness of the spring",
-            f"{1e3 * SPRING_LOSS_S:g} ms",
-            "an assumption: rubber's loss factor of 0.1 at 5 Hz, chosen so that light arms ring as little as "
-            "the thesis' did; with a third of it their estimated lengths are 10 % longer",
-        ),
-        (
-            "end stops",
-            "stiff and lossy, where a type's rotation is limited",
-            f"{STOP_NM_RAD:g} Nm/rad",
-            "an assumption",
-        ),
-        (
-            "voltage and PWM limits",
-            "duty = u x 48 V / bus voltage, cut off at 1",
-            f"{BUS_VOLTAGE_V:g} V",
-            "real X5-1 log",
-        ),
-        (
-            "winding's PWM ceiling",
-            "in the firmware: 1 - 1 / (155 - temperature)",
-            "0.9923 at 25 °C",
-            "published; real X5-1 log: 0.9636 at 127.6 °C",
-        ),
-        (
-            "velocity cut-off",
-            "in the firmware: the velocity target is clamped",
-            "by type: 9.62, 3.43, 1.50 rad/s",
-            "published gains",
-        ),
+        f"reflected inertia | the rotor's, times the gear ratio squared | {rotor:.2g} kg m² at the rotor | "
+        "real X5-1 log: the first step",
+        f"spring loss | damping over stiffness of the spring | {1e3 * SPRING_LOSS_S:g} ms | an assumption: "
+        "rubber's loss factor of 0.1 at 5 Hz, chosen so that light arms ring as little as the thesis' did; "
+        "with a third of it their estimated lengths are 10 % longer",
+        f"end stops | stiff and lossy, where a type's rotation is limited | {STOP_NM_RAD:g} Nm/rad | "
+        "an assumption",
+        f"voltage and PWM limits | duty = u x 48 V / bus voltage, cut off at 1 | {BUS_VOLTAGE_V:g} V | "
+        "real X5-1 log",
+        "winding's PWM ceiling | in the firmware: 1 - 1 / (155 - temperature) | 0.9923 at 25 °C | "
+        "published; real X5-1 log: 0.9636 at 127.6 °C",
+        "velocity cut-off | in the firmware: the velocity target is clamped | "
+        "by type: 9.62, 3.43, 1.50 rad/s | published gains",
     )
-    head = ["## Always there", "", "| effect | model | size | source |", "|---|---|---|---|"]
-    return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows), ""])
+    return _section("Always there", "effect | model | size | source", rows)
 
 
 def _network() -> str:
@@ -124,52 +102,31 @@ def _network() -> str:
     assert burst is not None
     assert stall is not None
     rows = (
-        (
-            "delay and jitter",
-            "minimum delay plus a gamma, lognormal or Pareto variate; order preserved as by one TCP link",
-            f"{lan.delay_ms:g} ms and {lan.jitter_ms:g} ms (`lan`); {wifi.delay_ms:g} ms and "
-            f"{wifi.jitter_ms:g} ms (`wifi`)",
-            "real X5-1: round trip 0.70 ms; `wifi`: Huitema 2023",
-        ),
-        (
-            "loss in bursts",
-            "Gilbert-Elliott channel in continuous time",
-            f"`wifi`: {wifi.loss:.1%}; {burst.loss:.0%} for {burst.mean_ms:g} ms every {burst.apart_s:g} s",
-            "Gilbert 1960, Elliott 1963; sizes: a busy room",
-        ),
-        (
-            "stalls",
-            "nothing passes for a while, then all waiting messages",
-            f"`wifi`: {stall.mean_ms:g} ms every {stall.apart_s:g} s",
-            "Huitema 2023: latency spikes of Wi-Fi",
-        ),
-        (
-            "asymmetry",
-            "another path in each direction",
-            f"`wifi`: jitter {wifi.jitter_ms:g} ms down, {up.jitter_ms:g} ms up; see `asymmetric`",
-            "stations contend for the channel, the access point has it more often",
-        ),
-        (
-            "reordering and duplication",
-            "a message overtakes, or arrives twice",
-            f"`wifi`: {wifi.reorder:.1%} and {wifi.duplicate:.1%}",
-            "an assumption: residue of retransmission below the transport",
-        ),
-        ("partition", "nothing passes in given intervals", "off; in a network file", "chosen by the user"),
-        (
-            "recorded trace",
-            "delays and losses as measured, repeated",
-            "off; in a network file",
-            "`ping -D -O`",
-        ),
+        "delay and jitter | minimum delay plus a gamma, lognormal or Pareto variate; order preserved as by "
+        f"one TCP link | {lan.delay_ms:g} ms and {lan.jitter_ms:g} ms (`lan`); {wifi.delay_ms:g} ms and "
+        f"{wifi.jitter_ms:g} ms (`wifi`) | real X5-1: round trip 0.70 ms; `wifi`: Huitema 2023",
+        f"loss in bursts | Gilbert-Elliott channel in continuous time | `wifi`: {wifi.loss:.1%}; "
+        f"{burst.loss:.0%} for {burst.mean_ms:g} ms every {burst.apart_s:g} s | "
+        "Gilbert 1960, Elliott 1963; sizes: a busy room",
+        "stalls | nothing passes for a while, then all waiting messages | "
+        f"`wifi`: {stall.mean_ms:g} ms every {stall.apart_s:g} s | Huitema 2023: latency spikes of Wi-Fi",
+        f"asymmetry | another path in each direction | `wifi`: jitter {wifi.jitter_ms:g} ms down, "
+        f"{up.jitter_ms:g} ms up; see `asymmetric` | stations contend for the channel, the access point has "
+        "it more often",
+        "reordering and duplication | a message overtakes, or arrives twice | "
+        f"`wifi`: {wifi.reorder:.1%} and {wifi.duplicate:.1%} | an assumption: residue of retransmission "
+        "below the transport",
+        "partition | nothing passes in given intervals | off; in a network file | chosen by the user",
+        "recorded trace | delays and losses as measured, repeated | off; in a network file | `ping -D -O`",
     )
-    head = [
-        "## Network",
-        "",
-        "| effect | model | size | source | switch |",
-        "|---|---|---|---|---|",
-    ]
-    return "\n".join([*head, *(f"| {' | '.join(row)} | `--network` |" for row in rows), ""])
+    columns = "effect | model | size | source | switch"
+    return _section("Network", columns, [f"{row} | `--network`" for row in rows])
+
+
+def _section(title: str, columns: str, rows: Iterable[str]) -> str:
+    """Return a heading and a table; cells are separated by bars."""
+    ruler = "---|" * len(columns.split(" | "))
+    return "\n".join([f"## {title}", "", f"| {columns} |", f"|{ruler}", *(f"| {row} |" for row in rows), ""])
 
 
 def default_size(effect: Effect) -> str:
@@ -182,37 +139,22 @@ def default_size(effect: Effect) -> str:
 
 
 def _table(part: str) -> str:
-    rows = [
-        f"## {part[0].upper()}{part[1:]}",
-        "",
-        "| effect | model | default size | profiles | source | switch |",
-        "|---|---|---|---|---|---|",
-    ]
+    rows = []
     for name, effect in EFFECTS.items():
-        if effect.part != part:
-            continue
-        size, where = default_size(effect), ", ".join(profiles_with(effect))
-        cells = (_title(name), effect.model, size, where, effect.source, f"`{name}`")
-        rows.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*rows, ""])
-
-
-def _title(name: str) -> str:
-    return name.replace("-", " ").replace("imu", "IMU")
+        if effect.part == part:
+            title, where = name.replace("-", " ").replace("imu", "IMU"), ", ".join(profiles_with(effect))
+            cells = (title, effect.model, default_size(effect), where, effect.source, f"`{name}`")
+            rows.append(" | ".join(cells))
+    columns = "effect | model | default size | profiles | source | switch"
+    return _section(f"{part[0].upper()}{part[1:]}", columns, rows)
 
 
 def _size(field: str, value: float) -> str:
-    for ending in _PERCENT:
-        if field.endswith(ending):
-            of_what = " of the largest" if ending == "_fraction" else ""
-            return f"{_words(field, ending)} {100.0 * value:.3g} %{of_what}"
     for ending, unit, small in _UNITS:
         if field.endswith(ending):
-            thousandths = small and value < 0.1
-            shown = f"{1e3 * value:.3g} m" if thousandths else f"{value:.3g} "
-            return f"{_words(field, ending)} {shown}{unit}"
+            name = field.removesuffix(ending).replace("_", " ")
+            if unit.startswith("%"):
+                return f"{name} {100.0 * value:.3g} {unit}"
+            shown = f"{1e3 * value:.3g} m" if small and value < 0.1 else f"{value:.3g} "
+            return f"{name} {shown}{unit}"
     return "as described" if value == 1.0 else f"{value:.3g} times as described"
-
-
-def _words(field: str, ending: str) -> str:
-    return field.removesuffix(ending).replace("_", " ")

@@ -6,21 +6,10 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from coordinator.runtime.command_line import fail
-from coordinator.runtime.terminal import print_table
-from module_agent.model.errors import EXIT_FAILED
+from coordinator.runtime.command_line import with_options
+from coordinator.runtime.terminal import new_table, print_table
 from sim.benchmark.case import Trial
-from sim.commands.experiment import (
-    JsonFile,
-    ProfileName,
-    WorkerCount,
-    check_writable,
-    chosen_profile,
-    experiment,
-    profile_settings,
-    trial_results,
-)
-from sim.commands.options import Seed, With, Without
+from sim.commands.experiment import JsonFile, ModuleOptions, WorkerCount, experiment, trial_results
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.thesis.estimator_variants import Arm, EstimatorRow, compare, estimator_rows, write_estimators
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM, TRIALS
@@ -29,11 +18,9 @@ ARMS = tuple(Arm(alignment, length_mm) for alignment in ALIGNMENTS for length_mm
 _COST_S = 2.0
 
 
+@with_options
 def estimators(
-    seed: Seed = 0,
-    noise: ProfileName = "x5",
-    with_effects: With = None,
-    without_effects: Without = None,
+    modules: ModuleOptions,
     trials: Annotated[
         int, typer.Option(min=1, help="Trials for each arm, each with other modules.")
     ] = TRIALS,
@@ -41,16 +28,10 @@ def estimators(
     json_file: JsonFile = None,
 ) -> None:
     """Compare estimators of one joint's radial distance on the thesis' eight arms, and their bound."""
-    profile = chosen_profile(noise, with_effects, without_effects)
-    check_writable(json_file)
-    rows = _run(profile, trials, seed, processes)
+    rows = _run(modules.profile(), trials, modules.seed, processes)
     print_table(estimator_table(rows))
-    settings = {"seed": seed} | profile_settings(noise, with_effects, without_effects) | {"trials": trials}
     if json_file is not None:
-        try:
-            write_estimators(json_file, settings, rows)
-        except OSError as error:
-            fail(f"cannot write {json_file}: {error.strerror or error}", EXIT_FAILED)
+        write_estimators(json_file, {**modules.settings(), "trials": trials}, rows)
 
 
 def _run(profile: NoiseProfile, trials: int, seed: int, processes: int | None) -> list[EstimatorRow]:
@@ -75,32 +56,20 @@ def _run(profile: NoiseProfile, trials: int, seed: int, processes: int | None) -
 
 def estimator_table(rows: Sequence[EstimatorRow]) -> Table:
     """Return the rows as a table, a section for each arm."""
-    titles = (
-        "arm",
-        "estimator",
-        "trials",
-        "mean |e|",
-        "bias",
-        "rms",
-        "sigma",
-        "bound",
-        "rms / bound",
-        "in 95 %",
+    shown = new_table(
+        "Errors of the radial distance [mm]",
+        "arm | estimator | trials | mean |e| | bias | rms | sigma | bound | rms / bound | in 95 %",
     )
-    shown = Table(*titles, title="Errors of the radial distance [mm]")
-    for row, following in zip(rows, [*rows[1:], None], strict=True):
-        last = following is None or (following.alignment, following.length_mm) != (
-            row.alignment,
-            row.length_mm,
-        )
+    arms = [f"{row.length_mm} mm {row.alignment}" for row in rows]
+    for row, arm, following in zip(rows, arms, [*arms[1:], ""], strict=True):
         shown.add_row(
-            f"{row.length_mm} mm {row.alignment}",
+            arm,
             row.estimator,
             str(row.trials),
             *(f"{value:.3f}" for value in (row.mean_error_mm, row.bias_mm, row.rms_mm, row.sigma_mm)),
             f"{row.bound_mm:.3f}",
             f"{row.ratio:.2f}",
             f"{100.0 * row.covered:.0f} %",
-            end_section=last,
+            end_section=following != arm,
         )
     return shown

@@ -4,41 +4,47 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from coordinator.runtime.command_line import fail
+from coordinator.runtime.command_line import fail, in_a_folder
 from coordinator.runtime.event_loop import SIGNALS
 from coordinator.runtime.terminal import Terminal
-from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE
+from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED
 from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trials
+from sim.commands.options import NoiseOptions
 from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile, noise_profile, switched
 
 ProfileName = Annotated[str, typer.Option("--noise", help=f"Noise profile: {', '.join(NOISE_PROFILES)}.")]
 WorkerCount = Annotated[
     int | None, typer.Option("--processes", min=1, help="Processes that share the work [one for each core].")
 ]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file to write.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="JSON file to write.", callback=in_a_folder)]
 
 
-def chosen_profile(name: str, on: Sequence[str] | None, off: Sequence[str] | None) -> NoiseProfile:
-    """Return a noise profile with effects switched on and off."""
-    return switched(noise_profile(name), tuple(on or ()), tuple(off or ()))
+@dataclass(frozen=True, kw_only=True)
+class ModuleOptions(NoiseOptions):
+    """The noise of an experiment's modules, and its seed."""
 
+    noise: ProfileName = "x5"
 
-def profile_settings(name: str, on: Sequence[str] | None, off: Sequence[str] | None) -> dict[str, object]:
-    """Return profile and effects as the settings of a results file state them."""
-    return {"noise": name, "with": list(on or ()), "without": list(off or ())}
+    def profile(self) -> NoiseProfile:
+        """Return the noise profile with effects switched on and off.
 
+        Raises:
+            UsageError: there is no such profile or effect.
+        """
+        choice = self.choice()
+        return switched(noise_profile(self.noise), choice.on, choice.off)
 
-def check_writable(*files: Path | None) -> None:
-    """End the command if the folder of a file to be written does not exist."""
-    for file in files:
-        if file is not None and not file.parent.is_dir():
-            fail(f"{file}: there is no folder {file.parent}", EXIT_USAGE)
+    def settings(self) -> dict[str, object]:
+        """Return seed, profile and effects as the settings of a results file state them."""
+        effects = {"with": list(self.with_effects or ()), "without": list(self.without_effects or ())}
+        return {"seed": self.seed, "noise": self.noise, **effects}
 
 
 @contextmanager

@@ -8,9 +8,7 @@ import typer
 from rich.table import Table
 
 from coordinator.monitoring.findings import KINDS, UNITS, Kind
-from coordinator.runtime.command_line import fail
-from coordinator.runtime.terminal import print_table
-from module_agent.model.errors import EXIT_FAILED, EXIT_USAGE, UsageError
+from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.files import write_json
 from sim.benchmark.case import Trial
 from sim.benchmark.cases.monitoring import (
@@ -24,17 +22,9 @@ from sim.benchmark.cases.monitoring import (
     false_alarms,
     monitoring_trial,
 )
-from sim.commands.experiment import (
-    JsonFile,
-    ProfileName,
-    WorkerCount,
-    check_writable,
-    experiment,
-    trial_results,
-)
-from sim.commands.options import Seed
+from sim.commands.experiment import JsonFile, ProfileName, WorkerCount, experiment, trial_results
+from sim.commands.options import Seed, load
 from sim.imperfections.noise_profile import noise_profile
-from sim.robot.robot_file import load_robot
 
 _KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
 # Length of a trial without event: with longer ones processes would idle at the end.
@@ -61,8 +51,9 @@ def monitoring(
     json_file: JsonFile = None,
 ) -> None:
     """Monitor known robots that move, with an event or without, and count the findings."""
-    subject = _subject(robot, noise, seed)._replace(brief=quick)
-    check_writable(json_file)
+    load(robot)
+    noise_profile(noise)
+    subject = Subject(robot=robot, noise=noise, seed=seed, brief=quick)
     if quick:
         trials, after_s, segments = 1, _QUICK_AFTER_S, [_QUICK_SEGMENT_S]
     else:
@@ -79,17 +70,14 @@ def monitoring(
         f"{alarms.per_hour:.2f} an hour, 95 % interval {low:.2f} to {high:.2f}"
     )
     if json_file is not None:
-        try:
-            write_json(json_file, figures(happened, alarms))
-        except OSError as error:
-            fail(f"cannot write {json_file}: {error.strerror or error}", EXIT_FAILED)
+        write_json(json_file, figures(happened, alarms))
 
 
 def confusion_table(trials: Sequence[MonitoringTrial]) -> Table:
     """Return the confusion matrix: kinds of events by kinds of findings."""
     counted = confusion(trials)
     columns: tuple[Found, ...] = ("nothing", *KINDS)
-    table = Table("event", *columns, "right module", title="Findings by event")
+    table = new_table("Findings by event", " | ".join(("event", *columns, "right module")))
     for happened, row in counted.items():
         own = [trial for trial in trials if trial.happened == happened]
         cells = [str(row[column]) if column in row else "-" for column in columns]
@@ -99,14 +87,8 @@ def confusion_table(trials: Sequence[MonitoringTrial]) -> Table:
 
 def size_table(trials: Sequence[MonitoringTrial]) -> Table:
     """Return latencies and errors of sizes by kind of event."""
-    table = Table(
-        "event",
-        "first finding [s]",
-        "its kind [s]",
-        "size",
-        "error, rms",
-        "largest",
-        title="Median; how large",
+    table = new_table(
+        "Median; how large", "event | first finding [s] | its kind [s] | size | error, rms | largest"
     )
     for kind, one in summary(trials).items():
         sizes = f"{one['smallest']:.2f} to {one['largest']:.2f} {UNITS[kind]}" if one["sized"] else "-"
@@ -156,15 +138,6 @@ def figures(trials: Sequence[MonitoringTrial], alarms: Alarms) -> dict[str, obje
         "per_hour_interval_95": alarms.interval_per_hour(),
         "trials": [trial._asdict() for trial in trials],
     }
-
-
-def _subject(robot: str, noise: str, seed: int) -> Subject:
-    try:
-        load_robot(robot)
-        noise_profile(noise)
-    except (UsageError, OSError) as error:
-        fail(error, EXIT_USAGE)
-    return Subject(robot=robot, noise=noise, seed=seed)
 
 
 def _run(

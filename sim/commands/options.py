@@ -14,7 +14,7 @@ from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from sim.imperfections.noise_profile import NOISE_PROFILES
 from sim.robot.noise_choice import NoiseChoice
-from sim.robot.robot_file import Robot, RobotFileError, load_robot
+from sim.robot.robot_file import Robot, load_robot
 from sim.world.external_force import Push, check_pushed, parse_push
 
 RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
@@ -25,40 +25,34 @@ With = Annotated[
 Without = Annotated[list[str] | None, typer.Option("--without", help="Switch an effect off; repeat.")]
 
 
-@dataclass(frozen=True)
-class WorldOptions:
-    """A simulated robot and its world."""
+@dataclass(frozen=True, kw_only=True)
+class NoiseOptions:
+    """The noise of simulated modules, and its seed."""
 
-    robot: RobotArgument
     seed: Seed = 0
     noise: Annotated[
         str | None, typer.Option(help=f"Noise profile: {', '.join(NOISE_PROFILES)} [the robot's].")
     ] = None
     with_effects: With = None
     without_effects: Without = None
+
+    def choice(self) -> NoiseChoice:
+        """Return the noise profile and effects that were chosen."""
+        return NoiseChoice(self.noise, tuple(self.with_effects or ()), tuple(self.without_effects or ()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldOptions(NoiseOptions):
+    """A simulated robot and its world."""
+
+    robot: RobotArgument
     push: Annotated[
         list[str] | None,
         typer.Option(help="Push a module: serial=S,force_n=[0,0,-10],from_s=2,for_s=0.5; repeat."),
     ] = None
-    speed: Annotated[float, typer.Option(help="Times real time; slower helps a busy machine.")] = 1.0
-
-    def check_speed(self) -> float:
-        """Return the world's speed.
-
-        Raises:
-            UsageError: it is no positive number.
-        """
-        return check_speed(self.speed)
-
-    def noise_of(self, robot: Robot) -> NoiseChoice:
-        """Return the noise profile and effects that were chosen.
-
-        Raises:
-            UsageError: there is no such profile or effect.
-        """
-        choice = NoiseChoice(self.noise, tuple(self.with_effects or ()), tuple(self.without_effects or ()))
-        choice.of(robot)
-        return choice
+    speed: Annotated[
+        float, typer.Option(help="Times real time; slower helps a busy machine.", callback=check_speed)
+    ] = 1.0
 
     def pushes_on(self, robot: Robot) -> tuple[Push, ...]:
         """Return the external forces that were chosen.
@@ -118,5 +112,5 @@ def load(name: str) -> Robot:
     """
     try:
         return load_robot(name)
-    except (RobotFileError, OSError) as error:
+    except OSError as error:
         raise UsageError(str(error)) from error

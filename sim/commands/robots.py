@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from coordinator.runtime.terminal import print_table
+from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import UsageError
 from sim.commands.options import RobotArgument, load
 from sim.robot.robot_file import load_robot, shipped_robots
@@ -14,7 +13,7 @@ from sim.robot.robot_file import load_robot, shipped_robots
 
 def robots() -> None:
     """List the robots that are shipped."""
-    table = Table("robot", "modules", "types", "mounting")
+    table = new_table(None, "robot | modules | types | mounting")
     for name in shipped_robots():
         robot = load_robot(name)
         kinds = [module.type for module in robot.modules]

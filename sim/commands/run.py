@@ -8,12 +8,11 @@ from typing import Annotated
 import typer
 
 from coordinator.commands.options import PlanOptions, Quiet
-from coordinator.runtime.command_line import fail, with_options
+from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
 from coordinator.runtime.event_loop import SIGNALS, Interruption, ignore_signals
-from coordinator.runtime.exit_codes import explain
 from coordinator.runtime.terminal import Terminal
 from coordinator.viewer.targets import NATIVE_PORT, proxy_url, viewer_choice
-from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED, UsageError
+from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED
 from sim.commands.options import LaunchOptions, WorldOptions, load
 from sim.commands.score import print_score
 from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError
@@ -37,28 +36,22 @@ def run(
 ) -> None:
     """Identify a simulated robot and score the result against the truth."""
     if not virtual:
-        config = _launch_config(settings, launched, motions, *(("--quiet",) if quiet else ()))
-        _run_processes(config)
-        add_truth(config.out, None, _note)
-        print_score(config.out)
+        _launch(settings, launched, motions, None, *(("--quiet",) if quiet else ()))
         return
     robot = load(settings.robot)
-    settings.check_speed()
     launched.check()
-    noise, pushes = settings.noise_of(robot).of(robot), settings.pushes_on(robot)
-    plan, out = motions.chosen(), launched.new_folder(robot)
-    virtual_config = VirtualConfig(
+    config = VirtualConfig(
         robot=robot,
-        out=out,
         seed=settings.seed,
         network=launched.network or robot.network,
-        noise=noise,
-        plan=plan,
+        noise=settings.choice().of(robot),
+        pushes=settings.pushes_on(robot),
+        plan=motions.chosen(),
         refined_previews=MAX_REFINED_MODULES,
-        pushes=pushes,
+        out=launched.new_folder(robot),
     )
-    _run_virtual(virtual_config, quiet)
-    print_score(out)
+    _run_virtual(config, quiet)
+    print_score(config.out)
 
 
 @with_options
@@ -70,33 +63,37 @@ def launch(
 ) -> None:
     """Start world, agents and coordinator as processes, with the live viewer; Ctrl-C stops everything."""
     choice = viewer_choice(viewer)
-    config = _launch_config(settings, launched, motions, "--viewer", viewer)
-    _run_processes(config)
     # Where the viewer can still be reached when the run is over.
-    add_truth(config.out, proxy_url(NATIVE_PORT) if choice.spawn else choice.connect, _note)
-    print_score(config.out)
+    reachable = proxy_url(NATIVE_PORT) if choice.spawn else choice.connect
+    _launch(settings, launched, motions, reachable, "--viewer", viewer)
 
 
 def _note(text: str) -> None:
     typer.echo(text, err=True)
 
 
-def _launch_config(
-    settings: WorldOptions, launched: LaunchOptions, motions: PlanOptions, *coordinator_options: str
-) -> LaunchConfig:
+def _launch(
+    settings: WorldOptions,
+    launched: LaunchOptions,
+    motions: PlanOptions,
+    viewer: str | None,
+    *coordinator_options: str,
+) -> None:
+    """Run all processes, then score the result, and draw the truth in the recording and in the viewer."""
     robot = load(settings.robot)
     launched.check()
-    # The plan and the pushes are checked here; coordinator and world read them again.
+    # The noise, the plan and the pushes are checked here; coordinator and world read them again.
+    settings.choice().of(robot)
     motions.chosen()
     settings.pushes_on(robot)
-    return LaunchConfig(
+    config = LaunchConfig(
         robot_file=settings.robot,
         robot_name=robot.name,
         serials=robot.serials,
         seed=settings.seed,
         network=launched.network or robot.network,
-        noise=settings.noise_of(robot),
-        speed=settings.check_speed(),
+        noise=settings.choice(),
+        speed=settings.speed,
         endpoint=launched.endpoint,
         processes=launched.processes,
         pushes=tuple(settings.push or ()),
@@ -104,6 +101,9 @@ def _launch_config(
         coordinator_options=("--no-advise", *coordinator_options, *motions.arguments()),
         out=launched.new_folder(robot),
     )
+    _run_processes(config)
+    add_truth(config.out, viewer, _note)
+    print_score(config.out)
 
 
 def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
@@ -119,13 +119,11 @@ def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
     try:
         with Terminal(quiet) as terminal:
             result = run_virtual(config, terminal, on_signal=on_signal)
-    except RobotFileError as error:
-        raise UsageError(str(error)) from error
-    except BaseException as error:
-        failure = explain(error)
-        if failure is None:
-            raise
-        fail(f"{failure.text}; recorded up to here: {config.out}", failure.exit_code)
+    except RobotFileError:
+        raise
+    except ENDINGS as error:
+        end = ending(error)
+        fail(f"{end}; recorded up to here: {config.out}", end.exit_code)
     wall_s = time.monotonic() - started_s
     typer.echo(f"trace hash {result.trace_hash}")
     typer.echo(
@@ -133,23 +131,15 @@ def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
     )
 
 
-class _Stopped(Exception):
-    """SIGINT or SIGTERM came; `number` says which."""
-
-    def __init__(self, number: int):
-        super().__init__(signal.strsignal(number))
-        self.number = number
-
-
-def _stop(number: int, _frame: FrameType | None) -> None:
-    # Once: everything is then stopped in order, and a second signal would leave some of it behind.
-    ignore_signals()
-    raise _Stopped(number)
-
-
 def _run_processes(config: LaunchConfig) -> None:
+    def stop(number: int, _frame: FrameType | None) -> None:
+        # Once: everything is then stopped in order, and a second signal would leave some of it behind.
+        ignore_signals()
+        code = EXIT_INTERRUPTED if number == signal.SIGINT else 128 + number
+        fail(f"interrupted, everything is stopped; recorded up to here: {config.out}", code)
+
     for number in SIGNALS:
-        signal.signal(number, _stop)
+        signal.signal(number, stop)
     try:
         with Launcher(config, _note) as launcher:
             launcher.start_world()
@@ -157,8 +147,5 @@ def _run_processes(config: LaunchConfig) -> None:
             code = launcher.watch(launcher.start_coordinator())
     except LaunchError as error:
         fail(f"{error}; logs: {config.out / LOGS}", EXIT_FAILED)
-    except _Stopped as stopped:
-        code = EXIT_INTERRUPTED if stopped.number == signal.SIGINT else 128 + stopped.number
-        fail(f"interrupted, everything is stopped; recorded up to here: {config.out}", code)
     if code:
         fail(f"the coordinator ended with {code}; logs of the others: {config.out / LOGS}", code)

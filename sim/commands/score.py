@@ -7,9 +7,8 @@ import typer
 from rich.table import Table
 
 from coordinator.commands.options import AsJson
-from coordinator.runtime.terminal import print_table
-from module_agent.model.errors import DataError
-from sim.scoring.score import Score, ScoreError, score, write_score
+from coordinator.runtime.terminal import new_table, print_table
+from sim.scoring.score import Score, score, write_score
 
 
 def score_run(
@@ -21,11 +20,8 @@ def score_run(
 
 
 def print_score(folder: Path, as_json: bool = False) -> None:
-    """Score a run, write `score.json` into its folder and print it, or end the command."""
-    try:
-        result = score(folder)
-    except ScoreError as error:
-        raise DataError(str(error)) from error
+    """Score a run, write `score.json` into its folder and print it."""
+    result = score(folder)
     write_score(folder / "score.json", result)
     if as_json:
         typer.echo((folder / "score.json").read_text())
@@ -36,9 +32,12 @@ def print_score(folder: Path, as_json: bool = False) -> None:
 def table(result: Score) -> Table:
     """Return the score as a table to print."""
     unidentifiable = "\n".join(f"Not identifiable: {summary}" for summary in result.unidentifiable)
-    shown = Table(title="Result against truth", caption=unidentifiable or None, caption_justify="left")
-    for name in ("", "truth", "error", "claimed sigma", "axis error"):
-        shown.add_column(name, justify="left" if not name else "right")
+    shown = new_table(
+        "Result against truth",
+        " | >truth | >error | >claimed sigma | >axis error",
+        caption=unidentifiable or None,
+        caption_justify="left",
+    )
     shown.add_row("topology", "", "correct" if result.topology_correct else "WRONG", "", "")
     for line in result.topology_differences:
         shown.add_row(f"  {line}", "", "", "", "")

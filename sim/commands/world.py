@@ -11,7 +11,6 @@ import typer
 from coordinator.runtime.command_line import with_options
 from module_agent.model.errors import UsageError
 from sim.commands.options import WorldOptions, load
-from sim.robot.robot_file import RobotFileError
 from sim.world.bus_server import BusServer
 from sim.world.truth import TruthLog, write_truth
 from sim.world.world import World
@@ -30,8 +29,8 @@ def world(
     ] = None,
 ) -> None:
     """Run the world of one robot until a signal comes; agents attach to its bus."""
-    robot, speed = load(settings.robot), settings.check_speed()
-    noise, pushes = settings.noise_of(robot), settings.pushes_on(robot)
+    robot = load(settings.robot)
+    noise, pushes = settings.choice().of(robot), settings.pushes_on(robot)
     stopping: list[int] = []
 
     def stop(number: int, _frame: FrameType | None) -> None:
@@ -40,17 +39,17 @@ def world(
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     try:
-        plant = World(robot, settings.seed, noise.of(robot), pushes=pushes)
+        plant = World(robot, settings.seed, noise, pushes=pushes)
         log = TruthLog(plant)
         server = BusServer(bus, log, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
-    except (RobotFileError, OSError) as error:
+    except OSError as error:
         raise UsageError(str(error)) from error
     typer.echo(f"{robot.name}: {len(plant.modules)} modules on {bus}", err=True)
     # A full collection of what the imports have left would stop all modules' ticks.
     gc.collect()
     gc.freeze()
     with server:
-        report = server.run(speed, lambda: bool(stopping))
+        report = server.run(settings.speed, lambda: bool(stopping))
     typer.echo(f"{report.simulated_s:.1f} s at {report.achieved_speed:.2f} times real time", err=True)
     if truth is not None:
         truth.mkdir(parents=True, exist_ok=True)

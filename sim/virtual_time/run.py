@@ -10,6 +10,7 @@ from coordinator.identification.result import Result
 from coordinator.runtime.event_loop import Interruption, run_to_end
 from coordinator.session.run import Run, RunConfig
 from coordinator.viewer.feed import Screen
+from coordinator.viewer.targets import ViewerTargets
 from module_agent.network_emulation.profile_file import network
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
@@ -84,7 +85,7 @@ def run_virtual(
                 sender=COORDINATOR,
                 plan=config.plan,
                 expect=len(robot.world.modules),
-                connect_viewer=config.connect_viewer,
+                viewer=ViewerTargets(connect=config.connect_viewer),
                 inline=True,
                 refined_previews=config.refined_previews,
                 baseline=config.baseline,

@@ -11,15 +11,14 @@ import rerun.blueprint as rrb
 import rerun_bindings as bindings
 
 from coordinator.viewer.scene import entity_paths
-from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Parameter, is_dynamic
+from coordinator.viewer.scene.parameter_plot import AXIS_ANGLE, LINK_LENGTH, Parameter
 from coordinator.viewer.scene.topology_graph import Topology, extent
-from module_agent.model.errors import UsageError
 
 IDENTIFICATION, DYNAMICS, IMU, NETWORK = TABS = ("Identification", "Dynamics", "IMU", "Network")
 
 # More on one page would make plots too small to read; the rest is on further pages.
 MODULES_PER_PAGE = 4
-ROWS_PER_PAGE, COLUMNS_PER_PAGE = 3, 3
+COLUMNS_PER_PAGE = 3
 # About a housing's length: margin around the reach of the joints.
 HOUSING_M = 0.12
 
@@ -44,19 +43,11 @@ def views(contents: Contents) -> Contents:
     return contents._replace(estimated=tuple(p.without_ranges() for p in contents.estimated))
 
 
-def build(contents: Contents, active_tab: str = IDENTIFICATION) -> rrb.Blueprint:
-    """Return the layout for modules, estimates and topology.
-
-    Raises:
-        UsageError: there is no such tab.
-    """
-    if active_tab not in TABS:
-        raise UsageError(f"no tab {active_tab!r}; there are {', '.join(TABS)}")
+def build(contents: Contents) -> rrb.Blueprint:
+    """Return the layout for modules, estimates and topology."""
     tabs = (_identification(contents), _dynamics(contents), _imu(contents), _network(contents))
     return rrb.Blueprint(
-        rrb.Horizontal(
-            _left(contents), rrb.Tabs(*tabs, active_tab=TABS.index(active_tab)), column_shares=[2, 3]
-        ),
+        rrb.Horizontal(_left(contents), rrb.Tabs(*tabs, active_tab=0), column_shares=[2, 3]),
         rrb.TimePanel(state="collapsed", timeline=entity_paths.TIMELINE),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -116,18 +107,13 @@ def _robot(contents: Contents) -> rrb.Spatial3DView:
 
 def _identification(contents: Contents) -> rrb.Vertical:
     # The links of the identified robot come before the estimates of single modules.
-    geometric = sorted(
-        (parameter for parameter in contents.estimated if not is_dynamic(parameter)),
-        key=lambda parameter: (
-            parameter.name not in (LINK_LENGTH, AXIS_ANGLE),
-            parameter.name != LINK_LENGTH,
-        ),
-    )
+    first = (LINK_LENGTH, AXIS_ANGLE)
+    shown = sorted(contents.estimated, key=lambda p: first.index(p.name) if p.name in first else len(first))
     log = rrb.TextLogView(
         origin=entity_paths.PHASE_LOG, name="Log", columns=rrb.TextLogColumns(text_log_columns=["Body"])
     )
     return rrb.Vertical(
-        _parameters(geometric, "Estimates", contents) if geometric else _no_estimates(contents),
+        _parameters(shown, contents) if shown else _no_estimates(contents),
         rrb.Horizontal(_topology(contents), log, column_shares=[2, 3]),
         row_shares=[3, 2],
         name=IDENTIFICATION,
@@ -143,23 +129,18 @@ def _no_estimates(contents: Contents) -> rrb.View:
     )
 
 
-def _parameters(parameters: Sequence[Parameter], name: str, contents: Contents) -> rrb.Container:
+def _parameters(parameters: Sequence[Parameter], contents: Contents) -> rrb.Container:
     """Lay out parameters by row and modules by column, on as many pages as needed."""
+    name = "Estimates"
     serials = list(dict.fromkeys(serial for p in parameters for serial in p.ranges_by_serial()))
     # From the base to the tips, as far as the topology is known.
     known = contents.topology.serials if contents.topology is not None else ()
     serials.sort(key=lambda serial: known.index(serial) if serial in known else len(known))
-    rows = [parameters[i : i + ROWS_PER_PAGE] for i in range(0, len(parameters), ROWS_PER_PAGE)]
     columns = [serials[i : i + COLUMNS_PER_PAGE] for i in range(0, len(serials), COLUMNS_PER_PAGE)]
-    if len(rows) == len(columns) == 1:
+    if len(columns) == 1:
         return _parameter_page(parameters, serials, name)
-    what = [f": {some[0].title()} …" if len(rows) > 1 else "" for some in rows]
     whose = [f"{some[0]} to {some[-1]}" if len(some) > 1 else some[0] for some in columns]
-    pages = [
-        _parameter_page(rows[i], columns[k], whose[k] + what[i])
-        for i in range(len(rows))
-        for k in range(len(columns))
-    ]
+    pages = [_parameter_page(parameters, some, who) for some, who in zip(columns, whose, strict=True)]
     return rrb.Tabs(*pages, name=name)
 
 
@@ -209,37 +190,33 @@ def _dynamics(contents: Contents) -> rrb.Vertical:
         ),
         name="All modules",
     )
-    inertial = [parameter for parameter in contents.estimated if is_dynamic(parameter)]
     return rrb.Vertical(
         _paged(held_out, MODULES_PER_PAGE, "Held-out torque"),
-        rrb.Tabs(of_all, _parameters(inertial, "Parameters", contents), active_tab=0) if inertial else of_all,
+        of_all,
         row_shares=[1, 1],
         name=DYNAMICS,
     )
 
 
 def _imu(contents: Contents) -> rrb.Container:
-    plots: list[rrb.View] = []
-    for serial in contents.serials:
-        for group, title in (
-            (entity_paths.GYRO, "gyro [rad/s]"),
-            (entity_paths.ACCEL, "specific force [m/s²]"),
-        ):
-            path = entity_paths.module_path(serial, group)
-            plots.append(rrb.TimeSeriesView(origin=path, name=f"{serial} {title}"))
+    sensors = ((entity_paths.GYRO, "gyro [rad/s]"), (entity_paths.ACCEL, "specific force [m/s²]"))
+    plots = [
+        rrb.TimeSeriesView(origin=entity_paths.module_path(serial, group), name=f"{serial} {title}")
+        for serial in contents.serials
+        for group, title in sensors
+    ]
     # No container around a single plot: the viewer removes such a container together with its name.
     return _paged(plots, 2 * MODULES_PER_PAGE, IMU)
 
 
 def _network(contents: Contents) -> rrb.Vertical:
+    plots = (
+        ("Round trip [ms]", entity_paths.ROUND_TRIP),
+        ("Age of the newest sample [ms]", entity_paths.AGE),
+        ("Refused commands, total", entity_paths.REFUSALS),
+    )
     return rrb.Vertical(
-        _of_modules("Round trip [ms]", contents.serials, entity_paths.network_path, entity_paths.ROUND_TRIP),
-        _of_modules(
-            "Age of the newest sample [ms]", contents.serials, entity_paths.network_path, entity_paths.AGE
-        ),
-        _of_modules(
-            "Refused commands, total", contents.serials, entity_paths.network_path, entity_paths.REFUSALS
-        ),
+        *(_of_modules(name, contents.serials, entity_paths.network_path, group) for name, group in plots),
         rrb.StateTimelineView(
             origin="/modules",
             contents=[entity_paths.module_path(serial, entity_paths.STATE) for serial in contents.serials],
@@ -261,7 +238,5 @@ def _paged(views: Sequence[rrb.View], per_page: int, name: str) -> rrb.Container
     pages = [views[i : i + per_page] for i in range(0, len(views), per_page)]
     if len(pages) <= 1:
         return rrb.Grid(*views, grid_columns=2, name=name)
-    grids = [
-        rrb.Grid(*page, grid_columns=2, name=f"{name} {number}") for number, page in enumerate(pages, start=1)
-    ]
+    grids = [rrb.Grid(*page, grid_columns=2, name=f"{name} {k}") for k, page in enumerate(pages, start=1)]
     return rrb.Tabs(*grids, name=name)

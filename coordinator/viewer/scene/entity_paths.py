@@ -103,17 +103,11 @@ def part(name: str) -> str:
     return rr.escape_entity_path_part(name)
 
 
-class Palette:
-    """Assigns each module one colour, the same in every view and for the whole run."""
+class Palette(dict[str, Colour]):
+    """The colour of each module, the same in every view and for the whole run; a new one gets the next."""
 
-    def __init__(self) -> None:
-        self._colours: dict[str, Colour] = {}
-
-    def colour(self, serial: str) -> Colour:
-        """Return the module's colour; a new module gets the next one."""
-        if serial not in self._colours:
-            self._colours[serial] = nth_colour(len(self._colours))
-        return self._colours[serial]
+    def __missing__(self, serial: str) -> Colour:
+        return self.setdefault(serial, nth_colour(len(self)))
 
 
 def nth_colour(index: int) -> Colour:

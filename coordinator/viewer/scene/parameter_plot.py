@@ -50,14 +50,6 @@ class Parameter(NamedTuple):
         """Return the name without underscores."""
         return self.name.replace("_", " ")
 
-    def with_range(
-        self, serial: str, value: float, sigma: float, previous: float | None, truth: float | None = None
-    ) -> "Parameter":
-        """Return the parameter with a range in which this estimate, its band and the truth are visible."""
-        ranges = self.ranges_by_serial()
-        ranges[serial] = including(fitting(ranges.get(serial), value, sigma, previous), truth)
-        return self._replace(ranges=tuple(ranges.items()))
-
 
 def fitting(before: Range | None, value: float, sigma: float, previous: float | None) -> Range | None:
     """Return the axis range for an estimate, unchanged where that is possible: a new one needs a new layout.
@@ -88,21 +80,20 @@ def including(around: Range | None, value: float | None) -> Range | None:
     return (low if value > low else value - edge, high if value < high else value + edge)
 
 
-def is_dynamic(parameter: Parameter) -> bool:
-    """Return whether it is a parameter of the dynamics: its unit contains kg or Nm."""
-    return "kg" in parameter.units or "Nm" in parameter.units
-
-
 def with_estimate(
     parameters: tuple[Parameter, ...],
     estimate: Estimate,
     previous: float | None,
     truth: float | None = None,
 ) -> tuple[Parameter, ...]:
-    """Return the parameters including this estimate; the units are those of the first estimate."""
+    """Return the parameters including this estimate, with a range in which it and the truth are visible.
+
+    The units are those of the first estimate.
+    """
     known = {parameter.name: parameter for parameter in parameters}
     parameter = known.get(estimate.name, Parameter(estimate.name, estimate.units))
-    known[estimate.name] = parameter.with_range(
-        estimate.serial, estimate.value, estimate.sigma, previous, truth
-    )
+    ranges = parameter.ranges_by_serial()
+    fitted = fitting(ranges.get(estimate.serial), estimate.value, estimate.sigma, previous)
+    ranges[estimate.serial] = including(fitted, truth)
+    known[estimate.name] = parameter._replace(ranges=tuple(ranges.items()))
     return tuple(known.values())

@@ -75,9 +75,9 @@ def log_network(
     stream: rr.RecordingStream, serial: str, round_trip_ms: float, age_ms: float, refusals: int
 ) -> None:
     """Log a module's round trip, the age of its newest sample and the number of refused commands."""
-    stream.log(entity_paths.network_path(serial, entity_paths.ROUND_TRIP), rr.Scalars(round_trip_ms))
-    stream.log(entity_paths.network_path(serial, entity_paths.AGE), rr.Scalars(age_ms))
-    stream.log(entity_paths.network_path(serial, entity_paths.REFUSALS), rr.Scalars(float(refusals)))
+    groups = (entity_paths.ROUND_TRIP, entity_paths.AGE, entity_paths.REFUSALS)
+    for group, value in zip(groups, (round_trip_ms, age_ms, float(refusals)), strict=True):
+        stream.log(entity_paths.network_path(serial, group), rr.Scalars(value))
 
 
 def send_residuals(

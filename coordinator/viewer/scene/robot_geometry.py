@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.catalogue import module_type
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.perturbation import apply_perturbation
 
@@ -20,19 +20,12 @@ from module_agent.model.perturbation import apply_perturbation
 GAP_M = 0.25
 
 
-class Box(NamedTuple):
-    """A housing's outline in its own frame [m]."""
-
-    size: tuple[float, float, float]
-    centre: tuple[float, float, float]
-
-
 class Module(NamedTuple):
     """Geometry of one module of a chain.
 
     housing_body, output_body: the bodies that carry the housing and the output, `BASE` for the base.
     housing: (4, 4) pose of the housing frame.
-    box: the housing's outline.
+    box_size, box_centre: (3,) edges and centre of the housing's outline, in its own frame [m].
     output: (3,) the point of the identified axis nearest to where the output is in the housing.
     axis: (3,) unit vector of the joint's axis.
     """
@@ -40,7 +33,8 @@ class Module(NamedTuple):
     housing_body: int
     output_body: int
     housing: Array
-    box: Box
+    box_size: Array
+    box_centre: Array
     output: Array
     axis: Array
 
@@ -51,6 +45,11 @@ class Link(NamedTuple):
     body: int
     start: Array
     end: Array
+
+    @property
+    def length_m(self) -> float:
+        """Its length [m]."""
+        return float(np.linalg.norm(self.end - self.start))
 
 
 def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
@@ -66,25 +65,22 @@ def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
     return tuple(_module(chain, k, types) for k in range(len(chain.serials)))
 
 
-def _box(made: ModuleType) -> Box:
-    corners = np.array([made.housing_min_xyz, made.housing_max_xyz])
-    size, centre = corners[1] - corners[0], corners.mean(axis=0)
-    return Box((size[0], size[1], size[2]), (centre[0], centre[1], centre[2]))
-
-
 def _module(chain: Chain, k: int, types: Mapping[str, str]) -> Module:
     serial = chain.serials[k]
     if serial not in types:
         raise KeyError(f"the type of module {serial!r} is not known; known are {', '.join(types) or 'none'}")
     made = module_type(types[serial])
-    housing = chain.imu_home[k] @ _shift(-np.array(made.imu_xyz))
+    housing = chain.imu_home[k].copy()
+    housing[:3, 3] -= housing[:3, :3] @ made.imu_xyz
+    corners = np.array([made.housing_min_xyz, made.housing_max_xyz])
     nominal = housing[:3, :3] @ made.output_xyz + housing[:3, 3]
     axis, point = chain.axis[k], chain.point[k]
     return Module(
         housing_body=chain.carrier(k),
         output_body=chain.parent[k] if chain.reversed[k] else k,
         housing=housing,
-        box=_box(made),
+        box_size=corners[1] - corners[0],
+        box_centre=corners.mean(axis=0),
         output=point + axis * float(axis @ (nominal - point)),
         axis=axis,
     )
@@ -140,14 +136,8 @@ def reach_m(chain: Chain, placed: tuple[Module, ...]) -> float:
         parent = chain.parent[k]
         before = 0.0 if parent == BASE else along[parent]
         stacked = float(np.linalg.norm(placed[k].output - placed[k].housing[:3, 3]))
-        along.append(before + float(np.linalg.norm(link.end - link.start)) + stacked)
+        along.append(before + link.length_m + stacked)
     return max(along, default=0.0)
-
-
-def _shift(by: Array) -> Array:
-    pose = np.eye(4)
-    pose[:3, 3] = by
-    return pose
 
 
 def side_by_side(chain: Chain) -> Chain:

@@ -19,8 +19,6 @@ OUTPUT_RADIUS_M = 0.024
 OUTPUT_THICKNESS_M = 0.008
 AXIS_LENGTH_M = 0.09
 IMU_AXIS_LENGTH_M = 0.05
-# Radius in sigmas, as the 95 % intervals of the plots.
-SPREAD = NINETY_FIVE_SIGMAS
 
 Drawn = rr.AsComponents
 
@@ -85,11 +83,12 @@ def build_scene(
     """
     if sigma_m is not None and len(sigma_m) != len(chain.serials):
         raise ValueError(f"{len(sigma_m)} sigmas for a chain of {len(chain.serials)} joints")
-    placed = modules(chain, types)
     paint = [style.uniform or colours[serial] for serial in chain.serials]
-    drawn: list[tuple[str, tuple[Drawn, ...]]] = [(style.world, (_upright(chain.gravity),))]
+    painter = _Painter(chain, modules(chain, types), paint, sigma_m, style)
+    vertical = rr.Transform3D(quaternion=_quaternion(upright(chain.gravity)))
+    drawn: list[tuple[str, tuple[Drawn, ...]]] = [(style.world, (vertical,))]
     for body in range(BASE, len(chain.serials)):
-        drawn += _body(chain, placed, paint, sigma_m, style, body)
+        drawn += painter.body(body)
     return Scene(chain, style, tuple(drawn))
 
 
@@ -98,7 +97,10 @@ def log_scene(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
     for path, archetypes in scene.drawn:
         for archetype in archetypes:
             stream.log(path, archetype)
-    _log_pose(stream, scene, q_rad)
+    displaced = body_displacements(scene.chain, q_rad[None, :])[0]
+    for serial, motion in zip(scene.chain.serials, displaced, strict=True):
+        path = entity_paths.body_path(scene.style.world, serial)
+        stream.log(path, rr.Transform3D(translation=motion[:3, 3], mat3x3=motion[:3, :3]))
 
 
 def send_poses(stream: rr.RecordingStream, scene: Scene, t_ns: IntArray, q_rad: Array) -> None:
@@ -113,13 +115,6 @@ def send_poses(stream: rr.RecordingStream, scene: Scene, t_ns: IntArray, q_rad: 
             translation=displaced[:, body, :3, 3], mat3x3=displaced[:, body, :3, :3]
         )
         stream.send_columns(entity_paths.body_path(scene.style.world, serial), [time_column(t_ns)], moved)
-
-
-def _log_pose(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
-    displaced = body_displacements(scene.chain, q_rad[None, :])[0]
-    for serial, motion in zip(scene.chain.serials, displaced, strict=True):
-        path = entity_paths.body_path(scene.style.world, serial)
-        stream.log(path, rr.Transform3D(translation=motion[:3, 3], mat3x3=motion[:3, :3]))
 
 
 def clear_removed(stream: rr.RecordingStream, before: Scene, after: Scene) -> None:
@@ -144,127 +139,101 @@ def gravity_arrow(chain: Chain, reach_m: float) -> rr.Arrows3D:
     )
 
 
-def _body(
-    chain: Chain,
-    placed: tuple[Module, ...],
-    paint: Sequence[entity_paths.Colour],
-    sigma_m: Sequence[float] | None,
-    style: SceneStyle,
-    body: int,
-) -> list[tuple[str, tuple[Drawn, ...]]]:
-    path = entity_paths.body_path(style.world, None if body == BASE else chain.serials[body])
-    housed = [k for k, module in enumerate(placed) if module.housing_body == body]
-    drawn: list[tuple[str, tuple[Drawn, ...]]] = []
-    if housed:
-        drawn.append((f"{path}/housing", (_housings(chain, placed, paint, sigma_m, style, housed),)))
-        if style.uniform is None:
-            drawn += [(f"{path}/imu/{entity_paths.part(chain.serials[k])}", _imu(chain, k)) for k in housed]
-    turning = [k for k, module in enumerate(placed) if module.output_body == body]
-    if turning:
-        drawn.append((f"{path}/output", (_outputs(placed, paint, style, turning),)))
-    if body != BASE:
-        drawn.append((f"{path}/axis", (_axis(placed[body], paint[body]),)))
-        if sigma_m is not None and np.isfinite(sigma_m[body]):
-            drawn.append((f"{path}/spread", (_spread(placed[body], sigma_m[body], style),)))
-    joined = [link for link in links(chain, placed) if link.body == body and _length(link) > 1e-4]
-    if body == BASE and style.uniform is not None:
+class _Painter(NamedTuple):
+    """A chain with its geometry, and how it is drawn; `paint` are the modules' colours."""
+
+    chain: Chain
+    placed: tuple[Module, ...]
+    paint: Sequence[entity_paths.Colour]
+    sigma_m: Sequence[float] | None
+    style: SceneStyle
+
+    def body(self, body: int) -> list[tuple[str, tuple[Drawn, ...]]]:
+        """Draw what a body carries."""
+        chain, placed, style = self.chain, self.placed, self.style
+        path = entity_paths.body_path(style.world, None if body == BASE else chain.serials[body])
+        housed = [k for k, module in enumerate(placed) if module.housing_body == body]
+        drawn: list[tuple[str, tuple[Drawn, ...]]] = []
+        if housed:
+            drawn.append((f"{path}/housing", (self._housings(housed),)))
+            if style.uniform is None:
+                names = [entity_paths.part(chain.serials[k]) for k in housed]
+                drawn += [(f"{path}/imu/{name}", self._imu(k)) for name, k in zip(names, housed, strict=True)]
+        turning = [k for k, module in enumerate(placed) if module.output_body == body]
+        if turning:
+            drawn.append((f"{path}/output", (self._outputs(turning),)))
+        if body != BASE:
+            drawn.append((f"{path}/axis", (self._axis(body),)))
+            if self.sigma_m is not None and np.isfinite(self.sigma_m[body]):
+                drawn.append((f"{path}/spread", (self._spread(body, self.sigma_m[body]),)))
+        joined = [link for link in links(chain, placed) if link.body == body and link.length_m > 1e-4]
         # The base is at the first module of the identified robot; the truth may be drawn elsewhere.
-        joined = []
-    if joined:
-        drawn.append((f"{path}/link", (_links(joined, style),)))
-    return drawn
+        if joined and not (body == BASE and style.uniform is not None):
+            drawn.append((f"{path}/link", (self._links(joined),)))
+        return drawn
 
+    def _housings(self, housed: Sequence[int]) -> rr.Boxes3D:
+        carried = [self.placed[k] for k in housed]
+        return rr.Boxes3D(
+            sizes=[each.box_size for each in carried],
+            centers=[each.housing[:3, :3] @ each.box_centre + each.housing[:3, 3] for each in carried],
+            quaternions=[_quaternion(Rotation.from_matrix(each.housing[:3, :3])) for each in carried],
+            colors=[self.paint[k] for k in housed],
+            fill_mode=self.style.fill,
+            labels=[self._label(k) for k in housed],
+            show_labels=self.style.labels,
+        )
 
-def _housings(
-    chain: Chain,
-    placed: tuple[Module, ...],
-    paint: Sequence[entity_paths.Colour],
-    sigma_m: Sequence[float] | None,
-    style: SceneStyle,
-    housed: Sequence[int],
-) -> rr.Boxes3D:
-    poses = [placed[k].housing for k in housed]
-    return rr.Boxes3D(
-        sizes=[placed[k].box.size for k in housed],
-        centers=[
-            pose[:3, :3] @ placed[k].box.centre + pose[:3, 3] for k, pose in zip(housed, poses, strict=True)
-        ],
-        quaternions=[_quaternion(Rotation.from_matrix(pose[:3, :3])) for pose in poses],
-        colors=[paint[k] for k in housed],
-        fill_mode=style.fill,
-        labels=[_label(chain, k, sigma_m) for k in housed],
-        show_labels=style.labels,
-    )
+    def _label(self, k: int) -> str:
+        name = self.chain.serials[k] + (" (reversed)" if self.chain.reversed[k] else "")
+        if self.sigma_m is None or self.sigma_m[k] == 0.0:  # the root is the reference of the others
+            return name
+        if not np.isfinite(self.sigma_m[k]):
+            return f"{name}  position unknown"
+        return f"{name}  ±{1e3 * self.sigma_m[k]:.2g} mm"
 
+    def _outputs(self, turning: Sequence[int]) -> rr.Cylinders3D:
+        return rr.Cylinders3D(
+            lengths=[OUTPUT_THICKNESS_M] * len(turning),
+            radii=[OUTPUT_RADIUS_M] * len(turning),
+            centers=[self.placed[k].output for k in turning],
+            quaternions=[_quaternion(from_z(self.placed[k].axis)) for k in turning],
+            colors=[entity_paths.shade(self.paint[k], 0.5) for k in turning],
+            fill_mode=self.style.fill,
+        )
 
-def _label(chain: Chain, k: int, sigma_m: Sequence[float] | None) -> str:
-    how = " (reversed)" if chain.reversed[k] else ""
-    if sigma_m is None or sigma_m[k] == 0.0:  # the root is the reference of the others
-        return f"{chain.serials[k]}{how}"
-    if not np.isfinite(sigma_m[k]):
-        return f"{chain.serials[k]}{how}  position unknown"
-    return f"{chain.serials[k]}{how}  ±{1e3 * sigma_m[k]:.2g} mm"
+    def _axis(self, k: int) -> rr.Arrows3D:
+        return rr.Arrows3D(
+            origins=[self.placed[k].output],
+            vectors=[AXIS_LENGTH_M * self.placed[k].axis],
+            radii=0.004,
+            colors=[entity_paths.shade(self.paint[k], 1.4)],
+        )
 
+    def _spread(self, k: int, sigma_m: float) -> rr.Ellipsoids3D:
+        return rr.Ellipsoids3D(
+            centers=[self.placed[k].output],
+            radii=[NINETY_FIVE_SIGMAS * sigma_m],  # as the intervals of the plots
+            colors=[self.style.link],
+            fill_mode="transparentfillmajorwireframe",
+        )
 
-def _outputs(
-    placed: tuple[Module, ...],
-    paint: Sequence[entity_paths.Colour],
-    style: SceneStyle,
-    turning: Sequence[int],
-) -> rr.Cylinders3D:
-    return rr.Cylinders3D(
-        lengths=[OUTPUT_THICKNESS_M] * len(turning),
-        radii=[OUTPUT_RADIUS_M] * len(turning),
-        centers=[placed[k].output for k in turning],
-        quaternions=[_quaternion(from_z(placed[k].axis)) for k in turning],
-        colors=[entity_paths.shade(paint[k], 0.5) for k in turning],
-        fill_mode=style.fill,
-    )
+    def _links(self, joined: Sequence[Link]) -> rr.Capsules3D:
+        return rr.Capsules3D(
+            lengths=[link.length_m for link in joined],
+            radii=[LINK_RADIUS_M] * len(joined),
+            translations=[link.start for link in joined],
+            quaternions=[_quaternion(from_z((link.end - link.start) / link.length_m)) for link in joined],
+            colors=[self.style.link] * len(joined),
+            fill_mode=self.style.fill,
+        )
 
-
-def _axis(module: Module, colour: entity_paths.Colour) -> rr.Arrows3D:
-    return rr.Arrows3D(
-        origins=[module.output],
-        vectors=[AXIS_LENGTH_M * module.axis],
-        radii=0.004,
-        colors=[entity_paths.shade(colour, 1.4)],
-    )
-
-
-def _spread(module: Module, sigma_m: float, style: SceneStyle) -> rr.Ellipsoids3D:
-    return rr.Ellipsoids3D(
-        centers=[module.output],
-        radii=[SPREAD * sigma_m],
-        colors=[style.link],
-        fill_mode="transparentfillmajorwireframe",
-    )
-
-
-def _links(joined: Sequence[Link], style: SceneStyle) -> rr.Capsules3D:
-    return rr.Capsules3D(
-        lengths=[_length(link) for link in joined],
-        radii=[LINK_RADIUS_M] * len(joined),
-        translations=[link.start for link in joined],
-        quaternions=[_quaternion(from_z((link.end - link.start) / _length(link))) for link in joined],
-        colors=[style.link] * len(joined),
-        fill_mode=style.fill,
-    )
-
-
-def _imu(chain: Chain, k: int) -> tuple[Drawn, ...]:
-    pose = chain.imu_home[k]
-    return (
-        rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
-        rr.TransformAxes3D(axis_length=IMU_AXIS_LENGTH_M),
-    )
-
-
-def _upright(gravity: Array) -> rr.Transform3D:
-    return rr.Transform3D(quaternion=_quaternion(upright(gravity)))
-
-
-def _length(link: Link) -> float:
-    return float(np.linalg.norm(link.end - link.start))
+    def _imu(self, k: int) -> tuple[Drawn, ...]:
+        pose = self.chain.imu_home[k]
+        return (
+            rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
+            rr.TransformAxes3D(axis_length=IMU_AXIS_LENGTH_M),
+        )
 
 
 def _quaternion(rotation: Rotation) -> rr.Quaternion:

@@ -4,8 +4,8 @@ A chunk of a recording has some 2.6 kB of headers, and a call of `send_columns` 
 for 250, so rows should come in large batches. The recording shows the run; every row is in the MCAP file.
 """
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -16,7 +16,6 @@ from module_agent.wire.feedback_rows import STATE_NAMES, Rows
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
-
 
 # At most two rows per interval are logged. On 1500 pixels a minute looks the same as with all rows.
 INTERVAL_NS = 40_000_000
@@ -33,46 +32,32 @@ class Batch(NamedTuple):
 
 
 class Series(NamedTuple):
-    """Names a group of sensors in plots: the last part of its entity, its unit and its components."""
+    """A group of sensors: the last part of its entity, its fields in a row, and its components in plots."""
 
     group: str
-    unit: str
-    components: tuple[str, ...]
+    fields: tuple[str, ...]
+    components: tuple[str, ...] = ("",)
+
+    def values(self, rows: Rows) -> FloatArray:
+        """Return the group's values (m, k) in m rows."""
+        return np.column_stack([rows[field] for field in self.fields]).astype(float)
 
 
-# The components are in the order of the columns of `groups`.
-SERIES: tuple[Series, ...] = (
-    Series(entity_paths.POSITION, "rad", ("",)),
-    Series(entity_paths.VELOCITY, "rad/s", ("",)),
-    Series(entity_paths.EFFORT, "Nm", ("",)),
-    Series(entity_paths.POSITION_COMMAND, "rad", ("command",)),
-    Series(entity_paths.VELOCITY_COMMAND, "rad/s", ("command",)),
-    Series(entity_paths.EFFORT_COMMAND, "Nm", ("command",)),
-    Series(entity_paths.GYRO, "rad/s", ("x", "y", "z")),
-    Series(entity_paths.ACCEL, "m/s²", ("x", "y", "z")),
-    Series(entity_paths.MOTOR, "1, A", ("PWM", "current")),
-    Series(entity_paths.SUPPLY, "V, °C", ("bus voltage", "winding temperature")),
+_COMMAND, _XYZ = ("command",), ("x", "y", "z")
+FAST: tuple[Series, ...] = (
+    Series(entity_paths.POSITION, ("position_rad",)),
+    Series(entity_paths.VELOCITY, ("velocity_rad_s",)),
+    Series(entity_paths.EFFORT, ("effort_nm",)),
+    Series(entity_paths.POSITION_COMMAND, ("position_command_rad",), _COMMAND),
+    Series(entity_paths.VELOCITY_COMMAND, ("velocity_command_rad_s",), _COMMAND),
+    Series(entity_paths.EFFORT_COMMAND, ("effort_command_nm",), _COMMAND),
+    Series(entity_paths.GYRO, ("gyro_rad_s",), _XYZ),
+    Series(entity_paths.ACCEL, ("accel_m_s2",), _XYZ),
+    Series(entity_paths.MOTOR, ("pwm", "motor_current_a"), ("PWM", "current")),
 )
-
-
-_COMMANDS = (
-    (entity_paths.POSITION_COMMAND, "position_command_rad"),
-    (entity_paths.VELOCITY_COMMAND, "velocity_command_rad_s"),
-    (entity_paths.EFFORT_COMMAND, "effort_command_nm"),
+SUPPLY = Series(
+    entity_paths.SUPPLY, ("voltage_v", "winding_temperature_c"), ("bus voltage", "winding temperature")
 )
-
-
-def groups(rows: Rows) -> Iterator[tuple[str, FloatArray]]:
-    """Return the vector entities of m rows, as (group, (m, k)); a command that is never set is left out."""
-    yield entity_paths.POSITION, _columns(rows, "position_rad")
-    yield entity_paths.VELOCITY, _columns(rows, "velocity_rad_s")
-    yield entity_paths.EFFORT, _columns(rows, "effort_nm")
-    for group, field in _COMMANDS:
-        if not np.isnan(rows[field]).all():
-            yield group, _columns(rows, field)
-    yield entity_paths.GYRO, rows["gyro_rad_s"].astype(float)
-    yield entity_paths.ACCEL, rows["accel_m_s2"].astype(float)
-    yield entity_paths.MOTOR, _columns(rows, "pwm", "motor_current_a")
 
 
 def envelope(t_ns: IntArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -110,15 +95,15 @@ def _first_rows(t_ns: IntArray, interval_ns: int) -> NDArray[np.intp]:
 
 
 def send_rows(stream: rr.RecordingStream, batch: Batch) -> None:
-    """Log the envelopes of a batch, and one row a second of the slow group."""
-    for group, values in groups(batch.rows):
-        path = entity_paths.module_path(batch.serial, group)
-        send_scalars(stream, path, *envelope(batch.t_ns, values))
+    """Log the envelopes of a batch without commands that are never set, and the supply once a second."""
+    for series in FAST:
+        values = series.values(batch.rows)
+        if series.components != _COMMAND or not np.isnan(values).all():
+            path = entity_paths.module_path(batch.serial, series.group)
+            send_scalars(stream, path, *envelope(batch.t_ns, values))
     slow = _first_rows(batch.t_ns, SUPPLY_INTERVAL_NS)
-    supply = _columns(batch.rows[slow], "voltage_v", "winding_temperature_c")
-    send_scalars(
-        stream, entity_paths.module_path(batch.serial, entity_paths.SUPPLY), batch.t_ns[slow], supply
-    )
+    path = entity_paths.module_path(batch.serial, SUPPLY.group)
+    send_scalars(stream, path, batch.t_ns[slow], SUPPLY.values(batch.rows[slow]))
 
 
 def send_scalars(stream: rr.RecordingStream, path: str, t_ns: IntArray, values: FloatArray) -> None:
@@ -145,7 +130,9 @@ class StateChanges:
         before = np.concatenate([[self._last.get(batch.serial, -1)], states[:-1]])
         self._last[batch.serial] = int(states[-1])
         at = np.flatnonzero(states != before)
-        return batch.t_ns[at], [_state_name(int(s)) for s in states[at]]
+        # A newer firmware may know more states; show its number rather than lose the rows.
+        names = [STATE_NAMES[s] if s < len(STATE_NAMES) else f"state {s}" for s in states[at].tolist()]
+        return batch.t_ns[at], names
 
 
 def send_states(stream: rr.RecordingStream, serial: str, t_ns: IntArray, names: Sequence[str]) -> None:
@@ -155,61 +142,26 @@ def send_states(stream: rr.RecordingStream, serial: str, t_ns: IntArray, names: 
         stream.send_columns(path, [time_column(t_ns)], rr.StateChange.columns(state=list(names)))
 
 
-def log_module_styles(
-    stream: rr.RecordingStream, serial: str, label: str, colour: entity_paths.Colour
-) -> None:
+def log_module_styles(stream: rr.RecordingStream, serial: str, colour: entity_paths.Colour) -> None:
     """Log the names and colours of all series of a module, static."""
-    for series in SERIES:
-        names = [f"{label} {component}".strip() for component in series.components]
-        style = rr.SeriesLines(names=names, colors=_colours(series, colour), widths=[1.5] * len(names))
-        stream.log(entity_paths.module_path(serial, series.group), style, static=True)
-    stream.log(entity_paths.module_path(serial, entity_paths.STATE), _state_style(), static=True)
-    _log_residual_styles(stream, serial, label, colour)
-    _log_network_styles(stream, serial, label, colour)
 
+    def log(path: str, names: Sequence[str], colours: Sequence[entity_paths.Colour], **style: Any) -> None:
+        labels = [f"{serial} {name}".strip() for name in names]
+        widths = style.pop("widths", [1.5] * len(labels))
+        lines = rr.SeriesLines(names=labels, colors=list(colours), widths=widths, **style)
+        stream.log(path, lines, static=True)
 
-def _log_residual_styles(
-    stream: rr.RecordingStream, serial: str, label: str, colour: entity_paths.Colour
-) -> None:
-    held_out = rr.SeriesLines(
-        names=[f"{label} measured", f"{label} predicted"],
-        colors=[colour, entity_paths.PREDICTION_COLOUR],
-        widths=[2.0, 1.5],
-    )
-    stream.log(entity_paths.residual_path(serial, entity_paths.HELD_OUT), held_out, static=True)
-    error = rr.SeriesLines(names=label, colors=[colour], widths=[1.0])
-    stream.log(entity_paths.residual_path(serial, entity_paths.ERROR), error, static=True)
-
-
-def _log_network_styles(
-    stream: rr.RecordingStream, serial: str, label: str, colour: entity_paths.Colour
-) -> None:
+    for series in (*FAST, SUPPLY):
+        shades = entity_paths.axis_shades(colour)[: len(series.components)]
+        colours = (entity_paths.COMMAND_COLOUR,) if series.components == _COMMAND else shades
+        log(entity_paths.module_path(serial, series.group), series.components, colours)
+    states = entity_paths.STATE_COLOURS
+    style = rr.StateConfiguration(values=list(states), labels=list(states), colors=list(states.values()))
+    stream.log(entity_paths.module_path(serial, entity_paths.STATE), style, static=True)
+    both = (colour, entity_paths.PREDICTION_COLOUR)
+    held_out = entity_paths.residual_path(serial, entity_paths.HELD_OUT)
+    log(held_out, ("measured", "predicted"), both, widths=[2.0, 1.5])
+    log(entity_paths.residual_path(serial, entity_paths.ERROR), ("",), (colour,), widths=[1.0])
     for group in (entity_paths.ROUND_TRIP, entity_paths.AGE, entity_paths.REFUSALS):
-        shape: rr.components.InterpolationModeLike = (
-            "stepafter" if group == entity_paths.REFUSALS else "linear"
-        )
-        style = rr.SeriesLines(names=label, colors=[colour], widths=[1.5], interpolation_mode=shape)
-        stream.log(entity_paths.network_path(serial, group), style, static=True)
-
-
-def _colours(series: Series, colour: entity_paths.Colour) -> list[entity_paths.Colour]:
-    if series.components == ("command",):
-        return [entity_paths.COMMAND_COLOUR]
-    return list(entity_paths.axis_shades(colour)[: len(series.components)])
-
-
-def _state_style() -> rr.StateConfiguration:
-    return rr.StateConfiguration(
-        values=list(entity_paths.STATE_COLOURS),
-        labels=list(entity_paths.STATE_COLOURS),
-        colors=list(entity_paths.STATE_COLOURS.values()),
-    )
-
-
-def _state_name(state: int) -> str:
-    # A newer firmware may know more states; show its number rather than lose the rows.
-    return STATE_NAMES[state] if state < len(STATE_NAMES) else f"state {state}"
-
-
-def _columns(rows: Rows, *fields: str) -> FloatArray:
-    return np.stack([rows[field] for field in fields], axis=1).astype(float)
+        mode = "stepafter" if group == entity_paths.REFUSALS else "linear"
+        log(entity_paths.network_path(serial, group), ("",), (colour,), interpolation_mode=mode)

@@ -83,17 +83,6 @@ def extent(topology: Topology) -> tuple[float, float, float, float]:
     return (min(x) - LEAF, max(x) + LEAF, min(y) - 0.6 * LEVEL, max(y) + 0.6 * LEVEL)
 
 
-def error_in(topology: Topology) -> str | None:
-    """Return what is wrong with a topology; None if it is a tree with parents before children."""
-    count = len(topology.serials)
-    if not (len(topology.parent) == len(topology.reversed) == count):
-        return f"{count} serials, {len(topology.parent)} parents, {len(topology.reversed)} directions"
-    for k, parent in enumerate(topology.parent):
-        if not BASE <= parent < k:
-            return f"module {topology.serials[k]!r} (index {k}) has parent index {parent}"
-    return None
-
-
 def _label(topology: Topology, k: int, types: Mapping[str, str]) -> str:
     made = types.get(topology.serials[k], "")
     how = ["reversed"] if topology.reversed[k] else []
@@ -106,8 +95,12 @@ def as_topology(serials: Sequence[str], parent: Sequence[int], reverse: Sequence
     Raises:
         ValueError: the sequences differ in length, or a parent does not come before its child.
     """
-    topology = Topology(tuple(serials), tuple(int(p) for p in parent), tuple(bool(r) for r in reverse))
-    wrong = error_in(topology)
-    if wrong is not None:
-        raise ValueError(f"not a tree with parents before children: {wrong}")
-    return topology
+    if not (len(parent) == len(reverse) == len(serials)):
+        raise ValueError(f"{len(serials)} serials, {len(parent)} parents, {len(reverse)} directions")
+    for k, above in enumerate(parent):
+        if not BASE <= above < k:
+            raise ValueError(
+                f"not a tree with parents before children: module {serials[k]!r} (index {k}) has parent "
+                f"index {above}"
+            )
+    return Topology(tuple(serials), tuple(int(p) for p in parent), tuple(bool(r) for r in reverse))

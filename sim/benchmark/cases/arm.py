@@ -17,9 +17,9 @@ from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
 from coordinator.kinematics.chain_estimate import link_lengths
 from coordinator.recording.recording import Recording
-from coordinator.runtime.exit_codes import explain
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import RobotError
 from module_agent.model.perturbation import apply_perturbation
 from module_agent.network_emulation.profile_file import network as named_network
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
@@ -116,11 +116,8 @@ def arm_trial(
         start_s = time.process_time()
         kinematics = identify_kinematics(recording)
         spent_s = time.process_time() - start_s
-    except Exception as error:
-        failure = explain(error)
-        if failure is None:
-            raise
-        return ArmTrial(described.name, mode, seed, joints, failure.text)
+    except RobotError as error:
+        return ArmTrial(described.name, mode, seed, joints, str(error))
     return _scored(
         ArmTrial(described.name, mode, seed, joints, ""), described, recording, kinematics, spent_s
     )

@@ -24,9 +24,9 @@ from coordinator.identification.inertia.inertia import find_inertia
 from coordinator.parameter_fit.base_parameters import joint_frames
 from coordinator.parameter_fit.least_squares import solve_information
 from coordinator.recording.recording import Recording
-from coordinator.runtime.exit_codes import explain
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, dynamic_motion, dynamic_windows
 from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import RobotError
 from module_agent.model.information import gather
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
 from module_agent.network_emulation.profile_file import network
@@ -123,11 +123,8 @@ def inertia_trial(
         recorded = _Recorded(recording, motions[0])
         chain, phi = true_chain(described), true_inertia(described)
         return _compared(trial, identified, recorded, chain, phi, poses)._replace(identify_s=spent_s)
-    except Exception as error:
-        failure = explain(error)
-        if failure is None:
-            raise
-        return trial._replace(why=failure.text)
+    except RobotError as error:
+        return trial._replace(why=str(error))
 
 
 def _compared(

@@ -13,7 +13,7 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
 from coordinator.recording.recording import Recording
-from coordinator.runtime.exit_codes import explain
+from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network as named_network
 from module_agent.signals.clock_map import ClockMap
 from sim.benchmark.case import Case, Summary, Trial, trial_seed
@@ -79,11 +79,8 @@ def network_trial(
     try:
         recording = record_session(settings, plan or arm_plan("joint", imu_kind(profile)))
         kinematics = identify_kinematics(recording)
-    except Exception as error:
-        failure = explain(error)
-        if failure is None:
-            raise
-        return begun._replace(why=failure.text)
+    except RobotError as error:
+        return begun._replace(why=str(error))
     world = World(described, seed, profile)
     try:
         clocks = dict(zip(described.serials, world.sensors.clocks, strict=True))

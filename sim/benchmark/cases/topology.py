@@ -13,8 +13,8 @@ import numpy as np
 from coordinator.excitation.plan import Plan
 from coordinator.identification.topology_search import search_topology
 from coordinator.recording.recording import Recording
-from coordinator.runtime.exit_codes import explain
 from coordinator.topology.topology import Topology, TopologyError
+from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network as named_network
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, count, largest
@@ -63,11 +63,8 @@ def topology_trial(
     robot = random_robot(seed)
     try:
         recording = record_session(VirtualSettings(robot, named_network(network), seed, noise), plan)
-    except Exception as error:
-        failure = explain(error)
-        if failure is None:
-            raise
-        return TopologyTrial(seed, len(robot.modules), (failure.text,), 0.0, 0, float("nan"))
+    except RobotError as error:
+        return TopologyTrial(seed, len(robot.modules), (str(error),), 0.0, 0, float("nan"))
     return compared(robot, seed, recording)
 
 

@@ -21,9 +21,9 @@ from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry
 from coordinator.recording.run_folder import SESSION, RunFolderError, check_free, open_run_folder
 from coordinator.recording.session_file import SessionWriter
+from coordinator.runtime.command_line import ENDINGS, ending
 from coordinator.runtime.event_loop import Interruption, run_to_end
-from coordinator.runtime.exit_codes import explain
-from coordinator.viewer.targets import ViewerChoice, viewer_choice
+from coordinator.viewer.targets import ViewerTargets, viewer_choice
 from module_agent.model.catalogue import CATALOGUE, UnknownModuleType, module_type
 from module_agent.model.errors import UsageError
 from module_agent.transport.transport import Event, Liveness, Reply, Sink
@@ -157,22 +157,22 @@ def test_every_end_of_a_run_has_a_sentence_and_a_code_and_a_defect_has_none() ->
         130: asyncio.CancelledError(),
     }
     for code, error in codes.items():
-        failure = explain(error)
-        assert failure is not None
-        assert failure.exit_code == code
+        assert isinstance(error, ENDINGS)
+        assert ending(error).exit_code == code
     with pytest.raises(UnknownModuleType) as unknown:
         module_type("X5-7")
-    failure = explain(unknown.value)
-    assert failure is not None
-    assert failure.text == f"unknown module type 'X5-7'; the catalogue knows {', '.join(CATALOGUE)}"
-    assert explain(KeyError("a bug")) is None
-    assert explain(ZeroDivisionError()) is None
+    assert (
+        str(ending(unknown.value))
+        == f"unknown module type 'X5-7'; the catalogue knows {', '.join(CATALOGUE)}"
+    )
+    assert not isinstance(KeyError("a bug"), ENDINGS)
+    assert not isinstance(ZeroDivisionError(), ENDINGS)
 
 
 def test_a_viewer_is_a_word_or_an_address() -> None:
-    assert viewer_choice("none") == ViewerChoice()
+    assert viewer_choice("none") == ViewerTargets()
     assert viewer_choice("spawn").spawn
-    assert viewer_choice("serve").serve
+    assert viewer_choice("serve", 9090) == ViewerTargets(serve_port=9090)
     assert viewer_choice("rerun+http://host:9876/proxy").connect == "rerun+http://host:9876/proxy"
     for nonsense in ("", "rerun+http://", "ftp://host", "spawned"):
         with pytest.raises(UsageError, match="it must be none, spawn, serve"):

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated
 
 import pytest
@@ -12,10 +13,14 @@ from typer.testing import CliRunner
 
 import coordinator.main
 import sim.main
-from coordinator.runtime.command_line import LazyCommand, fail, lazy_app, with_options
+from coordinator.runtime.command_line import fail, lazy_app, with_options
 from module_agent.model.errors import LostError
 
-COMMANDS = {**coordinator.main.COMMANDS, **{f"sim {name}": c for name, c in sim.main.COMMANDS.items()}}
+PLACES = [
+    f"{program.__name__.replace('main', 'commands')}.{place}"
+    for program in (coordinator.main, sim.main)
+    for place, _ in program.COMMANDS.values()
+]
 
 
 @dataclass(frozen=True)
@@ -31,10 +36,14 @@ def count(settings: Options, loud: bool = False) -> None:
         raise LostError("module A: no feedback for 1.2 s")
     if settings.subject == "failed":
         fail("interrupted", 130)
+    if settings.subject == "signal":
+        raise KeyboardInterrupt
+    if settings.subject == "file":
+        Path("/no/such/file").read_text()
     typer.echo(f"{settings.count} {settings.subject} {loud}")
 
 
-APP = lazy_app("program", "Test.", {"count": LazyCommand(__name__, "count", "Count things.")})
+APP = lazy_app("program", "Test.", __name__, {"count": ("count", "Count things.")})
 
 
 @pytest.mark.parametrize("program", ["coordinator.main", "sim.main"])
@@ -43,10 +52,10 @@ def test_the_help_of_a_program_imports_no_numerics(program: str) -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=30.0)
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_every_command_of_the_tables_exists(name: str) -> None:
-    command = COMMANDS[name]
-    assert callable(getattr(import_module(command.module), command.attribute))
+@pytest.mark.parametrize("place", PLACES)
+def test_every_command_of_the_tables_exists(place: str) -> None:
+    module, _, function = place.rpartition(".")
+    assert callable(getattr(import_module(module), function))
 
 
 def test_the_help_lists_the_lines_of_the_table() -> None:
@@ -60,7 +69,7 @@ def test_options_are_expanded_from_their_class() -> None:
     assert CliRunner().invoke(APP, ["count"]).exit_code == 2
 
 
-@pytest.mark.parametrize(("subject", "code"), [("lost", 3), ("failed", 130)])
+@pytest.mark.parametrize(("subject", "code"), [("lost", 3), ("failed", 130), ("signal", 130), ("file", 1)])
 def test_an_error_of_the_domain_is_printed_and_ends_with_its_exit_code(subject: str, code: int) -> None:
     done = CliRunner().invoke(APP, ["count", subject])
     assert done.exit_code == code

@@ -47,7 +47,6 @@ class Rig:
         self.recording = Recording()
         self.viewer: Any = Shown()
         self.feed = ViewerFeed(self.viewer, self.recording)
-        self.feed.since_start(0)
 
     def receive(self, entry: Entry) -> None:
         message = self.recording.add(entry)

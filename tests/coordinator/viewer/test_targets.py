@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from coordinator.viewer import viewer_process
-from coordinator.viewer.targets import ViewerTargets, listens, proxy_url
+from coordinator.viewer.targets import ViewerTargets, proxy_url
 from coordinator.viewer.viewer import Viewer
 from module_agent.wire.feedback_rows import Rows
 
@@ -69,10 +69,10 @@ def test_the_web_page_is_served_to_this_machine_only_and_ends_with_the_run() -> 
         listening = subprocess.run(["ss", "-ltnH"], capture_output=True, text=True, check=True).stdout
         ours = [line.split()[3] for line in listening.splitlines() if line.split()[3].endswith(f":{port}")]
         assert ours == [f"127.0.0.1:{port}"]
-        assert listens("127.0.0.1", port + 1)
+        assert viewer_process.listens("127.0.0.1", port + 1)
     finally:
         viewer.close()
-    assert not listens("127.0.0.1", port)
+    assert not viewer_process.listens("127.0.0.1", port)
 
 
 @pytest.mark.integration

@@ -188,7 +188,7 @@ def test_steps_network_and_topology_are_at_their_times(viewer: Viewer, file: Pat
 def test_there_is_no_robot_before_it_is_known(viewer: Viewer, file: Path, make_rows: MakeRows) -> None:
     viewer.modules(["a"], {"a": "X5-9"})
     viewer.rows("a", np.arange(5), make_rows(0, 5))
-    viewer.pose(1, [0.3])
+    viewer.poses([1], [[0.3]], ["a"])
     done(viewer)
     assert not [path for path in entities(file) if path.startswith("/world")]
 
@@ -199,7 +199,7 @@ def test_the_bodies_turn_so_that_the_imus_are_where_the_kinematics_says(
     q = np.array([0.7, -1.1])
     viewer.modules(arm.serials, types)
     viewer.chain(10, arm, [0.0, 0.001])
-    viewer.pose(20, q)
+    viewer.poses([20], [q], arm.serials)
     done(viewer)
     body = "/world/est/body/b\\/1"
     table = read(file, "/world/est/**")
@@ -216,7 +216,7 @@ def test_poses_that_come_together_are_logged_each_at_its_time(
     t_ns, q = [20, 21, 40], np.array([[0.7, -1.1], [0.8, 0.3], [-2.0, 1.4]])
     viewer.modules(arm.serials, types)
     viewer.chain(10, arm)
-    viewer.poses(t_ns, q)
+    viewer.poses(t_ns, q, arm.serials)
     viewer.chain(50, arm)
     done(viewer)
     body = "/world/est/body/b\\/1"
@@ -242,7 +242,7 @@ def test_a_refined_robot_keeps_its_posture_and_loses_what_is_no_longer_known(
     q = np.array([0.7, -1.1])
     viewer.modules(arm.serials, types)
     viewer.chain(10, arm, [0.0, 0.02])
-    viewer.pose(20, q)
+    viewer.poses([20], [q], arm.serials)
     viewer.chain(30, arm, [0.0, float("nan")])
     done(viewer)
     table = read(file, "/world/est/**")
@@ -251,20 +251,6 @@ def test_a_refined_robot_keeps_its_posture_and_loses_what_is_no_longer_known(
     spread = table[f"{body}/spread:Ellipsoids3D:half_sizes"]
     assert spread[0][0].tolist() == pytest.approx([0.0392] * 3)  # 95 % of a normal distribution
     assert len(spread[2]) == 0
-
-
-def test_poses_come_at_most_thirty_times_a_second(
-    viewer: Viewer, file: Path, read: Read, arm: Chain, types: dict[str, str]
-) -> None:
-    viewer.modules(arm.serials, types)
-    viewer.chain(0, arm)
-    for i in range(1000):
-        viewer.pose(i * 4_000_000, [0.001 * i, 0.0])
-    done(viewer)
-    table = read(file, "/world/est/body/a")
-    # 4 s of poses every 4 ms: one in nine, every 36 ms.
-    assert len(table) == 112
-    assert np.diff(times_ns(table)).min() > 33_000_000
 
 
 def test_the_blueprint_of_the_same_application_is_in_the_file(viewer: Viewer, file: Path) -> None:
@@ -323,8 +309,8 @@ def test_mistakes_of_the_caller_are_raised_at_the_call(viewer: Viewer, make_rows
     with pytest.raises(ValueError, match="times of shape"):
         viewer.rows("a", np.arange(4), make_rows(0, 5))
     with pytest.raises(ValueError, match="for poses of shape"):
-        viewer.poses([1, 2], [[0.1, 0.2]])
-    with pytest.raises(ValueError, match="for 3 serials"):
+        viewer.poses([1, 2], [[0.1, 0.2]], ["a", "b"])
+    with pytest.raises(ValueError, match="3 serials for poses"):
         viewer.poses([1], [[0.1, 0.2]], ["a", "b", "c"])
     with pytest.raises(ValueError, match="have shapes"):
         viewer.residuals("a", np.arange(2), [1.0], [1.0, 2.0])

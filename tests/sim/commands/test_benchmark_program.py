@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from module_agent.model.errors import EXIT_FINDING
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row
 from sim.commands import benchmark
-from sim.commands.benchmark import EXIT_MISSED
 from sim.main import app
 
 KINEMATICS = ("benchmark", "kinematics")
@@ -33,7 +33,7 @@ def run(monkeypatch: pytest.MonkeyPatch, found: list[Case], *arguments: str) -> 
     return CliRunner().invoke(app, [*KINEMATICS, *arguments])
 
 
-@pytest.mark.parametrize(("limit", "code"), [(8.0, 0), (7.0, EXIT_MISSED), (None, 0)])
+@pytest.mark.parametrize(("limit", "code"), [(8.0, 0), (7.0, EXIT_FINDING), (None, 0)])
 def test_the_exit_code_says_whether_all_bars_are_met(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, limit: float | None, code: int
 ) -> None:
@@ -62,7 +62,7 @@ def test_a_trial_that_fails_is_named_and_misses_a_bar(
     path = tmp_path / "found.json"
     found = cases(8.0, Trial(pow, (2, 3)), Trial(pow, (0, -1)))
     done = run(monkeypatch, found, "--json", str(path))
-    assert done.exit_code == EXIT_MISSED
+    assert done.exit_code == EXIT_FINDING
     assert "failed: powers: pow(0, -1): ZeroDivisionError" in done.stderr
     document = json.loads(path.read_text())
     assert [row["holds"] for row in document["rows"]] == [False, True]
@@ -93,7 +93,7 @@ def test_one_arm_is_measured_from_end_to_end(tmp_path: Path) -> None:
             *("--json", str(table), "--plot", str(picture)),
         ],
     )
-    assert done.exit_code in (0, EXIT_MISSED), done.output
+    assert done.exit_code in (0, EXIT_FINDING), done.output
     document = json.loads(table.read_text())
     assert document["failures"] == []
     assert document["settings"]["joints"] == 1

@@ -93,9 +93,9 @@ def test_an_estimate_without_a_sigma_leaves_the_range_to_the_viewer() -> None:
 
 def test_a_module_keeps_its_colour_and_no_two_of_64_share_one() -> None:
     palette = Palette()
-    first = palette.colour("a")
-    others = [palette.colour(f"m{k}") for k in range(63)]
-    assert palette.colour("a") == first
+    first = palette["a"]
+    others = [palette[f"m{k}"] for k in range(63)]
+    assert palette["a"] == first
     assert len(dict.fromkeys([first, *others])) == 64
     assert len(dict.fromkeys(axis_shades(first))) == 3
 
