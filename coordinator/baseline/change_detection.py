@@ -24,7 +24,7 @@ from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, re
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics
 from coordinator.identification.robot_refinement import KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
-from coordinator.synchronisation.motion_windows import Window, sensor_data, window
+from coordinator.synchronisation.motion_windows import Window, filtered, thinned, window
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import UNCALIBRATED
 from module_agent.model.perturbation import adjoint, perturbation_between
@@ -84,7 +84,8 @@ def _turned(matrices: Array, vectors: Array) -> Array:
 def _fit(chain: Chain, windows: Sequence[Window]) -> Refinement:
     samples = sum(len(one.t_ns) for one in windows) * len(chain.serials)
     keep_every = max(KEEP_EVERY, -(-samples // MAX_IMU_SAMPLES))
-    return refine_chain(chain, sensor_data(windows, REFINEMENT_CUTOFF_HZ, keep_every), TIED)
+    parts = [filtered(one, REFINEMENT_CUTOFF_HZ) for one in windows]
+    return refine_chain(chain, thinned(parts, keep_every), TIED)
 
 
 # Differences of an unchanged link between two sessions with different motions, by compliance and filters.

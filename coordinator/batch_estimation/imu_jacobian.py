@@ -50,7 +50,9 @@ def imu_jacobian(
     """
     body = chain.carrier(module)
     joints = chain.ancestors(body)
-    seen = _at_home(chain.imu_home[module], q_rad.shape[0])
+    samples, home = q_rad.shape[0], chain.imu_home[module]
+    frame = np.broadcast_to(home[:3, :3, None], (3, 3, samples))
+    seen = _Seen(frame, np.broadcast_to(home[:3, 3, None], (3, samples)), np.zeros((3, samples)))
     moved = {body: _displaced(bodies[body], seen)}
     for joint in reversed(joints):
         seen = _from_below(chain, joint, q_rad[:, joint], qd_rad_s[:, joint], seen)
@@ -58,15 +60,9 @@ def imu_jacobian(
     poses = {joint: moved[chain.parent[joint]] - moved[joint] for joint in joints}
     poses[module] = poses.get(module, 0.0) + moved[body]
     modules = tuple(sorted(poses))
-    gravity = np.zeros((3, 6, q_rad.shape[0]))
+    gravity = np.zeros((3, 6, samples))
     gravity[:, 3:] = seen.frame
     return ImuJacobian(modules, np.concatenate([poses[joint] for joint in modules]), gravity)
-
-
-def _at_home(home: Array, samples: int) -> _Seen:
-    """Return an IMU relative to its carrier, at rest."""
-    frame = np.broadcast_to(home[:3, :3, None], (3, 3, samples))
-    return _Seen(frame, np.broadcast_to(home[:3, 3, None], (3, samples)), np.zeros((3, samples)))
 
 
 def _from_below(chain: Chain, joint: int, q: Array, qd: Array, seen: _Seen) -> _Seen:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from coordinator.batch_estimation.imu_prediction import (
     BodyMotion,
@@ -56,14 +57,6 @@ class LinkLoad(NamedTuple):
     force: Array
     moment: Array
 
-    def bending(self, compliance: float) -> LinkTurn:
-        """Return how the link turns across its direction, for a compliance in rad/Nm."""
-        return LinkTurn(self.hinge, compliance * (self.moment - self._about_itself()))
-
-    def twisting(self, compliance: float) -> LinkTurn:
-        """Return how the link turns about its direction, for a compliance in rad/Nm."""
-        return LinkTurn(self.hinge, compliance * self._about_itself())
-
     def moved(self, shift: Array) -> "LinkLoad":
         """Return the load of a hinge that is somewhere else by (3,) metres."""
         about = self.moment - cross(np.broadcast_to(shift[:, None], self.force.shape), self.force)
@@ -71,16 +64,14 @@ class LinkLoad(NamedTuple):
 
     def turns(self, bending: float, twisting: float) -> list[LinkTurn]:
         """Return how the link turns across its direction and about it, for two compliances in rad/Nm."""
-        return [self.bending(bending), self.twisting(twisting)]
+        about = np.asarray(self.along[:, None] * np.einsum("i,dim->dm", self.along, self.moment)[:, None])
+        return [LinkTurn(self.hinge, bending * (self.moment - about)), LinkTurn(self.hinge, twisting * about)]
 
     @property
     def shifts(self) -> Array:
         """Unit shifts (3, 3) of the hinge: by the link's length along it, and by a metre to either side."""
         aside = np.linalg.svd(self.along[None])[2][1:]
         return np.vstack([self.length_m * self.along, aside])
-
-    def _about_itself(self) -> Array:
-        return np.asarray(self.along[:, None] * np.einsum("i,dim->dm", self.along, self.moment)[:, None])
 
 
 def link_loads(
@@ -108,7 +99,7 @@ def link_loads(
     for i in reversed(range(len(chain.parent))):
         parent = chain.parent[i]
         if chain.reversed[i]:
-            carried[i] += _weight(bodies[i], _centre(chain, kinds, i), kinds[i].mass_kg)
+            carried[i] += _weight(bodies[i], _place(chain, kinds, i, kinds[i].com_xyz), kinds[i].mass_kg)
         if parent == BASE:
             continue
         below = _seen_from_below(chain, i, q_rad[:, i], carried[i])
@@ -117,7 +108,7 @@ def link_loads(
         beyond = given(bodies[parent], (turns or {}).get(i, ()))
         below += _weight(beyond, 0.5 * (start + end), LINK_MASS_KG + LINK_MASS_KG_M * length)
         if not chain.reversed[i]:
-            below += _weight(beyond, _centre(chain, kinds, i), kinds[i].mass_kg)
+            below += _weight(beyond, _place(chain, kinds, i, kinds[i].com_xyz), kinds[i].mass_kg)
         hinge = start + HINGE_SHARE * (end - start)
         moment = below[1] - cross(hinge[:, None], below[0])
         along = (end - start) / max(length, 1e-9)
@@ -137,34 +128,25 @@ def joined(parts: Sequence[Sequence[LinkLoad | None]], keep_every: int = 1) -> l
     loads: list[LinkLoad | None] = []
     for of_link in zip(*parts, strict=True):
         known = [part for part in of_link if part is not None]
-        force, moment = (
-            [getattr(part, name)[..., ::keep_every] for part in known] for name in ("force", "moment")
-        )
-        loads.append(
-            known[0]._replace(force=np.concatenate(force, axis=2), moment=np.concatenate(moment, axis=2))
-            if known
-            else None
-        )
+        force = [part.force[..., ::keep_every] for part in known]
+        moment = [part.moment[..., ::keep_every] for part in known]
+        signals = known and {"force": np.concatenate(force, axis=2), "moment": np.concatenate(moment, axis=2)}
+        loads.append(known[0]._replace(**signals) if signals else None)
     return loads
 
 
 def link_ends(chain: Chain, kinds: Sequence[ModuleType], module: int) -> tuple[Array, Array]:
     """Return where the link below a module begins, at its parent's face, and where it ends, at its own."""
     parent = chain.parent[module]
-    begins = _face(chain, kinds, parent, output=not chain.reversed[parent])
-    return begins, _face(chain, kinds, module, output=chain.reversed[module])
+    outputs = [kinds[k].output_xyz for k in (parent, module)]
+    begins = _place(chain, kinds, parent, np.zeros(3) if chain.reversed[parent] else outputs[0])
+    return begins, _place(chain, kinds, module, outputs[1] if chain.reversed[module] else np.zeros(3))
 
 
-def _face(chain: Chain, kinds: Sequence[ModuleType], module: int, output: bool) -> Array:
-    kind, home = kinds[module], chain.imu_home[module]
-    seen = np.array(kind.output_xyz if output else (0.0, 0.0, 0.0)) - np.array(kind.imu_xyz)
-    return np.asarray(home[:3, :3] @ seen + home[:3, 3])
-
-
-def _centre(chain: Chain, kinds: Sequence[ModuleType], module: int) -> Array:
-    kind, home = kinds[module], chain.imu_home[module]
-    seen = np.array(kind.com_xyz) - np.array(kind.imu_xyz)
-    return np.asarray(home[:3, :3] @ seen + home[:3, 3])
+def _place(chain: Chain, kinds: Sequence[ModuleType], module: int, xyz: ArrayLike) -> Array:
+    """Return where a point of a module's housing is at q = 0."""
+    home = chain.imu_home[module]
+    return np.asarray(home[:3, :3] @ (np.array(xyz) - np.array(kinds[module].imu_xyz)) + home[:3, 3])
 
 
 def _weight(body: BodyMotion, place: Array, mass_kg: float) -> Array:
@@ -211,7 +193,7 @@ def compliance_jacobian(
     for module, load in enumerate(loads):
         if load is None:
             continue
-        for turn in (load.bending(UNIT_RAD_NM), load.twisting(UNIT_RAD_NM)):
+        for turn in load.turns(UNIT_RAD_NM, UNIT_RAD_NM):
             links.append(module)
             slopes.append(_change(chain, joints, still, module, turn))
     if not links:

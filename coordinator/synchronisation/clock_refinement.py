@@ -8,12 +8,12 @@ maps and covariance.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coordinator.batch_estimation.imu_prediction import turned
+from coordinator.synchronisation.motion_windows import RATE_HZ, Window
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import DELAY_RMS_S, DELAY_SPREAD_S, GYRO_BIAS_SIGMA_RAD_S
 from module_agent.model.perturbation import cross
@@ -22,7 +22,6 @@ from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import CLOCK_CUTOFF_HZ, filtered_signals
 
-RATE_HZ = 250.0
 # Half the time constant of the low-pass: about the number of independent samples.
 KEEP_EVERY = 5
 # Error of a single lag that is not due to clocks: a gyro's sensitivity to acceleration (0.1 deg/s/g at 0.3 m)
@@ -38,25 +37,6 @@ STILL_RAD_S, FINEST_RAD_S = 0.02, 3e-4
 EXACT = 1e-12
 # One second of residuals (every fifth sample at 250 Hz).
 _MAX_LAG = 50
-
-
-class Moved(Protocol):
-    """One motion on one time base at `RATE_HZ`: `t_ns` (m,) session time, (m, n) joints, (m, n, 3) gyros."""
-
-    @property
-    def t_ns(self) -> NDArray[np.int64]:
-        """Session time."""
-        ...
-
-    @property
-    def q_rad(self) -> Array:
-        """Positions of the joints."""
-        ...
-
-    @property
-    def gyro_rad_s(self) -> Array:
-        """Rates in the IMUs' frames."""
-        ...
 
 
 class ClockRefinement(NamedTuple):
@@ -81,7 +61,7 @@ class _Normal(NamedTuple):
     rhs: Array
 
 
-def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequence[Moved]) -> ClockRefinement:
+def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequence[Window]) -> ClockRefinement:
     """Refine the clocks by which `motions` were put on one time base.
 
     Clock errors up to some milliseconds; the chain's axes may be off by some degrees, and the gyros' scales
@@ -107,7 +87,8 @@ def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequenc
             lags += 1
     covariance = np.linalg.inv(information) * np.outer(before, before)
     estimate = covariance @ (rhs / before)
-    base = _base([clocks[s] for s in serials])
+    # The clock to which the others are mapped: the one without drift.
+    base = min(range(n), key=lambda k: (abs(clocks[serials[k]].drift), clocks[serials[k]].drift_sigma))
     against = np.eye(2 * n)
     against[:n, base] -= 1.0
     against[:n, n + base] -= 1e-9 * (origins - origins[base])
@@ -134,11 +115,6 @@ def _before(clocks: Sequence[ClockMap]) -> Array:
     return np.array([*offsets, *drifts, DELAY_RMS_S, *[DELAY_SPREAD_S] * len(clocks)])
 
 
-def _base(clocks: Sequence[ClockMap]) -> int:
-    """Return the clock to which the others are mapped: the one without drift."""
-    return min(range(len(clocks)), key=lambda k: (abs(clocks[k].drift), clocks[k].drift_sigma))
-
-
 def _onto(n: int, imu: int, since_s: Array) -> Array:
     """Return the slopes (n + 1, 3 n + 1) of clock errors at a time, and of the observer's lag."""
     slopes = np.zeros((n + 1, 3 * n + 1))
@@ -151,19 +127,15 @@ def _onto(n: int, imu: int, since_s: Array) -> Array:
     return slopes
 
 
-def _lags(chain: Chain, motion: Moved) -> list[tuple[int, _Normal]]:
+def _lags(chain: Chain, motion: Window) -> list[tuple[int, _Normal]]:
     """Return the normal equations of the lag of every IMU that was turned."""
     signals = filtered_signals(motion.q_rad, [motion.gyro_rad_s], RATE_HZ, CLOCK_CUTOFF_HZ, KEEP_EVERY)
     *joints, gyro = signals.settled()
-    lags = []
-    for imu in range(len(chain.serials)):
-        lag = _lag(chain, imu, tuple(joints), gyro[:, imu])
-        if lag is not None:
-            lags.append((imu, lag))
-    return lags
+    lags = [(imu, _lag(chain, imu, joints, gyro[:, imu])) for imu in range(len(chain.serials))]
+    return [(imu, lag) for imu, lag in lags if lag is not None]
 
 
-def _lag(chain: Chain, imu: int, joints: tuple[Array, ...], gyro: Array) -> _Normal | None:
+def _lag(chain: Chain, imu: int, joints: Sequence[Array], gyro: Array) -> _Normal | None:
     """Return the normal equations of one IMU's lag behind the joints that turn it; None if it hardly turns.
 
     gyro = b + (I + E) rate + sum over the joints of slopes_j (e_j - lag), where slopes_j is how the rate
@@ -182,13 +154,16 @@ def _lag(chain: Chain, imu: int, joints: tuple[Array, ...], gyro: Array) -> _Nor
     nuisance = np.column_stack([np.full(len(rate), GYRO_BIAS_SIGMA_RAD_S), AXES * rate])
     variance = FIRST_RAD_S**2
     for _ in range(2):
-        clean = _without(nuisance, variance, np.concatenate([columns, [gyro - rate]]))
+        signals = np.concatenate([columns, [gyro - rate]])
+        clean = signals - nuisance @ _shares(nuisance, variance, signals)
         common, rest = clean[count], clean[-1]
         power = float(np.vdot(columns[count], common))
         if power <= 0.0:
             return None
         left = rest - common * float(np.vdot(columns[count], rest)) / power
-        variance = _variance(left)
+        # Per axis, as large as if the samples were independent.
+        power_left = float(np.mean(left**2)) + FINEST_RAD_S**2 / 12.0
+        variance = power_left * float(samples_per_independent(left, _MAX_LAG))
     off = nuisance[:, 1:] @ _shares(nuisance, variance, (gyro - rate)[None])[0, 1:] + left
     if np.vdot(off, off) > MAX_OFF**2 * np.vdot(rate, rate):
         return None
@@ -200,25 +175,14 @@ def _lag(chain: Chain, imu: int, joints: tuple[Array, ...], gyro: Array) -> _Nor
     return _Normal(information - np.outer(share, information[count]), rhs - share * rhs[count])
 
 
-def _without(nuisance: Array, variance: float, signals: Array) -> Array:
-    """Return signals (k, m, 3) without what each axis' own share of the nuisance (m, l) explains of them.
+def _shares(nuisance: Array, variance: float, signals: Array) -> Array:
+    """Return the shares (k, l, 3) of the nuisance (m, l) in signals (k, m, 3), axis by axis.
 
     The shares have a standard deviation of one before, so that no small part of the nuisance explains much:
-    (I - N (N^T N + variance I)^-1 N^T) x.
+    (N^T N + variance I)^-1 N^T x.
     """
-    return np.asarray(signals - nuisance @ _shares(nuisance, variance, signals))
-
-
-def _shares(nuisance: Array, variance: float, signals: Array) -> Array:
-    """Return the shares (k, l, 3) of the nuisance (m, l) in signals (k, m, 3)."""
     inner = nuisance.T @ nuisance + variance * np.eye(nuisance.shape[1])
     return np.asarray(np.linalg.solve(inner, nuisance.T @ signals))
-
-
-def _variance(residual: Array) -> float:
-    """Return the variance per axis of residuals (m, 3), as large as if its samples were independent."""
-    size = float(np.mean(residual**2)) + FINEST_RAD_S**2 / 12.0
-    return size * float(samples_per_independent(residual, _MAX_LAG))
 
 
 def _turns(chain: Chain, imu: int, q: Array, qd: Array, qdd: Array) -> tuple[Array, list[int], Array] | None:

@@ -42,7 +42,7 @@ class Window(NamedTuple):
     tau_nm: Array
     gyro_rad_s: Array
     accel_m_s2: Array
-    step_rad: Array | None = None
+    step_rad: Array
 
 
 def window(
@@ -67,7 +67,8 @@ def window(
     common = np.arange(start_ns, end_ns, STEP_NS, dtype=np.int64)
     joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common)
     imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common)
-    step = np.array([_step(track.joint[:, 0]) for track in tracks])
+    changes = [np.diff(np.unique(track.joint[:, 0])) for track in tracks]
+    step = np.array([float(change.min()) if change.size else 0.0 for change in changes])
     return Window(common, joint[..., 0], joint[..., 1], imu[..., :3], imu[..., 3:], step)
 
 
@@ -86,7 +87,7 @@ def _track(
     first_ns, last_ns = clock.module_span(start_ns, end_ns, STEP_NS)
     rows = recording.modules[serial].rows.between(first_ns, last_ns)
     if not len(rows):
-        raise DataError(_no_row(serial, event))
+        raise _no_row(serial, event)
     # An IMU that is slower than the rows repeats its samples.
     imu_t_ns, fresh = np.unique(rows["imu_t_ns"], return_index=True)
     return _Track(
@@ -95,12 +96,6 @@ def _track(
         np.column_stack([rows[field] for field in ("position_rad", "effort_nm")]),
         np.column_stack([rows["gyro_rad_s"], rows["accel_m_s2"]])[fresh],
     )
-
-
-def _step(position: Array) -> float:
-    """Return the smallest change between readings of an encoder; 0 if none has changed."""
-    apart = np.diff(np.unique(position))
-    return float(apart.min()) if apart.size else 0.0
 
 
 def span(
@@ -113,22 +108,21 @@ def span(
     """
     assert event.motion is not None
     assert event.motion.end_row is not None
-    log = recording.modules[event.serial].rows
-    rows = log.rows(event.motion.start_row, event.motion.end_row)
+    rows = recording.rows(event.serial, event.motion.start_row, event.motion.end_row)
     if not len(rows):
-        raise DataError(_no_row(event.serial, event))
+        raise _no_row(event.serial, event)
     session = clocks[event.serial].to_session(rows["t_ns"][[0, -1]].astype(np.int64))
     margin_ns = round(settling_samples(RATE_HZ, cutoff_hz) / RATE_HZ * 1e9) if cutoff_hz else 0
     return int(session[0]) - margin_ns, int(session[1]) + margin_ns
 
 
-def _no_row(serial: str, event: JournalEvent) -> str:
+def _no_row(serial: str, event: JournalEvent) -> DataError:
     motion = f"{event.purpose} motion of {event.serial}"
-    return f"module {serial} has no row in the {motion}: its recording has a hole"
+    return DataError(f"module {serial} has no row in the {motion}: its recording has a hole")
 
 
 def noise_floor(rest: Window, cutoff_hz: float, module: int) -> NoiseFloor:
-    """Return the noise of one module's IMU at rest, through the same low-pass as `sensor_data`."""
+    """Return the noise of one module's IMU at rest, through the same low-pass as `filtered`."""
     edge = settling_samples(RATE_HZ, cutoff_hz)
     gyro, accel = (
         zero_phase_low_pass(signal[:, module], RATE_HZ, cutoff_hz)[edge:-edge].var(axis=0)
@@ -137,32 +131,17 @@ def noise_floor(rest: Window, cutoff_hz: float, module: int) -> NoiseFloor:
     return NoiseFloor(gyro, accel, cutoff_hz)
 
 
-def sensor_data(
-    windows: Sequence[Window], cutoff_hz: float, keep_every: int, floor: NoiseFloor | None = None
-) -> SensorData:
-    """Filter all signals of all windows alike, differentiate, and keep one sample in `keep_every`.
-
-    With the noise `floor` of the first module's IMU, which rides on the base, it has the base's motion.
-    """
-    return thinned([filtered(one, cutoff_hz, floor) for one in windows], keep_every)
-
-
-def encoder_steps(windows: Sequence[Window]) -> Array | None:
+def encoder_steps(windows: Sequence[Window]) -> Array:
     """Return the encoders' resolution (n,), the smallest change in any window; 0 if none."""
-    steps = [one.step_rad for one in windows if one.step_rad is not None]
-    if not steps:
-        return None
-    resolution = np.min(np.where(np.array(steps) > 0.0, steps, np.inf), axis=0)
+    steps = np.array([one.step_rad for one in windows])
+    resolution = np.min(np.where(steps > 0.0, steps, np.inf), axis=0)
     return np.asarray(np.where(np.isfinite(resolution), resolution, 0.0))
 
 
 def thinned(parts: Sequence[SensorData], keep_every: int) -> SensorData:
     """Join filtered windows, one sample in `keep_every` of each."""
-    parts = [
-        part._replace(motion=np.full(len(part.q_rad), number, dtype=np.int64))
-        for number, part in enumerate(parts)
-    ]
-    columns = zip(*parts, strict=True)
+    numbered = [part._replace(motion=np.full(len(part.q_rad), k, np.int64)) for k, part in enumerate(parts)]
+    columns = zip(*numbered, strict=True)
     return SensorData(
         *(None if one[0] is None else np.concatenate([part[::keep_every] for part in one]) for one in columns)  # type: ignore[arg-type]
     )
@@ -178,7 +157,8 @@ def filtered(
     """Filter all signals of a window alike and differentiate; the filter's settling time is cut.
 
     The joints are delayed as the IMUs are. Given the resolution (n,) of the encoders, whose noise
-    differentiation amplifies, the instrument is the part of the motion above that noise.
+    differentiation amplifies, the instrument is the part of the motion above that noise. With the noise
+    `floor` of the first module's IMU, which rides on the base, the data has the base's motion.
     """
     others = [one.gyro_rad_s, one.accel_m_s2]
     q, qd, qdd, (gyro, accel), settled = filtered_signals(
@@ -196,17 +176,8 @@ def filtered(
         omega = outstanding(gyro[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
         force = outstanding(accel[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
         base = np.concatenate([omega, differentiate(omega, RATE_HZ), force], axis=1)[settled]
-    return SensorData(
-        q[settled],
-        qd[settled],
-        qdd[settled],
-        gyro[settled],
-        accel[settled],
-        rates[settled],
-        base,
-        None,
-        instrument,
-    )
+    q, qd, qdd, gyro, accel, rates = (signal[settled] for signal in (q, qd, qdd, gyro, accel, rates))
+    return SensorData(q, qd, qdd, gyro, accel, rates, base, None, instrument)
 
 
 # Independent samples per sample after the low-pass.
@@ -238,8 +209,8 @@ def dynamic_motion(
     Raises:
         DataError: as there.
     """
-    motions = [filtered_window(one) for one in dynamic_windows(recording, clocks, serials, *purposes)]
-    return joined_motions(motions)
+    windows = dynamic_windows(recording, clocks, serials, *purposes)
+    return joined_motions([filtered_window(one) for one in windows])
 
 
 def joined_motions(motions: Sequence[JointMotion]) -> JointMotion:

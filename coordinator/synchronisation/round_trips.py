@@ -7,7 +7,6 @@ the shortest trip is not observable from round trips.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +46,7 @@ def _map(trips: _Columns) -> ClockMap:
     base = int(sent[0]) - origin
     trip = (received - sent).astype(np.float64)
     middle = (sent - (module + base)).astype(np.float64) + 0.5 * trip
-    return _fitted(origin, base, _fit(module - origin, middle, trip), trip)
+    return _fit(origin, base, module - origin, middle, trip, trip)
 
 
 def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
@@ -64,9 +63,8 @@ def map_clocks(trips: Mapping[str, Sequence[RoundTrip]]) -> dict[str, ClockMap]:
     reference, *others = columns
     whole = _map(columns[reference])
     base = whole._replace(drift=0.0, drift_sigma=0.0)
-    return {
-        reference: base,
-        **{name: _relative_map(base, columns[reference], columns[name]) for name in others},
+    return {reference: base} | {
+        name: _relative_map(base, columns[reference], columns[name]) for name in others
     }
 
 
@@ -89,8 +87,7 @@ def _relative_map(base: ClockMap, reference: _Columns, trips: _Columns) -> Clock
     shift = int(module_r[near[0]]) - origin
     offset = (module_r[near] - (module + shift)).astype(np.float64) + apart
     both = (received - sent + received_r[near] - sent_r[near]).astype(np.float64)
-    line = _fit(module - origin, offset, both)
-    fitted = _fitted(origin, shift, line, (received - sent).astype(np.float64))
+    fitted = _fit(origin, shift, module - origin, offset, both, (received - sent).astype(np.float64))
     return fitted._replace(offset_ns=base.offset_ns + fitted.offset_ns)
 
 
@@ -101,41 +98,33 @@ def _columns(trips: Sequence[RoundTrip]) -> _Columns:
     return sent, received, module
 
 
-class _Line(NamedTuple):
-    """offset = constant + slope * (since - centre), with standard deviations."""
+def _fit(
+    origin_ns: int,
+    base_ns: int,
+    since_ns: Times,
+    offset_ns: NDArray[np.float64],
+    weighing_ns: NDArray[np.float64],
+    trip_ns: NDArray[np.float64],
+) -> ClockMap:
+    """Fit a line to offsets beyond `base_ns`, of slope zero if the time is too short for one.
 
-    centre_ns: int
-    constant_ns: float
-    slope: float
-    constant_sigma_ns: float
-    slope_sigma: float
-
-
-def _fitted(origin_ns: int, base_ns: int, line: _Line, trip_ns: NDArray[np.float64]) -> ClockMap:
-    # The way there may be any share of the shortest trip: uniform, so that half of it is root three sigmas.
-    divided = 0.5 * float(trip_ns.min()) / np.sqrt(3.0)
-    sigma = float(np.hypot(divided, line.constant_sigma_ns))
-    drift_sigma = max(line.slope_sigma, MIN_DRIFT_SIGMA)
-    return ClockMap(origin_ns + line.centre_ns, base_ns + line.constant_ns, line.slope, sigma, drift_sigma)
-
-
-def _fit(since: Times, offset: NDArray[np.float64], trip: NDArray[np.float64]) -> _Line:
-    """Fit a line, of slope zero if the time is too short for one.
-
-    Sigmas are those of weighted least squares with heteroscedastic, clustered errors (White, 1980; Liang and
-    Zeger, 1986), clustered by `CORRELATED_NS`.
+    `weighing_ns` are the durations that weigh the offsets. Sigmas are those of weighted least squares with
+    heteroscedastic, clustered errors (White, 1980; Liang and Zeger, 1986), clustered by `CORRELATED_NS`.
     """
-    weight = (trip - trip.min() + FLOOR_NS) ** -2.0
+    weight = (weighing_ns - weighing_ns.min() + FLOOR_NS) ** -2.0
     weight = weight / weight.sum()
-    centre = round(float(weight @ since))
-    x = (since - centre).astype(np.float64)
-    constant = float(weight @ offset)
-    moments = np.unique(since // CORRELATED_NS, return_inverse=True)[1]
-    if x.max() - x.min() < MIN_FIT_NS:
-        scatter = np.bincount(moments, weight * (offset - constant))
-        return _Line(centre, constant, 0.0, float(np.linalg.norm(scatter)), CRYSTAL_DRIFT)
-    lever = weight * x / float(weight @ x**2)
-    slope = float(lever @ (offset - constant))
-    rest = offset - constant - slope * x
-    sigmas = (float(np.linalg.norm(np.bincount(moments, share * rest))) for share in (weight, lever))
-    return _Line(centre, constant, slope, *sigmas)
+    centre = round(float(weight @ since_ns))
+    x = (since_ns - centre).astype(np.float64)
+    constant = float(weight @ offset_ns)
+    moments = np.unique(since_ns // CORRELATED_NS, return_inverse=True)[1]
+    rest = offset_ns - constant
+    slope, drift_sigma = 0.0, CRYSTAL_DRIFT
+    if x.max() - x.min() >= MIN_FIT_NS:
+        lever = weight * x / float(weight @ x**2)
+        slope = float(lever @ rest)
+        rest = offset_ns - constant - slope * x
+        drift_sigma = max(float(np.linalg.norm(np.bincount(moments, lever * rest))), MIN_DRIFT_SIGMA)
+    scatter = float(np.linalg.norm(np.bincount(moments, weight * rest)))
+    # The way there may be any share of the shortest trip: uniform, so that half of it is root three sigmas.
+    sigma = float(np.hypot(0.5 * float(trip_ns.min()) / np.sqrt(3.0), scatter))
+    return ClockMap(origin_ns + centre, base_ns + constant, slope, sigma, drift_sigma)

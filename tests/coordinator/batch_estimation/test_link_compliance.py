@@ -123,7 +123,7 @@ def _bent(chain: Chain, types: list[ModuleType], compliance: float, seed: int) -
     bodies = body_motions(chain, *joints)
     loads = joined([link_loads(chain, types, bodies, joints[0], RATE_HZ)], 5)
     few = tuple(signal[::5] for signal in joints)
-    turns = {k: [load.bending(compliance * UNIT_RAD_NM)] for k, load in enumerate(loads) if load is not None}
+    turns = {k: load.turns(compliance * UNIT_RAD_NM, 0.0) for k, load in enumerate(loads) if load is not None}
     seen = readings_on(chain, body_motions(chain, *few, turns=turns), turns)
     rng = np.random.default_rng(seed)
     gyro, accel = (true + rng.normal(0, s, true.shape) for true, s in zip(seen, (5e-4, 1e-2), strict=True))

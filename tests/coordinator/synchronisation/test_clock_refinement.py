@@ -1,13 +1,12 @@
 """Clocks from the motion: they resolve what round trips leave open, where a common motion does."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from coordinator.batch_estimation.imu_prediction import imu_readings
-from coordinator.synchronisation.clock_refinement import LAG_FLOOR_S, RATE_HZ, refine_clocks
+from coordinator.synchronisation.clock_refinement import LAG_FLOOR_S, refine_clocks
+from coordinator.synchronisation.motion_windows import RATE_HZ, Window
 from module_agent.model.chain import Chain
 from module_agent.signals.clock_map import ClockMap
 from sim.robot.robot_file import load_robot
@@ -18,12 +17,6 @@ SPAN_S = 5.6
 GYRO_NOISE_RAD_S = 6e-4
 # Half a round trip of 3.5 ms, and drifts as from a minute on a wireless network.
 OFFSET_SIGMA_S, DRIFT_SIGMA = 1e-3, 3e-6
-
-
-class Moved(NamedTuple):
-    t_ns: NDArray[np.int64]
-    q_rad: NDArray[np.float64]
-    gyro_rad_s: NDArray[np.float64]
 
 
 class World:
@@ -64,7 +57,7 @@ class World:
         before, here, after = (position(t_s + shift) for shift in (-step, 0.0, step))
         return [here, (after - before) / (2 * step), (after - 2 * here + before) / step**2]
 
-    def motion(self, start_s: float, moving: list[int]) -> Moved:
+    def motion(self, start_s: float, moving: list[int]) -> Window:
         """What the modules record, by the clocks as they are mapped, of a motion of some joints."""
         n = len(self.chain.serials)
         amplitudes = self.held_rad * self.rng.uniform(0.2, 1.0, n)
@@ -77,7 +70,8 @@ class World:
             ideal = imu_readings(self.chain, *self.joints(t_s - lag, start_s, amplitudes)).gyro_rad_s[:, k]
             gyro[:, k] = ideal @ self.gyro_matrix[k].T + self.gyro_bias[k]
         gyro += GYRO_NOISE_RAD_S * self.rng.normal(size=gyro.shape)
-        return Moved(np.rint(1e9 * t_s).astype(np.int64), q, gyro)
+        t_ns = np.rint(1e9 * t_s).astype(np.int64)
+        return Window(t_ns, q, np.zeros_like(q), gyro, np.zeros_like(gyro), np.zeros(n))
 
     def left_s(self, clocks: dict[str, ClockMap], module: int) -> tuple[float, float]:
         """How wrong a refined map is against the base: at its origin [s], and in drift."""

@@ -13,7 +13,7 @@ from coordinator.synchronisation.motion_windows import (
     Window,
     encoder_steps,
     filtered,
-    sensor_data,
+    thinned,
     window,
 )
 from module_agent.model.errors import DataError
@@ -138,7 +138,7 @@ def test_a_module_without_any_row_in_the_motion_is_named(wire: SimpleNamespace) 
 
 def test_filtered_data_is_the_motion_and_its_derivative(wire: SimpleNamespace) -> None:
     one = window(_recording(wire), CLOCKS, SERIALS, _event(wire), cutoff_hz=20.0 / 3.0)
-    data = sensor_data([one, one], cutoff_hz=15.0, keep_every=5)
+    data = thinned([filtered(one, 15.0)] * 2, keep_every=5)
     samples = data.q_rad.shape[0]
     assert data.gyro_rad_s.shape == data.accel_m_s2.shape == (samples, 3, 3)
     # What is blocks lies inside by two periods of the cut-off, every fifth sample of it, twice.
@@ -187,4 +187,3 @@ def test_the_instrument_has_the_motion_and_not_the_encoders_noise() -> None:
 def test_without_a_known_step_the_instrument_is_what_was_measured() -> None:
     data = filtered(_noisy_window(1e-4), 12.0)
     assert data.smooth[2] is data.qdd_rad_s2
-    assert encoder_steps([_noisy_window(1e-4)._replace(step_rad=None)]) is None
