@@ -9,6 +9,7 @@ in doubt, and leaving them out understates that by up to a factor of seven.
 """
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -34,25 +35,20 @@ def ancestors(parent: Sequence[int]) -> "np.ndarray[tuple[int, int], np.dtype[np
     Raises:
         ValueError: the parents form a ring.
     """
-    above = np.zeros((len(parent), len(parent)), dtype=bool)
-    for k in _parents_first(parent):
-        if parent[k] != BASE:
-            above[:, k] = above[:, parent[k]]
-            above[parent[k], k] = True
-    return above
-
-
-def _parents_first(parent: Sequence[int]) -> list[int]:
     children: list[list[int]] = [[] for _ in range(len(parent) + 1)]
     for k, p in enumerate(parent):
         children[p].append(k)  # BASE is the last
+    above = np.zeros((len(parent), len(parent)), dtype=bool)
     ordered = list(children[BASE])
     for k in ordered:
+        if parent[k] != BASE:
+            above[:, k] = above[:, parent[k]]
+            above[parent[k], k] = True
         ordered += children[k]
     if len(ordered) < len(parent):
         ring = sorted(set(range(len(parent))) - set(ordered))
         raise ValueError(f"the parents of modules {ring} never reach the base")
-    return ordered
+    return above
 
 
 def likeliest_forest(odds: Array, leaves: Collection[int] = ()) -> Parents:
@@ -94,19 +90,22 @@ def _by_insertion(odds: Array, leaves: Collection[int]) -> Parents:
 
 def _climbed(parent: Parents, odds: Array, leaves: Collection[int]) -> Parents:
     while True:
-        best = max(nearby(parent, odds, leaves), key=lambda move: move[1], default=(parent, 0.0))
+        others = rivals(parent, odds, leaves)
+        best = max(others.items(), key=lambda move: move[1], default=(parent, 0.0))
         # Gains of rounding errors would let it go round for ever.
         if best[1] <= 1e-9:
             return parent
         parent = best[0]
 
 
-def nearby(parent: Parents, odds: Array, leaves: Collection[int] = ()) -> Iterator[tuple[Parents, float]]:
-    """Yield the forests one move away, some of them twice, and how much likelier each is (log)."""
-    odds = _without_diagonal(odds)
-    for k in range(len(parent)):
-        yield from _mounted_elsewhere(parent, odds, leaves, k)
-        yield from _put_in_between(parent, odds, leaves, k)
+def rivals(parent: Parents, odds: Array, leaves: Collection[int] = ()) -> dict[Parents, float]:
+    """Return the forests one move away, each once, with their log-likelihood relative to this one."""
+    odds = np.where(np.eye(len(odds), dtype=bool), 0.0, odds)
+    moves = (
+        (*_mounted_elsewhere(parent, odds, leaves, k), *_put_in_between(parent, odds, leaves, k))
+        for k in range(len(parent))
+    )
+    return dict(chain.from_iterable(moves))
 
 
 def _mounted_elsewhere(
@@ -149,15 +148,6 @@ def _place_gain(above: "np.ndarray[tuple[int, int], np.dtype[np.bool_]]", odds: 
 
 def _with(parent: Parents, changes: dict[int, int]) -> Parents:
     return tuple(changes.get(k, p) for k, p in enumerate(parent))
-
-
-def _without_diagonal(odds: Array) -> Array:
-    return np.where(np.eye(len(odds), dtype=bool), 0.0, odds)
-
-
-def rivals(parent: Parents, odds: Array, leaves: Collection[int] = ()) -> dict[Parents, float]:
-    """Return the forests one move away, each once, with their log-likelihood relative to this one."""
-    return dict(nearby(parent, odds, leaves))
 
 
 def edge_log_odds(parent: Parents, others: dict[Parents, float]) -> Array:

@@ -147,7 +147,10 @@ def find_topology(observations: Observations, unmoved: Collection[str] = ()) -> 
     _check_reversed(serials, observations)
     wrong = [d for d in topology.doubts if d.kind == "contradiction" and d.log_odds < -CONTRADICTS_ABOVE]
     if wrong:
-        raise _contradiction_error(wrong[0], serials, observations)
+        pair = (wrong[0].joint, wrong[0].observer)
+        reason, pairs = _impossible(serials, observations, pair)
+        involved = dict.fromkeys(serial for one in (pair, *pairs) for serial in one)
+        raise TopologyError(f"{reason and reason + ': no tree does that. '}{wrong[0].text}", tuple(involved))
     open_ = [d for d in topology.doubts if d.kind != "contradiction" and d.log_odds < UNBELIEVABLE_BELOW]
     if open_:
         raise TopologyError(open_[0].text, tuple(dict.fromkeys((open_[0].module, open_[0].joint))))
@@ -162,7 +165,9 @@ def likely_topology(observations: Observations, unmoved: Collection[str] = ()) -
     """
     serials = sorted({serial for pair in observations for serial in pair} | set(unmoved))
     _check_complete(serials, observations, unmoved)
-    odds = _log_odds(serials, observations)
+    # (n, n) log-odds that joint i carries the IMU of module k, 0 for what was not seen.
+    seen = [[observations.get((joint, observer)) for observer in serials] for joint in serials]
+    odds = np.array([[one.log_odds if one is not None else 0.0 for one in row] for row in seen])
     leaves = frozenset(serials.index(s) for s in unmoved)
     parent = likeliest_forest(odds, leaves)
     others = rivals(parent, odds, leaves)
@@ -179,16 +184,6 @@ class _Case(NamedTuple):
     parent: Parents
     others: dict[Parents, float]
     edge_odds: Array
-
-
-def _log_odds(serials: list[str], observations: Observations) -> Array:
-    """Return (n, n) log-odds that joint i carries the IMU of module k, 0 for what was not seen."""
-    odds = np.zeros((len(serials), len(serials)))
-    for i, joint in enumerate(serials):
-        for k, observer in enumerate(serials):
-            seen = observations.get((joint, observer))
-            odds[i, k] = seen.log_odds if seen is not None else 0.0
-    return odds
 
 
 def _described(case: _Case, unmoved: Collection[str]) -> Topology:
@@ -216,47 +211,37 @@ def _described(case: _Case, unmoved: Collection[str]) -> Topology:
 def _doubts(case: _Case, unmoved: Collection[str]) -> Iterator[Doubt]:
     for k, serial in enumerate(case.serials):
         if case.edge_odds[k] < DOUBTFUL_BELOW:
-            yield _parent_doubt(case, k)
+            # The least certain observation that separates the forest from the likeliest other parent.
+            rival = max((r for r in case.others if r[k] != case.parent[k]), key=lambda r: case.others[r])
+            apart = np.argwhere(ancestors(case.parent) != ancestors(rival))
+            i, o = min(apart, key=lambda pair: abs(case.odds[tuple(pair)]))
+            on, instead = (case.serials[p] if p != BASE else "the base" for p in (case.parent[k], rival[k]))
+            question = f"on {on} or on {instead}"
+            yield _doubt(case, "parent", k, float(case.edge_odds[k]), (i, o), question)
         if serial not in unmoved and abs(case.odds[k, k]) < DOUBTFUL_BELOW:
-            yield _mounting_doubt(case, k)
+            yield _doubt(case, "mounting", k, float(abs(case.odds[k, k])), (k, k), "forward or reversed")
     above = ancestors(case.parent)
     for i, k in np.argwhere((case.odds > 0.0) != above):
         if i != k and (case.serials[i], case.serials[k]) in case.observations:
             yield from _outvoted(case, int(i), int(k))
 
 
-def _parent_doubt(case: _Case, k: int) -> Doubt:
-    """Name the likeliest other parent, and the least certain observation that separates them."""
-    rival = max((r for r in case.others if r[k] != case.parent[k]), key=lambda r: case.others[r])
-    apart = np.argwhere(ancestors(case.parent) != ancestors(rival))
-    i, o = min(apart, key=lambda pair: abs(case.odds[tuple(pair)]))
-    on, instead = (case.serials[p] if p != BASE else "the base" for p in (case.parent[k], rival[k]))
-    odds, joint, observer = float(case.edge_odds[k]), case.serials[i], case.serials[o]
-    text = (
-        f"whether {case.serials[k]} is mounted on {on} or on {instead} is not certain ({_chance(odds)}): "
-        f"{_saw(case.observations, joint, observer)}; repeat that motion"
-    )
-    return Doubt("parent", case.serials[k], odds, joint, observer, text)
-
-
-def _mounting_doubt(case: _Case, k: int) -> Doubt:
-    serial, odds = case.serials[k], float(abs(case.odds[k, k]))
-    text = (
-        f"whether {serial} is mounted forward or reversed is not certain ({_chance(odds)}): "
-        f"{_saw(case.observations, serial, serial)}; repeat that motion"
-    )
-    return Doubt("mounting", serial, odds, serial, serial, text)
+def _doubt(
+    case: _Case, kind: Literal["parent", "mounting"], k: int, odds: float, pair: tuple[int, int], how: str
+) -> Doubt:
+    serial, joint, observer = (case.serials[one] for one in (k, *pair))
+    saw = _saw(case.observations, joint, observer)
+    text = f"whether {serial} is mounted {how} is not certain ({_chance(odds)}): {saw}; repeat that motion"
+    return Doubt(kind, serial, odds, joint, observer, text)
 
 
 def _outvoted(case: _Case, i: int, k: int) -> Iterator[Doubt]:
     """Name an observation that does not fit; if it is a sure one, all those of which one must be wrong."""
     joint, observer, odds = case.serials[i], case.serials[k], float(abs(case.odds[i, k]))
-    pairs = {(joint, observer): None}
-    if odds > CONTRADICTS_ABOVE and (
-        contradiction := _impossible(case.serials, case.observations, (joint, observer))
-    ):
-        pairs |= dict.fromkeys(contradiction.pairs)
-    for pair in pairs:
+    pairs = [(joint, observer)]
+    if odds > CONTRADICTS_ABOVE:
+        pairs += _impossible(case.serials, case.observations, (joint, observer)).pairs
+    for pair in dict.fromkeys(pairs):
         text = f"{_saw(case.observations, *pair)}, which does not fit the rest; repeat that motion"
         yield Doubt("contradiction", pair[1], -odds, *pair, text)
 
@@ -281,21 +266,15 @@ class _Contradiction(NamedTuple):
 
 
 def _check_complete(serials: list[str], observations: Observations, unmoved: Collection[str]) -> None:
-    """A module that never answered is named as such, rather than with each of its missing pairs.
-
-    Raises:
-        TopologyError: a module has no observations, or its joint has none and it is not `unmoved`.
-    """
+    """Raise a TopologyError that names a module that never answered, not each of its missing pairs."""
     joints, observers = {i for i, _ in observations}, {k for _, k in observations}
     silent = [k for k in serials if k not in observers]
     unseen = [i for i in serials if i not in joints and i not in unmoved]
     parts = [f"module {k} reported on no joint" for k in silent]
     parts += [f"no module reported on joint {i}" for i in unseen]
     if parts:
-        raise TopologyError(
-            "; ".join(parts) + ". Every module must have watched every joint",
-            tuple(dict.fromkeys([*silent, *unseen])),
-        )
+        text = "; ".join(parts) + ". Every module must have watched every joint"
+        raise TopologyError(text, tuple(dict.fromkeys([*silent, *unseen])))
 
 
 def _contradictions(serials: list[str], movers: Mapping[str, list[str]]) -> Iterator[_Contradiction]:
@@ -306,53 +285,28 @@ def _contradictions(serials: list[str], movers: Mapping[str, list[str]]) -> Iter
                 yield _Contradiction(f"{i} moves {k} and {k} moves {i}", ((i, k), (k, i)))
             for a in movers[i]:
                 if a != k and a not in movers[k]:
-                    yield _Contradiction(
-                        f"{a} moves {i} and {i} moves {k}, but {a} does not move {k}",
-                        ((a, i), (i, k), (a, k)),
-                    )
+                    text = f"{a} moves {i} and {i} moves {k}, but {a} does not move {k}"
+                    yield _Contradiction(text, ((a, i), (i, k), (a, k)))
             for other in movers[k]:
                 if i < other and i not in movers[other] and other not in movers[i]:
-                    yield _Contradiction(
-                        f"{i} and {other} both move {k}, but neither moves the other",
-                        ((i, k), (other, k), (i, other), (other, i)),
-                    )
+                    text = f"{i} and {other} both move {k}, but neither moves the other"
+                    yield _Contradiction(text, ((i, k), (other, k), (i, other), (other, i)))
 
 
-def _impossible(
-    serials: list[str], observations: Observations, pair: tuple[str, str]
-) -> _Contradiction | None:
-    movers = {k: [i for i in serials if i != k and _carried(observations, i, k)] for k in serials}
-    return next((one for one in _contradictions(serials, movers) if pair in one.pairs), None)
-
-
-def _contradiction_error(doubt: Doubt, serials: list[str], observations: Observations) -> TopologyError:
-    """Say what no tree allows, with the observation that does not fit the rest."""
-    pair = (doubt.joint, doubt.observer)
-    contradiction = _impossible(serials, observations, pair)
-    reason, pairs = "", [pair]
-    if contradiction is not None:
-        reason, pairs = f"{contradiction.text}: no tree does that. ", [pair, *contradiction.pairs]
-    return TopologyError(
-        f"{reason}{doubt.text}", tuple(dict.fromkeys(serial for one in pairs for serial in one))
-    )
-
-
-def _carried(observations: Observations, joint: str, observer: str) -> bool:
-    seen = observations.get((joint, observer))
-    return seen is not None and seen.moved
+def _impossible(serials: list[str], observations: Observations, pair: tuple[str, str]) -> _Contradiction:
+    """Return the first contradiction that a pair is part of; empty without one."""
+    moved = {known for known, seen in observations.items() if seen.moved and known[0] != known[1]}
+    movers = {k: [i for i in serials if (i, k) in moved] for k in serials}
+    every = (one for one in _contradictions(serials, movers) if pair in one.pairs)
+    return next(every, _Contradiction("", ()))
 
 
 def _check_reversed(serials: list[str], observations: Observations) -> None:
-    """A housing that turns about its own axis turns backwards: about -z of its IMU when the position grows.
-
-    Raises:
-        TopologyError: a module surely turned about something else.
-    """
+    """Raise a TopologyError if a housing that its own joint turns does not turn about -z of its IMU."""
     for k in serials:
         seen = observations.get((k, k))
-        if seen is None or seen.axis is None or seen.log_odds < CONTRADICTS_ABOVE:
-            continue
-        if seen.axis[2] > -0.7:
+        sure = seen is not None and seen.log_odds >= CONTRADICTS_ABOVE
+        if seen is not None and sure and seen.axis is not None and seen.axis[2] > -0.7:
             raise TopologyError(
                 f"{k} moved with its own joint, as a reversed module does, but about "
                 f"{seen.axis.round(2).tolist()} instead of -z of its IMU: check its encoder's sign, "
