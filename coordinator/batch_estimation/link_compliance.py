@@ -216,15 +216,15 @@ def hinge_slopes(
     chain: Chain,
     joints: JointTrack,
     loads: Sequence[LinkLoad | None],
-    known: ComplianceJacobian,
     compliance: Array,
     taken: Array | None = None,
 ) -> ComplianceJacobian:
-    """Return the slopes `known` and those by the places of the hinges (see `LinkLoad.shifts`).
+    """Return the slopes of `compliance_jacobian` and those by the places of the hinges (`LinkLoad.shifts`).
 
-    Their size follows from the compliances (2 l,) of l links, as estimated with the slopes `known`. taken:
+    Their size follows from the compliances (2 l,) of l links, as estimated with the former alone. taken:
     (3 l,) by how much the hinges of the loads have been moved already.
     """
+    known = compliance_jacobian(chain, joints, loads)
     if not known.links:
         return known
     links: list[int] = []

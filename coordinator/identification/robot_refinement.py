@@ -11,7 +11,6 @@ from coordinator.batch_estimation.base_heading import faced
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import DELAY
 from coordinator.batch_estimation.link_compliance import (
-    ComplianceJacobian,
     LinkLoad,
     compliance_jacobian,
     hinge_slopes,
@@ -23,7 +22,7 @@ from coordinator.batch_estimation.link_compliance import (
 from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, encoder_steps, filtered, thinned
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
+from module_agent.model.chain import Chain
 from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.read_only import frozen
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
@@ -57,18 +56,19 @@ def refine_robot(
         DataError: as `refine_chain`.
     """
     keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MAX_IMU_SAMPLES))
-    parts = _parts(windows, floor)
+    parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor) for one in windows]
     rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior)
     # The first IMU may have no motion to determine its delay; all IMUs are of one type.
     late_s = float(np.median(rigid.intrinsics.errors[1:, DELAY])) if len(chain.serials) > 1 else 0.0
-    parts = _parts(windows, floor, late_s, encoder_steps(windows))
+    steps = encoder_steps(windows)
+    parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor, late_s, steps) for one in windows]
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
     giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
     if not giving.compliance.size:
         return refine_chain(giving.chain, thinned(parts, keep), prior)._replace(late_s=late_s)
     # The hinges' positions change the torques that turn them: first a coarse estimate, then the final one.
     coarse = thinned(parts, COARSE * keep)
-    flex = _hinged(giving.chain, coarse, joined(loads, COARSE * keep), giving.compliance)
+    flex = hinge_slopes(giving.chain, coarse.smooth, joined(loads, COARSE * keep), giving.compliance)
     hinged = refine_chain(giving.chain, coarse, prior, flex)
     links = len(giving.compliance)
     moved, joints = hinged.compliance[links:], flex.links[:links:2]
@@ -77,30 +77,11 @@ def refine_robot(
     loads = loads_of(hinged.chain, kinds, parts, RATE_HZ, turns)
     loads = with_hinges_moved(loads, joints, moved)
     fine = thinned(parts, keep)
-    flex = _hinged(hinged.chain, fine, joined(loads, keep), hinged.compliance[:links], moved)
+    compliance = hinged.compliance[:links]
+    flex = hinge_slopes(hinged.chain, fine.smooth, joined(loads, keep), compliance, moved)
     refined = refine_chain(hinged.chain, fine, prior, flex)
     # The last step estimates the change of the hinges' positions.
     return refined._replace(compliance=frozen(refined.compliance + flex.taken), late_s=late_s)
-
-
-def _hinged(
-    chain: Chain,
-    data: SensorData,
-    loads: Sequence[LinkLoad | None],
-    compliance: Array,
-    moved: Array | None = None,
-) -> ComplianceJacobian:
-    flex = compliance_jacobian(chain, data.smooth, loads)
-    return hinge_slopes(chain, data.smooth, loads, flex, compliance, moved)
-
-
-def _parts(
-    windows: Sequence[Window],
-    floor: NoiseFloor | None,
-    late_s: float = 0.0,
-    step_rad: Array | None = None,
-) -> list[SensorData]:
-    return [filtered(one, REFINEMENT_CUTOFF_HZ, floor, late_s, step_rad) for one in windows]
 
 
 def _giving(

@@ -29,7 +29,9 @@ def axis_angles(chain: Chain, covariance: Array) -> tuple[Array, Array]:
         cross = np.cross(chain.axis[parent], chain.axis[k])
         sine = float(np.linalg.norm(cross))
         angle[k] = np.arctan2(sine, chain.axis[parent] @ chain.axis[k])
-        spread = _turn_covariance(covariance, parent, k)
+        # Of the module's rotation against its parent's, in the root frame.
+        a, b = slice(6 * parent, 6 * parent + 3), slice(6 * k, 6 * k + 3)
+        spread = covariance[a, a] + covariance[b, b] - covariance[a, b] - covariance[a, b].T
         if sine > PARALLEL_BELOW:
             about = cross / sine
             sigma[k] = np.sqrt(about @ spread @ about)
@@ -37,13 +39,6 @@ def axis_angles(chain: Chain, covariance: Array) -> tuple[Array, Array]:
             across = np.eye(3) - np.outer(chain.axis[k], chain.axis[k])
             sigma[k] = np.sqrt(np.trace(across @ spread @ across))
     return frozen(angle), frozen(sigma)
-
-
-def _turn_covariance(covariance: Array, parent: int, child: int) -> Array:
-    """Return the covariance (3, 3) of the child's rotation against the parent's, in the root frame."""
-    a, b = slice(6 * parent, 6 * parent + 3), slice(6 * child, 6 * child + 3)
-    crossed = covariance[a, b]
-    return np.asarray(covariance[a, a] + covariance[b, b] - crossed - crossed.T)
 
 
 def housing_homes(chain: Chain, types: Sequence[ModuleType]) -> Array:

@@ -200,9 +200,6 @@ def link_from_joint(
     return regress_joint(observed_motions([windows]), None, prior)
 
 
-# ---------------------------------------------------------------------- the data
-
-
 def _signals(
     t_s: ArrayLike, gyros: tuple[ArrayLike, ...], accels: tuple[ArrayLike, ...], cutoff_hz: float
 ) -> _Signals:
@@ -235,9 +232,6 @@ def _signals(
     if moved < _MIN_RATE_RAD_S:
         raise DataError(f"the IMUs turned at {moved:.2g} rad/s rms; {_MIN_RATE_RAD_S} are needed")
     return _Signals(t[part], smooth[:, part], acceleration[:, part], turned[:, ::step], force[:, part])
-
-
-# ---------------------------------------------------------------------- the model
 
 
 def _predicted(signals: _Signals, state: _State) -> tuple[Array, Array, Array]:
@@ -277,15 +271,12 @@ def _weighted(signals: _Signals, state: _State, sigmas: tuple[float, float], pri
 
 def _rms(signals: _Signals, state: _State) -> tuple[float, float]:
     gyro, accel, _ = _predicted(signals, state)
-    return (max(float(np.sqrt(np.mean(gyro**2))), 1e-9), max(float(np.sqrt(np.mean(accel**2))), 1e-9))
+    return max(float(np.sqrt(np.mean(gyro**2))), 1e-9), max(float(np.sqrt(np.mean(accel**2))), 1e-9)
 
 
 def _misfit(signals: _Signals, state: _State) -> float:
     gyro, accel = _rms(signals, state)
     return float(np.hypot(gyro / _FIRST_SIGMAS[0], accel / _FIRST_SIGMAS[1]))
-
-
-# ---------------------------------------------------------------------- the fit
 
 
 def _best(signals: _Signals, priors: Array) -> _State:
@@ -341,11 +332,8 @@ def _arms(signals: _Signals, frame_1: Array, frame_2: Array) -> tuple[float, _St
         values = np.zeros(_GEOMETRY + 12)
         values[4] = angle
         at_zero = _predicted(signals, _State(frames, values))[1].ravel()
-        columns = []
-        for k in range(5, _GEOMETRY):
-            one = values.copy()
-            one[k] = 1.0
-            columns.append(_predicted(signals, _State(frames, one))[1].ravel() - at_zero)
+        ones = [_State(frames, values + one) for one in np.eye(len(values))[5:_GEOMETRY]]
+        columns = [_predicted(signals, one)[1].ravel() - at_zero for one in ones]
         values[5:_GEOMETRY] = np.linalg.lstsq(np.stack(columns, axis=1), -at_zero, rcond=1e-6)[0]
         state = _State(frames, values)
         trials.append((_misfit(signals, state), state))
@@ -365,9 +353,6 @@ def _refined(signals: _Signals, state: _State, sigmas: tuple[float, float], prio
     turns = Rotation.from_rotvec(np.c_[values[:4].reshape(2, 2), np.zeros(2)]).as_matrix()
     values[:4] = 0.0
     return _State(state.frames @ turns, values)
-
-
-# ---------------------------------------------------------------------- the result
 
 
 def _described(signals: _Signals, state: _State, priors: Array) -> ImuLink:
@@ -427,25 +412,23 @@ def _covariance(signals: _Signals, state: _State, priors: Array) -> tuple[Array,
     rms = _rms(signals, state)
     sigmas = rms[0] * float(np.sqrt(repeats[0])), rms[1] * float(np.sqrt(repeats[1]))
     steps = np.r_[np.full(_GEOMETRY, 1e-5), 1e-3 * priors]
-    columns = []
-    for k, step in enumerate(steps):
-        ends = []
-        for side in (step, -step):
-            values = state.values.copy()
-            values[k] += side
-            ends.append(_weighted(signals, _State(state.frames, values), sigmas, priors))
-        columns.append((ends[0] - ends[1]) / (2.0 * step))
-    jacobian = np.stack(columns, axis=1)
+
+    def residual(values: Array) -> Array:
+        return _weighted(signals, _State(state.frames, values), sigmas, priors)
+
+    ends = [(residual(state.values + step), residual(state.values - step)) for step in np.diag(steps)]
+    jacobian = np.stack(
+        [(ahead - behind) / (2.0 * s) for (ahead, behind), s in zip(ends, steps, strict=True)], 1
+    )
     information = jacobian.T @ jacobian
     geometry, cross = information[:_GEOMETRY, :_GEOMETRY], information[:_GEOMETRY, _GEOMETRY:]
-    reduced = geometry - cross @ np.linalg.solve(information[_GEOMETRY:, _GEOMETRY:], cross.T)
+    through = np.linalg.solve(information[_GEOMETRY:, _GEOMETRY:], cross.T)
+    reduced = geometry - cross @ through
     reduced -= np.diag(_NOISE_MARGIN * _noise_information(signals, rms, sigmas))
     values, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
     resolved = values > UNRESOLVED_ABOVE**-2
     covariance = (vectors[:, resolved] / values[resolved]) @ vectors[:, resolved].T
-    rows = jacobian[:, :_GEOMETRY] - jacobian[:, _GEOMETRY:] @ np.linalg.solve(
-        information[_GEOMETRY:, _GEOMETRY:], cross.T
-    )
+    rows = jacobian[:, :_GEOMETRY] - jacobian[:, _GEOMETRY:] @ through
     drift = covariance @ _drift(signals, rows, jacobian[:, _ANGLE], rms[0])
     return covariance + drift @ drift.T, vectors[:, ~resolved]
 
