@@ -11,7 +11,7 @@ import csv
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Literal, NamedTuple, NoReturn
 from zipfile import BadZipFile
 
 import numpy as np
@@ -42,7 +42,7 @@ class JointLog(NamedTuple):
     rate_hz: sampling rate. q_rad: (m, n) joint positions. qd_rad_s: (m, n) joint velocities, None if they
     were not measured. tau_nm: (m, n) joint torques. resampled: whether the times of the file were not
     uniform. breaks: samples before which there is a hole, or where another recording begins. repeated: rows
-    like the one before, left out.
+    like the one before, left out. file: where it was read from.
     """
 
     rate_hz: float
@@ -52,6 +52,20 @@ class JointLog(NamedTuple):
     resampled: bool = False
     breaks: tuple[int, ...] = ()
     repeated: int = 0
+    file: str = "a recording in memory"
+
+    def column(self, signal: Literal["t", "q", "qd", "tau"], joint: str) -> str:
+        """Return the file and the column of a joint's signal, for messages."""
+        if self.file.lower().endswith(".npz"):
+            arrays = {
+                "t": "t_s or sample_rate_hz",
+                "q": "position_rad",
+                "qd": "velocity_rad_s",
+                "tau": "torque",
+            }
+            return f"{self.file}: {arrays[signal]}{'' if signal == 't' else ' of ' + joint}"
+        names = {"t": "t_s", "q": f"q_{joint}_rad", "qd": f"qd_{joint}_rad_s", "tau": f"tau_{joint}_nm"}
+        return f"{self.file}: column {names[signal]}"
 
     @property
     def duration_s(self) -> float:
@@ -142,7 +156,7 @@ def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
     if path.suffix.lower() not in readers:
         raise DataFileError(f"{path}: its name ends on {path.suffix!r}; .csv and .npz are read")
     try:
-        return _log(readers[path.suffix.lower()](path, joints))
+        return _log(readers[path.suffix.lower()](path, joints))._replace(file=str(path))
     except DataFileError as error:
         raise DataFileError(f"{path}: {error}") from None
 

@@ -1,15 +1,16 @@
 """The library's `fit_dynamics`: inertia, friction and motors of an arm from its URDF and a log of torques."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from coordinator.arm_fit.checks import wrong_motion, wrong_torques
 from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
 from coordinator.arm_fit.cutoff import chosen_cutoff_hz, cutoff_curve
-from coordinator.arm_fit.data_file import JointLog, in_two, read_log
+from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_log
 from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
@@ -68,6 +69,7 @@ def fit_dynamics(
     cutoff_hz: float | None = None,
     gravity: ArrayLike = STANDARD_GRAVITY,
     trust: float = USUAL_TRUST,
+    checked: bool = True,
     progress: Callable[[str], None] = lambda _: None,
 ) -> ArmFit:
     """Identify inertia, friction and motors of an arm, and test the result on held-out samples.
@@ -90,6 +92,7 @@ def fit_dynamics(
         gravity: (3,) specific force at rest in the root link's frame [m/s^2], upwards. Ignored if `urdf` is a
             robot, whose chain has its own.
         trust: weight of the URDF's inertias for the bodies.
+        checked: refuse a recording whose units, signs, gravity or length are wrong (`checks`).
         progress: is called with a sentence before every step (`STEPS`).
 
     Raises:
@@ -102,9 +105,13 @@ def fit_dynamics(
     progress(f"read {_name(urdf)} and {_name(data)}")
     robot = urdf if isinstance(urdf, UrdfRobot) else read_urdf(urdf, gravity)
     log = _log(data, robot)
+    if checked:
+        _refuse(wrong_motion(robot, log))
     progress("choose the low-pass")
     curve = cutoff_curve(robot, log, choice) if cutoff_hz is None else ()
     posed = _posed(robot, log, choice, cutoff_hz or chosen_cutoff_hz(curve), instruments)
+    if checked:
+        _refuse(wrong_torques(posed, log))
     elsewhere = None if held_out is None else Elsewhere(_name(held_out), _posed_like(posed, held_out))
     result = fit_and_test(
         posed,
@@ -124,6 +131,11 @@ def fit_dynamics(
     return ArmFit(
         robot=robot, report=result.report, bodies=fitted.bodies, phi=fitted.phi, friction=friction, urdf=text
     )
+
+
+def _refuse(findings: Iterable[str]) -> None:
+    if texts := list(findings):
+        raise DataFileError("\n".join(texts))
 
 
 def _name(source: str | Path | UrdfRobot | JointLog) -> str:

@@ -68,6 +68,10 @@ _Gravity = Annotated[
 ]
 _Mask = Annotated[float, typer.Option(help="Part of a joint's top speed below which samples are masked.")]
 _Slow = Annotated[float, typer.Option(help="Part of a joint's top speed below which Coulomb friction fades.")]
+_Unchecked = Annotated[
+    bool,
+    typer.Option("--unchecked", help="Fit even if units, signs, gravity or length of the data look wrong."),
+]
 
 
 def fit_dynamics(
@@ -85,6 +89,7 @@ def fit_dynamics(
     gravity: _Gravity = _UP,
     mask: _Mask = _USUAL.mask_part,
     slow: _Slow = _USUAL.slow_part,
+    unchecked: _Unchecked = False,
     quiet: Quiet = False,
 ) -> None:
     """Identify inertia, friction and motors of an arm, and test the result on samples that were held out.
@@ -104,6 +109,7 @@ def fit_dynamics(
                 instruments=instruments,
                 cutoff_hz=cutoff,
                 trust=trust,
+                checked=not unchecked,
                 progress=lambda text: terminal.step(next(numbers), STEPS, text),
             )
         for line in notes(fit.report):

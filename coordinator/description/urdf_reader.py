@@ -37,6 +37,7 @@ class UrdfRobot(NamedTuple):
     carried: all links that move with some joint.
     phi: (10 n,) the inertias of the file, as in `torque_regressor`: in the root frame at q = 0, of all
         links of a body together. None if no moving link has one.
+    limits: (n, 3) lowest and highest position [rad] and speed [rad/s], infinite where the file gives none.
     path: of the file.
     """
 
@@ -45,6 +46,7 @@ class UrdfRobot(NamedTuple):
     homes: Array
     carried: frozenset[str]
     phi: Array | None
+    limits: Array
     path: Path = Path()
 
 
@@ -55,6 +57,7 @@ class _Joint(NamedTuple):
     moves: bool
     pose: Array
     axis: Array
+    limits: tuple[float, float, float]
 
 
 class _Placed(NamedTuple):
@@ -115,6 +118,7 @@ def _robot(root: Element, gravity: Array) -> UrdfRobot:
         homes,
         frozenset(carried),
         _inertias(links, carried, len(moving)),
+        read_only(np.array([joint.limits for joint in moving])),
     )
 
 
@@ -141,7 +145,20 @@ def _joint(element: Element, links: dict[str, Element]) -> _Joint:
     if kind in _MOVING and not length > 1e-9:
         raise UrdfError(f"axis of joint {name!r} is zero; it must be a direction")
     pose = _pose(element.find("origin"), f"origin of joint {name!r}")
-    return _Joint(name, ends[0], ends[1], kind in _MOVING, pose, axis / max(length, 1e-9))
+    return _Joint(
+        name, ends[0], ends[1], kind in _MOVING, pose, axis / max(length, 1e-9), _limits(element, name, kind)
+    )
+
+
+def _limits(element: Element, name: str, kind: str) -> tuple[float, float, float]:
+    """Return the lowest and the highest position and the speed; what is not given is unlimited."""
+    limit, where = element.find("limit"), f"limit of joint {name!r}"
+    if limit is None:
+        return -np.inf, np.inf, np.inf
+    low, high, speed = (_float(limit.get(key, "0"), key, where) for key in ("lower", "upper", "velocity"))
+    if kind == "continuous" or not low < high:
+        low, high = -np.inf, np.inf
+    return low, high, speed if speed > 0.0 else np.inf
 
 
 def _root_link(joints: Sequence[_Joint], links: dict[str, Element]) -> str:

@@ -152,16 +152,22 @@ def test_a_urdf_without_masses_is_fitted_in_sums_and_not_written(tmp_path: Path)
 
 def test_gravity_is_what_one_says(tmp_path: Path) -> None:
     files = write_files(tmp_path)
-    found = []
-    for name, gravity in (("right", "0,0,9.81"), ("wrong", "0,9.81,0")):
+    errors = []
+    for name, options in (
+        ("right", ("--gravity", "0,0,9.81")),
+        ("wrong", ("--gravity", "0,9.81,0", "--unchecked")),
+    ):
         path = tmp_path / f"{name}.json"
-        assert called(*files, "--gravity", gravity, "--json", str(path)).exit_code == 0
+        assert called(*files, *options, "--json", str(path)).exit_code == 0
         report = FitReport.model_validate_json(path.read_text())
         error = report.errors("fitted")[0].overall
         assert error is not None
-        found.append(error)
+        errors.append(error)
     # Without a pull down the pendulum's greatest torque has no column.
-    assert found[1] > 20.0 * found[0]
+    assert errors[1] > 20.0 * errors[0]
+    refused = called(*files, "--gravity", "0,9.81,0")
+    assert refused.exit_code == 2
+    assert "the base is mounted otherwise" in " ".join(refused.output.split())
 
 
 @pytest.mark.parametrize(
@@ -199,6 +205,6 @@ def test_a_file_that_is_broken_is_named_with_the_line(tmp_path: Path) -> None:
 
 
 def test_a_recording_too_short_for_its_parameters_is_a_failure(tmp_path: Path) -> None:
-    done = called(*write_files(tmp_path, seconds=1.1), "--cutoff", "6")
+    done = called(*write_files(tmp_path, seconds=1.1), "--cutoff", "6", "--unchecked")
     assert done.exit_code == 1, done.output
     assert "nothing is left to estimate the noise from" in done.output
