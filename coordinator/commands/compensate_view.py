@@ -8,7 +8,7 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.table import Table
 
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.runtime.terminal import Displayed, new_table, print_table
 from coordinator.torque_control.session import Moment
 from coordinator.torque_control.summary import CompensationSummary
 
@@ -16,7 +16,7 @@ from coordinator.torque_control.summary import CompensationSummary
 LIVE_S, LINE_S = 0.25, 0.5
 
 
-class CompensationView:
+class CompensationView(Displayed):
     """Shows moments at intervals; `now_s` is the clock of the session.
 
     Use as a context manager. Notes, and what is live, go to standard error; lines of JSON and the summary to
@@ -27,36 +27,23 @@ class CompensationView:
         self._serials = serials
         self._now_s = now_s
         self._as_json, self._quiet = as_json, quiet
-        self._console = Console(stderr=True, highlight=False, quiet=quiet)
-        is_live = self._console.is_terminal and not quiet and not as_json
-        self._live = Live(console=self._console, auto_refresh=False, transient=True) if is_live else None
+        console = Console(stderr=True, highlight=False, quiet=quiet)
+        self._live = Live(console=console, auto_refresh=False, transient=True)
+        super().__init__(console, None if as_json else self._live)
         self._due_s = 0.0
-
-    def __enter__(self) -> "CompensationView":
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def note(self, text: str) -> None:
-        """Print a line."""
-        self._console.print(f"  {text}", markup=False, soft_wrap=True)
 
     def moment(self, now: Moment) -> None:
         """Show a moment, if the interval is over."""
         now_s = self._now_s()
         if now_s < self._due_s:
             return
-        self._due_s = now_s + (LIVE_S if self._live is not None else LINE_S)
+        self._due_s = now_s + (LIVE_S if self._display is not None else LINE_S)
         if self._as_json:
             print(json.dumps(moment_fields(self._serials, now)), flush=True)
-        elif self._live is not None:
+        elif self._display is not None:
             self._live.update(moment_table(self._serials, now), refresh=True)
         else:
-            self._console.print(moment_line(self._serials, now), markup=False, soft_wrap=True)
+            self.console.print(moment_line(self._serials, now), markup=False, soft_wrap=True)
 
     def summary(self, found: CompensationSummary) -> None:
         """Print the summary."""

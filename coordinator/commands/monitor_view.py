@@ -10,32 +10,25 @@ from rich.text import Text
 
 from coordinator.monitoring.findings import Finding, Key
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from coordinator.runtime.terminal import new_table
+from coordinator.runtime.terminal import Displayed, new_table
 
 _NOTES = 6
 
 
-class MonitorScreen:
+class MonitorScreen(Displayed):
     """Shows what a watcher says. Times are seconds since `start_ns`, which is set before anything is said."""
 
     def __init__(self, monitor: Monitor, json_file: Path | None, quiet: bool = False):
         self.start_ns = 0
         self._monitor = monitor
         self._file: TextIO | None = json_file.open("w", encoding="utf-8") if json_file else None
-        self._console = Console(highlight=False, quiet=quiet)
-        self._live: Live | None = None
-        if self._console.is_terminal and not quiet:
-            self._live = Live(get_renderable=self._shown, console=self._console, refresh_per_second=4.0)
+        console = Console(highlight=False, quiet=quiet)
+        self._live = Live(get_renderable=self._shown, console=console, refresh_per_second=4.0)
+        super().__init__(console, self._live)
         self._notes: list[str] = []
 
-    def __enter__(self) -> "MonitorScreen":
-        if self._live is not None:
-            self._live.start()
-        return self
-
     def __exit__(self, *_: object) -> None:
-        if self._live is not None:
-            self._live.stop()
+        super().__exit__()
         if self._file is not None:
             self._file.close()
 
@@ -56,14 +49,12 @@ class MonitorScreen:
         found, monitor = self._monitor.finding_log.all, self._monitor
         all_findings = [finding.model_dump() for finding in found]
         self._write({"monitored_s": round(monitor.monitored_s, 3), "findings": all_findings})
-        if self._live is not None:
+        if self._display is not None:
             self._live.refresh()
             return
-        self._console.print(f"monitored for {monitor.monitored_s:.1f} s", markup=False)
-        for finding in found:
-            self._console.print(f"  {self.sentence(finding)}", markup=False, soft_wrap=True)
-        if not found:
-            self._console.print("  no findings", markup=False)
+        self.console.print(f"monitored for {monitor.monitored_s:.1f} s", markup=False)
+        for line in [self.sentence(finding) for finding in found] or ["no findings"]:
+            self.note(line)
 
     def sentence(self, finding: Finding) -> str:
         """Return a finding in a line."""
@@ -73,8 +64,8 @@ class MonitorScreen:
         return f"{since:8.2f} s  {finding.kind}: {finding.summary}{f' ({sure})' if sure else ''}{over}"
 
     def _line(self, text: str) -> None:
-        if self._live is None:
-            self._console.print(text, markup=False, soft_wrap=True)
+        if self._display is None:
+            self.console.print(text, markup=False, soft_wrap=True)
         else:
             self._notes = [*self._notes, text][-_NOTES:]
 

@@ -1,14 +1,15 @@
-"""Terminal output of a run: a progress line with notes above it; plain lines in a pipe."""
+"""Terminal output: tables, and a progress line with notes above it; plain lines in a pipe."""
 
-import time
-from typing import Any
+import sys
+from typing import Any, Self
 
 from rich.console import Console
+from rich.live import Live
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-_PIPE_WIDTH = 140
+_MIN_PIPE_WIDTH = 150
 
 
 def new_table(title: str | None, columns: str, **appearance: Any) -> Table:
@@ -22,47 +23,60 @@ def new_table(title: str | None, columns: str, **appearance: Any) -> Table:
     return table
 
 
+def figure(value: float | None, form: str, unit: str = "") -> str:
+    """Return a figure with its unit; a dash if there is none."""
+    return "-" if value is None else f"{value:{form}}{unit}"
+
+
 def print_table(table: Table) -> None:
-    """Print a command's result on standard output, with colours where it is a terminal."""
+    """Print a command's result on standard output; with FORCE_COLOR set the colours go through a pipe too."""
     console = Console(highlight=False)
-    # A pipe has no width; truncated cells could not be searched.
-    console.width = console.width if console.is_terminal else _PIPE_WIDTH
+    if not sys.stdout.isatty():
+        # A pipe has no width; truncated cells could not be searched.
+        console.width = max(console.width, _MIN_PIPE_WIDTH)
     console.print(table)
 
 
-class Terminal:
+class Displayed:
+    """Has a live display during a `with` block, if its console is a terminal."""
+
+    def __init__(self, console: Console, display: Live | Progress | None):
+        self.console = console
+        self._display = display if console.is_terminal and not console.quiet else None
+
+    def __enter__(self) -> Self:
+        if self._display is not None:
+            self._display.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._display is not None:
+            self._display.stop()
+
+    def note(self, text: str) -> None:
+        """Show a line of text."""
+        self.console.print(f"  {text}", markup=False, soft_wrap=True)
+
+
+class Terminal(Displayed):
     """Progress and notes on standard error, so that standard output stays for results."""
 
     def __init__(self, quiet: bool = False):
-        self.console = Console(stderr=True, highlight=False, quiet=quiet)
-        self._live = self.console.is_terminal and not quiet
+        console = Console(stderr=True, highlight=False, quiet=quiet)
         self._progress = Progress(
             TextColumn("[bold]{task.description}"),
             BarColumn(bar_width=30),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
-            console=self.console,
+            console=console,
             transient=True,
         )
         self._task = self._progress.add_task("starting", total=None)
-        self._start_s = time.monotonic()
-
-    def __enter__(self) -> "Terminal":
-        if self._live:
-            self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._live:
-            self._progress.stop()
+        super().__init__(console, self._progress)
 
     def step(self, index: int, total: int, text: str) -> None:
         """Show that a step begins."""
-        if self._live:
+        if self._display is not None:
             self._progress.update(self._task, description=text, completed=index - 1, total=total)
         else:
             self.console.print(f"[{index}/{total}] {text}", markup=False, soft_wrap=True)
-
-    def note(self, text: str) -> None:
-        """Show a line of text."""
-        self.console.print(f"  {text}", markup=False, soft_wrap=True)

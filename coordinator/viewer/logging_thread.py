@@ -88,13 +88,9 @@ class LoggingThread:
             job()
         except Exception as failure:
             # A run goes on without a picture, and the next job may succeed.
-            kind = _raised_at(failure)
+            last = traceback.extract_tb(failure.__traceback__)[-1]
+            # Of few values, unlike its text.
+            kind = f"{type(failure).__name__} at {last.filename}:{last.lineno}"
             self._failures[kind] = self._failures.get(kind, 0) + 1
             if self._failures[kind] == 1:
                 logger.exception("the viewer could not log something")
-
-
-def _raised_at(failure: Exception) -> str:
-    """Return the type of an exception and where it was raised: of few values, unlike its text."""
-    last = traceback.extract_tb(failure.__traceback__)[-1]
-    return f"{type(failure).__name__} at {last.filename}:{last.lineno}"

@@ -1,25 +1,20 @@
 """What the logging thread does: keep the state of what is shown, and write it to one stream."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 
-from coordinator.viewer.scene import (
-    blueprint,
-    entity_paths,
-    progress,
-    robot_geometry,
-    robot_scene,
-    time_series,
-)
+from coordinator.viewer.scene import blueprint, entity_paths, robot_geometry, robot_scene, time_series
 from coordinator.viewer.scene import topology_graph as graphs
-from coordinator.viewer.scene.parameter_plot import Estimate, with_estimate
+from coordinator.viewer.scene.parameter_plot import NINETY_FIVE_SIGMAS, Estimate, with_estimate
 from coordinator.viewer.scene.time_series import Batch, IntArray
 from module_agent.model.chain import Array, Chain
 from module_agent.wire.feedback_rows import Rows
 
+LEGEND = "Band: 1σ. Thin lines and spheres: 95 %. Grey: the truth, if known."
 # The camera is moved when the reach of the robot exceeds this many times the reach it was set for.
 OUTGROWN = 1.25
 STYLES = {style.world: style for style in (robot_scene.ESTIMATE_STYLE, robot_scene.TRUTH_STYLE)}
@@ -104,19 +99,23 @@ class Recorder:
         """Log a step of the run."""
         if self._pace.layout_follows:
             self._show()
-        progress.set_time(self._stream, t_ns)
-        progress.log_phase(self._stream, text)
+        self._set_time(t_ns)
+        self._stream.log(entity_paths.PHASE_LOG, rr.TextLog(text, level=rr.TextLogLevel.INFO))
+        heading = rr.TextDocument(f"**{text}**\n\n{LEGEND}", media_type="text/markdown")
+        self._stream.log(entity_paths.PHASE_NOW, heading)
 
     def network(self, serial: str, t_ns: int, round_trip_ms: float, age_ms: float, refusals: int) -> None:
         """Log the state of a module's connection."""
         self._register([serial])
-        progress.set_time(self._stream, t_ns)
-        progress.log_network(self._stream, serial, round_trip_ms, age_ms, refusals)
+        self._set_time(t_ns)
+        groups = (entity_paths.ROUND_TRIP, entity_paths.AGE, entity_paths.REFUSALS)
+        for group, value in zip(groups, (round_trip_ms, age_ms, float(refusals)), strict=True):
+            self._stream.log(entity_paths.network_path(serial, group), rr.Scalars(value))
 
     def topology(self, t_ns: int, topology: graphs.Topology) -> None:
         """Log the tree of modules."""
         self._register(topology.serials)
-        progress.set_time(self._stream, t_ns)
+        self._set_time(t_ns)
         colours = {serial: self._palette[serial] for serial in topology.serials}
         for drawn in graphs.graph(topology, self._types, colours):
             self._stream.log(entity_paths.TOPOLOGY, drawn)
@@ -132,25 +131,55 @@ class Recorder:
         truth, previous = self._truths.get(key), self._estimates.get(key)
         colour = self._palette[estimate.serial]
         if previous is None:
-            progress.log_interval_style(self._stream, *key, colour)
+            ends = rr.SeriesLines(
+                names=["95 %: from", "95 %: to"],
+                colors=[entity_paths.shade(colour, 0.75)] * 2,
+                widths=[1.0, 1.0],
+                interpolation_mode="stepafter",
+            )
+            self._stream.log(entity_paths.interval_path(*key), ends, static=True)
         if estimate != previous:
             before = None if previous is None else previous.value
             estimated = with_estimate(self._contents.estimated, estimate, before, truth)
             self._contents = self._contents._replace(estimated=estimated)
             self._estimates[key] = estimate
-        progress.set_time(self._stream, t_ns)
-        progress.log_estimate(self._stream, estimate, colour)
+        self._set_time(t_ns)
+        self._log_estimate(estimate, colour)
         if truth is not None:
-            progress.log_truth(self._stream, *key, truth)
+            self._stream.log(entity_paths.truth_path(*key), rr.Scalars(truth))
+
+    def _log_estimate(self, estimate: Estimate, colour: entity_paths.Colour) -> None:
+        """Log a value with its variance and its 95 % interval; without these if sigma is not finite.
+
+        The viewer draws a line in a band of one sigma, and the ends of the interval as two thin lines.
+        """
+        known = math.isfinite(estimate.sigma)
+        drawn = rr.Measurements(
+            [estimate.value],
+            # With None the variance of the previous estimate would remain valid.
+            variances=[estimate.sigma**2] if known else [],
+            units=estimate.units,
+            names=estimate.serial,
+            colors=[colour],
+            widths=[2.0],
+            # An estimate is valid until the next one.
+            interpolation_mode="stepafter",
+        )
+        self._stream.log(entity_paths.estimate_path(estimate.name, estimate.serial), drawn)
+        reach = NINETY_FIVE_SIGMAS * estimate.sigma if known else math.nan
+        ends = [estimate.value - reach, estimate.value + reach]
+        self._stream.log(entity_paths.interval_path(estimate.name, estimate.serial), rr.Scalars(ends))
 
     def true_value(self, name: str, serial: str, value: float, t_ns: Sequence[int]) -> None:
         """Set the true value of a parameter, which is logged at `t_ns` and with every estimate."""
+        path = entity_paths.truth_path(name, serial)
         if (name, serial) not in self._truths:
-            progress.log_truth_style(self._stream, name, serial)
+            style = rr.SeriesLines(names="true", colors=[entity_paths.TRUTH_COLOUR], widths=[1.5])
+            self._stream.log(path, style, static=True)
         self._truths[name, serial] = value
         for t in t_ns:
-            progress.set_time(self._stream, t)
-            progress.log_truth(self._stream, name, serial, value)
+            self._set_time(t)
+            self._stream.log(path, rr.Scalars(value))
 
     def chain(
         self,
@@ -170,7 +199,7 @@ class Recorder:
         style = STYLES[world]
         colours = {serial: self._palette[serial] for serial in chain.serials}
         scene = robot_scene.build_scene(chain, self._types, colours, sigma_m, style)
-        progress.set_time(self._stream, t_ns)
+        self._set_time(t_ns)
         before = self._scenes.get(world)
         if before is not None:
             robot_scene.clear_removed(self._stream, before, scene)
@@ -202,9 +231,17 @@ class Recorder:
             robot_scene.send_poses(self._stream, scene, t_ns, postures)
 
     def residuals(self, serial: str, t_ns: IntArray, measured_nm: Array, predicted_nm: Array) -> None:
-        """Log held-out torque."""
+        """Log the envelopes of held-out torque (m,), measured and predicted, and of the residual."""
         self._register([serial])
-        progress.send_residuals(self._stream, serial, t_ns, measured_nm, predicted_nm)
+        both = np.stack([measured_nm, predicted_nm], axis=1)
+        error = (measured_nm - predicted_nm)[:, None]
+        for group, values in ((entity_paths.HELD_OUT, both), (entity_paths.ERROR, error)):
+            thinned = time_series.envelope(t_ns, values)
+            time_series.send_scalars(self._stream, entity_paths.residual_path(serial, group), *thinned)
+
+    def _set_time(self, t_ns: int) -> None:
+        """Set the session time of everything that is logged next."""
+        self._stream.set_time(entity_paths.TIMELINE, duration=np.timedelta64(t_ns, "ns"))
 
     def _register(self, serials: Sequence[str]) -> None:
         new = [serial for serial in dict.fromkeys(serials) if serial not in self._contents.serials]

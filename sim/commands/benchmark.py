@@ -1,19 +1,17 @@
 """`x5-sim benchmark`: figures of the whole system on simulated robots, against the bars set for it."""
 
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from coordinator.excitation.plan import Motions
 from coordinator.runtime.command_line import in_a_folder
-from coordinator.runtime.terminal import new_table
+from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import EXIT_FINDING, UsageError
 from sim.benchmark.case import Case, CaseResult
 from sim.benchmark.cases.staubli_tx40 import MOTION, URDF
@@ -156,7 +154,7 @@ def _run(cases: list[Case], processes: int) -> list[CaseResult]:
 
 
 def _report(results: Results, json_file: Path | None, plot_file: Path | None) -> None:
-    print_rows(results.rows, f"Benchmark of {results.benchmark}")
+    print_table(table(results.rows, f"Benchmark of {results.benchmark}"))
     for text in results.failures:
         typer.echo(f"failed: {text}", err=True)
     held = sum(row.holds is True for row in results.rows)
@@ -168,8 +166,7 @@ def _report(results: Results, json_file: Path | None, plot_file: Path | None) ->
         plot(results.rows, plot_file)
 
 
-# A pipe has no width; a table cut short in it would be of no use.
-_MIN_WIDTH = 150
+_OUTCOMES = {None: "", True: "[green]holds[/]", False: "[bold red]MISSED[/]"}
 
 
 def table(rows: Sequence[Row], title: str) -> Table:
@@ -183,21 +180,9 @@ def table(rows: Sequence[Row], title: str) -> Table:
         cells = (_number(row.thesis), _number(row.ours), _number(row.bound), _bar(row.limit))
         # Units stand in brackets, which are markup to rich.
         name = escape(row.case) if row.case != before else ""
-        shown.add_row(name, escape(row.figure), *cells, _outcome(row.holds))
+        shown.add_row(name, escape(row.figure), *cells, _OUTCOMES[row.holds])
         before = row.case
     return shown
-
-
-def print_rows(rows: Sequence[Row], title: str) -> None:
-    """Print the table on standard output; with FORCE_COLOR set the colours go through a pipe too."""
-    console = Console(highlight=False)
-    if not sys.stdout.isatty():
-        console.width = max(console.width, _MIN_WIDTH)
-    console.print(table(rows, title))
-
-
-def _outcome(holds: bool | None) -> str:
-    return "" if holds is None else "[green]holds[/]" if holds else "[bold red]MISSED[/]"
 
 
 def _bar(limit: Limit) -> str:

@@ -8,7 +8,7 @@ import typer
 from rich.table import Table
 
 from coordinator.monitoring.findings import KINDS, UNITS, Kind
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.runtime.terminal import figure, new_table, print_table
 from module_agent.model.files import write_json
 from sim.benchmark.case import Trial
 from sim.benchmark.cases.monitoring import (
@@ -94,11 +94,11 @@ def size_table(trials: Sequence[MonitoringTrial]) -> Table:
         sizes = f"{one['smallest']:.2f} to {one['largest']:.2f} {UNITS[kind]}" if one["sized"] else "-"
         table.add_row(
             kind,
-            _number(one["first_finding_s"], 3),
-            _number(one["named_s"], 2),
+            figure(one["first_finding_s"], ".3f"),
+            figure(one["named_s"], ".2f"),
             sizes,
-            _number(one["error_rms"], 3),
-            _number(one["error_largest"], 3),
+            figure(one["error_rms"], ".3f"),
+            figure(one["error_largest"], ".3f"),
         )
     return table
 
@@ -159,7 +159,3 @@ def _run(
 def _median(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

@@ -7,7 +7,7 @@ import typer
 from rich.table import Table
 
 from coordinator.commands.options import AsJson
-from coordinator.runtime.terminal import new_table, print_table
+from coordinator.runtime.terminal import figure, new_table, print_table
 from sim.scoring.score import Score, score, write_score
 
 
@@ -45,25 +45,21 @@ def table(result: Score) -> Table:
         shown.add_row(
             f"link {link.parent} - {link.child}",
             f"{link.link_length_true_mm:.2f} mm",
-            _shown(link.link_length_error_mm, "+.2f", " mm"),
-            _shown(link.link_length_sigma_mm, ".2f", " mm"),
-            _shown(link.axis_error_deg, ".3f", " deg"),
+            figure(link.link_length_error_mm, "+.2f", " mm"),
+            figure(link.link_length_sigma_mm, ".2f", " mm"),
+            figure(link.axis_error_deg, ".3f", " deg"),
         )
     shown.add_section()
-    shown.add_row("tip position, rms", "", _shown(result.tip_position_rms_mm, ".2f", " mm"), "", "")
-    shown.add_row("tip orientation, rms", "", _shown(result.tip_orientation_rms_deg, ".3f", " deg"), "", "")
-    shown.add_row("held-out torque against the true", "", _shown(result.torque_relative_error, ".2%"), "", "")
+    shown.add_row("tip position, rms", "", figure(result.tip_position_rms_mm, ".2f", " mm"), "", "")
+    shown.add_row("tip orientation, rms", "", figure(result.tip_orientation_rms_deg, ".3f", " deg"), "", "")
+    shown.add_row("held-out torque against the true", "", figure(result.torque_relative_error, ".2%"), "", "")
     for serial, error in (result.torque_relative_error_per_joint or {}).items():
         absolute = (result.torque_rms_error_nm_per_joint or {}).get(serial)
-        shown_error = _shown(absolute, ".3f", " Nm") if error is None else _shown(error, ".2%")
+        shown_error = figure(absolute, ".3f", " Nm") if error is None else figure(error, ".2%")
         shown.add_row(f"  of {serial}", "", shown_error, "", "")
-    measured = _shown(result.torque_relative_error_measured, ".2%")
+    measured = figure(result.torque_relative_error_measured, ".2%")
     shown.add_row("held-out torque against the measured", "", measured, "", "")
     shown.add_section()
-    shown.add_row("robot time", _shown(result.robot_time_s, ".1f", " s"), "", "", "")
-    shown.add_row("wall time", _shown(result.wall_time_s, ".1f", " s"), "", "", "")
+    shown.add_row("robot time", figure(result.robot_time_s, ".1f", " s"), "", "", "")
+    shown.add_row("wall time", figure(result.wall_time_s, ".1f", " s"), "", "", "")
     return shown
-
-
-def _shown(value: float | None, form: str, unit: str = "") -> str:
-    return "-" if value is None else f"{value:{form}}{unit}"

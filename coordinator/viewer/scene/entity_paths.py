@@ -9,6 +9,7 @@
 """
 
 import colorsys
+from functools import partial
 from typing import Final
 
 APPLICATION_ID: Final = "x5"
@@ -61,9 +62,14 @@ HELD_OUT, ERROR = "torque", "error"
 ROUND_TRIP, AGE, REFUSALS = "round_trip", "age", "refusals"
 
 
-def module_path(serial: str, group: str) -> str:
-    """Return the entity of one group of sensors of a module."""
-    return f"/modules/{part(serial)}/{group}"
+def _group_path(root: str, serial: str, group: str) -> str:
+    return f"/{root}/{part(serial)}/{group}"
+
+
+# Of a group of a module's sensors; of its held-out torque (`HELD_OUT`, residual `ERROR`); of its connection.
+module_path, residual_path, network_path = (
+    partial(_group_path, root) for root in ("modules", "residuals", "network")
+)
 
 
 def estimate_path(name: str, serial: str) -> str:
@@ -79,16 +85,6 @@ def interval_path(name: str, serial: str) -> str:
 def truth_path(name: str, serial: str) -> str:
     """Return the entity of a parameter's true value, which is known in simulations only."""
     return f"{estimate_path(name, serial)}/true"
-
-
-def residual_path(serial: str, group: str) -> str:
-    """Return the entity of a module's held-out torque (`HELD_OUT`) or of its residual (`ERROR`)."""
-    return f"/residuals/{part(serial)}/{group}"
-
-
-def network_path(serial: str, group: str) -> str:
-    """Return the entity of one property of a module's connection."""
-    return f"/network/{part(serial)}/{group}"
 
 
 def body_path(world: str, serial: str | None) -> str:

@@ -1,6 +1,7 @@
 """The tree of modules as a graph: parent, child and mounting direction of every module."""
 
 from collections.abc import Mapping, Sequence
+from itertools import count
 from typing import TYPE_CHECKING, NamedTuple
 
 from coordinator.viewer.scene import entity_paths
@@ -28,28 +29,18 @@ def positions(topology: Topology) -> list[tuple[float, float]]:
 
     A parent is above the middle of its children, so no two edges cross.
     """
-    children: dict[int, list[int]] = {}
-    for k, parent in enumerate(topology.parent):
-        children.setdefault(parent, []).append(k)
-    across: dict[int, float] = {}
-    depths: dict[int, int] = {BASE: 0}
-    leaves = 0
-    # Post-order without recursion: a chain of 64 modules is as deep as it is long.
-    stack: list[tuple[int, bool]] = [(BASE, False)]
-    while stack:
-        node, done = stack.pop()
-        below = children.get(node, [])
-        if done:
-            across[node] = sum(across[k] for k in below) / len(below)
-        elif below:
-            depths |= dict.fromkeys(below, depths[node] + 1)
-            stack.append((node, True))
-            stack += [(k, False) for k in reversed(below)]
-        else:
-            across[node] = float(leaves)
-            leaves += 1
-    order = (BASE, *range(len(topology.serials)))
-    return [(LEAF * across[k], LEVEL * depths[k]) for k in order]
+    placed: dict[int, tuple[float, float]] = {}
+    columns = count()
+
+    def place(node: int, depth: int) -> float:
+        """Place a node and all below it, and return how far across it is."""
+        below = [place(k, depth + 1) for k, parent in enumerate(topology.parent) if parent == node]
+        across = sum(below) / len(below) if below else float(next(columns))
+        placed[node] = (LEAF * across, LEVEL * depth)
+        return across
+
+    place(BASE, 0)
+    return [placed[k] for k in (BASE, *range(len(topology.serials)))]
 
 
 def graph(

@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from coordinator.runtime.terminal import print_table
 from module_agent.model.errors import UsageError
 from sim.benchmark.case import Case, Failed, Summary, Trial, concluded, trial_seed
 from sim.benchmark.report import SCHEMA, Cost, Results, gathered, plot, write_results
 from sim.benchmark.row import Row
 from sim.benchmark.workers import run_cases
-from sim.commands.benchmark import print_rows, table
+from sim.commands.benchmark import table
 
 ROWS = (
     Row("long arm", "length [mm]", 4.35, 0.12, 0.08, 0.5),
@@ -69,7 +70,7 @@ def test_a_table_in_a_pipe_is_not_cut_short(capsys: pytest.CaptureFixture[str]) 
         "and a figure with a long one as well [mm]",
         *[1.0] * 4,
     )
-    print_rows([long], "Benchmark")
+    print_table(table([long], "Benchmark"))
     shown = capsys.readouterr().out
     assert long.case in shown
     assert long.figure in shown
