@@ -46,7 +46,6 @@ from module_agent.signals.clock_map import ClockMap
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import Feedback, GoTo, Message
-from module_agent.wire.refusal import WireError
 
 _STEP = 1e-6
 _NS = 1e-9
@@ -397,15 +396,12 @@ def _recorder(recording: Recording, retained_rows: int = _RETAINED_ROWS) -> Reco
     """Return what adds messages to a recording that retains the newest feedback rows of every module."""
 
     def record(entry: Entry) -> Message | None:
-        try:
-            message = recording.add(entry)
-        except WireError:
-            return None  # counted in `recording.refused`
+        message = recording.accept(entry)
         if isinstance(message, Feedback):
             module = recording.module(message.serial, message.boot)
             if module.rows.end_row - module.rows.first_row > 1.1 * retained_rows:
                 module.forget(retained_rows, _RETAINED_TRIPS)
-        return message if isinstance(message, Message) else None
+        return message
 
     return record
 

@@ -10,7 +10,6 @@ from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.recording.recording import Entry, Recording
 from coordinator.synchronisation.round_trips import map_clocks
-from module_agent.model.errors import RobotError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ask, Message
@@ -42,11 +41,7 @@ class LiveMonitor:
 
     def record(self, entry: Entry) -> Message | None:
         """Add a received message to the recording."""
-        try:
-            message = self.recording.add(entry)
-        except RobotError:
-            return None  # counted by the recording, by reason
-        return message if isinstance(message, Message) else None
+        return self.recording.accept(entry)
 
     async def watch(
         self, messenger: Messenger, until_ns: int | None = None, enough: Callable[[], bool] = lambda: False

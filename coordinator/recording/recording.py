@@ -14,7 +14,7 @@ import numpy as np
 from coordinator.kinematics.chain_observations import RestObservation
 from coordinator.recording.journal import JournalEvent, Purpose
 from module_agent.model.catalogue import ImuKind, ModuleType, TorqueKind, module_type
-from module_agent.model.errors import DataError
+from module_agent.model.errors import DataError, RobotError
 from module_agent.wire.codec import decode
 from module_agent.wire.feedback_rows import ROW, Rows
 from module_agent.wire.information_messages import Information, InformationRequest
@@ -126,6 +126,14 @@ class Recording:
         except WireError as error:
             self.refused[error.reason.value] = self.refused.get(error.reason.value, 0) + 1
             raise
+
+    def accept(self, entry: Entry) -> Message | None:
+        """Add one entry; return its message, None if it is of the journal or unreadable, see `refused`."""
+        try:
+            message = self.add(entry)
+        except RobotError:
+            return None
+        return message if isinstance(message, Message) else None
 
     def _index(self, entry: Entry, exchange: Exchange) -> Message:
         parts = parse(entry.topic)

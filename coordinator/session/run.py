@@ -55,7 +55,7 @@ from coordinator.viewer.targets import ViewerTargets
 from coordinator.viewer.viewer import Viewer
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Chain
-from module_agent.model.errors import DataError, RobotError, UsageError
+from module_agent.model.errors import DataError, UsageError
 from module_agent.transport.transport import Transport
 from module_agent.wire.messages import Message
 
@@ -148,13 +148,9 @@ class Run:
 
     def _record(self, entry: Entry) -> Message | None:
         self._writer.write(entry)
-        try:
-            message = self.recording.add(entry)
-        except RobotError:
-            return None  # counted by the recording, by reason
-        if not isinstance(message, Message):
-            return None
-        self._feed.on_message(entry, message)
+        message = self.recording.accept(entry)
+        if message is not None:
+            self._feed.on_message(entry, message)
         return message
 
     def _journal(self, event: JournalEvent) -> None:

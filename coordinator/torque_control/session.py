@@ -13,7 +13,7 @@ import numpy as np
 from coordinator.live_robot.errors import ModuleLost, RobotStopped
 from coordinator.live_robot.messenger import Clock, Messenger, Post, gather_all
 from coordinator.live_robot.module_group import KEEP_ALIVE_S, POLL_S, ModuleGroup
-from coordinator.recording.recording import Entry, Recording
+from coordinator.recording.recording import Recording
 from coordinator.torque_control.gains import compensation_gains, holding_gains
 from coordinator.torque_control.gravity_compensation import (
     CompensationRefused,
@@ -29,8 +29,6 @@ from coordinator.torque_control.summary import CompensationSummary, Compensation
 from module_agent.model.chain import Array
 from module_agent.transport.transport import Transport
 from module_agent.wire.feedback_rows import STATE_NAMES, Rows
-from module_agent.wire.messages import Message
-from module_agent.wire.refusal import WireError
 
 # The oldest feedback to act on, as a share of the command lifetime: modules refuse commands that echo older
 # feedback.
@@ -96,7 +94,7 @@ class CompensationSession:
         sender: str,
     ):
         self._recording = Recording()
-        self._messenger = Messenger(transport, name, clock, post, self._record)
+        self._messenger = Messenger(transport, name, clock, post, self._recording.accept)
         self._group = ModuleGroup(self._messenger, self._recording, clock, sender)
         self._model, self._plan, self._clock, self._screen = model, plan, clock, screen
         self._serials = model.chain.serials
@@ -133,13 +131,6 @@ class CompensationSession:
             return await self._run()
         finally:
             self._messenger.close()
-
-    def _record(self, entry: Entry) -> Message | None:
-        try:
-            message = self._recording.add(entry)
-        except WireError:
-            return None  # counted by the recording, by reason
-        return message if isinstance(message, Message) else None
 
     async def _run(self) -> CompensationSummary:
         await find_robot(self._group, self._messenger, self._model, self._clock)

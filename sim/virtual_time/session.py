@@ -20,8 +20,6 @@ from coordinator.runtime.event_loop import run_to_end
 from coordinator.session.session import Session
 from coordinator.topology.next_motion import NextMotion
 from module_agent.model.catalogue import module_type
-from module_agent.model.errors import RobotError
-from module_agent.wire.messages import Message
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.run import COORDINATOR, SilentScreen
@@ -42,7 +40,9 @@ def record_session(
     robot = VirtualRobot(settings, loop)
     recorder = _MemoryRecorder(plan)
     endpoint = robot.endpoint(COORDINATOR)
-    messenger = Messenger(endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, recorder.record)
+    messenger = Messenger(
+        endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, recorder.recording.accept
+    )
     group = ModuleGroup(messenger, recorder.recording, lambda: loop.now_ns, COORDINATOR)
     session = Session(
         group, messenger, recorder.recording, plan, lambda: loop.now_ns, recorder.journal, recorder
@@ -84,13 +84,6 @@ class _MemoryRecorder(SilentScreen):
     def __init__(self, plan: Plan) -> None:
         self.recording = Recording()
         self._plan = plan
-
-    def record(self, entry: Entry) -> Message | None:
-        try:
-            message = self.recording.add(entry)
-        except RobotError:
-            return None  # counted by the recording, by reason
-        return message if isinstance(message, Message) else None
 
     def journal(self, event: JournalEvent) -> None:
         self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))

@@ -16,12 +16,11 @@ from coordinator.live_robot.messenger import Messenger, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.monitoring.live import LiveMonitor
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from coordinator.recording.recording import Entry, Recording
+from coordinator.recording.recording import Recording
 from coordinator.runtime.event_loop import run_to_end
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Chain
-from module_agent.model.errors import RobotError
-from module_agent.wire.messages import GoTo, Message
+from module_agent.wire.messages import GoTo
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.world.world import World
@@ -72,7 +71,7 @@ def monitor_robot(
     robot = VirtualRobot(settings, loop)
     recording = Recording()
     mover = Messenger(
-        robot.endpoint(MOVER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, _kept(recording)
+        robot.endpoint(MOVER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, recording.accept
     )
     watch = LiveMonitor(monitor, lambda: loop.now_ns, MONITOR, lambda update: report(update, loop.now_ns))
     listener = Messenger(
@@ -104,17 +103,6 @@ def monitor_robot(
     finally:
         robot.close()
         loop.close()
-
-
-def _kept(recording: Recording) -> Callable[[Entry], Message | None]:
-    def keep(entry: Entry) -> Message | None:
-        try:
-            message = recording.add(entry)
-        except RobotError:
-            return None  # counted by the recording, by reason
-        return message if isinstance(message, Message) else None
-
-    return keep
 
 
 async def _move(
