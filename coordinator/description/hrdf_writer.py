@@ -54,11 +54,7 @@ class _Robot(NamedTuple):
 
 
 def write_hrdf(
-    path: Path,
-    chain: Chain,
-    types: Sequence[ModuleType],
-    phi: ArrayLike | None = None,
-    name: str = "robot",
+    path: Path, chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None = None, name: str = "robot"
 ) -> None:
     """Write the robot; the file is the complete old or the complete new one.
 

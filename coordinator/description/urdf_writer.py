@@ -56,10 +56,7 @@ def write_urdf(
 
 
 def robot_element(
-    chain: Chain,
-    phi: ArrayLike | None,
-    name: str = "robot",
-    module_types: Sequence[ModuleType] | None = None,
+    chain: Chain, phi: ArrayLike | None, name: str = "robot", module_types: Sequence[ModuleType] | None = None
 ) -> Element:
     """Return the `robot` element; for the arguments and errors see `write_urdf`."""
     joints = len(chain.serials)

@@ -318,11 +318,7 @@ class ModuleGroup:
         await self._achieve(serial, Leaf.GAINS, lambda: self._command(GainsCommand, serial, gains=gains))
 
     def stream(
-        self,
-        serial: str,
-        position_rad: float | None,
-        velocity_rad_s: float | None,
-        effort_nm: float | None,
+        self, serial: str, position_rad: float | None, velocity_rad_s: float | None, effort_nm: float | None
     ) -> None:
         """Send one set-point, which is not acknowledged; None switches a loop off."""
         point = {"position_rad": position_rad, "velocity_rad_s": velocity_rad_s, "effort_nm": effort_nm}

@@ -14,11 +14,10 @@ smaller.
     held          holds
     returning     moves to a given position under position control
 
-Compensation lasts until `hold` is called, or a joint exceeds the speed limit, comes near the end of its range
-or needs more torque than it has. Before the start, and again before the release, the torque sensors are
-compared with the model: the difference counts as the sensors' offset, and the release is refused if it is
-larger than offsets and scale errors explain. A joint that sinks during the release is held too. Pure: time is
-an argument, and nothing is sent from here.
+Compensation lasts until `hold` is called, or a joint exceeds the speed limit, comes near the end of its
+range, needs more torque than it has, or sinks during the release. Before the start, and again before the
+release, the difference of torque sensors and model counts as the sensors' offset; the release is refused if
+offsets and scale errors do not explain it. Pure: time is an argument, and nothing is sent from here.
 """
 
 from collections.abc import Callable
@@ -42,8 +41,7 @@ OFFSET_FROM = 0.7
 # its offset). The springs measure beyond the motors' friction, so friction does not contribute.
 MAX_OFFSET_OF_WEIGHT = 0.08
 MAX_OFFSET_OF_EFFORT = 0.02
-# How far a joint may move while loading and while releasing. Measured: heavy arms whose motors were off sink
-# by 9 degrees into the soft factory gains, and by 1 degree on release.
+# How far a joint may move while loading and while releasing. Measured on heavy arms: 9 and 1 degrees.
 MAX_LOADING_MOTION_RAD, MAX_RELEASE_MOTION_RAD = float(np.radians(15.0)), float(np.radians(5.0))
 # Largest lag on the way back; more means that something blocks the joint.
 MAX_LAG_RAD = 0.08
@@ -56,14 +54,7 @@ class CompensationRefused(RobotError):
 
 
 class StaleFeedback(LostError):
-    """The newest feedback of a module is too old to compensate by."""
-
-    def __init__(self, serial: str, age_s: float, most_s: float):
-        super().__init__(
-            f"module {serial}: newest feedback is {1e3 * age_s:.0f} ms old, at most {1e3 * most_s:.0f} ms "
-            "are accepted; check the network"
-        )
-        self.serial = serial
+    """The newest feedback of a module is too old to compensate by; the message names the module."""
 
 
 class CompensationSettings(NamedTuple):
@@ -135,26 +126,16 @@ class GravityCompensator:
         self._low = _ends([one.min_position_rad for one in limits], -np.inf) + settings.margin_rad
         self._high = _ends([one.max_position_rad for one in limits], np.inf) - settings.margin_rad
         self._since_s = 0.0
-        self._place: Array | None = None
         self._way: _Way | None = None
         # The stiffness share at the beginning of holding: 1 if the position loops were not released.
         self._stiffness_share = 1.0
         self._held_share: float | None = None
         # The torque commanded when loading was aborted.
         self._aborted_nm: Array | None = None
-        self._initial_nm, self._asked, self._offset = np.zeros((3, len(limits)))
+        # The held, or last held, positions; the first step sets them.
+        self._has_begun = False
+        self._place, self._initial_nm, self._asked, self._offset = np.zeros((4, len(limits)))
         self._offsets: list[Array] = []
-
-    @property
-    def place_rad(self) -> Array:
-        """The held, or last held, joint positions (n,).
-
-        Raises:
-            ValueError: before the first step.
-        """
-        if self._place is None:
-            raise ValueError("no position is held before the first step")
-        return self._place
 
     def check_start(self, reading: Reading) -> None:
         """Check that the robot can be compensated in its pose, before leases are taken.
@@ -183,7 +164,7 @@ class GravityCompensator:
         self._check_age(reading.age_s)
         rate = reading.qd_rad_s if self._settings.velocity_forces else np.zeros_like(reading.q_rad)
         weight_nm = self._model.effort_nm(reading.q_rad, rate)
-        if self._place is None:
+        if not self._has_begun:
             self._begin(t_s, reading, weight_nm)
         self._guard(t_s, reading, weight_nm)
         if self.phase == "loading" and self._share(t_s, self._settings.ramp_s) >= OFFSET_FROM:
@@ -196,7 +177,7 @@ class GravityCompensator:
         return Targets(self._held(t_s, reading.q_rad), np.zeros_like(self._asked), self._asked)
 
     def _begin(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
-        self._since_s, self._place = t_s, reading.q_rad.copy()
+        self._has_begun, self._since_s, self._place = True, t_s, reading.q_rad.copy()
         self._initial_nm = self._asked = reading.effort_nm.copy()
         if self._aborted_nm is not None:
             self._aborted_nm = self._initial_nm
@@ -246,8 +227,8 @@ class GravityCompensator:
         """Move to positions (n,). Only from `held`."""
         if self.phase == "held":
             speed = min(BACK_RAD_S, BACK_SHARE * self._settings.max_speed_rad_s)
-            farthest_rad = float(np.abs(target_rad - self.place_rad).max())
-            self._way = _Way(self.place_rad, target_rad, minimum_jerk_duration_s(farthest_rad, speed))
+            farthest_rad = float(np.abs(target_rad - self._place).max())
+            self._way = _Way(self._place, target_rad, minimum_jerk_duration_s(farthest_rad, speed))
             self._enter("returning", t_s)
 
     def _enter(self, phase: Phase, t_s: float) -> None:
@@ -261,7 +242,6 @@ class GravityCompensator:
 
         A share of the stiffness is a set-point at that share of the way from the measured to the held one.
         """
-        assert self._place is not None
         if self.phase == "compensating":
             return None
         if self._held_share is not None and self.phase == "holding":
@@ -297,6 +277,7 @@ class GravityCompensator:
             self._enter("held", t_s)
 
     def _guard(self, t_s: float, reading: Reading, weight_nm: Array) -> None:
+        reason = ""
         if self._way is not None:
             wanted = self._way.at(t_s - self._since_s)[0]
             reason = self._astray(reading.q_rad - wanted, MAX_LAG_RAD, "behind on the way back")
@@ -304,30 +285,30 @@ class GravityCompensator:
         elif self.phase in ("releasing", "compensating"):
             reason = self._too_fast(reading.qd_rad_s) or self._at_an_end(reading.q_rad)
             reason = reason or self._overload(weight_nm)
-        else:
-            reason = ""
         if self.phase in ("loading", "releasing"):
-            given = reading.q_rad - self.place_rad
+            given = reading.q_rad - self._place
             max_rad = MAX_LOADING_MOTION_RAD if self.phase == "loading" else MAX_RELEASE_MOTION_RAD
             reason = reason or self._astray(given, max_rad, "from its held position before the release")
         if reason:
             self._fault(t_s, reading, reason)
 
     def _fault(self, t_s: float, reading: Reading, why: str) -> None:
-        was_on_its_way = self._way is not None
-        if was_on_its_way:
-            # This fault, not the end of the session, is the reason now.
-            self.why = ""
         self.is_fault = True
-        self.hold(t_s, why)
-        if was_on_its_way:
-            # Do not push on against an obstacle.
+        if self._way is None:
+            self.hold(t_s, why)
+        else:
+            # This fault, not the end of the session, is the reason now; do not push against an obstacle.
+            self.why = ""
+            self.hold(t_s, why)
             self._place = reading.q_rad.copy()
 
     def _check_age(self, age_s: Array) -> None:
         worst = int(np.argmax(age_s))
         if age_s[worst] > self._settings.stale_s:
-            raise StaleFeedback(self._serials[worst], float(age_s[worst]), self._settings.stale_s)
+            raise StaleFeedback(
+                f"module {self._serials[worst]}: newest feedback is {1e3 * age_s[worst]:.0f} ms old, at most "
+                f"{1e3 * self._settings.stale_s:.0f} ms are accepted; check the network"
+            )
 
     def _exceeded(self, excess: Array, text: Callable[[int], str]) -> str:
         """Return the text on the joint with the largest excess (n,), empty if none is above zero."""

@@ -21,7 +21,6 @@ from coordinator.torque_control.gravity_compensation import (
     GravityCompensator,
     Phase,
     Reading,
-    Targets,
 )
 from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.preconditions import check_gravity, find_robot
@@ -153,7 +152,11 @@ class CompensationSession:
             await self._compensate(compensator)
             await self._return(compensator, stood.q_rad)
             await _cancelled(self._streaming)
-            await self._release_all()
+            keeper = asyncio.create_task(self._group.keep_alive())
+            try:
+                await self._group.release_all()
+            finally:
+                await _cancelled(keeper)
         except BaseException as error:
             if self._streaming is not None:
                 await _cancelled(self._streaming)
@@ -216,7 +219,8 @@ class CompensationSession:
                 self._group.renew()
                 renewed_s = now_s
             if now_s - forgot_s >= _FORGET_EVERY_S:
-                self._forget()
+                for serial in self._serials:
+                    self._group.module(serial).forget(_RETAINED_ROWS, 0)
                 forgot_s = now_s
             due_s += period_s
             if (late_s := self._now_s() - due_s) > period_s:
@@ -227,20 +231,17 @@ class CompensationSession:
     def _step(self, compensator: GravityCompensator, now_s: float) -> None:
         reading = self._reading()
         targets = compensator.step(now_s, reading)
-        self._send(targets)
+        for k, serial in enumerate(self._serials):
+            place = None if targets.position_rad is None else float(targets.position_rad[k])
+            rate, effort = float(targets.velocity_rad_s[k]), float(targets.effort_nm[k])
+            self._group.stream(serial, place, rate, effort)
         tally = self._tally
+        tally.sent += 1
         if compensator.phase == "compensating":
             tally.add(now_s, reading.q_rad, reading.qd_rad_s, targets.effort_nm)
         self._screen.moment(
             Moment(compensator.phase, tally.compensated_s, tally.missed, reading, targets.effort_nm)
         )
-
-    def _send(self, targets: Targets) -> None:
-        for k, serial in enumerate(self._serials):
-            place = None if targets.position_rad is None else float(targets.position_rad[k])
-            rate, effort = float(targets.velocity_rad_s[k]), float(targets.effort_nm[k])
-            self._group.stream(serial, place, rate, effort)
-        self._tally.sent += 1
 
     def _check_states(self) -> None:
         """Check that every module executes set-points, once all have begun to.
@@ -288,13 +289,6 @@ class CompensationSession:
         end_s = self._now_s() + self._plan.final_hold_s
         await self._until(lambda: self._now_s() >= end_s)
 
-    async def _release_all(self) -> None:
-        keeper = asyncio.create_task(self._group.keep_alive())
-        try:
-            await self._group.release_all()
-        finally:
-            await _cancelled(keeper)
-
     # ------------------------------------------------------------------ feedback
 
     def _now_s(self) -> float:
@@ -316,10 +310,6 @@ class CompensationSession:
 
     def _check_gravity(self) -> None:
         check_gravity(self._model.chain, *self._means(_REST_ROWS, "position_rad", "accel_m_s2"))
-
-    def _forget(self) -> None:
-        for serial in self._serials:
-            self._group.module(serial).forget(_RETAINED_ROWS, 0)
 
 
 async def _cancelled(task: "asyncio.Task[None]") -> None:
