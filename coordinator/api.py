@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import RigidTransform
 
-from coordinator.baseline.baseline_robot import BaselineError
 from coordinator.description.denavit_hartenberg import DhPath, dh_paths
 from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
@@ -33,10 +32,10 @@ from coordinator.live_robot.discovery import await_modules
 from coordinator.live_robot.messenger import Messenger, Record
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.recording import Entry, Recording
-from coordinator.recording.run_folder import HELD_OUT, RESULT, SESSION
+from coordinator.recording.run_folder import HELD_OUT, SESSION
 from coordinator.recording.run_folder import load_recording as read_recording
 from coordinator.synchronisation.round_trips import map_clocks
-from coordinator.torque_control.gravity_model import gravity_model_of_result
+from coordinator.torque_control.gravity_model import gravity_model_of_result, read_result
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import LostError
@@ -169,10 +168,7 @@ def load_run(folder: Path | str) -> SavedRun:
     Raises:
         BaselineError: the folder holds no result, or one that cannot be read.
     """
-    path = Path(folder) / RESULT
-    if not path.is_file():
-        raise BaselineError(f"{folder} holds no {RESULT}: give the folder of a run that has finished")
-    return SavedRun(Path(folder), Result.model_validate_json(path.read_bytes()))
+    return SavedRun(Path(folder), read_result(Path(folder)))
 
 
 def load_recording(path: Path | str) -> Recording:

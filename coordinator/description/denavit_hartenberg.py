@@ -3,7 +3,7 @@
 Frame i - 1 has its z along the axis of joint i, so that joint i turns A_i = Rz(theta_i + q_i) Tz(d_i) Tx(a_i)
 Rx(alpha_i). They exist for serial chains only: a tree has one table per path from a root to a leaf. Two axes
 that are all but parallel have a common normal far away, and d is then dominated by noise
-(Hayati 1983); `parallel_below_rad` takes such axes for parallel.
+(Hayati 1983).
 """
 
 from itertools import pairwise
@@ -38,12 +38,12 @@ class DhPath(NamedTuple):
     rows: tuple[DhRow, ...]
 
 
-def dh_paths(chain: Chain, parallel_below_rad: float = PARALLEL_BELOW_RAD) -> tuple[DhPath, ...]:
+def dh_paths(chain: Chain) -> tuple[DhPath, ...]:
     """Return one table per leaf, in the order of the chain."""
-    return tuple(dh_path(chain, leaf, parallel_below_rad) for leaf in chain.leaves)
+    return tuple(dh_path(chain, leaf) for leaf in chain.leaves)
 
 
-def dh_path(chain: Chain, leaf: int, parallel_below_rad: float = PARALLEL_BELOW_RAD) -> DhPath:
+def dh_path(chain: Chain, leaf: int) -> DhPath:
     """Return the table of the joints from the base to module `leaf`.
 
     Frame 0 has its origin at the first joint's point and its x along the root frame's x, as near as it goes.
@@ -56,29 +56,22 @@ def dh_path(chain: Chain, leaf: int, parallel_below_rad: float = PARALLEL_BELOW_
     for joint, following in pairwise(path):
         x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
         axis = chain.axis[following]
-        normal, foot, along = _common_normal(frame, axis, chain.point[following], parallel_below_rad)
-        row = DhRow(
-            serial=chain.serials[joint],
-            theta_rad=_angle(x, normal, z),
-            d_m=float((foot - origin) @ z),
-            a_m=float((along - foot) @ normal),
-            alpha_rad=_angle(z, axis, normal),
-        )
-        rows.append(row)
+        normal, foot, along = _common_normal(frame, axis, chain.point[following])
+        theta_rad, alpha_rad = _angle(x, normal, z), _angle(z, axis, normal)
+        d_m, a_m = float((foot - origin) @ z), float((along - foot) @ normal)
+        rows.append(DhRow(chain.serials[joint], theta_rad, d_m, a_m, alpha_rad))
         frame = _frame(axis, normal, along)
     rows.append(DhRow(chain.serials[path[-1]], 0.0, 0.0, 0.0, 0.0))
     return DhPath(base, tuple(rows))
 
 
-def _common_normal(
-    frame: Array, axis: Array, point: Array, parallel_below_rad: float
-) -> tuple[Array, Array, Array]:
+def _common_normal(frame: Array, axis: Array, point: Array) -> tuple[Array, Array, Array]:
     """Return the common normal of a frame's z and an axis: its direction and its feet on the two."""
     x, z, origin = frame[:3, 0], frame[:3, 2], frame[:3, 3]
     cross = np.cross(z, axis)
     between = point - origin
     sine = float(np.linalg.norm(cross))
-    if sine < parallel_below_rad:
+    if sine < PARALLEL_BELOW_RAD:
         along = point - axis * (axis @ between)
         gap = (along - origin) - z * (z @ (along - origin))
         size = float(np.linalg.norm(gap))

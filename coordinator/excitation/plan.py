@@ -17,10 +17,6 @@ Excitation = Literal["joint-by-joint", "d-optimal"]
 Seconds = Annotated[float, Field(gt=0.0, le=60.0)]
 
 
-class PlanFileError(UsageError):
-    """The file is not a plan; the message names the file, the setting and the accepted values."""
-
-
 class Plan(BaseModel):
     """The settings of an identification run; defaults are the thesis' where the thesis has one."""
 
@@ -126,18 +122,18 @@ def load_plan(path: Path) -> Plan:
     """Read a plan from a TOML file; what the file does not set keeps its default.
 
     Raises:
-        PlanFileError: the file cannot be read, is not TOML, or sets something unknown or out of range.
+        UsageError: the file cannot be read, is not TOML, or sets something unknown or out of range.
     """
     try:
         return Plan.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except OSError as error:
-        raise PlanFileError(f"{path}: {error.strerror or error}") from error
+        raise UsageError(f"{path}: {error.strerror or error}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise PlanFileError(f"{path} is not TOML: {error}") from error
+        raise UsageError(f"{path} is not TOML: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         fault = f"{name} = {first['input']!r}: {first['msg']}"
         if first["type"] == "extra_forbidden":
             fault = f"unknown setting {name}; known are {', '.join(Plan.model_fields)}"
-        raise PlanFileError(f"{path}: {fault}") from error
+        raise UsageError(f"{path}: {fault}") from error

@@ -19,7 +19,7 @@ class RowCompletion:
         self._log = log
         self._fetch = fetch
         self._met_row = log.end_row
-        self._complete_to: int | None = None
+        self._complete_to = 0
 
     def has_gap(self, end: int) -> bool:
         """Return whether a row before `end` is missing."""
@@ -51,4 +51,4 @@ class RowCompletion:
 
     @property
     def _first(self) -> int:
-        return max(self._log.first_row, self._complete_to or 0)
+        return max(self._log.first_row, self._complete_to)

@@ -42,12 +42,9 @@ class SetPoints(NamedTuple):
 
 
 def joint_reference(
-    serials: Sequence[str],
-    patterns: Mapping[str, Pattern],
-    origins_rad: Mapping[str, float],
-    rate_hz: float = RATE_HZ,
+    serials: Sequence[str], patterns: Mapping[str, Pattern], origins_rad: Mapping[str, float]
 ) -> Reference:
-    """Sample the motion of all joints; one without a pattern stands still at its origin.
+    """Sample the motion of all joints at 1 kHz; one without a pattern stands still at its origin.
 
     Raises:
         KeyError: a pattern of a module that is not among the serials, or a joint without an origin.
@@ -58,7 +55,7 @@ def joint_reference(
     if missing := [serial for serial in serials if serial not in origins_rad]:
         raise KeyError(f"joint {missing[0]} has no origin: give its position at the start of the motion")
     total_s = _common_duration_s(patterns, origins_rad)
-    t_s = np.arange(round(total_s * rate_hz) + 1) / rate_hz
+    t_s = np.arange(round(total_s * RATE_HZ) + 1) / RATE_HZ
     q, qd = np.empty((2, t_s.size, len(serials)))
     for column, serial in enumerate(serials):
         q[:, column], qd[:, column] = origins_rad[serial], 0.0
@@ -66,12 +63,12 @@ def joint_reference(
             samples = waveform(patterns[serial], origins_rad[serial], np.minimum(t_s, total_s))
             q[:, column] += samples.offset_rad
             qd[:, column] = samples.velocity_rad_s
-    return Reference(*(read_only(array) for array in (t_s, q, qd, differentiate(qd, rate_hz))))
+    return Reference(*(read_only(array) for array in (t_s, q, qd, differentiate(qd, RATE_HZ))))
 
 
-def standing(reference: Reference, row: int, length_s: float, rate_hz: float = RATE_HZ) -> Reference:
+def standing(reference: Reference, row: int, length_s: float) -> Reference:
     """Return a reference that rests at the position of a row of another one (-1: its end)."""
-    t_s = np.arange(round(length_s * rate_hz) + 1) / rate_hz
+    t_s = np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
     q = np.tile(reference.q_rad[row], (t_s.size, 1))
     return Reference(*(read_only(array) for array in (t_s, q, np.zeros_like(q), np.zeros_like(q))))
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from coordinator.baseline.baseline_robot import BaselineError
 from coordinator.description.urdf_writer import link_homes
 from coordinator.dynamics.pseudo_inertia import parameter_transform
-from coordinator.identification.result import BodiesPart, ModuleBodyPart, Result
+from coordinator.identification.result import ModuleBodyPart, Result
 from coordinator.recording.run_folder import RESULT
 from module_agent.model.chain import Array, Chain
 from module_agent.model.read_only import read_only
@@ -35,6 +35,23 @@ class GravityModel(NamedTuple):
         return np.asarray(inverse_dynamics(self.chain, self.phi, q, rate, np.zeros_like(q))[0])
 
 
+def read_result(folder: Path) -> Result:
+    """Read the result of a run from its folder.
+
+    Raises:
+        BaselineError: the folder holds no result, or one that cannot be read.
+    """
+    path = folder / RESULT
+    if not path.is_file():
+        raise BaselineError(f"{folder} holds no {RESULT}: give the folder of a run that has finished")
+    try:
+        return Result.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise BaselineError(f"{path} is no result of a run: {place}: {first['msg']}") from error
+
+
 def gravity_model(folder: Path) -> GravityModel:
     """Read the gravity model of a robot from the folder of a run.
 
@@ -44,18 +61,11 @@ def gravity_model(folder: Path) -> GravityModel:
     Raises:
         BaselineError: the folder holds no result, or one without dynamics.
     """
-    path = folder / RESULT
-    if not path.is_file():
-        raise BaselineError(f"{folder} holds no {RESULT}: give the folder of a run that has finished")
-    try:
-        result = Result.model_validate_json(path.read_bytes())
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise BaselineError(f"{path} is no result of a run: {place}: {first['msg']}") from error
+    result = read_result(folder)
     if result.dynamics is None:
         raise BaselineError(
-            f"{path} has no inertial parameters, since the run had --no-dynamics; identify the robot again"
+            f"{folder / RESULT} has no inertial parameters, since the run had --no-dynamics; identify the "
+            "robot again"
         )
     return gravity_model_of_result(result)
 
@@ -70,15 +80,13 @@ def gravity_model_of_result(result: Result) -> GravityModel:
     if dynamics is None:
         raise ValueError("a result without dynamics has no inertial parameters")
     chain = result.chain.chain()
-    phi = np.array(dynamics.phi) if dynamics.bodies is None else _phi(chain, dynamics.bodies)
-    return GravityModel(result.robot, tuple(result.types[s] for s in chain.serials), chain, read_only(phi))
-
-
-def _phi(chain: Chain, part: BodiesPart) -> Array:
-    """Return the parameters (10 n,) in the root frame of bodies given in their links' frames."""
-    by_serial = {one.serial: one for one in part.bodies}
-    pairs = zip(chain.serials, link_homes(chain), strict=True)
-    return np.concatenate([parameter_transform(home) @ _about_origin(by_serial[s]) for s, home in pairs])
+    phi = np.array(dynamics.phi)
+    if dynamics.bodies is not None:
+        by_serial = {one.serial: one for one in dynamics.bodies.bodies}
+        pairs = zip(chain.serials, link_homes(chain), strict=True)
+        phi = np.concatenate([parameter_transform(home) @ _about_origin(by_serial[s]) for s, home in pairs])
+    types = tuple(result.types[s] for s in chain.serials)
+    return GravityModel(result.robot, types, chain, read_only(phi))
 
 
 def _about_origin(one: ModuleBodyPart) -> Array:
