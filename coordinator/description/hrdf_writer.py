@@ -77,16 +77,20 @@ def hrdf_element(
     chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None = None, name: str = "robot"
 ) -> Element:
     """Return the `robot` element; for the arguments and errors see `write_hrdf`."""
-    written = _prepared(chain, types, phi)
+    housing, tip, axes = housing_homes(chain, types), distal_homes(chain, types), link_homes(chain)
+    bodies = None if phi is None else check_phi(chain, phi).reshape(len(chain.serials), PER_BODY)
+    made = tuple(_actuator(chain, k, kind, tip[k]) for k, kind in enumerate(types))
+    is_made = np.array([m is not None for m in made])[:, None, None]
+    entry, leave = np.where(is_made, housing, axes), np.where(is_made, tip, axes)
     rot = numbers(upright_pose(chain.gravity)[:3, :3])
     robot = Element("robot", version=VERSION, rot=rot, description=name)
     order = ", ".join(chain.serials[k] for k in joint_order(chain))
     comment(robot, f"Lengths in m. The order of the degrees of freedom: {order}.")
-    if phi is None:
-        comment(robot, "Masses of links are not identified: only the actuators have their types' mass.")
-    else:
-        comment(robot, "The modules' own masses are part of the identified bodies.")
-    _follow(robot, written, BASE, np.eye(4))
+    unidentified = "Masses of links are not identified: only the actuators have their types' mass."
+    comment(
+        robot, unidentified if phi is None else "The modules' own masses are part of the identified bodies."
+    )
+    _follow(robot, _Robot(chain, entry, leave, made, tip, bodies), BASE, np.eye(4))
     return robot
 
 
@@ -99,15 +103,6 @@ def joint_order(chain: Chain) -> tuple[int, ...]:
         order.append(joint)
         stack += reversed(chain.children(joint))
     return tuple(order)
-
-
-def _prepared(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None) -> _Robot:
-    housing, tip, axes = housing_homes(chain, types), distal_homes(chain, types), link_homes(chain)
-    bodies = None if phi is None else check_phi(chain, phi).reshape(len(chain.serials), PER_BODY)
-    made = tuple(_actuator(chain, k, kind, tip[k]) for k, kind in enumerate(types))
-    is_made = np.array([m is not None for m in made])[:, None, None]
-    entry, leave = np.where(is_made, housing, axes), np.where(is_made, tip, axes)
-    return _Robot(chain, entry, leave, made, tip, bodies)
 
 
 def _actuator(chain: Chain, k: int, kind: ModuleType, output: Array) -> str | None:

@@ -56,23 +56,21 @@ def clearance_m(chain: Chain, q_rad: Array, home_rad: Array) -> Array:
             out.
     """
     axes = link_axes(chain)
-    first, second = np.triu_indices(len(axes.body), 1)
-    at_home = _distances(chain, axes, home_rad[None], first, second)[0]
+    pairs = np.array(np.triu_indices(len(axes.body), 1))
+    at_home = _distances(chain, axes, home_rad[None], pairs)[0]
     apart = at_home > TOUCHING_M
     if not apart.any():
         return np.full(len(q_rad), np.inf)
     allowed = np.minimum(CLEARANCE_M, at_home[apart] - NEARER_M)
-    spare = _distances(chain, axes, q_rad, first[apart], second[apart]) - allowed
+    spare = _distances(chain, axes, q_rad, pairs[:, apart]) - allowed
     return np.asarray(CLEARANCE_M + spare.min(axis=1))
 
 
-def _distances(
-    chain: Chain, axes: LinkAxes, q_rad: Array, first: NDArray[np.int64], second: NDArray[np.int64]
-) -> Array:
-    """Return (m, pairs) distances of the links' axes."""
+def _distances(chain: Chain, axes: LinkAxes, q_rad: Array, pairs: NDArray[np.int64]) -> Array:
+    """Return (m, k) distances of the links' axes of pairs (2, k)."""
     displaced = body_displacements(chain, q_rad)[:, axes.body]
     ends = np.einsum("mkij,kej->mkei", displaced[..., :3, :3], axes.ends) + displaced[:, :, None, :3, 3]
-    return segment_distances(ends[:, first], ends[:, second])
+    return segment_distances(ends[:, pairs[0]], ends[:, pairs[1]])
 
 
 def segment_distances(one: Array, other: Array) -> Array:

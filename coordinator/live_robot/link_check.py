@@ -35,7 +35,11 @@ async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Cal
         if not faults:
             break
     for serial in group.serials:
-        note(_summary(group, serial, rates[serial]))
+        median, most = (float(np.percentile(_trips_ms(group, serial), share)) for share in (50, 95))
+        note(
+            f"{serial} ({group.info(serial).module_type}): {rates[serial]:.0f} rows/s, round trip "
+            f"{median:.2f} ms, 95 % {most:.2f} ms"
+        )
     if faults:
         raise UnfitLink(faults[0])
 
@@ -48,12 +52,6 @@ async def _ask_until(group: ModuleGroup, serial: str, clock: Clock, end_ns: int)
 
 def _trips_ms(group: ModuleGroup, serial: str) -> list[float]:
     return [(trip.received_ns - trip.sent_ns) / 1e6 for trip in group.module(serial).round_trips]
-
-
-def _summary(group: ModuleGroup, serial: str, rate: float) -> str:
-    median, most = (float(np.percentile(_trips_ms(group, serial), share)) for share in (50, 95))
-    kind = group.info(serial).module_type
-    return f"{serial} ({kind}): {rate:.0f} rows/s, round trip {median:.2f} ms, 95 % {most:.2f} ms"
 
 
 def _fault(group: ModuleGroup, serial: str, rate: float) -> str:
