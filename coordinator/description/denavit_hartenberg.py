@@ -2,8 +2,7 @@
 
 Frame i - 1 has its z along the axis of joint i, so that joint i turns A_i = Rz(theta_i + q_i) Tz(d_i) Tx(a_i)
 Rx(alpha_i). They exist for serial chains only: a tree has one table per path from a root to a leaf. Two axes
-that are all but parallel have a common normal far away, and d is then dominated by noise
-(Hayati 1983).
+that are all but parallel have a common normal far away, and d is dominated by noise (Hayati 1983).
 """
 
 from itertools import pairwise

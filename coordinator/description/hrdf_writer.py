@@ -3,10 +3,8 @@
 A forward X5 module is an `actuator`, which goes from its housing to its output; what was identified between
 two modules is a `rigid-body`. The format has no actuator that is mounted by its output and none for modules
 other than its own types: those are a `joint` about z between rigid bodies. Every joint is tagged with its
-serial, every end of a branch with `tip_<serial>`. The format knows no IMUs, no limits but the types', and no
-uncertainty: those are in `result.json`.
-
-The base frame has z up; the degrees of freedom are in the order of the file, which a comment in it repeats.
+serial, every end of a branch with `tip_<serial>`. IMUs, limits and uncertainty are in `result.json` only. The
+base frame has z up; the degrees of freedom are in the order of the file, which a comment in it repeats.
 """
 
 from collections.abc import Sequence
@@ -38,12 +36,7 @@ SAME_BELOW = 1e-11
 
 
 class _Robot(NamedTuple):
-    """The robot as it is written, in the root frame at q = 0.
-
-    entry, leave: (n, 4, 4) the frames before and after every joint's element. actuator: its type, None for a
-    joint without actuator. tip: (n, 4, 4) the faces that the joints move. bodies: (n, 10) inertial
-    parameters, or None.
-    """
+    """The frames before, after and at the moved face of every joint, its actuator and inertial parameters."""
 
     chain: Chain
     entry: Array
@@ -56,15 +49,10 @@ class _Robot(NamedTuple):
 def write_hrdf(
     path: Path, chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None = None, name: str = "robot"
 ) -> None:
-    """Write the robot; the file is the complete old or the complete new one.
+    """Write the robot of n joints, with a type each; the file is the complete old or the complete new one.
 
-    Args:
-        path: the file.
-        chain: n joints.
-        types: per joint.
-        phi: (10 n,) inertial parameters as in `torque_regressor`. They include the modules' own masses, so
-            that the actuators get none; without them the actuators have their types' and links none.
-        name: of the robot.
+    phi: (10 n,) inertial parameters as in `torque_regressor`. They include the modules' own masses, so that
+    the actuators get none; without them the actuators have their types' and links none.
 
     Raises:
         ValueError: `phi` or `types` do not fit the chain.
@@ -114,10 +102,7 @@ def _actuator(chain: Chain, k: int, kind: ModuleType, output: Array) -> str | No
 
 
 def _follow(parent: Element, robot: _Robot, carrier: int, frame: Array) -> None:
-    """Add the elements of the body `carrier`; `frame` is where the element before it ended.
-
-    Without recursion over a chain: one of a hundred joints is as deep as it is long.
-    """
+    """Add the elements of the body `carrier`, which begins at `frame`; recursive at forks only."""
     while True:
         children = robot.chain.children(carrier)
         if len(children) != 1:

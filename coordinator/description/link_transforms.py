@@ -47,12 +47,9 @@ def link_transforms(
 ) -> tuple[LinkTransform, ...]:
     """Return one transform per module that has a parent, in the order of the chain.
 
-    Args:
-        chain: n joints.
-        types: per joint.
-        covariance: (6 n, 6 n) of the chain's perturbations (`apply_perturbation`).
-        null_basis: (6 n, k) unobservable perturbations of length 1. Exact motions
-            (`null_space.Unresolved`) name parameters sharper than the null vectors of a noisy fit.
+    covariance: (6 n, 6 n) of the chain's perturbations (`apply_perturbation`). null_basis: (6 n, k)
+    unobservable perturbations of length 1. Exact motions (`null_space.Unresolved`) name parameters sharper
+    than the null vectors of a noisy fit.
 
     Raises:
         ValueError: the arguments do not fit the chain.

@@ -1,9 +1,8 @@
 """The chain as a product of exponentials: screw axes in the space frame and the tips' poses at q = 0.
 
 T_tip(q) = exp([S_1] q_1) ... exp([S_k] q_k) M_tip over the joints from the base to the tip (Lynch and Park,
-Modern Robotics, eq. 4.14). Unlike Denavit-Hartenberg parameters it exists for every robot, and is as well
-conditioned for parallel axes as for any other. Twists are [rotation, translation], the space frame is the
-root frame.
+Modern Robotics, eq. 4.14): for every robot, and as well conditioned for parallel axes as for any other.
+Twists are [rotation, translation], the space frame is the root frame.
 """
 
 from collections.abc import Sequence
@@ -48,12 +47,9 @@ class ScrewModel(NamedTuple):
 
 
 def screw_model(chain: Chain, types: Sequence[ModuleType], covariance: ArrayLike) -> ScrewModel:
-    """Return the screws and tips of a chain.
+    """Return the screws and tips of a chain whose modules' types say where the outputs are.
 
-    Args:
-        chain: n joints.
-        types: per joint, which say where the outputs are.
-        covariance: (6 n, 6 n) of the chain's perturbations (`apply_perturbation`).
+    covariance: (6 n, 6 n) of the chain's perturbations (`apply_perturbation`).
 
     Raises:
         ValueError: types or covariance do not fit the chain.

@@ -29,10 +29,8 @@ def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLi
     The inertia of a body is in the link right behind its joint; links fixed to that lose their own, which is
     contained in it. Joints get viscous and Coulomb friction.
 
-    Args:
-        robot: of `read_urdf`, whose file is read again. bodies: (n,) in the frames of the links
-        `robot.bodies`.
-        friction: (n, 2) viscous [Nm s/rad] and Coulomb [Nm] of every joint.
+    robot: its file is read again. bodies: (n,) in the frames of the links `robot.bodies`. friction: (n, 2)
+    viscous [Nm s/rad] and Coulomb [Nm] of every joint.
     """
     # Comments of the given file are kept.
     root = parse(robot.path, XMLParser(target=TreeBuilder(insert_comments=True))).getroot()

@@ -37,16 +37,11 @@ def write_urdf(
     name: str = "robot",
     module_types: Sequence[ModuleType] | None = None,
 ) -> None:
-    """Write the robot; the file is the complete old or the complete new one.
+    """Write the robot of n joints; the file is the complete old or the complete new one.
 
-    Args:
-        path: the file.
-        chain: n joints.
-        phi: (10 n,) inertial parameters as in `torque_regressor`, None to write no inertias. Parameters that
-            are no real body's are replaced by the nearest real body (`nearest_consistent`), and a comment
-            says so.
-        name: of the robot.
-        module_types: per joint; their effort and speed limits are written.
+    phi: (10 n,) inertial parameters as in `torque_regressor`, None to write no inertias. Parameters that are
+    no real body's are replaced by the nearest real body (`nearest_consistent`), and a comment says so.
+    module_types: per joint; their effort and speed limits are written.
 
     Raises:
         ValueError: `phi` or `module_types` do not fit the chain.

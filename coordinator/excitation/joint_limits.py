@@ -30,8 +30,7 @@ RANGE_SHARE = 0.9
 # Links and brackets weigh about 0.6 of the modules; a module with its link reaches about 0.12 m further.
 LINK_MASS_SHARE = 0.6
 REACH_PER_MODULE_M = 0.12
-# Of the torque that holds an arm level: a module that can carry an arm has at least this share left to move
-# it.
+# Share of the torque that holds an arm level which a module that can carry the arm has left to move it.
 LEVEL_SHARE = 0.05
 # Of any motion: 100 a period at 4 Hz for 15 s.
 PEAK_SAMPLES = 6001
@@ -68,12 +67,9 @@ def continuous_torque_nm(kind: ModuleType) -> float:
 
 
 def joint_limits(kind: ModuleType, rest_torque_nm: float, inertia_kg_m2: float) -> JointLimits:
-    """Return the limits of a joint.
+    """Return the limits of a joint by its type, its torque at rest and an upper bound of its inertia.
 
-    Args:
-        kind: its type.
-        rest_torque_nm: its torque at rest where the motion takes place.
-        inertia_kg_m2: of all that it moves, about its axis; an upper bound.
+    The torque is that where the motion takes place, the inertia that of all that moves, about the axis.
 
     Raises:
         ValueError: an inertia that is not positive.
@@ -131,11 +127,8 @@ class Load(NamedTuple):
 def measured_load(q_rad: Array, tau_nm: Array, rate_hz: float) -> Load:
     """Fit tau = I d2q/dt2 + c dq/dt + a q + b to one motion of one joint, the others held.
 
-    Over a turn in one direction dry friction is part of b, and gravity is straight to first order.
-
-    Args:
-        q_rad, tau_nm: (m,) samples of the joint's position and measured torque.
-        rate_hz: of the samples.
+    q_rad, tau_nm: (m,) samples of the joint's position and measured torque. Over a turn in one direction dry
+    friction is part of b, and gravity is straight to first order.
 
     Raises:
         ValueError: a motion that is too short for the low-pass.

@@ -59,11 +59,7 @@ def robot_excitation(
 
 
 def excitation_task(chain: Chain, modules: Sequence[RobotModule], plan: Plan) -> ExcitationTask:
-    """Return the excitation task of a robot by its modules and the prior of its bodies.
-
-    Raises:
-        ValueError: there is not one module per joint.
-    """
+    """Return the excitation task of a robot by its modules, one per joint, and the prior of its bodies."""
     types = [module.kind for module in modules]
     phi = np.concatenate([parameters(body) for body in module_prior(chain, types)])
     home = np.full(len(types), plan.home_rad)

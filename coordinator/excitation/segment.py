@@ -13,8 +13,7 @@ from module_agent.model.read_only import make_read_only, read_only
 from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import GoTo, MultiSine, Sine
 
-# Sines per joint, within the band: fast enough for inertia to show against gravity, slow enough for compliant
-# links and for the joints' own bandwidth.
+# Sines per joint, fast enough for inertia to show against gravity, slow enough for compliant links.
 SINES = 3
 BAND_HZ = (0.2, 1.6)
 # Share of the limits of speed and acceleration that is used: the taper adds the rest.

@@ -1,9 +1,8 @@
 """Clearance of a robot from itself: its links as capsules, of which only the axes are known.
 
-A link is the straight line from a joint to the next module's housing, by the chain; a tool on the last module
-is not known. Links that are near to each other at home are built that close, and may come only a little
-nearer. Neighbours meet in the joint between them and are not checked: it takes a turn of more than 2 rad to
-fold one onto the other.
+A link is the straight line from a joint to the next module's housing; a tool on the last module is not known.
+Links that are near to each other at home are built that close, and may come only a little nearer. Neighbours
+meet in their joint and are not checked: it takes more than 2 rad to fold one onto the other.
 """
 
 from typing import NamedTuple
@@ -46,14 +45,10 @@ def link_axes(chain: Chain) -> LinkAxes:
 
 
 def clearance_m(chain: Chain, q_rad: Array, home_rad: Array) -> Array:
-    """Return how near any two links come to each other (m,), inf without a pair that can collide.
+    """Return how near any two links come at positions (m, n): (m,), inf without a pair that can collide.
 
-    Args:
-        chain: n joints.
-        q_rad: (m, n) positions.
-        home_rad: (n,) where the robot is known to stand clear of itself: for pairs that are nearer than
-            `CLEARANCE_M` there, coming `NEARER_M` nearer counts as `CLEARANCE_M`; those that meet are left
-            out.
+    home_rad: (n,) where the robot is known to stand clear of itself: for pairs nearer than `CLEARANCE_M`
+    there, coming `NEARER_M` nearer counts as `CLEARANCE_M`; those that meet are left out.
     """
     axes = link_axes(chain)
     pairs = np.array(np.triu_indices(len(axes.body), 1))

@@ -32,8 +32,7 @@ class Search(NamedTuple):
     expect: int | None = None
 
 
-# Agents without a hub look for one once a second, and each try lasts a second: a program that becomes their
-# hub waits for them.
+# Agents without a hub look for one every second, for a second: their new hub waits for them.
 AS_HUB_S = 2.5
 MAX_S = 10.0
 

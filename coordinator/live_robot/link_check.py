@@ -9,8 +9,7 @@ from coordinator.live_robot.errors import UnfitLink
 from coordinator.live_robot.messenger import Clock, gather_all
 from coordinator.live_robot.module_group import ModuleGroup
 
-# This share of the round trips must take at most half a command's lifetime: the keep-alives in between,
-# several per lifetime, bridge the rest.
+# This share of the round trips must take at most half a command's lifetime; the keep-alives bridge the rest.
 FIT_FRACTION = 0.8
 # Measurements at most, each as long as the plan says: a poor network may be worst during one of them.
 MAX_MEASUREMENTS = 3
@@ -21,8 +20,7 @@ async def check_link(group: ModuleGroup, clock: Clock, seconds: float, note: Cal
     """Measure rates and round trips of all modules and note them.
 
     Raises:
-        UnfitLink: after `MAX_MEASUREMENTS`, feedback of a module is lost, or commands would be too old on
-            arrival.
+        UnfitLink: after `MAX_MEASUREMENTS`, feedback is lost, or commands would be too old on arrival.
     """
     before = {serial: group.module(serial).rows.end_row for serial in group.serials}
     start_ns = clock()

@@ -46,8 +46,8 @@ SILENT_NS = 1_000_000_000
 TOKEN_GONE_NS = 300_000_000
 # Refusals that the next attempt can resolve: it carries a newer echo and a newer sequence number.
 PASSING = (Refusal.STALE.value, Refusal.SEQUENCE.value)
-# Refusals of a motion that re-arming resolves. A SEQUENCE refusal of every attempt means that the motion has
-# ended already: it had begun, and the answer and the keep-alives were lost.
+# Refusals of a motion that re-arming resolves. If every attempt is refused by SEQUENCE, the motion has ended
+# already: it had begun, and the answer and the keep-alives were lost.
 UNSTARTED = (Refusal.NOT_ARMED.value, Refusal.NO_LEASE.value, Refusal.SEQUENCE.value)
 
 T = TypeVar("T")
@@ -168,8 +168,7 @@ class ModuleGroup:
         """Check that every module is still present and held.
 
         Raises:
-            ModuleLost: a module's token is missing, it sends no feedback, it has booted again, or another
-                sender took its lease.
+            ModuleLost: its token or feedback is missing, it has booted again, or its lease was taken.
             RobotStopped: a module that this sender holds was stopped.
         """
         now = self._clock()
@@ -237,8 +236,7 @@ class ModuleGroup:
         """Renew all leases until cancelled; a late answer does not hold up the next renewal.
 
         While renewals are late or lost, the running motions are commanded again in between, which renews the
-        lease too. Messages on one key keep their order, so that a late one delays all behind it; on two keys
-        that seldom happens at the same time.
+        lease too: messages keep their order on one key, and are seldom late on two keys at the same time.
         """
         while True:
             self.renew()
@@ -335,13 +333,11 @@ class ModuleGroup:
     ) -> dict[str, MotionRecord]:
         """Run one motion on each of the given modules at the same time; return their records.
 
-        `efforts` are fed forward along the motions of the modules that they name; the effort loops of the
-        others are off.
+        `efforts` are fed forward along the motions of their modules; the effort loops of the others are off.
 
         Raises:
             KeyError: efforts of a module that has no motion.
-            MotionInterrupted: one of them expired or was stopped, or another module that this sender holds
-                expired meanwhile and released its joint.
+            MotionInterrupted: one of them expired or was stopped, or another held module expired meanwhile.
             ModuleLost: see `check`.
         """
         fed = efforts or {}

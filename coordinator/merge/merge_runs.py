@@ -71,10 +71,8 @@ def merge_runs(
 ) -> MergedInformation:
     """Return the base parameters of module parts that runs determine together.
 
-    Args:
-        runs: at least one, each a robot of some of the modules.
-        tolerance: singular values below this share of the largest count as zero; the default is for chains
-            that were themselves estimated.
+    Singular values below the share `tolerance` of the largest count as zero; the default is for chains that
+    were themselves estimated.
 
     Raises:
         MergeError: no runs, the same run twice, or runs with no module in common.

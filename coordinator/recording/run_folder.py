@@ -29,9 +29,7 @@ class RunFolderError(UsageError):
 
 
 def check_free(path: Path) -> None:
-    """Check that a new run may use the folder, without making it.
-
-    A run that ended before its first step, for example because no module was found, does not count.
+    """Check that a new run may use the folder; one that ended before its first step does not count.
 
     Raises:
         RunFolderError: it holds a run already.
@@ -41,14 +39,10 @@ def check_free(path: Path) -> None:
 
 
 def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path | None:
-    """Make the folder; return the recording of the crashed run to resume from, if there is one.
+    """Make the folder; return the recording of the crashed run to `resume` from, if there is one.
 
     The crashed run's recording is set aside under another name and kept until the resumed run is complete.
-
-    Args:
-        path: of the folder.
-        resume: continue the run in the folder.
-        robot: name of the robot that the run to resume must be of; None for any.
+    It must be of the robot of that name, None for any.
 
     Raises:
         RunFolderError: the folder holds a run already and `resume` is false, or nothing is there to resume,

@@ -1,8 +1,7 @@
 """Feed-forward torques of a motion from the identified model: the thesis' input mode 3 (chapter 6.3.2).
 
-The effort of a module, and the set-point of its effort loop, is the torque of its spring on its output. It is
-therefore that of the rigid bodies alone, tau = Y(q, qd, qdd) phi (eq. 28): friction, gear loss and the
-rotor's inertia act before the spring and are compensated by the module's loops.
+The effort of a module, and its set-point, is the torque of its spring on its output: that of the rigid bodies
+alone, tau = Y(q, qd, qdd) phi (eq. 28). Friction, gear loss and the rotor's inertia act before the spring.
 """
 
 from collections.abc import Mapping, Sequence
@@ -76,9 +75,7 @@ def standing(reference: Reference, row: int, length_s: float) -> Reference:
 def feed_forward(chain: Chain, phi: ArrayLike, reference: Reference) -> SetPoints:
     """Return the spring torques along a reference whose columns are in the chain's order.
 
-    Args:
-        chain: as identified.
-        phi: (10 n,) or (n, 10), its inertial parameters. Only their identifiable combinations have an effect.
+    phi: (10 n,) or (n, 10) inertial parameters; only their identifiable combinations have an effect.
 
     Raises:
         ValueError: another number of joints or parameters, or values that are not finite.

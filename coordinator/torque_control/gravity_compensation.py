@@ -2,15 +2,13 @@
 
 Under torque control the commanded spring torque of every joint is that of the bodies beyond it,
 tau = C(q, qd) qd + g(q) (eq. 28 without acceleration). Friction and gear loss act before the spring, inside
-the effort loop, which compensates them. The residual friction holds the arm where the model's error is
-smaller.
+the effort loop, which compensates them; what remains holds the arm where the model's error is smaller.
 
     loading       factory gains; holds the position; the torque fades from the measured to the modelled one
     loaded        holds; waits for the gains of torque control
     releasing     the stiffness of the position loop fades to zero
     compensating  the modelled weight is exerted, nothing else
-    holding       the position loop regains its stiffness, at the measured position; if it had not been
-                  released yet, at the held position
+    holding       the position loop regains its stiffness, at the measured position, or still at the held one
     held          holds
     returning     moves to a given position under position control
 
@@ -143,8 +141,7 @@ class GravityCompensator:
         `reading` should be the mean of some rows, since its torques are compared with the model.
 
         Raises:
-            CompensationRefused: a joint needs more torque than it has, is at the end of its range, or carries
-                another load than the modelled one.
+            CompensationRefused: a joint is overloaded, at the end of its range, or not loaded as modelled.
         """
         weight_nm = self._model.effort_nm(reading.q_rad, np.zeros_like(reading.q_rad))
         reason = (
@@ -238,10 +235,7 @@ class GravityCompensator:
         return min(max((t_s - self._since_s) / length_s, 0.0), 1.0)
 
     def _held(self, t_s: float, q_rad: Array) -> Array | None:
-        """Return the position set-points, None when the position loops are off.
-
-        A share of the stiffness is a set-point at that share of the way from the measured to the held one.
-        """
+        """Return the set-points: a share of the stiffness is that share of the way to the held position."""
         if self.phase == "compensating":
             return None
         if self._held_share is not None and self.phase == "holding":

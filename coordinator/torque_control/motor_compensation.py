@@ -10,12 +10,10 @@ efficiency and the back-EMF; the loops compensate the rest, which shows as track
     u = (R i + K N thd) / 48 V                   R at the winding's temperature
 
 and the torque set-point is raised until the effort loop, whose response to a target is E + F (gain and
-feed-forward), adds the missing PWM. Single modules deviate from the catalogue's friction by a tenth or more;
-the loops compensate that.
+feed-forward), adds the missing PWM. The loops compensate what single modules deviate from the catalogue.
 
-Thermal model of R: winding, housing and body are three heat capacities in a row. Within the seconds of a
-motion the winding follows its losses, the housing warms a little, and the body does not. Constants are the
-manufacturer's.
+Thermal model of R: winding, housing and body are three heat capacities in a row, the manufacturer's. Within
+the seconds of a motion the winding follows its losses, the housing warms a little, and the body does not.
 """
 
 from collections.abc import Sequence
@@ -44,12 +42,10 @@ _STRATEGIES_WITH_EFFORT = (2, 3, 4)
 
 
 def winding_c(cold_w: Array, step_s: float, start_c: float) -> Array:
-    """Return the winding's temperature (m,) [deg C] from `start_c` on.
+    """Return the winding's temperature (m,) [deg C] from `start_c`, as measured, on.
 
-    Args:
-        cold_w: (m,) the losses i^2 R that the current makes in a winding at the ambient temperature [W].
-        step_s: between them; much less than the winding's 1.7 s.
-        start_c: as measured. The housing is as warm as the first losses leave it to be.
+    cold_w: (m,) losses i^2 R [W] of a winding at the ambient temperature, every `step_s`, which is much less
+    than the winding's 1.7 s. The housing begins as warm as the first losses leave it.
     """
     found = np.empty(len(cold_w))
     winding = start_c
@@ -76,7 +72,7 @@ def with_motor_compensation(
 ) -> SetPoints:
     """Return set-points at 1 kHz whose efforts include the motors' losses, one type and gains per column.
 
-    `winding_start_c` are the windings' temperatures at the start of the reference, by default the ambient's.
+    `winding_start_c`: the windings' temperatures at the start of the reference, by default the ambient's.
     A joint with an integrating loop is left unchanged: the loop compensates by itself, and would wind up.
 
     Raises:

@@ -18,8 +18,7 @@ DISCOVER_S, QUIET_S = 12.0, 3.0
 UNKNOWN_MODULES_S = 0.5
 # Modules send feedback without a lease; a network may lose some.
 FEEDBACK_S = 2.0
-# Largest angle between measured and modelled gravity of an IMU: errors as delivered are under 3 degrees, a
-# lost joint zero makes more.
+# Largest angle between measured and modelled gravity of an IMU; errors as delivered are under 3 degrees.
 MAX_TILT_RAD = float(np.radians(12.0))
 
 
@@ -28,9 +27,7 @@ class RobotMismatch(RobotError):
 
 
 async def find_robot(group: ModuleGroup, messenger: Messenger, model: GravityModel, clock: Clock) -> None:
-    """Wait until all modules of the model are there, and check that they are the same.
-
-    Serials and types must be the same; boots may differ.
+    """Wait until all modules of the model are there, and check that serials and types are the same.
 
     Raises:
         RobotMismatch: a module is missing, has another type, sends no feedback, or is not in the model.
