@@ -15,6 +15,16 @@ from coordinator.recording.run_folder import RESULT
 from tests import random_chains
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the processes in real time: they stay on one worker and take longest."""
+
+    def later(item: pytest.Item) -> bool:
+        group = item.get_closest_marker("xdist_group")
+        return group is None or group.args != ("integration",)
+
+    items.sort(key=later)
+
+
 @pytest.fixture
 def rng() -> Generator:
     return np.random.default_rng(20261121)
