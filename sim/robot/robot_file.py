@@ -4,23 +4,18 @@ A link leads from the distal frame of the parent (its output; its housing if the
 to the proximal frame of the child (its housing; its output if the child is mounted reversed).
 """
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    BeforeValidator,
-    Field,
-    ValidationError,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, ValidationInfo, model_validator
 
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import RobotError, UsageError
-from module_agent.network_emulation.profile_file import network, network_relative_to
+from module_agent.network_emulation.profile_file import network as network_profile
+from module_agent.network_emulation.profile_file import network_relative_to
 from module_agent.network_emulation.toml_location import Location, fault_lines, faults_of, parse_toml
 from module_agent.wire.keys import check_chunk
 from sim.geometry.link_parts import Angle, FreePose, Part, Solid, Strict, Xyz
@@ -47,12 +42,23 @@ def _in_a_list(value: Any) -> Any:
     return [value] if isinstance(value, dict) else value
 
 
-def _known(value: str, lookup: Any) -> str:
-    try:
-        lookup(value)
-    except RobotError as error:
-        raise ValueError(str(error)) from error
-    return value
+def _known(lookup: Callable[[str], object]) -> AfterValidator:
+    """Return the validator of a name whose look-up succeeds."""
+
+    def check(value: str) -> str:
+        try:
+            lookup(value)
+        except RobotError as error:
+            raise ValueError(str(error)) from error
+        return value
+
+    return AfterValidator(check)
+
+
+def _check_serial(serial: str) -> None:
+    if serial == BASE:
+        raise ValueError(f"{BASE!r} is the base's own name; call the module otherwise")
+    check_chunk("serial", serial)
 
 
 Stiffness = Annotated[float, Field(ge=0.0, le=1e9)]
@@ -141,8 +147,8 @@ class Module(Strict):
     side of the joint: mass, centre and inertia in the output's frame, or the housing's if mounted reversed.
     """
 
-    serial: str
-    type: str
+    serial: Annotated[str, _known(_check_serial)]
+    type: Annotated[str, _known(module_type)]
     parent: str
     mounted: Literal["forward", "reversed"] = "forward"
     start_rad: Annotated[float, Field(ge=-100.0, le=100.0)] = 0.0
@@ -150,17 +156,9 @@ class Module(Strict):
     payload: FreePose | None = None
     flex: Flex | None = None
 
-    @field_validator("serial")
-    @classmethod
-    def _fits_a_key(cls, serial: str) -> str:
-        if serial == BASE:
-            raise ValueError(f"{BASE!r} is the base's own name; call the module otherwise")
-        return _known(serial, partial(check_chunk, "serial"))
 
-    @field_validator("type")
-    @classmethod
-    def _in_the_catalogue(cls, name: str) -> str:
-        return _known(name, module_type)
+def _resolved(name: str, info: ValidationInfo) -> str:
+    return network_relative_to(name, (info.context or {}).get("folder", Path()))
 
 
 class Robot(Strict):
@@ -169,27 +167,11 @@ class Robot(Strict):
     `network` is a profile's name, or the path of a network file, in the robot's file from its own folder.
     """
 
-    name: str
-    network: str = "none"
-    noise: str = DEFAULT_PROFILE
+    name: Annotated[str, _known(partial(check_chunk, "robot"))]
+    network: Annotated[str, AfterValidator(_resolved), _known(network_profile)] = "none"
+    noise: Annotated[str, _known(noise_profile)] = DEFAULT_PROFILE
     base: Base = Base()
     modules: Annotated[tuple[Module, ...], Field(alias="module", min_length=1, max_length=64)]
-
-    @field_validator("name")
-    @classmethod
-    def _fits_a_key(cls, name: str) -> str:
-        return _known(name, partial(check_chunk, "robot"))
-
-    @field_validator("network")
-    @classmethod
-    def _known_network(cls, name: str, info: ValidationInfo) -> str:
-        resolved = network_relative_to(name, (info.context or {}).get("folder", Path()))
-        return _known(resolved, network)
-
-    @field_validator("noise")
-    @classmethod
-    def _known_noise(cls, name: str) -> str:
-        return _known(name, noise_profile)
 
     @property
     def serials(self) -> tuple[str, ...]:
@@ -206,11 +188,6 @@ class Robot(Strict):
     def start_rad(self) -> Array:
         """The joint positions in which the world begins, (n,) [rad]."""
         return np.array([m.start_rad for m in self.modules])
-
-
-class _Fault(NamedTuple):
-    location: Location
-    reason: str
 
 
 def shipped_robots() -> tuple[str, ...]:
@@ -251,24 +228,23 @@ def parse_robot(text: str, name: str) -> Robot:
     return robot.model_copy(update={"modules": _depth_first(robot.modules)})
 
 
-def _tree_faults(modules: tuple[Module, ...]) -> list[_Fault]:
-    faults: list[_Fault] = []
+def _tree_faults(modules: tuple[Module, ...]) -> list[tuple[Location, str]]:
+    faults: list[tuple[Location, str]] = []
     first: dict[str, int] = {}
     for i, module in enumerate(modules):
-        if module.serial in first:
+        if first.setdefault(module.serial, i) != i:
             reason = f"serial {module.serial!r} is already that of module[{first[module.serial]}]"
-            faults.append(_Fault(("module", i, "serial"), reason))
-        first.setdefault(module.serial, i)
+            faults.append((("module", i, "serial"), reason))
     for i, module in enumerate(modules):
         if module.parent == module.serial:
-            faults.append(_Fault(("module", i, "parent"), f"module {module.serial!r} is its own parent"))
-        elif module.parent != BASE and module.parent not in first:
+            faults.append((("module", i, "parent"), f"module {module.serial!r} is its own parent"))
+        elif module.parent not in (BASE, *first):
             reason = f"unknown parent {module.parent!r}; known are {', '.join((BASE, *first))}"
-            faults.append(_Fault(("module", i, "parent"), reason))
+            faults.append((("module", i, "parent"), reason))
     return faults or _cycle_faults(modules)
 
 
-def _cycle_faults(modules: tuple[Module, ...]) -> list[_Fault]:
+def _cycle_faults(modules: tuple[Module, ...]) -> list[tuple[Location, str]]:
     parent_of = {m.serial: m.parent for m in modules}
     for i, module in enumerate(modules):
         path = [module.serial]
@@ -276,11 +252,8 @@ def _cycle_faults(modules: tuple[Module, ...]) -> list[_Fault]:
             path.append(parent_of[path[-1]])
         if path[-1] != BASE:
             loop = " -> ".join([*path, parent_of[path[-1]]])
-            return [
-                _Fault(
-                    ("module", i, "parent"), f"the parents of {module.serial!r} never reach the base: {loop}"
-                )
-            ]
+            reason = f"the parents of {module.serial!r} never reach the base: {loop}"
+            return [(("module", i, "parent"), reason)]
     return []
 
 

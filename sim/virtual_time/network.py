@@ -8,13 +8,13 @@ import re
 from collections.abc import Callable
 from functools import lru_cache, partial
 
+from module_agent.transport.handles import Answer, Declaration, Question
 from module_agent.transport.transport import (
     CLOSED,
     NO_ANSWER,
     TIMEOUT,
     Event,
     Liveness,
-    Reply,
     Request,
     Sample,
     Sink,
@@ -56,48 +56,6 @@ def _check(key: str, payload: bytes = b"") -> None:
         raise TypeError(f"a payload is bytes, not {type(payload).__name__}")
 
 
-class _Declaration:
-    """Something declared by an endpoint: a subscription, a service or a watch, with its sink; or a token."""
-
-    __slots__ = ("_network", "endpoint", "key_expr", "kind", "live", "sink")
-
-    def __init__(
-        self,
-        network: "VirtualNetwork",
-        endpoint: "VirtualEndpoint",
-        kind: str,
-        key_expr: str,
-        sink: Sink | None,
-    ):
-        self._network = network
-        self.endpoint = endpoint
-        self.kind = kind
-        self.key_expr = key_expr
-        self.sink = sink
-        self.live = True
-
-    def deliver(self, event: Event) -> None:
-        if self.live and self.sink is not None:
-            self.sink(event)
-
-    def undeclare(self) -> None:
-        if self.live:
-            self.live = False
-            self._network._withdraw(self)
-
-
-class _Question:
-    """A query under way."""
-
-    __slots__ = ("asker", "key", "sink", "tag")
-
-    def __init__(self, asker: "VirtualEndpoint", key: str, sink: Sink, tag: int):
-        self.asker = asker
-        self.key = key
-        self.sink = sink
-        self.tag = tag
-
-
 class VirtualEndpoint:
     """One session of the virtual network, made by `VirtualNetwork.endpoint`."""
 
@@ -111,43 +69,41 @@ class VirtualEndpoint:
         self._check_open(f"publish on {key}")
         self._network._publish(self, key, payload)
 
-    def subscribe(self, key_expr: str, sink: Sink) -> _Declaration:
+    def subscribe(self, key_expr: str, sink: Sink) -> Declaration:
         """Deliver a `Sample` for everything published on a matching key from now on."""
         return self._declare("sample", key_expr, sink)
 
-    def serve(self, key_expr: str, sink: Sink) -> _Declaration:
+    def serve(self, key_expr: str, sink: Sink) -> Declaration:
         """Deliver a `Request` for every query on a matching key."""
         return self._declare("request", key_expr, sink)
 
     def query(self, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int) -> None:
         """Ask; exactly one `Reply` comes, unless this endpoint is killed."""
         self._check_open(f"query {key}")
-        self._network._query(_Question(self, key, sink, tag), payload, timeout_s)
+        self._network._query(self, key, payload, timeout_s, sink, tag)
 
-    def declare_alive(self, key: str) -> _Declaration:
+    def declare_alive(self, key: str) -> Declaration:
         """Hold a liveliness token while this endpoint lives."""
         _check(key)
         return self._declare("token", key, None)
 
-    def watch_alive(self, key_expr: str, sink: Sink) -> _Declaration:
+    def watch_alive(self, key_expr: str, sink: Sink) -> Declaration:
         """Deliver a `Liveness` for every present and future change of a matching token."""
         return self._declare("liveness", key_expr, sink)
 
     def close(self) -> None:
         """End all declarations; queries under way get their `Reply`."""
-        if not self._why_closed:
-            self._why_closed = CLOSED
-            self._network._close(self, answer=True)
+        self._end(CLOSED, answer=True)
 
-    def _kill(self) -> None:
+    def _end(self, why: str, answer: bool) -> None:
         if not self._why_closed:
-            self._why_closed = f"endpoint {self.name!r} was killed"
-            self._network._close(self, answer=False)
+            self._why_closed = why
+            self._network._close(self, answer)
 
-    def _declare(self, kind: str, key_expr: str, sink: Sink | None) -> _Declaration:
+    def _declare(self, kind: str, key_expr: str, sink: Sink | None) -> Declaration:
         self._check_open(f"declare {key_expr}")
         _pattern(key_expr)
-        return self._network._add(_Declaration(self._network, self, kind, key_expr, sink))
+        return self._network._add(self, kind, key_expr, sink)
 
     def _check_open(self, what: str) -> None:
         if self._why_closed:
@@ -165,13 +121,12 @@ class VirtualNetwork:
         self._loop = loop
         self._tap = tap
         self._endpoints: dict[str, VirtualEndpoint] = {}
-        # Dictionaries as ordered sets: delivery goes in the order of declaration.
-        self._declared: dict[str, dict[_Declaration, None]] = {
+        # Delivery goes in the order of declaration.
+        self._declared: dict[str, dict[Declaration, tuple[str, VirtualEndpoint]]] = {
             kind: {} for kind in ("sample", "request", "token", "liveness")
         }
-        self._routes: dict[str, tuple[_Declaration, ...]] = {}
-        self._tokens: dict[str, int] = {}
-        self._questions: dict[_Question, None] = {}
+        self._routes: dict[str, tuple[Declaration, ...]] = {}
+        self._questions: dict[Question, VirtualEndpoint] = {}
 
     def endpoint(self, name: str) -> VirtualEndpoint:
         """Open an endpoint; a name is free again when its endpoint was closed or killed.
@@ -194,7 +149,7 @@ class VirtualNetwork:
         """
         if name not in self._endpoints:
             raise KeyError(f"no endpoint {name!r}; open are {', '.join(self._endpoints) or 'none'}")
-        self._endpoints[name]._kill()
+        self._endpoints[name]._end(f"endpoint {name!r} was killed", answer=False)
 
     # The methods below are called by the endpoints and declarations of this module only.
 
@@ -205,100 +160,93 @@ class VirtualNetwork:
             route = self._routes[key] = self._matching("sample", key)
         if type(payload) is not bytes:
             _check(key, payload)
-        if self._tap is not None:
-            self._tap(self._loop.now_ns, endpoint.name, "sample", key, payload)
+        self._note(endpoint, "sample", key, payload)
         if route:
             self._soon(lambda: _deliver(route, Sample(key, payload)))
 
-    def _query(self, question: _Question, payload: bytes, timeout_s: float) -> None:
-        _check(question.key, payload)
-        self._questions[question] = None
-        if self._tap is not None:
-            self._tap(self._loop.now_ns, question.asker.name, "request", question.key, payload)
-        self._soon(lambda: self._ask(question, payload))
+    def _query(
+        self, asker: VirtualEndpoint, key: str, payload: bytes, timeout_s: float, sink: Sink, tag: int
+    ) -> None:
+        _check(key, payload)
+        question = Question(key, tag, sink, self._forget)
+        self._questions[question] = asker
+        self._note(asker, "request", key, payload)
+        self._soon(lambda: self._ask(question, key, payload))
         due_ns = self._loop.now_ns + round(timeout_s * NS_PER_S)
-        self._loop.schedule_ns(due_ns, lambda: self._finish(question, None, TIMEOUT))
+        self._loop.schedule_ns(due_ns, lambda: question.finish(None, TIMEOUT))
 
-    def _ask(self, question: _Question, payload: bytes) -> None:
+    def _forget(self, question: Question) -> None:
+        self._questions.pop(question, None)
+
+    def _ask(self, question: Question, key: str, payload: bytes) -> None:
         if question not in self._questions:
             return
-        servers = self._matching("request", question.key)
+        servers = [(each, self._declared["request"][each][1]) for each in self._matching("request", key)]
         if not servers:
-            self._finish(question, None, NO_ANSWER)
-        for server in servers:
-            server.deliver(Request(question.key, payload, self._answer(question, server.endpoint)))
+            question.finish(None, NO_ANSWER)
+        for declaration, server in servers:
+            answer = Answer(partial(self._answer, question, server, key))
+            declaration.deliver(Request(key, payload, answer))
 
-    def _answer(self, question: _Question, server: VirtualEndpoint) -> Callable[[bytes], None]:
-        used = False
+    def _answer(self, question: Question, server: VirtualEndpoint, key: str, payload: bytes) -> None:
+        _check(key, payload)
+        if not server._why_closed:
+            self._note(server, "reply", key, payload)
+            self._soon(lambda: question.finish(payload))
 
-        def reply(payload: bytes) -> None:
-            nonlocal used
-            _check(question.key, payload)
-            if used or server._why_closed:
-                return
-            used = True
-            if self._tap is not None:
-                self._tap(self._loop.now_ns, server.name, "reply", question.key, payload)
-            self._soon(lambda: self._finish(question, payload, ""))
-
-        return reply
-
-    def _finish(self, question: _Question, payload: bytes | None, error: str) -> None:
-        if question in self._questions:
-            del self._questions[question]
-            question.sink(Reply(question.tag, question.key, payload, error))
-
-    def _add(self, declaration: _Declaration) -> _Declaration:
-        key_expr = declaration.key_expr
-        self._declared[declaration.kind][declaration] = None
-        if declaration.kind == "sample":
+    def _add(self, endpoint: VirtualEndpoint, kind: str, key_expr: str, sink: Sink | None) -> Declaration:
+        tokens = self._tokens()
+        declaration = Declaration(sink, partial(self._withdraw, kind))
+        self._declared[kind][declaration] = key_expr, endpoint
+        if kind == "sample":
             self._routes.clear()
-        elif declaration.kind == "token":
-            self._tokens[key_expr] = self._tokens.get(key_expr, 0) + 1
-            if self._tokens[key_expr] == 1:
-                self._announce(key_expr, True)
-        elif declaration.kind == "liveness":
-            for key in self._tokens:
+        elif kind == "token" and key_expr not in tokens:
+            self._announce(key_expr, True)
+        elif kind == "liveness":
+            for key in tokens:
                 if matches(key_expr, key):
-                    self._tell((declaration,), Liveness(key, True))
+                    self._soon(partial(_deliver, (declaration,), Liveness(key, True)))
         return declaration
 
-    def _withdraw(self, declaration: _Declaration) -> None:
-        key_expr = declaration.key_expr
-        del self._declared[declaration.kind][declaration]
-        if declaration.kind == "sample":
+    def _withdraw(self, kind: str, declaration: Declaration) -> None:
+        if declaration not in self._declared[kind]:
+            return
+        key_expr, _ = self._declared[kind].pop(declaration)
+        if kind == "sample":
             self._routes.clear()
-        elif declaration.kind == "token":
-            self._tokens[key_expr] -= 1
-            if self._tokens[key_expr] == 0:
-                del self._tokens[key_expr]
-                self._announce(key_expr, False)
+        elif kind == "token" and key_expr not in self._tokens():
+            self._announce(key_expr, False)
 
     def _close(self, endpoint: VirtualEndpoint, answer: bool) -> None:
         del self._endpoints[endpoint.name]
         for declared in self._declared.values():
-            for declaration in [d for d in declared if d.endpoint is endpoint]:
+            for declaration in [d for d, (_, holder) in declared.items() if holder is endpoint]:
                 declaration.undeclare()
-        for question in [q for q in self._questions if q.asker is endpoint]:
+        for question in [q for q, asker in self._questions.items() if asker is endpoint]:
             if answer:
-                self._soon(partial(self._finish, question, None, CLOSED))
+                self._soon(partial(question.finish, None, CLOSED))
             else:
-                del self._questions[question]
+                question.withdraw()
+
+    def _tokens(self) -> dict[str, None]:
+        return dict.fromkeys(key for key, _ in self._declared["token"].values())
 
     def _announce(self, key: str, alive: bool) -> None:
-        self._tell(self._matching("liveness", key), Liveness(key, alive))
+        watches = self._matching("liveness", key)
+        if watches:
+            self._soon(lambda: _deliver(watches, Liveness(key, alive)))
 
-    def _tell(self, declarations: tuple[_Declaration, ...], event: Liveness) -> None:
-        if declarations:
-            self._soon(lambda: _deliver(declarations, event))
+    def _matching(self, kind: str, key: str) -> tuple[Declaration, ...]:
+        return tuple(d for d, (key_expr, _) in self._declared[kind].items() if matches(key_expr, key))
 
-    def _matching(self, kind: str, key: str) -> tuple[_Declaration, ...]:
-        return tuple(d for d in self._declared[kind] if matches(d.key_expr, key))
+    def _note(self, sender: VirtualEndpoint, kind: str, key: str, payload: bytes) -> None:
+        if self._tap is not None:
+            self._tap(self._loop.now_ns, sender.name, kind, key, payload)
 
     def _soon(self, call: Callable[[], object]) -> None:
         self._loop.schedule_ns(self._loop.now_ns, call)
 
 
-def _deliver(declarations: tuple[_Declaration, ...], event: Event) -> None:
+def _deliver(declarations: tuple[Declaration, ...], event: Event) -> None:
     for declaration in declarations:
         declaration.deliver(event)

@@ -5,22 +5,22 @@ import tomllib
 from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from module_agent.model.errors import UsageError
-from sim.geometry.link_parts import Xyz
+from module_agent.network_emulation.toml_location import faults_of
+from sim.geometry.link_parts import Strict, Xyz
 
 _NOTHING = (0.0, 0.0, 0.0)
 _EXAMPLE = "serial=X-00011,force_n=[0,0,-10],from_s=2,for_s=0.5"
 # Serials may be given without quotation marks, which a command line would have to protect from the shell.
 _UNQUOTED_SERIAL = re.compile(r"(?<![\w-])serial\s*=\s*(?![\s\"'])([^,\s]+)")
 
-Newton = Annotated[float, Field(ge=-1e4, le=1e4)]
-NewtonMetre = Annotated[float, Field(ge=-1e4, le=1e4)]
+Load = Annotated[float, Field(ge=-1e4, le=1e4)]
 Second = Annotated[float, Field(ge=0.0, le=1e6)]
 
 
-class Push(BaseModel):
+class Push(Strict):
     """A wrench on the body that the joint of module `serial` turns, from `from_s` on for `for_s` [s, world].
 
     `force_n` and `torque_nm` are in world axes (z up) and keep their directions while the robot moves. The
@@ -28,11 +28,9 @@ class Push(BaseModel):
     output's frame of a module that is mounted forward).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
     serial: str
-    force_n: tuple[Newton, Newton, Newton] = _NOTHING
-    torque_nm: tuple[NewtonMetre, NewtonMetre, NewtonMetre] = _NOTHING
+    force_n: tuple[Load, Load, Load] = _NOTHING
+    torque_nm: tuple[Load, Load, Load] = _NOTHING
     at_m: Xyz = _NOTHING
     from_s: Second = 0.0
     for_s: Annotated[float, Field(gt=0.0, le=1e6)]
@@ -65,17 +63,8 @@ def parse_push(text: str) -> Push:
     except tomllib.TOMLDecodeError as error:
         raise UsageError(f"{text!r} is no push: {error}; one is {_EXAMPLE}") from error
     except ValidationError as error:
-        faults = "; ".join(_fault(dict(e)) for e in error.errors(include_url=False))
+        faults = "; ".join(f"{at[0]}: {reason}" if at else reason for at, reason in faults_of(error))
         raise UsageError(f"{text!r} is no push: {faults}; one is {_EXAMPLE}") from error
-
-
-def _fault(error: dict[str, object]) -> str:
-    place = error["loc"]
-    key = str(place[0]) if isinstance(place, tuple) and place else ""
-    reason = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(
-        str(error["type"]), str(error["msg"]).removeprefix("Value error, ")
-    )
-    return f"{key}: {reason}" if key else reason
 
 
 def check_pushed(push: Push, serials: Sequence[str]) -> None:
