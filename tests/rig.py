@@ -12,12 +12,10 @@ from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
 from coordinator.live_robot.messenger import Messenger
 from coordinator.live_robot.module_group import ModuleGroup
-from coordinator.recording.recording import Entry, Recording
+from coordinator.recording.recording import Recording
 from coordinator.session.run import Run, RunConfig
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
 from module_agent.transport.transport import Event, Reply, Request, Sample, Transport, Undeclare
-from module_agent.wire.messages import Message
-from module_agent.wire.refusal import WireError
 from sim.robot.robot_file import load_robot
 from sim.virtual_time.loop import VirtualLoop
 from sim.virtual_time.network import VirtualNetwork
@@ -134,20 +132,12 @@ class Rig(VirtualRobot):
     def group(self, sender: str = "tester") -> tuple[Messenger, Recording, ModuleGroup]:
         """A coordinator's hold on the robot."""
         recording = Recording()
-
-        def record(entry: Entry) -> Message | None:
-            try:
-                message = recording.add(entry)
-            except WireError:
-                return None
-            return message if isinstance(message, Message) else None
-
         messenger = Messenger(
             _Cuttable(self, self.endpoint(sender)),
             self.robot.name,
             lambda: self.loop.now_ns,
             self.loop.call_soon,
-            record,
+            recording.accept,
         )
         messenger.start()
         return messenger, recording, ModuleGroup(messenger, recording, lambda: self.loop.now_ns, sender)

@@ -1,10 +1,13 @@
 """One robot in virtual time: world, network, and one agent for every module, on one event loop."""
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+import asyncio
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from coordinator.runtime.event_loop import Interruption, run_to_end
 from module_agent.firmware.config import config_of
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.loop_inside import LoopInside
@@ -21,6 +24,8 @@ from sim.world.external_force import Push
 from sim.world.truth import TruthLog
 from sim.world.world import TICK_NS, World
 
+T = TypeVar("T")
+
 
 class VirtualSettings(NamedTuple):
     """The settings of a virtual robot; every seed in it follows from `seed`.
@@ -33,7 +38,6 @@ class VirtualSettings(NamedTuple):
     profile: NetworkProfile
     seed: int = 0
     noise: str | NoiseProfile | None = None
-    feedback_rate_hz: float = 250.0
     noise_seed: int | None = None
     pushes: tuple[Push, ...] = ()
 
@@ -54,6 +58,17 @@ class _Wires:
 
     def close(self) -> None:
         self._robot.pwm[self._index] = 0.0
+
+
+@contextmanager
+def virtual_robot(settings: VirtualSettings) -> "Iterator[VirtualRobot]":
+    """Yield a robot in a loop of its own; both end with the context."""
+    robot = VirtualRobot(settings, VirtualLoop())
+    try:
+        yield robot
+    finally:
+        robot.close()
+        robot.loop.close()
 
 
 class VirtualRobot:
@@ -79,13 +94,8 @@ class VirtualRobot:
         self.loop = loop
         self.robot = settings.robot
         self.serials = settings.robot.serials
-        self.world = World(
-            settings.robot,
-            settings.seed,
-            settings.noise,
-            noise_seed=settings.noise_seed,
-            pushes=settings.pushes,
-        )
+        seeds, pushes = (settings.seed, settings.noise_seed), settings.pushes
+        self.world = World(settings.robot, seeds[0], settings.noise, noise_seed=seeds[1], pushes=pushes)
         self.network = VirtualNetwork(loop) if network is None else network
         self.truth = TruthLog(self.world)
         self.pwm = [0.0] * len(self.serials)
@@ -93,7 +103,7 @@ class VirtualRobot:
         self.on_tick: list[Callable[[], None]] = []
         self._profile = settings.profile
         self._endpoint_seeds, self._boot_ids = self._draws(settings)
-        self._firmware = {"feedback_rate_hz": settings.feedback_rate_hz, **firmware}
+        self._firmware = firmware
         self._loops: dict[str, LoopInside] = {}
         self.hosts: dict[str, AgentHost] = {}
         for serial in self.serials:
@@ -151,6 +161,29 @@ class VirtualRobot:
         """Run an agent no more, as SIGSTOP does: its motor gets zero PWM, its endpoint stays."""
         del self.hosts[serial]
         self.pwm[self.serials.index(serial)] = 0.0
+
+    def complete(
+        self,
+        work: Coroutine[Any, Any, T],
+        on_signal: Callable[[Interruption], None] = lambda interruption: None,
+    ) -> T:
+        """Tick until `work` ends, and then end with the loop; return its result or raise its error.
+
+        `on_signal` receives the function that a signal handler calls to end the work with
+        `asyncio.CancelledError` after its clean-up.
+        """
+
+        async def ticking() -> T:
+            try:
+                return await work
+            finally:
+                self.stop()
+                await asyncio.sleep(0)
+
+        self.start()
+        task = self.loop.create_task(ticking())
+        on_signal(Interruption(self.loop, task))
+        return run_to_end(self.loop, task)
 
     def stop(self) -> None:
         """Tick no more."""

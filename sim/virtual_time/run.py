@@ -1,23 +1,20 @@
 """A whole run in virtual time: the same agents, coordinator and world in one process."""
 
-import asyncio
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 from coordinator.excitation.plan import Plan
 from coordinator.identification.result import Result
-from coordinator.runtime.event_loop import Interruption, run_to_end
+from coordinator.runtime.event_loop import Interruption
 from coordinator.session.run import Run, RunConfig
 from coordinator.viewer.feed import Screen
-from coordinator.viewer.targets import ViewerTargets
 from module_agent.network_emulation.profile_file import network
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.truth_view import TruthView
-from sim.virtual_time.loop import VirtualLoop
-from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings, virtual_robot
 from sim.world.external_force import Push
 from sim.world.truth import write_truth
 
@@ -37,8 +34,6 @@ class VirtualConfig(NamedTuple):
     network: str = "lan"
     noise: str | NoiseProfile | None = None
     plan: Plan = Plan()
-    connect_viewer: str | None = None
-    feedback_rate_hz: float = 250.0
     noise_seed: int | None = None
     refined_previews: int = 0
     baseline: Path | None = None
@@ -63,21 +58,18 @@ def run_virtual(
 ) -> Result:
     """Run one identification in virtual time and write the run's folder, truth included.
 
-    `between` receives the robot before the run begins, to schedule faults on its loop; `on_signal` receives
-    the function that a signal handler calls to end the run with `asyncio.CancelledError` after its clean-up.
+    `between` receives the robot before the run begins, to schedule faults on its loop; `on_signal` as in
+    `VirtualRobot.complete`.
     """
-    loop = VirtualLoop()
     settings = VirtualSettings(
         robot=config.robot,
         profile=network(config.network),
         seed=config.seed,
         noise=config.noise,
-        feedback_rate_hz=config.feedback_rate_hz,
         noise_seed=config.noise_seed,
         pushes=config.pushes,
     )
-    robot = VirtualRobot(settings, loop)
-    try:
+    with virtual_robot(settings) as robot:
         run = Run(
             RunConfig(
                 robot=config.robot.name,
@@ -85,34 +77,19 @@ def run_virtual(
                 sender=COORDINATOR,
                 plan=config.plan,
                 expect=len(robot.world.modules),
-                viewer=ViewerTargets(connect=config.connect_viewer),
                 inline=True,
                 refined_previews=config.refined_previews,
                 baseline=config.baseline,
             ),
             robot.endpoint(COORDINATOR),
-            lambda: loop.now_ns,
-            loop.call_soon,
+            lambda: robot.loop.now_ns,
+            robot.loop.call_soon,
             screen,
             TruthView(true_chain(config.robot), [module.type for module in config.robot.modules]),
         )
         if between is not None:
             between(robot)
-        robot.start()
-        task = loop.create_task(_to_end(run, robot))
-        on_signal(Interruption(loop, task))
-        result = run_to_end(loop, task)
+        result = robot.complete(run.run(), on_signal)
         write_truth(config.out / "truth.json", config.robot, robot.world)
         robot.truth.save(config.out / "truth.npz")
         return result
-    finally:
-        robot.close()
-        loop.close()
-
-
-async def _to_end(run: Run, robot: VirtualRobot) -> Result:
-    try:
-        return await run.run()
-    finally:
-        robot.stop()
-        await asyncio.sleep(0)

@@ -3,7 +3,6 @@
 The recording equals a run's `session.mcap`; it is for experiments that need many sessions and no folder.
 """
 
-import asyncio
 from collections.abc import Callable
 
 from coordinator.excitation.joint_limits import NoExcitation
@@ -16,12 +15,10 @@ from coordinator.live_robot.messenger import Messenger
 from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
-from coordinator.runtime.event_loop import run_to_end
 from coordinator.session.session import Session
 from coordinator.topology.next_motion import NextMotion
 from module_agent.model.catalogue import module_type
-from sim.virtual_time.loop import VirtualLoop
-from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings, virtual_robot
 from sim.virtual_time.run import COORDINATOR, SilentScreen
 
 
@@ -36,46 +33,29 @@ def record_session(
         what `coordinator.session.session` raises: no module found, an unfit link, a module lost, a motion
             interrupted.
     """
-    loop = VirtualLoop()
-    robot = VirtualRobot(settings, loop)
     recorder = _MemoryRecorder(plan)
-    endpoint = robot.endpoint(COORDINATOR)
-    messenger = Messenger(
-        endpoint, settings.robot.name, lambda: loop.now_ns, loop.call_soon, recorder.recording.accept
-    )
-    group = ModuleGroup(messenger, recorder.recording, lambda: loop.now_ns, COORDINATOR)
-    session = Session(
-        group, messenger, recorder.recording, plan, lambda: loop.now_ns, recorder.journal, recorder
-    )
-    robot.start()
-    try:
-        recorder.journal(
-            JournalEvent(
-                t_ns=loop.now_ns,
-                what="session",
-                robot=settings.robot.name,
-                imu=plan.imu,
-                torque=plan.torque,
-            )
-        )
-        run_to_end(loop, loop.create_task(_to_end(session, messenger, robot)))
+    recording = recorder.recording
+    with virtual_robot(settings) as robot:
+        name, loop = settings.robot.name, robot.loop
+        endpoint = robot.endpoint(COORDINATOR)
+        messenger = Messenger(endpoint, name, lambda: loop.now_ns, loop.call_soon, recording.accept)
+        group = ModuleGroup(messenger, recording, lambda: loop.now_ns, COORDINATOR)
+        session = Session(group, messenger, recording, plan, lambda: loop.now_ns, recorder.journal, recorder)
+
+        async def whole_session() -> None:
+            messenger.start()
+            try:
+                await session.run(len(robot.world.modules))
+            finally:
+                messenger.close()
+
+        began = JournalEvent(t_ns=loop.now_ns, what="session", robot=name, imu=plan.imu, torque=plan.torque)
+        recorder.journal(began)
+        robot.complete(whole_session())
         recorder.journal(JournalEvent(t_ns=loop.now_ns, what="finished"))
         if at_end is not None:
             at_end(robot)
-        return recorder.recording
-    finally:
-        robot.close()
-        loop.close()
-
-
-async def _to_end(session: Session, messenger: Messenger, robot: VirtualRobot) -> None:
-    messenger.start()
-    try:
-        await session.run(len(robot.world.modules))
-    finally:
-        messenger.close()
-        robot.stop()
-        await asyncio.sleep(0)
+    return recording
 
 
 class _MemoryRecorder(SilentScreen):

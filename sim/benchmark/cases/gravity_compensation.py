@@ -4,7 +4,6 @@ The session of `x5-coordinator compensate` runs on a simulated robot over a simu
 external force at the tip.
 """
 
-import asyncio
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -13,7 +12,6 @@ import numpy as np
 
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify
-from coordinator.runtime.event_loop import run_to_end
 from coordinator.torque_control.gravity_model import GravityModel, gravity_model_of_result
 from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
 from coordinator.torque_control.summary import CompensationSummary
@@ -27,8 +25,7 @@ from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import at_random_site
-from sim.virtual_time.loop import VirtualLoop
-from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings, virtual_robot
 from sim.virtual_time.session import record_session
 from sim.world.external_force import Push
 
@@ -201,37 +198,21 @@ def compensate_robot(
     Raises:
         what `CompensationSession.run` raises.
     """
-    loop = VirtualLoop()
     settings = VirtualSettings(robot, network(network_name), seed, noise, noise_seed=1, pushes=tuple(pushes))
-    virtual = VirtualRobot(settings, loop)
-    observer = _TruthAtSetPoints(virtual)
-    session = CompensationSession(
-        virtual.endpoint(COORDINATOR),
-        robot.name,
-        weight,
-        plan,
-        lambda: loop.now_ns,
-        loop.call_soon,
-        observer,
-        COORDINATOR,
-    )
-    virtual.start()
-    try:
-        summary = run_to_end(loop, loop.create_task(_to_end(session, virtual)))
-        return CompensationRun(
-            summary, tuple(observer.phases), np.array(observer.t_s), np.array(observer.q_rad)
+    with virtual_robot(settings) as virtual:
+        observer = _TruthAtSetPoints(virtual)
+        session = CompensationSession(
+            virtual.endpoint(COORDINATOR),
+            robot.name,
+            weight,
+            plan,
+            lambda: virtual.loop.now_ns,
+            virtual.loop.call_soon,
+            observer,
+            COORDINATOR,
         )
-    finally:
-        virtual.close()
-        loop.close()
-
-
-async def _to_end(session: CompensationSession, virtual: VirtualRobot) -> CompensationSummary:
-    try:
-        return await session.run()
-    finally:
-        virtual.stop()
-        await asyncio.sleep(0)
+        summary = virtual.complete(session.run())
+    return CompensationRun(summary, tuple(observer.phases), np.array(observer.t_s), np.array(observer.q_rad))
 
 
 class _TruthAtSetPoints:

@@ -17,12 +17,11 @@ from coordinator.live_robot.module_group import ModuleGroup
 from coordinator.monitoring.live import LiveMonitor
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.recording.recording import Recording
-from coordinator.runtime.event_loop import run_to_end
 from module_agent.model.catalogue import module_type
 from module_agent.model.chain import Chain
 from module_agent.wire.messages import GoTo
 from sim.virtual_time.loop import VirtualLoop
-from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.virtual_time.robot import VirtualSettings, virtual_robot
 from sim.world.world import World
 
 MOVER, MONITOR = "mover", "watcher"
@@ -67,42 +66,35 @@ def monitor_robot(
     Raises:
         ModuleLost, RobotStopped: see `ModuleGroup`.
     """
-    loop = VirtualLoop()
-    robot = VirtualRobot(settings, loop)
-    recording = Recording()
-    mover = Messenger(
-        robot.endpoint(MOVER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, recording.accept
-    )
-    watch = LiveMonitor(monitor, lambda: loop.now_ns, MONITOR, lambda update: report(update, loop.now_ns))
-    listener = Messenger(
-        robot.endpoint(MONITOR), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
-    )
-    group = ModuleGroup(mover, recording, lambda: loop.now_ns, MOVER)
-    for one in events:
-        loop.schedule_ns(round(one.at_s * 1e9), lambda one=one: one.what(robot.world))  # type: ignore[misc]
-    robot.start()
+    with virtual_robot(settings) as robot:
+        loop = robot.loop
+        recording = Recording()
+        mover = Messenger(
+            robot.endpoint(MOVER), settings.robot.name, lambda: loop.now_ns, loop.call_soon, recording.accept
+        )
+        watch = LiveMonitor(monitor, lambda: loop.now_ns, MONITOR, lambda update: report(update, loop.now_ns))
+        listener = Messenger(
+            robot.endpoint(MONITOR), settings.robot.name, lambda: loop.now_ns, loop.call_soon, watch.record
+        )
+        group = ModuleGroup(mover, recording, lambda: loop.now_ns, MOVER)
+        for one in events:
+            loop.schedule_ns(round(one.at_s * 1e9), lambda one=one: one.what(robot.world))  # type: ignore[misc]
 
-    async def live() -> None:
-        mover.start()
-        listener.start()
-        attending = asyncio.create_task(watch.watch(listener))
-        try:
-            await _move(group, mover, motions, len(settings.robot.modules), round(for_s * 1e9), loop)
-        finally:
-            attending.cancel()
-            (failure,) = await asyncio.gather(attending, return_exceptions=True)
-            if isinstance(failure, Exception):
-                raise failure
-            mover.close()
-            listener.close()
-            robot.stop()
-            await asyncio.sleep(0)
+        async def live() -> None:
+            mover.start()
+            listener.start()
+            attending = asyncio.create_task(watch.watch(listener))
+            try:
+                await _move(group, mover, motions, len(settings.robot.modules), round(for_s * 1e9), loop)
+            finally:
+                attending.cancel()
+                (failure,) = await asyncio.gather(attending, return_exceptions=True)
+                if isinstance(failure, Exception):
+                    raise failure
+                mover.close()
+                listener.close()
 
-    try:
-        run_to_end(loop, loop.create_task(live()))
-    finally:
-        robot.close()
-        loop.close()
+        robot.complete(live())
 
 
 async def _move(
