@@ -75,8 +75,7 @@ def _transform(
     pose = np.asarray(np.linalg.solve(from_face, to_face), dtype=np.float64)
     turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
     slope = np.zeros((6, covariance.shape[0]))
-    inverse = np.asarray(np.linalg.inv(from_face), dtype=np.float64)
-    local = parameter_slope(pose) @ adjoint(inverse)
+    local = parameter_slope(pose) @ adjoint(np.asarray(np.linalg.inv(from_face), dtype=np.float64))
     slope[:, 6 * child : 6 * child + 6] = local
     slope[:, 6 * parent : 6 * parent + 6] -= local
     null, unknown = _null_directions(slope / _UNITS[:, None] @ null_basis)

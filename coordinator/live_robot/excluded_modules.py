@@ -38,10 +38,9 @@ class ExcludedModules:
                 self._exclude(serial, str(error))
         self._group.serials = tuple(met)
         await self._group.wait(lambda: not self._group.without_feedback(), FEEDBACK_WAIT_S)
-        silent = self._group.without_feedback()
-        self._group.serials = tuple(s for s in met if s not in silent)
-        for serial in silent:
+        for serial in self._group.without_feedback():
             self._exclude(serial, f"module {serial} answers, but sends no feedback")
+        self._group.serials = tuple(s for s in met if s not in self.why)
 
     def without(self, error: Refused | MotionInterrupted) -> bool:
         """Exclude the module of an error if repeating cannot help; return whether it was excluded.

@@ -57,12 +57,10 @@ def merge_report(merged: MergedInformation) -> MergeReport:
 
 def _run(run: RunShare) -> RunPart:
     size = np.abs(run.base.value) * WEAK_ABOVE
-    return RunPart(
+    return RunPart.of(
+        run,
         run=run.name,
-        serials=list(run.serials),
         rank=run.base.rank,
         identified_alone=int(np.sum(run.sigma_alone < size)),
         identified_merged=int(np.sum(run.sigma_merged < size)),
-        gain=run.gain,
-        inconsistency_sigma=run.inconsistency_sigma,
     )

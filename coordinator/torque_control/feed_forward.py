@@ -53,7 +53,16 @@ def joint_reference(
         raise KeyError(f"a pattern for {unknown[0]}, which is not among the joints {', '.join(serials)}")
     if missing := [serial for serial in serials if serial not in origins_rad]:
         raise KeyError(f"joint {missing[0]} has no origin: give its position at the start of the motion")
-    total_s = _common_duration_s(patterns, origins_rad)
+    if not patterns:
+        raise ValueError("no joint has a pattern")
+    ends = {serial: duration_s(pattern, origins_rad[serial]) for serial, pattern in patterns.items()}
+    first, last = min(ends, key=lambda s: ends[s]), max(ends, key=lambda s: ends[s])
+    total_s = ends[last]
+    if total_s - ends[first] > _TOGETHER_S:
+        raise ValueError(
+            f"joint {first} ends after {ends[first]:.3f} s and {last} after {total_s:.3f} s: all "
+            "patterns must end together, since a joint needs torque as long as the others move"
+        )
     t_s = np.arange(round(total_s * RATE_HZ) + 1) / RATE_HZ
     q, qd = np.empty((2, t_s.size, len(serials)))
     for column, serial in enumerate(serials):
@@ -96,16 +105,3 @@ def on_module(points: SetPoints) -> list[EffortProfile]:
     count = int(np.ceil(t_s[-1] * 1e9 / period_ns - 1e-9)) + 1
     at_s = np.arange(max(count, 2)) * (period_ns * 1e-9)
     return [effort_profile(np.interp(at_s, t_s, joint), period_ns) for joint in points.effort_nm.T]
-
-
-def _common_duration_s(patterns: Mapping[str, Pattern], origins_rad: Mapping[str, float]) -> float:
-    if not patterns:
-        raise ValueError("no joint has a pattern")
-    ends = {serial: duration_s(pattern, origins_rad[serial]) for serial, pattern in patterns.items()}
-    first, last = min(ends, key=lambda s: ends[s]), max(ends, key=lambda s: ends[s])
-    if ends[last] - ends[first] > _TOGETHER_S:
-        raise ValueError(
-            f"joint {first} ends after {ends[first]:.3f} s and {last} after {ends[last]:.3f} s: all "
-            "patterns must end together, since a joint needs torque as long as the others move"
-        )
-    return ends[last]

@@ -18,7 +18,6 @@ release, the difference of torque sensors and model counts as the sensors' offse
 offsets and scale errors do not explain it. Pure: time is an argument, and nothing is sent from here.
 """
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -304,56 +303,47 @@ class GravityCompensator:
                 f"{1e3 * self._settings.stale_s:.0f} ms are accepted; check the network"
             )
 
-    def _exceeded(self, excess: Array, text: Callable[[int], str]) -> str:
-        """Return the text on the joint with the largest excess (n,), empty if none is above zero."""
-        k = int(np.argmax(excess))
-        return "" if excess[k] <= 0.0 else f"joint {self._serials[k]}: {text(k)}"
+    def _about(self, k: int, excess: float, text: str) -> str:
+        return "" if excess <= 0.0 else f"joint {self._serials[k]}: {text}"
 
     def _overload(self, weight_nm: Array) -> str:
         most = self._max_effort_nm
-        return self._exceeded(
-            np.abs(weight_nm) - most,
-            lambda k: (
-                f"this pose needs {weight_nm[k]:.2f} Nm, the limit is {most[k]:.2f} Nm. Move the arm to a "
-                "pose with less load."
-            ),
-        )
+        k = int(np.argmax(np.abs(weight_nm) - most))
+        text = f"this pose needs {weight_nm[k]:.2f} Nm, the limit is {most[k]:.2f} Nm. "
+        return self._about(k, abs(weight_nm[k]) - most[k], text + "Move the arm to a pose with less load.")
 
     def _unexplained_offset(self, effort_nm: Array, weight_nm: Array) -> str:
         explained = MAX_OFFSET_OF_WEIGHT * np.abs(weight_nm) + MAX_OFFSET_OF_EFFORT * self._max_effort_nm
-        return self._exceeded(
-            np.abs(effort_nm - weight_nm) - explained,
-            lambda k: (
-                f"measured {effort_nm[k]:.2f} Nm, model predicts {weight_nm[k]:.2f} Nm. Remove any payload "
-                "or contact, or identify the robot again (base orientation changed?)."
-            ),
+        excess = np.abs(effort_nm - weight_nm) - explained
+        k = int(np.argmax(excess))
+        text = (
+            f"measured {effort_nm[k]:.2f} Nm, model predicts {weight_nm[k]:.2f} Nm. Remove any payload or "
+            "contact, or identify the robot again (base orientation changed?)."
         )
+        return self._about(k, excess[k], text)
 
     def _astray(self, away_rad: Array, max_rad: float, how: str) -> str:
-        return self._exceeded(
-            np.abs(away_rad) - max_rad,
-            lambda k: (
-                f"{np.degrees(abs(away_rad[k])):.1f} degrees {how}, at most {np.degrees(max_rad):.1f} are "
-                "allowed. Remove obstacles; identify again if the load changed."
-            ),
+        k = int(np.argmax(np.abs(away_rad)))
+        text = (
+            f"{np.degrees(abs(away_rad[k])):.1f} degrees {how}, at most {np.degrees(max_rad):.1f} are "
+            "allowed. Remove obstacles; identify again if the load changed."
         )
+        return self._about(k, abs(away_rad[k]) - max_rad, text)
 
     def _too_fast(self, rate_rad_s: Array) -> str:
-        speed, most = np.abs(rate_rad_s), self._settings.max_speed_rad_s
-        return self._exceeded(
-            speed - most,
-            lambda k: f"moved at {speed[k]:.2f} rad/s, at most {most:.2f} rad/s are allowed (--max-speed)",
-        )
+        k, most = int(np.argmax(np.abs(rate_rad_s))), self._settings.max_speed_rad_s
+        speed = abs(rate_rad_s[k])
+        text = f"moved at {speed:.2f} rad/s, at most {most:.2f} rad/s are allowed (--max-speed)"
+        return self._about(k, speed - most, text)
 
     def _at_an_end(self, q_rad: Array) -> str:
-        margin = self._settings.margin_rad
-        return self._exceeded(
-            np.maximum(q_rad - self._high, self._low - q_rad),
-            lambda k: (
-                f"position {q_rad[k]:.2f} rad is within {margin:.2f} rad of the end of its range, "
-                f"{self._low[k] - margin:.2f} to {self._high[k] + margin:.2f} rad"
-            ),
+        margin, beyond = self._settings.margin_rad, np.maximum(q_rad - self._high, self._low - q_rad)
+        k = int(np.argmax(beyond))
+        text = (
+            f"position {q_rad[k]:.2f} rad is within {margin:.2f} rad of the end of its range, "
+            f"{self._low[k] - margin:.2f} to {self._high[k] + margin:.2f} rad"
         )
+        return self._about(k, beyond[k], text)
 
 
 def _ends(values: list[float | None], otherwise: float) -> Array:

@@ -68,11 +68,9 @@ class CompensationScreen(Protocol):
 
     def note(self, text: str) -> None:
         """Show a line of text."""
-        ...
 
     def moment(self, now: Moment) -> None:
         """Show a moment; called at the rate of the set-points."""
-        ...
 
 
 class CompensationSession:
