@@ -1,11 +1,8 @@
 """One batch refinement of a chain over all motions at once, from all IMUs and all encoders.
 
-The circle point analysis assumes that only one joint moves. In a real arm the springs of the held joints
-give, so that distal IMUs turn by more than the moving joint does (up to 50 % more near a resonance), and
-the circles are biased. Here every IMU sample is predicted from the measured motion of all joints
-(`imu_prediction`), so the motion of held joints is part of the model. The weighted least squares are solved
-by Gauss-Newton on the normal equations; gravity, the IMUs' own errors (`imu_intrinsics`) and the links'
-compliance (`link_compliance`) are estimated along.
+The circle point analysis assumes that only one joint moves, but held joints give on their springs: distal
+IMUs turn by up to 50 % more near a resonance, which biases the circles. Here every IMU sample is predicted
+from the measured motion of all joints (docs/theory.md, "The chain").
 """
 
 from collections.abc import Sequence

@@ -46,9 +46,8 @@ class Kinematics(NamedTuple):
                 lines.append(f"{serial} on the base{mounted}")
                 continue
             length, sigma = 1e3 * self.fit.link_length_m[k], 1e3 * self.fit.link_length_sigma_m[k]
-            lines.append(
-                f"{serial} on {self.topology.serials[parent]}{mounted}: {length:.1f} +- {sigma:.1f} mm"
-            )
+            on = f"{serial} on {self.topology.serials[parent]}{mounted}"
+            lines.append(f"{on}: {length:.1f} +- {sigma:.1f} mm")
         return lines
 
 

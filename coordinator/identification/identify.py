@@ -160,9 +160,8 @@ def _explored(recording: Recording) -> list[str]:
     explored = {e.serial for e in recording.latest_motions("windowed_sine", "whole")}
     missing = [s for s in rested if s not in explored and s not in excluded_modules(recording.journal)]
     if not rested or missing:
-        raise IdentificationError(
-            "no rest was recorded" if not rested else f"no exploration of {', '.join(missing)} was recorded"
-        )
+        what = f"exploration of {', '.join(missing)}" if rested else "rest"
+        raise IdentificationError(f"no {what} was recorded")
     return rested
 
 

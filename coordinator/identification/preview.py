@@ -207,11 +207,8 @@ class Previewer:
 
     def _parts_of(self, serials: Sequence[str]) -> list[SensorData]:
         """Return the samples of every slow and fast motion of these modules so far."""
-        events: dict[tuple[str, str], JournalEvent] = {}
-        for event in self._recording.journal:
-            if event.what == "motion" and event.purpose in ("constant", "windowed_sine"):
-                events[event.serial, event.purpose] = event
-        moved = [event for event in events.values() if event.serial in serials and event.motion is not None]
+        motions = self._recording.latest_motions("constant", "windowed_sine")
+        moved = [event for event in motions if event.serial in serials]
         if not moved:
             raise DataError("no motion of these modules is recorded")
         all_serials = tuple(sorted(self._recording.modules))

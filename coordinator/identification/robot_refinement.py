@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from coordinator.batch_estimation.base_heading import faced
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
 from coordinator.batch_estimation.imu_intrinsics import DELAY
+from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import (
     LinkLoad,
     compliance_jacobian,
@@ -20,10 +20,12 @@ from coordinator.batch_estimation.link_compliance import (
     with_hinges_moved,
 )
 from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData
+from coordinator.kinematics.null_space import name_null_space
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, encoder_steps, filtered, thinned
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Chain
+from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ImuPrior
+from module_agent.model.perturbation import apply_perturbation
 from module_agent.model.read_only import frozen
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
 
@@ -85,15 +87,10 @@ def refine_robot(
 
 
 def _giving(
-    rigid: Refinement,
-    parts: list[SensorData],
-    loads: Sequence[LinkLoad | None],
-    prior: ImuPrior,
-    keep: int,
+    rigid: Refinement, parts: list[SensorData], loads: Sequence[LinkLoad | None], prior: ImuPrior, keep: int
 ) -> tuple[Refinement, list[SensorData]]:
-    """Refine with compliant links, and with base motion if that reduces the other IMUs' residuals.
-
-    It does not if the first module's own gears shake the IMU on the base.
+    """Refine with compliant links, and with base motion if that reduces the other IMUs' residuals: not if the
+    first module's own gears shake the IMU on the base.
     """
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
@@ -111,3 +108,34 @@ def _misfit(fit: Refinement) -> float:
     """Return the mean log residual of the IMUs that are not fixed to the base."""
     residuals = np.concatenate([fit.residual_gyro_rad_s[1:], fit.residual_accel_m_s2[1:]])
     return float(np.log(residuals).mean())
+
+
+def faced(chain: Chain, data: SensorData, null_basis: Array) -> Chain:
+    """Return the chain with every unresolved heading estimated from the base's motion in `data`.
+
+    No motion of joints resolves the heading of a branch beyond an axis that is parallel to gravity, but the
+    direction of the base's shaking, as all IMUs measure it, does. It is needed to subtract the shaking; no
+    uncertainty of it is claimed. The correlation of the gyros' readings with the predicted rates of the base
+    is c0 + c1 cos + c2 sin of the heading; three headings give its maximum.
+    """
+    if data.base_motion is None or not data.base_motion.any():
+        return chain
+    for item in name_null_space(chain, null_basis):
+        if item.kind == "rotation_about_axis":
+            twist = item.directions[:, 0]
+            ahead, aside, behind = (
+                _agreement(apply_perturbation(chain, heading * twist), data)
+                for heading in (0.0, 0.5 * np.pi, np.pi)
+            )
+            middle = 0.5 * (ahead + behind)
+            heading = np.arctan2(aside - middle, ahead - middle)
+            chain = apply_perturbation(chain, heading * twist)
+    return chain
+
+
+def _agreement(chain: Chain, data: SensorData) -> float:
+    """Return the sum of products of the gyros' measured and predicted rates by the base's motion."""
+    resting = readings_on(chain, body_motions(chain, *data.joints)).gyro_rad_s
+    shaken = readings_on(chain, body_motions(chain, *data.joints, data.base)).gyro_rad_s
+    seen = data.gyro_rad_s - resting
+    return float(np.sum((seen - seen.mean(axis=0)) * (shaken - resting)))

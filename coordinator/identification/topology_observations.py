@@ -22,7 +22,7 @@ from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, window
 from coordinator.synchronisation.round_trips import map_clocks
-from coordinator.topology.motion_evidence import MotionEvidence, NotMoved, motion_evidence
+from coordinator.topology.motion_evidence import NotMoved, motion_evidence
 from coordinator.topology.topology import (
     DOUBTFUL_BELOW,
     MotionObservation,
@@ -131,17 +131,8 @@ def _usual_pose(motions: Mapping[str, Sequence["MotionFeedback"]]) -> dict[str, 
 
 def slow_motions(recording: Recording, joint: str) -> list[JournalEvent]:
     """Return the slow motions of a joint that were completed since its module's latest boot."""
-    boot = recording.modules[joint].boot
-    return [
-        event
-        for event in recording.journal
-        if event.what == "motion"
-        and event.purpose == "constant"
-        and event.serial == joint
-        and event.boot in (0, boot)
-        and event.motion is not None
-        and event.motion.end_row is not None
-    ]
+    slow = [(event, event.motion) for event in recording.motions("constant") if event.serial == joint]
+    return [event for event, motion in slow if motion is not None and motion.end_row is not None]
 
 
 class _Source(NamedTuple):
@@ -171,8 +162,7 @@ def _of_motion(source: _Source, event: JournalEvent) -> MotionFeedback:
     signals = filtered_signals(one.q_rad, [one.gyro_rad_s], RATE_HZ, TOPOLOGY_CUTOFF_HZ, KEEP_EVERY)
     q, qd, _, gyro = signals.settled()
     offset = np.array([source.offsets[s] for s in observers])
-    mean = q.mean(axis=0)
-    return MotionFeedback(event, tuple(observers), mean, qd, gyro, offset)
+    return MotionFeedback(event, tuple(observers), q.mean(axis=0), qd, gyro, offset)
 
 
 class Axes(NamedTuple):
@@ -249,7 +239,15 @@ def by_feedback(feedback: MotionFeedback, axes: Axes | None) -> dict[str, Motion
     joint = names.index(feedback.event.serial)
     known = axes.of(names) if axes is not None and not axes.turned_away(feedback) else None
     evidence = motion_evidence(joint, feedback.qd_rad_s, feedback.gyro_rad_s, feedback.offset_rad_s, known)
-    return {s: _observation(evidence, k) for k, s in enumerate(names)}
+    columns = zip(
+        names, evidence.coefficient, evidence.rate_ratio, evidence.ratio_sigma, evidence.give, strict=True
+    )
+    return {
+        serial: MotionObservation(
+            bool(ratio > 0.5), float(ratio), axis / ratio if ratio > 0.5 else None, float(sigma), float(give)
+        )
+        for serial, axis, ratio, sigma, give in columns
+    }
 
 
 def _observers(source: _Source, event: JournalEvent) -> list[str]:
@@ -268,13 +266,6 @@ def _covered(source: _Source, serials: Sequence[str], event: JournalEvent) -> bo
     # A window is cut to the rows of all modules: one that stopped sending must not shorten the others'.
     whole = window(source.recording, source.clocks, [event.serial], event, TOPOLOGY_CUTOFF_HZ)
     return len(joint_window.t_ns) > 0.9 * len(whole.t_ns)
-
-
-def _observation(evidence: MotionEvidence, k: int) -> MotionObservation:
-    ratio = float(evidence.rate_ratio[k])
-    moved = ratio > 0.5
-    axis = evidence.coefficient[k] / ratio if moved else None
-    return MotionObservation(moved, ratio, axis, float(evidence.ratio_sigma[k]), float(evidence.give[k]))
 
 
 def _compared(observed: MotionObservation | None, own: Estimate | None) -> MotionObservation | None:

@@ -40,12 +40,7 @@ from module_agent.estimate.smoothing import SmoothMotion, smooth_imu
 from module_agent.estimate.windows import ImuWindow, JointWindow
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
-from module_agent.model.imu_prior import (
-    ACCEL_BIAS_SIGMA_M_S2,
-    CALIBRATED,
-    GYRO_BIAS_SIGMA_RAD_S,
-    ImuPrior,
-)
+from module_agent.model.imu_prior import ACCEL_BIAS_SIGMA_M_S2, CALIBRATED, GYRO_BIAS_SIGMA_RAD_S, ImuPrior
 from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass

@@ -97,13 +97,7 @@ def _along_and_about(chain: Chain, joint: int, child: int) -> Iterator[Unresolve
 
 
 def _item(
-    chain: Chain,
-    kind: Kind,
-    joint: str,
-    modules: tuple[int, ...],
-    text: str,
-    resolved_by: str,
-    twists: Array,
+    chain: Chain, kind: Kind, joint: str, modules: tuple[int, ...], text: str, resolved_by: str, twists: Array
 ) -> Unresolved:
     columns = np.atleast_2d(twists.T).T.reshape(6, -1)
     directions = np.zeros((len(chain.serials), 6, columns.shape[1]))

@@ -1,10 +1,9 @@
 """Refinement of the modules' clocks from motion: gyros against the rates of the joints that turn them.
 
-Round trips leave an error of half the difference between the ways there and back. An IMU carried by a joint
-measures the same motion: its gyro lags the encoder's rate by the IMU's delay and by the difference of the two
-clocks' errors. All lags of all motions enter one weighted least squares for offset and drift of every clock
-and for the IMUs' delay, with the round trips as prior; clocks without a common motion keep their round trips'
-maps and covariance.
+Round trips leave an error of half the difference between the ways there and back. The gyro of an IMU that a
+joint carries lags the encoder's rate by the IMU's delay and by the difference of the two clocks' errors. All
+lags enter one weighted least squares for all clocks and the IMUs' delay, with the round trips as prior;
+clocks without a common motion keep their maps and covariance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -54,11 +53,8 @@ class ClockRefinement(NamedTuple):
     lags: int
 
 
-class _Normal(NamedTuple):
-    """Normal equations of [clock errors of all modules (n), the observer's lag] about one lag."""
-
-    information: Array
-    rhs: Array
+# Normal equations of [clock errors of all modules (n), the observer's lag] about one lag: matrix, right side.
+_Normal = tuple[Array, Array]
 
 
 def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequence[Window]) -> ClockRefinement:
@@ -80,10 +76,10 @@ def refine_clocks(chain: Chain, clocks: Mapping[str, ClockMap], motions: Sequenc
     information, rhs, lags = np.eye(3 * n + 1), np.zeros(3 * n + 1), 0
     for motion in motions:
         since_s = 1e-9 * (int(motion.t_ns.mean()) - origins).astype(np.float64)
-        for imu, lag in _lags(chain, motion):
+        for imu, (of_lag, target) in _lags(chain, motion):
             onto = _onto(n, imu, since_s) * before
-            information += onto.T @ lag.information @ onto
-            rhs += onto.T @ lag.rhs
+            information += onto.T @ of_lag @ onto
+            rhs += onto.T @ target
             lags += 1
     covariance = np.linalg.inv(information) * np.outer(before, before)
     estimate = covariance @ (rhs / before)
@@ -172,7 +168,7 @@ def _lag(chain: Chain, imu: int, joints: Sequence[Array], gyro: Array) -> _Norma
     information, rhs = normal[:, :-1], normal[:, -1]
     # The floor: an error of this lag alone, taken out.
     share = information[:, count] / (information[count, count] + LAG_FLOOR_S**-2)
-    return _Normal(information - np.outer(share, information[count]), rhs - share * rhs[count])
+    return information - np.outer(share, information[count]), rhs - share * rhs[count]
 
 
 def _shares(nuisance: Array, variance: float, signals: Array) -> Array:

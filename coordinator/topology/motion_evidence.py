@@ -99,8 +99,10 @@ def motion_evidence(
     if size < MIN_RATE_RAD_S:
         raise NotMoved(f"it turned at only {size:.2g} rad/s rms; {MIN_RATE_RAD_S} is needed")
     others = np.arange(qd_rad_s.shape[1]) != joint
-    given, left = _given(qd_rad_s[:, others], axes[others] if axes is not None else None, gyro_rad_s.shape[1])
-    gyro = gyro_rad_s - offset_rad_s - given
+    held = np.full((others.sum(), gyro_rad_s.shape[1], 3), np.nan) if axes is None else axes[others]
+    # The remaining shares (joints, n) of what held joints add to the rates of every IMU.
+    left = np.where(np.isnan(held).any(axis=2), 1.0, RESIDUAL_GIVE)
+    gyro = gyro_rad_s - offset_rad_s - np.tensordot(qd_rad_s[:, others], np.nan_to_num(held, nan=0.0), axes=1)
     blocks = np.array_split(np.arange(rate.size), BLOCKS)
     power = np.array([rate[b] @ rate[b] for b in blocks])
     moment = np.array([np.tensordot(rate[b], gyro[b], axes=1) for b in blocks])
@@ -110,11 +112,3 @@ def motion_evidence(
     give = (np.abs(rate @ qd_rad_s[:, others]) / power.sum()) @ left
     spread = np.sqrt((BLOCKS - 1) / BLOCKS * scatter)
     return MotionEvidence(frozen(coefficient), frozen(spread), frozen(give))
-
-
-def _given(rates: Array, axes: Array | None, imus: int) -> tuple[Array, Array]:
-    """Return the rates of every IMU by held joints (m, n, 3), and the remaining shares (joints, n)."""
-    if axes is None:
-        return np.zeros((len(rates), imus, 3)), np.ones((rates.shape[1], imus))
-    given = np.tensordot(rates, np.nan_to_num(axes, nan=0.0), axes=1)
-    return np.asarray(given), np.where(np.isnan(axes).any(axis=2), 1.0, RESIDUAL_GIVE)

@@ -29,9 +29,8 @@ class NextMotion(NamedTuple):
         """Return the motion, `slow` being the one that every joint is explored with."""
         travel = self.travel * slow.velocity_rad_s * (slow.duration_s + slow.ramp_s)
         velocity = self.speed * slow.velocity_rad_s
-        return slow.model_copy(
-            update={"velocity_rad_s": velocity, "duration_s": travel / velocity - slow.ramp_s}
-        )
+        duration = travel / velocity - slow.ramp_s
+        return slow.model_copy(update={"velocity_rad_s": velocity, "duration_s": duration})
 
     def travel_rad(self, slow: ConstantMotion) -> float:
         """Return how far the joint turns; the motion is to begin half of that before home."""
@@ -52,9 +51,8 @@ def next_motions(
     wanted: dict[str, NextMotion] = {}
     for doubt in doubts:
         done = repeated.get(doubt.joint, 0)
-        if doubt.joint in wanted or done >= MAX_REPEATS:
-            continue
-        wanted[doubt.joint] = _next(doubt, observations, done)
+        if doubt.joint not in wanted and done < MAX_REPEATS:
+            wanted[doubt.joint] = _next(doubt, observations, done)
     return tuple(wanted.values())
 
 

@@ -3,9 +3,8 @@
 The joints that move a module's IMU are the ones between it and the base. So the joints that move it, its own
 apart, are its ancestors; the parent is the ancestor that itself has the most ancestors. A module that moves
 with its own joint is mounted reversed: by its output, so that the housing turns.
-
-Every observation is weighted by its log-odds: the forest is the one of maximum likelihood, each of its edges
-has the odds of being right, and observations that contradict it or leave it in doubt are named.
+Observations are weighted by their log-odds (docs/theory.md, "Topology"); those that contradict the likeliest
+forest, or leave it in doubt, are named.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence

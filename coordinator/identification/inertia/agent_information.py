@@ -107,10 +107,7 @@ def _span_part(
 
 
 def gathered(
-    recording: Recording,
-    chain: Chain,
-    clocks: Mapping[str, ClockMap],
-    own: Sequence[JointInformation],
+    recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap], own: Sequence[JointInformation]
 ) -> AgentInformation:
     """Return the agents' information where they have answered, else the coordinator's `own`, joint by joint.
 
@@ -120,10 +117,7 @@ def gathered(
     digest, why = _asked(recording, chain, clocks)
     if digest is None:
         return AgentInformation(tuple(own), (), None, why)
-    joints = list(own)
-    by_agents: list[str] = []
-    apart: list[float] = []
-    reasons: list[str] = []
+    joints, by_agents, apart, reasons = list(own), list[str](), list[float](), list[str]()
     for k, serial in enumerate(chain.serials):
         try:
             theirs = _answer(recording.modules[serial], digest)

@@ -16,12 +16,7 @@ from coordinator.dynamics.body_regressor import track_regressor
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.inertia.agent_information import AgentInformation
-from coordinator.identification.inertia.body_motion import (
-    MotionSource,
-    Robot,
-    body_motion_tracks,
-    readings,
-)
+from coordinator.identification.inertia.body_motion import MotionSource, Robot, body_motion_tracks, readings
 from coordinator.identification.inertia.projected_rows import ProjectedRows
 from coordinator.parameter_fit.instrumental_variables import (
     InstrumentalFit,
@@ -30,12 +25,7 @@ from coordinator.parameter_fit.instrumental_variables import (
 )
 from coordinator.parameter_fit.systematic_errors import chain_effects, scale_effects
 from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE, SCALE_SIGMA, scaled
-from coordinator.synchronisation.motion_windows import (
-    INDEPENDENT_FRACTION,
-    RATE_HZ,
-    Window,
-    filtered_window,
-)
+from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ, Window, filtered_window
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress, merge
 from module_agent.model.regressor import torque_regressor

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from coordinator.batch_estimation.base_heading import faced
 from coordinator.batch_estimation.estimator import refine_chain
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.sensor_data import BaseMotion, SensorData, outstanding
+from coordinator.identification.robot_refinement import faced
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import BIASES_ONLY
 from module_agent.model.perturbation import apply_perturbation
