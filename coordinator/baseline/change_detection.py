@@ -21,7 +21,7 @@ from scipy.stats import chi2
 
 from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain
-from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics
+from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, undone
 from coordinator.identification.robot_refinement import KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
 from coordinator.synchronisation.motion_windows import Window, filtered, thinned, window
@@ -68,17 +68,13 @@ def exploration(run: BaselineRobot, serials: Sequence[str]) -> list[Window]:
 
 def corrected(windows: Sequence[Window], imus: ImuIntrinsics) -> list[Window]:
     """Return the readings as IMUs without errors of scale and axes would have given them, biases left in."""
-    gyro, accel = (
-        np.asarray(np.linalg.inv(matrix), dtype=float) for matrix in (imus.gyro_matrix, imus.accel_matrix)
-    )
     return [
-        one._replace(gyro_rad_s=_turned(gyro, one.gyro_rad_s), accel_m_s2=_turned(accel, one.accel_m_s2))
+        one._replace(
+            gyro_rad_s=undone(imus.gyro_matrix, one.gyro_rad_s),
+            accel_m_s2=undone(imus.accel_matrix, one.accel_m_s2),
+        )
         for one in windows
     ]
-
-
-def _turned(matrices: Array, vectors: Array) -> Array:
-    return np.asarray(np.einsum("nij,mnj->mni", matrices, vectors))
 
 
 def _fit(chain: Chain, windows: Sequence[Window]) -> Refinement:

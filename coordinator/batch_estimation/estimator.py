@@ -57,7 +57,6 @@ class Refinement(NamedTuple):
     residual_accel_m_s2: Array
     intrinsics: ImuIntrinsics
     compliance: Array
-    iterations: int
     late_s: float = 0.0
 
     @property
@@ -128,7 +127,6 @@ def refine_chain(
     state = _State(chain, perfect(count), np.zeros(len(problem.flex.links)))
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
-    used = 0
     for used in range(1, ITERATIONS + 1):
         expected = _expected(problem, state)
         if used > 1:
@@ -148,7 +146,7 @@ def refine_chain(
     ]
     spectrum = _solve(_normal_equations(problem, state, expected, believed))[2]
     by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
-    return _report(state, spectrum, by_noise, [_rms(residual) for residual in expected.residuals], used)
+    return _report(state, spectrum, by_noise, [_rms(residual) for residual in expected.residuals])
 
 
 def _expected(problem: _Problem, state: _State) -> _Expected:
@@ -208,8 +206,7 @@ def _normal_equations(
 def _before(problem: _Problem, state: _State) -> tuple[Array, Array]:
     """Return the information on [perturbations (6 n), gravity (3), free IMU errors], and its right-hand side.
 
-    These are the priors of the IMUs' errors, of the links' compliances, and of the magnitude of gravity,
-    which makes the accelerometers' scales observable.
+    Gravity's magnitude makes the accelerometers' scales observable.
     """
     count, free, flex = len(state.chain.serials), problem.free, problem.flex
     nothing = np.zeros(6 * count + 3)
@@ -284,9 +281,7 @@ def _moved(problem: _Problem, state: _State, step: Array, nuisance: Array) -> _S
     )
 
 
-def _report(
-    state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[Array], iterations: int
-) -> Refinement:
+def _report(state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[Array]) -> Refinement:
     known = spectrum.known
     kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
@@ -309,5 +304,4 @@ def _report(
         residual_accel_m_s2=frozen(rms[1]),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
         compliance=frozen(state.compliance),
-        iterations=iterations,
     )

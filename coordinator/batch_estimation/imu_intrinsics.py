@@ -76,6 +76,11 @@ def read(intrinsics: ImuIntrinsics, gyro: Array, accel: Array, rates: Array | No
     return turned - late * rates[..., :3], forced - late * rates[..., 3:]
 
 
+def undone(matrices: Array, readings: Array) -> Array:
+    """Return the vectors (m, n, 3) that the matrices (n, 3, 3) of n sensors turn into their readings."""
+    return np.asarray(np.einsum("nij,mnj->mni", np.linalg.inv(matrices), readings))
+
+
 def mixing(intrinsics: ImuIntrinsics, module: int) -> Array:
     """Return the matrix (6, 6) from one IMU's true rates and forces to its readings."""
     matrix = np.zeros((6, 6))

@@ -48,9 +48,6 @@ def imu_readings(chain: Chain, q_rad: ArrayLike, qd_rad_s: ArrayLike, qdd_rad_s2
     Args:
         chain: n joints; `chain.gravity` is the specific force of rest.
         q_rad, qd_rad_s, qdd_rad_s2: (m, n) joint positions, velocities, accelerations.
-
-    Returns:
-        Readings in the IMU frames, (m, n, 3).
     """
     return readings_on(chain, body_motions(chain, q_rad, qd_rad_s, qdd_rad_s2))
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.model.chain import Array
+from module_agent.signals.filtering import differentiate
 
 # A mean of three bins of nothing but noise exceeds its expectation by this factor once in 2000 times.
 STANDS_OUT = 4.0
@@ -53,6 +54,13 @@ def outstanding(signal: Array, variance: Array, cutoff_hz: float, rate_hz: float
     noise = samples * variance * 0.5 * rate_hz / cutoff_hz
     weight = np.where(power > STANDS_OUT * noise, 1.0 - noise / np.maximum(power, 1e-300), 0.0)
     return np.asarray(np.fft.irfft(spectrum * weight, samples, axis=0))
+
+
+def measured_base_motion(gyro: Array, accel: Array, floor: NoiseFloor, rate_hz: float) -> BaseMotion:
+    """Return the base's motion by the readings (m, 3) of an IMU on it, filtered alike, beyond its noise."""
+    omega = outstanding(gyro, floor.gyro, floor.cutoff_hz, rate_hz)
+    force = outstanding(accel, floor.accel, floor.cutoff_hz, rate_hz)
+    return BaseMotion(omega, differentiate(omega, rate_hz), force)
 
 
 class SensorData(NamedTuple):

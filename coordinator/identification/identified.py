@@ -40,8 +40,7 @@ class Kinematics(NamedTuple):
         lines = []
         for k, serial in enumerate(self.topology.serials):
             parent = self.topology.parent[k]
-            mounted = ", mounted reversed" if self.topology.reversed[k] else ""
-            mounted += self.topology.caveat(k)
+            mounted = (", mounted reversed" if self.topology.reversed[k] else "") + self.topology.caveat(k)
             if parent < 0:
                 lines.append(f"{serial} on the base{mounted}")
                 continue

@@ -96,9 +96,6 @@ def identify(
     return Identified(kinematics, inertia, bodies, held_out, result)
 
 
-# ---------------------------------------------------------------------- kinematics
-
-
 def identify_kinematics(recording: Recording) -> Kinematics:
     """Identify topology and chain.
 
@@ -111,15 +108,15 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         search = search_topology(recording, serials)
         topology = search.topology
         types = [recording.module_type(s) for s in topology.serials]
-        windows = _exploration(recording, clocks, topology.serials)
+        explored = _exploration(recording, clocks, topology.serials)
         first = assemble(
             topology,
             types,
-            _pairs(recording, clocks, topology.serials, windows),
+            _pairs(recording, clocks, topology.serials, *explored),
             [recording.rest_observation(topology.serials, MIN_REST_ROWS)],
         )
-        clocks |= refine_clocks(first.chain, clocks, windows).clocks
-        windows = _exploration(recording, clocks, topology.serials)
+        clocks |= refine_clocks(first.chain, clocks, explored[1]).clocks
+        _, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
         refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
@@ -166,13 +163,17 @@ def _explored(recording: Recording) -> list[str]:
 
 
 def _pairs(
-    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str], windows: Sequence[Window]
+    recording: Recording,
+    clocks: dict[str, ClockMap],
+    serials: Sequence[str],
+    motions: Sequence[JournalEvent],
+    windows: Sequence[Window],
 ) -> list[PairObservation]:
     """Return the circles as observations."""
     whole = simultaneous_motion(recording, serials)
     if whole is not None:
         return circle_observations(serials, respond(recording, clocks, serials, whole))
-    explored = zip(_exploration_motions(recording, serials), windows, strict=True)
+    explored = zip(motions, windows, strict=True)
     sines = {e.serial: (e.motion, one) for e, one in explored if e.purpose == "windowed_sine"}
     pairs = []
     for joint in [s for s in serials if s in sines]:
@@ -190,24 +191,19 @@ def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topo
     if topology.reversed[0]:
         return None
     still = [e for e in recording.latest_motions("rest") if e.serial == topology.serials[0]]
-    return noise_floor(window(recording, clocks, topology.serials, still[0]), REFINEMENT_CUTOFF_HZ, 0)
+    return noise_floor(window(recording, clocks, topology.serials, still[0]), REFINEMENT_CUTOFF_HZ)
 
 
-def _exploration_motions(recording: Recording, serials: Sequence[str]) -> list[JournalEvent]:
-    """Return the motions to which the chain is fitted, of the modules in it."""
+def _exploration(
+    recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]
+) -> tuple[list[JournalEvent], list[Window]]:
+    """Return the motions to which the chain is fitted, of the modules in it, and their windows."""
     alone = recording.latest_motions("constant", "windowed_sine")
     whole, repeats = recording.latest_motions("whole"), recording.motions("repeat")
     alone, whole, repeats = ([e for e in some if e.serial in serials] for some in (alone, whole, repeats))
     # The window of any one joint of a simultaneous motion holds all joints.
-    return [*alone, *whole[:1], *repeats]
-
-
-def _exploration(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> list[Window]:
-    motions = _exploration_motions(recording, serials)
-    return [window(recording, clocks, serials, e, REFINEMENT_CUTOFF_HZ) for e in motions]
-
-
-# ---------------------------------------------------------------------- dynamics
+    motions = [*alone, *whole[:1], *repeats]
+    return motions, [window(recording, clocks, serials, e, REFINEMENT_CUTOFF_HZ) for e in motions]
 
 
 def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Array) -> HeldOutMotion:

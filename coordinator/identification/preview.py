@@ -58,10 +58,9 @@ def preview(recording: Recording, explored: Collection[str]) -> Preview | None:
     if not observations:
         return None
     forest = likely_topology(observations, [s for s in serials if s not in moved])
-    linked = _linked(forest)
-    if not linked:
+    topology = _linked(forest)
+    if not topology.serials:
         return None
-    topology = _part(forest, linked)
     rest = recording.rest_observation(topology.serials)
     pairs = []
     for joint in [s for s in moved if s in topology.serials]:
@@ -83,9 +82,6 @@ def adjacent(chain: Chain, explored: Collection[str]) -> tuple[bool, ...]:
         parent != BASE and not any(unexplored[other] for other in chain.children(parent) if other != k)
         for k, parent in enumerate(chain.parent)
     )
-
-
-# ---------------------------------------------------------------------- observations
 
 
 def _observation(recording: Recording, joint: str, observer: str) -> MotionObservation | None:
@@ -134,25 +130,18 @@ def _mean_position(recording: Recording, joint: str, motion_ids: Sequence[int]) 
     return float(rows[-1].mean())
 
 
-# ---------------------------------------------------------------------- linked modules
-
-
-def _linked(topology: Topology) -> list[int]:
-    """Return the modules of all trees with more than one module."""
+def _linked(forest: Topology) -> Topology:
+    """Return the trees with more than one module, in the order of the forest."""
     root: list[int] = []
-    for k, parent in enumerate(topology.parent):
+    for k, parent in enumerate(forest.parent):
         root.append(k if parent == BASE else root[parent])
-    return [k for k, r in enumerate(root) if root.count(r) > 1]
-
-
-def _part(topology: Topology, linked: Sequence[int]) -> Topology:
-    """Return whole trees of a topology, in its order."""
+    linked = [k for k, r in enumerate(root) if root.count(r) > 1]
     place = {k: n for n, k in enumerate(linked)} | {BASE: BASE}
     return Topology(
-        serials=tuple(topology.serials[k] for k in linked),
-        parent=tuple(place[topology.parent[k]] for k in linked),
-        reversed=tuple(topology.reversed[k] for k in linked),
-        confidence=topology.confidence,
+        serials=tuple(forest.serials[k] for k in linked),
+        parent=tuple(place[forest.parent[k]] for k in linked),
+        reversed=tuple(forest.reversed[k] for k in linked),
+        confidence=forest.confidence,
     )
 
 

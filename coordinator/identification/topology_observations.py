@@ -7,7 +7,7 @@ module's own estimate: it shows how much other joints gave way, and whether the 
 A module's own estimate replaces feedback that is missing, and increases the uncertainty where the two differ.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +34,6 @@ from module_agent.model.errors import DataError
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import SIMULTANEOUS_CUTOFF_HZ, TOPOLOGY_CUTOFF_HZ, filtered_signals
 from module_agent.wire.feedback_rows import Rows
-from module_agent.wire.messages import Estimate
 
 KEEP_EVERY = 5
 # Up to this rotation of the joints in between, an axis counts as unchanged: the residual is some tenths of it
@@ -77,9 +76,6 @@ def respond(
     still = StillReading(*(np.array([_mean(rows, field) for rows in rests]) for field in fields))
     motion = SimultaneousMotion(*signals.settled())
     return simultaneous_response(motion, still, RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
-
-
-# ---------------------------------------------------------------------- motions of one joint
 
 
 class ObservedMotions(NamedTuple):
@@ -197,34 +193,21 @@ def _evaluate(
     observations: dict[tuple[str, str], MotionObservation] = {}
     unmoved: dict[str, str] = {}
     for joint in serials:
-        observed, why = _of_joint(recording, serials, motions[joint], axes)
+        observed: dict[str, list[MotionObservation]] = {}
+        why = "it was never commanded to move, or did not complete its motion"
+        for feedback in motions[joint]:
+            try:
+                by_observer = by_feedback(feedback, axes)
+            except NotMoved as error:
+                why = str(error)
+                continue
+            for observer, observation in _with_own(recording, serials, feedback.event, by_observer):
+                observed.setdefault(observer, []).append(observation)
+            why = "no module observed its motion"
         observations |= {(joint, observer): combined_observation(many) for observer, many in observed.items()}
         if not observed:
             unmoved[joint] = why
     return observations, unmoved
-
-
-def _of_joint(
-    recording: Recording, serials: Sequence[str], motions: Sequence[MotionFeedback], axes: Axes | None
-) -> tuple[dict[str, list[MotionObservation]], str]:
-    """Return all observers' observations of the motions of a joint; without any, the reason."""
-    observed: dict[str, list[MotionObservation]] = {}
-    why = "it was never commanded to move, or did not complete its motion"
-    for feedback in motions:
-        motion = feedback.event.motion
-        assert motion is not None
-        try:
-            by_observer = by_feedback(feedback, axes)
-        except NotMoved as error:
-            why = str(error)
-            continue
-        for observer in serials:
-            own = recording.estimates.get((feedback.event.serial, observer), {}).get((motion.motion_id,))
-            observation = _compared(by_observer.get(observer), own)
-            if observation is not None:
-                observed.setdefault(observer, []).append(observation)
-        why = "no module observed its motion"
-    return observed, why
 
 
 def by_feedback(feedback: MotionFeedback, axes: Axes | None) -> dict[str, MotionObservation]:
@@ -268,14 +251,25 @@ def _covered(source: _Source, serials: Sequence[str], event: JournalEvent) -> bo
     return len(joint_window.t_ns) > 0.9 * len(whole.t_ns)
 
 
-def _compared(observed: MotionObservation | None, own: Estimate | None) -> MotionObservation | None:
-    """Return the observation from feedback, less certain if the module's own valid estimate differs."""
-    if own is None or own.note:
-        return observed
-    if observed is None:
-        return MotionObservation(own.moved, own.rate_ratio, None, OWN_SIGMA)
-    apart = abs(observed.rate_ratio - own.rate_ratio)
-    return observed._replace(sigma=float(np.hypot(observed.sigma, max(0.0, apart - observed.sigma))))
+def _with_own(
+    recording: Recording,
+    serials: Sequence[str],
+    event: JournalEvent,
+    by_observer: Mapping[str, MotionObservation],
+) -> Iterator[tuple[str, MotionObservation]]:
+    """Yield the observations of a motion, less certain where the module's own valid estimate differs."""
+    assert event.motion is not None
+    for observer in serials:
+        observed = by_observer.get(observer)
+        own = recording.estimates.get((event.serial, observer), {}).get((event.motion.motion_id,))
+        if own is not None and not own.note:
+            if observed is None:
+                observed = MotionObservation(own.moved, own.rate_ratio, None, OWN_SIGMA)
+            else:
+                apart = max(0.0, abs(observed.rate_ratio - own.rate_ratio) - observed.sigma)
+                observed = observed._replace(sigma=float(np.hypot(observed.sigma, apart)))
+        if observed is not None:
+            yield observer, observed
 
 
 def _mean(rows: Rows, field: str) -> Array:

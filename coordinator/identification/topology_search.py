@@ -67,11 +67,7 @@ def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:
 
 
 def _observed_motions(recording: Recording, serials: Sequence[str]) -> ObservedMotions:
-    """Return the observations of the slow motions combined with those of a motion of all joints at once.
-
-    Raises:
-        DataError: the motion of all joints cannot be evaluated; see `respond`.
-    """
+    """Return the observations of slow motions combined with those of all joints at once (`respond`)."""
     slow, whole = observe(recording, serials), simultaneous_motion(recording, serials)
     if whole is None:
         return slow
@@ -90,11 +86,7 @@ def _usable(observed: ObservedMotions) -> tuple[dict[tuple[str, str], MotionObse
 
 def _notes(observed: ObservedMotions, topology: Topology) -> list[str]:
     notes = [f"{s} observed no motion and is left out: its parent is not known" for s in observed.silent]
-    notes += [
-        f"joint {s} did not move ({why}): its mounting is not known, and what it carries is attributed to "
-        "its parent"
-        for s, why in observed.unmoved.items()
-        if s in topology.unmoved
-    ]
-    notes += [f"in doubt: {doubt.text}" for doubt in topology.doubts]
-    return notes
+    unknown = "its mounting is not known, and what it carries is attributed to its parent"
+    unmoved = {s: why for s, why in observed.unmoved.items() if s in topology.unmoved}
+    notes += [f"joint {s} did not move ({why}): {unknown}" for s, why in unmoved.items()]
+    return notes + [f"in doubt: {doubt.text}" for doubt in topology.doubts]

@@ -119,7 +119,10 @@ def _refine(chain: Chain, observations: ChainObservations, min_gain: float) -> C
         keep = slice(parts.rank)
         step = -parts.vt[keep].T @ ((parts.u[:, keep].T @ rest) / parts.s[keep])
         before = float(rest @ rest)
-        better = _shortened(chain, observations, step, before)
+        # The longest of the halved steps that lowers the cost.
+        moved = (_stepped(chain, 0.5**halving * step) for halving in range(HALVINGS))
+        trials = ((trial, residuals(trial, observations)) for trial in moved)
+        better = next((one for one in trials if float(one[1] @ one[1]) < before), None)
         if better is None:
             return chain
         chain, rest = better
@@ -127,18 +130,6 @@ def _refine(chain: Chain, observations: ChainObservations, min_gain: float) -> C
         if np.abs(step).max() < STILL or gain < min_gain:
             return chain
     return chain
-
-
-def _shortened(
-    chain: Chain, observations: ChainObservations, step: Array, cost: float
-) -> tuple[Chain, Array] | None:
-    """Return the chain after the longest of the halved steps that lowers the cost; None if none does."""
-    for halving in range(HALVINGS):
-        moved = _stepped(chain, 0.5**halving * step)
-        rest = residuals(moved, observations)
-        if float(rest @ rest) < cost:
-            return moved, rest
-    return None
 
 
 def _stepped(chain: Chain, step: Array) -> Chain:

@@ -32,6 +32,10 @@ class ChainEstimate:
         """The null space by name."""
         return name_null_space(self.chain, self.null_basis)
 
+    @cached_property
+    def _link_lengths(self) -> tuple[Array, Array]:
+        return link_lengths(self.chain, self.covariance)
+
     @property
     def link_length_m(self) -> Array:
         """(n,) perpendicular distance from the parent's axis to the module's IMU at q = 0; NaN for roots."""
@@ -42,14 +46,9 @@ class ChainEstimate:
         """(n,) one standard deviation of `link_length_m`."""
         return self._link_lengths[1]
 
-    @cached_property
-    def _link_lengths(self) -> tuple[Array, Array]:
-        return link_lengths(self.chain, self.covariance)
-
 
 def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
-    """Return the lengths (n,) from each parent's axis to the module's IMU at q = 0 and their sigmas; NaN for
-    roots.
+    """Return the lengths (n,) [m] of `ChainEstimate.link_length_m` and their sigmas; NaN for roots.
 
     Where the length is zero it has no slope; the sigma is then that of the place across the axis.
     """
@@ -62,8 +61,8 @@ def link_lengths(chain: Chain, covariance: Array) -> tuple[Array, Array]:
         length[k] = float(np.linalg.norm(radial))
         # Only the motion of the IMU against the axis counts: that of the line, as a body, is taken off.
         slope = np.zeros((3, covariance.shape[0]))
-        slope[:, 6 * k : 6 * k + 6] = np.concatenate([-skew(place), np.eye(3)], axis=1)
-        slope[:, 6 * parent : 6 * parent + 6] -= np.concatenate([-skew(place), np.eye(3)], axis=1)
+        own = np.concatenate([-skew(place), np.eye(3)], axis=1)
+        slope[:, 6 * k : 6 * k + 6], slope[:, 6 * parent : 6 * parent + 6] = own, -own
         across = np.eye(3) - np.outer(axis, axis)
         outward = radial[None, :] / length[k] if length[k] > 1e-6 else across
         spread = outward @ slope @ covariance @ slope.T @ outward.T

@@ -5,8 +5,9 @@ half a turn moves on a circle. So every named freedom is applied as a finite mot
 at the pose that the ones before it have led to.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -80,8 +81,20 @@ def nearest(chain: Chain, free: Sequence[GaugeFreedom], places: Sequence[int], i
         off = moved(chain, free, amounts).imu_home[list(places)] - imu_home
         return np.concatenate([off[:, :3, 3].ravel(), REACH_M / np.sqrt(2.0) * off[:, :3, :3].ravel()])
 
-    fit = least_squares(misfit, _start(misfit, free), xtol=1e-10, ftol=1e-10)
-    return np.asarray(fit.x)
+    # A free heading may be off by half a turn, beyond the convergence of least squares.
+    sizes = [3 if one.kind == "position" else 1 for one in free]
+    start = np.zeros(sum(sizes))
+    best = float(np.sum(misfit(start) ** 2))
+    turning = [
+        k for k, one in zip(np.cumsum([0, *sizes]), free, strict=False) if one.kind.startswith("rotation")
+    ]
+    for place, angle in product(turning, TURNS_RAD):
+        trial = start.copy()
+        trial[place] = angle
+        cost = float(np.sum(misfit(trial) ** 2))
+        if cost < best:
+            best, start = cost, trial
+    return np.asarray(least_squares(misfit, start, xtol=1e-10, ftol=1e-10).x)
 
 
 def moved(chain: Chain, free: Sequence[GaugeFreedom], amounts: Array) -> Chain:
@@ -114,20 +127,3 @@ def _twists(chain: Chain, one: GaugeFreedom) -> Array:
     if one.kind == "offset_along_axis":
         return frozen(np.r_[np.zeros(3), axis][None])
     return frozen(np.r_[axis, np.cross(point, axis)][None])
-
-
-def _start(misfit: Callable[[Array], Array], free: Sequence[GaugeFreedom]) -> Array:
-    """Choose the start of least squares: a free heading may be off by half a turn, beyond its convergence."""
-    sizes = [3 if one.kind == "position" else 1 for one in free]
-    start = np.zeros(sum(sizes))
-    best = float(np.sum(misfit(start) ** 2))
-    for place, one in zip(np.cumsum([0, *sizes]), free, strict=False):
-        if not one.kind.startswith("rotation"):
-            continue
-        for angle in TURNS_RAD:
-            trial = start.copy()
-            trial[place] = angle
-            cost = float(np.sum(misfit(trial) ** 2))
-            if cost < best:
-                best, start = cost, trial
-    return start

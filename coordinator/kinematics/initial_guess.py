@@ -42,7 +42,11 @@ def initial_chain(
         gravity=np.array([0.0, 0.0, gravity_m_s2]),
     )
     chain = _placed(chain, 0, types[0], np.eye(3), np.array(types[0].imu_xyz))
-    chain = chain._replace(gravity=frozen(gravity_m_s2 * _root_gravity(chain, observations)))
+    # Gravity in the root frame, by the first module's IMU.
+    rows = observations.rest_module == 0
+    own = _own_motion(chain, 0, observations.positions[observations.rest_pose[rows]])
+    up = np.einsum("vij,vj->i", own[:, :3, :3], observations.gravity[rows])
+    chain = chain._replace(gravity=frozen(gravity_m_s2 * (up / np.linalg.norm(up))))
     for k in range(1, count):
         evidence = _evidence(chain, k, observations)
         turn, place = _neutral(chain, k, types)
@@ -84,14 +88,6 @@ def own_line(kind: ModuleType, mounted_reversed: bool) -> tuple[Array, Array]:
     """
     direction = np.array([0.0, 0.0, -1.0 if mounted_reversed else 1.0])
     return direction, np.array(kind.output_xyz) - np.array(kind.imu_xyz)
-
-
-def _root_gravity(chain: Chain, observations: ChainObservations) -> Array:
-    """Return the unit specific force of rest in the root frame, by the first module's IMU."""
-    rows = observations.rest_module == 0
-    own = _own_motion(chain, 0, observations.positions[observations.rest_pose[rows]])
-    total = np.einsum("vij,vj->i", own[:, :3, :3], observations.gravity[rows])
-    return np.asarray(total / np.linalg.norm(total))
 
 
 def _own_motion(chain: Chain, k: int, positions: Array) -> Array:

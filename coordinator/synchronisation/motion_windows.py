@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData, outstanding
+from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData, measured_base_motion
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from module_agent.model.chain import Array
@@ -121,11 +121,11 @@ def _no_row(serial: str, event: JournalEvent) -> DataError:
     return DataError(f"module {serial} has no row in the {motion}: its recording has a hole")
 
 
-def noise_floor(rest: Window, cutoff_hz: float, module: int) -> NoiseFloor:
-    """Return the noise of one module's IMU at rest, through the same low-pass as `filtered`."""
+def noise_floor(rest: Window, cutoff_hz: float) -> NoiseFloor:
+    """Return the noise of the first module's IMU at rest, through the same low-pass as `filtered`."""
     edge = settling_samples(RATE_HZ, cutoff_hz)
     gyro, accel = (
-        zero_phase_low_pass(signal[:, module], RATE_HZ, cutoff_hz)[edge:-edge].var(axis=0)
+        zero_phase_low_pass(signal[:, 0], RATE_HZ, cutoff_hz)[edge:-edge].var(axis=0)
         for signal in (rest.gyro_rad_s, rest.accel_m_s2)
     )
     return NoiseFloor(gyro, accel, cutoff_hz)
@@ -173,9 +173,7 @@ def filtered(
     rates = np.concatenate([differentiate(gyro, RATE_HZ), differentiate(accel, RATE_HZ)], axis=2)
     base = None
     if floor is not None:
-        omega = outstanding(gyro[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
-        force = outstanding(accel[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
-        base = np.concatenate([omega, differentiate(omega, RATE_HZ), force], axis=1)[settled]
+        base = np.hstack(measured_base_motion(gyro[:, 0], accel[:, 0], floor, RATE_HZ))[settled]
     q, qd, qdd, gyro, accel, rates = (signal[settled] for signal in (q, qd, qdd, gyro, accel, rates))
     return SensorData(q, qd, qdd, gyro, accel, rates, base, None, instrument)
 

@@ -104,11 +104,6 @@ class Topology(NamedTuple):
     unmoved: tuple[str, ...] = ()
     doubts: tuple[Doubt, ...] = ()
 
-    @property
-    def roots(self) -> tuple[str, ...]:
-        """The modules on the base."""
-        return tuple(s for s, p in zip(self.serials, self.parent, strict=True) if p == BASE)
-
     def caveat(self, k: int) -> str:
         """Return a phrase about what is uncertain of the module with this index; empty if nothing is."""
         if self.serials[k] in self.unmoved:
@@ -204,9 +199,6 @@ def _described(case: _Case, unmoved: Collection[str]) -> Topology:
     )
 
 
-# ---------------------------------------------------------------------- doubts
-
-
 def _doubts(case: _Case, unmoved: Collection[str]) -> Iterator[Doubt]:
     for k, serial in enumerate(case.serials):
         if case.edge_odds[k] < DOUBTFUL_BELOW:
@@ -254,9 +246,6 @@ def _saw(observations: Observations, joint: str, observer: str) -> str:
 
 def _chance(log_odds: float) -> str:
     return f"{100.0 / (1.0 + np.exp(-log_odds)):.1f} %"
-
-
-# ---------------------------------------------------------------------- what no tree allows
 
 
 class _Contradiction(NamedTuple):

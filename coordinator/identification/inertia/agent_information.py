@@ -78,6 +78,13 @@ def question(
     steps = dynamic_steps(recording)
     if not steps or len(chain.serials) > MAX_MODULES:
         raise DataError(f"{len(steps)} dynamic motions of {len(chain.serials)} modules")
+    motions = []
+    for event in steps:
+        assert event.motion is not None
+        start_ns, end_ns = span(recording, clocks, event, DYNAMIC_CUTOFF_HZ)
+        t_ns = window(recording, clocks, chain.serials, event, DYNAMIC_CUTOFF_HZ).t_ns
+        within = {"start_ns": start_ns, "end_ns": end_ns, "first_ns": int(t_ns[0]), "samples": len(t_ns)}
+        motions.append(SpanPart(motion_id=event.motion.motion_id, **within))
     return InformationRequest(
         serial="",
         boot=0,
@@ -85,24 +92,9 @@ def question(
         sender=sender,
         chain=chain_part(chain),
         clocks=tuple(clock_part(clocks[s]) for s in chain.serials),
-        motions=tuple(_span_part(recording, chain, clocks, event) for event in steps),
+        motions=tuple(motions),
         step_ns=STEP_NS,
         cutoff_hz=DYNAMIC_CUTOFF_HZ,
-    )
-
-
-def _span_part(
-    recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap], event: JournalEvent
-) -> SpanPart:
-    assert event.motion is not None
-    start_ns, end_ns = span(recording, clocks, event, DYNAMIC_CUTOFF_HZ)
-    t_ns = window(recording, clocks, chain.serials, event, DYNAMIC_CUTOFF_HZ).t_ns
-    return SpanPart(
-        motion_id=event.motion.motion_id,
-        start_ns=start_ns,
-        end_ns=end_ns,
-        first_ns=int(t_ns[0]),
-        samples=len(t_ns),
     )
 
 

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from coordinator.batch_estimation.estimator import Refinement
-from coordinator.batch_estimation.imu_intrinsics import DELAY
+from coordinator.batch_estimation.imu_intrinsics import DELAY, undone
 from coordinator.batch_estimation.imu_prediction import (
     BodyMotion,
     LinkTurns,
@@ -20,7 +20,7 @@ from coordinator.batch_estimation.imu_prediction import (
     given,
 )
 from coordinator.batch_estimation.link_compliance import link_loads, turns_under, with_hinges_moved
-from coordinator.batch_estimation.sensor_data import BaseMotion, NoiseFloor, SensorData, outstanding
+from coordinator.batch_estimation.sensor_data import BaseMotion, NoiseFloor, SensorData, measured_base_motion
 from coordinator.dynamics.body_regressor import BodyTrack, body_tracks
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window
 from module_agent.model.catalogue import ModuleType, TorqueKind
@@ -57,9 +57,9 @@ def readings(one: Window, refined: Refinement, cutoff_hz: float) -> SensorData:
     imus = refined.intrinsics
     late_s = (refined.late_s + imus.errors[:, DELAY])[:, None]
     gyro, accel = (signal + late_s * differentiate(signal, RATE_HZ) for signal in (gyro, accel))
-    force = _undone(imus.accel_matrix, accel - imus.accel_bias_m_s2)
+    force = undone(imus.accel_matrix, accel - imus.accel_bias_m_s2)
     from_acceleration = np.einsum("nij,mnj->mni", imus.g_sensitivity_s_m, force)
-    rate = _undone(imus.gyro_matrix, gyro - imus.gyro_bias_rad_s - from_acceleration)
+    rate = undone(imus.gyro_matrix, gyro - imus.gyro_bias_rad_s - from_acceleration)
     q, qd, qdd, rate, force = (signal[kept] for signal in (q, qd, qdd, rate, force))
     return SensorData(q, qd, qdd, rate, force)
 
@@ -72,7 +72,9 @@ def body_motion_tracks(robot: Robot, measured: SensorData, imus: bool) -> list[B
         measured: one stretch of time without a gap.
         imus: whether the residuals of the IMUs are used too.
     """
-    base = None if robot.floor is None else _base(measured, robot.floor)
+    base, gyro, accel = None, measured.gyro_rad_s, measured.accel_m_s2
+    if robot.floor is not None:
+        base = measured_base_motion(gyro[:, 0], accel[:, 0], robot.floor, RATE_HZ)
     turns = _turns(robot, measured, base)
     bodies = body_motions(robot.chain, *measured.joints, base, turns)
     tracks = body_tracks(robot.chain, measured.q_rad, bodies, turns)
@@ -84,16 +86,6 @@ def body_motion_tracks(robot: Robot, measured: SensorData, imus: bool) -> list[B
         _corrected(robot.chain, bodies, turns, measured, track, riders[i]) if i in riders else track
         for i, track in enumerate(tracks)
     ]
-
-
-def _undone(matrix: Array, read: Array) -> Array:
-    return np.asarray(np.einsum("nij,mnj->mni", np.linalg.inv(matrix), read))
-
-
-def _base(measured: SensorData, floor: NoiseFloor) -> BaseMotion:
-    omega = outstanding(measured.gyro_rad_s[:, 0], floor.gyro, floor.cutoff_hz, RATE_HZ)
-    force = outstanding(measured.accel_m_s2[:, 0], floor.accel, floor.cutoff_hz, RATE_HZ)
-    return BaseMotion(omega, differentiate(omega, RATE_HZ), force)
 
 
 def _turns(robot: Robot, measured: SensorData, base: BaseMotion | None) -> LinkTurns:

@@ -80,8 +80,7 @@ def robot_bodies(
     """Return the bodies that a robot's joints move.
 
     Args:
-        information: per joint of n.
-        chain, types: of the same n.
+        information, chain, types: of n joints.
         least_squares: its noise weighs the joints.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         effects: (k_i, j) of every joint: effects of systematic errors on its rows (`systematic_errors`).

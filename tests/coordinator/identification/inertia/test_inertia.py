@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.random import Generator, default_rng
 
-from coordinator.identification.inertia.projected_rows import ProjectedRows
+from coordinator.identification.inertia.inertia import ProjectedRows
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation, compress, merge_joint
 
