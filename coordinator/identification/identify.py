@@ -207,17 +207,10 @@ def _exploration(
 
 
 def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Array) -> HeldOutMotion:
-    check = check_held_out(kinematics.fit.chain, phi, motion, means)
-    serials = kinematics.topology.serials
-    return HeldOutMotion(
-        serials,
-        motion.t_ns,
-        np.stack([kinematics.clocks[s].to_module(motion.t_ns) for s in serials], axis=1),
-        motion.q_rad,
-        motion.tau_nm,
-        check.tau_predicted_nm,
-        check.error,
-    )
+    serials, t_ns = kinematics.topology.serials, motion.t_ns
+    _, predicted, error = check_held_out(kinematics.fit.chain, phi, motion, means)
+    module_ns = np.stack([kinematics.clocks[s].to_module(t_ns) for s in serials], axis=1)
+    return HeldOutMotion(serials, t_ns, module_ns, motion.q_rad, motion.tau_nm, predicted, error)
 
 
 def write_held_out(path: Path, held_out: HeldOutMotion) -> None:

@@ -222,15 +222,14 @@ def by_feedback(feedback: MotionFeedback, axes: Axes | None) -> dict[str, Motion
     joint = names.index(feedback.event.serial)
     known = axes.of(names) if axes is not None and not axes.turned_away(feedback) else None
     evidence = motion_evidence(joint, feedback.qd_rad_s, feedback.gyro_rad_s, feedback.offset_rad_s, known)
-    columns = zip(
-        names, evidence.coefficient, evidence.rate_ratio, evidence.ratio_sigma, evidence.give, strict=True
-    )
-    return {
-        serial: MotionObservation(
-            bool(ratio > 0.5), float(ratio), axis / ratio if ratio > 0.5 else None, float(sigma), float(give)
+    observed = {}
+    for k, name in enumerate(names):
+        ratio, sigma, give = (
+            float(of[k]) for of in (evidence.rate_ratio, evidence.ratio_sigma, evidence.give)
         )
-        for serial, axis, ratio, sigma, give in columns
-    }
+        axis = evidence.coefficient[k] / ratio if ratio > 0.5 else None
+        observed[name] = MotionObservation(ratio > 0.5, ratio, axis, sigma, give)
+    return observed
 
 
 def _observers(source: _Source, event: JournalEvent) -> list[str]:

@@ -106,14 +106,8 @@ def simultaneous_response(
     first, second = np.triu_indices(count)
     terms = np.column_stack([data.qdd_rad_s2, swing, one, qd[:, first] * qd[:, second]])
     tangential, sigma_tangential = _regressed(terms, force, independent)
-    return SimultaneousResponse(
-        frozen(axis[:count]),
-        frozen(tangential[:count]),
-        frozen(sigma_axis[:count]),
-        frozen(sigma_tangential[:count]),
-        frozen(np.mean(swing**2, axis=0)),
-        frozen(q.mean(axis=0)),
-    )
+    own = (part[:count] for part in (axis, tangential, sigma_axis, sigma_tangential))
+    return SimultaneousResponse(*map(frozen, (*own, np.mean(swing**2, axis=0), q.mean(axis=0))))
 
 
 def motion_observations(

@@ -25,8 +25,7 @@ def log_likelihood(parent: Sequence[int], odds: Array) -> float:
     Args:
         odds: (n, n) log-odds that joint i carries the IMU of module k; the diagonal does not matter here.
     """
-    above = ancestors(parent)
-    return float(odds[above].sum())
+    return float(odds[ancestors(parent)].sum())
 
 
 def ancestors(parent: Sequence[int]) -> "np.ndarray[tuple[int, int], np.dtype[np.bool_]]":

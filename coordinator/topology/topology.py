@@ -3,6 +3,7 @@
 The joints that move a module's IMU are the ones between it and the base. So the joints that move it, its own
 apart, are its ancestors; the parent is the ancestor that itself has the most ancestors. A module that moves
 with its own joint is mounted reversed: by its output, so that the housing turns.
+
 Observations are weighted by their log-odds (docs/theory.md, "Topology"); those that contradict the likeliest
 forest, or leave it in doubt, are named.
 """
