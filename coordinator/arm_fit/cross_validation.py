@@ -27,6 +27,8 @@ Predictor = Callable[[slice, slice], Array]
 
 # Parts of a half of which the data-length curve is made.
 CURVE_PARTS = (0.25, 0.5, 0.75, 1.0)
+# Gauss-Newton steps for friction that grows with the load, until it changes by less.
+_MAX_STEPS, _SETTLED = 10, 1e-4
 
 
 class HeldOutError(NamedTuple):
@@ -69,23 +71,35 @@ def halves(samples: int, settling: int) -> tuple[slice, slice]:
 def fit_part(problem: Problem, some: slice) -> WeightedFit:
     """Fit to the moving samples of a part of the recording.
 
+    Friction that grows with the load makes the model bilinear; Gauss-Newton steps from no such friction.
+
     Raises:
         DataError: a joint with too few samples.
     """
-    return fit_weighted(
-        regressor=problem.regressor[some],
-        tau_nm=problem.log.tau_nm[some],
-        scale=problem.columns.scale,
-        used=problem.moving[some],
-        robust=problem.choice.robust,
-        min_correlation=problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
-        instruments=None if problem.instruments is None else problem.instruments[some],
-    )
+    other = None if problem.instruments is None else problem.instruments[some]
+    x, loads = np.zeros(len(problem.columns.names)), [column for column, _ in problem.loads]
+    for _ in range(_MAX_STEPS):
+        slope, shift = problem.linearised(x, problem.regressor[some])
+        fit = fit_weighted(
+            regressor=slope,
+            tau_nm=problem.log.tau_nm[some] + shift,
+            scale=problem.columns.scale,
+            used=problem.moving[some],
+            robust=problem.choice.robust,
+            min_correlation=problem.log.rate_hz / (2.0 * problem.log.cutoff_hz),
+            instruments=None if other is None else problem.linearised(x, other)[0],
+        )
+        # The first step only finds the load.
+        settled = x.any() and np.abs(fit.parameters[loads] - x[loads]).max(initial=0.0) < _SETTLED
+        if settled or not loads:
+            break
+        x = fit.parameters
+    return fit
 
 
 def fitted(problem: Problem) -> Predictor:
     """Return the predictor that fits all of the problem's columns."""
-    return lambda seen, tried: problem.regressor[tried] @ fit_part(problem, seen).parameters
+    return lambda seen, tried: problem.predicted(fit_part(problem, seen).parameters, tried)
 
 
 def by_consistent_bodies(problem: Problem, prior: Array, trust: float) -> Predictor:
@@ -93,8 +107,7 @@ def by_consistent_bodies(problem: Problem, prior: Array, trust: float) -> Predic
 
     def predict(seen: slice, tried: slice) -> Array:
         fit = consistent_bodies(problem, fit_part(problem, seen), prior, trust)
-        predicted: Array = problem.regressor[tried] @ np.concatenate([fit.phi, fit.drives])
-        return predicted
+        return problem.predicted(np.concatenate([fit.phi, fit.drives]), tried)
 
     return predict
 
@@ -161,7 +174,7 @@ def gain_of_terms(problem: Problem) -> Iterator[TermGain]:
     Raises:
         DataError: too few samples.
     """
-    for term in problem.choice.terms:
+    for term in dict.fromkeys(drive.term for drive in problem.drives):
         lacking = _without(problem, term)
         yield TermGain(term, *overall(held_out_errors(lacking, fitted(lacking))))
     if problem.choice.coupled:

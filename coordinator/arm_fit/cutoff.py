@@ -22,20 +22,18 @@ _LOWEST_PERIODS, _HIGHEST_OF_RATE = 40.0, 0.2
 _STEP = np.sqrt(2.0)
 # The ladder ends where the error is so many times the least: noise grows with the cube of the cut-off.
 _BEYOND = 1.3
+# Of the residual's power, for a cut-off below that of the least error.
+_SPARED = 0.2
 # Samples for a fit of the ladder.
 _MAX_COUNT = 2000
 
 
 class CutoffPoint(NamedTuple):
-    """Relative errors of torques that were held out, both ways together, behind a low-pass.
-
-    sigma: standard error of `filtered`.
-    """
+    """Relative errors of torques that were held out, both ways together, behind a low-pass."""
 
     cutoff_hz: float
     filtered: float
     raw: float
-    sigma: float
 
 
 def cutoff_curve(robot: UrdfRobot, log: JointLog, choice: ModelChoice) -> tuple[CutoffPoint, ...]:
@@ -66,13 +64,13 @@ def cutoff_curve(robot: UrdfRobot, log: JointLog, choice: ModelChoice) -> tuple[
 
 
 def chosen_cutoff_hz(curve: tuple[CutoffPoint, ...]) -> float:
-    """Return the lowest cut-off whose raw error is within one standard error of the least.
+    """Return the lowest cut-off that does about as well as the one of the least raw error.
 
-    One standard error (Breiman et al. 1984, Classification and regression trees, section 3.4.3) keeps chance
-    from deciding among cut-offs that do equally well; the lowest of them lets the least noise through.
+    Near the least the curve is flat. A lower cut-off lets less noise through, and may cost a fifth of the
+    residual's power.
     """
     best = min(curve, key=lambda point: point.raw)
-    allowed = best.raw**2 + 2.0 * best.filtered * best.sigma
+    allowed = best.raw**2 + _SPARED * best.filtered**2
     return next(point.cutoff_hz for point in curve if point.raw**2 <= allowed)
 
 
@@ -80,12 +78,11 @@ def _point(some: Problem) -> CutoffPoint:
     log, (first, second) = some.log, halves(len(some.log.tau_nm), some.log.settling)
     fits = fit_part(some, first), fit_part(some, second)
     off = [
-        log.tau_nm[tried] - some.regressor[tried] @ fit.parameters
+        log.tau_nm[tried] - some.predicted(fit.parameters, tried)
         for fit, tried in zip(fits, (second, first), strict=True)
     ]
     size = np.linalg.norm(np.concatenate([log.tau_nm[first], log.tau_nm[second]]))
     filtered = float(np.linalg.norm(np.concatenate(off)) / size)
-    independent = sum(fit.independent_samples for fit in fits)
     # The filtered torques have 1 - noise^2 of the power of the raw ones.
     raw = float(np.hypot(log.noise, filtered * np.sqrt(1.0 - log.noise**2)))
-    return CutoffPoint(log.cutoff_hz, filtered, raw, filtered / np.sqrt(2.0 * independent))
+    return CutoffPoint(log.cutoff_hz, filtered, raw)

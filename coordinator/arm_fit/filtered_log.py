@@ -17,7 +17,7 @@ _KEPT_PER_CUTOFF = 6.0
 # A regressor of so many entries has 120 MB, and a fit holds some copies; a joint has about so many columns.
 # Longer recordings are thinned further.
 _MAX_ENTRIES = 1.5e7
-_COLUMNS_PER_JOINT = 15
+_COLUMNS_PER_JOINT = 20
 
 
 class FilteredLog(NamedTuple):

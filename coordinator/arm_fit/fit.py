@@ -27,6 +27,7 @@ from coordinator.arm_fit.cross_validation import (
 )
 from coordinator.arm_fit.cutoff import CutoffPoint
 from coordinator.arm_fit.data_file import JointLog
+from coordinator.arm_fit.drive_choice import Trial
 from coordinator.arm_fit.problem import Problem, joined
 from coordinator.arm_fit.report import (
     ArmParameterPart,
@@ -41,6 +42,7 @@ from coordinator.arm_fit.report import (
     Model,
     TermGainPart,
     TermPart,
+    TrialPart,
 )
 from coordinator.parameter_fit.base_parameters import (
     BaseParameters,
@@ -59,8 +61,8 @@ from module_agent.model.regressor import PER_BODY
 _ROUNDING = 1e-9
 
 Step = Callable[[str], None]
-# Of `fit_dynamics`: reading, filtering and the four of `fit_and_test`.
-STEPS = 6
+# Of `fit_dynamics`: reading, filtering, choosing and the four of `fit_and_test`.
+STEPS = 7
 
 
 class FitResult(NamedTuple):
@@ -81,6 +83,7 @@ def fit_and_test(
     problem: Problem,
     log: JointLog,
     curve: Sequence[CutoffPoint],
+    trials: Sequence[Trial],
     *,
     urdf_name: str,
     data_name: str,
@@ -92,7 +95,7 @@ def fit_and_test(
 
     Args:
         problem: the recording as a least-squares problem. log: the same as recorded. curve: of the choice of
-            the low-pass, empty if it was given.
+            the low-pass, empty if it was given. trials: of the choice of friction terms.
         urdf_name, data_name: names of the files for the report.
         step: is called with a sentence before each of the steps.
         trust: weight of the URDF's inertias for the consistent bodies (`consistent_bodies`).
@@ -127,6 +130,7 @@ def fit_and_test(
         lengths=lengths,
         gains=gains,
         fit=_fit_part(problem, fit, bodies, note),
+        trials=[TrialPart(**trial._asdict()) for trial in trials],
     )
     return FitResult(report, bodies)
 
@@ -159,7 +163,7 @@ def _predictors(problem: Problem, trust: float | None) -> list[tuple[Model, tupl
     if problem.robot.phi is not None:
         tried.append(("urdf", (problem, by_given_bodies(problem, problem.robot.phi))))
     if problem.drives:
-        alone = problem.with_drives(lambda _: True, bodies=False)
+        alone = problem.with_drives(lambda drive: drive.term != "load", bodies=False)
         tried.append(("drives_only", (alone, fitted(alone))))
     return [*tried, ("mean", (problem, mean_torque(problem)))]
 
@@ -212,8 +216,8 @@ def _fit_part(problem: Problem, fit: WeightedFit, bodies: ConsistentBodies | Non
         condition=fit.condition,
         robust=problem.choice.robust,
         instruments=problem.instruments is not None,
-        terms=list(problem.choice.terms),
-        coupled=[[names[i], names[j]] for i, j in problem.choice.coupled],
+        terms=list(dict.fromkeys(drive.term for drive in problem.drives)),
+        coupled=[[names[i], names[j]] for i, j in problem.choice.coupled or ()],
         independent_samples=fit.independent_samples,
         base_parameters=_base_parts(problem, base),
         bodies=_bodies(problem, base, bodies),

@@ -11,6 +11,7 @@ from coordinator.arm_fit.checks import wrong_motion, wrong_torques
 from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
 from coordinator.arm_fit.cutoff import chosen_cutoff_hz, cutoff_curve
 from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_log
+from coordinator.arm_fit.drive_choice import candidates, choose_drives, pairs
 from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
@@ -108,15 +109,23 @@ def fit_dynamics(
     if checked:
         _refuse(wrong_motion(robot, log))
     progress("choose the low-pass")
-    curve = cutoff_curve(robot, log, choice) if cutoff_hz is None else ()
-    posed = _posed(robot, log, choice, cutoff_hz or chosen_cutoff_hz(curve), instruments)
+    joints = len(robot.bodies)
+    with_pairs = choice._replace(coupled=choice.coupled or pairs(choice, joints))
+    curve = cutoff_curve(robot, log, with_pairs) if cutoff_hz is None else ()
+    extra = candidates(choice, joints)
+    posed = _posed(
+        robot, log, choice._replace(extra=extra), cutoff_hz or chosen_cutoff_hz(curve), instruments
+    )
     if checked:
-        _refuse(wrong_torques(posed, log))
+        _refuse(wrong_torques(posed.with_drives(lambda drive: drive not in extra), log))
+    progress("choose the friction of each joint")
+    posed, trials = choose_drives(posed)
     elsewhere = None if held_out is None else Elsewhere(_name(held_out), _posed_like(posed, held_out))
     result = fit_and_test(
         posed,
         log,
         curve,
+        trials,
         urdf_name=_name(urdf),
         data_name=_name(data),
         step=progress,

@@ -26,15 +26,19 @@ from module_agent.signals.torque_terms import TERM_KINDS, Term
 class ModelChoice(NamedTuple):
     """The terms and options of the model.
 
-    terms, coupled: see `drive_columns`. robust: Huber's weights. slow_part, mask_part: the speed below which
-    the sign of friction fades, and that below which a sample is masked, in parts of the joint's top speed.
+    terms, coupled: see `drive_columns`; if `coupled` is None, pairs of neighbouring joints are tried.
+    robust: Huber's weights. slow_part, mask_part: the speed below which the sign of friction fades, and that
+    below which a sample is masked, in parts of the joint's top speed. tried: terms that are tried joint by
+    joint, and kept where they pay (`drive_choice`). extra: columns that are in the model besides.
     """
 
     terms: tuple[Term, ...] = USUAL_TERMS
-    coupled: tuple[tuple[int, int], ...] = ()
+    coupled: tuple[tuple[int, int], ...] | None = None
     robust: bool = False
     slow_part: float = 0.01
     mask_part: float = 0.05
+    tried: tuple[Term, ...] = ("load", "curved", "stribeck", "asymmetry")
+    extra: tuple[DriveColumn, ...] = ()
 
 
 class Problem(NamedTuple):
@@ -43,6 +47,8 @@ class Problem(NamedTuple):
     moving: (m, n) samples whose joint turns fast enough that friction has a direction. Only these are fitted:
         friction at rest depends on how the joint came to a stop. instruments: (m, n, p) the regressor by
         other measurements of the same motion, None for least squares.
+
+    The column of friction that grows with the load has the sign alone; `linearised` multiplies by the load.
     """
 
     robot: UrdfRobot
@@ -58,6 +64,35 @@ class Problem(NamedTuple):
     def inertial(self) -> int:
         """The number of columns of the bodies."""
         return PER_BODY * len(self.robot.bodies)
+
+    @property
+    def loads(self) -> list[tuple[int, int]]:
+        """The columns of friction that grows with the load, each with its joint."""
+        return [(self.inertial + k, d.joints[0]) for k, d in enumerate(self.drives) if d.term == "load"]
+
+    def linearised(self, x: Array, regressor: Array) -> tuple[Array, Array]:
+        """Return the derivatives J (m, n, p) of the torques at parameters x, and J x less the torques (m, n).
+
+        Of tau = Y phi + Fl |Y phi| s the derivative by phi is Y (1 + Fl sign(Y phi) s).
+        """
+        shift = np.zeros(regressor.shape[:2])
+        if not self.loads:
+            return regressor, shift
+        slope = regressor.copy()
+        for column, joint in self.loads:
+            rigid, sign = (
+                regressor[:, joint, : self.inertial] @ x[: self.inertial],
+                regressor[:, joint, column],
+            )
+            slope[:, joint, : self.inertial] *= (1.0 + x[column] * np.sign(rigid) * sign)[:, None]
+            slope[:, joint, column] = sign * np.abs(rigid)
+            shift[:, joint] = x[column] * slope[:, joint, column]
+        return slope, shift
+
+    def predicted(self, x: Array, some: slice) -> Array:
+        """Return the torques (m', n) of some samples by parameters x (p,)."""
+        slope, shift = self.linearised(x, self.regressor[some])
+        return np.asarray(slope @ x - shift)
 
     def with_drives(self, keep: Callable[[DriveColumn], bool], bodies: bool = True) -> "Problem":
         """Return the problem with some of the drives' columns, and with or without the bodies'."""
@@ -108,7 +143,7 @@ def problem(
             f"joint {robot.chain.serials[still[0]]!r} never moves in the recording; its friction is not "
             "determined: record a motion of all joints"
         )
-    drives = drive_columns(len(robot.bodies), choice.terms, choice.coupled)
+    drives = (*drive_columns(len(robot.bodies), choice.terms, choice.coupled or ()), *choice.extra)
     slow_rad_s = choice.slow_part * top_rad_s
     moving = np.abs(log.qd_rad_s) > choice.mask_part * top_rad_s
     moving.flags.writeable = False

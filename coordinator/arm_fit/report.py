@@ -77,6 +77,22 @@ class TermGainPart(Part):
     masked: float
 
 
+class TrialPart(Part):
+    """A term of one joint that was tried, or a drive that two share, by its most significant term.
+
+    joint: the last of two. f, chance: as in `TermPart`, before the choice. before, after: the joint's
+    held-out error without and with it, filtered, all samples; after is null if it was not significant.
+    """
+
+    name: str
+    joint: str
+    f: float
+    chance: float
+    before: float
+    after: float | None
+    kept: bool
+
+
 class TermPart(Part):
     """A parameter of a drive, and whether it is significant.
 
@@ -175,6 +191,7 @@ class FitReport(Part):
     held_out: list[ErrorPart]
     lengths: list[LengthPart]
     gains: list[TermGainPart]
+    trials: list[TrialPart]
     fit: FitPart
 
     def errors(self, model: Model, torque: str = "filtered") -> list[ErrorPart]:

@@ -23,6 +23,7 @@ from module_agent.signals.torque_terms import DRIVE_TERMS, Term
 _UP = ",".join(f"{part:g}" for part in STANDARD_GRAVITY)
 _USUAL_TERMS = ",".join(USUAL_TERMS)
 _USUAL = ModelChoice()
+_TRIED = ",".join(_USUAL.tried)
 
 
 _Urdf = Annotated[Path, typer.Option(help="URDF file: revolute, continuous and fixed joints.")]
@@ -44,9 +45,16 @@ _FittedUrdf = Annotated[
 ]
 _Trust = Annotated[float, typer.Option(help="Weight of the URDF's inertias as the prior of the bodies.")]
 _Terms = Annotated[str, typer.Option(help=f"Terms of the drives, of {', '.join(DRIVE_TERMS)}; or none.")]
+_Tried = Annotated[
+    str,
+    typer.Option(help="Terms to try joint by joint, and to keep where they pay on held-out data; or none."),
+]
 _Coupled = Annotated[
     list[str] | None,
-    typer.Option(help="Two joints that share a drive, by number or name: 5,6. Repeat for several."),
+    typer.Option(
+        help="Two joints that share a drive, by number or name: 5,6. Repeat for several; none for none. By "
+        "default neighbouring joints are tried."
+    ),
 ]
 _Robust = Annotated[bool, typer.Option("--robust", help="Huber's weights: outliers count less.")]
 _Instruments = Annotated[
@@ -82,6 +90,7 @@ def fit_dynamics(
     fitted_urdf: _FittedUrdf = None,
     trust: _Trust = USUAL_TRUST,
     terms: _Terms = _USUAL_TERMS,
+    tried: _Tried = _TRIED,
     coupled: _Coupled = None,
     robust: _Robust = False,
     instruments: _Instruments = False,
@@ -105,7 +114,7 @@ def fit_dynamics(
                 robot,
                 data,
                 held_out=held_out,
-                choice=ModelChoice(_terms(terms), _pairs(robot, coupled or ()), robust, slow, mask),
+                choice=ModelChoice(_terms(terms), _pairs(robot, coupled), robust, slow, mask, _terms(tried)),
                 instruments=instruments,
                 cutoff_hz=cutoff,
                 trust=trust,
@@ -151,9 +160,11 @@ def _terms(text: str) -> tuple[Term, ...]:
     return known
 
 
-def _pairs(robot: UrdfRobot, texts: Sequence[str]) -> tuple[tuple[int, int], ...]:
+def _pairs(robot: UrdfRobot, texts: Sequence[str] | None) -> tuple[tuple[int, int], ...] | None:
+    if texts is None:
+        return None
     pairs = []
-    for text in texts:
+    for text in texts if texts != ["none"] else ():
         joints = [_joint(robot, word.strip()) for word in text.split(",")]
         if len(joints) != 2 or joints[0] == joints[1]:
             raise UsageError(f"coupled {text!r}: it must be two different joints, like 5,6")

@@ -50,6 +50,12 @@ def notes(report: FitReport) -> Iterator[str]:
         f"rank {fit.rank} of {fit.parameters} parameters, condition {fit.condition:.3g}; "
         f"{fit.independent_samples:.0f} independent samples"
     )
+    for trial in report.trials:
+        if trial.after is not None:
+            yield (
+                f"{trial.name} is significant and {'kept' if trial.kept else 'left out'}: held-out error of "
+                f"{trial.joint} {_percent(trial.before)} % without it, {_percent(trial.after)} % with it"
+            )
     if fit.bodies_note:
         yield f"no physically consistent bodies: {fit.bodies_note}"
 

@@ -41,7 +41,7 @@ def drive_columns(
 ) -> tuple[DriveColumn, ...]:
     """Return the columns of n joints: every term for every joint, then those of coupled pairs (indices).
 
-    A pair has no offset of its own: it would be the sum of the two that are there.
+    A pair has no offset of its own: it would be the sum of the two that are there. Its load is not known.
 
     Raises:
         ValueError: an unknown or repeated term, or a pair that is not of two different joints of the robot.
@@ -56,7 +56,7 @@ def drive_columns(
                 f"two different joints of 1 to {joints} are needed"
             )
     alone = [DriveColumn(term, (i,)) for i in range(joints) for term in terms]
-    shared = [DriveColumn(term, pair) for pair in coupled for term in terms if term != "offset"]
+    shared = [DriveColumn(term, pair) for pair in coupled for term in terms if term not in ("offset", "load")]
     return (*alone, *shared)
 
 

@@ -3,7 +3,13 @@
 Every term is a column, linear in one parameter per joint (Khalil and Dombre 2002, Modeling, identification
 and control of robots, section 9.6). A drive adds the torque of its rotor, friction and an offset:
 
-    tau = bodies + Ia qdd + Fv qd + Fc s(qd) + Fr s(qd) sqrt|qd| + offset,    s(v) = tanh(v / slow).
+    tau = bodies + Ia qdd + Fv qd + Fc s(qd) + Fr s(qd) sqrt|qd| + offset
+          + Fl |bodies| s(qd) + Fs s(qd) exp(-(qd / 10 slow)^2) + Fa |s(qd)|,    s(v) = tanh(v / slow).
+
+Fl is the friction of gears and bearings that grows with their load (Khalil and Dombre, section 9.6; Hamon,
+Gautier and Garrec 2010, Dynamic identification of robots with a dry friction model depending on load and
+velocity), Fs what slow motion adds to Coulomb friction (Stribeck), and Fa half of the difference of Coulomb
+friction between the directions.
 
 A spring is read by its deflection y, and what rubber or grease in it damps does not show there: it transmits
 k (y + T y'), so the reading k y lags by T (a spring with a damper in parallel is a Kelvin-Voigt element). The
@@ -20,7 +26,7 @@ from module_agent.model.chain import Array
 from module_agent.model.read_only import read_only
 from module_agent.signals.filtering import JointMotion, differentiate, zero_phase_low_pass
 
-Term = Literal["inertia", "viscous", "coulomb", "curved", "offset", "lag"]
+Term = Literal["inertia", "viscous", "coulomb", "curved", "offset", "load", "stribeck", "asymmetry", "lag"]
 
 
 class TermKind(NamedTuple):
@@ -40,17 +46,25 @@ TERM_KINDS: dict[Term, TermKind] = {
     "coulomb": TermKind("Fc", "Nm", False),
     "curved": TermKind("Fr", "Nm (s/rad)^0.5", False),
     "offset": TermKind("offset", "Nm", True),
+    "load": TermKind("Fl", "Nm/Nm", False),
+    "stribeck": TermKind("Fs", "Nm", False),
+    "asymmetry": TermKind("Fa", "Nm", False),
     "lag": TermKind("T", "s", True),
 }
 
 # What the torque of a drive may hold; a motor's current has no lag.
-DRIVE_TERMS: tuple[Term, ...] = ("inertia", "viscous", "coulomb", "curved", "offset")
+DRIVE_TERMS: tuple[Term, ...] = (
+    *("inertia", "viscous", "coulomb", "offset"),
+    *("load", "curved", "stribeck", "asymmetry"),
+)
 # What the reading of a spring may hold; the rotor is on its other side.
 READING_TERMS: tuple[Term, ...] = ("lag", "offset", "viscous", "coulomb")
 
 # Below this speed the sign of a reading's Coulomb friction fades: ten times what an encoder of 14 bits,
 # low-passed, reads of a joint at rest.
 SLOW_RAD_S = 0.01
+# Of `slow`: the speed at which what Stribeck friction adds has faded to 1/e.
+_STRIBECK = 10.0
 
 
 def term_signal(term: Term, qd_rad_s: Array, qdd_rad_s2: Array, slow_rad_s: float) -> Array:
@@ -70,11 +84,16 @@ def term_signal(term: Term, qd_rad_s: Array, qdd_rad_s2: Array, slow_rad_s: floa
             return qdd_rad_s2
         case "viscous":
             return qd_rad_s
-        case "coulomb":
+        case "coulomb" | "load":
+            # That of the load is to be multiplied by the load.
             return np.tanh(qd_rad_s / slow_rad_s)
         case "curved":
             # Lubricated gears: friction that rises steeply first and then ever less.
             return np.tanh(qd_rad_s / slow_rad_s) * np.sqrt(np.abs(qd_rad_s))
+        case "stribeck":
+            return np.tanh(qd_rad_s / slow_rad_s) * np.exp(-((qd_rad_s / (_STRIBECK * slow_rad_s)) ** 2))
+        case "asymmetry":
+            return np.abs(np.tanh(qd_rad_s / slow_rad_s))
         case "offset":
             return np.ones_like(qd_rad_s)
         case "lag":

@@ -47,7 +47,13 @@ class Recorded(NamedTuple):
     npz: Path
 
 
-def recorded(folder: Path, seconds: float = 24.0, noise_nm: float = 0.05, seed: int = 3) -> Recorded:
+def recorded(
+    folder: Path,
+    seconds: float = 24.0,
+    noise_nm: float = 0.05,
+    seed: int = 3,
+    load: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> Recorded:
     """Record sums of sines; torques are pinocchio's, with friction that has a plain sign."""
     rng = default_rng(seed)
     t = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
@@ -57,7 +63,8 @@ def recorded(folder: Path, seconds: float = 24.0, noise_nm: float = 0.05, seed: 
     q = np.sum(size * np.sin(angle), axis=1)
     qd = np.sum(size * rate * np.cos(angle), axis=1)
     qdd = -np.sum(size * rate**2 * np.sin(angle), axis=1)
-    tau = _bodies(folder / "three.urdf", q, qd, qdd) + qdd * IA + qd * FV + np.sign(qd) * FC + OFFSET
+    rigid = _bodies(folder / "three.urdf", q, qd, qdd)
+    tau = rigid + qdd * IA + qd * FV + np.sign(qd) * (FC + load * np.abs(rigid)) + OFFSET
     speed, pull = qd[:, 1:].sum(axis=1), qdd[:, 1:].sum(axis=1)
     tau[:, 1:] += (SHARED_IA * pull + SHARED_FV * speed + SHARED_FC * np.sign(speed))[:, None]
     tau += noise_nm * rng.normal(size=tau.shape)

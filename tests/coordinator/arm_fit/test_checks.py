@@ -14,7 +14,7 @@ from coordinator.description.urdf_reader import read_urdf
 from module_agent.model.regressor import inverse_dynamics
 
 TX40 = Path(__file__).resolve().parents[3] / ".." / "shared" / "data" / "tx40"
-SHARED = ModelChoice(coupled=((1, 2),))
+SHARED = ModelChoice(coupled=((1, 2),), tried=())
 
 
 def refusal(urdf: Path, log: JointLog, choice: ModelChoice = SHARED, **options: Any) -> str:
@@ -128,7 +128,7 @@ def test_the_staubli_tx40_is_refused_under_wrong_names_only(damage: str, words: 
         "flipped": log._replace(tau_nm=-log.tau_nm),
         "one flipped": log._replace(tau_nm=log.tau_nm * [1, 1, 1, 1, 1, -1]),
     }[damage]
-    choice, options = ModelChoice(coupled=((4, 5),)), {"cutoff_hz": 16.0}
+    choice, options = ModelChoice(coupled=((4, 5),), tried=()), {"cutoff_hz": 16.0}
     if words:
         assert words in refusal(TX40 / "tx40.urdf", log, choice, **options)
     else:

@@ -12,7 +12,7 @@ from coordinator.description.urdf_reader import read_urdf
 from module_agent.model.errors import UsageError
 
 RATE_HZ = 400.0
-SHARED = ModelChoice(coupled=((1, 2),))
+SHARED = ModelChoice(coupled=((1, 2),), tried=())
 
 
 def test_the_noisier_the_encoder_the_lower_the_cut_off(recording: Any) -> None:
@@ -23,7 +23,7 @@ def test_the_noisier_the_encoder_the_lower_the_cut_off(recording: Any) -> None:
         curve = cutoff_curve(robot, JointLog(RATE_HZ, shaken, None, recording.tau_nm), SHARED)
         chosen.append(chosen_cutoff_hz(curve))
         best = min(point.raw for point in curve)
-        assert next(p.raw for p in curve if p.cutoff_hz == chosen[-1]) < 1.02 * best
+        assert next(p.raw for p in curve if p.cutoff_hz == chosen[-1]) < 1.1 * best
         # The ladder shows the way down and up.
         assert curve[0].raw > best
         assert curve[-1].raw > best
@@ -32,15 +32,9 @@ def test_the_noisier_the_encoder_the_lower_the_cut_off(recording: Any) -> None:
 
 def test_the_lowest_of_those_that_do_equally_well_is_chosen() -> None:
     curve = tuple(
-        CutoffPoint(hz, filtered, raw, 0.004)
-        for hz, filtered, raw in (
-            (5.0, 0.08, 0.19),
-            (10.0, 0.08, 0.152),
-            (20.0, 0.08, 0.150),
-            (40.0, 0.1, 0.16),
-        )
+        CutoffPoint(hz, 0.08, raw) for hz, raw in ((5.0, 0.19), (10.0, 0.153), (20.0, 0.150), (40.0, 0.16))
     )
-    # 0.150^2 + 2 0.08 0.004 = 0.1521^2.
+    # 0.150^2 + 0.2 0.08^2 = 0.1542^2.
     assert chosen_cutoff_hz(curve) == 10.0
 
 

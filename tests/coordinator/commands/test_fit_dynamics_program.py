@@ -173,7 +173,7 @@ def test_gravity_is_what_one_says(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--terms", "stiction"), "terms 'stiction': known are inertia, viscous, coulomb, curved, offset"),
+        (("--terms", "stiction"), "terms 'stiction': known are inertia, viscous, coulomb, offset, load,"),
         (("--coupled", "1"), "coupled '1': it must be two different joints"),
         (("--coupled", "swing,hip"), "coupled: no joint 'hip'; the joints are 1 to 2: swing, knee"),
         (("--coupled", "2,2"), "coupled '2,2': it must be two different joints"),
