@@ -4,12 +4,12 @@ from coordinator.runtime.command_line import lazy_app
 
 COMMANDS = {
     "run": ("run.run", "Identify a robot: topology, kinematic chain and inertia."),
-    "replay": ("replay.replay", "Compute a run's result again from its recording."),
+    "replay": ("run.replay", "Compute a run's result again from its recording."),
     "list": ("list_modules.list_modules", "List the modules on the network."),
     "stop": ("list_modules.stop", "Stop every module of a robot at once."),
     "screenshot": ("screenshot.screenshot", "Render a recording as a PNG file."),
-    "check": ("check.check_robot", "Find the links that changed since an earlier run."),
-    "payload": ("payload.find_payload", "Measure the payload that a robot carries."),
+    "check": ("measured_again.check_robot", "Find the links that changed since an earlier run."),
+    "payload": ("measured_again.find_payload", "Measure the payload that a robot carries."),
     "merge": ("merge.merge", "Combine runs with the same modules."),
     "monitor": ("monitor.monitor_robot", "Report collisions, payloads and wear while a robot moves."),
     "fit-dynamics": ("fit_dynamics.fit_dynamics", "Fit the inertia of any arm from its URDF and a log."),

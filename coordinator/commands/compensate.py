@@ -13,7 +13,7 @@ from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal
 from coordinator.torque_control.gains import max_damping_nm_s_rad
 from coordinator.torque_control.gravity_compensation import CompensationSettings
-from coordinator.torque_control.gravity_model import GravityModel, gravity_model
+from coordinator.torque_control.gravity_model import gravity_model
 from coordinator.torque_control.session import CompensationPlan, CompensationSession
 from module_agent.model.catalogue import module_type
 from module_agent.model.errors import EXIT_FAILED, UsageError
@@ -53,8 +53,13 @@ def compensate_robot(
     """
     model = gravity_model(baseline)
     place = at.place(model.robot)
-    _check_numbers(rate, max_speed, for_s, hold_s)
-    _check_damping(damping, model)
+    most, kind = min((max_damping_nm_s_rad(module_type(name)), name) for name in set(model.types))
+    _check("rate", rate, MIN_RATE_HZ, MAX_RATE_HZ, "Hz")
+    _check("for", for_s, 0.0, MAX_COMPENSATION_S, "s")
+    _check("hold", hold_s, 0.0, MAX_HOLD_S, "s")
+    _check("damping", damping, 0.0, most, f"Nm s/rad, the most for type {kind}")
+    if not (math.isfinite(max_speed) and max_speed > 0.0):
+        raise UsageError(f"--max-speed {max_speed}: it must be a positive number of rad/s")
     settings = CompensationSettings(damping, max_speed, velocity_forces=velocity_forces)
     plan = CompensationPlan(settings, rate, for_s, hold_s, back)
     transport = open_connection(place, Terminal(at.quiet).note).transport
@@ -78,20 +83,6 @@ def compensate_robot(
         fail(summary.why, EXIT_FAILED)
 
 
-def _check_numbers(rate_hz: float, max_speed_rad_s: float, for_s: float | None, hold_s: float) -> None:
-    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
-        raise UsageError(f"--rate {rate_hz}: it must be {MIN_RATE_HZ:.0f} to {MAX_RATE_HZ:.0f} Hz")
-    if not (math.isfinite(max_speed_rad_s) and max_speed_rad_s > 0.0):
-        raise UsageError(f"--max-speed {max_speed_rad_s}: it must be a positive number of rad/s")
-
-    for option, value, most in (("--for", for_s, MAX_COMPENSATION_S), ("--hold", hold_s, MAX_HOLD_S)):
-        if value is not None and not 0.0 <= value <= most:
-            raise UsageError(f"{option} {value}: it must be 0 to {most:.0f} s")
-
-
-def _check_damping(damping_nm_s_rad: float, model: GravityModel) -> None:
-    most, name = min((max_damping_nm_s_rad(module_type(name)), name) for name in set(model.types))
-    if not 0.0 <= damping_nm_s_rad <= most:
-        raise UsageError(
-            f"--damping {damping_nm_s_rad}: it must be 0 to {most:g} Nm s/rad, the most for type {name}"
-        )
+def _check(option: str, value: float | None, least: float, most: float, unit: str) -> None:
+    if value is not None and not least <= value <= most:
+        raise UsageError(f"--{option} {value}: it must be {least:g} to {most:g} {unit}")

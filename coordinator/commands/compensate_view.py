@@ -56,15 +56,8 @@ class CompensationView(Displayed):
 def moment_fields(serials: tuple[str, ...], now: Moment) -> dict[str, object]:
     """Return a moment for programs; SI units."""
     reading = now.reading
-    columns = zip(
-        serials,
-        reading.q_rad.tolist(),
-        reading.qd_rad_s.tolist(),
-        now.effort_nm.tolist(),
-        reading.effort_nm.tolist(),
-        reading.age_s.tolist(),
-        strict=True,
-    )
+    arrays = (reading.q_rad, reading.qd_rad_s, now.effort_nm, reading.effort_nm, reading.age_s)
+    columns = zip(serials, *(array.tolist() for array in arrays), strict=True)
     names = "serial", "position_rad", "velocity_rad_s", "commanded_nm", "measured_nm", "age_s"
     return {
         "phase": now.phase,

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 from rich.table import Table
 
-from coordinator.arm_fit.report import ArmParameterPart, ErrorPart, FitReport, Model, TermPart
+from coordinator.arm_fit.report import ErrorPart, FitReport, Model, TermPart
+from coordinator.runtime.terminal import figure, new_table
 
 _MODEL_WORDS: dict[Model, str] = {
     "fitted": "least squares",
@@ -146,7 +147,7 @@ def _base(report: FitReport) -> Table:
             f"{part.value:.4g}",
             f"{part.sigma:.2g}",
             _percent(part.relative_sigma),
-            _claim(part),
+            figure(part.urdf, ".4g"),
             part.identifiability,
         )
     return table
@@ -155,13 +156,10 @@ def _base(report: FitReport) -> Table:
 def _bodies(report: FitReport) -> Table:
     table = _table("Body by body", ("body", "turned by", "its parameters"), ("mass [kg]", "URDF"))
     for i, part in enumerate(report.fit.bodies, start=1):
-        masses = (_mass(part.rigid_body.mass_kg if part.rigid_body else None), _mass(part.urdf_mass_kg))
+        own = part.rigid_body.mass_kg if part.rigid_body else None
+        masses = [figure(mass, ".3g") for mass in (own, part.urdf_mass_kg)]
         table.add_row(f"{i}: {part.link}", part.joint, part.summary, *masses)
     return table
-
-
-def _mass(mass_kg: float | None) -> str:
-    return "-" if mass_kg is None else f"{mass_kg:.3g}"
 
 
 def _both(report: FitReport, model: Model, torque: str, samples: str) -> ErrorPart:
@@ -178,10 +176,6 @@ def _place(part: TermPart) -> str:
     return "significant" if part.significant else "not significant"
 
 
-def _claim(part: ArmParameterPart) -> str:
-    return "-" if part.urdf is None else f"{part.urdf:.4g}"
-
-
 def _percent(part: float | None) -> str:
     if part is None:
         return "-"
@@ -190,9 +184,4 @@ def _percent(part: float | None) -> str:
 
 
 def _table(title: str, words: tuple[str, ...], figures: "list[str] | tuple[str, ...]") -> Table:
-    table = Table(title=title)
-    for name in words:
-        table.add_column(name)
-    for name in figures:
-        table.add_column(name, justify="right")
-    return table
+    return new_table(title, " | ".join([*words, *(f">{name}" for name in figures)]))

@@ -4,12 +4,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from coordinator.commands.options import AsJson
 from coordinator.merge.information_file import read_information
 from coordinator.merge.merge_runs import merge_runs
-from coordinator.merge.report import MERGED, MergeReport, merge_report
+from coordinator.merge.report import MERGED, merge_report
 from coordinator.recording.run_folder import INFORMATION
 from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import UsageError
@@ -37,18 +36,6 @@ def merge(
     if as_json:
         typer.echo(report.model_dump_json(indent=1))
         return
-    print_table(_table(report))
-    for run in report.runs:
-        if run.inconsistency_sigma > INCONSISTENT_ABOVE:
-            typer.echo(
-                f"{run.run} disagrees with the other runs by {run.inconsistency_sigma:.0f} sigma (at "
-                f"most {INCONSISTENT_ABOVE:.0f} expected): a part or a link differs, or the covariance of "
-                "its chain is too small"
-            )
-
-
-def _table(report: MergeReport) -> Table:
-    """Return one row per run."""
     table = new_table(
         f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts",
         "run | modules | rank | below 10 % | below 10 %, merged | sigma merged / alone | "
@@ -65,4 +52,11 @@ def _table(report: MergeReport) -> Table:
             f"{run.inconsistency_sigma:.1f}",
         )
     table.add_row("merged", "", str(report.rank), "", "", f"{report.gain:.2f}", "")
-    return table
+    print_table(table)
+    for run in report.runs:
+        if run.inconsistency_sigma > INCONSISTENT_ABOVE:
+            typer.echo(
+                f"{run.run} disagrees with the other runs by {run.inconsistency_sigma:.0f} sigma (at "
+                f"most {INCONSISTENT_ABOVE:.0f} expected): a part or a link differs, or the covariance of "
+                "its chain is too small"
+            )

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -106,27 +105,25 @@ def _monitor_live(
     screen.start_ns = loop.clock_ns()
     live = LiveMonitor(monitor, loop.clock_ns, sender_name(), screen.report)
     messenger = Messenger(transport, place.robot, loop.clock_ns, loop.call_soon_threadsafe, live.record)
+
+    def after_ns(seconds: float) -> int:
+        return loop.clock_ns() + round(seconds * 1e9)
+
+    async def watch() -> None:
+        messenger.start()
+        try:
+            await live.watch(messenger, after_ns(_FIRST_FEEDBACK_S), lambda: monitor.monitored_s > 0.0)
+            if monitor.monitored_s > 0.0:
+                await live.watch(messenger, None if for_s is None else after_ns(for_s))
+        finally:
+            messenger.close()
+
     # A signal cancels the task; the summary of the findings follows.
     with contextlib.suppress(asyncio.CancelledError):
-        attend(loop, _attend(live, messenger, monitor, for_s, loop.clock_ns))
+        attend(loop, watch())
     if not monitor.monitored_s:
         serials = ", ".join(monitor.reference.chain.serials)
         raise RobotError(
             f"not all modules of robot {place.robot!r} sent feedback within {_FIRST_FEEDBACK_S:.0f} s; "
             f"needed: {serials}"
         )
-
-
-async def _attend(
-    live: LiveMonitor, messenger: Messenger, monitor: Monitor, for_s: float | None, clock: Callable[[], int]
-) -> None:
-    start_ns = clock()
-    messenger.start()
-    try:
-        await live.watch(
-            messenger, start_ns + round(_FIRST_FEEDBACK_S * 1e9), lambda: monitor.monitored_s > 0.0
-        )
-        if monitor.monitored_s > 0.0:
-            await live.watch(messenger, None if for_s is None else clock() + round(for_s * 1e9))
-    finally:
-        messenger.close()

@@ -1,19 +1,26 @@
-"""`x5-coordinator run`: a robot identifies itself."""
+"""`x5-coordinator run` and `replay`: a robot identifies itself, and again from its recording."""
 
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coordinator.commands.attended_run import run_attended
+from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within
+from coordinator.baseline.update import updated
 from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed
+from coordinator.identification.identify import identify
 from coordinator.identification.result import DynamicsPart, Result
-from coordinator.live_robot.connection import sender_name
-from coordinator.runtime.command_line import with_options
+from coordinator.live_robot.connection import Place, open_connection, sender_name
+from coordinator.recording.run_folder import load_recording
+from coordinator.recording.session_file import SessionFileError
+from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
+from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal, new_table
-from coordinator.session.run import RunConfig
+from coordinator.session.run import Run, RunConfig, write_outputs
 from coordinator.viewer.targets import viewer_choice
+from module_agent.model.errors import UsageError
 
 
 @with_options
@@ -61,6 +68,47 @@ def run(
         result, _ = run_attended(config, place, speed, terminal, advice)
     print_result(result, terminal)
     terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
+
+
+def replay(
+    session: Annotated[Path, typer.Argument(help="A session.mcap.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for result.json [folder of the session].")] = None,
+) -> None:
+    """Compute the result of a run again from its recording, without a robot."""
+    folder = out if out is not None else session.parent
+    recording = load_recording(session)
+    before = baseline_within(session.parent)
+    identified = identify(recording, partial(updated, before) if before is not None else None)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_outputs(folder, identified)
+    print_result(identified.result, Terminal())
+
+
+def run_attended(
+    config: RunConfig, place: Place, speed: float, terminal: Terminal, advice: str
+) -> tuple[Result, BaselineRobot]:
+    """Run to the end, and return the result and the robot; a first signal stops the robot in order.
+
+    Raises:
+        CommandFailed: the run ended early; the text says why, what is recorded, and the advice.
+        UsageError: the run cannot begin.
+    """
+    transport = open_connection(place, terminal.note).transport
+    loop = ScaledLoop(speed)
+    try:
+        work = Run(config, transport, loop.clock_ns, loop.call_soon_threadsafe, terminal)
+    except BaseException as error:
+        transport.close()
+        loop.close()
+        if isinstance(error, SessionFileError | OSError):
+            raise UsageError(str(error)) from error
+        raise
+    try:
+        return attend(loop, work.run()), work.robot
+    except ENDINGS as error:
+        end = ending(error)
+        ended = f"{end}; {work.standstill}; recorded up to here: {config.out}"
+        fail("\n".join((ended, advice)).rstrip(), end.exit_code)
 
 
 def resuming(context: typer.Context) -> str:

@@ -126,11 +126,16 @@ def with_options(function: Callable[..., None]) -> Callable[..., None]:
         if isinstance(p.annotation, type) and dataclasses.is_dataclass(p.annotation)
     }
     parameters: list[inspect.Parameter] = []
+    keyword = inspect.Parameter.KEYWORD_ONLY
     for parameter in signature.parameters.values():
-        if parameter.name in kinds:
-            parameters += _fields(kinds[parameter.name])
-        else:
-            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+        if parameter.name not in kinds:
+            parameters.append(parameter.replace(kind=keyword))
+            continue
+        hints = get_type_hints(kinds[parameter.name], include_extras=True)
+        for field in dataclasses.fields(kinds[parameter.name]):
+            default = inspect.Parameter.empty if field.default is dataclasses.MISSING else field.default
+            hint = hints[field.name]
+            parameters.append(inspect.Parameter(field.name, keyword, default=default, annotation=hint))
 
     def command(**values: Any) -> None:
         for name, kind in kinds.items():
@@ -142,16 +147,3 @@ def with_options(function: Callable[..., None]) -> Callable[..., None]:
     command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
-
-
-def _fields(kind: Any) -> list[inspect.Parameter]:
-    hints = get_type_hints(kind, include_extras=True)
-    return [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if field.default is dataclasses.MISSING else field.default,
-            annotation=hints[field.name],
-        )
-        for field in dataclasses.fields(kind)
-    ]

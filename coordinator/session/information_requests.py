@@ -5,6 +5,7 @@ Information that a module does not deliver is computed from the recording instea
 
 import asyncio
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from coordinator.identification.inertia.agent_information import dynamic_steps, question, rows_to_keep
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, gather_all
@@ -56,17 +57,14 @@ class InformationRequests:
                 continue
             await gather_all(
                 self._collect_one(
-                    CollectRequest(
-                        serial=serial,
-                        boot=self._recording.modules[serial].boot,
-                        seq=self._messenger.next_seq(),
-                        sender=self._sender,
-                        motion_id=number,
-                        rows=rows,
-                    )
+                    CollectRequest(**self._head(serial), sender=self._sender, motion_id=number, rows=rows)
                 )
                 for serial in serials
             )
+
+    def _head(self, serial: str) -> dict[str, Any]:
+        boot = self._recording.modules[serial].boot
+        return {"serial": serial, "boot": boot, "seq": self._messenger.next_seq()}
 
     async def _collect_one(self, request: CollectRequest) -> None:
         for _ in range(ATTEMPTS):
@@ -91,12 +89,7 @@ class InformationRequests:
         end_ns = self._clock() + PATIENCE_NS
         silent, offset = 0, 0
         while silent < ATTEMPTS and self._clock() < end_ns:
-            head = {
-                "serial": serial,
-                "boot": self._recording.modules[serial].boot,
-                "seq": self._messenger.next_seq(),
-                "offset": offset,
-            }
+            head = {**self._head(serial), "offset": offset}
             try:
                 answer = await self._messenger.ask(serial, Leaf.INFORMATION, request.model_copy(update=head))
             except NoAnswer:

@@ -106,6 +106,7 @@ class MotionChoice:
 
     def _task(self, serial: str, limits: JointLimits) -> JointTask:
         force = self._recording.rest_rows(serial)["accel_m_s2"].astype(float).mean(axis=0)
+        designed_s = np.clip(DESIGNED_JOINT_S - AROUND_S / len(self._serials()), MIN_JOINT_S, MAX_JOINT_S)
         return JointTask(
             limits,
             float(force[2] / np.linalg.norm(force)),
@@ -113,14 +114,8 @@ class MotionChoice:
             self._plan.home_rad,
             self._plan.travel_speed_rad_s,
             self._plan.settle_s,
-            self._joint_s() - 2.0 * ANSWERS_S,
+            (self._plan.joint_s or float(designed_s)) - 2.0 * ANSWERS_S,
             self._radius_m(serial),
-        )
-
-    def _joint_s(self) -> float:
-        count = len(self._serials())
-        return self._plan.joint_s or float(
-            np.clip(DESIGNED_JOINT_S - AROUND_S / count, MIN_JOINT_S, MAX_JOINT_S)
         )
 
     def _radius_m(self, serial: str) -> float:

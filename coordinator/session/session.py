@@ -258,7 +258,7 @@ class Session:
     # ------------------------------------------------------------------ the steps
 
     async def _home(self) -> None:
-        await self._go_all(dict.fromkeys(self._excluded.movers(), self._plan.home_rad))
+        await self._go(dict.fromkeys(self._excluded.movers(), self._plan.home_rad))
 
     async def _rest(self) -> None:
         longest_s = SIMULTANEOUS_REST_S if self._plan.mode == "simultaneous" else self._plan.rest_s
@@ -272,9 +272,9 @@ class Session:
         plan, home = self._plan, self._plan.home_rad
         constant = self._choice.slow(serial)
         travel = constant.velocity_rad_s * (constant.duration_s + constant.ramp_s)
-        await self._go(serial, home - 0.5 * travel)
+        await self._go({serial: home - 0.5 * travel})
         slow = await self._observe(serial, constant, "constant")
-        await self._go(serial, home)
+        await self._go({serial: home})
         if plan.topology_only:
             return
         fast = await self._observe(serial, self._choice.fast(serial, slow), "windowed_sine")
@@ -316,12 +316,12 @@ class Session:
         slow, home = self._plan.constant(), self._plan.home_rad
         others = {s: home + motion.others_rad for s in self._excluded.movers() if s != serial}
         if motion.others_rad:
-            await self._go_all(others)
-        await self._go(serial, home - 0.5 * motion.travel_rad(slow))
+            await self._go(others)
+        await self._go({serial: home - 0.5 * motion.travel_rad(slow)})
         await self._observe(serial, motion.pattern(slow), "constant")
-        await self._go(serial, home)
+        await self._go({serial: home})
         if motion.others_rad:
-            await self._go_all(dict.fromkeys(others, home))
+            await self._go(dict.fromkeys(others, home))
 
     async def _explore_all(self) -> None:
         """Move all joints about home at the same time, each at its own frequencies (thesis 7.2)."""
@@ -377,22 +377,19 @@ class Session:
 
     async def _run_simultaneous(self, step: str, motion: RobotMotion, purpose: Purpose) -> None:
         # The paths between home and the pose are checked for collisions, those between two poses are not.
-        await self._go_all(motion.pose_rad)
+        await self._go(motion.pose_rad)
         for serial, record in (await self.group.run(dict(motion.patterns))).items():
             self._note_motion(step, serial, record, purpose)
-        await self._go_all(dict.fromkeys(motion.pose_rad, self._plan.home_rad))
+        await self._go(dict.fromkeys(motion.pose_rad, self._plan.home_rad))
 
     async def _excite(self, purpose: Purpose, motion: Callable[[ModuleType], Pattern], serial: str) -> None:
         step = "held_out" if purpose == "held_out" else "excite"
         await self._move(f"{step}/{serial}", serial, motion(self.group.kind(serial)), purpose)
-        await self._go(serial, self._plan.home_rad)
+        await self._go({serial: self._plan.home_rad})
 
     # ------------------------------------------------------------------ pieces
 
-    async def _go(self, serial: str, target_rad: float) -> None:
-        await self._go_all({serial: target_rad})
-
-    async def _go_all(self, targets_rad: Mapping[str, float]) -> None:
+    async def _go(self, targets_rad: Mapping[str, float]) -> None:
         speed = self._plan.travel_speed_rad_s
         await self.group.run({s: GoTo(target_rad=q, max_speed_rad_s=speed) for s, q in targets_rad.items()})
         await asyncio.sleep(self._plan.settle_s)

@@ -116,8 +116,7 @@ class Recorder:
         """Log the tree of modules."""
         self._register(topology.serials)
         self._set_time(t_ns)
-        colours = {serial: self._palette[serial] for serial in topology.serials}
-        for drawn in graphs.graph(topology, self._types, colours):
+        for drawn in graphs.graph(topology, self._types, self._palette):
             self._stream.log(entity_paths.TOPOLOGY, drawn)
         self._contents = self._contents._replace(topology=topology)
         self.show_if_new()
@@ -197,13 +196,9 @@ class Recorder:
         self._register(chain.serials)
         self._log_poses()  # of the previous chain
         style = STYLES[world]
-        colours = {serial: self._palette[serial] for serial in chain.serials}
-        scene = robot_scene.build_scene(chain, self._types, colours, sigma_m, style)
+        scene = robot_scene.build_scene(chain, self._types, self._palette, sigma_m, style)
         self._set_time(t_ns)
-        before = self._scenes.get(world)
-        if before is not None:
-            robot_scene.clear_removed(self._stream, before, scene)
-        robot_scene.log_scene(self._stream, scene, self._posture(chain))
+        robot_scene.log_scene(self._stream, scene, self._posture(chain), self._scenes.get(world))
         self._scenes[world] = scene
         self._contents = self._contents._replace(truth=entity_paths.TRUE_WORLD in self._scenes)
         self._frame(chain)

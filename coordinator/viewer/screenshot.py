@@ -46,7 +46,11 @@ def screenshot(rrd: Path, out: Path, tab: str | None = None, size: tuple[int, in
     if not is_recording(rrd):
         raise ScreenshotFailed(f"{rrd} is not a Rerun recording: it does not begin with {MAGIC.decode()!r}")
     port = viewer_process.free_port()
-    viewer = _start(port, size)
+    options = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
+    try:
+        viewer = viewer_process.start(options, port, detached=False)
+    except viewer_process.ViewerNotStarted as failure:
+        raise ScreenshotFailed(_advice(str(failure))) from failure
     try:
         client = ViewerClient.connect(proxy_url(port))
         _open(client, rrd)
@@ -61,14 +65,6 @@ def screenshot(rrd: Path, out: Path, tab: str | None = None, size: tuple[int, in
         raise ScreenshotFailed(_advice(viewer.output_tail())) from failure
     finally:
         viewer_process.stop(viewer)
-
-
-def _start(port: int, size: tuple[int, int]) -> viewer_process.ViewerProcess:
-    options = ["--headless", "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
-    try:
-        return viewer_process.start(options, port, detached=False)
-    except viewer_process.ViewerNotStarted as failure:
-        raise ScreenshotFailed(_advice(str(failure))) from failure
 
 
 def _advice(output: str) -> str:

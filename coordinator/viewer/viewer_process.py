@@ -81,8 +81,11 @@ def start(options: Sequence[str], port: int, *, detached: bool) -> ViewerProcess
         start_new_session=detached,
     )
     started = ViewerProcess(process, output)
-    if _wait_until_ready(process, port):
-        return started
+    deadline = time.monotonic() + START_SECONDS
+    while process.poll() is None and time.monotonic() < deadline:
+        if listens("127.0.0.1", port):
+            return started
+        time.sleep(_POLL_SECONDS)
     output_tail = started.output_tail()
     stop(started)
     raise ViewerNotStarted(f"{' '.join(command)} did not get ready:\n{output_tail}")
@@ -104,15 +107,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def _wait_until_ready(process: subprocess.Popen[bytes], port: int) -> bool:
-    deadline = time.monotonic() + START_SECONDS
-    while process.poll() is None and time.monotonic() < deadline:
-        if listens("127.0.0.1", port):
-            return True
-        time.sleep(_POLL_SECONDS)
-    return False
 
 
 def listens(host: str, port: int) -> bool:

@@ -60,7 +60,9 @@ def amplitudes(
         series += repeat_series(arms, trials, modules.seed, choice)
     measured = _run(series, processes)
     write_results(out, {"rigs": rigs, **modules.settings()}, measured)
-    plot(measured, out / "amplitudes.png", _title(series[0]))
+    names = [f"with {name}" for name in choice.on] + [f"without {name}" for name in choice.off]
+    title = f"Link length by circle point analysis: profile {', '.join([modules.noise, *names])}"
+    plot(measured, out / "amplitudes.png", title)
     if trials:
         print_table(table(repeats(measured, filtered), filtered))
     typer.echo(str(out / "amplitudes.png"))
@@ -75,13 +77,6 @@ def _run(series: list[Series], processes: int | None) -> list[AmplitudeTrial]:
 
     with experiment() as terminal:
         return [trial for trials in trial_results(terminal, work, processes, label) for trial in trials]
-
-
-def _title(series: Series) -> str:
-    switched = [f"with {name}" for name in series.noise.on] + [f"without {name}" for name in series.noise.off]
-    return (
-        f"Link length by circle point analysis: profile {', '.join([str(series.noise.profile), *switched])}"
-    )
 
 
 def _numbers(

@@ -27,7 +27,7 @@ from sim.benchmark.cases.suites import (
     kinematic_cases,
     over_all,
 )
-from sim.benchmark.report import Results, gathered, plot, write_results
+from sim.benchmark.report import gathered, plot, write_results
 from sim.benchmark.row import Limit, Row
 from sim.benchmark.workers import run_cases
 from sim.commands.experiment import JsonFile, WorkerCount, experiment, worker_count
@@ -133,7 +133,16 @@ def _benchmark(
     started_s = time.monotonic()
     measured = _run(selected, worker_count(processes))
     results = gathered(name, settings, measured, over_all(measured), time.monotonic() - started_s)
-    _report(results, json_file, plot_file)
+    print_table(table(results.rows, f"Benchmark of {name}"))
+    for text in results.failures:
+        typer.echo(f"failed: {text}", err=True)
+    held = sum(row.holds is True for row in results.rows)
+    cost = f"{results.wall_time_s:.0f} s, of processors {results.cpu_time_s:.0f} s"
+    typer.echo(f"{held} bars met, {len(results.missed)} missed; {cost}")
+    if json_file is not None:
+        write_results(json_file, results)
+    if plot_file is not None:
+        plot(results.rows, plot_file)
     if results.missed:
         raise typer.Exit(EXIT_FINDING)
 
@@ -151,19 +160,6 @@ def _run(cases: list[Case], processes: int) -> list[CaseResult]:
 
     with experiment() as terminal:
         return run_cases(cases, processes, show)
-
-
-def _report(results: Results, json_file: Path | None, plot_file: Path | None) -> None:
-    print_table(table(results.rows, f"Benchmark of {results.benchmark}"))
-    for text in results.failures:
-        typer.echo(f"failed: {text}", err=True)
-    held = sum(row.holds is True for row in results.rows)
-    cost = f"{results.wall_time_s:.0f} s, of processors {results.cpu_time_s:.0f} s"
-    typer.echo(f"{held} bars met, {len(results.missed)} missed; {cost}")
-    if json_file is not None:
-        write_results(json_file, results)
-    if plot_file is not None:
-        plot(results.rows, plot_file)
 
 
 _OUTCOMES = {None: "", True: "[green]holds[/]", False: "[bold red]MISSED[/]"}

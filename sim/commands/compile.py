@@ -31,17 +31,13 @@ GROUPS = {
 TICKS = 10
 
 
-class KernelsNotCompiled(RobotError):
-    """A compiling process failed; its output has the reason."""
-
-
 def compile_kernels() -> None:
     """Compile all kernels, so that the first run does not wait for them."""
     started_s = time.monotonic()
     workers = [subprocess.Popen([sys.executable, "-m", "sim.commands.compile", name]) for name in GROUPS]
     failed = [name for name, worker in zip(GROUPS, workers, strict=True) if worker.wait() != 0]
     if failed:
-        raise KernelsNotCompiled(
+        raise RobotError(
             f"the kernels of {', '.join(failed)} were not compiled, for the reason above; "
             "a run compiles them when it needs them"
         )

@@ -2,6 +2,7 @@
 
 import signal
 import time
+from functools import partial
 from types import FrameType
 from typing import Annotated
 
@@ -14,12 +15,13 @@ from coordinator.runtime.terminal import Terminal
 from coordinator.viewer.targets import NATIVE_PORT, proxy_url, viewer_choice
 from module_agent.model.errors import EXIT_FAILED, EXIT_INTERRUPTED
 from sim.commands.options import LaunchOptions, WorldOptions, load
-from sim.commands.score import print_score
+from sim.commands.score import score_run
 from sim.processes.launcher import LOGS, LaunchConfig, Launcher, LaunchError
 from sim.robot.robot_file import RobotFileError
 from sim.scoring.truth_recording import add_truth
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
+_note = partial(typer.echo, err=True)
 # Previews of larger robots are only assembled: their refinements would take longer than the run.
 MAX_REFINED_MODULES = 8
 
@@ -51,7 +53,7 @@ def run(
         out=launched.new_folder(robot),
     )
     _run_virtual(config, quiet)
-    print_score(config.out)
+    score_run(config.out)
 
 
 @with_options
@@ -66,10 +68,6 @@ def launch(
     # Where the viewer can still be reached when the run is over.
     reachable = proxy_url(NATIVE_PORT) if choice.spawn else choice.connect
     _launch(settings, launched, motions, reachable, "--viewer", viewer)
-
-
-def _note(text: str) -> None:
-    typer.echo(text, err=True)
 
 
 def _launch(
@@ -103,7 +101,7 @@ def _launch(
     )
     _run_processes(config)
     add_truth(config.out, viewer, _note)
-    print_score(config.out)
+    score_run(config.out)
 
 
 def _run_virtual(config: VirtualConfig, quiet: bool) -> None:

@@ -16,11 +16,6 @@ def score_run(
     as_json: AsJson = False,
 ) -> None:
     """Compare a run's result with the simulator's truth."""
-    print_score(folder, as_json)
-
-
-def print_score(folder: Path, as_json: bool = False) -> None:
-    """Score a run, write `score.json` into its folder and print it."""
     result = score(folder)
     write_score(folder / "score.json", result)
     if as_json:

@@ -3,12 +3,12 @@
 import gc
 import signal
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
 
 from coordinator.runtime.command_line import with_options
+from coordinator.runtime.event_loop import SIGNALS
 from module_agent.model.errors import UsageError
 from sim.commands.options import WorldOptions, load
 from sim.world.bus_server import BusServer
@@ -32,12 +32,8 @@ def world(
     robot = load(settings.robot)
     noise, pushes = settings.choice().of(robot), settings.pushes_on(robot)
     stopping: list[int] = []
-
-    def stop(number: int, _frame: FrameType | None) -> None:
-        stopping.append(number)
-
-    signal.signal(signal.SIGINT, stop)
-    signal.signal(signal.SIGTERM, stop)
+    for each in SIGNALS:
+        signal.signal(each, lambda number, _: stopping.append(number))
     try:
         plant = World(robot, settings.seed, noise, pushes=pushes)
         log = TruthLog(plant)

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from coordinator.baseline.baseline_robot import BaselineError, BaselineRobot, load_baseline
 from coordinator.baseline.check import check, check_plan
-from coordinator.commands.check import CHECK
+from coordinator.commands.measured_again import CHECK
 from coordinator.excitation.plan import Plan
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal

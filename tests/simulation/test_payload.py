@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from coordinator.baseline.baseline_robot import BaselineRobot, load_baseline
 from coordinator.baseline.payload import PayloadError, payload_plan, search_payload
-from coordinator.commands.payload import PAYLOAD
+from coordinator.commands.measured_again import PAYLOAD
 from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan
 from coordinator.main import app

@@ -40,7 +40,8 @@ class Contents(NamedTuple):
 
 def views(contents: Contents) -> Contents:
     """Return the contents without the ranges of the plots; contents that then differ need different views."""
-    return contents._replace(estimated=tuple(p.without_ranges() for p in contents.estimated))
+    bare = (p._replace(ranges=tuple((serial, None) for serial, _ in p.ranges)) for p in contents.estimated)
+    return contents._replace(estimated=tuple(bare))
 
 
 def build(contents: Contents) -> rrb.Blueprint:
@@ -109,23 +110,20 @@ def _identification(contents: Contents) -> rrb.Vertical:
     # The links of the identified robot come before the estimates of single modules.
     first = (LINK_LENGTH, AXIS_ANGLE)
     shown = sorted(contents.estimated, key=lambda p: first.index(p.name) if p.name in first else len(first))
+    # One empty plot announces the first estimate.
+    announced = rrb.TimeSeriesView(
+        origin="/",
+        contents=[entity_paths.estimate_path(LINK_LENGTH, serial) for serial in contents.serials],
+        name="Link length [m]: no estimate yet",
+    )
     log = rrb.TextLogView(
         origin=entity_paths.PHASE_LOG, name="Log", columns=rrb.TextLogColumns(text_log_columns=["Body"])
     )
     return rrb.Vertical(
-        _parameters(shown, contents) if shown else _no_estimates(contents),
+        _parameters(shown, contents) if shown else announced,
         rrb.Horizontal(_topology(contents), log, column_shares=[2, 3]),
         row_shares=[3, 2],
         name=IDENTIFICATION,
-    )
-
-
-def _no_estimates(contents: Contents) -> rrb.View:
-    # One empty plot announces the first estimate.
-    return rrb.TimeSeriesView(
-        origin="/",
-        contents=[entity_paths.estimate_path(LINK_LENGTH, serial) for serial in contents.serials],
-        name="Link length [m]: no estimate yet",
     )
 
 

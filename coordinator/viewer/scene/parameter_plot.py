@@ -42,10 +42,6 @@ class Parameter(NamedTuple):
         """Return the axis range by serial, in the same order."""
         return dict(self.ranges)
 
-    def without_ranges(self) -> "Parameter":
-        """Return the parameter with the viewer's own ranges."""
-        return self._replace(ranges=tuple((serial, None) for serial, _ in self.ranges))
-
     def title(self) -> str:
         """Return the name without underscores."""
         return self.name.replace("_", " ")

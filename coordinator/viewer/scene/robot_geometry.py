@@ -62,28 +62,29 @@ def modules(chain: Chain, types: Mapping[str, str]) -> tuple[Module, ...]:
     Raises:
         KeyError: a serial of the chain is not in `types`, or its type is not in the catalogue.
     """
-    return tuple(_module(chain, k, types) for k in range(len(chain.serials)))
-
-
-def _module(chain: Chain, k: int, types: Mapping[str, str]) -> Module:
-    serial = chain.serials[k]
-    if serial not in types:
-        raise KeyError(f"the type of module {serial!r} is not known; known are {', '.join(types) or 'none'}")
-    made = module_type(types[serial])
-    housing = chain.imu_home[k].copy()
-    housing[:3, 3] -= housing[:3, :3] @ made.imu_xyz
-    corners = np.array([made.housing_min_xyz, made.housing_max_xyz])
-    nominal = housing[:3, :3] @ made.output_xyz + housing[:3, 3]
-    axis, point = chain.axis[k], chain.point[k]
-    return Module(
-        housing_body=chain.carrier(k),
-        output_body=chain.parent[k] if chain.reversed[k] else k,
-        housing=housing,
-        box_size=corners[1] - corners[0],
-        box_centre=corners.mean(axis=0),
-        output=point + axis * float(axis @ (nominal - point)),
-        axis=axis,
-    )
+    placed = []
+    for k, serial in enumerate(chain.serials):
+        if serial not in types:
+            known = ", ".join(types) or "none"
+            raise KeyError(f"the type of module {serial!r} is not known; known are {known}")
+        made = module_type(types[serial])
+        housing = chain.imu_home[k].copy()
+        housing[:3, 3] -= housing[:3, :3] @ made.imu_xyz
+        corners = np.array([made.housing_min_xyz, made.housing_max_xyz])
+        nominal = housing[:3, :3] @ made.output_xyz + housing[:3, 3]
+        axis, point = chain.axis[k], chain.point[k]
+        placed.append(
+            Module(
+                housing_body=chain.carrier(k),
+                output_body=chain.parent[k] if chain.reversed[k] else k,
+                housing=housing,
+                box_size=corners[1] - corners[0],
+                box_centre=corners.mean(axis=0),
+                output=point + axis * float(axis @ (nominal - point)),
+                axis=axis,
+            )
+        )
+    return tuple(placed)
 
 
 def links(chain: Chain, placed: tuple[Module, ...]) -> tuple[Link, ...]:

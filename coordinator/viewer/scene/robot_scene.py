@@ -92,8 +92,12 @@ def build_scene(
     return Scene(chain, style, tuple(drawn))
 
 
-def log_scene(stream: rr.RecordingStream, scene: Scene, q_rad: Array) -> None:
-    """Log a scene at the present time of the stream, in the posture `q_rad` (n,)."""
+def log_scene(stream: rr.RecordingStream, scene: Scene, q_rad: Array, before: Scene | None) -> None:
+    """Log a scene in the posture `q_rad` (n,), at the stream's time, in place of the one before."""
+    retained = {path for path, _ in scene.drawn}
+    for path, _ in before.drawn if before is not None else ():
+        if path not in retained:
+            stream.log(path, rr.Clear(recursive=False))
     for path, archetypes in scene.drawn:
         for archetype in archetypes:
             stream.log(path, archetype)
@@ -115,14 +119,6 @@ def send_poses(stream: rr.RecordingStream, scene: Scene, t_ns: IntArray, q_rad: 
             translation=displaced[:, body, :3, 3], mat3x3=displaced[:, body, :3, :3]
         )
         stream.send_columns(entity_paths.body_path(scene.style.world, serial), [time_column(t_ns)], moved)
-
-
-def clear_removed(stream: rr.RecordingStream, before: Scene, after: Scene) -> None:
-    """Clear, from the present time of the stream on, the entities that the new scene no longer has."""
-    retained = {path for path, _ in after.drawn}
-    for path, _ in before.drawn:
-        if path not in retained:
-            stream.log(path, rr.Clear(recursive=False))
 
 
 def gravity_arrow(chain: Chain, reach_m: float) -> rr.Arrows3D:

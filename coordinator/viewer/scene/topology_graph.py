@@ -49,7 +49,10 @@ def graph(
     """Draw the tree at fixed positions, which need no settling."""
     import rerun as rr
 
-    labels = [_label(topology, k, types) for k in range(len(topology.serials))]
+    labels = [
+        " · ".join(filter(None, [serial, types.get(serial), "reversed" if reverse else ""]))
+        for serial, reverse in zip(topology.serials, topology.reversed, strict=True)
+    ]
     nodes = rr.GraphNodes(
         node_ids=[BASE_NODE, *topology.serials],
         labels=[BASE_NODE, *labels],
@@ -72,12 +75,6 @@ def extent(topology: Topology) -> tuple[float, float, float, float]:
     """Return the box (x_min, x_max, y_min, y_max) that shows all of the graph."""
     x, y = zip(*positions(topology), strict=True)
     return (min(x) - LEAF, max(x) + LEAF, min(y) - 0.6 * LEVEL, max(y) + 0.6 * LEVEL)
-
-
-def _label(topology: Topology, k: int, types: Mapping[str, str]) -> str:
-    made = types.get(topology.serials[k], "")
-    how = ["reversed"] if topology.reversed[k] else []
-    return " · ".join([topology.serials[k], *([made] if made else []), *how])
 
 
 def as_topology(serials: Sequence[str], parent: Sequence[int], reverse: Sequence[bool]) -> Topology:

@@ -161,7 +161,7 @@ def test_a_launcher_hands_pushes_on_to_its_world(tmp_path: Path, monkeypatch: py
 def test_a_virtual_run_is_pushed_as_its_command_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     configs: list[VirtualConfig] = []
     monkeypatch.setattr("sim.commands.run._run_virtual", lambda config, quiet: configs.append(config))
-    monkeypatch.setattr("sim.commands.run.print_score", lambda folder: None)
+    monkeypatch.setattr("sim.commands.run.score_run", lambda folder: None)
     text = f"serial={TIP},force_n=[0,0,1],from_s=3,for_s=1"
     out = str(tmp_path / "run")
     done = CliRunner().invoke(app, ["run", ARM, "--virtual", "--out", out, "--push", text])

@@ -1,0 +1,109 @@
+"""`x5-coordinator check` and `payload`: a robot measured again, against an earlier run of it."""
+
+from collections.abc import Callable
+
+import numpy as np
+import typer
+
+from coordinator.baseline.baseline_robot import BaselineRobot, load_baseline
+from coordinator.baseline.check import check, check_plan
+from coordinator.baseline.check_report import CheckReport, write_check
+from coordinator.baseline.payload import payload_plan, search_payload
+from coordinator.baseline.payload_report import write_payload
+from coordinator.commands.options import (
+    AgainOptions,
+    AsJson,
+    BaselineFolder,
+    ConnectOptions,
+    DynamicsFolder,
+    planned,
+)
+from coordinator.commands.run import run_attended
+from coordinator.excitation.plan import Plan
+from coordinator.live_robot.connection import sender_name
+from coordinator.runtime.command_line import with_options
+from coordinator.runtime.terminal import Terminal, new_table
+from coordinator.session.run import RunConfig
+from module_agent.model.errors import EXIT_FINDING, UsageError
+
+CHECK, PAYLOAD = "check.json", "payload.json"
+
+
+@with_options
+def check_robot(
+    baseline: BaselineFolder, at: ConnectOptions, again: AgainOptions, as_json: AsJson = False
+) -> None:
+    """Measure a robot again in a short run, and say which of its links changed since an earlier run.
+
+    Writes check.json. Exit codes: 0 nothing changed, 4 a link or the modules changed, others as of `run`.
+    """
+    before = load_baseline(baseline)
+    after = measured_again(before, at, again, check_plan)
+    report = check(before, after)
+    write_check(after.folder / CHECK, report)
+    if as_json:
+        typer.echo(report.model_dump_json(indent=1, by_alias=True))
+    else:
+        _print(report)
+    if report.changed:
+        raise typer.Exit(EXIT_FINDING)
+
+
+def _print(report: CheckReport) -> None:
+    table = new_table(
+        f"{report.robot} against {report.baseline}",
+        "parent | child | >displaced [mm] | >+- | >turned [deg] | >+- | >false alarm | ",
+    )
+    for link in report.links:
+        table.add_row(
+            link.parent,
+            link.child,
+            f"{link.length_mm:.2f}",
+            f"{link.length_sigma_mm:.2f}",
+            f"{np.linalg.norm(link.rotation_deg):.3f}",
+            f"{max(link.rotation_sigma_deg):.3f}",
+            f"{link.false_alarm_probability:.1g}",
+            "changed" if link.changed else "",
+        )
+    if report.links:
+        Terminal().console.print(table)
+    typer.echo("\n".join(report.summary))
+
+
+@with_options
+def find_payload(
+    baseline: DynamicsFolder, at: ConnectOptions, again: AgainOptions, as_json: AsJson = False
+) -> None:
+    """Move a robot for some ten seconds, and identify its payload: mass, centre, inertia, and where it is.
+
+    Writes payload.json. Exit codes: 0 also without a payload, others as of `run`.
+    """
+    before = load_baseline(baseline)
+    after = measured_again(before, at, again, payload_plan)
+    report = search_payload(before, after)
+    write_payload(after.folder / PAYLOAD, report)
+    typer.echo(report.model_dump_json(indent=1) if as_json else "\n".join(report.summary))
+
+
+def measured_again(
+    before: BaselineRobot,
+    at: ConnectOptions,
+    again: AgainOptions,
+    plan: Callable[[BaselineRobot, Plan], Plan],
+) -> BaselineRobot:
+    """Return the robot of a baseline as it is now: by a short run of this plan, or as of a finished run.
+
+    Raises:
+        UsageError: neither is chosen, or both; otherwise as `run_attended`.
+    """
+    if again.out is None and again.measured is not None:
+        return load_baseline(again.measured)
+    if again.out is None or again.measured is not None:
+        raise UsageError("give either --out, to measure the robot, or --measured, a run to compare with")
+    place = at.place(before.name)
+    short = plan(before, planned(again.plan))
+    config = RunConfig(
+        robot=place.robot, out=again.out, sender=sender_name(), plan=short, expect=again.expect
+    )
+    with Terminal(at.quiet) as terminal:
+        return run_attended(config, place, again.speed, terminal, advice="")[1]
