@@ -29,10 +29,6 @@ class LaunchError(RobotError):
     """A process did not start or ended early; the message has its name and its last output."""
 
 
-def _directly(process: str) -> tuple[str, ...]:
-    return ()
-
-
 class LaunchConfig(NamedTuple):
     """The settings of a launch; `processes` is how many agent processes share the modules (None: one each).
 
@@ -53,7 +49,7 @@ class LaunchConfig(NamedTuple):
     processes: int | None = None
     coordinator_options: tuple[str, ...] = ()
     agent_options: tuple[str, ...] = ()
-    within: Callable[[str], tuple[str, ...]] = _directly
+    within: Callable[[str], tuple[str, ...]] = lambda process: ()
     pushes: tuple[str, ...] = ()
 
 

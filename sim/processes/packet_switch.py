@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.network_emulation.channel import Channel
-from module_agent.network_emulation.profile import NetworkProfile, Receiver
+from module_agent.network_emulation.profile import NetworkProfile
 
 _COORDINATOR = 0
 _IPV4 = 4
@@ -51,8 +51,9 @@ class PacketSwitch:
         self._partitions = profile.partitions
         pairs = [(a, b) for a in range(len(hosts)) for b in range(len(hosts)) if a != b]
         seeds = np.random.SeedSequence(seed).spawn(len(pairs))
+        paths = profile.path("module"), profile.path("coordinator")
         self._links = {
-            pair: _Link(Channel(profile.path(_receiver(pair[1])), np.random.default_rng(each)))
+            pair: _Link(Channel(paths[pair[1] == _COORDINATOR], np.random.default_rng(each)))
             for pair, each in zip(pairs, seeds, strict=True)
         }
         self._heap: list[tuple[float, int, int, bytes]] = []
@@ -106,7 +107,3 @@ class PacketSwitch:
 
     def _push(self, due_s: float, destination: int, packet: bytes) -> None:
         heapq.heappush(self._heap, (due_s, next(self._numbers), destination, packet))
-
-
-def _receiver(host: int) -> Receiver:
-    return "coordinator" if host == _COORDINATOR else "module"

@@ -94,13 +94,9 @@ def _frame(axes: Any, corners: Array) -> None:
         axis.set_major_locator(MaxNLocator(nbins=4))
 
 
-def _size(axes: Any) -> float:
-    limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
-    return float(np.max(limits[:, 1] - limits[:, 0]))
-
-
 def _axes_and_imus(axes: Any, tree: RobotTree) -> None:
-    length = np.clip(0.12 * _size(axes), 0.06, 0.12)
+    limits = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
+    length = np.clip(0.12 * np.max(np.ptp(limits, axis=1)), 0.06, 0.12)
     for i, kind in enumerate(tree.types):
         start = tree.output[i][:3, 3]
         # The direction about which the distal side turns when the joint's position grows.

@@ -17,8 +17,7 @@ class NoiseChoice(NamedTuple):
         """Return the chosen profile for a robot.
 
         Raises:
-            KeyError: unknown profile or effect; the message lists the known ones.
-            ValueError: an effect is switched both on and off.
+            UsageError: unknown profile or effect, or an effect is switched both on and off.
         """
         return switched(noise_profile(self.profile or robot.noise), self.on, self.off)
 

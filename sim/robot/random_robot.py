@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from module_agent.model.catalogue import CATALOGUE, module_type
 from module_agent.model.errors import RobotError
 from sim.geometry.link_parts import BRACKETS
-from sim.geometry.pose import Array, inverse
+from sim.geometry.pose import inverse
 from sim.geometry.rigid_body import about_origin, joined, moved
 from sim.robot.robot_file import BASE, MOUNTS, Robot
 from sim.robot.robot_tree import build_tree
@@ -126,15 +126,12 @@ def _parents(rng: np.random.Generator, count: int) -> list[int]:
 
 
 def _base(rng: np.random.Generator) -> dict[str, Any]:
-    if rng.random() < 0.4:
-        return {"mount": str(rng.choice(sorted(MOUNTS)))}
-    return {"rpy_deg": _any_turn(rng)}
+    return {"mount": str(rng.choice(sorted(MOUNTS)))} if rng.random() < 0.4 else {"rpy_deg": _any_turn(rng)}
 
 
 def _any_turn(rng: np.random.Generator) -> list[float]:
     """Draw roll, pitch, yaw of a rotation that is uniform over all rotations."""
-    turn: Array = Rotation.from_quat(rng.normal(size=4)).as_euler("xyz", degrees=True)
-    return [float(angle) for angle in turn]
+    return [float(a) for a in Rotation.from_quat(rng.normal(size=4)).as_euler("xyz", degrees=True)]
 
 
 def _module(

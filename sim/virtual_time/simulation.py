@@ -88,16 +88,13 @@ def simulate(
     if dynamics is not None:
         planned = planned.model_copy(update={"dynamics": dynamics})
     if out is not None:
-        config = VirtualConfig(
-            robot=described,
-            out=Path(out),
-            seed=seed,
-            network=network,
-            noise=profile,
-            plan=planned,
-            pushes=pushes,
+        folder = Path(out)
+        check_free(folder)
+        run_virtual(
+            VirtualConfig(described, folder, seed, network, noise=profile, plan=planned, pushes=pushes)
         )
-        return _written(config)
+        truth, motion = read_truth(folder / "truth.json"), read_motion(folder / "truth.npz")
+        return Simulation(described, folder, load_recording(folder / SESSION), truth, motion)
     ended: list[tuple[Truth, Motion]] = []
 
     def keep_truth(simulated: VirtualRobot) -> None:
@@ -109,15 +106,3 @@ def simulate(
     # Compute at once, so that an identification error is raised by this call.
     _ = simulation.identified
     return simulation
-
-
-def _written(config: VirtualConfig) -> Simulation:
-    check_free(config.out)
-    run_virtual(config)
-    return Simulation(
-        robot=config.robot,
-        folder=config.out,
-        recording=load_recording(config.out / SESSION),
-        truth=read_truth(config.out / "truth.json"),
-        motion=read_motion(config.out / "truth.npz"),
-    )

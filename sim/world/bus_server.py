@@ -149,11 +149,12 @@ class BusServer:
         try:
             while not stop():
                 if speed is not None:
-                    lag_s = _wait_until(due_s)
-                    if lag_s > _MAX_LAG_S:
-                        slipped_s += lag_s - _MAX_LAG_S
-                        due_s += lag_s - _MAX_LAG_S
-                    due_s += tick_s / speed
+                    lag_s = time.monotonic() - due_s
+                    if lag_s < 0.0:
+                        time.sleep(-lag_s)
+                    lost_s = max(0.0, lag_s - _MAX_LAG_S)
+                    slipped_s += lost_s
+                    due_s += lost_s + tick_s / speed
                 self.tick()
         finally:
             self.close()
@@ -209,11 +210,10 @@ class BusServer:
             return
         try:
             tick, pwm = agent.frames.unpack_pwm(frame)
+            if tick != agent.owes_tick:
+                raise FrameError(f"it answers tick {tick} where {agent.owes_tick} is due")
         except FrameError as error:
             self._drop(agent, f"is dropped: {error}")
-            return
-        if tick != agent.owes_tick:
-            self._drop(agent, f"is dropped: it answers tick {tick} where {agent.owes_tick} is due")
             return
         for slot, value in zip(agent.slots, pwm, strict=True):
             self._pwm[slot] = value
@@ -345,10 +345,8 @@ def _clear(path: str) -> None:
     """Remove the socket of a world that has ended."""
     try:
         mode = os.stat(path).st_mode
-    except FileNotFoundError:
-        return
     except OSError:
-        # Binding will tell what is wrong with the path.
+        # There is none, or binding will tell what is wrong with the path.
         return
     if not stat.S_ISSOCK(mode):
         raise UsageError(f"{path} is a file, not a socket; give another bus path")
@@ -359,12 +357,3 @@ def _clear(path: str) -> None:
             os.unlink(path)
             return
     raise BusInUse(f"another world listens on {path}; stop it, or give another bus path")
-
-
-def _wait_until(due_s: float) -> float:
-    """Sleep until a monotonic time [s]; return by how much it was too late."""
-    now_s = time.monotonic()
-    if now_s < due_s:
-        time.sleep(due_s - now_s)
-        return 0.0
-    return now_s - due_s

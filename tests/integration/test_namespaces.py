@@ -15,9 +15,10 @@ import pytest
 from coordinator.recording.run_folder import load_recording
 from sim.processes.launcher import Child, LaunchConfig, Launcher, stop_child
 from sim.processes.link_emulator import UP
-from sim.processes.network_namespace import NamespaceError, NetworkNamespace, open_tun
+from sim.processes.network_namespace import NamespaceError, open_tun
 from sim.robot.robot_file import load_robot
 from sim.scoring.score import score
+from tests.network_namespace import NetworkNamespace
 
 ROBOT = "thesis_245_horizontal"
 HUB = "10.77.0.1"
