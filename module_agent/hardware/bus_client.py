@@ -8,7 +8,6 @@ from module_agent.hardware.bus_frames import (
     MAX_HANDSHAKE_BYTES,
     FrameError,
     TickFrames,
-    Welcome,
     pack_hello,
     unpack_welcome,
 )
@@ -108,7 +107,7 @@ def _greet(
     connection.settimeout(timeout_s)
     try:
         connection.send(pack_hello(serials))
-        answer: Welcome | str = unpack_welcome(connection.recv(MAX_HANDSHAKE_BYTES))
+        answer = unpack_welcome(connection.recv(MAX_HANDSHAKE_BYTES))
     except TimeoutError as error:
         raise HardwareLost(
             f"the world on {path} does not answer within {timeout_s} s; is it paused?"

@@ -1,11 +1,9 @@
 """The contract between the firmware and the modules whose motors it commands and whose sensors it reads.
 
-The firmware hands over targets (`Command`), and the module closes its loops inside. Real modules close them
-behind an Ethernet port, at a rate that no network round trip could keep; for simulated modules `loop_inside`
-does it. In the firmware is what depends on the lease, on the freshness of commands and on motions: the sender
-that may command, the command lifetime and its expiry action, states, motions. In the module is what depends
-on nothing else: loops and gains, limits of position and temperature, the brake, and a watchdog that turns the
-motor off when no commands come.
+The firmware hands over targets (`Command`), and the module closes its loops inside: real modules behind an
+Ethernet port, simulated ones in `loop_inside`. In the firmware is what depends on the lease, on the freshness
+of commands and on motions; in the module are loops and gains, limits of position and temperature, the brake,
+and a watchdog that turns the motor off when no commands come.
 """
 
 from collections.abc import Sequence
@@ -20,10 +18,9 @@ from module_agent.wire.messages import GainSet, Limits
 class SensorSample(NamedTuple):
     """The sensor readings of one tick of one module, in the module's own clock and frames.
 
-    The accelerometer reads specific force (+g on the axis that points up at rest). Gyro and accelerometer
-    are in the IMU frame. Effort is the torque that the output exerts on what it is mounted to, read from
-    the spring. Position, velocity and effort are those of the output relative to the housing about the
-    module's +z.
+    The accelerometer reads specific force (+g on the axis that points up at rest). Gyro and accelerometer are
+    in the IMU frame. Position, velocity and effort are those of the output relative to the housing about the
+    module's +z; effort is the torque that the output exerts on what it is mounted to, read from the spring.
     """
 
     t_ns: int
@@ -100,8 +97,8 @@ class Modules(Protocol):
     def information(self) -> Sequence[ModuleInformation]:
         """The modules, in the order in which all else counts them.
 
-        HEBI: a lookup of the serials and `request_info`. Its tick is the period of feedback that the driver
-        has set, its clock `hardware_transmit_time`.
+        HEBI: a lookup of the serials and `request_info`; the tick is the period of feedback that the driver
+        has set, the clock `hardware_transmit_time`.
         """
 
     def receive(self) -> Sequence[ModuleSample]:

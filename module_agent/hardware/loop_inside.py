@@ -1,9 +1,7 @@
 """Simulated modules behind the contract of real ones: the loops that a real module closes inside.
 
-The loops and their gains, the motor guard (limits of position and temperature), the brake and the watchdog
-that turns the motor off when no commands come are here, because they depend on nothing but the module. What
-depends on the lease, on the freshness of commands and on motions stays in the firmware: it decides between
-motor off, hold and brake on expiry, and expresses the decision as a command.
+Loops, gains, motor guard, brake and watchdog are here, as they depend on nothing but the module; `hardware`
+says what is in the firmware instead.
 """
 
 from collections.abc import Sequence
@@ -19,13 +17,10 @@ from module_agent.wire.messages import GainSet
 DEFAULT_LIFETIME_NS = 250_000_000
 DEFAULT_STRATEGY = 3
 FAMILY = "simulated"
-_NO_LIMIT = LimitState.NONE
 
 
 class _Drive:
     """Loops, guard and watchdog of one module."""
-
-    __slots__ = ("_dt_s", "_kind", "_running", "controller", "guard", "identified", "lifetime_ns", "module")
 
     def __init__(self, module: WiredModule):
         self._kind = module_type(module.module_type)
@@ -60,7 +55,7 @@ class _Drive:
             self.controller.reset()
         if brake:
             return self.guard.damping(sensors)
-        self.guard.state = _NO_LIMIT
+        self.guard.state = LimitState.NONE
         return 0.0
 
 
@@ -104,9 +99,8 @@ class LoopInside:
             self._go_on()
         pwm, self._sensors = self.pwm, self._wires.exchange(self.pwm)
         self._sequence += 1
-        sequence = self._sequence
         return [
-            ModuleSample(sensors, u, sequence, drive.guard.state, False)
+            ModuleSample(sensors, u, self._sequence, drive.guard.state, False)
             for drive, sensors, u in zip(self._drives, self._sensors, pwm, strict=True)
         ]
 
@@ -128,12 +122,11 @@ class LoopInside:
 
     def _go_on(self) -> None:
         """Run the loops on their last commands, or none where the lifetime is over."""
-        answered_ns = [sensors.t_ns for sensors in self._answered or self._sensors]
+        answered = self._answered or self._sensors
+        each = zip(self._drives, self._commands, self._sensors, answered, strict=True)
         self.pwm = [
-            drive.run(command if sensors.t_ns - t_ns <= drive.lifetime_ns else MOTOR_OFF, sensors)
-            for drive, command, sensors, t_ns in zip(
-                self._drives, self._commands, self._sensors, answered_ns, strict=True
-            )
+            drive.run(command if sensors.t_ns - last.t_ns <= drive.lifetime_ns else MOTOR_OFF, sensors)
+            for drive, command, sensors, last in each
         ]
 
     def set_gains(self, index: int, gains: GainSet) -> None:

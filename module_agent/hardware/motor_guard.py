@@ -9,39 +9,31 @@ from module_agent.wire.messages import Limits
 CEILING_LIMIT_C = 155.0
 DAMPING_LIMIT_PWM = 0.25
 
-_NONE, _POSITION = LimitState.NONE, LimitState.POSITION
-_TEMPERATURE, _OVER_TEMPERATURE = LimitState.TEMPERATURE, LimitState.OVER_TEMPERATURE
-
 
 class MotorGuard:
-    """The output stage of one module: bounds on the PWM (at 48 V), and the PWM that brakes.
-
-    `state` is what bounded the last PWM.
-    """
-
-    __slots__ = ("_high_rad", "_low_rad", "_max_motor_rad_s", "state")
+    """Bounds on one module's PWM (at 48 V), and the PWM that brakes; `state` is what bounded the last PWM."""
 
     def __init__(self, kind: ModuleType, limits: Limits):
         self._low_rad = limits.min_position_rad
         self._high_rad = limits.max_position_rad
         self._max_motor_rad_s = kind.gear_ratio * kind.max_speed_rad_s
-        self.state = _NONE
+        self.state = LimitState.NONE
 
     def limit(self, pwm: float, sample: SensorSample) -> float:
         """Keep the duty below the winding's ceiling 1 - 1/(155 - T), and never drive out of the range."""
-        self.state = _NONE
+        self.state = LimitState.NONE
         low, high, position = self._low_rad, self._high_rad, sample.position_rad
         if (high is not None and position > high and pwm > 0.0) or (
             low is not None and position < low and pwm < 0.0
         ):
-            self.state = _POSITION
+            self.state = LimitState.POSITION
             return 0.0
         room_c = CEILING_LIMIT_C - sample.winding_temperature_c
         ceiling = 1.0 - 1.0 / room_c if room_c > 1.0 else 0.0
         max_pwm = ceiling * sample.voltage_v / NOMINAL_VOLTAGE_V
         if -max_pwm <= pwm <= max_pwm:
             return pwm
-        self.state = _TEMPERATURE if ceiling else _OVER_TEMPERATURE
+        self.state = LimitState.TEMPERATURE if ceiling else LimitState.OVER_TEMPERATURE
         return max_pwm if pwm > 0.0 else -max_pwm
 
     def damping(self, sample: SensorSample) -> float:

@@ -99,16 +99,12 @@ CATALOGUE = _read_catalogue()
 class UnknownModuleType(RobotError):
     """The catalogue has no such type; the message lists those that it has."""
 
-    def __str__(self) -> str:
-        # A KeyError would show its message in quotes.
-        return str(self.args[0])
-
 
 def module_type(name: str) -> ModuleType:
     """Look up a type by name.
 
     Raises:
-        UnknownModuleType: a KeyError; the message lists the known ones.
+        UnknownModuleType: the message lists the known ones.
     """
     if name not in CATALOGUE:
         raise UnknownModuleType(f"unknown module type {name!r}; the catalogue knows {', '.join(CATALOGUE)}")
@@ -120,8 +116,5 @@ def module_type(name: str) -> ModuleType:
 # gravity field, Geophys. Res. Lett. 40, 2013. Taken as a uniform distribution: its mean, its sigma.
 GRAVITY_M_S2, GRAVITY_SIGMA_M_S2 = 9.80, 0.02
 
-
 TorqueKind = Literal["calibrated", "uncalibrated"]
-
-
 ImuKind = Literal["calibrated", "uncalibrated"]

@@ -103,38 +103,30 @@ class Chain(NamedTuple):
 
     def ancestors(self, body: int) -> tuple[int, ...]:
         """Return the joints that move a body, from the root joint to its own; empty for `BASE`."""
-        return () if body == BASE else _walks(self.parent).up[body]
+        return () if body == BASE else _walks(self.parent)[0][body]
 
     def descendants(self, joint: int) -> tuple[int, ...]:
         """Return the bodies that move with a joint, itself first, in the order of the chain."""
-        return _walks(self.parent).down[joint]
-
-
-class _Walks(NamedTuple):
-    """For every body the joints from the root to it (`up`), and the bodies that it moves (`down`)."""
-
-    up: tuple[tuple[int, ...], ...]
-    down: tuple[tuple[int, ...], ...]
+        return _walks(self.parent)[1][joint]
 
 
 @lru_cache(maxsize=64)
-def _walks(parent: tuple[int, ...]) -> _Walks:
-    # Inner loops ask for these: 330 us to compute for 64 modules in a row, 0.5 us to look up.
+def _walks(parent: tuple[int, ...]) -> tuple[tuple[tuple[int, ...], ...], tuple[tuple[int, ...], ...]]:
+    """Return for every body the joints from the root to it, and the bodies that it moves.
+
+    Inner loops ask for these: 330 us to compute for 64 modules in a row, 0.5 us to look up.
+    """
     up: list[tuple[int, ...]] = []
     down: list[list[int]] = [[] for _ in parent]
     for body, above in enumerate(parent):
         up.append((*(() if above == BASE else up[above]), body))
         for joint in up[body]:
             down[joint].append(body)
-    return _Walks(tuple(up), tuple(tuple(bodies) for bodies in down))
+    return tuple(up), tuple(map(tuple, down))
 
 
 def _checked(fields: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Array:
-    """Return a read-only copy of a field as an array.
-
-    Raises:
-        ChainError: another shape, or values that are not finite.
-    """
+    """Return a read-only copy of a field as an array of finite values."""
     try:
         array = np.array(fields[name], dtype=float)
     except ValueError:

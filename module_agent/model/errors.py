@@ -1,9 +1,7 @@
 """Errors of the domain: their text is for the user, their exit code for the program that called.
 
-A RobotError is raised for what may go wrong with a correct program: unsuitable data, an absent module, a
-file that cannot be used. Everything else (ValueError, TypeError, LinAlgError...) is a programming error and
-ends the program with a traceback. A RobotError is therefore never a ValueError: numerics raise ValueErrors,
-and catching one kind would catch the other.
+A RobotError is raised for what may go wrong with a correct program. Everything else (ValueError, LinAlgError)
+is a programming error and ends it with a traceback; a RobotError is therefore never a ValueError.
 """
 
 EXIT_FAILED, EXIT_USAGE, EXIT_LOST, EXIT_FINDING, EXIT_INTERRUPTED = 1, 2, 3, 4, 130

@@ -66,8 +66,7 @@ class ImuPrior(NamedTuple):
 UNCALIBRATED = ImuPrior(scale=0.01, misalignment_rad=radians(1.0))
 # Calibrated on a rate table and by gravity: what is left of scale and axes is below what motions can measure.
 CALIBRATED = ImuPrior(scale=1e-4, misalignment_rad=1e-4)
-# For motions that tell neither scale nor axes. The accelerometer's bias separates what they cannot: the bias
-# itself and gravity where the IMU never turns.
+# For motions that tell neither scale nor axes.
 BIASES_ONLY = ImuPrior(scale=0.0, misalignment_rad=0.0, delay_s=0.0, g_sensitivity_s_m=0.0)
 
 IMU_PRIORS: dict[ImuKind, ImuPrior] = {"calibrated": CALIBRATED, "uncalibrated": UNCALIBRATED}

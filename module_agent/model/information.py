@@ -6,6 +6,7 @@ and joint by joint, because a joint's torque depends on the bodies that it carri
 """
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -69,12 +70,9 @@ def gather(
     """
     signals = [np.asarray(signal, dtype=float) for signal in (q_rad, qd_rad_s, qdd_rad_s2)]
     tau = np.asarray(tau_nm, dtype=float)
-    total: tuple[JointInformation, ...] = ()
-    for begin in range(0, max(tau.shape[0], 1), _BLOCK):
-        part = slice(begin, begin + _BLOCK)
-        block = compress(torque_regressor(chain, *(signal[part] for signal in signals)), tau[part])
-        total = merge(total, block) if total else block
-    return total
+    parts = [slice(begin, begin + _BLOCK) for begin in range(0, max(tau.shape[0], 1), _BLOCK)]
+    blocks = (compress(torque_regressor(chain, *(s[part] for s in signals)), tau[part]) for part in parts)
+    return reduce(merge, blocks)
 
 
 def gather_joint(
@@ -102,26 +100,18 @@ def gather_joint(
     if not tau.size or not np.isfinite(tau).all():
         raise DataError(f"{tau.size} torques: at least one is needed, and all finite")
     extra = np.zeros((tau.size, 0)) if further is None else np.asarray(further, dtype=float)
-    total: JointInformation | None = None
-    for begin in range(0, tau.size, _BLOCK):
-        part = slice(begin, begin + _BLOCK)
-        bodies = _own_rows(chain, joint, [signal[part] for signal in signals])
-        own = np.column_stack([bodies, extra[part]])
-        block = _triangular(own, tau[part], 0.0, len(own))
-        total = block if total is None else merge_joint(total, block)
-    assert total is not None
-    return total
+
+    def block(part: slice) -> JointInformation:
+        own = np.column_stack([_own_rows(chain, joint, [s[part] for s in signals]), extra[part]])
+        return _triangular(own, tau[part], 0.0, len(own))
+
+    return reduce(merge_joint, (block(slice(k, k + _BLOCK)) for k in range(0, tau.size, _BLOCK)))
 
 
 def _own_rows(chain: Chain, joint: int, signals: Sequence[Array]) -> Array:
-    joints = len(chain.serials)
-    step = max(32, _VALUES // (PER_BODY * joints**2))
-    starts = range(0, len(signals[0]), step)
-    parts = [
-        torque_regressor(chain, *(signal[start : start + step] for signal in signals))[:, joint]
-        for start in starts
-    ]
-    return np.concatenate(parts)
+    step = max(32, _VALUES // (PER_BODY * len(chain.serials) ** 2))
+    parts = (slice(start, start + step) for start in range(0, len(signals[0]), step))
+    return np.concatenate([torque_regressor(chain, *(s[part] for s in signals))[:, joint] for part in parts])
 
 
 def merge(one: Sequence[JointInformation], other: Sequence[JointInformation]) -> tuple[JointInformation, ...]:

@@ -1,9 +1,7 @@
 """Small and finite changes of a chain: one twist per module, in the root frame.
 
 An increment is (6 n,): for every module [rotation (3), translation (3)], the exponential coordinates of a
-displacement of its housing in the root frame at q = 0, applied from the left. Housing, IMU and axis of the
-module move together, since the catalogue ties them. Moving everything beyond a joint about or along that
-joint's axis is the same twist for all of it, for finite amounts too.
+displacement of its housing in the root frame at q = 0, applied from the left; IMU and axis move with it.
 """
 
 import numpy as np

@@ -5,9 +5,8 @@ body j, and that wrench is linear in the ten parameters of the body (thesis eqs 
 coincide with the root frame at q = 0, so a body's parameters are constants in the root frame at q = 0.
 
 The screws of all the joints below a body are carried up into the body's frame, which gives every entry of the
-regressor directly; neither 6 x 6 transforms nor 6 x 10 wrench matrices are built. Twists and spatial
-accelerations transform as Ad(exp(-S q)), and V' = Ad V + S qd, A' = Ad A + ad(V') S qd + S qdd (Featherstone,
-Rigid Body Dynamics Algorithms, table 5.1).
+regressor directly. Twists and spatial accelerations transform as Ad(exp(-S q)), and V' = Ad V + S qd,
+A' = Ad A + ad(V') S qd + S qdd (Featherstone, Rigid Body Dynamics Algorithms, table 5.1).
 """
 
 import numpy as np

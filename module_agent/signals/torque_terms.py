@@ -108,17 +108,11 @@ def term_columns(motion: JointMotion, rate_hz: float, cutoff_hz: float) -> Array
         rate_hz: of its samples.
         cutoff_hz: nonlinear columns are low-passed as the motion was.
     """
-    columns = [
-        -differentiate(motion.tau_nm, rate_hz)
-        if term == "lag"
-        else term_signal(term, motion.qd_rad_s, motion.qdd_rad_s2, SLOW_RAD_S)
-        for term in READING_TERMS
-    ]
-    stacked = np.stack(
-        [
-            column if TERM_KINDS[term].linear else zero_phase_low_pass(column, rate_hz, cutoff_hz)
-            for term, column in zip(READING_TERMS, columns, strict=True)
-        ],
-        axis=2,
-    )
-    return read_only(stacked)
+
+    def column(term: Term) -> Array:
+        if term == "lag":
+            return -differentiate(motion.tau_nm, rate_hz)
+        signal = term_signal(term, motion.qd_rad_s, motion.qdd_rad_s2, SLOW_RAD_S)
+        return signal if TERM_KINDS[term].linear else zero_phase_low_pass(signal, rate_hz, cutoff_hz)
+
+    return read_only(np.stack(list(map(column, READING_TERMS)), axis=2))

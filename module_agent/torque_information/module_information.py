@@ -5,6 +5,7 @@ coordinator with the rows of all modules: both results agree to rounding.
 """
 
 from collections.abc import Mapping
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,15 +49,14 @@ def own_information(
         )
     joint = chain.serials.index(serial)
     clocks = dict(zip(chain.serials, clocks_of(request.clocks), strict=True))
-    total: JointInformation | None = None
-    for span in {motion.motion_id: motion for motion in request.motions}.values():
+
+    def of(span: SpanPart) -> JointInformation:
         own = _motion(chain, joint, clocks, request, span, tracks[span.motion_id])
         terms = term_columns(own, NS_PER_S / request.step_ns, request.cutoff_hz)[:, joint]
         motion = own.q_rad, own.qd_rad_s, own.qdd_rad_s2
-        one = gather_joint(chain, joint, *motion, own.tau_nm[:, joint], terms)
-        total = one if total is None else merge_joint(total, one)
-    assert total is not None
-    return total
+        return gather_joint(chain, joint, *motion, own.tau_nm[:, joint], terms)
+
+    return reduce(merge_joint, map(of, {motion.motion_id: motion for motion in request.motions}.values()))
 
 
 def _motion(

@@ -21,7 +21,7 @@ M = TypeVar("M", bound=Message)
 
 # The types of maps and arrays from `unpackb`.
 _CONTAINERS = (dict, tuple)
-_RANGE_ERRORS = frozenset({"greater_than", "greater_than_equal", "less_than", "less_than_equal"})
+_RANGE_ERRORS = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
 
 
 def encode(message: Message) -> bytes:
@@ -34,12 +34,10 @@ def encode(message: Message) -> bytes:
 
 def _is_nested_deeper(value: dict[str, Any] | tuple[Any, ...], levels: int) -> bool:
     """Return whether there are more than `levels` of containers in each other, `value` the first."""
-    if not levels:
-        return True
-    for part in value.values() if isinstance(value, dict) else value:
-        if isinstance(part, _CONTAINERS) and _is_nested_deeper(part, levels - 1):
-            return True
-    return False
+    parts = value.values() if isinstance(value, dict) else value
+    return not levels or any(
+        isinstance(part, _CONTAINERS) and _is_nested_deeper(part, levels - 1) for part in parts
+    )
 
 
 def _unpack(data: bytes, max_bytes: int) -> dict[str, Any]:
@@ -68,21 +66,13 @@ def _unpack(data: bytes, max_bytes: int) -> dict[str, Any]:
 
 def _reason(error: ValidationError) -> WireError:
     """Pick the error that comes first in the order types, finiteness, range."""
-    ranks = {Refusal.TYPES: 0, Refusal.NOT_FINITE: 1, Refusal.RANGE: 2}
-    errors: list[tuple[int, str, Refusal]] = []
-    for item in error.errors(include_url=False, include_context=False):
-        kind = item["type"]
-        reason = Refusal.TYPES
-        if kind == "finite_number":
-            reason = Refusal.NOT_FINITE
-        elif kind in _RANGE_ERRORS:
-            reason = Refusal.RANGE
-        where = ".".join(str(part) for part in item["loc"])
-        # An array whose elements are wrong counts as too short as well: the elements say why.
-        rank = len(ranks) if kind == "too_short" else ranks[reason]
-        errors.append((rank, f"{where}: {item['msg']}", reason))
-    _, detail, reason = min(errors, key=lambda row: row[0])
-    return WireError(reason, detail[:480])
+    # An array whose elements are wrong counts as too short as well: the elements say why.
+    order = {"finite_number": 1, **dict.fromkeys(_RANGE_ERRORS, 2), "too_short": 3}
+    first = min(
+        error.errors(include_url=False, include_context=False), key=lambda item: order.get(item["type"], 0)
+    )
+    reason = (Refusal.TYPES, Refusal.NOT_FINITE, Refusal.RANGE, Refusal.TYPES)[order.get(first["type"], 0)]
+    return WireError(reason, f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:480])
 
 
 def decode(kind: type[M], data: bytes, max_bytes: int = MAX_COMMAND_BYTES) -> M:

@@ -61,9 +61,8 @@ def pack_row(ring: bytearray, slot: int, values: Sequence[float]) -> None:
     try:
         _PACKING.pack_into(ring, offset, *values)
     except OverflowError:
-        _PACKING.pack_into(
-            ring, offset, *(math.copysign(math.inf, v) if abs(v) > _MAX_F4 else v for v in values)
-        )
+        bounded = (math.copysign(math.inf, v) if abs(v) > _MAX_F4 else v for v in values)
+        _PACKING.pack_into(ring, offset, *bounded)
 
 
 def unpack(feedback: Feedback) -> Rows:

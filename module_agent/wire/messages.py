@@ -38,9 +38,6 @@ class Message(Part):
     seq: Counter
 
 
-# --------------------------------------------------------------------------- motion patterns
-
-
 class Rest(Part):
     """Hold the present set position."""
 
@@ -127,9 +124,6 @@ class EffortProfile(Part):
     samples: Annotated[bytes, Field(min_length=8, max_length=3200)]
 
 
-# --------------------------------------------------------------------------- gains
-
-
 class PidGains(Part):
     """One loop's parameters, with the manufacturer's meanings (see `control.pid`)."""
 
@@ -156,9 +150,6 @@ class GainSet(Part):
     position: PidGains
     velocity: PidGains
     effort: PidGains
-
-
-# --------------------------------------------------------------------------- from the agent
 
 
 class MotionRecord(Part):
@@ -302,9 +293,6 @@ class Ack(Message):
     holder: Name | None
     lease_left_ns: Nanoseconds
     token: Counter
-
-
-# --------------------------------------------------------------------------- to the agent
 
 
 class Ask(Message):

@@ -4,6 +4,7 @@ Rows are numbered since the module's boot, so that a listener knows which are mi
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from module_agent.wire.feedback_rows import ROW, Rows, unpack
 from module_agent.wire.messages import Feedback
@@ -57,8 +58,7 @@ class RowLog:
     def _reserve(self, first: int, end: int, base: int) -> None:
         if max(end, self._end) - min(first, base) > MAX_ROWS:
             raise WireError(
-                Refusal.RANGE,
-                f"row {first} is too far from rows {base} to {self._end} to be of this boot",
+                Refusal.RANGE, f"row {first} is too far from rows {base} to {self._end} to be of this boot"
             )
         before = max(0, base - first)
         after = max(0, end - base - len(self._have))
@@ -69,42 +69,37 @@ class RowLog:
 
     def missing(self, first: int, end: int) -> list[tuple[int, int]]:
         """Return the ranges within rows `first` up to and without `end` that have not arrived."""
-        if self._base is None:
-            return [(first, end)] if end > first else []
-        have = np.zeros(max(0, end - first), dtype=bool)
-        low, high = max(first, self._base), min(end, self._base + len(self._have))
+        base, have = self.first_row, np.zeros(max(0, end - first), dtype=bool)
+        low, high = max(first, base), min(end, base + len(self._have))
         if high > low:
-            have[low - first : high - first] = self._have[low - self._base : high - self._base]
+            have[low - first : high - first] = self._have[low - base : high - base]
         edges = np.flatnonzero(np.diff(np.concatenate(([True], have, [True])).astype(np.int8)))
         return [(first + int(a), first + int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
     def rows(self, first: int, end: int) -> Rows:
         """Return the rows of a range that have arrived, in order, as a copy."""
-        if self._base is None:
-            return np.zeros(0, ROW)
-        low, high = max(first, self._base), min(end, self._base + len(self._have))
-        if high <= low:
-            return np.zeros(0, ROW)
-        span = slice(low - self._base, high - self._base)
+        base = self.first_row
+        span = slice(max(first - base, 0), max(end - base, 0))
         return self._rows[span][self._have[span]]
 
     def between(self, start_ns: int, end_ns: int) -> Rows:
         """Return the rows that have arrived of a span of module time, both ends included, as a copy."""
-        arrived = np.flatnonzero(self._have)
-        t_ns = self._rows["t_ns"][arrived]
-        return self._rows[arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]]
+        return self._rows[self._within(start_ns, end_ns)]
 
     def range_between(self, start_ns: int, end_ns: int) -> tuple[int, int]:
         """Return the row numbers, first and one past the last, of a span of module time; (0, 0) if none came.
 
         Rows within it that have not arrived are counted.
         """
+        within = self._within(start_ns, end_ns)
+        if not len(within):
+            return 0, 0
+        return self.first_row + int(within[0]), self.first_row + int(within[-1]) + 1
+
+    def _within(self, start_ns: int, end_ns: int) -> NDArray[np.intp]:
         arrived = np.flatnonzero(self._have)
         t_ns = self._rows["t_ns"][arrived]
-        within = arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]
-        if self._base is None or not len(within):
-            return 0, 0
-        return self._base + int(within[0]), self._base + int(within[-1]) + 1
+        return arrived[(t_ns >= start_ns) & (t_ns <= end_ns)]
 
     def forget_before(self, row: int) -> None:
         """Drop rows below `row`, for listeners with little memory."""

@@ -2,9 +2,7 @@
 
 A module serves the requests of its own keys and answers each with the reply of the table, or refuses it with
 an `Ack`. Publications go one way on a key: from the module to everyone who subscribes, or from a coordinator
-to the module. Host, firmware, coordinator and recordings read this table. To add a message, define it in
-`messages`, name its key in `keys.Leaf`, add a row here, and handle it in `firmware` or `host`, whichever
-`answered_by` says.
+to the module. Host, firmware, coordinator and recordings read this table; docs/wire.md says how to extend it.
 """
 
 from typing import Literal, NamedTuple
@@ -48,7 +46,7 @@ class Topic(NamedTuple):
     @property
     def to_module(self) -> type[Message] | None:
         """The message that a module takes on this leaf, as a request or as a publication."""
-        return self.request or (self.publication if self.published_by == "coordinator" else None)
+        return self.request or (None if self.published_by == "module" else self.publication)
 
     def message(self, exchange: Exchange) -> type[Message] | None:
         """Return the message type of a publication, request or reply; None if there is none."""
@@ -56,24 +54,15 @@ class Topic(NamedTuple):
 
     def max_bytes(self, exchange: Exchange) -> int:
         """Return how many bytes of a publication, request or reply are decoded at most."""
-        to_module = exchange == "request" or (
-            exchange == "publication" and self.published_by == "coordinator"
-        )
-        return self.max_bytes_to_module if to_module else self.max_bytes_from_module
+        sender = {"publication": self.published_by, "request": "coordinator", "reply": "module"}[exchange]
+        return self.max_bytes_from_module if sender == "module" else self.max_bytes_to_module
 
 
 TOPICS: dict[Leaf, Topic] = {
     Leaf.ALIVE: Topic("Liveliness token of a module's agent; it carries no message."),
-    Leaf.INFO: Topic(
-        "Type, limits, gains and rates of the module.",
-        request=Ask,
-        reply=Info,
-        any_boot=True,
-    ),
+    Leaf.INFO: Topic("Type, limits, gains and rates of the module.", request=Ask, reply=Info, any_boot=True),
     Leaf.FEEDBACK: Topic(
-        "The newest measured rows, in batches.",
-        publication=Feedback,
-        max_bytes_from_module=MAX_MESSAGE_BYTES,
+        "The newest measured rows, in batches.", publication=Feedback, max_bytes_from_module=MAX_MESSAGE_BYTES
     ),
     Leaf.STATUS: Topic(
         "State, lease, motion and refusals: published at every change and at least twice a second.",
@@ -90,11 +79,7 @@ TOPICS: dict[Leaf, Topic] = {
     ),
     Leaf.LEASE: Topic("Acquire, renew or release the command of the joint.", request=LeaseRequest),
     Leaf.MOTION: Topic("Start a motion that runs on the module.", request=MotionCommand),
-    Leaf.SETPOINT: Topic(
-        "Stream setpoints to the joint.",
-        publication=Setpoint,
-        published_by="coordinator",
-    ),
+    Leaf.SETPOINT: Topic("Stream setpoints to the joint.", publication=Setpoint, published_by="coordinator"),
     Leaf.STOP: Topic(
         "Stop at once; needs no lease.",
         publication=Stop,
@@ -128,9 +113,6 @@ TOPICS: dict[Leaf, Topic] = {
 }
 
 SERVED = tuple(leaf for leaf, topic in TOPICS.items() if topic.request)
-PUBLISHED_BY_MODULE = tuple(
-    leaf for leaf, topic in TOPICS.items() if topic.publication and topic.published_by == "module"
-)
-PUBLISHED_TO_MODULE = tuple(
-    leaf for leaf, topic in TOPICS.items() if topic.publication and topic.published_by == "coordinator"
-)
+_PUBLISHED = {leaf: topic.published_by for leaf, topic in TOPICS.items() if topic.publication}
+PUBLISHED_BY_MODULE = tuple(leaf for leaf, sender in _PUBLISHED.items() if sender == "module")
+PUBLISHED_TO_MODULE = tuple(leaf for leaf, sender in _PUBLISHED.items() if sender == "coordinator")
