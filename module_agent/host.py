@@ -15,10 +15,9 @@ from module_agent.hardware.hardware import Modules, ModuleSample
 from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
 from module_agent.torque_information.service import InformationService, Worker
-from module_agent.transport.inbox import Inbox
 from module_agent.transport.transport import (
     Event,
-    Liveness,
+    Inbox,
     Reply,
     Request,
     Sample,
@@ -196,10 +195,8 @@ class AgentHost:
     @property
     def own_rows(self) -> dict[str, OwnRows]:
         """The rows of the process's own modules."""
-        return {
-            module.serial: OwnRows(module.firmware.config.boot, module.firmware.history)
-            for module in self.modules
-        }
+        firmwares = (module.firmware for module in self.modules)
+        return {each.config.serial: OwnRows(each.config.boot, each.history) for each in firmwares}
 
     @property
     def now_ns(self) -> int:
@@ -207,16 +204,15 @@ class AgentHost:
         return self.modules[0].now_ns
 
     def _declare(self) -> None:
-        transport = self._transport
+        transport, declared = self._transport, self._declared
         for module in self.modules:
-            for leaf in SERVED:
-                self._declared.append(transport.serve(module.key(leaf), module.sink(leaf)))
-            for leaf in PUBLISHED_TO_MODULE:
-                self._declared.append(transport.subscribe(module.key(leaf), module.sink(leaf)))
-        self._declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._from_others.put))
+            declared += [transport.serve(module.key(leaf), module.sink(leaf)) for leaf in SERVED]
+            declared += [
+                transport.subscribe(module.key(leaf), module.sink(leaf)) for leaf in PUBLISHED_TO_MODULE
+            ]
+        declared.append(transport.subscribe(every(self._robot, Leaf.STATUS), self._from_others.put))
         # Last, so that everything else is in place when the token is seen.
-        for module in self.modules:
-            self._declared.append(transport.declare_alive(module.key(Leaf.ALIVE)))
+        declared += [transport.declare_alive(module.key(Leaf.ALIVE)) for module in self.modules]
 
     def cycle(self) -> None:
         """Run one tick of all modules: receive samples, send commands, publish.
@@ -251,8 +247,6 @@ class AgentHost:
         else:
             self._transport.publish(module.key(outgoing.leaf), outgoing.payload)
 
-    # ------------------------------------------------------------------ the other modules
-
     def _read_others(self) -> None:
         clocks = {module.serial: module.now_ns for module in self.modules}
         for event in self._from_others.drain(limit=512):
@@ -263,12 +257,11 @@ class AgentHost:
                     module.firmware.admission.count(error.reason)
 
     def _on_event(self, event: Event, clocks: dict[str, int]) -> None:
-        if isinstance(event, Liveness | Request):
-            return
         if isinstance(event, Reply):
             asked = self._asked.pop(event.tag, None)
             if event.payload is not None and asked is not None:
                 self._on_history(asked, event.payload, clocks)
+        if not isinstance(event, Sample):
             return
         _, serial, leaf = parse(event.key)
         max_bytes = TOPICS[leaf].max_bytes_from_module

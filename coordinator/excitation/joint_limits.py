@@ -9,10 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from module_agent.control.waveform import duration_s, waveform
-from module_agent.model.catalogue import GRAVITY_M_S2, ModuleType
+from module_agent.model.catalogue import COPPER_PER_K, GRAVITY_M_S2, RESISTANCES_K_W, ModuleType
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
-from module_agent.model.thermal import COPPER_PER_K, RESISTANCES_K_W
 from module_agent.signals.filtering import HELD_JOINT_CUTOFF_HZ, filtered_signals, settling_samples
 from module_agent.wire.messages import Pattern
 

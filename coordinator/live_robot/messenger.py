@@ -8,8 +8,16 @@ from collections.abc import Callable, Coroutine, Iterable
 
 from coordinator.recording.recording import Entry
 from module_agent.model.errors import RobotError
-from module_agent.transport.inbox import Inbox
-from module_agent.transport.transport import CLOSED, Event, Liveness, Reply, Sample, Transport, Undeclare
+from module_agent.transport.transport import (
+    CLOSED,
+    Event,
+    Inbox,
+    Liveness,
+    Reply,
+    Sample,
+    Transport,
+    Undeclare,
+)
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Message

@@ -23,10 +23,9 @@ import numpy as np
 
 from coordinator.torque_control.feed_forward import RATE_HZ, SetPoints
 from module_agent.control.controller import NOMINAL_VOLTAGE_V, pwm_per_rad_s, torque_at_full_pwm_nm
-from module_agent.model.catalogue import ModuleType
+from module_agent.model.catalogue import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W, ModuleType
 from module_agent.model.chain import Array
 from module_agent.model.read_only import read_only
-from module_agent.model.thermal import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W
 from module_agent.signals.filtering import differentiate
 from module_agent.wire.messages import GainSet
 

@@ -11,18 +11,17 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
     type's effort, all others to full PWM.
     """
     kp = {2: kind.gains.strategy_2, 4: kind.gains.strategy_4}.get(strategy, kind.gains.strategy_3)
-    effort = kind.max_effort_nm
+    effort, speed = kind.max_effort_nm, kind.velocity_clamp_rad_s
     position_limit = effort if strategy in (2, 4) else 1.0
     velocity_limit = effort if strategy == 2 else 1.0
-    effort_target = 1.6 * effort
     return GainSet(
         strategy=strategy,
         position=PidGains(kp=kp[0], min_output=-position_limit, max_output=position_limit),
         velocity=PidGains(
             kp=kp[1],
             feed_forward=0.0 if strategy == 2 else 1.0,
-            min_target=-kind.velocity_clamp_rad_s,
-            max_target=kind.velocity_clamp_rad_s,
+            min_target=-speed,
+            max_target=speed,
             min_output=-velocity_limit,
             max_output=velocity_limit,
             output_lowpass=0.75,
@@ -31,8 +30,8 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
             kp=kp[2],
             kd=0.001,
             feed_forward=1.0,
-            min_target=-effort_target,
-            max_target=effort_target,
+            min_target=-1.6 * effort,
+            max_target=1.6 * effort,
             output_lowpass=0.9,
             d_on_error=False,
         ),
@@ -41,10 +40,6 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
 
 def catalogue_limits(kind: ModuleType) -> Limits:
     """Return the limits of a module type."""
-    low, high = kind.range_rad if kind.range_rad is not None else (None, None)
-    return Limits(
-        max_speed_rad_s=kind.max_speed_rad_s,
-        max_effort_nm=kind.max_effort_nm,
-        min_position_rad=low,
-        max_position_rad=high,
-    )
+    low, high = kind.range_rad or (None, None)
+    speed, effort = kind.max_speed_rad_s, kind.max_effort_nm
+    return Limits(max_speed_rad_s=speed, max_effort_nm=effort, min_position_rad=low, max_position_rad=high)

@@ -51,7 +51,7 @@ class JointRegression(NamedTuple):
     """The estimate of one joint by one IMU; vectors (3,) in frame u, arrays read-only.
 
     gravity_m_s2: the specific force of rest at q = 0.
-    compliance_s2: c of `joint_model`; at f Hz the IMU moves by c (2 pi f)^2 more than the encoder reports.
+    compliance_s2: c of `joint_model`.
     delays_s: per motion, beyond its offset.
     covariance: (6, 6) of axis [rad] and radial vector [m], both in frame u; singular along the axis.
     base_shakes: whether the shake of the joint's base was measured and subtracted.

@@ -1,8 +1,4 @@
-"""One module's local estimates from the motions of all joints, its own included.
-
-`job` copies the samples that an estimate needs and returns the work as a function, so that it can run in
-parallel to the firmware's ticks.
-"""
+"""One module's local estimates from the motions of all joints, its own included."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -64,7 +60,7 @@ class Observer:
         self._rest: tuple[int, Rows] | None = None
 
     def job(self, motion: JointMotion, history: History, rest: MotionRecord | None) -> Callable[[], Finding]:
-        """Copy the needed rows of the own history; return the estimate as work to be done."""
+        """Copy the needed rows of the own history; return the estimate as work to do in parallel."""
         own = _own_rows(history, motion, motion.rough_offset_ns.get(self.serial, 0))
         still = self._rest_rows(history, rest)
         return lambda: self._analyse(motion, imu_window(own), imu_window(still))

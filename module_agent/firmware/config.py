@@ -36,19 +36,8 @@ def config_of(module: ModuleInformation, boot: int, **settings: Any) -> Firmware
     Raises:
         UnknownModuleType: the catalogue has no such type.
     """
-    return FirmwareConfig(
-        serial=module.serial,
-        kind=module_type(module.module_type),
-        boot=boot,
-        limits=module.limits,
-        tick_ns=module.tick_ns,
-        imu_period_ns=module.imu_period_ns,
-        **settings,
-    )
-
-
-MAX_LIFETIME_NS = 1_000_000_000
-MAX_FEEDBACK_RATE_HZ = 1000.0
+    kind, periods = module_type(module.module_type), (module.tick_ns, module.imu_period_ns)
+    return FirmwareConfig(module.serial, kind, boot, module.limits, *periods, **settings)
 
 
 def check_config(config: FirmwareConfig) -> FirmwareConfig:
@@ -58,9 +47,9 @@ def check_config(config: FirmwareConfig) -> FirmwareConfig:
         UsageError: a lifetime that is infinite or over 1 s, or a rate that the tick or a message cannot
         carry.
     """
-    if not 0 < config.lifetime_ns <= MAX_LIFETIME_NS:
+    if not 0 < config.lifetime_ns <= 1_000_000_000:
         raise UsageError(f"lifetime {config.lifetime_ns / 1e6:.0f} ms: it must be over 0 and at most 1000 ms")
-    if not 1.0 <= config.feedback_rate_hz <= MAX_FEEDBACK_RATE_HZ:
+    if not 1.0 <= config.feedback_rate_hz <= 1000.0:
         raise UsageError(f"feedback rate {config.feedback_rate_hz} Hz: it must be 1 to 1000 Hz")
     if not 1 <= config.batch_rows <= 64:
         raise UsageError(f"{config.batch_rows} rows a batch: it must be 1 to 64")

@@ -2,10 +2,8 @@
 
 `step` takes a sample of the module and what has arrived from the network, and returns a command for the
 module; `publish` takes the PWM that the module makes of it, and returns what to send. There is no clock, no
-socket, no file and no randomness in here: the module is behind `Modules`, and its samples bring the time.
-
-The firmware decides by the lease, by how fresh commands are and by its motions. What a module does by itself
-(loops, limits of position and temperature, a watchdog against a dead agent) is behind `Modules`.
+socket, no file and no randomness in here. The firmware decides by the lease, by how fresh commands are and by
+its motions; what a module does by itself is behind `Modules`.
 """
 
 import math
@@ -15,12 +13,11 @@ from typing import Any, NamedTuple
 from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
 from module_agent.control.gains import default_gains
 from module_agent.control.motion import Motion, check_duration, check_motion, check_setpoint
-from module_agent.firmware.admission import Admission
+from module_agent.firmware.admission import Admission, Lease
 from module_agent.firmware.config import FirmwareConfig, check_config
 from module_agent.firmware.feedback import FeedbackStream
-from module_agent.firmware.lease import Lease
 from module_agent.firmware.state import COMMANDED, TRANSITIONS, Trigger
-from module_agent.hardware.hardware import Modules, ModuleSample, SensorSample
+from module_agent.hardware.hardware import Modules, ModuleSample
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import (
@@ -113,8 +110,6 @@ class Firmware:
         modules.set_lifetime(index, config.lifetime_ns)
         self._apply_gains(default_gains(config.kind, config.strategy))
 
-    # ------------------------------------------------------------------ the tick
-
     def step(self, sample: ModuleSample, inbox: Sequence[Incoming]) -> Command:
         """Begin a tick: expire what is stale, read the inbox; return the command for the module."""
         self._sample = sample
@@ -138,40 +133,38 @@ class Firmware:
         assert self._sample is not None
         sensors, out, self._out = self._sample.sensors, self._out, []
         if self._rows.due(self._now_ns, sensors.imu_t_ns):
-            self._append_row(sensors, pwm, out)
+            motion_id = self._record.motion_id if self._motion and self._record else 0
+            batch = self._rows.append(sensors, motion_id, self.state, self._command, pwm)
+            if batch is not None:
+                out.append(Publication(Leaf.FEEDBACK, encode(self._feedback(*batch))))
         if self._now_ns >= self._status_due_ns:
             self._status_due_ns = self._now_ns + STATUS_PERIOD_NS
             out.append(Publication(Leaf.STATUS, encode(self._status(re=0))))
         return out
 
-    # ------------------------------------------------------------------ what the module shall do
-
     def _command_of_state(self) -> dict[State, Callable[[], Command]]:
         # While braking, feedback rows go on showing the last targets.
-        on_expiry = {"motor_off": self._rest, "hold": self._follow, "damping": self._brake}
+        on_expiry = {"motor_off": self._rest, "hold": self._follow, "damping": lambda: BRAKE}
         return {
             "idle": self._rest,
             "armed": self._follow,
             "moving": self._follow_motion,
             "streaming": self._follow_setpoint,
             "expired": on_expiry[self.config.expiry_action],
-            "stopped": self._brake,
+            "stopped": lambda: BRAKE,
             "fault": self._rest,
         }
-
-    def _rest(self) -> Command:
-        self._command = MOTOR_OFF
-        return MOTOR_OFF
 
     def _follow(self) -> Command:
         return self._command
 
-    def _brake(self) -> Command:
-        return BRAKE
+    def _rest(self) -> Command:
+        self._command = MOTOR_OFF
+        return self._command
 
     def _follow_setpoint(self) -> Command:
         self._command = self._setpoint
-        return self._setpoint
+        return self._command
 
     def _follow_motion(self) -> Command:
         assert self._motion is not None
@@ -182,8 +175,6 @@ class Firmware:
         else:
             self._command = command
         return self._command
-
-    # ------------------------------------------------------------------ states
 
     def _enter(self, trigger: Trigger, note: str = "") -> None:
         target = TRANSITIONS[self.state].get(trigger)
@@ -224,18 +215,15 @@ class Firmware:
         if self._motion is None or self._record is None:
             return
         self._record = self._record.model_copy(update={"outcome": outcome, "end_row": self.history.next_row})
-        if outcome == "done" and self._record.pattern.kind == "rest":
-            self.last_rest = self._record
         # An interrupted motion holds its last commanded position and not its end; the effort that was fed
         # forward to move the joint is not the one that holds it.
+        self._command = Command(self._command.position_rad, 0.0, math.nan)
         if outcome == "done":
             self._command = Command(self._motion.last_position_rad, 0.0, self._motion.last_effort_nm)
-        else:
-            self._command = Command(self._command.position_rad, 0.0, math.nan)
+            if self._record.pattern.kind == "rest":
+                self.last_rest = self._record
         self._motion = None
         self._status_due_ns = 0
-
-    # ------------------------------------------------------------------ inbox
 
     def _receive(self, incoming: Incoming) -> None:
         try:
@@ -343,9 +331,9 @@ class Firmware:
         check_setpoint(setpoint, self.config.limits)
         if self.state != "streaming":
             self._enter("setpoint")
-        self._setpoint = Command(
-            _or_nan(setpoint.position_rad), _or_nan(setpoint.velocity_rad_s), _or_nan(setpoint.effort_nm)
-        )
+        targets = (setpoint.position_rad, setpoint.velocity_rad_s, setpoint.effort_nm)
+        position, velocity, effort = (math.nan if target is None else target for target in targets)
+        self._setpoint = Command(position, velocity, effort)
         self._refresh(setpoint.echo_ns)
 
     def _set_gains(self, command: GainsCommand) -> None:
@@ -353,14 +341,6 @@ class Firmware:
             raise WireError(Refusal.BUSY, "gains are taken when no motion is running")
         self._apply_gains(command.gains)
         self._refresh(command.echo_ns)
-
-    # ------------------------------------------------------------------ what it publishes
-
-    def _append_row(self, sample: SensorSample, pwm: float, out: list[Outgoing]) -> None:
-        motion = self._record.motion_id if self._motion is not None and self._record is not None else 0
-        batch = self._rows.append(sample, motion, self.state, self._command, pwm)
-        if batch is not None:
-            out.append(Publication(Leaf.FEEDBACK, encode(self._feedback(*batch))))
 
     def _head(self) -> dict[str, Any]:
         """Return what every message begins with."""
@@ -410,7 +390,3 @@ def acknowledgement(
     return Ack(
         **head, **lease.state(now_ns), re=re, accepted=accepted, reason=reason, detail=detail, t_ns=now_ns
     )
-
-
-def _or_nan(target: float | None) -> float:
-    return math.nan if target is None else target

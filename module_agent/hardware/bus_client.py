@@ -11,8 +11,7 @@ from module_agent.hardware.bus_frames import (
     pack_hello,
     unpack_welcome,
 )
-from module_agent.hardware.hardware import HardwareLost, SensorSample
-from module_agent.hardware.wires import WiredModule
+from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
 
 _RETRY_S = 0.02
 

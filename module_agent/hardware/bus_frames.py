@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from module_agent.hardware.hardware import SensorSample
-from module_agent.hardware.wires import WiredModule
+from module_agent.hardware.hardware import SensorSample, WiredModule
 from module_agent.model.errors import RobotError
 
 BUS_VERSION = 1
@@ -137,8 +136,7 @@ def unpack_welcome(frame: bytes) -> Welcome | str:
 
 
 def _pack(value: dict[str, Any]) -> bytes:
-    packed: bytes = msgpack.packb(value)
-    return packed
+    return bytes(msgpack.packb(value))
 
 
 def _unpack(frame: bytes, what: str) -> dict[str, Any]:

@@ -8,9 +8,15 @@ from collections.abc import Sequence
 
 from module_agent.control.controller import MOTOR_OFF, Command, Controller
 from module_agent.control.gains import catalogue_limits, default_gains
-from module_agent.hardware.hardware import LimitState, ModuleInformation, ModuleSample, SensorSample
+from module_agent.hardware.hardware import (
+    LimitState,
+    ModuleInformation,
+    ModuleSample,
+    SensorSample,
+    WiredModule,
+    Wires,
+)
 from module_agent.hardware.motor_guard import MotorGuard
-from module_agent.hardware.wires import WiredModule, Wires
 from module_agent.model.catalogue import module_type
 from module_agent.wire.messages import GainSet
 

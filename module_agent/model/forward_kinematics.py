@@ -6,7 +6,7 @@ so no link frames are needed.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from module_agent.model.chain import BASE, Array, Chain
@@ -26,7 +26,10 @@ def body_displacements(chain: Chain, q_rad: ArrayLike) -> Array:
     Raises:
         ValueError: `q_rad` is not (m, n).
     """
-    q = _positions(chain, q_rad)
+    q = np.asarray(q_rad, dtype=float)
+    joints = len(chain.serials)
+    if q.ndim != 2 or q.shape[1] != joints:
+        raise ValueError(f"q_rad has shape {q.shape}; a chain of {joints} joints needs (samples, {joints})")
     displacement = np.empty((*q.shape, 4, 4))
     for i, parent in enumerate(chain.parent):
         own = screw_motion(chain.axis[i], chain.point[i], q[:, i])
@@ -68,11 +71,3 @@ def places_on_axes(chain: Chain) -> Array:
     off = chain.imu_home[:, :3, 3] - chain.point
     nearest = chain.point + np.einsum("ni,ni->n", off, chain.axis)[:, None] * chain.axis
     return read_only(nearest)
-
-
-def _positions(chain: Chain, q_rad: ArrayLike) -> NDArray[np.float64]:
-    q = np.asarray(q_rad, dtype=float)
-    joints = len(chain.serials)
-    if q.ndim != 2 or q.shape[1] != joints:
-        raise ValueError(f"q_rad has shape {q.shape}; a chain of {joints} joints needs (samples, {joints})")
-    return q

@@ -1,8 +1,7 @@
 """The regressor's arithmetic, sample by sample in scalars, compiled; `regressor` says what it computes.
 
-In batches of numpy every intermediate of every body goes through memory; here a sample's stay in the first
-cache, and no entry is touched that is zero. Arrays are indexed, never sliced: a slice costs as much as a
-cross product.
+A sample's intermediates stay in the first cache, and no entry is touched that is zero. Arrays are indexed,
+never sliced: a slice costs as much as a cross product.
 """
 
 from math import cos, sin

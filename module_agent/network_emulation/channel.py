@@ -39,8 +39,7 @@ class _Draws(NamedTuple):
 class Channel:
     """Decides the fates of the messages of one path, asked in the order of their times.
 
-    Stalls and loss bursts are Markov chains in continuous time on generators of their own, and the trace is a
-    function of time: so when they come depends on the seed and not on what is sent.
+    Stalls and loss bursts have generators of their own: when they come does not depend on what is sent.
     """
 
     def __init__(self, path: PathProfile, rng: np.random.Generator):
@@ -53,10 +52,8 @@ class Channel:
 
     def fate(self, t_s: float) -> Fate:
         """Return the fate of a message that is sent at a time from the start of the channel [s]."""
-        path = self._path
-        draws = next(self._draws)
-        base_s = self._base_s
-        loss = path.loss
+        path, draws = self._path, next(self._draws)
+        base_s, loss = self._base_s, path.loss
         if self._burst is not None and path.loss_burst is not None and self._burst.end_s(t_s) is not None:
             loss = path.loss_burst.loss
         if self._stall is not None and (end_s := self._stall.end_s(t_s)) is not None:
@@ -66,13 +63,8 @@ class Channel:
             row = path.trace.at(t_s)
             base_s += 1e-3 * row.delay_ms
             lost = lost or row.lost
-        copied = draws.duplicate < path.duplicate
-        return Fate(
-            lost,
-            draws.reorder < path.reorder,
-            base_s + draws.jitter_s,
-            base_s + draws.copy_jitter_s if copied else None,
-        )
+        copy_s = base_s + draws.copy_jitter_s if draws.duplicate < path.duplicate else None
+        return Fate(lost, draws.reorder < path.reorder, base_s + draws.jitter_s, copy_s)
 
 
 class BadTimes:

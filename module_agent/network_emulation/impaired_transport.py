@@ -52,8 +52,7 @@ class ImpairedTransport:
     Order is kept per key and kind of message but for the fraction `reorder`. A stall holds up all messages of
     the endpoint together. Lost requests and replies end as a `Reply` with error "Timeout" when the query's
     time is up. A reply is never duplicated, and a duplicated request is answered once. Liveliness is delayed,
-    in order, never lost; errors of queries, which
-    no message carries, are delivered at once. A perfect path delivers within the call of the inner transport.
+    in order, never lost; errors of queries are delivered at once, as are all messages of a perfect path.
 
     Partition: from `partition` to `heal`, and at a coordinator at the profile's times, the endpoint is cut
     off: what it sends and what comes for it is lost, what is under way to it already arrives. Liveliness
@@ -182,16 +181,13 @@ class ImpairedTransport:
         for question in questions:
             question.finish(None, CLOSED)
 
-    # ------------------------------------------------------------------ partition
-
     def partition(self) -> None:
         """Cut this endpoint off until `heal`; nothing happens if it is cut off already."""
         with self._parting:
             if self._parted:
                 return
             self._parted = True
-            self._partition += 1
-            number = self._partition
+            number = self._partition = self._partition + 1
         self._scheduler.call_later(LEASE_S, lambda: self._lapse(number))
 
     def heal(self) -> None:
@@ -202,9 +198,7 @@ class ImpairedTransport:
             self._parted = False
             for watched in self._watched.values():
                 watched.heal()
-            tokens = list(self._own_tokens)
-        if self._closed:
-            return
+            tokens = [] if self._closed else list(self._own_tokens)
         for token in tokens:
             token.show()
 
@@ -239,8 +233,6 @@ class ImpairedTransport:
     def _forget_watch(self, declaration: Declaration) -> None:
         with self._parting:
             self._watched.pop(declaration, None)
-
-    # ------------------------------------------------------------------ what comes in
 
     def _on_reply(self, question: Question, event: Event) -> None:
         assert isinstance(event, Reply)
@@ -281,19 +273,14 @@ class ImpairedTransport:
         if fate.lost:
             self._dropped[kind] += 1
             return []
+        delays_s = [fate.delay_s]
         # The copy has its place in the queue right behind the original, as order goes but for `reorder`.
-        route = self._past_queue if fate.reordered else self._enter
-        calls = [(fate.delay_s, route(kind, key, deliver))]
         if fate.copy_delay_s is not None and kind != "reply":
-            calls.append((fate.copy_delay_s, route(kind, key, deliver)))
-        return calls
-
-    def _past_queue(self, kind: str, key: str, deliver: Callable[[], None]) -> Callable[[], None]:
-        def call() -> None:
-            if not self._closed:
-                deliver()
-
-        return call
+            delays_s.append(fate.copy_delay_s)
+        if fate.reordered:
+            # Past the queue.
+            return [(delay_s, lambda: None if self._closed else deliver()) for delay_s in delays_s]
+        return [(delay_s, self._enter(kind, key, deliver)) for delay_s in delays_s]
 
     def _enter(self, kind: str, key: str, deliver: Callable[[], None]) -> Callable[[], None]:
         """Queue behind the earlier messages of this key; return what is to be called at its own time."""

@@ -44,8 +44,8 @@ class LossBurst(Burst):
     """The bad state of a Gilbert-Elliott channel, in continuous time; `loss` is that of the bad state.
 
     Gilbert, "Capacity of a burst-noise channel", 1960; Elliott, 1963. The profile's own `loss` is that of the
-    good state. Two states are the least that bursts; indoor 802.11 has longer memory than they can show
-    (Cardoso and de Rezende, IEEE Communications Letters 13 (2009)): for that there are recorded traces.
+    good state. Indoor 802.11 has longer memory (Cardoso and de Rezende, IEEE Communications Letters 13
+    (2009)): for that there are recorded traces.
     """
 
     loss: Probability = 1.0
@@ -134,9 +134,8 @@ PROFILES: dict[str, NetworkProfile] = {
         # The same segment with a bad plug: nothing is late, one message in twenty is lost.
         _LAN.model_copy(update={"name": "lossy", "loss": 0.05}),
         # Round trips as measured in one room (C. Huitema, "The weird case of the wifi latency spikes", 2023:
-        # median 4 ms, 99th percentile 51 ms from stalls that release all that waited), at the busier end:
-        # 1 % lost, most of it in bursts, and stalls more often but shorter than the command lifetime. The way
-        # up is the worse one: stations contend for the channel, the access point has it more often.
+        # median 4 ms, 99th percentile 51 ms from stalls that release all that waited), at the busier end. The
+        # way up is the worse one: stations contend for the channel, the access point has it more often.
         NetworkProfile(
             name="wifi",
             delay_ms=1.5,
@@ -161,9 +160,8 @@ PROFILES: dict[str, NetworkProfile] = {
             reorder=0.05,
             duplicate=0.01,
         ),
-        # A round trip hides which way took how long: up takes 6 ms more than down, a clock mapped by round
-        # trips is wrong by half of that; and each module's way down is another, so that the clocks of two
-        # modules are mapped wrongly to one another, by up to 2 ms. Sizes as of an overloaded uplink.
+        # Up takes 6 ms more than down: a clock mapped by round trips is wrong by half of that. Each module's
+        # way down is another, so that two modules' clocks are up to 2 ms apart. As of an overloaded uplink.
         NetworkProfile(
             name="asymmetric",
             jitter_ms=0.3,

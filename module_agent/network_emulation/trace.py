@@ -57,14 +57,11 @@ class NetworkTrace(BaseModel):
     @cached_property
     def period_s(self) -> float:
         """How long one round of the trace takes [s]; infinite with a single row."""
-        if len(self.rows) < 2:
-            return float("inf")
-        return 2.0 * self.rows[-1].time_s - self.rows[-2].time_s
+        return 2.0 * self.rows[-1].time_s - self.rows[-2].time_s if len(self.rows) > 1 else float("inf")
 
     def at(self, t_s: float) -> TraceRow:
         """Return the row that holds at a time from the start of the replay [s]."""
-        phase_s = t_s % self.period_s
-        return self.rows[max(0, bisect_right(self._times_s, phase_s) - 1)]
+        return self.rows[max(0, bisect_right(self._times_s, t_s % self.period_s) - 1)]
 
 
 def read_trace(path: Path) -> NetworkTrace:

@@ -37,6 +37,25 @@ class AskHistory(NamedTuple):
 Action = Listen | AskHistory
 
 
+class Fetch:
+    """Rows of one boot of a module on their way, what the network dropped asked for again."""
+
+    def __init__(self, serial: str, boot: int, asked_until_ns: int, give_up_ns: int):
+        self.serial = serial
+        self.boot = boot
+        self.log = RowLog(boot)
+        self.asked_until_ns = asked_until_ns
+        self.give_up_ns = give_up_ns
+
+    def question(self, missing: tuple[int, int], now_ns: int) -> AskHistory | None:
+        """Return the request for missing rows, None while the last one may still be answered."""
+        if now_ns < self.asked_until_ns:
+            return None
+        self.asked_until_ns = now_ns + ANSWER_TIMEOUT_NS
+        first, end = missing
+        return AskHistory(self.serial, self.boot, first, min(end, first + ROWS_PER_QUESTION))
+
+
 class JointMotion(NamedTuple):
     """A complete motion of one joint: its record and all its rows, and a rough mapping of its clock.
 
@@ -50,17 +69,13 @@ class JointMotion(NamedTuple):
     rough_offset_ns: Mapping[str, int]
 
 
-class _Track:
+class _Track(Fetch):
     """One motion being collected."""
 
     def __init__(self, status: Status, record: MotionRecord, now_ns: int):
-        self.serial = status.serial
-        self.boot = status.boot
+        super().__init__(status.serial, status.boot, 0, now_ns + GIVE_UP_NS)
         self.record = record
-        self.log = RowLog(status.boot)
         self.offset_ns: dict[str, int] = {}
-        self.asked_until_ns = 0
-        self.give_up_ns = now_ns + GIVE_UP_NS
 
     def note_arrival(self, t_ns: int, own_ns: Mapping[str, int]) -> None:
         # The smallest difference belongs to the message with the smallest delay.
@@ -103,16 +118,14 @@ class MotionListener:
             return
         if self._finished.get(status.serial) == (status.boot, record.motion_id):
             return
-        track = self._tracks.get(status.serial)
-        if track is None or track.boot != status.boot or track.record.motion_id != record.motion_id:
-            self._drop(status.serial)
-            if record.outcome not in ("running", "done"):
-                return
-            track = self._tracks[status.serial] = _Track(status, record, now_ns)
-            self._actions.append(Listen(status.serial, True))
         if record.outcome not in ("running", "done"):
             self._drop(status.serial)
             return
+        track = self._tracks.get(status.serial)
+        if track is None or track.boot != status.boot or track.record.motion_id != record.motion_id:
+            self._drop(status.serial)
+            track = self._tracks[status.serial] = _Track(status, record, now_ns)
+            self._actions.append(Listen(status.serial, True))
         if track.record.end_row is None:
             # Counted from when the end is known, so that lost rows are not requested for ever.
             track.give_up_ns = now_ns + GIVE_UP_NS
@@ -148,17 +161,11 @@ class MotionListener:
                 complete.append(
                     JointMotion(track.serial, track.boot, track.record, rows, dict(track.offset_ns))
                 )
+            if not missing or now_ns >= track.give_up_ns:
                 self._finished[track.serial] = (track.boot, track.record.motion_id)
                 self._drop(track.serial)
-            elif now_ns >= track.give_up_ns:
-                self._finished[track.serial] = (track.boot, track.record.motion_id)
-                self._drop(track.serial)
-            elif now_ns >= track.asked_until_ns:
-                first, stop = missing[0]
-                track.asked_until_ns = now_ns + ANSWER_TIMEOUT_NS
-                self._actions.append(
-                    AskHistory(track.serial, track.boot, first, min(stop, first + ROWS_PER_QUESTION))
-                )
+            elif question := track.question(missing[0], now_ns):
+                self._actions.append(question)
         self.has_work = any(track.record.end_row is not None for track in self._tracks.values())
         actions, self._actions = self._actions, []
         return actions, complete

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from module_agent.firmware.feedback import History
-from module_agent.peers.motion_listener import ANSWER_TIMEOUT_NS, ROWS_PER_QUESTION, AskHistory
+from module_agent.peers.motion_listener import AskHistory, Fetch
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.information_messages import CollectRequest, RowRange
 from module_agent.wire.messages import Feedback
@@ -40,16 +40,14 @@ class OwnRows(NamedTuple):
     history: History
 
 
-class _Part:
+class _Part(Fetch):
     """The rows of one module in one motion, complete or on their way."""
 
     def __init__(self, wanted: RowRange, now_ns: int):
+        super().__init__(wanted.serial, wanted.boot, now_ns, now_ns + GIVE_UP_NS)
         self.wanted = wanted
         self.track: Track | None = None
-        self.log = RowLog(wanted.boot)
         self.asked: AskHistory | None = None
-        self.asked_until_ns = now_ns
-        self.give_up_ns = now_ns + GIVE_UP_NS
         self.lost = False
 
     @property
@@ -89,7 +87,7 @@ class MotionCollection:
         parts = {
             wanted.serial: _begun(wanted, own.get(wanted.serial), now_ns)
             for wanted in request.rows
-            if not _is_kept(known.get(wanted.serial), wanted)
+            if (kept := known.get(wanted.serial)) is None or kept.boot != wanted.boot or kept.lost
         }
         for serial in parts.keys() & known.keys():
             known[serial].lost = True
@@ -112,9 +110,8 @@ class MotionCollection:
         first, end = feedback.first_row, feedback.first_row + feedback.count
         for part in self._open:
             wanted = part.wanted
-            if not part.is_open or (wanted.serial, wanted.boot) != (feedback.serial, feedback.boot):
-                continue
-            if first >= wanted.end_row or end <= wanted.first_row:
+            meant = part.is_open and (wanted.serial, wanted.boot) == (feedback.serial, feedback.boot)
+            if not meant or first >= wanted.end_row or end <= wanted.first_row:
                 continue
             part.log.add(feedback)
             part.asked_until_ns = 0
@@ -122,10 +119,7 @@ class MotionCollection:
                 part.keep(part.log.rows(wanted.first_row, wanted.end_row))
 
     def on_lost(self, asked: AskHistory) -> None:
-        """Mark the rows of a refused request as lost: the module no longer has them.
-
-        Motions whose rows were not in that request keep waiting for their own.
-        """
+        """Mark the rows of a refused request as lost: the module no longer has them."""
         for part in self._open:
             if part.is_open and part.asked == asked:
                 part.lost = True
@@ -138,12 +132,9 @@ class MotionCollection:
         for part in self._open[:QUESTIONS_AT_ONCE]:
             if now_ns >= part.give_up_ns:
                 part.lost = True
-            elif now_ns >= part.asked_until_ns:
-                first, end = part.missing()[0]
-                part.asked_until_ns = now_ns + ANSWER_TIMEOUT_NS
-                end = min(end, first + ROWS_PER_QUESTION)
-                part.asked = AskHistory(part.wanted.serial, part.wanted.boot, first, end)
-                requests.append(part.asked)
+            elif question := part.question(part.missing()[0], now_ns):
+                part.asked = question
+                requests.append(question)
         return requests
 
     def tracks(self, motion_id: int) -> dict[str, Track]:
@@ -155,19 +146,13 @@ class MotionCollection:
         parts = self._motions.get(motion_id)
         if parts is None:
             raise WireError(Refusal.GONE, f"motion {motion_id} was not collected here")
-        lost = [serial for serial, part in parts.items() if part.lost]
+        lost = ", ".join(serial for serial, part in parts.items() if part.lost)
         if lost:
-            raise WireError(Refusal.GONE, f"motion {motion_id}: rows of {', '.join(lost)[:200]} are gone")
-        waiting = [serial for serial, part in parts.items() if part.track is None]
+            raise WireError(Refusal.GONE, f"motion {motion_id}: rows of {lost[:200]} are gone")
+        waiting = ", ".join(serial for serial, part in parts.items() if part.track is None)
         if waiting:
-            raise WireError(
-                Refusal.BUSY, f"motion {motion_id}: rows of {', '.join(waiting)[:200]} are on their way"
-            )
+            raise WireError(Refusal.BUSY, f"motion {motion_id}: rows of {waiting[:200]} are on their way")
         return {serial: part.track for serial, part in parts.items() if part.track is not None}
-
-
-def _is_kept(known: _Part | None, wanted: RowRange) -> bool:
-    return known is not None and known.wanted.boot == wanted.boot and not known.lost
 
 
 def _begun(wanted: RowRange, own: OwnRows | None, now_ns: int) -> _Part:

@@ -204,13 +204,13 @@ def filtered_motion(
             f"t_ns is not uniform at {rate_hz} Hz: sample {int(np.argmax(off)) + 1} is "
             f"{off.max() / 1e3:.1f} us off; resample first"
         )
-    filtered = [zero_phase_low_pass(signal, rate_hz, cutoff_hz) for signal in signals]
-    velocity = filtered[2] if qd_rad_s is not None else differentiate(filtered[0], rate_hz)
-    edge = settling_samples(rate_hz, cutoff_hz)
-    kept = slice(edge, times.size - edge)
+    q, qd, qdd, (tau,), kept = filtered_signals(q_rad, [tau_nm], rate_hz, cutoff_hz)
+    if qd_rad_s is not None:
+        qd = zero_phase_low_pass(qd_rad_s, rate_hz, cutoff_hz)
+        qdd = differentiate(qd, rate_hz)
     if kept.stop <= kept.start:
-        raise DataError(f"{times.size} samples; {edge} at either end are unsettled and nothing is left")
-    motion = (filtered[0], velocity, differentiate(velocity, rate_hz), filtered[1])
+        raise DataError(f"{times.size} samples; {kept.start} at either end are unsettled and nothing is left")
+    motion = (q, qd, qdd, tau)
     return JointMotion(read_only(times[kept].copy()), *(read_only(signal[kept].copy()) for signal in motion))
 
 

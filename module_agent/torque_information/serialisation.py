@@ -24,13 +24,12 @@ def chain_part(chain: Chain) -> ChainPart:
     Raises:
         DataError: more modules than a message carries.
     """
-    joints, fields = len(chain.serials), chain.to_dict()
-    columns = [chain.axis, chain.point, chain.imu_home.reshape(joints, 16)]
-    x, y, z = (float(value) for value in chain.gravity)
+    columns = [chain.axis, chain.point, chain.imu_home.reshape(-1, 16)]
+    x, y, z = chain.gravity.tolist()
     return ChainPart(
         serials=chain.serials,
-        parent=tuple(fields["parent"]),
-        reversed=tuple(fields["reversed"]),
+        parent=tuple(map(int, chain.parent)),
+        reversed=tuple(map(bool, chain.reversed)),
         geometry=np.hstack(columns).astype("<f8").tobytes(),
         gravity_m_s2=(x, y, z),
     )

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from module_agent.model.catalogue import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W
 from module_agent.model.compiled import compiled
 from module_agent.model.read_only import read_only
-from module_agent.model.thermal import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W
 from sim.geometry.pose import Array
 
 

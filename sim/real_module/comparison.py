@@ -15,9 +15,9 @@ from module_agent.firmware.config import config_of
 from module_agent.firmware.firmware import Answer, Firmware, Incoming
 from module_agent.hardware.hardware import SensorSample
 from module_agent.hardware.loop_inside import LoopInside
+from module_agent.model.catalogue import AMBIENT_C
 from module_agent.model.errors import RobotError
 from module_agent.model.read_only import read_only
-from module_agent.model.thermal import AMBIENT_C
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.keys import Leaf
 from module_agent.wire.messages import Ack, LeaseRequest, Message, Setpoint

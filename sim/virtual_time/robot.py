@@ -9,9 +9,8 @@ import numpy as np
 
 from coordinator.runtime.event_loop import Interruption, run_to_end
 from module_agent.firmware.config import config_of
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import SensorSample, WiredModule
 from module_agent.hardware.loop_inside import LoopInside
-from module_agent.hardware.wires import WiredModule
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile

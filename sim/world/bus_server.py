@@ -25,8 +25,7 @@ from module_agent.hardware.bus_frames import (
     pack_welcome,
     unpack_hello,
 )
-from module_agent.hardware.hardware import SensorSample
-from module_agent.hardware.wires import WiredModule
+from module_agent.hardware.hardware import SensorSample, WiredModule
 from module_agent.model.errors import UsageError
 
 _BACKLOG = 128

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.hardware.hardware import HardwareLost, SensorSample
-from module_agent.hardware.wires import WiredModule
+from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
 from module_agent.model.catalogue import module_type
 from module_agent.model.read_only import read_only
 from sim.actuator.actuator import BUS_VOLTAGE_V, Actuators

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from module_agent.hardware.wires import WiredModule
+from module_agent.hardware.hardware import WiredModule
 from sim.world.bus_server import BusServer
 
 ROBOT = "thesis_171_horizontal"

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Firmware, Incoming, Outgoing
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import SensorSample, WiredModule
 from module_agent.hardware.loop_inside import LoopInside
-from module_agent.hardware.wires import WiredModule
 
 MS = 1_000_000
 

@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.firmware.config import config_of
-from module_agent.hardware.hardware import SensorSample
+from module_agent.hardware.hardware import SensorSample, WiredModule
 from module_agent.hardware.loop_inside import LoopInside
-from module_agent.hardware.wires import WiredModule
 from module_agent.host import AgentHost, InlineWorker
 from module_agent.torque_information import module_information
 from module_agent.torque_information.service import Worker

@@ -5,8 +5,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 
-from module_agent.transport.inbox import Inbox
-from module_agent.transport.transport import Event, Sample
+from module_agent.transport.transport import Event, Inbox, Sample
 
 
 def _event(number: int) -> Event:

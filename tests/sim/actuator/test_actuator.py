@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from module_agent.model.catalogue import ModuleType, module_type
-from module_agent.model.thermal import CAPACITIES_J_K, RESISTANCES_K_W
+from module_agent.model.catalogue import CAPACITIES_J_K, RESISTANCES_K_W, ModuleType, module_type
 from sim.actuator.actuator import SPRING_LOSS_S, Actuators
 from sim.actuator.thermal import Windings, heat_flow
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched

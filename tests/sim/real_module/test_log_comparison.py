@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 from typer.testing import CliRunner
 
-from module_agent.model.thermal import CAPACITIES_J_K, RESISTANCES_K_W
+from module_agent.model.catalogue import CAPACITIES_J_K, RESISTANCES_K_W
 from sim.imperfections.noise_profile import noise_profile, switched
 from sim.main import app
 from sim.real_module.comparison import (

@@ -26,8 +26,7 @@ from module_agent.hardware.bus_frames import (
     unpack_hello,
     unpack_welcome,
 )
-from module_agent.hardware.hardware import HardwareLost, SensorSample
-from module_agent.hardware.wires import WiredModule
+from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
 from module_agent.model.errors import UsageError
 from sim.world.bus_server import BusInUse, BusServer
 

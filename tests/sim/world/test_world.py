@@ -4,8 +4,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from module_agent.hardware.hardware import HardwareLost, SensorSample
-from module_agent.hardware.wires import Wires
+from module_agent.hardware.hardware import HardwareLost, SensorSample, Wires
 from module_agent.model.errors import UsageError
 from sim.robot.robot_file import Robot, load_robot, parse_robot
 from sim.robot.robot_tree import true_chain
