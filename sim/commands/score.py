@@ -8,7 +8,8 @@ from rich.table import Table
 
 from coordinator.commands.options import AsJson
 from coordinator.runtime.terminal import figure, new_table, print_table
-from sim.scoring.score import Score, score, write_score
+from module_agent.model.files import write_json
+from sim.scoring.score import Score, score
 
 
 def score_run(
@@ -17,7 +18,7 @@ def score_run(
 ) -> None:
     """Compare a run's result with the simulator's truth."""
     result = score(folder)
-    write_score(folder / "score.json", result)
+    write_json(folder / "score.json", result)
     if as_json:
         typer.echo((folder / "score.json").read_text())
     else:

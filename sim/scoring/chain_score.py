@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.baseline.difference import difference, mountings
+from coordinator.topology.topology import Topology
 from module_agent.model.chain import Array, Chain
 from sim.scoring.gauge_alignment import align_gauge, move_root, reorder, reorder_basis, tip_error
 
@@ -28,20 +29,19 @@ class LinkErrors(NamedTuple):
     axis_deg: float
 
 
-def topology_differences(estimated: Chain, truth: Chain) -> list[str]:
+def topology_differences(estimated: Topology | Chain, truth: Chain) -> list[str]:
     """List where parents or mounting differ, in the order of the truth; empty if all is right."""
     changes, result, actual = difference(estimated, truth), mountings(estimated), mountings(truth)
     lines = [f"module {s} was not found" for s in changes.new]
     lines += [f"module {s} does not exist" for s in changes.removed]
     for serial in changes.moved:
-        is_on, result_on = (mounted[serial].parent or "the base" for mounted in (actual, result))
-        if is_on != result_on:
-            lines.append(f"module {serial} is mounted on {is_on}, the result says on {result_on}")
-        is_so, result_so = (
-            "reversed" if mounted[serial].reversed else "forward" for mounted in (actual, result)
+        (is_on, is_so), (result_on, result_so) = (
+            (f"on {mount.parent or 'the base'}", "reversed" if mount.reversed else "forward")
+            for mount in (actual[serial], result[serial])
         )
-        if is_so != result_so:
-            lines.append(f"module {serial} is mounted {is_so}, the result says {result_so}")
+        for is_it, says in ((is_on, result_on), (is_so, result_so)):
+            if is_it != says:
+                lines.append(f"module {serial} is mounted {is_it}, the result says {says}")
     return lines
 
 
@@ -79,12 +79,10 @@ def link_errors(estimated: Chain, truth: Chain, child: int) -> LinkErrors | None
     if serial not in estimated.serials:
         return None
     own = estimated.serials.index(serial)
-    if _parent(estimated, own) != _parent(truth, child):
+    if mountings(estimated)[serial].parent != mountings(truth)[serial].parent:
         return None
-    (axis, vector), (true_axis, true_vector) = (
-        _link_in_imu_frame(estimated, own),
-        _link_in_imu_frame(truth, child),
-    )
+    axis, vector = _link_in_imu_frame(estimated, own)
+    true_axis, true_vector = _link_in_imu_frame(truth, child)
     angle = np.arctan2(np.linalg.norm(np.cross(axis, true_axis)), axis @ true_axis)
     return LinkErrors(
         length_m=float(np.linalg.norm(vector) - np.linalg.norm(true_vector)),
@@ -100,7 +98,3 @@ def _link_in_imu_frame(chain: Chain, child: int) -> tuple[Array, Array]:
     axis = chain.axis[parent]
     turn = home[:3, :3].T
     return turn @ axis, turn @ (arm - axis * (axis @ arm))
-
-
-def _parent(chain: Chain, index: int) -> str:
-    return "the base" if chain.parent[index] < 0 else chain.serials[chain.parent[index]]

@@ -6,6 +6,8 @@ the result lists as unidentifiable, and along no others.
 
 import json
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +19,6 @@ from coordinator.identification.identified import Identified
 from coordinator.identification.result import SCHEMA, ChainPart, LinkPart, Result, UnresolvedPart, migrate
 from module_agent.model.chain import Array, Chain, ChainError
 from module_agent.model.errors import DataError, RobotError
-from module_agent.model.files import write_json
 from module_agent.signals.filtering import resample
 from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
 from sim.world.truth import Motion, read_motion, read_truth
@@ -65,10 +66,10 @@ class Score(BaseModel):
     tip_position_rms_mm: float | None
     tip_orientation_rms_deg: float | None
     unidentifiable: list[str]
-    torque_relative_error: float | None
-    torque_relative_error_per_joint: dict[str, float | None] | None
-    torque_rms_error_nm_per_joint: dict[str, float] | None
-    torque_relative_error_measured: float | None
+    torque_relative_error: float | None = None
+    torque_relative_error_per_joint: dict[str, float | None] | None = None
+    torque_rms_error_nm_per_joint: dict[str, float] | None = None
+    torque_relative_error_measured: float | None = None
     robot_time_s: float
     wall_time_s: float | None
 
@@ -97,16 +98,6 @@ class _HeldOut(NamedTuple):
     tau_predicted_nm: Array
 
 
-class _TorqueScore(NamedTuple):
-    overall: float | None
-    per_joint: dict[str, float | None] | None
-    rms_error_nm: dict[str, float] | None
-    measured: float | None
-
-
-_NO_TORQUE = _TorqueScore(None, None, None, None)
-
-
 def score(run: Path) -> Score:
     """Compare the result in the folder `run` with the truth next to it.
 
@@ -118,12 +109,14 @@ def score(run: Path) -> Score:
         estimated = result.chain.chain()
     except ChainError as error:
         raise ScoreError(f"{run / 'result.json'}: chain.{error}") from error
-    truth = _read_truth(run / "truth.json")
+    with _reading(run / "truth.json") as path:
+        truth = read_truth(path).chain
     basis = _null_basis(result, run / "result.json")
-    torque = _NO_TORQUE
+    torque: dict[str, Any] = {}
     if result.dynamics is not None and result.dynamics.get("held_out") is not None:
         held_out = _read_held_out(run / "held_out.npz", len(result.serials))
-        motion = _read_motion(run / "truth.npz")
+        with _reading(run / "truth.npz") as path:
+            motion = read_motion(path)
         torque = _torque(tuple(result.serials), held_out, motion, str(run / "truth.npz"))
     return _compared(result, estimated, basis, truth, torque)
 
@@ -134,7 +127,7 @@ def score_identified(identified: Identified, truth: Chain, motion: Motion) -> Sc
     Raises:
         ScoreError: the true motion does not cover the held-out motion.
     """
-    fit, held_out, torque = identified.kinematics.fit, identified.held_out, _NO_TORQUE
+    fit, held_out, torque = identified.kinematics.fit, identified.held_out, {}
     if held_out is not None:
         torques = _HeldOut(held_out.module_ns, held_out.tau_measured_nm, held_out.tau_predicted_nm)
         torque = _torque(held_out.serials, torques, motion, "the true motion")
@@ -142,7 +135,7 @@ def score_identified(identified: Identified, truth: Chain, motion: Motion) -> Sc
 
 
 def _compared(
-    result: "_ResultFile | Result", estimated: Chain, null_basis: Array, truth: Chain, torque: _TorqueScore
+    result: "_ResultFile | Result", estimated: Chain, null_basis: Array, truth: Chain, torque: dict[str, Any]
 ) -> Score:
     differences = topology_differences(estimated, truth)
     tip = (None, None) if differences else tip_errors(estimated, truth, null_basis)
@@ -153,18 +146,10 @@ def _compared(
         tip_position_rms_mm=tip[0],
         tip_orientation_rms_deg=tip[1],
         unidentifiable=[item.summary for item in result.unresolved],
-        torque_relative_error=torque.overall,
-        torque_relative_error_per_joint=torque.per_joint,
-        torque_rms_error_nm_per_joint=torque.rms_error_nm,
-        torque_relative_error_measured=torque.measured,
         robot_time_s=result.robot_time_s,
         wall_time_s=result.wall_time_s,
+        **torque,
     )
-
-
-def write_score(path: Path, result: Score) -> None:
-    """Write `score.json`; the file is the complete old or the complete new one."""
-    write_json(path, result)
 
 
 def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[LinkScore]:
@@ -189,26 +174,31 @@ def _links(estimated: Chain, truth: Chain, claimed: list[LinkPart]) -> list[Link
     return scores
 
 
-def _torque(serials: tuple[str, ...], held_out: _HeldOut, motion: Motion, source: str) -> _TorqueScore:
-    known = [column for column, serial in enumerate(serials) if serial in motion.serials]
+def _torque(serials: tuple[str, ...], held_out: _HeldOut, motion: Motion, source: str) -> dict[str, Any]:
+    """Return the fields of `Score` about torques."""
     measured = _ratio(held_out.tau_predicted_nm, held_out.tau_measured_nm)
+    known = [column for column, serial in enumerate(serials) if serial in motion.serials]
     if not known:
-        return _NO_TORQUE._replace(measured=measured)
-    true = np.column_stack([_true_torque(motion, serials[c], held_out.t_ns[:, c], source) for c in known])
-    predicted = held_out.tau_predicted_nm[:, known]
+        return {"torque_relative_error_measured": measured}
     own = [serials[c] for c in known]
+    true = np.column_stack([true_torque(motion, serials[c], held_out.t_ns[:, c], source) for c in known])
+    predicted = held_out.tau_predicted_nm[:, known]
     size, error = _rms(true), _rms(predicted - true)
     relative = [e / s if s >= MIN_TORQUE_NM else None for e, s in zip(error, size, strict=True)]
-    return _TorqueScore(
-        overall=_ratio(predicted, true),
-        per_joint=dict(zip(own, relative, strict=True)),
-        rms_error_nm=dict(zip(own, error, strict=True)),
-        measured=measured,
-    )
+    return {
+        "torque_relative_error": _ratio(predicted, true),
+        "torque_relative_error_per_joint": dict(zip(own, relative, strict=True)),
+        "torque_rms_error_nm_per_joint": dict(zip(own, error, strict=True)),
+        "torque_relative_error_measured": measured,
+    }
 
 
-def _true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], source: str) -> Array:
-    """Interpolate a module's true torque at times of its own clock."""
+def true_torque(motion: Motion, serial: str, t_ns: NDArray[np.int64], source: str) -> Array:
+    """Interpolate a module's true torque (m,) at times (m,) of its own clock.
+
+    Raises:
+        ScoreError: the motion, which is from `source`, does not cover these times.
+    """
     column = motion.serials.index(serial)
     try:
         torque = resample([motion.clock_ns[:, column]], [motion.spring_torque_nm[:, column]], t_ns)
@@ -231,26 +221,34 @@ def _rms(columns: Array) -> list[float]:
 # ---------------------------------------------------------------------- files
 
 
-def _existing(path: Path) -> Path:
+@contextmanager
+def _reading(path: Path) -> Iterator[Path]:
+    """Yield the path of a file to be read; say in a `ScoreError` if it is missing, broken or incomplete."""
     if not path.is_file():
         hints = {
             "result.json": "the run has not ended, or this is not the folder of a run",
             "held_out.npz": "result.json refers to a held-out motion",
         }
         raise ScoreError(f"{path} is missing: {hints.get(path.name, 'only simulated runs can be scored')}")
-    return path
+    try:
+        yield path
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ScoreError(f"{path} is not JSON: {error}") from error
+    except KeyError as error:
+        raise ScoreError(f"{path} lacks {error}") from error
+    except (ValueError, TypeError, OSError, zipfile.BadZipFile, DataError) as error:
+        raise ScoreError(f"{path} is broken: {error}") from error
 
 
 def _read_result(path: Path) -> _ResultFile:
     try:
-        document = json.loads(_existing(path).read_text(encoding="utf-8"))
-        result = _ResultFile.model_validate(migrate(document))
+        with _reading(path):
+            document = migrate(json.loads(path.read_text(encoding="utf-8")))
+        result = _ResultFile.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise ScoreError(f"{path}: {where or 'the document'}: {first['msg']}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ScoreError(f"{path} is not JSON: {error}") from error
     if result.schema_version != SCHEMA:
         raise ScoreError(f"{path} has schema {result.schema_version}; this program scores schema {SCHEMA}")
     if result.serials != result.chain.serials:
@@ -267,32 +265,9 @@ def _null_basis(result: _ResultFile, path: Path) -> Array:
     return np.array(result.null_basis, dtype=float)
 
 
-def _read_truth(path: Path) -> Chain:
-    try:
-        return read_truth(_existing(path)).chain
-    except KeyError as error:
-        raise ScoreError(f"{path} lacks {error}") from error
-    except (ValueError, TypeError, DataError) as error:  # ValueError: JSON and its numbers
-        raise ScoreError(f"{path} is broken: {error}") from error
-
-
-def _read_motion(path: Path) -> Motion:
-    try:
-        return read_motion(_existing(path))
-    except KeyError as error:
-        raise ScoreError(f"{path} lacks the array {error}") from error
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
-        raise ScoreError(f"{path} is broken: {error}") from error
-
-
 def _read_held_out(path: Path, joints: int) -> _HeldOut:
-    try:
-        with np.load(_existing(path), allow_pickle=False) as file:
-            held_out = _HeldOut(*(np.asarray(file[name]) for name in _HeldOut._fields))
-    except KeyError as error:
-        raise ScoreError(f"{path} lacks an array: {error}") from error
-    except (ValueError, OSError, zipfile.BadZipFile) as error:
-        raise ScoreError(f"{path} is broken: {error}") from error
+    with _reading(path), np.load(path, allow_pickle=False) as file:
+        held_out = _HeldOut(*(np.asarray(file[name]) for name in _HeldOut._fields))
     for name, array in zip(_HeldOut._fields, held_out, strict=True):
         if array.shape != (len(held_out.t_ns), joints):
             raise ScoreError(f"{path}: {name} has shape {array.shape}, (samples, {joints}) is needed")

@@ -6,7 +6,6 @@ been explored, when the identified robot is complete as well.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,30 +27,22 @@ PERIOD_NS = 33_000_000
 ADDITION = "truth.rrd"
 
 
-class _Shown(NamedTuple):
-    """True positions (k, n) of `serials` at times of the viewer (k,)."""
-
-    serials: tuple[str, ...]
-    t_ns: NDArray[np.int64]
-    q_rad: Array
-
-
 def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None:
     """Draw the true robot in a run's recording, and in the viewer at an address if that is still reachable.
 
     A failure is reported by `say`; the recording then stays as it was.
     """
     try:
-        recording, result = load_recording(run / SESSION), _result(run)
-        truth, shown = read_truth(run / "truth.json"), _motion(recording, read_motion(run / "truth.npz"))
+        result = Result.model_validate_json((run / RESULT).read_bytes())
+        truth, motion = read_truth(run / "truth.json"), read_motion(run / "truth.npz")
+        t_ns, q_rad = _shown(load_recording(run / SESSION), motion)
         view = TruthView(truth.chain, truth.module_types)
         targets = ViewerTargets(rrd=run / ADDITION, connect=viewer)
         drawn = Viewer(truth.robot, run.name, targets, waits=True, lays_out=False)
-        start_ns, end_ns = int(shown.t_ns[0]), int(shown.t_ns[-1])
-        view.values(drawn, (0, end_ns))
+        view.values(drawn, (0, int(t_ns[-1])))
         chain = result.chain.chain()
-        view.chain(drawn, start_ns, chain, name_null_space(chain, np.array(result.null_basis)))
-        drawn.poses(shown.t_ns, shown.q_rad, shown.serials)
+        view.chain(drawn, int(t_ns[0]), chain, name_null_space(chain, np.array(result.null_basis)))
+        drawn.poses(t_ns, q_rad, motion.serials)
         drawn.close()
         merge_into(run / VIEW, run / ADDITION)
     except (RobotError, OSError, ValueError, KeyError) as failure:
@@ -60,12 +51,8 @@ def add_truth(run: Path, viewer: str | None, say: Callable[[str], None]) -> None
         (run / ADDITION).unlink(missing_ok=True)
 
 
-def _result(run: Path) -> Result:
-    return Result.model_validate_json((run / RESULT).read_bytes())
-
-
-def _motion(recording: Recording, motion: Motion) -> _Shown:
-    """Return the true motion from the last exploration on, thirty times a second.
+def _shown(recording: Recording, motion: Motion) -> tuple[NDArray[np.int64], Array]:
+    """Return times of the viewer (k,) and true positions (k, n): 30 a second after the last exploration.
 
     Raises:
         DataError: the session does not say when it began, or nothing of the motion is after its exploration.
@@ -77,9 +64,9 @@ def _motion(recording: Recording, motion: Motion) -> _Shown:
     serial = next(s for s in motion.serials if recording.modules[s].round_trips)
     clock = map_clocks({serial: recording.modules[serial].round_trips})[serial]
     session_ns = clock.to_session(motion.clock_ns[:, motion.serials.index(serial)])
-    shown = np.flatnonzero((session_ns >= explored[-1]) & (session_ns <= recording.journal[-1].t_ns))
-    if not shown.size:
+    after = np.flatnonzero((session_ns >= explored[-1]) & (session_ns <= recording.journal[-1].t_ns))
+    if not after.size:
         raise DataError("the true motion ends before the exploration")
     step = max(1, round(PERIOD_NS / float(np.median(np.diff(session_ns)))))
-    rows = shown[::step]
-    return _Shown(motion.serials, session_ns[rows] - begun[-1], motion.q_rad[rows])
+    rows = after[::step]
+    return session_ns[rows] - begun[-1], motion.q_rad[rows]

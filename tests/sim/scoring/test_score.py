@@ -10,13 +10,14 @@ from numpy.random import default_rng
 from rich.console import Console
 
 from module_agent.model.chain import Array, Chain
+from module_agent.model.files import write_json
 from module_agent.model.perturbation import apply_perturbation
 from sim.commands.score import table
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.chain_score import tip_errors
 from sim.scoring.gauge_alignment import reorder
-from sim.scoring.score import Score, ScoreError, score, write_score
+from sim.scoring.score import Score, ScoreError, score
 from sim.world.truth import write_truth
 
 ROBOT = load_robot("tree_y")
@@ -244,7 +245,7 @@ def test_a_wrong_mounting_and_a_missing_module_are_said(tmp_path: Path) -> None:
 
 def test_the_file_says_what_the_score_says(tmp_path: Path) -> None:
     found = score(make_run(tmp_path, TRUTH, predicted=1.05))
-    write_score(tmp_path / "score.json", found)
+    write_json(tmp_path / "score.json", found)
     document = json.loads((tmp_path / "score.json").read_text())
     assert Score.model_validate(document) == found
     assert not list(tmp_path.glob("*.part"))
