@@ -8,10 +8,11 @@ from rich.table import Table
 
 from coordinator.runtime.command_line import with_options
 from coordinator.runtime.terminal import new_table, print_table
+from module_agent.model.files import write_json
 from sim.benchmark.case import Trial
 from sim.commands.experiment import JsonFile, ModuleOptions, WorkerCount, experiment, trial_results
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.thesis.estimator_variants import Arm, EstimatorRow, compare, estimator_rows, write_estimators
+from sim.thesis.estimator_variants import Arm, EstimatorRow, compare, estimator_rows
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM, TRIALS
 
 ARMS = tuple(Arm(alignment, length_mm) for alignment in ALIGNMENTS for length_mm in LENGTHS_MM)
@@ -31,7 +32,8 @@ def estimators(
     rows = _run(modules.profile(), trials, modules.seed, processes)
     print_table(estimator_table(rows))
     if json_file is not None:
-        write_estimators(json_file, {**modules.settings(), "trials": trials}, rows)
+        settings = {**modules.settings(), "trials": trials}
+        write_json(json_file, {"settings": settings, "rows": [row._asdict() for row in rows]})
 
 
 def _run(profile: NoiseProfile, trials: int, seed: int, processes: int | None) -> list[EstimatorRow]:

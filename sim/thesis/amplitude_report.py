@@ -72,16 +72,13 @@ def write_results(folder: Path, settings: dict[str, object], trials: Sequence[Am
 
 
 def _plain(row: Repeats) -> dict[str, object]:
-    return {**row.thesis._asdict(), "thesis_mean_mm": row.thesis.mean_mm} | {
-        "trials": row.trials,
-        "true_mm": row.true_mm,
-        "mean_mm": row.mean_mm,
-        "error_mm": row.error_mm,
-        "scatter_mm": row.scatter_mm,
-    }
+    names = ("trials", "true_mm", "mean_mm", "error_mm", "scatter_mm")
+    thesis = {**row.thesis._asdict(), "thesis_mean_mm": row.thesis.mean_mm}
+    return thesis | {name: getattr(row, name) for name in names}
 
 
-_FILTERED, _UNFILTERED, _THESIS, _TRUTH, _SATURATED = "#1f5fa8", "#d07a1f", "#b0204a", "#404040", "#e9e4da"
+_THESIS, _TRUTH, _SATURATED = "#b0204a", "#404040", "#e9e4da"
+_SERIES = {True: ("#1f5fa8", "o", "thesis' analysis"), False: ("#d07a1f", "s", "without its filter")}
 # The same relative range in every panel, so that they can be compared; what is beyond is drawn at its edge.
 _MIN_RANGE, _MAX_RANGE = 0.10, 0.30
 
@@ -147,8 +144,8 @@ def _panel(axes: Any, own: Sequence[AmplitudeTrial], half: float) -> None:
     true = own[0].true_mm
     axes.axhline(true, color=_TRUTH, linewidth=1.0, label="true length")
     _shade(axes, own)
-    _series(axes, own, True, _FILTERED, "o", "thesis' analysis", half)
-    _series(axes, own, False, _UNFILTERED, "s", "without its filter", half)
+    _series(axes, own, True, half)
+    _series(axes, own, False, half)
     axes.set_xlim(0.0, max(t.amplitude_rad for t in own) + 0.02)
     axes.set_ylim(true * (1 - half), true * (1 + half))
     axes.error_axis = axes.twinx()
@@ -168,15 +165,8 @@ def _shade(axes: Any, own: Sequence[AmplitudeTrial]) -> None:
         )
 
 
-def _series(
-    axes: Any,
-    own: Sequence[AmplitudeTrial],
-    filtered: bool,
-    colour: str,
-    marker: str,
-    label: str,
-    half: float,
-) -> None:
+def _series(axes: Any, own: Sequence[AmplitudeTrial], filtered: bool, half: float) -> None:
+    colour, marker, label = _SERIES[filtered]
     true = own[0].true_mm
     low, high = true * (1 - half), true * (1 + half)
     points = [(t.amplitude_rad, true * (1 + e)) for t in own if (e := t.error(filtered)) is not None]
@@ -187,14 +177,10 @@ def _series(
     face = colour if filtered else "white"
     style = {"color": colour, "markersize": 4.0, "markerfacecolor": face, "linestyle": "none"}
     axes.plot(amplitudes, means, color=colour, linewidth=1.3, linestyle="-" if filtered else "--")
-    axes.plot(*_columns(inside), marker=marker, label=label, **style)
+    axes.plot([a for a, _ in inside], [y for _, y in inside], marker=marker, label=label, **style)
     for amplitude, y in outside:
         edge, arrow = (high, "^") if y >= high else (low, "v")
         axes.plot([amplitude], [edge], marker=arrow, clip_on=False, **style)
-
-
-def _columns(points: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    return [a for a, _ in points], [y for _, y in points]
 
 
 def _thesis_mark(axes: Any, alignment: Alignment, length_mm: int, half: float) -> None:

@@ -13,7 +13,6 @@ from coordinator.excitation.plan import Plan
 from module_agent.estimate.circle_point_analysis import CircleFit
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
 from module_agent.model.errors import DataError
-from module_agent.wire.feedback_rows import Rows
 from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
@@ -83,15 +82,7 @@ def sweep_series(
 ) -> list[Series]:
     """Return the sweep over amplitudes: every length in both alignments, on `rigs` rigs each."""
     return [
-        Series(
-            purpose="sweep",
-            alignment=alignment,
-            length_mm=length,
-            rig=rig,
-            seed=_seed(seed, 0, a, length, rig),
-            amplitudes_rad=tuple(amplitudes_rad),
-            noise=noise,
-        )
+        Series("sweep", alignment, length, rig, _seed(seed, 0, a, length, rig), tuple(amplitudes_rad), noise)
         for a, alignment in enumerate(ALIGNMENTS)
         for length in lengths_mm
         for rig in range(rigs)
@@ -99,32 +90,20 @@ def sweep_series(
 
 
 def repeat_series(
-    lengths_mm: Sequence[int],
-    trials: int,
-    seed: int,
-    noise: NoiseChoice = ROBOTS_OWN_NOISE,
+    lengths_mm: Sequence[int], trials: int, seed: int, noise: NoiseChoice = ROBOTS_OWN_NOISE
 ) -> list[Series]:
     """Return the repeated trials at the amplitudes that the thesis chose (its tables 4 and 5)."""
-    return [
-        Series(
-            purpose="repeats",
-            alignment=alignment,
-            length_mm=length,
-            rig=0,
-            seed=_seed(seed, 1, a, length, 0),
-            amplitudes_rad=(thesis_length(alignment, length).amplitude_rad,) * trials,
-            noise=noise,
-        )
-        for a, alignment in enumerate(ALIGNMENTS)
-        for length in lengths_mm
-    ]
+    series = []
+    for a, alignment in enumerate(ALIGNMENTS):
+        for length in lengths_mm:
+            amplitudes_rad = (thesis_length(alignment, length).amplitude_rad,) * trials
+            own = _seed(seed, 1, a, length, 0)
+            series.append(Series("repeats", alignment, length, 0, own, amplitudes_rad, noise))
+    return series
 
 
 def _seed(seed: int, *key: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
-
-
-# ---------------------------------------------------------------------- one rig
 
 
 def run_series(series: Series) -> list[AmplitudeTrial]:
@@ -138,37 +117,36 @@ def run_series(series: Series) -> list[AmplitudeTrial]:
     true_mm = 1e3 * link_length_m(true_chain(robot), child=1)
     trials = []
     with OneJointRig(robot, series.seed, series.noise.of(robot)) as rig:
-        clamp = rig.modules[JOINT].firmware.config.kind.velocity_clamp_rad_s
-        for number, amplitude in enumerate(series.amplitudes_rad):
-            rows = rig.trial(Plan(sine_amplitude_rad=amplitude))
-            trials.append(_trial(series, number, amplitude, true_mm, rows, clamp))
+        clamp_rad_s = rig.modules[JOINT].firmware.config.kind.velocity_clamp_rad_s
+        for number, amplitude_rad in enumerate(series.amplitudes_rad):
+            rows = rig.trial(Plan(sine_amplitude_rad=amplitude_rad))
+            filtered, note = _fit(rows, TAPS)
+            unfiltered, _ = _fit(rows, taps=1)
+            joint = rows.sine.joint
+            # The sag under a load counts neither for the motion nor for the commanded one.
+            moving = joint[np.isfinite(joint["position_command_rad"])]
+            stroke = np.std(moving["position_rad"]) / np.std(moving["position_command_rad"])
+            commanded_rad_s = float(np.nanmax(np.abs(joint["velocity_command_rad_s"])))
+            trials.append(
+                AmplitudeTrial(
+                    purpose=series.purpose,
+                    alignment=series.alignment,
+                    length_mm=series.length_mm,
+                    rig=series.rig,
+                    trial=number,
+                    amplitude_rad=amplitude_rad,
+                    true_mm=true_mm,
+                    estimated_mm=filtered and 1e3 * filtered.distance_m,
+                    sigma_mm=filtered and 1e3 * filtered.sigma_distance_m,
+                    unfiltered_mm=unfiltered and 1e3 * unfiltered.distance_m,
+                    commanded_rad_s=commanded_rad_s,
+                    reached_rad_s=float(np.abs(gaussian_filter(joint["velocity_rad_s"])).max()),
+                    saturated=commanded_rad_s > clamp_rad_s,
+                    stroke=float(stroke),
+                    note=note,
+                )
+            )
     return trials
-
-
-def _trial(
-    series: Series, number: int, amplitude: float, true_mm: float, rows: TrialRows, clamp_rad_s: float
-) -> AmplitudeTrial:
-    filtered, note = _fit(rows, TAPS)
-    unfiltered, _ = _fit(rows, taps=1)
-    joint = rows.sine.joint
-    commanded = float(np.nanmax(np.abs(joint["velocity_command_rad_s"])))
-    return AmplitudeTrial(
-        purpose=series.purpose,
-        alignment=series.alignment,
-        length_mm=series.length_mm,
-        rig=series.rig,
-        trial=number,
-        amplitude_rad=amplitude,
-        true_mm=true_mm,
-        estimated_mm=filtered and 1e3 * filtered.distance_m,
-        sigma_mm=filtered and 1e3 * filtered.sigma_distance_m,
-        unfiltered_mm=unfiltered and 1e3 * unfiltered.distance_m,
-        commanded_rad_s=commanded,
-        reached_rad_s=float(np.abs(gaussian_filter(joint["velocity_rad_s"])).max()),
-        saturated=commanded > clamp_rad_s,
-        stroke=_stroke(joint),
-        note=note,
-    )
 
 
 def _fit(rows: TrialRows, taps: int) -> tuple[CircleFit | None, str]:
@@ -177,9 +155,3 @@ def _fit(rows: TrialRows, taps: int) -> tuple[CircleFit | None, str]:
         return analyse(rows, taps), ""
     except DataError as error:
         return None, str(error)
-
-
-def _stroke(joint: Rows) -> float:
-    """Return the size of a motion over that of the commanded one; the sag under a load counts for neither."""
-    moving = joint[np.isfinite(joint["position_command_rad"])]
-    return float(np.std(moving["position_rad"]) / np.std(moving["position_command_rad"]))

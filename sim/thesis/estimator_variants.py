@@ -14,25 +14,23 @@ inherit the gyro's scale error. The agents use `encoder`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from module_agent.estimate.circle_point_analysis import rest_reading
+from module_agent.estimate.circle_point_analysis import CircleFit, rest_reading
 from module_agent.estimate.gaussian_filter import gaussian_filter
 from module_agent.estimate.joint_regression import JointRegression, regress_joint
 from module_agent.estimate.observed_motion import MotionWindows, ObservedMotion, observed_motions
 from module_agent.estimate.smoothing import SmoothMotion
 from module_agent.estimate.windows import Array, ImuWindow, JointWindow, imu_window
 from module_agent.model.errors import DataError
-from module_agent.model.files import write_json
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.chain_score import link_length_m
 from sim.test_bench.one_joint_rig import IMU, OneJointRig, TrialRows, analyse, regress, windows
-from sim.thesis.joint_trial import bound_m, imu_knowledge, trial_plan
+from sim.thesis.joint_trial import bound_m, imu_knowledge, rms, trial_plan
 from sim.thesis.published import Alignment, thesis_length
 
 # Below this Gaussian low-pass the encoder is used, above it the gyro: it has 96 % of 2 Hz, so that the angle
@@ -56,7 +54,7 @@ class Comparison(NamedTuple):
     bound_m: float
 
 
-Variant = Callable[[TrialRows, NoiseProfile], tuple[float, float]]
+Variant = Callable[[TrialRows, NoiseProfile], CircleFit | JointRegression]
 
 
 def compare(length_mm: int, alignment: Alignment, profile: NoiseProfile, seed: int) -> Comparison:
@@ -77,61 +75,44 @@ def compare_estimators(trial: TrialRows, profile: NoiseProfile, true_m: float) -
     estimates: dict[str, Estimate] = {}
     for name, variant in VARIANTS.items():
         try:
-            distance_m, sigma_m = variant(trial, profile)
+            fit = variant(trial, profile)
         except DataError:
             continue
-        estimates[name] = Estimate(distance_m - true_m, sigma_m)
+        estimates[name] = Estimate(fit.distance_m - true_m, fit.sigma_distance_m)
     return Comparison(estimates, bound_m(trial, profile))
 
 
 # ---------------------------------------------------------------------- the variants
 
 
-def _thesis(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
-    fit = analyse(trial)
-    return fit.distance_m, fit.sigma_distance_m
+def _encoder(trial: TrialRows, profile: NoiseProfile) -> JointRegression:
+    return regress(trial, imu_knowledge(profile))
 
 
-def _encoder(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
-    return _distance(regress(trial, imu_knowledge(profile)))
+def _gyro(trial: TrialRows, profile: NoiseProfile, crossover_s: float | None = None) -> JointRegression:
+    motions = [_by_gyro(trial, window, crossover_s) for window in windows(trial)]
+    return _regressed(trial, profile, motions)
 
 
-def _gyro(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
-    return _regressed(trial, profile, [_by_gyro(trial, window, None) for window in windows(trial)])
-
-
-def _fused(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
-    return _regressed(trial, profile, [_by_gyro(trial, window, CROSSOVER_S) for window in windows(trial)])
-
-
-def _command(trial: TrialRows, profile: NoiseProfile) -> tuple[float, float]:
-    motions = [
-        observed._replace(
-            instrument=SmoothMotion(_commanded(window.joint, motion.joint["position_command_rad"]))
-        )
-        for observed, window, motion in zip(
-            observed_motions(windows(trial)), windows(trial), (trial.constant, trial.sine), strict=True
-        )
-    ]
+def _command(trial: TrialRows, profile: NoiseProfile) -> JointRegression:
+    motions = []
+    for window, motion in zip(windows(trial), (trial.constant, trial.sine), strict=True):
+        commanded = _commanded(window.joint, motion.joint["position_command_rad"])
+        motions.append(observed_motions([window])[0]._replace(instrument=SmoothMotion(commanded)))
     return _regressed(trial, profile, motions)
 
 
 VARIANTS: Mapping[str, Variant] = {
-    "thesis": _thesis,
+    "thesis": lambda trial, _profile: analyse(trial),
     "encoder": _encoder,
     "gyro": _gyro,
-    "fused": _fused,
+    "fused": lambda trial, profile: _gyro(trial, profile, CROSSOVER_S),
     "command": _command,
 }
 
 
-def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[ObservedMotion]) -> tuple[float, float]:
-    rest = rest_reading(imu_window(trial.rest))
-    return _distance(regress_joint(motions, rest, imu_knowledge(profile)))
-
-
-def _distance(fit: JointRegression) -> tuple[float, float]:
-    return fit.distance_m, fit.sigma_distance_m
+def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[ObservedMotion]) -> JointRegression:
+    return regress_joint(motions, rest_reading(imu_window(trial.rest)), imu_knowledge(profile))
 
 
 def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None) -> ObservedMotion:
@@ -200,7 +181,7 @@ class EstimatorRow(NamedTuple):
 
 def estimator_rows(arm: Arm, comparisons: Sequence[Comparison]) -> list[EstimatorRow]:
     """Return a row for every estimator with an estimate in any trial of an arm."""
-    bound = _rms(np.array([each.bound_m for each in comparisons]))
+    bound = rms(np.array([each.bound_m for each in comparisons]))
     rows = []
     for name in VARIANTS:
         estimates = [each.estimates[name] for each in comparisons if name in each.estimates]
@@ -215,24 +196,11 @@ def estimator_rows(arm: Arm, comparisons: Sequence[Comparison]) -> list[Estimato
                 trials=len(estimates),
                 mean_error_mm=1e3 * float(np.abs(error).mean()),
                 bias_mm=1e3 * float(error.mean()),
-                rms_mm=1e3 * _rms(error),
-                sigma_mm=1e3 * _rms(sigma),
+                rms_mm=1e3 * rms(error),
+                sigma_mm=1e3 * rms(sigma),
                 bound_mm=1e3 * bound,
-                ratio=_rms(error) / bound,
+                ratio=rms(error) / bound,
                 covered=float(np.mean(np.abs(error) < _WITHIN * sigma)),
             )
         )
     return rows
-
-
-def write_estimators(path: Path, settings: dict[str, object], rows: Sequence[EstimatorRow]) -> None:
-    """Write settings and rows as JSON.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    write_json(path, {"settings": settings, "rows": [row._asdict() for row in rows]})
-
-
-def _rms(values: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]") -> float:
-    return float(np.sqrt(np.mean(values**2)))

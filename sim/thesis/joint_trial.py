@@ -18,14 +18,14 @@ from module_agent.estimate.circle_point_analysis import rest_reading
 from module_agent.estimate.joint_regression import distance_bound_m
 from module_agent.estimate.observed_motion import observed_motions
 from module_agent.estimate.windows import imu_window
+from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import CALIBRATED, IMU_PRIORS, ImuPrior
-from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
+from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.robot.variants import at_random_site
 from sim.scoring.chain_score import link_length_m
-from sim.sensors.imu import WHITE_RATE_HZ
 from sim.test_bench.one_joint_rig import IMU, JOINT, OneJointRig, TrialRows, analyse, regress, windows
 from sim.thesis.published import Alignment, ThesisLength, thesis_length
 
@@ -38,18 +38,14 @@ def imu_knowledge(profile: NoiseProfile) -> ImuPrior:
     return IMU_PRIORS[imu_kind(profile)]
 
 
-def white_noise(profile: NoiseProfile, rate_hz: float = WHITE_RATE_HZ) -> tuple[float, float]:
+def white_noise(profile: NoiseProfile) -> tuple[float, float]:
     """Return the white noise of one sample of gyro [rad/s] and accelerometer [m/s^2], with its steps.
 
     That is an IMU whose own motor stands: vibration is what its own gears make.
     """
-    gain = np.sqrt(rate_hz / WHITE_RATE_HZ)
-    pairs = (
-        (profile.gyro_white_rad_s, profile.gyro_step_rad_s),
-        (profile.accel_white_m_s2, profile.accel_step_m_s2),
-    )
-    gyro, accel = (float(np.hypot(gain * white, step / np.sqrt(12.0))) for white, step in pairs)
-    return gyro, accel
+    gyro = np.hypot(profile.gyro_white_rad_s, profile.gyro_step_rad_s / np.sqrt(12.0))
+    accel = np.hypot(profile.accel_white_m_s2, profile.accel_step_m_s2 / np.sqrt(12.0))
+    return float(gyro), float(accel)
 
 
 def bound_m(trial: TrialRows, profile: NoiseProfile) -> float:
@@ -93,53 +89,41 @@ def trial_plan(arm: ThesisLength, profile: NoiseProfile) -> Plan:
     return Plan(sine_amplitude_rad=arm.amplitude_rad, home_rad=home_rad)
 
 
-def joint_trial(
-    length_mm: int, alignment: Alignment, noise: str | NoiseProfile, seed: int, plan: Plan | None = None
-) -> JointTrial:
-    """Run one trial on a new rig and evaluate it.
+def joint_trial(length_mm: int, alignment: Alignment, profile: NoiseProfile, seed: int) -> JointTrial:
+    """Run one trial on a new rig, and compare the estimated distance with the rig's truth.
 
     Args:
         length_mm, alignment: one of the thesis' eight arms (`thesis_lengths`).
-        noise: profile, by name or as `switched` makes it.
+        profile: noise.
         seed: of the rig's modules, their noise, and the site.
-        plan: the motions; those of `trial_plan` when None.
 
     Raises:
-        KeyError: the thesis had no such arm, or there is no such profile.
+        UsageError: the thesis had no such arm.
         ExperimentFailed: a module refused a motion, or broke it off.
         ValueError: too little motion, with what would be enough.
     """
-    profile = noise_profile(noise) if isinstance(noise, str) else noise
-    motions = plan if plan is not None else trial_plan(thesis_length(alignment, length_mm), profile)
     robot = at_random_site(load_robot(f"thesis_{length_mm}_{alignment}"), seed)
     with OneJointRig(robot, seed, profile) as rig:
-        rows = rig.trial(motions)
-        return evaluate(rig, rows, profile)
-
-
-def evaluate(rig: OneJointRig, rows: TrialRows, profile: NoiseProfile) -> JointTrial:
-    """Estimate the distance from a trial, and compare it with the rig's truth.
-
-    Raises:
-        ValueError: too little motion, with what would be enough.
-    """
-    chain = true_chain(rig.robot)
+        rows = rig.trial(trial_plan(thesis_length(alignment, length_mm), profile))
+        robot_time_s = 1e-9 * rig.world.t_ns
+    chain = true_chain(robot)
     true_m = link_length_m(chain, child=IMU)
     true_axis = chain.imu_home[IMU, :3, :3].T @ chain.axis[JOINT]
+    try:
+        thesis_error_m: float | None = analyse(rows).distance_m - true_m
+    except DataError:
+        thesis_error_m = None
     ours = regress(rows, imu_knowledge(profile))
-    cosine = float(np.clip(ours.axis @ true_axis, -1.0, 1.0))
     return JointTrial(
-        thesis_error_m=_thesis_error_m(rows, true_m),
+        thesis_error_m=thesis_error_m,
         ours_error_m=ours.distance_m - true_m,
         ours_sigma_m=ours.sigma_distance_m,
         bound_m=bound_m(rows, profile),
-        axis_error_deg=degrees(acos(cosine)),
-        robot_time_s=1e-9 * rig.world.t_ns,
+        axis_error_deg=degrees(acos(float(np.clip(ours.axis @ true_axis, -1.0, 1.0)))),
+        robot_time_s=robot_time_s,
     )
 
 
-def _thesis_error_m(rows: TrialRows, true_m: float) -> float | None:
-    try:
-        return analyse(rows).distance_m - true_m
-    except DataError:
-        return None
+def rms(values: Array) -> float:
+    """Return the root mean square of all entries."""
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -33,6 +33,7 @@ from sim.robot.robot_file import Robot, load_robot
 from sim.robot.variants import at_random_site
 from sim.test_bench.module_bench import ExperimentFailed
 from sim.test_bench.robot_bench import BenchRobot, Streaming, Track
+from sim.thesis.joint_trial import rms
 from sim.thesis.published import Reading, setting, thesis_gains, without_velocity
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
@@ -82,6 +83,12 @@ class Gains(NamedTuple):
     def name(self) -> str:
         """The setting's name."""
         return f"factory S{self.strategy}" if self.setting is None else self.setting
+
+    def of(self, kind: ModuleType) -> GainSet:
+        """Return the gains of a type of module."""
+        if self.setting is None or self.reading is None:
+            return default_gains(kind, self.strategy)
+        return thesis_gains(kind, setting(self.setting), self.reading)
 
 
 class Model(NamedTuple):
@@ -156,7 +163,7 @@ def follow(
     movers = list(stage.patterns)
     types = {module.serial: module_type(module.type) for module in stage.robot.modules}
     kinds = [types[serial] for serial in movers]
-    sets = [_gain_set(kind, gains, mode) for kind in kinds]
+    sets = [gains.of(kind) if mode > 1 else without_velocity(gains.of(kind)) for kind in kinds]
     points = _phases(stage, model)
     try:
         with BenchRobot(stage.robot, seed, noise, noise_seed=TRIAL_DAY) as bench:
@@ -172,7 +179,8 @@ def follow(
     except ExperimentFailed as error:
         return _broken_off(points[1].reference, str(error))
     columns = [stage.robot.serials.index(serial) for serial in movers]
-    return tracking(points[1].reference, *(_of(track, columns) for track in tracks[1:]))
+    moving, after = (Track(*(signal[:, columns] for signal in track)) for track in tracks[1:])
+    return tracking(points[1].reference, moving, after)
 
 
 def tracking(commanded: Reference, moving: Track, after: Track) -> Follow:
@@ -183,13 +191,18 @@ def tracking(commanded: Reference, moving: Track, after: Track) -> Follow:
     ringing = float(after.q_rad[-still:].std(axis=0).max())
     saturated = _largest_share(np.abs(moving.duty) > _SATURATED_DUTY)
     duty_jumps = _largest_share(np.abs(np.diff(moving.duty, axis=0)) > _DUTY_JUMP)
+    reasons = (
+        (ringing > MAX_RINGING_RAD, f"rings by {1e3 * ringing:.1f} mrad"),
+        (saturated > MAX_SATURATED, f"saturates {100.0 * saturated:.0f} % of the time"),
+        (duty_jumps > MAX_DUTY_JUMPS, f"duty jumps in {100.0 * duty_jumps:.0f} % of the ticks"),
+    )
     return Follow(
-        rms_error_rad=_rms(error),
-        motion_rms_rad=_rms(q - q.mean(axis=0)),
+        rms_error_rad=rms(error),
+        motion_rms_rad=rms(q - q.mean(axis=0)),
         ringing_rad=ringing,
         saturated=saturated,
         duty_jumps=duty_jumps,
-        unstable=_unstable(ringing, saturated, duty_jumps),
+        unstable=", ".join(text for applies, text in reasons if applies),
         commanded_rad=read_only(q[::4].copy()),
         true_rad=read_only(moving.q_rad[: len(q) : 4].copy()),
     )
@@ -199,20 +212,9 @@ def _largest_share(when: NDArray[np.bool_]) -> float:
     return float(np.mean(when, axis=0).max())
 
 
-def _unstable(ringing_rad: float, saturated: float, duty_jumps: float) -> str:
-    reasons = []
-    if ringing_rad > MAX_RINGING_RAD:
-        reasons.append(f"rings by {1e3 * ringing_rad:.1f} mrad")
-    if saturated > MAX_SATURATED:
-        reasons.append(f"saturates {100.0 * saturated:.0f} % of the time")
-    if duty_jumps > MAX_DUTY_JUMPS:
-        reasons.append(f"duty jumps in {100.0 * duty_jumps:.0f} % of the ticks")
-    return ", ".join(reasons)
-
-
 def _broken_off(commanded: Reference, why: str) -> Follow:
     nothing = read_only(np.empty((0, commanded.q_rad.shape[1])))
-    motion = _rms(commanded.q_rad - commanded.q_rad.mean(axis=0))
+    motion = rms(commanded.q_rad - commanded.q_rad.mean(axis=0))
     return Follow(np.inf, motion, np.inf, 1.0, 1.0, f"broken off: {why}", nothing, nothing)
 
 
@@ -230,9 +232,13 @@ def _driven(
 ) -> list[SetPoints]:
     """Return successive phases with motor compensation, in which the motors get warmer."""
     driven = with_motor_compensation(_joined(phases), kinds, gains, winding_c).effort_nm
-    ends = np.cumsum([len(phase.effort_nm) for phase in phases])[:-1]
-    parts = np.split(driven, ends)
+    parts = np.split(driven, _ends(phases))
     return [phase._replace(effort_nm=part) for phase, part in zip(phases, parts, strict=True)]
+
+
+def _ends(phases: list[SetPoints]) -> NDArray[np.int64]:
+    """Return the rows at which all phases but the first begin."""
+    return np.cumsum([len(phase.effort_nm) for phase in phases])[:-1]
 
 
 def _joined(phases: list[SetPoints]) -> SetPoints:
@@ -245,14 +251,6 @@ def _picked(points: SetPoints, columns: list[int]) -> SetPoints:
     t_s, *motion = points.reference
     chosen = Reference(t_s, *(read_only(signal[:, columns].copy()) for signal in motion))
     return SetPoints(chosen, read_only(points.effort_nm[:, columns].copy()))
-
-
-def _gain_set(kind: ModuleType, gains: Gains, mode: InputMode) -> GainSet:
-    if gains.setting is None or gains.reading is None:
-        chosen = default_gains(kind, gains.strategy)
-    else:
-        chosen = thesis_gains(kind, setting(gains.setting), gains.reading)
-    return without_velocity(chosen) if mode == 1 else chosen
 
 
 def _on_module(bench: BenchRobot, stage: Stage, points: list[SetPoints], mode: InputMode) -> list[Track]:
@@ -275,13 +273,5 @@ def _streamed(
     assert delivery.network is not None
     how = Streaming(network(delivery.network), delivery.rate_hz, velocity=mode > 1, effort=mode == 3)
     track = bench.stream(movers, _joined(points), how, seed)
-    ends = np.cumsum([len(phase.effort_nm) for phase in points])[:-1]
-    return [Track(*part) for part in zip(*(np.split(signal, ends) for signal in track), strict=True)]
-
-
-def _of(track: Track, columns: list[int]) -> Track:
-    return Track(*(signal[:, columns] for signal in track))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    parts = (np.split(signal, _ends(points)) for signal in track)
+    return [Track(*part) for part in zip(*parts, strict=True)]

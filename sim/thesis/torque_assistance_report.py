@@ -6,7 +6,7 @@ The picture shows how the thesis' arm follows in the three input modes, as its f
 from collections.abc import Callable, Sequence
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,9 +17,6 @@ from sim.robot.robot_tree import true_chain, true_inertia
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
 from sim.thesis.torque_assistance import MODES, ON_MODULE, Model, standing_robot
 from sim.thesis.torque_assistance_cases import Combination
-
-if TYPE_CHECKING:
-    from matplotlib.lines import Line2D
 
 # The required gain of an arm of six joints under torque control.
 MIN_GAIN = 3.0
@@ -87,14 +84,9 @@ def write_assistance(path: Path, settings: dict[str, object], combinations: Sequ
 
 def _row(each: Combination) -> dict[str, object]:
     case = each.case
+    names = ("rms_error_rad", "ringing_rad", "saturated", "duty_jumps")
     modes = {
-        str(mode): {
-            "rms_error_rad": _number(one.rms_error_rad),
-            "ringing_rad": _number(one.ringing_rad),
-            "saturated": one.saturated,
-            "duty_jumps": one.duty_jumps,
-            "unstable": one.unstable,
-        }
+        str(mode): {name: _number(getattr(one, name)) for name in names} | {"unstable": one.unstable}
         for mode, one in zip(MODES, each.follows, strict=True)
     }
     return {
@@ -135,12 +127,11 @@ def true_model(name: str, seed: int) -> Model:
 
 
 _COMMANDED = "#202020"
-_COLOURS = ("#d07a1f", "#1f5fa8", "#2c8a4b")
-_LABELS = (
-    "mode 1: position",
-    "mode 2: position and velocity",
-    "mode 3: position, velocity and calculated torque",
-)
+_MODES = {
+    "mode 1: position": "#d07a1f",
+    "mode 2: position and velocity": "#1f5fa8",
+    "mode 3: position, velocity and calculated torque": "#2c8a4b",
+}
 # The thesis' figures by alignment and setting; where it found nothing stable it has none.
 _FIGURES = {("vertical", f"#{k}"): 51 + k for k in range(1, 7)} | {
     ("horizontal", f"#{k}"): 55 + k for k in range(4, 7)
@@ -156,6 +147,7 @@ def plot_assistance(combinations: Sequence[Combination], path: Path, title: str)
         UsageError: none of the combinations is one of the thesis', or matplotlib cannot write the suffix.
     """
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     panels = [
         _first(combinations, alignment, each.name) for alignment in ALIGNMENTS[::-1] for each in SETTINGS
@@ -174,27 +166,19 @@ def plot_assistance(combinations: Sequence[Combination], path: Path, title: str)
     for row in grid:
         row[0].set_ylabel("position [rad]")
     figure.suptitle(title, fontsize=12, y=0.99)
-    figure.legend(handles=_legend(), loc="lower center", ncol=4, fontsize=10, frameon=False)
+    handles = [Line2D([], [], color=_COMMANDED, linewidth=1.0, linestyle="--", label="commanded")]
+    handles += [Line2D([], [], color=colour, label=label) for label, colour in _MODES.items()]
+    figure.legend(handles=handles, loc="lower center", ncol=4, fontsize=10, frameon=False)
     figure.subplots_adjust(left=0.06, right=0.985, top=0.94, bottom=0.075, wspace=0.18, hspace=0.33)
     figure.savefig(path)
 
 
-def _legend() -> list["Line2D"]:
-    from matplotlib.lines import Line2D
-
-    modes = [
-        Line2D([], [], color=colour, label=label) for colour, label in zip(_COLOURS, _LABELS, strict=True)
-    ]
-    return [Line2D([], [], color=_COMMANDED, linewidth=1.0, linestyle="--", label="commanded"), *modes]
-
-
 def _first(combinations: Sequence[Combination], alignment: str, setting: str) -> Combination | None:
     """Return the first combination of an alignment and a setting, on the module and in the first reading."""
+    wanted = (alignment, setting, READINGS[0], ON_MODULE)
     for each in combinations:
-        gains = each.case.gains
-        if (each.case.alignment, gains.setting) == (alignment, setting) and (
-            gains.reading == READINGS[0] and each.case.delivery == ON_MODULE
-        ):
+        case = each.case
+        if (case.alignment, case.gains.setting, case.gains.reading, case.delivery) == wanted:
             return each
     return None
 
@@ -202,7 +186,7 @@ def _first(combinations: Sequence[Combination], alignment: str, setting: str) ->
 def _panel(axes: Any, one: Combination) -> None:
     case = one.case
     axes.grid(True, linewidth=0.4, color="#d5d5d5")
-    for each, colour in zip(one.follows, _COLOURS, strict=True):
+    for each, colour in zip(one.follows, _MODES.values(), strict=True):
         t_s = _SAMPLE_S * np.arange(len(each.true_rad))
         # A ringing motion would hide the others: it is drawn thin and pale.
         style = {"linewidth": 0.6, "alpha": 0.6} if each.unstable else {"linewidth": 1.3}
