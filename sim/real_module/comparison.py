@@ -169,24 +169,23 @@ class _Bench:
         inbox, self._inbox = self._inbox, []
         (pwm,) = self._hardware.send([self._firmware.step(sample, inbox)])
         for answer in self._firmware.publish(pwm):
-            if isinstance(answer, Answer):
-                _check(decode(Ack, answer.payload), answer.request)
+            ack = decode(Ack, answer.payload) if isinstance(answer, Answer) else None
+            if isinstance(answer, Answer) and ack is not None and not ack.accepted:
+                # Line 1 of the file is its header.
+                line = answer.request + 2
+                raise CommandRefused(f"the command of line {line} is refused: {ack.reason}: {ack.detail}")
         return _row(sample.sensors, pwm)
 
     def command(self, log: RealLog, number: int) -> None:
         """Send row `number` of the log as a setpoint, and keep the lease."""
-        position, velocity, effort = (
-            None if math.isnan(value) else float(value)
-            for value in (
-                log.position_command_rad[number],
-                log.velocity_command_rad_s[number],
-                log.effort_command_nm[number],
-            )
-        )
+        aims = {
+            "position_rad": log.position_command_rad[number],
+            "velocity_rad_s": log.velocity_command_rad_s[number],
+            "effort_nm": log.effort_command_nm[number],
+        }
+        known = {name: None if math.isnan(value) else float(value) for name, value in aims.items()}
         self._send(Leaf.LEASE, self._request("renew"), number)
-        aims = {"position_rad": position, "velocity_rad_s": velocity, "effort_nm": effort}
-        setpoint = Setpoint.model_validate({**self._head(), **aims})
-        self._send(Leaf.SETPOINT, setpoint, number)
+        self._send(Leaf.SETPOINT, Setpoint.model_validate({**self._head(), **known}), number)
 
     def _send(self, leaf: Leaf, message: Message, number: int = 0) -> None:
         self._inbox.append(Incoming(leaf, encode(message), number))
@@ -204,12 +203,6 @@ class _Bench:
             "token": self._firmware.lease.token,
             "echo_ns": self._sample_ns,
         }
-
-
-def _check(ack: Ack, number: int) -> None:
-    if not ack.accepted:
-        # Line 1 of the file is its header.
-        raise CommandRefused(f"the command of line {number + 2} is refused: {ack.reason}: {ack.detail}")
 
 
 def _row(sample: SensorSample, pwm: float) -> tuple[float, ...]:

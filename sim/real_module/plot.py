@@ -39,24 +39,13 @@ def plot(log: RealLog, simulated: Simulated, title: str, path: Path | None = Non
     figure = Figure(figsize=(13.0, 11.0), dpi=110)
     FigureCanvasAgg(figure)
     ratios = {row.signal: row for row in compare(log, simulated)}
-    grid = figure.add_gridspec(
-        3,
-        2,
-        width_ratios=(2.2, 1.0),
-        left=0.07,
-        right=0.985,
-        top=0.905,
-        bottom=0.05,
-        hspace=0.27,
-        wspace=0.16,
-    )
+    margins = {"left": 0.07, "right": 0.985, "top": 0.905, "bottom": 0.05}
+    grid = figure.add_gridspec(3, 2, width_ratios=(2.2, 1.0), hspace=0.27, wspace=0.16, **margins)
     for i, panel in enumerate(_PANELS):
-        heading = f"{panel.title}{_off(ratios[panel.signal].ratio)}"
-        _signal(figure, grid[i, 0], log, simulated, panel, heading, last=i == len(_PANELS) - 1)
-        close = f"the first {_CLOSE_S:g} s"
-        _signal(
-            figure, grid[i, 1], log, simulated, panel, close, last=i == len(_PANELS) - 1, until_s=_CLOSE_S
-        )
+        ratio, last = ratios[panel.signal].ratio, panel is _PANELS[-1]
+        off = "" if ratio is None else f": rms difference {100.0 * ratio:.1f} % of the recorded rms"
+        _signal(figure, grid[i, 0], log, simulated, panel, f"{panel.title}{off}", last)
+        _signal(figure, grid[i, 1], log, simulated, panel, f"the first {_CLOSE_S:g} s", last, _CLOSE_S)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     more, names = figure.axes[1].get_legend_handles_labels()
     figure.legend(
@@ -72,10 +61,6 @@ def plot(log: RealLog, simulated: Simulated, title: str, path: Path | None = Non
     if path is not None:
         figure.savefig(path)
     return figure
-
-
-def _off(ratio: float | None) -> str:
-    return "" if ratio is None else f": rms difference {100.0 * ratio:.1f} % of the recorded rms"
 
 
 def _signal(

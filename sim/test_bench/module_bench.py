@@ -4,7 +4,7 @@ All messages go through the firmware's inbox, encoded, as they would come from a
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from module_agent.control.controller import Command
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, Publication
@@ -110,15 +110,11 @@ class ModuleBench:
         return self.firmware.history.rows(first, end)
 
     def _keep_alive(self) -> None:
-        if self._renewed_ns is None:
-            self._send_lease("acquire", _ASKED)
-        elif self.now_ns - self._renewed_ns >= _KEEP_ALIVE_NS:
-            self._send_lease("renew", None)
-
-    def _send_lease(self, action: Literal["acquire", "renew"], request: int | None) -> None:
-        lease = LeaseRequest(**self._head(), action=action)
-        self._waiting.append(Incoming(Leaf.LEASE, encode(lease), request))
-        self._renewed_ns = self.now_ns
+        first = self._renewed_ns is None
+        if self._renewed_ns is None or self.now_ns - self._renewed_ns >= _KEEP_ALIVE_NS:
+            lease = LeaseRequest(**self._head(), action="acquire" if first else "renew")
+            self._waiting.append(Incoming(Leaf.LEASE, encode(lease), _ASKED if first else None))
+            self._renewed_ns = self.now_ns
 
     def _head(self) -> dict[str, Any]:
         """Return the fields that every command has."""

@@ -13,7 +13,7 @@ from module_agent.estimate.gaussian_filter import TAPS
 from module_agent.estimate.joint_regression import JointRegression, regress_joint
 from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.observer import MARGIN_NS
-from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
+from module_agent.estimate.windows import align, imu_window, joint_window
 from module_agent.model.imu_prior import CALIBRATED, ImuPrior
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
@@ -100,9 +100,8 @@ def analyse(trial: TrialRows, taps: int = TAPS) -> CircleFit:
     Raises:
         ValueError: too little motion, with what would be enough.
     """
-    return circle_point_analysis(
-        imu_window(trial.rest), _aligned(trial.constant), _aligned(trial.sine), taps=taps
-    )
+    constant, sine = (align(one.imu, one.joint, one.offset_ns) for one in windows(trial))
+    return circle_point_analysis(imu_window(trial.rest), constant, sine, taps=taps)
 
 
 def regress(trial: TrialRows, knowledge: ImuPrior = CALIBRATED) -> JointRegression:
@@ -120,18 +119,13 @@ def windows(trial: TrialRows) -> list[MotionWindows]:
     Raises:
         ValueError: too few samples to estimate the offset of the clocks.
     """
-    motions = []
-    for motion in (trial.constant, trial.sine):
-        own, joint = imu_window(motion.imu), joint_window(motion.joint)
-        offset_ns = clock_delay(own, joint, motion.rough_offset_ns).offset_ns
-        motions.append(MotionWindows(own, joint, imu_window(motion.joint), offset_ns))
-    return motions
+    return [_windows(motion) for motion in (trial.constant, trial.sine)]
 
 
-def _aligned(motion: MotionRows) -> AlignedMotion:
+def _windows(motion: MotionRows) -> MotionWindows:
     own, joint = imu_window(motion.imu), joint_window(motion.joint)
-    delay = clock_delay(own, joint, motion.rough_offset_ns)
-    return align(own, joint, delay.offset_ns)
+    offset_ns = clock_delay(own, joint, motion.rough_offset_ns).offset_ns
+    return MotionWindows(own, joint, imu_window(motion.joint), offset_ns)
 
 
 def _end(record: MotionRecord) -> int:
