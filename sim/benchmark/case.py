@@ -32,15 +32,15 @@ class Summary(NamedTuple):
     sigmas_off: |error| / claimed sigma of every interval that was claimed, for the coverage over all cases.
     """
 
-    rows: tuple[Row, ...]
-    sigmas_off: tuple[float, ...] = ()
+    rows: Sequence[Row]
+    sigmas_off: Sequence[float] = ()
 
 
 class Case(NamedTuple):
     """Trials that belong together; `summarise` is given the results of those that did not fail, in order."""
 
     name: str
-    trials: tuple[Trial, ...]
+    trials: Sequence[Trial]
     summarise: Callable[[Sequence[Any]], Summary]
 
 
@@ -58,14 +58,12 @@ def concluded(case: Case, results: Sequence[Any], cpu_s: float = 0.0) -> CaseRes
     """Summarise the results of all trials of a case; one that failed makes a row that misses its bar."""
     failures = tuple(result.text for result in results if isinstance(result, Failed))
     summary = case.summarise([result for result in results if not isinstance(result, Failed)])
-    if failures:
-        failed = Row(
-            case.name, f"trials that failed, of {len(results)}", None, float(len(failures)), None, 0.0
-        )
-        summary = summary._replace(rows=(failed, *summary.rows))
-    return CaseResult(case.name, len(results), summary, failures, cpu_s)
+    failed = [Row(f"trials that failed, of {len(results)}", float(len(failures)), 0.0)] if failures else []
+    rows = [row._replace(case=case.name) for row in (*failed, *summary.rows)]
+    return CaseResult(case.name, len(results), summary._replace(rows=rows), failures, cpu_s)
 
 
-def trial_seed(seed: int, name: str, number: int) -> int:
-    """Return the seed of a trial; it depends on nothing but the benchmark's seed, a name and a number."""
-    return int(np.random.SeedSequence(seed, spawn_key=(crc32(name.encode()), number)).generate_state(1)[0])
+def trial_seeds(seed: int, name: str, trials: int) -> list[int]:
+    """Return the seeds of trials; they depend on the benchmark's seed, a name and their numbers alone."""
+    sequences = [np.random.SeedSequence(seed, spawn_key=(crc32(name.encode()), k)) for k in range(trials)]
+    return [int(sequence.generate_state(1)[0]) for sequence in sequences]

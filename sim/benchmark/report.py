@@ -9,73 +9,61 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from math import ceil, floor, isfinite, log10
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_json
 from sim.benchmark.case import CaseResult
 from sim.benchmark.row import Row
 
-if TYPE_CHECKING:
-    from matplotlib.lines import Line2D
-
 SCHEMA = 1
 _MEASURED_WITH = ("x5-self-model", "numpy", "scipy", "numba", "pybullet")
 
 
-class Cost(NamedTuple):
-    """The processor time of a case's trials."""
-
-    case: str
-    trials: int
-    cpu_time_s: float
-
-
 class Results(NamedTuple):
-    """The rows of a benchmark, its failures, settings, processor and wall time."""
+    """The results of a benchmark: its cases, the rows over all of them, settings and wall time."""
 
     benchmark: str
     settings: dict[str, object]
-    rows: tuple[Row, ...]
-    failures: tuple[str, ...]
-    costs: tuple[Cost, ...]
+    cases: Sequence[CaseResult]
+    over_all: Sequence[Row]
     wall_time_s: float
+
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of all cases, those over all of them last."""
+        return [row for case in self.cases for row in case.summary.rows] + list(self.over_all)
+
+    @property
+    def failures(self) -> list[str]:
+        """What failed, with the case that it belongs to."""
+        return [f"{case.case}: {text}" for case in self.cases for text in case.failures]
 
     @property
     def cpu_time_s(self) -> float:
         """Processor time of all trials."""
-        return sum(cost.cpu_time_s for cost in self.costs)
+        return sum(case.cpu_s for case in self.cases)
 
     @property
-    def missed(self) -> tuple[Row, ...]:
+    def missed(self) -> list[Row]:
         """The rows whose bar is not met."""
-        return tuple(row for row in self.rows if row.holds is False)
-
-
-def gathered(
-    benchmark: str,
-    settings: dict[str, object],
-    cases: Sequence[CaseResult],
-    over_all: Sequence[Row],
-    wall_time_s: float,
-) -> Results:
-    """Put the rows of all cases together, those over all of them last."""
-    rows = [row for case in cases for row in case.summary.rows]
-    failures = tuple(f"{case.case}: {text}" for case in cases for text in case.failures)
-    costs = tuple(Cost(case.case, case.trials, round(case.cpu_s, 2)) for case in cases)
-    return Results(benchmark, settings, (*rows, *over_all), failures, costs, wall_time_s)
+        return [row for row in self.rows if row.holds is False]
 
 
 def write_results(path: Path, results: Results) -> None:
     """Write the results as JSON; the file is the complete old or the complete new one."""
+    costs = [
+        {"case": case.case, "trials": case.trials, "cpu_time_s": round(case.cpu_s, 2)}
+        for case in results.cases
+    ]
     document = {
         "schema": SCHEMA,
         "benchmark": results.benchmark,
         "settings": results.settings,
         "versions": {"python": platform.python_version()} | {name: version(name) for name in _MEASURED_WITH},
         "rows": [row.plain() for row in results.rows],
-        "failures": list(results.failures),
-        "costs": [cost._asdict() for cost in results.costs],
+        "failures": results.failures,
+        "costs": costs,
         "wall_time_s": results.wall_time_s,
     }
     write_json(path, document)
@@ -83,27 +71,18 @@ def write_results(path: Path, results: Results) -> None:
 
 _OURS, _MISSED, _THESIS, _BOUND, _BAR = "#1f5fa8", "#c0261c", "#d07a1f", "#606060", "#2f7d32"
 _ROW_INCH, _PANEL_INCH, _WIDTH_INCH = 0.19, 0.85, 15.0
-_MARKS = (
-    ("thesis", _THESIS, "*", 8.0),
-    ("bound", _BOUND, "|", 9.0),
-    ("ours", _OURS, "o", 5.0),
-)
+_MARKS = (("thesis", _THESIS, "*", 8.0), ("bound", _BOUND, "|", 9.0), ("ours", _OURS, "o", 5.0))
 
 
 class _Panel(NamedTuple):
     """One figure of all cases that have a bar for it."""
 
     figure: str
-    rows: tuple[Row, ...]
+    rows: list[Row]
 
     @property
     def height_inch(self) -> float:
         return _PANEL_INCH + _ROW_INCH * len(self.rows)
-
-    @property
-    def logarithmic(self) -> bool:
-        """Whether sizes are compared; counts and shares are on a plain scale."""
-        return all(isinstance(row.limit, float) and row.limit > 0.0 for row in self.rows)
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
@@ -138,7 +117,7 @@ def _panels(rows: Sequence[Row]) -> list[_Panel]:
     for row in rows:
         if row.limit is not None:
             groups.setdefault(row.figure.partition(", of ")[0], []).append(row)
-    return [_Panel(figure, tuple(own)) for figure, own in groups.items()]
+    return [_Panel(figure, own) for figure, own in groups.items()]
 
 
 def _columns(panels: Sequence[_Panel]) -> list[list[_Panel]]:
@@ -160,15 +139,19 @@ def _draw(axes: Any, panel: _Panel) -> None:
     axes.tick_params(axis="x", labelsize=7, pad=1.5)
     axes.grid(True, axis="x", linewidth=0.4, color="#dddddd")
     axes.set_axisbelow(True)
+    # Sizes are compared on a logarithmic scale, counts and shares on a plain one.
+    logarithmic = all(isinstance(row.limit, float) and row.limit > 0.0 for row in panel.rows)
     for place, row in enumerate(panel.rows):
-        _draw_bar(axes, row, place)
+        span = [place - 0.45, place + 0.45]
+        for edge in row.limit if isinstance(row.limit, tuple) else (row.limit,):
+            axes.plot([edge, edge], span, color=_BAR, linewidth=2.0, solid_capstyle="butt")
         for name, colour, marker, size in _MARKS:
             value = getattr(row, name)
-            if value is None or not isfinite(value) or (panel.logarithmic and value <= 0.0):
+            if value is None or not isfinite(value) or (logarithmic and value <= 0.0):
                 continue
             shown = _MISSED if name == "ours" and not row.holds else colour
             axes.plot([value], [place], marker=marker, markersize=size, color=shown, markeredgewidth=1.2)
-    if panel.logarithmic:
+    if logarithmic:
         _decades(axes)
     elif panel.rows[0].limit == 0.0:
         axes.set_xlim(left=-0.5, right=max([1.0, *(row.ours or 0.0 for row in panel.rows)]) + 0.5)
@@ -185,19 +168,11 @@ def _decades(axes: Any) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _draw_bar(axes: Any, row: Row, place: int) -> None:
-    for edge in row.limit if isinstance(row.limit, tuple) else (row.limit,):
-        axes.plot(
-            [edge, edge], [place - 0.45, place + 0.45], color=_BAR, linewidth=2.0, solid_capstyle="butt"
-        )
-
-
-def _legend() -> list["Line2D"]:
+def _legend() -> list[Any]:
     from matplotlib.lines import Line2D
 
     handles = [
         Line2D([], [], marker=marker, linestyle="none", color=colour, markersize=size, label=name)
-        for name, colour, marker, size in _MARKS
+        for name, colour, marker, size in (*_MARKS, ("ours, missed", _MISSED, "o", 5.0))
     ]
-    missed = Line2D([], [], marker="o", linestyle="none", color=_MISSED, markersize=5.0, label="ours, missed")
-    return [*handles, missed, Line2D([], [], color=_BAR, linewidth=2.0, label="bar")]
+    return [*handles, Line2D([], [], color=_BAR, linewidth=2.0, label="bar")]

@@ -11,7 +11,7 @@ from scipy.special import gammaincinv
 COVERAGE = (92.0, 98.0)
 # With fewer intervals than this, chance alone leaves the range: one standard deviation is then over 1.5 %.
 FEW_INTERVALS = 200
-_SIGMAS_95 = 1.96
+SIGMAS_95 = 1.96
 _SIGMAS_99 = 2.58
 # The trials of a case that the bars of means are meant for.
 ENOUGH_TRIALS = 13
@@ -23,14 +23,15 @@ class Row(NamedTuple):
     """A figure of a case; None where there is none.
 
     limit: what `ours` must not exceed, or a range that it must lie in; None for a figure without a bar.
+    case: filled in when the trials of a case are concluded.
     """
 
-    case: str
     figure: str
-    thesis: float | None
     ours: float | None
-    bound: float | None = None
     limit: Limit = None
+    thesis: float | None = None
+    bound: float | None = None
+    case: str = ""
 
     @property
     def holds(self) -> bool | None:
@@ -45,7 +46,7 @@ class Row(NamedTuple):
     def plain(self) -> dict[str, object]:
         """Return the row as it stands in JSON."""
         figures = {name: _finite(getattr(self, name)) for name in ("thesis", "ours", "bound")}
-        return {**self._asdict(), **figures, "holds": self.holds}
+        return {"case": self.case, "figure": self.figure, **figures, "limit": self.limit, "holds": self.holds}
 
 
 def _finite(value: float | None) -> float | None:
@@ -71,11 +72,6 @@ def largest(values: Sequence[float | None]) -> float | None:
     return float(np.max(known)) if known else None
 
 
-def highest(values: Sequence[float]) -> float | None:
-    """Return the largest value, None if there is none."""
-    return float(max(values)) if values else None
-
-
 def ratio(over: float | None, under: float | None) -> float | None:
     """Return a ratio, None where one of the two is not known or the lower one is 0."""
     return None if over is None or not under else over / under
@@ -86,9 +82,9 @@ def scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else factor * value
 
 
-def count(case: str, figure: str, hits: Sequence[bool]) -> Row:
+def count(figure: str, hits: Sequence[bool]) -> Row:
     """Return a row that counts what must never happen, with a bar of 0; None without any trial."""
-    return Row(case, f"{figure}, of {len(hits)}", None, float(sum(hits)) if hits else None, None, 0.0)
+    return Row(f"{figure}, of {len(hits)}", float(sum(hits)) if hits else None, 0.0)
 
 
 def for_few(limit: float | None, trials: int) -> float | None:
@@ -103,17 +99,17 @@ def for_few(limit: float | None, trials: int) -> float | None:
     return limit * few / enough
 
 
-def coverage(case: str, sigmas_off: Sequence[float]) -> Row:
+def coverage(sigmas_off: Sequence[float]) -> Row:
     """Return the share of 95 % intervals that cover the truth, from |error| / sigma of every interval [%].
 
     The bar is `COVERAGE`; with few intervals it is wider by what chance does to them in 99 of 100 cases.
     """
     figure = f"95 % intervals that cover, of {len(sigmas_off)} [%]"
     if not sigmas_off:
-        return Row(case, figure, None, None, None, COVERAGE)
-    share = 100.0 * float(np.mean(np.asarray(sigmas_off) <= _SIGMAS_95))
+        return Row(figure, None, COVERAGE)
+    share = 100.0 * float(np.mean(np.asarray(sigmas_off) <= SIGMAS_95))
     chance = 0.0
     if len(sigmas_off) < FEW_INTERVALS:
         chance = 100.0 * _SIGMAS_99 * sqrt(0.95 * 0.05 / len(sigmas_off))
     low, high = COVERAGE
-    return Row(case, figure, None, share, None, (max(low - chance, 0.0), min(high + chance, 100.0)))
+    return Row(figure, share, (max(low - chance, 0.0), min(high + chance, 100.0)))

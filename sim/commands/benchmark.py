@@ -27,7 +27,7 @@ from sim.benchmark.cases.suites import (
     kinematic_cases,
     over_all,
 )
-from sim.benchmark.report import gathered, plot, write_results
+from sim.benchmark.report import Results, plot, write_results
 from sim.benchmark.row import Limit, Row
 from sim.benchmark.workers import run_cases
 from sim.commands.experiment import JsonFile, WorkerCount, experiment, worker_count
@@ -132,7 +132,7 @@ def _benchmark(
         raise UsageError(f"--only {only}: no such case; they are\n  " + "\n  ".join(c.name for c in cases))
     started_s = time.monotonic()
     measured = _run(selected, worker_count(processes))
-    results = gathered(name, settings, measured, over_all(measured), time.monotonic() - started_s)
+    results = Results(name, settings, measured, over_all(measured), time.monotonic() - started_s)
     print_table(table(results.rows, f"Benchmark of {name}"))
     for text in results.failures:
         typer.echo(f"failed: {text}", err=True)

@@ -15,9 +15,10 @@ from coordinator.identification.result import Result
 from coordinator.identification.topology_search import search_topology
 from module_agent.network_emulation.profile_file import network as network_profile
 from sim import simulate
-from sim.benchmark.cases.topology import differences
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
 from sim.robot.robot_file import load_robot, shipped_robots
+from sim.robot.robot_tree import true_chain
+from sim.scoring.chain_score import topology_differences
 from sim.scoring.score import Score
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
@@ -80,7 +81,7 @@ def test_topology_and_mounting_are_identified(quick_plan: Plan, name: str, netwo
     plan = quick_plan.model_copy(update={"topology_only": True} | (SHORTER if name == "snake16" else {}))
     recording = record_session(VirtualSettings(robot, network_profile(network)), plan)
     topology = search_topology(recording, robot.serials).topology
-    assert differences(robot, topology) == ()
+    assert topology_differences(topology, true_chain(robot)) == []
     assert topology.serials[0] == robot.serials[0]
     # The odds of the least certain answer; where held joints give by a quarter it is the lowest.
     assert topology.confidence > 0.95

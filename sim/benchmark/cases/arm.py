@@ -5,7 +5,7 @@ motions.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from statistics import median
 from typing import NamedTuple
@@ -22,41 +22,41 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import RobotError
 from module_agent.model.perturbation import apply_perturbation
 from module_agent.network_emulation.profile_file import network as named_network
-from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from module_agent.signals.clock_map import ClockMap
+from sim.benchmark.case import Case, Summary, Trial, trial_seeds
 from sim.benchmark.row import Row, count, for_few, largest, mean_abs, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
-from sim.robot.robot_file import Robot, load_robot
+from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.robot.variants import at_random_site
-from sim.scoring.chain_score import link_errors, link_length_m, tip_errors, topology_differences
+from sim.scoring.chain_score import LinkErrors, link_errors, tip_errors, topology_differences
 from sim.scoring.gauge_alignment import tip_error
+from sim.sensors.module_clock import ModuleClock, module_time
 from sim.thesis.circle_chain import thesis_chain
-from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.session import record_session
 
 # The rms over so many draws scatters by some 15 %, more poses would not make it less.
 BOUND_DRAWS, BOUND_POSES = 24, 100
+# Instants of a session at which the clocks' maps are compared with one another.
+INSTANTS = 200
 
 
 class ArmLink(NamedTuple):
-    """The errors of one true link; None where the chain has no such link.
+    """The errors of one true link, by our chain and by the thesis'; None where a chain has no such link.
 
-    error_m: estimate - truth of the distance from the parent's axis to the child's IMU. vector_error_m: the
-    size of the error of that distance as a vector. sigma_m: as claimed for the length. bound_m: what it would
-    be if the sensors' noise were all that there is. The thesis' are those of its chain, None in a mode that
-    has none.
+    sigma_m: as claimed for our length. bound_m: what it would be if there were the sensors' noise alone.
     """
 
-    parent: str
-    child: str
-    true_m: float
-    error_m: float | None
+    ours: LinkErrors | None
+    thesis: LinkErrors | None
     sigma_m: float | None
     bound_m: float | None
-    vector_error_m: float | None
-    axis_error_deg: float | None
-    thesis_error_m: float | None
-    thesis_axis_error_deg: float | None
+
+    @property
+    def error_m(self) -> float | None:
+        """The error of our length."""
+        return None if self.ours is None else self.ours.length_m
 
 
 class TipErrors(NamedTuple):
@@ -72,9 +72,11 @@ class ArmTrial(NamedTuple):
     why: the reason for a failure, empty without one. differences: errors of the topology, described; tips are
     not compared then. tip_bound: errors expected from the sensors' noise alone (Cramer-Rao, by the curvature
     of the fit at its residual noise). identify_s: processor time from the recording to the chain.
+    clock_error_s: root mean square, over modules and times, of the differences between the modules' mapped
+    clocks; clock_sigma_s: as claimed.
     """
 
-    robot: str
+    network: str
     mode: Mode
     seed: int
     joints: int
@@ -86,10 +88,17 @@ class ArmTrial(NamedTuple):
     tip_bound: TipErrors | None = None
     robot_time_s: float = 0.0
     identify_s: float = 0.0
+    clock_error_s: float | None = None
+    clock_sigma_s: float | None = None
+
+    @property
+    def right(self) -> bool:
+        """Whether the session came to its end, and the topology is that of the robot."""
+        return not self.why and not self.differences
 
 
 def arm_trial(
-    robot: str | Robot,
+    robot: str,
     noise: str | NoiseProfile,
     seed: int,
     mode: Mode = "joint",
@@ -99,28 +108,30 @@ def arm_trial(
     """Run, identify and score one robot, in virtual time and without dynamics.
 
     Args:
-        robot: a shipped robot, a robot file, or a robot.
+        robot: a shipped robot or a robot file.
         noise: its profile; the IMUs count as calibrated where it has no errors of scale and misalignment.
         seed: of the modules, their noise, the network, and the site.
         mode: one joint after the other, or all at once.
         network: a network profile or file.
         plan: motions; those of the mode when None.
     """
-    described = at_random_site(robot if isinstance(robot, Robot) else load_robot(robot), seed)
+    described = at_random_site(load_robot(robot), seed)
     profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise)
-    planned = plan or arm_plan(mode, imu_kind(profile))
     settings = VirtualSettings(described, named_network(network), seed, profile)
-    joints = len(described.modules)
+    begun = ArmTrial(network, mode, seed, len(described.modules), "")
+    clocks: dict[str, ModuleClock] = {}
+
+    def keep_clocks(simulated: VirtualRobot) -> None:
+        clocks.update(zip(simulated.serials, simulated.world.sensors.clocks, strict=True))
+
     try:
-        recording = record_session(settings, planned)
+        recording = record_session(settings, plan or arm_plan(mode, imu_kind(profile)), keep_clocks)
         start_s = time.process_time()
         kinematics = identify_kinematics(recording)
-        spent_s = time.process_time() - start_s
+        begun = begun._replace(identify_s=time.process_time() - start_s)
     except RobotError as error:
-        return ArmTrial(described.name, mode, seed, joints, str(error))
-    return _scored(
-        ArmTrial(described.name, mode, seed, joints, ""), described, recording, kinematics, spent_s
-    )
+        return begun._replace(why=str(error))
+    return _scored(begun, true_chain(described), recording, kinematics, clocks)
 
 
 def arm_plan(mode: Mode, imu: ImuKind, motions: Motions | None = None) -> Plan:
@@ -130,20 +141,24 @@ def arm_plan(mode: Mode, imu: ImuKind, motions: Motions | None = None) -> Plan:
 
 
 def _scored(
-    begun: ArmTrial, robot: Robot, recording: Recording, kinematics: Kinematics, spent_s: float
+    begun: ArmTrial,
+    truth: Chain,
+    recording: Recording,
+    kinematics: Kinematics,
+    clocks: Mapping[str, ModuleClock],
 ) -> ArmTrial:
-    truth = true_chain(robot)
     fit, first = kinematics.fit, thesis_chain(recording, kinematics.topology)
     differences = topology_differences(fit.chain, truth)
-    times = [event.t_ns for event in recording.journal]
+    time_s = float(np.ptp([event.t_ns for event in recording.journal])) * 1e-9
     return begun._replace(
         differences=tuple(differences),
         links=_links(truth, kinematics, None if first is None else first.chain),
         tip=None if differences else _tip(fit.chain, truth, fit.null_basis),
         thesis_tip=None if differences or first is None else _tip(first.chain, truth, first.null_basis),
         tip_bound=expected_tip(fit.chain, kinematics.refinement.noise_covariance, begun.seed),
-        robot_time_s=float(np.ptp(times)) * 1e-9,
-        identify_s=spent_s,
+        robot_time_s=time_s,
+        clock_error_s=clock_error_s(kinematics.clocks, clocks, time_s),
+        clock_sigma_s=rms([1e-9 * clock.sigma_ns for clock in kinematics.clocks.values()]),
     )
 
 
@@ -164,41 +179,47 @@ def expected_tip(chain: Chain, covariance: Array, seed: int) -> TipErrors:
     return TipErrors(float(np.sqrt(squares[0])), float(np.degrees(np.sqrt(squares[1]))))
 
 
+def clock_error_s(estimated: Mapping[str, ClockMap], true: Mapping[str, ModuleClock], end_s: float) -> float:
+    """Return the root mean square, over modules and times, of differences between mapped clocks.
+
+    The same instants of all modules are mapped, spread from the world's start to `end_s`.
+    """
+    instants = [round(1e9 * t) for t in np.linspace(0.0, end_s, INSTANTS)]
+    mapped = np.stack(
+        [
+            clock.to_session(np.array([module_time(true[s], t) for t in instants], dtype=np.int64))
+            for s, clock in estimated.items()
+        ],
+        axis=1,
+    )
+    # Whole nanoseconds of years do not fit a float: differences first.
+    relative = (mapped - mapped[:, :1]).astype(np.float64)
+    return float(np.sqrt(np.mean(np.square(1e-9 * (relative - relative.mean(axis=1, keepdims=True))))))
+
+
 def _links(truth: Chain, kinematics: Kinematics, thesis: Chain | None) -> tuple[ArmLink, ...]:
     fit = kinematics.fit
     _, bounds = link_lengths(fit.chain, kinematics.refinement.noise_covariance)
-    found = []
+    links = []
     for child, parent in enumerate(truth.parent):
         if parent < 0:
             continue
-        ours = link_errors(fit.chain, truth, child)
-        theirs = None if thesis is None else link_errors(thesis, truth, child)
+        ours, sigma_m, bound_m = link_errors(fit.chain, truth, child), None, None
         # A link that was not identified is not in our chain either.
-        own = fit.chain.serials.index(truth.serials[child]) if ours is not None else None
-        found.append(
-            ArmLink(
-                parent=truth.serials[parent],
-                child=truth.serials[child],
-                true_m=link_length_m(truth, child),
-                error_m=None if ours is None else ours.length_m,
-                sigma_m=None if own is None else float(fit.link_length_sigma_m[own]),
-                bound_m=None if own is None else float(bounds[own]),
-                vector_error_m=None if ours is None else ours.vector_m,
-                axis_error_deg=None if ours is None else ours.axis_deg,
-                thesis_error_m=None if theirs is None else theirs.length_m,
-                thesis_axis_error_deg=None if theirs is None else theirs.axis_deg,
-            )
-        )
-    return tuple(found)
+        if ours is not None:
+            own = fit.chain.serials.index(truth.serials[child])
+            sigma_m, bound_m = float(fit.link_length_sigma_m[own]), float(bounds[own])
+        theirs = None if thesis is None else link_errors(thesis, truth, child)
+        links.append(ArmLink(ours, theirs, sigma_m, bound_m))
+    return tuple(links)
 
 
 ARMS = ("a2085_04", "a2085_06", "arm7")
 WHOLE_ARM = COST_ARM = "a2085_06"
 PROFILES = ("x5", "x5-uncalibrated")
 TIP_MM = {"x5": 1.0, "x5-uncalibrated": 4.0}
-# Where the IMU's own axes are only known to a degree, no tip's orientation is known better.
-TIP_DEG = {"x5": 0.1, "x5-uncalibrated": None}
-AXIS_DEG = {"x5": 0.1, "x5-uncalibrated": None}
+# Where the IMU's own axes are only known to a degree, no axis and no tip's orientation is known better.
+ANGLE_DEG = {"x5": 0.1, "x5-uncalibrated": None}
 JOINT_TIME_S, THESIS_JOINT_TIME_S = 10.0, 18.0
 WHOLE_TIME_S = 20.0
 REFINEMENT_S = 5.0
@@ -228,119 +249,81 @@ def arm_cases(trials: int, seed: int, shortened: bool = False, motions: Motions 
     cases = []
     for number, (arm, noise) in enumerate(joints):
         short = shortened and number > 0
-        plan = arm_plan("joint", _imu(noise), motions)
+        plan = arm_plan("joint", imu_kind(noise_profile(noise)), motions)
         own = plan.model_copy(update=SHORTENED) if short else plan
         cases.append(_case(arm, noise, own, trials, seed, short))
-    whole = [
-        _case(WHOLE_ARM, noise, arm_plan("simultaneous", _imu(noise)), trials, seed) for noise in PROFILES
-    ]
-    return cases + whole
-
-
-def _imu(noise: str) -> ImuKind:
-    return imu_kind(noise_profile(noise))
+    for noise in PROFILES:
+        plan = arm_plan("simultaneous", imu_kind(noise_profile(noise)))
+        cases.append(_case(WHOLE_ARM, noise, plan, trials, seed))
+    return cases
 
 
 def _case(arm: str, noise: str, plan: Plan, trials: int, seed: int, shortened: bool = False) -> Case:
-    mode = plan.mode
-    how = "joint by joint" if mode == "joint" else "all joints at once"
-    cost_s = _COST_S[arm] if mode == "joint" else _WHOLE_COST_S
+    by_joint = plan.mode == "joint"
+    cost_s = (0.5 if shortened else 1.0) * (_COST_S[arm] if by_joint else _WHOLE_COST_S)
     # The same modules in both profiles and both modes.
-    work = tuple(
-        Trial(
-            arm_trial,
-            (arm, noise, trial_seed(seed, arm, number), mode, "lan", plan),
-            0.5 * cost_s if shortened else cost_s,
-        )
-        for number in range(trials)
-    )
-    name = f"{arm}, {noise}, {how}"
-    return Case(name, work, partial(_summary, name, noise, mode, shortened))
-
-
-def _summary(case: str, noise: str, mode: Mode, shortened: bool, trials: Sequence[ArmTrial]) -> Summary:
-    """Return the rows of an arm; a trial that failed, or has another topology, is counted as wrong."""
-    rows = [
-        _wrong(case, trials),
-        *_tip_rows(case, noise, trials),
-        *_link_rows(case, noise, trials),
-        *_time_rows(case, mode, shortened, trials),
+    work = [
+        Trial(arm_trial, (arm, noise, own, plan.mode, "lan", plan), cost_s)
+        for own in trial_seeds(seed, arm, trials)
     ]
-    if mode == "joint" and case.startswith(COST_ARM):
-        spent = [t.identify_s for t in trials if not t.why]
-        figure = "refinement and all before it, median [s of a core]"
-        rows.append(Row(case, figure, None, median(spent) if spent else None, None, REFINEMENT_S))
-    return Summary(tuple(rows), sigmas_off(trials))
+    name = f"{arm}, {noise}, {'joint by joint' if by_joint else 'all joints at once'}"
+    return Case(name, work, partial(_summary, arm, noise, plan.mode, shortened))
 
 
-def sigmas_off(trials: Sequence[ArmTrial]) -> tuple[float, ...]:
-    """Return |error| / sigma of every link's length that was claimed."""
-    links = [link for trial in trials for link in trial.links]
-    return tuple(
-        abs(link.error_m) / link.sigma_m for link in links if link.error_m is not None and link.sigma_m
-    )
-
-
-def _wrong(case: str, trials: Sequence[ArmTrial]) -> Row:
-    return count(
-        case, "runs without the right topology", [bool(trial.why or trial.differences) for trial in trials]
-    )
-
-
-def _tip_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, Row]:
-    thesis, ours, bound = (
-        [tip for tip in tips if tip is not None]
-        for tips in (
-            [trial.thesis_tip for trial in trials],
-            [trial.tip for trial in trials],
-            [trial.tip_bound for trial in trials],
-        )
-    )
-
-    def row(figure: str, of: Callable[[TipErrors], float], limit: float | None) -> Row:
-        values = [rms([of(tip) for tip in tips]) for tips in (thesis, ours, bound)]
-        return Row(case, figure, values[0], values[1], values[2], for_few(limit, len(trials)))
-
-    return (
-        row("tip position, rms [mm]", lambda tip: 1e3 * tip.position_m, TIP_MM[noise]),
-        row("tip orientation, rms [deg]", lambda tip: tip.orientation_deg, TIP_DEG[noise]),
-    )
-
-
-def _link_rows(case: str, noise: str, trials: Sequence[ArmTrial]) -> tuple[Row, Row, Row]:
-    links = [link for trial in trials for link in trial.links]
-    thesis_mm = scaled(mean_abs([link.thesis_error_m for link in links]), 1e3)
-    ours_mm = scaled(mean_abs([link.error_m for link in links]), 1e3)
-    # The mean size of a Gaussian error is sqrt(2 / pi) of its standard deviation.
-    bound_mm = scaled(rms([link.bound_m for link in links]), 1e3 * 0.7979)
-    vector_mm = scaled(mean_abs([link.vector_error_m for link in links]), 1e3)
-    return (
-        Row(case, "link length, mean |error| [mm]", thesis_mm, ours_mm, bound_mm),
-        Row(case, "link vector, mean |error| [mm]", None, vector_mm),
-        Row(
-            case,
-            "axis, largest error [deg]",
-            largest([link.thesis_axis_error_deg for link in links]),
-            largest([link.axis_error_deg for link in links]),
-            limit=AXIS_DEG[noise],
-        ),
-    )
-
-
-def _time_rows(case: str, mode: Mode, shortened: bool, trials: Sequence[ArmTrial]) -> tuple[Row, ...]:
-    """Return the robot time; shortened motions have no bar."""
+def _summary(arm: str, noise: str, mode: Mode, shortened: bool, trials: Sequence[ArmTrial]) -> Summary:
+    """Return the rows of an arm; a trial that failed, or has another topology, is counted as wrong."""
     done = [trial for trial in trials if not trial.why]
+    rows = [wrong_row(trials), *_tip_rows(noise, trials), *_link_rows(noise, trials)]
     if mode == "simultaneous":
         spent = largest([trial.robot_time_s for trial in done])
-        return (Row(case, "robot time in all, longest [s]", None, spent, None, WHOLE_TIME_S),)
-    each = largest([trial.robot_time_s / trial.joints for trial in done])
-    return (
-        Row(
-            case,
-            "robot time a joint, longest [s]",
-            THESIS_JOINT_TIME_S,
-            each,
-            None,
-            None if shortened else JOINT_TIME_S,
-        ),
-    )
+        rows.append(Row("robot time in all, longest [s]", spent, WHOLE_TIME_S))
+    else:
+        each = largest([trial.robot_time_s / trial.joints for trial in done])
+        # Shortened motions have no bar.
+        limit = None if shortened else JOINT_TIME_S
+        rows.append(Row("robot time a joint, longest [s]", each, limit, THESIS_JOINT_TIME_S))
+    if mode == "joint" and arm == COST_ARM:
+        took = median([trial.identify_s for trial in done]) if done else None
+        rows.append(Row("refinement and all before it, median [s of a core]", took, REFINEMENT_S))
+    return Summary(rows, sigmas_off(trials))
+
+
+def sigmas_off(trials: Sequence[ArmTrial]) -> list[float]:
+    """Return |error| / sigma of every link's length that was claimed."""
+    links = [link for trial in trials for link in trial.links]
+    return [abs(link.error_m) / link.sigma_m for link in links if link.error_m is not None and link.sigma_m]
+
+
+def wrong_row(trials: Sequence[ArmTrial]) -> Row:
+    """Return the row of trials that failed or have another topology."""
+    return count("runs without the right topology", [not trial.right for trial in trials])
+
+
+def _tip_rows(noise: str, trials: Sequence[ArmTrial]) -> list[Row]:
+    rows = []
+    for figure, k, factor, limit in (
+        ("tip position, rms [mm]", 0, 1e3, TIP_MM[noise]),
+        ("tip orientation, rms [deg]", 1, 1.0, ANGLE_DEG[noise]),
+    ):
+        ours, thesis, bound = (
+            rms([factor * tip[k] for trial in trials if (tip := getattr(trial, name)) is not None])
+            for name in ("tip", "thesis_tip", "tip_bound")
+        )
+        rows.append(Row(figure, ours, for_few(limit, len(trials)), thesis, bound))
+    return rows
+
+
+def _link_rows(noise: str, trials: Sequence[ArmTrial]) -> list[Row]:
+    links = [link for trial in trials for link in trial.links]
+    ours = [link.ours for link in links if link.ours is not None]
+    thesis = [link.thesis for link in links if link.thesis is not None]
+    length_mm, thesis_mm = (scaled(mean_abs([link.length_m for link in own]), 1e3) for own in (ours, thesis))
+    # The mean size of a Gaussian error is sqrt(2 / pi) of its standard deviation.
+    bound_mm = scaled(rms([link.bound_m for link in links]), 1e3 * 0.7979)
+    axis_deg, thesis_deg = (largest([link.axis_deg for link in own]) for own in (ours, thesis))
+    vector_mm = scaled(mean_abs([link.vector_m for link in ours]), 1e3)
+    return [
+        Row("link length, mean |error| [mm]", length_mm, None, thesis_mm, bound_mm),
+        Row("link vector, mean |error| [mm]", vector_mm),
+        Row("axis, largest error [deg]", axis_deg, ANGLE_DEG[noise], thesis_deg),
+    ]

@@ -5,28 +5,25 @@ external force at the tip.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.excitation.plan import Plan
-from coordinator.identification.identify import identify
-from coordinator.torque_control.gravity_model import GravityModel, gravity_model_of_result
+from coordinator.torque_control.gravity_model import GravityModel
 from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
 from coordinator.torque_control.summary import CompensationSummary
 from module_agent.model.chain import Array, Chain
 from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.read_only import read_only
 from module_agent.network_emulation.profile_file import network
-from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.case import Case, Summary, Trial, trial_seeds
 from sim.benchmark.row import Row, largest, ratio
-from sim.imperfections.noise_profile import NoiseProfile, imu_kind
+from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import at_random_site
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings, virtual_robot
-from sim.virtual_time.session import record_session
+from sim.virtual_time.run import SilentScreen
 from sim.world.external_force import Push
 
 COORDINATOR = "coordinator"
@@ -131,14 +128,10 @@ def compensation_trial(
 def _growing(serial: str, max_n: float) -> list[Push]:
     """Return a force on a module's output, upwards, that grows from nothing in small steps."""
     steps = round(GROWING_S / STEP_S)
+    forces_n = [(0.0, 0.0, max_n * (k + 1) / steps) for k in range(steps)]
     return [
-        Push(
-            serial=serial,
-            force_n=(0.0, 0.0, max_n * (k + 1) / steps),
-            from_s=FREE_S + k * STEP_S,
-            for_s=STEP_S,
-        )
-        for k in range(steps)
+        Push(serial=serial, force_n=force_n, from_s=FREE_S + k * STEP_S, for_s=STEP_S)
+        for k, force_n in enumerate(forces_n)
     ]
 
 
@@ -161,19 +154,6 @@ def true_weight(robot: Robot) -> GravityModel:
     """Return the true gravity model of a simulated robot, in place of an identified one."""
     types = tuple(module.type for module in robot.modules)
     return GravityModel(robot.name, types, true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
-
-
-def identified_weight(robot: Robot, noise: NoiseProfile, seed: int, plan: Plan | None = None) -> GravityModel:
-    """Return the gravity model of a robot that a whole session identifies.
-
-    Raises:
-        what `record_session` and `identify` raise.
-        ValueError: the plan leaves out the dynamics.
-    """
-    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
-    return gravity_model_of_result(
-        identify(record_session(settings, plan or Plan(imu=imu_kind(noise)))).result
-    )
 
 
 def posed(robot: Robot, start_rad: Mapping[str, float]) -> Robot:
@@ -200,39 +180,27 @@ def compensate_robot(
     """
     settings = VirtualSettings(robot, network(network_name), seed, noise, noise_seed=1, pushes=tuple(pushes))
     with virtual_robot(settings) as virtual:
-        observer = _TruthAtSetPoints(virtual)
+        observer, loop = _TruthAtSetPoints(virtual), virtual.loop
+        endpoint, name = virtual.endpoint(COORDINATOR), robot.name
         session = CompensationSession(
-            virtual.endpoint(COORDINATOR),
-            robot.name,
-            weight,
-            plan,
-            lambda: virtual.loop.now_ns,
-            virtual.loop.call_soon,
-            observer,
-            COORDINATOR,
+            endpoint, name, weight, plan, lambda: loop.now_ns, loop.call_soon, observer, COORDINATOR
         )
         summary = virtual.complete(session.run())
-    return CompensationRun(summary, tuple(observer.phases), np.array(observer.t_s), np.array(observer.q_rad))
+    phases, t_s, q_rad = zip(*observer.rows, strict=True)
+    return CompensationRun(summary, phases, np.array(t_s), np.array(q_rad))
 
 
-class _TruthAtSetPoints:
-    """Records the true joint positions at every set-point."""
+class _TruthAtSetPoints(SilentScreen):
+    """Records phase, world time and true joint positions at every set-point."""
 
     def __init__(self, virtual: VirtualRobot):
         self._virtual = virtual
-        self.phases: list[str] = []
-        self.t_s: list[float] = []
-        self.q_rad: list[Array] = []
-
-    def note(self, text: str) -> None:
-        """Ignore a note."""
+        self.rows: list[tuple[str, float, Array]] = []
 
     def moment(self, now: Moment) -> None:
         """Record one set-point."""
         plant = self._virtual.world.plant
-        self.phases.append(now.phase)
-        self.t_s.append(1e-9 * plant.t_ns)
-        self.q_rad.append(plant.q_rad)
+        self.rows.append((now.phase, 1e-9 * plant.t_ns, plant.q_rad))
 
 
 ROBOT = "a2085_04"
@@ -246,11 +214,9 @@ _COST_S, _QUICK_COST_S = 10.0, 5.0
 
 def compensation_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return the one case; `shortened`: of one pose, and for some seconds."""
-    name = f"{ROBOT}, x5, gravity compensation, true model"
     cost_s = _QUICK_COST_S if shortened else _COST_S
-    seeds = [trial_seed(seed, _SEED_NAME, number) for number in range(trials)]
-    work = tuple(Trial(compensated, (own, shortened), cost_s) for own in seeds)
-    return [Case(name, work, partial(_summary, name))]
+    work = [Trial(compensated, (own, shortened), cost_s) for own in trial_seeds(seed, _SEED_NAME, trials)]
+    return [Case(f"{ROBOT}, x5, gravity compensation, true model", work, _summary)]
 
 
 def compensated(seed: int, shortened: bool) -> CompensationTrial:
@@ -260,15 +226,13 @@ def compensated(seed: int, shortened: bool) -> CompensationTrial:
     return compensation_trial(seed, robot, true_weight(robot), "x5", drift_s, poses)
 
 
-def _summary(case: str, trials: Sequence[CompensationTrial]) -> Summary:
-    alone = largest([trial.drift_deg for trial in trials])
-    after = largest([trial.rest_deg for trial in trials])
-    guiding = largest([trial.guiding_n for trial in trials])
+def _summary(trials: Sequence[CompensationTrial]) -> Summary:
     light = largest([ratio(trial.guiding_n, trial.held_n) for trial in trials])
-    rows = (
-        Row(case, "drift without a hand, largest [deg]", None, alone, None, DRIFT_DEG),
-        Row(case, "force that guides the tip, largest [N]", None, guiding),
-        Row(case, "the same over that of an arm held in position", None, light, None, LIGHT),
-        Row(case, "drift after guiding [deg]", None, after, None, DRIFT_DEG),
+    return Summary(
+        [
+            Row("drift without a hand, largest [deg]", largest([t.drift_deg for t in trials]), DRIFT_DEG),
+            Row("force that guides the tip, largest [N]", largest([t.guiding_n for t in trials])),
+            Row("the same over that of an arm held in position", light, LIGHT),
+            Row("drift after guiding [deg]", largest([t.rest_deg for t in trials]), DRIFT_DEG),
+        ]
     )
-    return Summary(rows)

@@ -16,7 +16,7 @@ from scipy.stats import binom, norm
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale, parameter_transform
 from coordinator.excitation.plan import Plan
-from coordinator.identification.identified import Identified
+from coordinator.identification.identified import Identified, Kinematics
 from coordinator.identification.identify import base_floor, identify
 from coordinator.identification.inertia.body_motion import MotionSource
 from coordinator.identification.inertia.body_motion import Robot as MeasuredRobot
@@ -30,15 +30,15 @@ from module_agent.model.errors import RobotError
 from module_agent.model.information import gather
 from module_agent.model.regressor import inverse_dynamics, torque_regressor
 from module_agent.network_emulation.profile_file import network
-from module_agent.signals.filtering import JointMotion, resample
-from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.case import Case, Summary, Trial, trial_seeds
 from sim.benchmark.cases.arm import SHORTENED
-from sim.benchmark.row import Row, count, highest, largest, scaled
+from sim.benchmark.row import Row, count, largest, scaled
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile, switched
-from sim.robot.robot_file import load_robot
+from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import at_random_site
-from sim.virtual_time.robot import VirtualRobot, VirtualSettings
+from sim.scoring.score import true_torque
+from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 from sim.world.truth import Motion
 
@@ -84,18 +84,13 @@ class InertiaTrial(NamedTuple):
     identify_s: float = 0.0
 
 
-class _Recorded(NamedTuple):
-    recording: Recording
-    truth: Motion
-
-
 def rigid_profile() -> NoiseProfile:
     """Return the x5 profile of a rigid robot without friction."""
     return switched(noise_profile("x5"), off=NON_RIGID)
 
 
 def inertia_trial(
-    robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, poses: int, label: str = ""
+    robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, poses: int, label: str
 ) -> InertiaTrial:
     """Identify a robot at a random site and compare its inertia with the truth.
 
@@ -107,45 +102,43 @@ def inertia_trial(
         poses: number of random poses in which the mass matrix is checked.
     """
     described = at_random_site(load_robot(robot), seed)
-    name = label or (noise if isinstance(noise, str) else noise.name)
-    trial = InertiaTrial(robot, name, seed, "")
+    trial = InertiaTrial(robot, label, seed, "")
     settings = VirtualSettings(described, network("lan"), seed, noise)
     motions: list[Motion] = []
-
-    def keep(simulated: VirtualRobot) -> None:
-        motions.append(simulated.truth.motion())
-
     try:
-        recording = record_session(settings, plan, keep)
+        recording = record_session(settings, plan, lambda robot: motions.append(robot.truth.motion()))
         start_s = time.process_time()
         identified = identify(recording)
-        spent_s = time.process_time() - start_s
-        recorded = _Recorded(recording, motions[0])
-        chain, phi = true_chain(described), true_inertia(described)
-        return _compared(trial, identified, recorded, chain, phi, poses)._replace(identify_s=spent_s)
+        trial = trial._replace(identify_s=time.process_time() - start_s)
+        return _compared(trial, identified, recording, described, motions[0], poses)
     except RobotError as error:
         return trial._replace(why=str(error))
 
 
 def _compared(
-    trial: InertiaTrial, found: Identified, recorded: _Recorded, chain: Chain, phi: Array, poses: int
+    trial: InertiaTrial, found: Identified, recording: Recording, robot: Robot, truth: Motion, poses: int
 ) -> InertiaTrial:
     kinematics, inertia, bodies = found.kinematics, found.inertia, found.bodies
-    serials = kinematics.topology.serials
+    serials, chain = kinematics.topology.serials, true_chain(robot)
     if inertia is None or bodies is None or serials != chain.serials:
         return trial._replace(why=f"no inertia was identified of {', '.join(chain.serials)}")
     base = bodies.base
     into = block_diag(*(parameter_transform(np.linalg.inv(frame)) for frame in joint_frames(chain)))
-    true = base.grouping @ (into @ phi.ravel())
+    true = base.grouping @ (into @ true_inertia(robot).ravel())
     known = base.relative_sigma < KNOWN_BELOW
     size = np.abs(true) / base.columns.scale[base.independent]
     largest = [i for i in np.argsort(-size) if known[i]][:LARGEST]
-    motion = dynamic_motion(recorded.recording, kinematics.clocks, serials, "held_out")
-    torque = _true_torque(motion, found, recorded.truth)
-    joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
-    estimated = kinematics.fit.chain
-    seen = inertia.instrumental
-    real = bodies.fit.phi if bodies.fit is not None else np.full_like(seen.fit.phi, np.nan)
+    motion = dynamic_motion(recording, kinematics.clocks, serials, "held_out")
+    times = [kinematics.clocks[serial].to_module(motion.t_ns) for serial in serials]
+    columns = [true_torque(truth, s, t, "the true motion") for s, t in zip(serials, times, strict=True)]
+    torque = np.column_stack(columns)
+
+    def error(chain: Chain, phi: Array) -> float:
+        predicted = inverse_dynamics(chain, phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+        return float(np.linalg.norm(predicted - torque) / np.linalg.norm(torque))
+
+    estimated, phi = kinematics.fit.chain, inertia.instrumental.fit.phi
+    real = bodies.fit.phi if bodies.fit is not None else np.full_like(phi, np.nan)
     return trial._replace(
         rank=base.rank,
         max_rank=_max_rank(chain),
@@ -153,10 +146,10 @@ def _compared(
         sigmas_off=tuple((np.abs(base.value - true) / base.sigma)[known].tolist()),
         largest=tuple((np.abs(base.value - true) / np.abs(true))[largest].tolist()),
         largest_sigma=tuple(base.relative_sigma[largest].tolist()),
-        held_out=_relative(inverse_dynamics(estimated, seen.fit.phi, *joints), torque),
-        with_true_chain=_relative(_by_true_chain(found, recorded, chain, joints), torque),
-        thesis=_relative(_thesis(found, recorded, joints), torque),
-        bodies=_relative(inverse_dynamics(estimated, real, *joints), torque),
+        held_out=error(estimated, phi),
+        with_true_chain=error(chain, _by_true_chain(kinematics, recording, chain)),
+        thesis=error(estimated, _thesis(kinematics, recording)),
+        bodies=error(estimated, real),
         poses=poses,
         not_definite=_not_definite(estimated, real, poses, trial.seed),
         motion_source=inertia.motion_source,
@@ -165,21 +158,8 @@ def _compared(
     )
 
 
-def _true_torque(motion: JointMotion, found: Identified, truth: Motion) -> Array:
-    """Return the springs' true torques (m, n) at the instants of a motion."""
-    columns = []
-    for serial in found.kinematics.topology.serials:
-        k = truth.serials.index(serial)
-        times = found.kinematics.clocks[serial].to_module(motion.t_ns)
-        columns.append(resample([truth.clock_ns[:, k]], [truth.spring_torque_nm[:, k]], times))
-    return np.hstack(columns)
-
-
-def _by_true_chain(
-    found: Identified, recorded: _Recorded, chain: Chain, joints: tuple[Array, Array, Array]
-) -> Array:
-    """Return the torques predicted by inertia that was identified with the true chain."""
-    kinematics, recording = found.kinematics, recorded.recording
+def _by_true_chain(kinematics: Kinematics, recording: Recording, chain: Chain) -> Array:
+    """Return the inertial parameters (10 n,) that are identified with the true chain."""
     serials = kinematics.topology.serials
     robot = MeasuredRobot(
         chain,
@@ -189,17 +169,15 @@ def _by_true_chain(
         base_floor(recording, kinematics.clocks, kinematics.topology),
         recording.torque,
     )
-    inertia = find_inertia(robot, dynamic_windows(recording, kinematics.clocks, serials, "dynamic"))
-    return inverse_dynamics(chain, inertia.instrumental.fit.phi, *joints)
+    windows = dynamic_windows(recording, kinematics.clocks, serials, "dynamic")
+    return find_inertia(robot, windows).instrumental.fit.phi
 
 
-def _thesis(found: Identified, recorded: _Recorded, joints: tuple[Array, Array, Array]) -> Array:
-    kinematics = found.kinematics
-    motion = dynamic_motion(recorded.recording, kinematics.clocks, kinematics.topology.serials, "dynamic")
+def _thesis(kinematics: Kinematics, recording: Recording) -> Array:
+    motion = dynamic_motion(recording, kinematics.clocks, kinematics.topology.serials, "dynamic")
     chain = kinematics.fit.chain
     information = gather(chain, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2, motion.tau_nm)
-    fit = solve_information(information, independent_fraction=INDEPENDENT_FRACTION)
-    return inverse_dynamics(chain, fit.phi, *joints)
+    return solve_information(information, independent_fraction=INDEPENDENT_FRACTION).phi
 
 
 def _max_rank(chain: Chain) -> int:
@@ -224,10 +202,6 @@ def _not_definite(chain: Chain, phi: Array, poses: int, seed: int) -> int:
     matrices = np.stack(columns, axis=2)
     smallest = np.linalg.eigvalsh(0.5 * (matrices + matrices.transpose(0, 2, 1)))[:, 0]
     return int(np.count_nonzero(smallest <= 0.0))
-
-
-def _relative(predicted: Array, true: Array) -> float:
-    return float(np.linalg.norm(predicted - true) / np.linalg.norm(true))
 
 
 ARMS = ("a2085_04", "a2085_06")
@@ -256,88 +230,68 @@ def inertia_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]
     profiles = {"rigid": rigid_profile(), "x5": "x5"}
     cases = []
     for arm in ARMS:
+        cost_s = (0.5 if shortened else 1.0) * _COST_S[arm]
         for label, noise in profiles.items():
-            work = tuple(
-                Trial(
-                    inertia_trial,
-                    (arm, noise, trial_seed(seed, arm, number), plan, poses, label),
-                    0.5 * _COST_S[arm] if shortened else _COST_S[arm],
-                )
-                for number in range(trials)
-            )
-            name = f"{arm}, {label}, inertia"
-            cases.append(Case(name, work, partial(_summary, name, label)))
+            work = [
+                Trial(inertia_trial, (arm, noise, own, plan, poses, label), cost_s)
+                for own in trial_seeds(seed, arm, trials)
+            ]
+            cases.append(Case(f"{arm}, {label}, inertia", work, partial(_summary, label)))
     return cases
 
 
-def _summary(case: str, label: str, trials: Sequence[InertiaTrial]) -> Summary:
+def _summary(label: str, trials: Sequence[InertiaTrial]) -> Summary:
     done = [trial for trial in trials if not trial.why]
-    off = tuple(value for trial in done for value in trial.sigmas_off)
+    off = [value for trial in done for value in trial.sigmas_off]
+    definite = [k < trial.not_definite for trial in done for k in range(trial.poses)]
+    gain = median([trial.gain for trial in done]) if done else None
     rows = [
-        count(case, "runs without inertia", [bool(trial.why) for trial in trials]),
-        count(case, "runs with fewer parameters than there are", [t.rank < t.max_rank for t in done]),
-        *_sigma_rows(case, off),
-        *_largest_rows(case, done),
-        *_torque_rows(case, label, done),
-        count(case, "poses with a mass matrix that is not definite", _poses(done)),
-        Row(case, "noise left in torques, encoders over IMUs", None, _median([t.gain for t in done])),
+        count("runs without inertia", [bool(trial.why) for trial in trials]),
+        count("runs with fewer parameters than there are", [t.rank < t.max_rank for t in done]),
+        *_sigma_rows(off),
+        *_largest_rows(done),
+        *_torque_rows(label, done),
+        count("poses with a mass matrix that is not definite", definite),
+        Row("noise left in torques, encoders over IMUs", gain),
     ]
-    return Summary(tuple(rows), off)
+    return Summary(rows, off)
 
 
-def _sigma_rows(case: str, off: Sequence[float]) -> list[Row]:
+def _sigma_rows(off: Sequence[float]) -> list[Row]:
     """Return how many errors are beyond three sigmas; as many may be as of normal ones in 99 of 100 cases."""
-    beyond = float(sum(abs(value) > SIGMAS for value in off))
-    limit = float(binom.isf(0.01, len(off), 2.0 * norm.sf(SIGMAS))) if off else None
+    beyond = float(sum(abs(value) > SIGMAS for value in off)) if off else None
+    limit = float(binom.isf(0.01, len(off), 2.0 * norm.sf(SIGMAS))) if off else 0.0
     figure = f"base parameters known to 10 %, beyond {SIGMAS:.0f} sigma, of {len(off)}"
-    return [
-        Row(case, figure, None, beyond if off else None, None, limit if off else 0.0),
-        Row(case, "the same: worst error [sigma]", None, largest(off)),
-    ]
+    return [Row(figure, beyond, limit), Row("the same: worst error [sigma]", largest(off))]
 
 
-def _largest_rows(case: str, done: Sequence[InertiaTrial]) -> list[Row]:
+def _largest_rows(done: Sequence[InertiaTrial]) -> list[Row]:
     """Return the errors of the largest ten: of those that noise allows to be known so well, and of all.
 
     Three standard deviations within the bar: of the others chance decides whether they keep it.
     """
     pairs = [pair for trial in done for pair in zip(trial.largest, trial.largest_sigma, strict=True)]
     allowed = [(error, sigma) for error, sigma in pairs if 3.0 * sigma < 0.01 * LARGEST_PERCENT]
-    told = f"largest {LARGEST} that are known: noise tells to 1 %, share [%]"
-    rows = [Row(case, told, None, 100.0 * len(allowed) / len(pairs) if pairs else None)]
+    figure = f"largest {LARGEST} that are known: noise tells to 1 %, share [%]"
+    rows = [Row(figure, 100.0 * len(allowed) / len(pairs) if pairs else None)]
     for what, chosen, limit in (
         ("largest ten, of those noise tells to 1 %", allowed, LARGEST_PERCENT),
         ("largest ten that are known", pairs, None),
     ):
         worst, claimed = (scaled(largest([pair[k] for pair in chosen]), 100.0) for k in range(2))
-        rows.append(Row(case, f"{what}: worst error [%]", None, worst, claimed, limit))
+        rows.append(Row(f"{what}: worst error [%]", worst, limit, bound=claimed))
     return rows
 
 
-def _torque_rows(case: str, label: str, done: Sequence[InertiaTrial]) -> list[Row]:
-    percent = {
-        name: [100.0 * getattr(trial, name) for trial in done]
-        for name in ("held_out", "with_true_chain", "thesis", "bodies")
-    }
+def _torque_rows(label: str, done: Sequence[InertiaTrial]) -> list[Row]:
+    ours, with_truth, thesis = (
+        largest([100.0 * getattr(trial, name) for trial in done])
+        for name in ("held_out", "with_true_chain", "thesis")
+    )
     ratios = [trial.held_out / trial.with_true_chain for trial in done]
     worse = [100.0 * (trial.bodies - trial.held_out) for trial in done]
     return [
-        Row(
-            case,
-            "held-out torque, worst [%]",
-            largest(percent["thesis"]),
-            largest(percent["held_out"]),
-            largest(percent["with_true_chain"]),
-            HELD_OUT_PERCENT[label],
-        ),
-        Row(case, "the same over that with the true chain", None, highest(ratios), None, TRUE_CHAIN_RATIO),
-        Row(case, "real bodies worse by [points]", None, highest(worse), None, BODIES_POINTS),
+        Row("held-out torque, worst [%]", ours, HELD_OUT_PERCENT[label], thesis, with_truth),
+        Row("the same over that with the true chain", max(ratios, default=None), TRUE_CHAIN_RATIO),
+        Row("real bodies worse by [points]", max(worse, default=None), BODIES_POINTS),
     ]
-
-
-def _poses(done: Sequence[InertiaTrial]) -> list[bool]:
-    return [k < trial.not_definite for trial in done for k in range(trial.poses)]
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return median(values) if values else None

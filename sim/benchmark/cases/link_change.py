@@ -5,7 +5,7 @@ and network differ.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,11 +13,10 @@ import numpy as np
 
 from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.baseline.check import check, check_plan
-from coordinator.baseline.check_report import CheckReport, LinkCheck
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identify import identify_kinematics
 from module_agent.model.chain import BASE, Array, Chain
-from module_agent.network_emulation.profile_file import network as network_named
+from module_agent.network_emulation.profile_file import network
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, count, largest, scaled
 from sim.geometry.link_parts import FreePose, Part
@@ -27,6 +26,9 @@ from sim.robot.variants import at_random_site
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
 
+ROBOT = "a2085_06"
+NOISE = "x5-uncalibrated"
+CHANGE_M = 2e-3
 # Seeds that share a robot: it is recorded once for all of them in a process.
 DAYS = 20
 PARALLEL = 0.999
@@ -35,19 +37,14 @@ PARALLEL = 0.999
 class LinkChangeTrial(NamedTuple):
     """The result of one check of a robot with one displaced link, or none.
 
-    detected: the check reported a change. located: it named exactly the displaced link.
-    size_error_m: error of the displacement's length, vector_error_m: of the displacement; None if it was not
-    located. false_alarm: it named a link that had not changed. child: the module of the displaced link.
+    located: the check reported a change, and named exactly the displaced link. size_error_m: error of the
+    displacement's length, None if it was not located. false_alarm: a link was named that had not changed.
     """
 
-    detected: bool
     located: bool
     size_error_m: float | None
     false_alarm: bool
     robot_time_s: float
-    vector_error_m: float | None
-    child: str | None
-    words: tuple[str, ...]
 
 
 class LinkChange(NamedTuple):
@@ -57,40 +54,27 @@ class LinkChange(NamedTuple):
     displacement_m: Array
 
 
-class _Subject(NamedTuple):
-    """A robot and the settings of its checks."""
-
-    robot: str
-    noise: str
-    network: str
-    seed: int
-    plan: Plan
-
-
-def link_change_trial(
-    seed: int,
-    changed: bool,
-    robot: str = "a2085_06",
-    noise: str = "x5-uncalibrated",
-    network: str = "lan",
-    change_m: float = 2e-3,
-    plan: Plan | None = None,
-) -> LinkChangeTrial:
+def link_change_trial(seed: int, changed: bool, plan: Plan | None = None) -> LinkChangeTrial:
     """Check a known robot with one link displaced, or unchanged.
 
     Args:
         seed: `DAYS` successive seeds are days of the same robot; link and direction follow from it.
         changed: whether a link is displaced.
-        robot: a shipped robot, or a robot file.
-        noise, network: profiles.
-        change_m: the displacement.
         plan: of the session that the robot is known from; its motions are those of the check.
     """
-    subject = _Subject(robot, noise, network, seed // DAYS, plan or Plan(dynamics=False))
-    change = draw_link_change(load_robot(robot), seed, change_m) if changed else None
-    known = _known(subject)
-    later = _recorded(subject, 1 + seed % DAYS, check_plan(known, Plan()), change)
-    return _trial(check(known, later), change)
+    known = _known(seed // DAYS, plan or Plan(dynamics=False))
+    change = draw_link_change(load_robot(ROBOT), seed, CHANGE_M) if changed else None
+    report = check(known, _recorded(seed // DAYS, 1 + seed % DAYS, check_plan(known, Plan()), change))
+    named = [link for link in report.links if link.changed]
+    if change is None:
+        return LinkChangeTrial(False, None, report.changed, report.robot_time_s)
+    located = report.changed and [link.child for link in named] == [change.child]
+    size_error_m = None
+    if located:
+        size_m = np.linalg.norm(1e-3 * np.array(named[0].displacement_mm))
+        size_error_m = float(abs(size_m - np.linalg.norm(change.displacement_m)))
+    wrong = any(link.child != change.child for link in named)
+    return LinkChangeTrial(located, size_error_m, wrong, report.robot_time_s)
 
 
 def with_link_change(robot: Robot, change: LinkChange) -> Robot:
@@ -138,53 +122,25 @@ def _hidden(chain: Chain, child: int) -> Array | None:
 
 
 @lru_cache(maxsize=1)
-def _known(subject: _Subject) -> BaselineRobot:
-    return _recorded(subject, 0, subject.plan, None)
+def _known(seed: int, plan: Plan) -> BaselineRobot:
+    return _recorded(seed, 0, plan, None)
 
 
-def _recorded(subject: _Subject, day: int, plan: Plan, change: LinkChange | None) -> BaselineRobot:
-    robot = at_random_site(load_robot(subject.robot), subject.seed)
-    settings = VirtualSettings(
-        robot if change is None else with_link_change(robot, change),
-        network_named(subject.network),
-        subject.seed,
-        subject.noise,
-        # Other robots have other days: no two checks share their noise.
-        noise_seed=subject.seed * (DAYS + 1) + day,
-    )
+def _recorded(seed: int, day: int, plan: Plan, change: LinkChange | None) -> BaselineRobot:
+    robot = at_random_site(load_robot(ROBOT), seed)
+    robot = robot if change is None else with_link_change(robot, change)
+    # Other robots have other days: no two checks share their noise.
+    noise_seed = seed * (DAYS + 1) + day
+    settings = VirtualSettings(robot, network("lan"), seed, NOISE, noise_seed=noise_seed)
+    return known_robot(settings, plan, day)
+
+
+def known_robot(settings: VirtualSettings, plan: Plan, day: int) -> BaselineRobot:
+    """Record a robot on one of its days and identify its chain: what other days are compared with."""
     recording = record_session(settings, plan)
     return BaselineRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
 
 
-def _trial(report: CheckReport, change: LinkChange | None) -> LinkChangeTrial:
-    named = [link for link in report.links if link.changed]
-    child = change.child if change is not None else None
-    located = [link.child for link in named] == [child]
-    errors = _errors(named, change) if located and change is not None else (None, None)
-    return LinkChangeTrial(
-        detected=report.changed,
-        located=located,
-        size_error_m=errors[0],
-        false_alarm=report.changed if change is None else any(link.child != child for link in named),
-        robot_time_s=report.robot_time_s,
-        vector_error_m=errors[1],
-        child=child,
-        words=tuple(report.summary),
-    )
-
-
-def _errors(named: Sequence[LinkCheck], change: LinkChange) -> tuple[float, float]:
-    """Return the error of the estimated displacement, of its length and as a vector [m]."""
-    estimated = 1e-3 * np.array(named[0].displacement_mm)
-    true = change.displacement_m
-    return (
-        float(abs(np.linalg.norm(estimated) - np.linalg.norm(true))),
-        float(np.linalg.norm(estimated - true)),
-    )
-
-
-ROBOT = "a2085_06"
-CHANGE_M = 2e-3
 SIZE_MM = 0.5
 CHECK_S = 60.0
 _KNOWN_COST_S, _CHECK_COST_S = 11.0, 11.0
@@ -216,14 +172,14 @@ def link_change_cases(changed: int, unchanged: int, seed: int, shortened: bool =
         plan, share = (AT_ONCE, _AT_ONCE_SHARE) if shortened else (None, 1.0)
         work.append(Trial(checks_of_one_robot, (tuple(changed_on), tuple(same), plan), share * cost_s))
     name = f"{ROBOT}, link change" + (", by all joints at once" if shortened else "")
-    return [Case(name, tuple(work), partial(_summary, name))]
+    return [Case(name, work, _summary)]
 
 
 def checks_of_one_robot(changed: Sequence[int], unchanged: Sequence[int], plan: Plan | None = None) -> Checks:
     """Check a robot on several days, one after the other in one process; plan: see `link_change_trial`."""
     return Checks(
-        tuple(link_change_trial(seed, True, ROBOT, change_m=CHANGE_M, plan=plan) for seed in changed),
-        tuple(link_change_trial(seed, False, ROBOT, change_m=CHANGE_M, plan=plan) for seed in unchanged),
+        tuple(link_change_trial(seed, True, plan) for seed in changed),
+        tuple(link_change_trial(seed, False, plan) for seed in unchanged),
     )
 
 
@@ -232,21 +188,17 @@ def _share(checks: int, robots: int, robot: int) -> int:
     return checks // robots + (robot < checks % robots)
 
 
-def _summary(case: str, robots: Sequence[Checks]) -> Summary:
+def _summary(robots: Sequence[Checks]) -> Summary:
     changed = [check for robot in robots for check in robot.changed]
     unchanged = [check for robot in robots for check in robot.unchanged]
     size_mm = scaled(largest([check.size_error_m for check in changed]), 1e3)
     spent_s = largest([check.robot_time_s for check in changed + unchanged])
     what = f"{1e3 * CHANGE_M:.0f} mm"
     return Summary(
-        (
-            count(
-                case,
-                f"{what} not detected, or not located",
-                [not (c.detected and c.located) for c in changed],
-            ),
-            Row(case, f"size of the {what}, largest error [mm]", None, size_mm, None, SIZE_MM),
-            count(case, "false alarms without a change", [check.false_alarm for check in unchanged]),
-            Row(case, "robot time of a check, longest [s]", None, spent_s, None, CHECK_S),
-        )
+        [
+            count(f"{what} not detected, or not located", [not check.located for check in changed]),
+            Row(f"size of the {what}, largest error [mm]", size_mm, SIZE_MM),
+            count("false alarms without a change", [check.false_alarm for check in unchanged]),
+            Row("robot time of a check, longest [s]", spent_s, CHECK_S),
+        ]
     )

@@ -5,36 +5,32 @@ the same, noise, drift and network differ. The seed draws the event: kind, modul
 """
 
 from collections.abc import Sequence
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import lru_cache
 from statistics import median
 from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.stats import binom, chi2
 
-from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
-from coordinator.identification.identify import identify_kinematics
 from coordinator.monitoring.findings import Finding
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, Reference, build_reference
 from module_agent.model.chain import Chain
 from module_agent.network_emulation.profile_file import network as network_named
 from sim.benchmark.case import Case, Summary, Trial
-from sim.benchmark.cases.link_change import LinkChange, draw_link_change, with_link_change
+from sim.benchmark.cases.link_change import draw_link_change, known_robot, with_link_change
 from sim.benchmark.cases.monitored_robot import WorldEvent, monitor_robot, ordinary_motions
 from sim.benchmark.row import Row
 from sim.geometry.link_parts import FreePose
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.variants import at_random_site, loaded
 from sim.virtual_time.robot import VirtualSettings
-from sim.virtual_time.session import record_session
 from sim.world.external_force import Push
 
 Happens = Literal["nothing", "collision", "payload", "friction", "wear"]
-HAPPENS: tuple[Happens, ...] = ("nothing", "collision", "payload", "friction", "wear")
+KINDS: tuple[Happens, ...] = ("collision", "payload", "friction", "wear")
 Found = Literal["nothing", "collision", "payload", "friction", "wear", "unexplained"]
 
 # Trials that share a robot, each a day of it; a robot's own day is the first.
@@ -90,6 +86,11 @@ class Alarms(NamedTuple):
         low = 0.5 * chi2.ppf(tail, 2 * self.alarms) if self.alarms else 0.0
         high = 0.5 * chi2.isf(tail, 2 * self.alarms + 2)
         return 3600.0 * float(low) / self.monitored_s, 3600.0 * float(high) / self.monitored_s
+
+
+def sum_of(segments: Sequence[Alarms]) -> Alarms:
+    """Return the alarms and the time of several segments."""
+    return Alarms(sum(one.alarms for one in segments), sum(one.monitored_s for one in segments))
 
 
 class Subject(NamedTuple):
@@ -174,10 +175,9 @@ def false_alarms(seed: int, for_s: float, subject: Subject = ARM) -> Alarms:
 def known_subject(subject: Subject) -> MonitoredRobot:
     """Return a robot, its model from one run, and other motions than those of that run."""
     robot = at_random_site(load_robot(subject.robot), subject.seed)
-    recording = record_session(settings_of(robot, subject, 0), subject.plan)
-    known = BaselineRobot(Path("the known run"), recording, identify_kinematics(recording))
+    known = known_robot(settings_of(robot, subject, 0), subject.plan, 0)
     plan = KNOWN_PLAN.model_copy(update={"excitation_s": MOTION_S, "excitation_motions": MOTIONS})
-    motions = ordinary_motions(known.chain, recording, plan, 1000 + subject.seed)
+    motions = ordinary_motions(known.chain, known.recording, plan, 1000 + subject.seed)
     return MonitoredRobot(robot, build_reference(known), motions)
 
 
@@ -209,17 +209,9 @@ def _draw(happens: Happens, rng: np.random.Generator, robot: Robot, at_s: float)
             return _Event(serial, 100.0 * (factor - 1.0), at_s, happening)
         case "wear":
             change = draw_link_change(robot, int(rng.integers(2**31)), float(rng.uniform(*SHIFT_M)))
-            return _Event(
-                change.child,
-                1e3 * float(np.linalg.norm(change.displacement_m)),
-                at_s,
-                _changed(robot, change, at_s),
-            )
-
-
-def _changed(robot: Robot, change: LinkChange, at_s: float) -> WorldEvent:
-    changed = with_link_change(robot, change)
-    return WorldEvent(at_s, lambda w: w.become(changed))
+            size_mm = 1e3 * float(np.linalg.norm(change.displacement_m))
+            displaced = with_link_change(robot, change)
+            return _Event(change.child, size_mm, at_s, WorldEvent(at_s, lambda w: w.become(displaced)))
 
 
 def _collision(rng: np.random.Generator, robot: Robot, at_s: float) -> _Event:
@@ -287,10 +279,10 @@ MISSED_SHARE = 0.2
 # Chance alone misses a bar in one case of so many.
 ONE_IN = 100.0
 SEGMENT_S = 300.0
-_QUICK_AFTER_S, _QUICK_SEGMENT_S = 5.0, 8.0
+QUICK_AFTER_S, QUICK_SEGMENT_S = 5.0, 8.0
 # Trials of unchanged robots are days of their own.
-_UNCHANGED_DAY = 500
-_KNOWN_COST_S, _COST_PER_S = 8.0, 0.2
+UNCHANGED_DAY = 500
+_KNOWN_COST_S, COST_PER_S = 8.0, 0.2
 
 
 class MonitoredSegments(NamedTuple):
@@ -305,21 +297,17 @@ def monitoring_cases(trials: int, segments: int, seed: int, shortened: bool = Fa
 
     `shortened`: trials and segments are short, all in one process, which records the robot once.
     """
-    kinds = [one for one in HAPPENS if one != "nothing"]
-    after_s, segment_s = (_QUICK_AFTER_S, _QUICK_SEGMENT_S) if shortened else (AFTER_S, SEGMENT_S)
-    name = f"{ARM.robot}, monitored"
-    drawn = [(kind, seed * 100 + number) for number in range(trials) for kind in kinds]
-    days = [_UNCHANGED_DAY + number for number in range(segments)]
-    pieces = [(tuple(drawn), tuple(days))] if shortened else _shares(drawn, days)
-    work = tuple(
-        Trial(
-            monitor_one_robot,
-            (own, still, after_s, segment_s, shortened),
-            _KNOWN_COST_S + _COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * segment_s),
-        )
-        for own, still in pieces
-    )
-    return [Case(name, work, partial(_summary, name))]
+    after_s, segment_s = (QUICK_AFTER_S, QUICK_SEGMENT_S) if shortened else (AFTER_S, SEGMENT_S)
+    drawn = [(kind, seed * 100 + number) for number in range(trials) for kind in KINDS]
+    days = [UNCHANGED_DAY + number for number in range(segments)]
+    # Pieces of work of some minutes each.
+    count = 1 if shortened else max(1, -(-len(drawn) // 12), len(days))
+    work = []
+    for k in range(count):
+        own, still = tuple(drawn[k::count]), tuple(days[k::count])
+        cost_s = _KNOWN_COST_S + COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * segment_s)
+        work.append(Trial(monitor_one_robot, (own, still, after_s, segment_s, shortened), cost_s))
+    return [Case(f"{ARM.robot}, monitored", work, _summary)]
 
 
 def monitor_one_robot(
@@ -337,17 +325,8 @@ def monitor_one_robot(
     )
 
 
-def _shares(
-    drawn: Sequence[tuple[Happens, int]], quiet: Sequence[int]
-) -> list[tuple[tuple[tuple[Happens, int], ...], tuple[int, ...]]]:
-    """Return pieces of work of some minutes each."""
-    count = max(1, -(-len(drawn) // 12), len(quiet))
-    return [(tuple(drawn[k::count]), tuple(quiet[k::count])) for k in range(count)]
-
-
-def _summary(case: str, robots: Sequence[MonitoredSegments]) -> Summary:
+def _summary(robots: Sequence[MonitoredSegments]) -> Summary:
     trials = [trial for one in robots for trial in one.trials]
-    unchanged = [alarms for one in robots for alarms in one.unchanged]
     rows = []
     for kind in dict.fromkeys(trial.happened for trial in trials):
         own = [trial for trial in trials if trial.happened == kind]
@@ -356,17 +335,16 @@ def _summary(case: str, robots: Sequence[MonitoredSegments]) -> Summary:
         # By chance so many of the trials may be missed.
         limit = float(binom.isf(1.0 / ONE_IN, len(own), MISSED_SHARE))
         rows += [
-            Row(case, f"{kind}: missed or misplaced, of {len(own)}", None, float(wrong), None, limit),
-            Row(case, f"{kind}: named after, median [s]", None, median(named_s) if named_s else None),
+            Row(f"{kind}: missed or misplaced, of {len(own)}", float(wrong), limit),
+            Row(f"{kind}: named after, median [s]", median(named_s) if named_s else None),
         ]
-    total = Alarms(sum(one.alarms for one in unchanged), sum(one.monitored_s for one in unchanged))
+    total = sum_of([alarms for one in robots for alarms in one.unchanged])
     low, high = total.interval_per_hour()
-    hours = total.monitored_s / 3600.0
     additional = sum(trial.false_alarms for trial in trials)
     rows += [
-        Row(case, f"additional findings, in {len(trials)} trials", None, float(additional)),
-        Row(case, f"false alarms in {hours:.2g} h", None, float(total.alarms)),
-        Row(case, "false alarms, 95 % sure to be above [1/h]", None, low, None, ALARMS_PER_HOUR),
-        Row(case, "false alarms, 95 % sure to be below [1/h]", None, high),
+        Row(f"additional findings, in {len(trials)} trials", float(additional)),
+        Row(f"false alarms in {total.monitored_s / 3600.0:.2g} h", float(total.alarms)),
+        Row("false alarms, 95 % sure to be above [1/h]", low, ALARMS_PER_HOUR),
+        Row("false alarms, 95 % sure to be below [1/h]", high),
     ]
-    return Summary(tuple(rows))
+    return Summary(rows)

@@ -1,8 +1,6 @@
 """Payloads: one is detected on the right body, with its mass and centre; without one none is detected."""
 
-from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +9,11 @@ from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.baseline.payload import payload_plan, search_payload
 from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan
-from coordinator.identification.identify import identify_kinematics
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.network_emulation.profile_file import network
-from sim.benchmark.case import Case, Summary, Trial, trial_seed
+from sim.benchmark.case import Case, Summary, Trial, trial_seeds
 from sim.benchmark.cases.inertia import PLAN, QUICK_PLAN
+from sim.benchmark.cases.link_change import known_robot
 from sim.benchmark.row import Row, count, largest, scaled
 from sim.geometry.link_parts import FreePose
 from sim.imperfections.noise_profile import NoiseProfile
@@ -23,7 +21,6 @@ from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import at_random_site, loaded
 from sim.virtual_time.robot import VirtualSettings
-from sim.virtual_time.session import record_session
 
 MASS_KG = 0.2
 # About as large as a fist, off the flange's axis.
@@ -81,8 +78,7 @@ def payload_trial(
 def _recorded(robot: Robot, noise: str | NoiseProfile, seed: int, day: int, plan: Plan) -> BaselineRobot:
     """Record a session of a robot; another day of the same seed has the same modules and other noise."""
     settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=1000 * seed + day)
-    recording = record_session(settings, plan)
-    return BaselineRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
+    return known_robot(settings, plan, day)
 
 
 def _from_axis(chain: Chain, point_m: Array) -> Array:
@@ -110,44 +106,31 @@ _COST_S, _QUICK_COST_S = 26.0, 15.0
 def payload_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return the case of a payload, and with more than one trial that of none."""
     plan, cost_s = (QUICK_PLAN, _QUICK_COST_S) if shortened else (PLAN, _COST_S)
-    cases = [_case(f"{ROBOT}, payload of 0.2 kg", True, trials, seed, plan, cost_s)]
-    if not shortened:
-        cases.append(_case(f"{ROBOT}, no payload", False, trials, seed, plan, cost_s))
-    return cases
+
+    def case(name: str, carries: bool, summarise: Callable[[Sequence[PayloadTrial]], Summary]) -> Case:
+        work = [
+            Trial(payload_trial, (ROBOT, "x5", own, plan, carries), cost_s)
+            for own in trial_seeds(seed, name, trials)
+        ]
+        return Case(name, work, summarise)
+
+    cases = [case(f"{ROBOT}, payload of 0.2 kg", True, _loaded_rows)]
+    return cases if shortened else [*cases, case(f"{ROBOT}, no payload", False, _unloaded_rows)]
 
 
-def _case(name: str, carries: bool, trials: int, seed: int, plan: Plan, cost_s: float) -> Case:
-    work = tuple(
-        Trial(payload_trial, (ROBOT, "x5", trial_seed(seed, name, number), plan, carries), cost_s)
-        for number in range(trials)
-    )
-    return Case(name, work, partial(_loaded_rows if carries else _unloaded_rows, name))
-
-
-def _loaded_rows(case: str, trials: Sequence[PayloadTrial]) -> Summary:
+def _loaded_rows(trials: Sequence[PayloadTrial]) -> Summary:
     found = [trial for trial in trials if trial.found]
-    rows = (
-        count(case, "payloads not found, or on another body", [not t.on_its_body for t in trials]),
-        Row(
-            case,
-            "mass, worst [%]",
-            None,
-            scaled(largest([t.mass_error for t in found]), 100.0),
-            None,
-            MASS_PERCENT,
-        ),
-        Row(
-            case,
-            "centre, worst [mm]",
-            None,
-            scaled(largest([t.com_error_m for t in found]), 1e3),
-            None,
-            COM_MM,
-        ),
-        Row(case, "motion, longest [s]", None, largest([t.motion_s for t in trials]), None, MOTION_S),
+    mass_percent = scaled(largest([t.mass_error for t in found]), 100.0)
+    centre_mm = scaled(largest([t.com_error_m for t in found]), 1e3)
+    return Summary(
+        [
+            count("payloads not found, or on another body", [not t.on_its_body for t in trials]),
+            Row("mass, worst [%]", mass_percent, MASS_PERCENT),
+            Row("centre, worst [mm]", centre_mm, COM_MM),
+            Row("motion, longest [s]", largest([t.motion_s for t in trials]), MOTION_S),
+        ]
     )
-    return Summary(rows)
 
 
-def _unloaded_rows(case: str, trials: Sequence[PayloadTrial]) -> Summary:
-    return Summary((count(case, "payloads found where none is", [t.found for t in trials]),))
+def _unloaded_rows(trials: Sequence[PayloadTrial]) -> Summary:
+    return Summary([count("payloads found where none is", [t.found for t in trials])])

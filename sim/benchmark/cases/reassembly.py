@@ -7,7 +7,6 @@ of the same parts. The information that the agents gathered must equal the coord
 
 import tempfile
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,10 +14,10 @@ import numpy as np
 
 from coordinator.excitation.plan import Plan
 from coordinator.merge.information_file import RunInformation, read_information
-from coordinator.merge.merge_runs import MergedInformation, merge_runs
+from coordinator.merge.merge_runs import merge_runs
 from coordinator.recording.run_folder import INFORMATION
-from sim.benchmark.case import Case, Summary, Trial, trial_seed
-from sim.benchmark.row import Row, highest, largest
+from sim.benchmark.case import Case, Summary, Trial, trial_seeds
+from sim.benchmark.row import Row, largest
 from sim.robot.robot_file import BASE, Robot, load_robot
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
@@ -54,40 +53,34 @@ class Reassembly(NamedTuple):
     inconsistency_sigma: tuple[float, ...]
 
 
-def reassembly_trial(seed: int, folder: Path, robot: str | Robot = ROBOT, plan: Plan = QUICK) -> Reassembly:
+def reassembly_trial(seed: int, folder: Path) -> Reassembly:
     """Identify a robot in three assemblies, in virtual time, and merge their torque information.
 
     Args:
         seed: of the modules, which are the same in all three, and of their noise, which is not.
         folder: for the three runs.
-        robot: a shipped robot, a robot file, or a robot; a chain of at least two modules.
-        plan: of every run.
 
     Raises:
         ValueError: an agent did not answer, so that there is nothing to compare.
     """
     runs: list[RunInformation] = []
     differences: list[float] = []
-    described = robot if isinstance(robot, Robot) else load_robot(robot)
-    for number, (name, assembled) in enumerate(assemblies(described).items()):
+    for number, (name, assembled) in enumerate(assemblies(load_robot(ROBOT)).items()):
         out = folder / name
-        config = VirtualConfig(assembled, out, seed=seed, noise_seed=number, plan=plan)
+        config = VirtualConfig(assembled, out, seed=seed, noise_seed=number, plan=QUICK)
         dynamics = run_virtual(config).dynamics
         if dynamics is None or dynamics.gathered_difference is None:
             raise ValueError(f"no agent of the assembly {name} sent its torque information")
         differences.append(dynamics.gathered_difference)
         runs.append(read_information(out / INFORMATION))
-    return _reassembly(merge_runs(runs), max(differences))
-
-
-def _reassembly(merged: MergedInformation, difference: float) -> Reassembly:
+    merged = merge_runs(runs)
     return Reassembly(
         parameters=len(merged.base.columns.names),
         rank_alone=tuple(run.base.rank for run in merged.runs),
         rank_merged=merged.base.rank,
         sigma_ratio=merged.gain,
         sigma_ratios=tuple(run.gain for run in merged.runs),
-        difference=difference,
+        difference=max(differences),
         inconsistency_sigma=tuple(run.inconsistency_sigma for run in merged.runs),
     )
 
@@ -118,10 +111,8 @@ _COST_S = 10.0
 def reassembly_cases(trials: int, seed: int) -> list[Case]:
     """Return the one case: an arm as it is, on a wall, and with its modules in another order."""
     name = f"{ROBOT}, three assemblies"
-    work = tuple(
-        Trial(reassembly_in_folder, (trial_seed(seed, name, number),), _COST_S) for number in range(trials)
-    )
-    return [Case(name, work, partial(_summary, name))]
+    work = [Trial(reassembly_in_folder, (own,), _COST_S) for own in trial_seeds(seed, name, trials)]
+    return [Case(name, work, _summary)]
 
 
 def reassembly_in_folder(seed: int) -> Reassembly:
@@ -130,26 +121,15 @@ def reassembly_in_folder(seed: int) -> Reassembly:
         return reassembly_trial(seed, Path(folder))
 
 
-def _summary(case: str, trials: Sequence[Reassembly]) -> Summary:
-    gained = [max(t.rank_alone) - t.rank_merged for t in trials]
-    rows = (
-        Row(
-            case,
-            "agents' information against the coordinator's [relative]",
-            None,
-            largest([t.difference for t in trials]),
-            None,
-            AGREES_BELOW,
-        ),
-        Row(case, "rank of the best alone less that of all merged", None, highest(gained), None, -1.0),
-        Row(case, "rank of all merged", None, min((float(t.rank_merged) for t in trials), default=None)),
-        Row(
-            case,
-            "standard deviations merged over alone, median",
-            None,
-            highest([t.sigma_ratio for t in trials]),
-            None,
-            1.0,
-        ),
+def _summary(trials: Sequence[Reassembly]) -> Summary:
+    difference = largest([t.difference for t in trials])
+    lost = max((float(max(t.rank_alone) - t.rank_merged) for t in trials), default=None)
+    sigma_ratio = max((t.sigma_ratio for t in trials), default=None)
+    return Summary(
+        [
+            Row("agents' information against the coordinator's [relative]", difference, AGREES_BELOW),
+            Row("rank of the best alone less that of all merged", lost, -1.0),
+            Row("rank of all merged", min((float(t.rank_merged) for t in trials), default=None)),
+            Row("standard deviations merged over alone, median", sigma_ratio, 1.0),
+        ]
     )
-    return Summary(rows)

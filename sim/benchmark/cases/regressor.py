@@ -5,7 +5,6 @@ Pinocchio is a development dependency; without it only our own time is measured.
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +14,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.regressor import PER_BODY, torque_regressor
 from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, largest, ratio
+from sim.geometry.pose import pose
 
 JOINTS, SAMPLES, CHUNK = 7, 4000, 50
 _TREES, _TREE_SAMPLES = 5, 20
@@ -49,8 +49,9 @@ def regressor_trial(seed: int, repeats: int) -> RegressorTrial:
         for begin in range(0, SAMPLES, CHUNK):
             torque_regressor(chain, *(signal[begin : begin + CHUNK] for signal in motion))
 
-    pin = _pinocchio()
-    if pin is None:
+    try:
+        import pinocchio as pin
+    except ImportError:
         return RegressorTrial(_cost_us(batch, repeats), _cost_us(chunks, repeats), None, None)
     model = _model(pin, chain)
     data = model.createData()
@@ -63,14 +64,6 @@ def regressor_trial(seed: int, repeats: int) -> RegressorTrial:
     return RegressorTrial(
         _cost_us(batch, repeats), _cost_us(chunks, repeats), _cost_us(loop, repeats), difference
     )
-
-
-def _pinocchio() -> Any | None:
-    try:
-        import pinocchio
-    except ImportError:
-        return None
-    return pinocchio
 
 
 def _cost_us(work: Callable[[], None], repeats: int) -> float:
@@ -120,7 +113,8 @@ def _difference(pin: Any, rng: np.random.Generator) -> float:
     model = _model(pin, chain)
     data = model.createData()
     ours = torque_regressor(chain, *motion)
-    into = [_about(point) for point in chain.point]
+    # From ten parameters about the root's origin to those about a point of the axis, axes parallel.
+    into = [parameter_transform(pose(-point)) for point in chain.point]
     worst = 0.0
     for row, q, qd, qdd in zip(ours, *motion, strict=True):
         theirs = np.atleast_2d(pin.computeJointTorqueRegressor(model, data, q, qd, qdd))
@@ -129,14 +123,6 @@ def _difference(pin: Any, rng: np.random.Generator) -> float:
         ]
         worst = max(worst, float(np.abs(row - np.hstack(blocks)).max() / np.abs(row).max()))
     return worst
-
-
-def _about(point: Array) -> Array:
-    """Return the matrix from ten parameters about the root's origin to those about a point, axes parallel."""
-
-    pose = np.eye(4)
-    pose[:3, 3] = -point
-    return parameter_transform(pose)
 
 
 EQUAL_BELOW = 1e-9
@@ -148,28 +134,18 @@ _REPEATS = 9
 def regressor_cases(seed: int) -> list[Case]:
     """Return the one case; it compares with pinocchio where that is installed."""
     name = f"regressor, {JOINTS} joints, {SAMPLES} samples"
-    return [Case(name, (Trial(regressor_trial, (seed, _REPEATS), 4.0),), partial(_summary, name))]
+    return [Case(name, [Trial(regressor_trial, (seed, _REPEATS), 4.0)], _summary)]
 
 
-def _summary(case: str, trials: Sequence[RegressorTrial]) -> Summary:
+def _summary(trials: Sequence[RegressorTrial]) -> Summary:
     compared = [trial for trial in trials if trial.loop_us is not None]
-    rows = [
-        Row(
-            case,
-            f"in chunks of {CHUNK} [us a sample]",
-            None,
-            largest([t.chunks_us for t in trials]),
-            None,
-            CHUNK_US,
-        )
-    ]
+    chunks_us = largest([trial.chunks_us for trial in trials])
+    rows = [Row(f"in chunks of {CHUNK} [us a sample]", chunks_us, CHUNK_US)]
     if compared:
-        shares = [ratio(trial.batch_us, trial.loop_us) for trial in compared]
-        differences = [trial.difference for trial in compared]
+        difference = largest([trial.difference for trial in compared])
+        share = largest([ratio(trial.batch_us, trial.loop_us) for trial in compared])
         rows += [
-            Row(
-                case, "difference from pinocchio's [relative]", None, largest(differences), None, EQUAL_BELOW
-            ),
-            Row(case, "cost of a batch over pinocchio's loop", None, largest(shares), None, BATCH_SHARE),
+            Row("difference from pinocchio's [relative]", difference, EQUAL_BELOW),
+            Row("cost of a batch over pinocchio's loop", share, BATCH_SHARE),
         ]
-    return Summary(tuple(rows))
+    return Summary(rows)

@@ -1,7 +1,6 @@
 """A real arm's recording: torques of the half that was not fitted to, all samples and those that move."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from coordinator.arm_fit.fit_dynamics import fit_dynamics
@@ -19,8 +18,7 @@ _COUPLED = ((4, 5),)
 
 def recorded_cases(folder: Path) -> list[Case]:
     """Return the one case, of a Staubli TX40: `tx40.urdf` and `motion.npz` in a folder."""
-    name = "TX40, halves of the run"
-    return [Case(name, (Trial(fitted, (folder,), 6.0),), partial(_summary, name))]
+    return [Case("TX40, halves of the run", [Trial(fitted, (folder,), 6.0)], _summary)]
 
 
 def fitted(folder: Path) -> FitReport:
@@ -28,7 +26,7 @@ def fitted(folder: Path) -> FitReport:
     return fit_dynamics(folder / URDF, folder / MOTION, choice=ModelChoice(coupled=_COUPLED)).report
 
 
-def _summary(case: str, reports: Sequence[FitReport]) -> Summary:
+def _summary(reports: Sequence[FitReport]) -> Summary:
     rows = []
     for report in reports:
         for samples, limit in (("all", ALL_PERCENT), ("masked", MASKED_PERCENT)):
@@ -38,10 +36,9 @@ def _summary(case: str, reports: Sequence[FitReport]) -> Summary:
                 if one.tried_on == "both" and one.samples == samples
             }
             figure = f"held-out torque, {samples} samples"
-            best = errors[("bodies", "filtered")]
             rows += [
-                Row(case, f"{figure} [%]", None, errors[("fitted", "filtered")], None, limit),
-                Row(case, f"{figure}, real bodies [%]", None, best, None, limit),
-                Row(case, f"{figure}, raw [%]", None, errors[("fitted", "raw")], None),
+                Row(f"{figure} [%]", errors["fitted", "filtered"], limit),
+                Row(f"{figure}, real bodies [%]", errors["bodies", "filtered"], limit),
+                Row(f"{figure}, raw [%]", errors["fitted", "raw"]),
             ]
-    return Summary(tuple(rows))
+    return Summary(rows)

@@ -69,7 +69,7 @@ def chosen(cases: Sequence[Case], pattern: str) -> list[Case]:
 def over_all(results: Sequence[CaseResult]) -> list[Row]:
     """Return the rows over all cases; none if no case claimed an interval."""
     off = [value for result in results for value in result.summary.sigmas_off]
-    return [coverage(ALL, off)] if off else []
+    return [coverage(off)._replace(case=ALL)] if off else []
 
 
 DYNAMIC_TRIALS = 5

@@ -8,7 +8,7 @@ from sim.benchmark.row import Row, count
 from sim.imperfections.noise_profile import noise_profile
 from sim.thesis.torque_assistance import identified_model, standing_robot
 from sim.thesis.torque_assistance_cases import Case as Combined
-from sim.thesis.torque_assistance_cases import Combination, try_case
+from sim.thesis.torque_assistance_cases import Combination, robots_of, try_case
 from sim.thesis.torque_assistance_cases import cases as combinations
 from sim.thesis.torque_assistance_report import MIN_GAIN, true_model
 
@@ -29,18 +29,12 @@ def assistance_cases(seed: int, shortened: bool = False) -> list[Case]:
     found = []
     for name, own in groups.items():
         chosen = [one for one in own if one.gains.setting in (None, _QUICK_SETTING)][:1] if shortened else own
+        cost_s = _CASE_COST_S * len(chosen) + (0.0 if shortened else _IDENTIFY_COST_S)
         # Every robot is identified once for all of its combinations.
-        robots = dict.fromkeys(one.robot for one in chosen)
-        work = tuple(
-            Trial(
-                assistance_of_robot,
-                (robot, tuple(one for one in chosen if one.robot == robot), seed, shortened),
-                _CASE_COST_S * len(chosen) + (0.0 if shortened else _IDENTIFY_COST_S),
-            )
-            for robot in robots
-        )
+        shares = [(robot, tuple(one for one in chosen if one.robot == robot)) for robot in robots_of(chosen)]
+        work = [Trial(assistance_of_robot, (*share, seed, shortened), cost_s) for share in shares]
         name += ", true model" if shortened else ""
-        found.append(Case(name, work, partial(_summary, name, _limit(chosen[0]))))
+        found.append(Case(name, work, partial(_summary, _limit(chosen[0]))))
     return found
 
 
@@ -69,14 +63,14 @@ def _limit(combined: Combined) -> float | None:
     return 1.0 if combined.gains.setting is not None else None
 
 
-def _summary(case: str, limit: float | None, trials: Sequence[list[Combination]]) -> Summary:
-    rows = [row for trial in trials for row in trial]
-    stable = [row for row in rows if row.is_stable]
-    most = max((1.0 / row.gain for row in stable), default=None)
-    found = [
-        Row(case, "error by calculated torque over that without, most", None, most, None, limit),
-        Row(case, f"unstable with it, of {len(rows)}", None, float(len(rows) - len(stable)), None, None),
+def _summary(limit: float | None, trials: Sequence[list[Combination]]) -> Summary:
+    tried = [combination for trial in trials for combination in trial]
+    stable = [each for each in tried if each.is_stable]
+    most = max((1.0 / each.gain for each in stable), default=None)
+    rows = [
+        Row("error by calculated torque over that without, most", most, limit),
+        Row(f"unstable with it, of {len(tried)}", float(len(tried) - len(stable))),
     ]
     if limit == 1.0:
-        found.insert(0, count(case, "stable, and not the best of three modes", [not r.helps for r in stable]))
-    return Summary(tuple(found))
+        rows.insert(0, count("stable, and not the best of three modes", [not each.helps for each in stable]))
+    return Summary(rows)

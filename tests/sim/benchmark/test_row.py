@@ -40,11 +40,11 @@ from sim.benchmark.row import (
 def test_a_bar_is_met_up_to_its_limit_and_missed_without_a_figure(
     ours: float | None, limit: float | tuple[float, float] | None, holds: bool | None
 ) -> None:
-    assert Row("arm", "error [mm]", None, ours, None, limit).holds is holds
+    assert Row("error [mm]", ours, limit).holds is holds
 
 
 def test_a_row_in_json_has_the_agreed_fields_and_no_number_that_json_lacks() -> None:
-    found = Row("arm", "error [mm]", math.inf, math.nan, 0.1, 0.5).plain()
+    found = Row("error [mm]", math.nan, 0.5, math.inf, 0.1, "arm").plain()
     assert list(found) == ["case", "figure", "thesis", "ours", "bound", "limit", "holds"]
     assert (found["thesis"], found["ours"], found["bound"], found["holds"]) == (None, None, 0.1, False)
 
@@ -69,14 +69,14 @@ def test_one_value_that_is_no_number_makes_the_figure_none_and_the_bar_missed(
     found = figure(values)
     assert found is not None
     assert math.isnan(found)
-    assert Row("arm", "error [mm]", None, found, None, 5.0).holds is False
+    assert Row("error [mm]", found, 5.0).holds is False
 
 
 def test_what_must_never_be_is_counted_and_of_no_cases_nothing_is_known() -> None:
-    found = count("robots", "wrong", [False, True, True])
+    found = count("wrong", [False, True, True])
     assert (found.figure, found.ours, found.holds) == ("wrong, of 3", 2.0, False)
-    assert count("robots", "wrong", [False]).holds
-    assert count("robots", "wrong", []).holds is False
+    assert count("wrong", [False]).holds
+    assert count("wrong", []).holds is False
 
 
 def test_a_bar_of_means_is_the_stated_one_from_thirteen_trials_on_and_wider_below() -> None:
@@ -101,14 +101,14 @@ def test_an_rms_that_holds_over_thirteen_trials_holds_as_surely_over_fewer(trial
 def test_honest_intervals_of_any_number_meet_the_bar_of_coverage_and_shy_or_bold_ones_do_not() -> None:
     rng = np.random.default_rng(5)
     for number in (10, 60, FEW_INTERVALS, 1000):
-        rows = [coverage("all", list(np.abs(rng.standard_normal(number)))) for _ in range(200)]
+        rows = [coverage(list(np.abs(rng.standard_normal(number)))) for _ in range(200)]
         # Chance leaves the range in one of a hundred where it is widened; at 200 by two sigmas, in one of 20.
         assert np.mean([row.holds for row in rows]) > (0.97 if number != FEW_INTERVALS else 0.90)
     many = np.abs(rng.standard_normal(1000))
-    assert not coverage("all", list(2.0 * many)).holds
-    assert not coverage("all", list(0.3 * many)).holds
-    assert coverage("all", list(many)).limit == COVERAGE
+    assert not coverage(list(2.0 * many)).holds
+    assert not coverage(list(0.3 * many)).holds
+    assert coverage(list(many)).limit == COVERAGE
 
 
 def test_coverage_without_intervals_misses_its_bar() -> None:
-    assert coverage("all", []).holds is False
+    assert coverage([]).holds is False

@@ -18,7 +18,7 @@ from sim.benchmark.cases.arm import (
 )
 from sim.benchmark.cases.joint import SETTINGS, joint_cases
 from sim.benchmark.cases.link_change import DAYS, Checks, LinkChangeTrial, link_change_cases
-from sim.benchmark.cases.network import NetworkTrial, network_cases
+from sim.benchmark.cases.network import network_cases
 from sim.benchmark.cases.suites import (
     ALL,
     KINEMATIC_TRIALS,
@@ -31,6 +31,7 @@ from sim.benchmark.cases.suites import (
 from sim.benchmark.cases.topology import TopologyTrial, topology_cases
 from sim.benchmark.row import Row
 from sim.robot.random_robot import random_robot
+from sim.scoring.chain_score import LinkErrors
 from sim.thesis.joint_trial import JointTrial
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM
 
@@ -144,9 +145,10 @@ def test_uncalibrated_arms_have_a_bar_where_gravity_calibrates_their_axis(
 
 
 def arm(tip_mm: float, **changed: Any) -> ArmTrial:
-    link = ArmLink("a", "b", 0.3, 1e-3, 5e-4, 2e-4, 2e-3, 0.05, -8e-3, 0.4)
+    ours, thesis = LinkErrors(1e-3, 2e-3, 0.05), LinkErrors(-8e-3, 9e-3, 0.4)
+    link = ArmLink(ours, thesis, sigma_m=5e-4, bound_m=2e-4)
     done = ArmTrial(
-        robot="a2085_06",
+        network="lan",
         mode="joint",
         seed=1,
         joints=6,
@@ -257,19 +259,19 @@ def test_small_robots_are_the_smallest_of_ten() -> None:
     assert sizes[trial.arguments[0]] == min(sizes)
 
 
-def network(name: str, seed: int, error_mm: float, **changed: Any) -> NetworkTrial:
-    done = NetworkTrial(
-        robot="a2085_04",
+def network(name: str, seed: int, error_mm: float, **changed: Any) -> ArmTrial:
+    links = tuple(
+        ArmLink(LinkErrors(1e-3 * sign * error_mm, 2e-3, 0.01), None, 1e-3, 1e-3) for sign in (1.0, -1.0)
+    )
+    done = ArmTrial(
         network=name,
+        mode="joint",
         seed=seed,
+        joints=4,
         why="",
+        links=links,
+        tip=TipErrors(2e-3 * error_mm, 0.02),
         robot_time_s=40.0,
-        topology_right=True,
-        link_error_m=(1e-3 * error_mm, -1e-3 * error_mm),
-        link_sigma_m=(1e-3, 1e-3),
-        axis_error_deg=(0.01, 0.01),
-        tip_position_m=2e-3 * error_mm,
-        tip_orientation_deg=0.02,
         clock_error_s=5e-6,
         clock_sigma_s=5e-6,
     )
@@ -280,9 +282,7 @@ def test_a_network_is_compared_on_the_same_modules_and_where_both_came_to_a_resu
     pair, _ = network_cases(3, 0)
     assert len(pair.trials) == 6
     trials = [network("none", s, 1.0) for s in range(3)] + [network("wifi", s, 1.1) for s in range(2)]
-    lost = network(
-        "wifi", 2, 0.0, why="ModuleLost: gone", topology_right=False, link_error_m=(), link_sigma_m=()
-    )
+    lost = network("wifi", 2, 0.0, why="ModuleLost: gone", links=(), tip=None)
     found = rows(pair.summarise([*trials, lost]))
     assert found["runs without the right topology, of 3"].ours == 1.0
     for figure in ("tip position", "link lengths"):
@@ -308,21 +308,17 @@ def test_over_a_bad_network_intervals_must_cover() -> None:
 
 def check(**changed: Any) -> LinkChangeTrial:
     done = LinkChangeTrial(
-        detected=True,
         located=True,
         size_error_m=2e-4,
         false_alarm=False,
         robot_time_s=40.0,
-        vector_error_m=3e-4,
-        child="elbow",
-        words=(),
     )
     return done._replace(**changed)
 
 
 def test_a_change_must_be_found_located_and_sized_in_time() -> None:
     (case,) = link_change_cases(3, 0, 0)
-    lost = check(located=False, size_error_m=None, vector_error_m=None)
+    lost = check(located=False, size_error_m=None)
     checks = [Checks((check(), check(size_error_m=6e-4)), ()), Checks((lost,), ())]
     found = rows(case.summarise(checks))
     assert found["2 mm not detected, or not located, of 3"].ours == 1.0
@@ -332,7 +328,7 @@ def test_a_change_must_be_found_located_and_sized_in_time() -> None:
 
 def test_a_false_alarm_misses_its_bar() -> None:
     (case,) = link_change_cases(3, 3, 0)
-    quiet = check(detected=False, located=False, size_error_m=None, child=None)
+    quiet = check(located=False, size_error_m=None)
     alarm = "false alarms without a change, of 3"
     assert rows(case.summarise([Checks((), (quiet,) * 3)]))[alarm].holds
     assert rows(case.summarise([Checks((), (quiet, quiet, check(false_alarm=True)))]))[alarm].holds is False
@@ -365,12 +361,12 @@ def test_no_bar_is_met_by_trials_that_all_failed(case: Case) -> None:
 
 def test_coverage_is_counted_over_the_intervals_of_all_cases() -> None:
     def bold(_: Any) -> Summary:
-        return Summary((), (0.5,) * 30 + (3.0,) * 70)
+        return Summary([], (0.5,) * 30 + (3.0,) * 70)
 
     def shy(_: Any) -> Summary:
-        return Summary((), (0.5,) * 900)
+        return Summary([], (0.5,) * 900)
 
-    results = [concluded(Case(name, (), how), []) for name, how in (("bold", bold), ("shy", shy))]
+    results = [concluded(Case(name, [], how), []) for name, how in (("bold", bold), ("shy", shy))]
     (row,) = over_all(results)
     assert (row.case, row.ours, row.holds) == (ALL, pytest.approx(93.0), True)
     assert over_all(results[:1])[0].holds is False

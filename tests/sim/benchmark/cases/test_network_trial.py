@@ -8,7 +8,8 @@ import pytest
 
 from coordinator.excitation.plan import Plan
 from module_agent.signals.clock_map import ClockMap
-from sim.benchmark.cases.network import OFFSET_S, clock_error_s, network_trial, with_clock_errors
+from sim.benchmark.cases.arm import arm_trial, clock_error_s
+from sim.benchmark.cases.network import OFFSET_S, with_clock_errors
 from sim.imperfections.noise_profile import noise_profile
 from sim.sensors.module_clock import ModuleClock
 
@@ -30,12 +31,14 @@ def short() -> Plan:
 
 
 def test_over_a_radio_network_links_and_clocks_are_as_good_as_claimed(short: Plan) -> None:
-    trial = network_trial(ARM, "wifi", NOISE, 5, short)
+    trial = arm_trial(ARM, NOISE, 5, network="wifi", plan=short)
     assert trial.why == ""
-    assert trial.topology_right
-    (error,), (sigma,) = trial.link_error_m, trial.link_sigma_m
+    assert trial.right
+    (link,) = trial.links
+    assert link.error_m is not None
+    assert link.sigma_m is not None
     # Four sigmas; of the base that shakes a part is not in the model.
-    assert abs(error) < max(4.0 * sigma, 2e-3)
+    assert abs(link.error_m) < max(4.0 * link.sigma_m, 2e-3)
     assert trial.clock_error_s is not None
     assert trial.clock_sigma_s is not None
     # One tie between two clocks: half a millisecond is half of a quick round trip.
@@ -46,10 +49,10 @@ def test_over_a_radio_network_links_and_clocks_are_as_good_as_claimed(short: Pla
 def test_a_trial_on_a_network_that_carries_nothing_says_why_it_ended(short: Plan, tmp_path: Path) -> None:
     slow = tmp_path / "slow.toml"
     slow.write_text("delay_ms = 150.0\n")
-    trial = network_trial(ARM, str(slow), NOISE, 0, short)
+    trial = arm_trial(ARM, NOISE, 0, network=str(slow), plan=short)
     assert trial.why.startswith("unfit: of the round trips")
-    assert trial.link_error_m == ()
-    assert trial.tip_position_m is None
+    assert trial.links == ()
+    assert trial.tip is None
 
 
 def test_clocks_apart_differ_by_offset_and_drift_and_nothing_else_changes() -> None:
