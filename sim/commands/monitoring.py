@@ -14,6 +14,11 @@ from sim.benchmark.case import Trial
 from sim.benchmark.cases.monitoring import (
     AFTER_S,
     ARM,
+    COST_PER_S,
+    QUICK_AFTER_S,
+    QUICK_SEGMENT_S,
+    SEGMENT_S,
+    UNCHANGED_DAY,
     Alarms,
     Found,
     MonitoringTrial,
@@ -21,19 +26,13 @@ from sim.benchmark.cases.monitoring import (
     confusion,
     false_alarms,
     monitoring_trial,
+    sum_of,
 )
 from sim.commands.experiment import JsonFile, ProfileName, WorkerCount, experiment, trial_results
 from sim.commands.options import Seed, load
 from sim.imperfections.noise_profile import noise_profile
 
 _KINDS: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind != "unexplained")
-# Length of a trial without event: with longer ones processes would idle at the end.
-_SEGMENT_S = 300.0
-# Of the quick form.
-_QUICK_AFTER_S, _QUICK_SEGMENT_S = 5.0, 8.0
-_COST_SHARE = 0.2
-# Trials of unchanged robots have numbers from here.
-_UNCHANGED_DAY = 500
 
 
 def monitoring(
@@ -55,13 +54,13 @@ def monitoring(
     noise_profile(noise)
     subject = Subject(robot=robot, noise=noise, seed=seed, brief=quick)
     if quick:
-        trials, after_s, segments = 1, _QUICK_AFTER_S, [_QUICK_SEGMENT_S]
+        trials, after_s, segments = 1, QUICK_AFTER_S, [QUICK_SEGMENT_S]
     else:
-        after_s, segments = AFTER_S, [_SEGMENT_S] * max(1, round(3600.0 * hours / _SEGMENT_S))
+        after_s, segments = AFTER_S, [SEGMENT_S] * max(1, round(3600.0 * hours / SEGMENT_S))
     results = _run(subject, trials, after_s, segments, processes)
     happened = [one for one in results if isinstance(one, MonitoringTrial)]
     quiet = [one for one in results if isinstance(one, Alarms)]
-    alarms = Alarms(sum(one.alarms for one in quiet), sum(one.monitored_s for one in quiet))
+    alarms = sum_of(quiet)
     print_table(confusion_table(happened))
     print_table(size_table(happened))
     low, high = alarms.interval_per_hour()
@@ -144,12 +143,12 @@ def _run(
     subject: Subject, trials: int, after_s: float, segments: Sequence[float], processes: int | None
 ) -> list[MonitoringTrial | Alarms]:
     work = [
-        Trial(monitoring_trial, (kind, day, subject, after_s), _COST_SHARE * (after_s + 10.0))
+        Trial(monitoring_trial, (kind, day, subject, after_s), COST_PER_S * (after_s + 10.0))
         for kind in _KINDS
         for day in range(trials)
     ]
     work += [
-        Trial(false_alarms, (_UNCHANGED_DAY + k, for_s, subject), _COST_SHARE * for_s)
+        Trial(false_alarms, (UNCHANGED_DAY + k, for_s, subject), COST_PER_S * for_s)
         for k, for_s in enumerate(segments)
     ]
     with experiment() as terminal:

@@ -278,6 +278,7 @@ def confusion(trials: Sequence[MonitoringTrial]) -> dict[Happens, dict[Found, in
 MISSED_SHARE = 0.2
 # Chance alone misses a bar in one case of so many.
 ONE_IN = 100.0
+# Length of a trial without event: with longer ones processes would idle at the end.
 SEGMENT_S = 300.0
 QUICK_AFTER_S, QUICK_SEGMENT_S = 5.0, 8.0
 # Trials of unchanged robots are days of their own.
