@@ -176,12 +176,12 @@ def find_changes(fits: TiedFits, false_alarms: float = FALSE_ALARMS) -> Findings
             break
         changed.append(best)
         alarms.append(alarm)
-    found = tuple(_explained(problem, [c.child for c in changed]).links)
+    found, _ = _explained(problem, [c.child for c in changed])
     limit = np.full(len(fits.before.chain.serials), np.nan)
     for child in links:
-        limit[child] = _would_find(_explained(problem, [child]).links[0], false_alarms / len(links))
-    each = tuple(_explained(problem, links).links)
-    return Findings(found, tuple(alarms), each, frozen(limit), least)
+        limit[child] = _would_find(_explained(problem, [child])[0][0], false_alarms / len(links))
+    each, _ = _explained(problem, links)
+    return Findings(tuple(found), tuple(alarms), tuple(each), frozen(limit), least)
 
 
 def _problem(fits: TiedFits) -> _Problem:
@@ -206,38 +206,29 @@ def _slope(chain: Chain, child: int) -> Array:
 
 def _visible(fits: TiedFits) -> Array:
     """Return orthonormal increments (6 (n - 1), r), as columns, that both sessions know."""
-    unknown = np.concatenate(
-        [fits.before.estimate.null_basis[6:], fits.after.estimate.null_basis[6:]], axis=1
-    )
+    unknown = np.hstack([fit.estimate.null_basis[6:] for fit in fits])
     full, sizes, _ = np.linalg.svd(np.column_stack([unknown, np.zeros(len(unknown))]))
     return np.asarray(full[:, np.count_nonzero(sizes > 1e-6) :])
 
 
 def _next(problem: _Problem, taken: Sequence[int]) -> LinkChange:
     """Return the link that explains most of what those taken leave."""
-    before = _explained(problem, taken).gain
+    _, before = _explained(problem, taken)
     candidates = []
     for child in problem.slopes:
         if child not in taken:
-            joint_fit = _explained(problem, [child, *taken])
-            candidates.append(joint_fit.links[0]._replace(gain=joint_fit.gain - before))
+            (first, *_), gain = _explained(problem, [child, *taken])
+            candidates.append(first._replace(gain=gain - before))
     return min(candidates, key=lambda c: (c.chance, -c.gain))
 
 
-class _Explained(NamedTuple):
-    """Changes of some links, and by how much all together lower chi^2."""
-
-    links: list[LinkChange]
-    gain: float
-
-
-def _explained(problem: _Problem, children: Sequence[int]) -> _Explained:
-    """Return the changes of some links that explain the differences best.
+def _explained(problem: _Problem, children: Sequence[int]) -> tuple[list[LinkChange], float]:
+    """Return the changes of some links that explain the differences best, and by how much they lower chi^2.
 
     What cannot be seen is left at zero.
     """
     if not children:
-        return _Explained([], 0.0)
+        return [], 0.0
     slopes = np.concatenate([problem.slopes[child] for child in children], axis=1)
     values, vectors = np.linalg.eigh(slopes.T @ slopes)
     known = values > UNKNOWN_ABOVE**-2
@@ -251,7 +242,7 @@ def _explained(problem: _Problem, children: Sequence[int]) -> _Explained:
         part, spread = twist[at], covariance[at, at]
         own = float(part @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ part)
         found.append(LinkChange(child, frozen(part[:3]), frozen(part[3:]), frozen(spread), unseen, own))
-    return _Explained(found, gain)
+    return found, gain
 
 
 def _unseen(parts: Array) -> Array:

@@ -38,9 +38,8 @@ class Difference(NamedTuple):
 
     def summary(self) -> list[str]:
         """Return the differences as lines of text."""
-        lines = [f"module {serial} is new" for serial in self.new]
-        lines += [f"module {serial} is missing" for serial in self.removed]
-        lines += [f"module {serial} is mounted differently" for serial in self.moved]
+        changes = {"new": self.new, "missing": self.removed, "mounted differently": self.moved}
+        lines = [f"module {serial} is {how}" for how, serials in changes.items() for serial in serials]
         return lines or ["all modules are mounted as in the baseline"]
 
 
@@ -66,12 +65,8 @@ def difference(baseline: Topology | Chain, later: Topology | Chain) -> Differenc
 def mountings(topology: Topology | Chain) -> dict[str, Mounting]:
     """Return how every module is mounted, by serial."""
     names: tuple[str | None, ...] = (*topology.serials, None)
-    return {
-        serial: Mounting(names[parent], backwards)
-        for serial, parent, backwards in zip(
-            topology.serials, topology.parent, topology.reversed, strict=True
-        )
-    }
+    columns = zip(topology.serials, topology.parent, topology.reversed, strict=True)
+    return {serial: Mounting(names[parent], backwards) for serial, parent, backwards in columns}
 
 
 def joints_to_explore(topology: Topology, changes: Difference) -> tuple[str, ...]:

@@ -57,17 +57,17 @@ def placed(baseline: ChainEstimate, session: ChainEstimate, parts: Sequence[Sequ
 
 def _with_parts(baseline: Chain, session: Chain, parts: Sequence[Sequence[str]]) -> Chain:
     """Return the session's chain with the baseline's geometry within every part."""
-    index, before = _index(session), _index(baseline)
+    index, before = session.serials.index, baseline.serials.index
     axis, point, home = session.axis.copy(), session.point.copy(), session.imu_home.copy()
     for part in parts:
         if len(part) == 1:
             continue
-        missing = [s for s in part if s not in before]
+        missing = [s for s in part if s not in baseline.serials]
         if missing:
             raise ValueError(f"the baseline has no module {', '.join(missing)}")
         frame = _frame(baseline, session, part[0])
         for serial in part[1:]:
-            k, j = index[serial], before[serial]
+            k, j = index(serial), before(serial)
             axis[k] = frame[:3, :3] @ baseline.axis[j]
             point[k] = frame[:3, :3] @ baseline.point[j] + frame[:3, 3]
             home[k] = frame @ baseline.imu_home[j]
@@ -76,7 +76,7 @@ def _with_parts(baseline: Chain, session: Chain, parts: Sequence[Sequence[str]])
 
 def _frame(baseline: Chain, session: Chain, top: str) -> Array:
     """Return the pose (4, 4) of the baseline's root frame in the session's, by a part's topmost module."""
-    there, here = baseline.imu_home[_index(baseline)[top]], session.imu_home[_index(session)[top]]
+    there, here = (chain.imu_home[chain.serials.index(top)] for chain in (baseline, session))
     return np.asarray(here @ np.linalg.inv(there))
 
 
@@ -85,18 +85,17 @@ def _within(baseline: ChainEstimate, chain: Chain, parts: Sequence[Sequence[str]
 
     Only errors relative to a part's topmost module count, since the session measures its pose.
     """
-    before, index = _index(baseline.chain), _index(chain)
-    size = baseline.covariance.shape[0]
+    before, index = baseline.chain.serials.index, chain.serials.index
     open_basis = baseline.null_basis
     covariance = baseline.covariance + OPEN_SIGMA**2 * open_basis @ open_basis.T
-    own = np.zeros((6 * len(chain.serials), size))
+    own = np.zeros((6 * len(chain.serials), len(covariance)))
     for part in parts:
         if len(part) == 1:
             continue
         carry = adjoint(_frame(baseline.chain, chain, part[0]))
-        top = 6 * before[part[0]]
+        top = 6 * before(part[0])
         for serial in part[1:]:
-            row, column = 6 * index[serial], 6 * before[serial]
+            row, column = 6 * index(serial), 6 * before(serial)
             own[row : row + 6, column : column + 6] += carry
             own[row : row + 6, top : top + 6] -= carry
     return covariance, own
@@ -104,12 +103,11 @@ def _within(baseline: ChainEstimate, chain: Chain, parts: Sequence[Sequence[str]
 
 def _rigidly(chain: Chain, parts: Sequence[Sequence[str]]) -> Array:
     """Return the perturbations (6 n, 6 (p - 1)) by twists of all parts but the root's, the frame."""
-    index = _index(chain)
     moving = [part for part in parts if part[0] != chain.serials[0]]
     twists = np.zeros((6 * len(chain.serials), 6 * len(moving)))
     for column, part in enumerate(moving):
         for serial in part:
-            row = 6 * index[serial]
+            row = 6 * chain.serials.index(serial)
             twists[row : row + 6, 6 * column : 6 * column + 6] = np.eye(6)
     return twists
 
@@ -140,10 +138,6 @@ def _report(chain: Chain, covariance: Array, open_basis: Array) -> ChainEstimate
         rank=len(covariance) - 6 - basis.shape[1],
         condition=float(used.max() / used.min()) if used.size else float("inf"),
     )
-
-
-def _index(chain: Chain) -> dict[str, int]:
-    return {serial: k for k, serial in enumerate(chain.serials)}
 
 
 def updated(baseline: Kinematics, session: Kinematics) -> Kinematics:

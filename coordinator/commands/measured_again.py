@@ -6,10 +6,8 @@ import numpy as np
 import typer
 
 from coordinator.baseline.baseline_robot import BaselineRobot, load_baseline
-from coordinator.baseline.check import check, check_plan
-from coordinator.baseline.check_report import CheckReport, write_check
-from coordinator.baseline.payload import payload_plan, search_payload
-from coordinator.baseline.payload_report import write_payload
+from coordinator.baseline.check import CheckReport, check, check_plan, write_check
+from coordinator.baseline.payload import payload_plan, search_payload, write_payload
 from coordinator.commands.options import (
     AgainOptions,
     AsJson,

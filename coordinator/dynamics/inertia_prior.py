@@ -34,9 +34,8 @@ def module_prior(chain: Chain, types: Sequence[ModuleType]) -> Array:
     """
     turned, held = sides_prior(chain, types)
     prior = turned.copy()
-    for i, parent in enumerate(chain.parent):
-        if parent != BASE:
-            prior[parent] += held[i]
+    for i in chain.linked:
+        prior[chain.parent[i]] += held[i]
     return read_only(prior)
 
 

@@ -18,7 +18,7 @@ from module_agent.model.read_only import make_read_only
 # (0.3 m)^2, a usual reach of a module with its link, so that all are in kg. A scale per column of the
 # regressor would enlarge columns of rounding errors, which would then count into the rank.
 REACH_M = 0.3
-
+_REACH = np.outer([REACH_M, REACH_M, REACH_M, 1.0], [REACH_M, REACH_M, REACH_M, 1.0])
 
 # Half a gram at 0.3 m, 5e-5 kg m^2: below every module's inertia, and still far enough from singular for
 # simulators that invert it.
@@ -38,7 +38,8 @@ class Body(NamedTuple):
 def pseudo_inertia(phi: ArrayLike) -> Array:
     """Return the (4, 4) integral of [r; 1] [r; 1]^T dm of ten parameters (order of thesis eq. 25)."""
     values = np.asarray(phi, dtype=float)
-    inertia = _symmetric(values[4:])
+    inertia = np.zeros((3, 3))
+    inertia[_UPPER] = inertia.T[_UPPER] = values[4:]
     pseudo = np.empty((4, 4))
     pseudo[:3, :3] = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     pseudo[:3, 3] = pseudo[3, :3] = values[1:4]
@@ -86,8 +87,7 @@ def nearest_consistent(pseudo: ArrayLike) -> Array:
     """
     values, vectors = np.linalg.eigh(_in_kg(pseudo))
     raised = vectors * np.maximum(values, MIN_EIGENVALUE_KG) @ vectors.T
-    nearest: Array = raised * _reach()
-    return nearest
+    return np.asarray(raised * _REACH)
 
 
 def body(pseudo: ArrayLike) -> Body:
@@ -111,20 +111,8 @@ def bodies_in_frames(pseudo: Array, homes: Array) -> tuple[Body, ...]:
     return tuple(body(own @ matrix @ own.T) for own, matrix in zip(into, pseudo, strict=True))
 
 
-def _symmetric(upper: Array) -> Array:
-    matrix = np.zeros((3, 3))
-    matrix[_UPPER] = upper
-    return matrix + np.triu(matrix, 1).T
-
-
-def _reach() -> Array:
-    scale = np.array([REACH_M, REACH_M, REACH_M, 1.0])
-    return np.outer(scale, scale)
-
-
 def _in_kg(pseudo: ArrayLike) -> Array:
-    scaled: Array = np.asarray(pseudo, dtype=float) / _reach()
-    return scaled
+    return np.asarray(np.asarray(pseudo, dtype=float) / _REACH)
 
 
 def parameter_scale(bodies: int) -> Array:

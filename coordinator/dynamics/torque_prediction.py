@@ -65,11 +65,9 @@ def torque_error(
     if not used.any():
         raise DataError("no samples to compare: the mask lets none through")
     size = np.where(used, tau, 0.0)
-    errors = (np.where(used, predicted - tau, 0.0), np.where(used, mean - tau, 0.0))
-    (overall, mean_overall), (per_joint, mean_per_joint) = (
-        [float(_ratio(_norm(e, None), _norm(size, None))) for e in errors],
-        [_ratio(_norm(e, 0), _norm(size, 0)) for e in errors],
-    )
+    errors = [np.where(used, of - tau, 0.0) for of in (predicted, mean)]
+    overall, mean_overall = (float(_ratio(_norm(e, None), _norm(size, None))) for e in errors)
+    per_joint, mean_per_joint = (_ratio(_norm(e, 0), _norm(size, 0)) for e in errors)
     samples = used.sum(axis=0, dtype=np.int64)
     make_read_only((per_joint, mean_per_joint, samples))
     return TorqueError(overall, per_joint, mean_overall, mean_per_joint, samples)
@@ -86,10 +84,8 @@ def check_held_out(chain: Chain, phi: ArrayLike, motion: JointMotion, tau_mean_n
 
 
 def _norm(signal: Array, axis: int | None) -> Array:
-    norm: Array = np.sqrt(np.sum(signal**2, axis=axis))
-    return norm
+    return np.asarray(np.sqrt(np.sum(signal**2, axis=axis)))
 
 
 def _ratio(error: Array, size: Array) -> Array:
-    ratio: Array = np.divide(error, size, out=np.full(np.shape(size), np.nan), where=size > 0.0)
-    return ratio
+    return np.asarray(np.divide(error, size, out=np.full(np.shape(size), np.nan), where=size > 0.0))

@@ -51,15 +51,9 @@ class Finding(BaseModel):
     @property
     def key(self) -> tuple[str, str | int]:
         """What makes it the same finding as an earlier one: a later word on it replaces the earlier."""
-        match self.kind:
-            case "collision":
-                return self.kind, self.since_ns
-            case "friction":
-                return self.kind, self.serial
-            case "wear":
-                return "structure", 0
-            case _:
-                return "load", 0
+        if self.kind in ("collision", "friction"):
+            return self.kind, self.since_ns if self.kind == "collision" else self.serial
+        return "structure" if self.kind == "wear" else "load", 0
 
 
 class Detection(NamedTuple):

@@ -20,7 +20,7 @@ from scipy.linalg import qr
 from scipy.stats import chi2
 
 from module_agent.model.chain import Array
-from module_agent.model.read_only import make_read_only
+from module_agent.model.read_only import make_read_only, read_only
 
 
 class WhitenedRows(NamedTuple):
@@ -72,8 +72,7 @@ def compressed(rows: ArrayLike, target: ArrayLike) -> WhitenedRows:
         raise ValueError(f"rows {matrix.shape} and targets {vector.shape} do not fit: (k, p) and (k,)")
     if not (np.isfinite(matrix).all() and np.isfinite(vector).all()):
         raise ValueError("a row or a target is not finite")
-    triangle = qr(np.column_stack([matrix, vector]), mode="r", check_finite=False)[0]
-    return _frozen(triangle[: matrix.shape[1]])
+    return _triangular(matrix, vector, 0)
 
 
 def joined(parts: Sequence[WhitenedRows]) -> WhitenedRows:
@@ -92,10 +91,8 @@ def without_own(evidence: WhitenedRows, own_sigma: ArrayLike) -> WhitenedRows:
     sigma = np.asarray(own_sigma, dtype=float)
     prior = np.zeros((sigma.size, evidence.parameters))
     np.fill_diagonal(prior, 1.0 / sigma)
-    stacked = np.vstack([prior, evidence.rows])
     target = np.concatenate([np.zeros(sigma.size), evidence.target])
-    triangle = qr(np.column_stack([stacked, target]), mode="r", check_finite=False)[0]
-    return _frozen(triangle[sigma.size : evidence.parameters, sigma.size :])
+    return _triangular(np.vstack([prior, evidence.rows]), target, sigma.size)
 
 
 def find_change(
@@ -124,12 +121,9 @@ def find_change(
     middle = np.column_stack([before.rows, np.zeros((len(before.rows), wide.shape[1])), before.target])
     bottom = np.column_stack([later.rows, later.rows @ wide, later.target])
     triangle = qr(np.vstack([top, middle, bottom]), mode="r", check_finite=False)[0][count:, count:]
-    target, begin, found = triangle[:, -1], 0, []
-    for change in changes:
-        end = begin + change.shape[1]
-        found.append(_explained(triangle[:, begin:end], target))
-        begin = end
-    return ChangeTest(float(target @ target), tuple(found))
+    target, ends = triangle[:, -1], np.cumsum([change.shape[1] for change in changes], dtype=np.int64)
+    columns = np.split(triangle[:, :-1], ends[:-1], axis=1) if changes else []
+    return ChangeTest(float(target @ target), tuple(_explained(own, target) for own in columns))
 
 
 def gain_above(freedom: int, tests_per_hour: float, alarms_per_hour: float) -> float:
@@ -151,7 +145,8 @@ def _explained(columns: Array, target: Array) -> Change:
     return Change(gain, best, covariance)
 
 
-def _frozen(triangle: Array) -> WhitenedRows:
-    rows, target = triangle[:, :-1].copy(), triangle[:, -1].copy()
-    make_read_only((rows, target))
-    return WhitenedRows(rows, target)
+def _triangular(matrix: Array, vector: Array, first: int) -> WhitenedRows:
+    """Return what rows say of the parameters from the first on, by QR."""
+    triangle = qr(np.column_stack([matrix, vector]), mode="r", check_finite=False)[0]
+    kept = triangle[first : matrix.shape[1]]
+    return WhitenedRows(read_only(kept[:, first:-1].copy()), read_only(kept[:, -1].copy()))

@@ -136,8 +136,8 @@ def imu_rows(model: ImuModel, segment: DataSegment) -> WhitenedRows:
     """Return the evidence (k, p): own parameters (`own_sigma`), then those that stay (`prior_sigma`)."""
     at, count = _thinned(segment), len(model.chain.serials)
     bodies, ideal, residual = _predicted(model, at)
-    samples, own = len(at.q_rad), len(_OWN) * count
-    rows = np.zeros((count, samples, 6, own + len(model.prior_sigma)))
+    own = len(_OWN) * count
+    rows = np.zeros((count, len(at.q_rad), 6, own + len(model.prior_sigma)))
     free = np.ones(SIZE, dtype=bool)
     for k in range(count):
         moved = imu_jacobian(model.chain, bodies, at.q_rad, at.qd_rad_s, k)

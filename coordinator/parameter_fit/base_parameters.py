@@ -201,7 +201,9 @@ def base_parameters(
         DataError: rows of zeros, or values that are not finite.
         ValueError: shapes that do not fit.
     """
-    rows, measured, common = _rows(triangle, target, len(columns.names), sigma, common_errors)
+    rows, measured = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
+    common = np.zeros((len(rows), 0)) if common_errors is None else np.asarray(common_errors, dtype=float)
+    _check(rows, measured, common, len(columns.names), sigma)
     whole = spectrum(rows * columns.scale)
     kept = whole.determined(tolerance) & (whole.values > sigma / max_sigma)
     values, space = whole.values[kept], whole.directions[kept]
@@ -228,18 +230,13 @@ def base_parameters(
     return base
 
 
-def _rows(
-    triangle: ArrayLike, target: ArrayLike, size: int, sigma: float, common_errors: ArrayLike | None
-) -> tuple[Array, Array, Array]:
-    rows, measured = np.asarray(triangle, dtype=float), np.asarray(target, dtype=float)
-    common = np.zeros((len(rows), 0)) if common_errors is None else np.asarray(common_errors, dtype=float)
+def _check(rows: Array, measured: Array, common: Array, size: int, sigma: float) -> None:
     if rows.ndim != 2 or rows.shape[1] != size or measured.shape != rows.shape[:1]:
         raise ValueError(f"rows {rows.shape} and target {measured.shape} do not fit {size} named columns")
     if common.ndim != 2 or len(common) != len(rows) or not np.isfinite(common).all():
         raise ValueError(f"common errors {common.shape} must be finite, {len(rows)} rows of them")
     if not (np.isfinite(rows).all() and np.isfinite(measured).all() and sigma > 0.0):
         raise DataError("the rows or the target hold a value that is not finite, or sigma is not positive")
-    return rows, measured, common
 
 
 def _independent(space: Array, preferred: NDArray[np.int64]) -> NDArray[np.int64]:

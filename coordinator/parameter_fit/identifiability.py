@@ -76,17 +76,23 @@ def identifiabilities(
             places[j].append(i)
     results = []
     for j, (name, unit) in enumerate(zip(base.columns.names, units, strict=True)):
-        if len(places[j]) == 1 and len(members[places[j][0]]) == 1:
-            i = places[j][0]
-            results.append(_known_alone(name, unit, i, float(base.value[i]), float(base.sigma[i])))
-            continue
         others = sorted({k for i in places[j] for k in members[i]} - {j})
-        names = tuple(base.columns.names[k] for k in others)
-        results.append(
-            _in_combination(
-                name, unit, tuple(places[j]), names, value=float(values[j]), sigma=float(sigmas[j])
-            )
+        one = Identifiability(
+            name=name,
+            kind="not identifiable",
+            value=None,
+            sigma=None,
+            base_parameters=tuple(places[j]),
+            lumped_with=tuple(base.columns.names[k] for k in others),
+            summary="not identifiable: without effect on torques",
         )
+        if len(places[j]) == 1 and not others:
+            i = places[j][0]
+            results.append(_known_alone(one, unit, float(base.value[i]), float(base.sigma[i])))
+        elif places[j]:
+            results.append(_in_combination(one, unit, float(values[j]), float(sigmas[j])))
+        else:
+            results.append(one)
     return tuple(results)
 
 
@@ -119,56 +125,22 @@ def base_summary(base: BaseParameters) -> str:
     )
 
 
-def _known_alone(name: str, unit: str, place: int, value: float, sigma: float) -> Identifiability:
+def _known_alone(one: Identifiability, unit: str, value: float, sigma: float) -> Identifiability:
     ratio = sigma / abs(value) if value else np.inf
     kind: Kind = "identified" if ratio <= WEAK_ABOVE else "weak"
-    return Identifiability(
-        name=name,
-        kind=kind,
-        value=value,
-        sigma=sigma,
-        base_parameters=(place,),
-        lumped_with=(),
-        summary=f"{kind}: {_figures(value, sigma, unit)}",
+    return one._replace(
+        kind=kind, value=value, sigma=sigma, summary=f"{kind}: {_figures(value, sigma, unit)}"
     )
 
 
-def _in_combination(
-    name: str, unit: str, places: tuple[int, ...], others: tuple[str, ...], *, value: float, sigma: float
-) -> Identifiability:
-    if not places:
-        summary = "not identifiable: without effect on torques"
-        return Identifiability(
-            name=name,
-            kind="not identifiable",
-            value=None,
-            sigma=None,
-            base_parameters=(),
-            lumped_with=(),
-            summary=summary,
-        )
+def _in_combination(one: Identifiability, unit: str, value: float, sigma: float) -> Identifiability:
+    others = one.lumped_with
     more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
     where = f"in combination with {', '.join(others[:_NAMED])}{more}"
     if sigma <= WEAK_ABOVE * abs(value):
         summary = f"weak: {_figures(value, sigma, unit)} by the prior, only {where}"
-        return Identifiability(
-            name=name,
-            kind="weak",
-            value=value,
-            sigma=sigma,
-            base_parameters=places,
-            lumped_with=others,
-            summary=summary,
-        )
-    return Identifiability(
-        name=name,
-        kind="not identifiable",
-        value=None,
-        sigma=None,
-        base_parameters=places,
-        lumped_with=others,
-        summary=f"not identifiable: only {where}",
-    )
+        return one._replace(kind="weak", value=value, sigma=sigma, summary=summary)
+    return one._replace(summary=f"not identifiable: only {where}")
 
 
 def _figures(value: float, sigma: float, unit: str) -> str:

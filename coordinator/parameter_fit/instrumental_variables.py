@@ -98,25 +98,12 @@ def solve_instrumental_variables(
         left = tuple(without_used(piece, size, one.used) for piece, one in zip(rigid, tests, strict=True))
         fit = solve_weighted(left, independent_fraction, ESTIMATED_CHAIN_TOLERANCE)
         sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _MIN_NM))
-        informed = solve_information(
-            left,
-            1.0 / sigma,
-            prior_phi,
-            independent_fraction=independent_fraction,
-            tolerance=ESTIMATED_CHAIN_TOLERANCE,
-        )
+        accuracy = {"independent_fraction": independent_fraction, "tolerance": ESTIMATED_CHAIN_TOLERANCE}
+        informed = solve_information(left, 1.0 / sigma, prior_phi, **accuracy)
         moved = np.abs((informed.phi - phi) / parameter_scale(len(information))).max()
         phi, before = informed.phi, scale
         if scale_sigma:
-            scale = refine_scale(
-                information=left,
-                phi=fit.phi,
-                noise_nm=sigma,
-                prior_sigma=scale_sigma,
-                so_far=scale,
-                independent_fraction=independent_fraction,
-                tolerance=ESTIMATED_CHAIN_TOLERANCE,
-            )
+            scale = refine_scale(left, fit.phi, sigma, scale_sigma, so_far=scale, **accuracy)
         if max(moved, np.abs(scale.value - before.value).max()) < _SETTLED:
             break
     return InstrumentalFit(fit, _terms(rigid, tests, fit, independent_fraction), scale, phi, left)
@@ -183,7 +170,7 @@ def _terms(
 ) -> TermsFit:
     """Return the terms of every joint with the fitted bodies subtracted."""
     size = len(fit.phi)
-    value, sigma = np.zeros((len(rigid), len(READING_TERMS))), np.zeros((len(rigid), len(READING_TERMS)))
+    value, sigma = np.zeros((2, len(rigid), len(READING_TERMS)))
     for i, (piece, one) in enumerate(zip(rigid, tests, strict=True)):
         inverse = np.linalg.pinv(piece.r[:, size:][:, one.used])
         bodies = piece.r[:, :size]

@@ -36,13 +36,13 @@ class InertialFit(NamedTuple):
     """Least-squares parameters of n bodies; arrays are read-only, p = 10 n.
 
     phi: (p,) as in `torque_regressor`. Only its projection is determined.
-    rank: number of parameter combinations that were identified; p - rank are `unidentifiable_count`.
+    rank: number of parameter combinations that were identified.
     singular_values: (p,) of the weighted regressor in kg (see `REACH_M`), falling, the discarded ones too.
     condition: largest over smallest kept singular value.
     covariance: (p, p) of the identified combinations; zero along all others, which is not certainty.
     projector: (p, p) onto the identifiable subspace: `projector @ phi_true` is what `phi` estimates.
-    identifiable: (p,) parameters known by themselves. without_effect: (p,) those in no identified
-        combination. The rest are known only in combination with others.
+    identifiable: (p,) parameters known by themselves: the projector's diagonal is 1 there, and 0 where a
+        parameter is in no identified combination.
     residual_rms_nm: (n,) of the torque. torque_sigma_nm: (n,) noise estimated from it (degrees of freedom
         taken off); without weights a noisy joint's errors of the parameters add to a quiet joint's residual,
         whose noise then comes out too large. samples: (n,) per joint.
@@ -50,13 +50,11 @@ class InertialFit(NamedTuple):
 
     phi: Array
     rank: int
-    unidentifiable_count: int
     singular_values: Array
     condition: float
     covariance: Array
     projector: Array
     identifiable: NDArray[np.bool_]
-    without_effect: NDArray[np.bool_]
     residual_rms_nm: Array
     torque_sigma_nm: Array
     samples: NDArray[np.int64]
@@ -108,14 +106,26 @@ def solve_information(
     sigma = _residual(information, system, inverse @ along[kept], left)[1]
     variance = np.diagonal(spread(left, (sigma * system.weights) ** 2)) / independent_fraction
     kept[kept] = variance < (max_sigma_kg * whole.values[kept]) ** 2
-    return _fit(
-        information=information,
-        system=system,
-        whole=whole,
-        along=along,
-        kept=kept,
-        independent_fraction=independent_fraction,
+    inverse = whole.inverse(kept)
+    deviation = inverse @ along[kept]
+    left = [block @ inverse for block in system.blocks]
+    rms, sigma = _residual(information, system, deviation, left)
+    covariance_kg = inverse @ spread(left, (sigma * system.weights) ** 2) @ inverse.T / independent_fraction
+    within = whole.directions[kept].T @ whole.directions[kept]
+    fit = InertialFit(
+        phi=system.prior + system.scale * deviation,
+        rank=int(kept.sum()),
+        singular_values=whole.values,
+        condition=whole.condition(kept),
+        covariance=system.scale[:, None] * covariance_kg * system.scale,
+        projector=system.scale[:, None] * within / system.scale,
+        identifiable=np.diagonal(within) > 1.0 - SHARE_TOLERANCE,
+        residual_rms_nm=rms,
+        torque_sigma_nm=sigma,
+        samples=np.array([piece.samples for piece in information], dtype=np.int64),
     )
+    make_read_only(fit)
+    return fit
 
 
 def solve_weighted(
@@ -181,36 +191,3 @@ def _residual(
         freedom = degrees_of_freedom(i, piece.samples, rows)
         rms[i], sigma[i] = np.sqrt(total / piece.samples), np.sqrt(total / freedom)
     return rms, sigma
-
-
-def _fit(
-    information: Sequence[JointInformation],
-    system: _System,
-    whole: Spectrum,
-    along: Array,
-    kept: NDArray[np.bool_],
-    independent_fraction: float,
-) -> InertialFit:
-    inverse = whole.inverse(kept)
-    deviation = inverse @ along[kept]
-    left = [block @ inverse for block in system.blocks]
-    rms, sigma = _residual(information, system, deviation, left)
-    covariance_kg = inverse @ spread(left, (sigma * system.weights) ** 2) @ inverse.T / independent_fraction
-    within = whole.directions[kept].T @ whole.directions[kept]
-    share = np.diagonal(within)
-    fit = InertialFit(
-        phi=system.prior + system.scale * deviation,
-        rank=int(kept.sum()),
-        unidentifiable_count=int(kept.size - kept.sum()),
-        singular_values=whole.values,
-        condition=whole.condition(kept),
-        covariance=system.scale[:, None] * covariance_kg * system.scale,
-        projector=system.scale[:, None] * within / system.scale,
-        identifiable=share > 1.0 - SHARE_TOLERANCE,
-        without_effect=share < SHARE_TOLERANCE,
-        residual_rms_nm=rms,
-        torque_sigma_nm=sigma,
-        samples=np.array([piece.samples for piece in information], dtype=np.int64),
-    )
-    make_read_only(fit)
-    return fit

@@ -9,8 +9,8 @@ that is fixed to the base.
 A module that is mounted reversed holds its output with the link and turns its housing: these are other parts.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from coordinator.dynamics.inertia_prior import sides_prior
 from coordinator.dynamics.pseudo_inertia import parameter_transform, parameters
 from coordinator.parameter_fit.base_parameters import Columns, inertial_columns
 from module_agent.model.catalogue import ModuleType
-from module_agent.model.chain import Array, Chain
+from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY
 
@@ -41,14 +41,7 @@ class Part(NamedTuple):
 
 def parts_of(chains: Iterable[Chain]) -> tuple[Part, ...]:
     """Return the parts of all these robots, each once and sorted."""
-    roles: tuple[Role, ...] = get_args(Role)
-    parts = {
-        Part(serial, role, bool(turned))
-        for chain in chains
-        for serial, turned in zip(chain.serials, chain.reversed, strict=True)
-        for role in roles
-    }
-    return tuple(sorted(parts))
+    return tuple(sorted({part for chain in chains for _, part, _ in _sides(chain)}))
 
 
 def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
@@ -62,16 +55,19 @@ def bodies_from_parts(chain: Chain, parts: Sequence[Part]) -> Array:
     """
     place = {part: k for k, part in enumerate(parts)}
     transform = np.zeros((PER_BODY * len(chain.serials), PER_BODY * len(parts)))
-    for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
-        into_root = parameter_transform(chain.imu_home[k])
-        roles: tuple[tuple[Role, int], ...] = (("turned", k), ("held", parent))
-        for role, body in roles:
-            part = Part(serial, role, bool(chain.reversed[k]))
-            if part not in place:
-                raise ValueError(f"{part.name} is not among the {len(parts)} parts")
-            if body >= 0:
-                transform[_ten(body), _ten(place[part])] = into_root
+    for k, part, body in _sides(chain):
+        if part not in place:
+            raise ValueError(f"{part.name} is not among the {len(parts)} parts")
+        if body != BASE:
+            transform[_ten(body), _ten(place[part])] = parameter_transform(chain.imu_home[k])
     return read_only(transform)
+
+
+def _sides(chain: Chain) -> Iterator[tuple[int, Part, int]]:
+    """Yield every part, the index of its module, and that of the body that it belongs to, or `BASE`."""
+    for k, (serial, backwards) in enumerate(zip(chain.serials, chain.reversed, strict=True)):
+        yield k, Part(serial, "turned", bool(backwards)), k
+        yield k, Part(serial, "held", bool(backwards)), chain.parent[k]
 
 
 def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> Array:
@@ -86,20 +82,16 @@ def likely_parts(chain: Chain, types: Sequence[ModuleType], phi: ArrayLike) -> A
     turned, held = (np.stack([parameters(one) for one in side]) for side in sides_prior(chain, types))
     bodies = np.asarray(phi, dtype=float).reshape(-1, PER_BODY)
     expected = turned.copy()
-    for k, parent in enumerate(chain.parent):
-        if parent >= 0:
-            expected[parent] += held[k]
+    for k in chain.linked:
+        expected[chain.parent[k]] += held[k]
     surplus = (bodies - expected) / expected[:, :1]
     place = {part: k for k, part in enumerate(parts_of([chain]))}
     phi_parts = np.zeros((len(place), PER_BODY))
-    for k, (serial, parent) in enumerate(zip(chain.serials, chain.parent, strict=True)):
-        into_imu = parameter_transform(np.linalg.inv(chain.imu_home[k]))
-        own: tuple[tuple[Role, Array, int], ...] = (("turned", turned[k], k), ("held", held[k], parent))
-        for role, part, body in own:
-            whole = part + part[0] * surplus[body] if body >= 0 else part
-            phi_parts[place[Part(serial, role, bool(chain.reversed[k]))]] = into_imu @ whole
-    flat = phi_parts.ravel()
-    return read_only(flat)
+    for k, part, body in _sides(chain):
+        own = turned[k] if part.role == "turned" else held[k]
+        whole = own + own[0] * surplus[body] if body != BASE else own
+        phi_parts[place[part]] = parameter_transform(np.linalg.inv(chain.imu_home[k])) @ whole
+    return read_only(phi_parts.ravel())
 
 
 def part_columns(parts: Sequence[Part]) -> Columns:

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import qr
 
-from coordinator.dynamics.pseudo_inertia import Body, body, parameter_scale, pseudo_inertia
+from coordinator.dynamics.pseudo_inertia import parameter_scale, pseudo_inertia
 from coordinator.parameter_fit.base_parameters import whitened
-from coordinator.parameter_fit.physically_consistent import physically_consistent
+from coordinator.parameter_fit.physically_consistent import Solution, physically_consistent
 from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
@@ -38,16 +38,6 @@ FOUND_ABOVE = 50.0
 # With a payload the misfit is one variance a row, and a little more where springs give; several times that
 # is another change of the robot.
 EXPLAINED_BELOW = 10.0
-
-
-class PayloadOn(NamedTuple):
-    """The best payload on one body: its parameters (10,), their covariance (10, 10), and the misfit with
-    it.
-    """
-
-    misfit: float
-    phi: Array
-    covariance: Array
 
 
 class Payload(NamedTuple):
@@ -102,11 +92,6 @@ class Payload(NamedTuple):
         slope[:, 1:4] = np.eye(3) / self.mass_kg
         return np.asarray(slope @ self.covariance @ slope.T)
 
-    @property
-    def body(self) -> Body:
-        """The payload as a body."""
-        return body(self.pseudo)
-
 
 def find_payload(
     before: Sequence[JointInformation],
@@ -143,20 +128,20 @@ def find_payload(
         raise DataError("no body may carry the payload")
     stacked = np.vstack([known, rows])
     none, beyond = _complement(stacked, np.concatenate([known_target, target]))
-    fits: dict[int, PayloadOn] = {}
+    fits: dict[int, tuple[Solution, float]] = {}
     for b in candidates:
         added = np.vstack([np.zeros((len(known), PER_BODY)), rows[:, PER_BODY * b : PER_BODY * (b + 1)]])
         fits[b] = _on(beyond.T @ added, none, likely[b])
-    gains = {b: float(none @ none) - one.misfit for b, one in fits.items()}
+    gains = {b: float(none @ none) - misfit for b, (_, misfit) in fits.items()}
     best = max(gains, key=lambda b: gains[b])
     rival = max((b for b in gains if b != best), key=lambda b: gains[b], default=None)
-    one, pseudo = fits[best], pseudo_inertia(fits[best].phi)
-    make_read_only((one.phi, one.covariance, pseudo))
+    (one, misfit), pseudo = fits[best], pseudo_inertia(fits[best][0].x)
+    make_read_only((one.x, one.covariance, pseudo))
     return Payload(
         carrier=best,
         changed=float(none @ none) > FOUND_ABOVE + EXPLAINED_BELOW * len(none) or gains[best] > FOUND_ABOVE,
-        left=one.misfit / max(len(none) - PER_BODY, 1),
-        phi=one.phi,
+        left=misfit / max(len(none) - PER_BODY, 1),
+        phi=one.x,
         covariance=one.covariance,
         pseudo=pseudo,
         gain=gains[best],
@@ -177,17 +162,13 @@ def _complement(rows: Array, target: Array) -> tuple[Array, Array]:
     return beyond.T @ target, beyond
 
 
-def _on(columns: Array, none: Array, place_m: Array) -> PayloadOn:
+def _on(columns: Array, none: Array, place_m: Array) -> tuple[Solution, float]:
+    """Return the payload on one body, likely at a place, and the misfit with it."""
     triangle = qr(np.column_stack([columns, none]), mode="r", check_finite=False)[0][: PER_BODY + 1]
     rows, target = triangle[:, :-1], triangle[:, -1]
-    solved = physically_consistent(rows, target, _likely(place_m)[None], PRIOR_WEIGHT)
-    off = rows @ solved.x - target
-    return PayloadOn(float(off @ off), solved.x, solved.covariance)
-
-
-def _likely(place_m: Array) -> Array:
-    """Return the pseudo-inertia (4, 4) of the prior of a payload."""
     centre = np.append(place_m, 1.0)
-    pseudo = LIKELY_KG * np.outer(centre, centre)
-    pseudo[:3, :3] += LIKELY_KG * LIKELY_SIZE_M**2 * np.eye(3)
-    return np.asarray(pseudo)
+    prior = LIKELY_KG * np.outer(centre, centre)
+    prior[:3, :3] += LIKELY_KG * LIKELY_SIZE_M**2 * np.eye(3)
+    solution = physically_consistent(rows, target, prior[None], PRIOR_WEIGHT)
+    off = rows @ solution.x - target
+    return solution, float(off @ off)

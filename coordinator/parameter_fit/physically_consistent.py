@@ -15,6 +15,7 @@ is convex, smooth and self-concordant, and needs no constraint: Newton's method 
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -80,22 +81,13 @@ class PhysicalFit(NamedTuple):
     error: float
     least_squares_error: float
 
-    @property
-    def cost(self) -> float:
-        """The relative torque error less that of least squares.
-
-        It is negative if the prior improves directions that least squares keeps at zero.
-        """
-        return self.error - self.least_squares_error
-
 
 class Solution(NamedTuple):
-    """The minimum for one weight: x (p,), its covariance (p, p), the divergences (n,), Newton's steps."""
+    """The minimum for one weight: x (p,), its covariance (p, p), the divergences (n,)."""
 
     x: Array
     covariance: Array
     divergence: Array
-    steps: int
 
 
 def fit_physical(
@@ -132,15 +124,15 @@ def fit_physical(
     size = float(np.sqrt(sum(piece.z @ piece.z + piece.rest for piece in information)))
     if not size > 0.0:
         raise UndeterminedError("all torques are zero: no bodies explain them")
-    best = _relative_error(information, least_squares.phi, size)
+    error_of = partial(_relative_error, information, size)
+    best = error_of(least_squares.phi)
     # Least squares fits its own noise too: by so much the true bodies themselves would be worse.
-    sigma = _common_sigma(information, least_squares, size)
+    finest = _FINEST * size / np.sqrt(sum(piece.samples for piece in information))
+    common = max(float(np.sqrt(np.mean(least_squares.torque_sigma_nm**2))), finest)
+    sigma = np.full(len(information), common)
     rows, target = whitened(information, sigma, independent_fraction)
-    own = least_squares.rank * float(sigma[0]) ** 2 / independent_fraction
+    own = least_squares.rank * common**2 / independent_fraction
     allowed = max(best + max_cost, float(np.hypot(best, np.sqrt(own) / size)))
-
-    def error_of(phi: Array) -> float:
-        return _relative_error(information, phi, size)
 
     solution, weight, error = _strongest_prior(
         rows=rows, target=target, prior=bodies, error_of=error_of, allowed=allowed, max_cost=max_cost
@@ -202,19 +194,17 @@ def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, 
     # 11.3). If the whole divergence did, a prior that is far off would cost hundreds of steps.
     high = problem.misfit(y) / (4.0 * problem.bodies)
     times = max(0, int(np.ceil(np.log(high / weight) / np.log(_FALL)))) if high > 0.0 else 0
-    steps = 0
     for left in range(times, 0, -1):
         barrier = weight * _FALL**left
         far = problem._replace(barrier=barrier, weight=max(weight, barrier / _LARGEST))
-        y, taken = _descend(far, y, _ROUGHLY)
-        steps += taken
-    y, taken = _descend(problem, y, _DECREMENT)
+        y = _descend(far, y, _ROUGHLY)
+    y = _descend(problem, y, _DECREMENT)
     spread = problem.scale @ solve_triangular(problem.slope(y)[1], np.eye(len(y)))
-    return Solution(problem.scale @ y, spread @ spread.T, problem.divergence(y), steps + taken)
+    return Solution(problem.scale @ y, spread @ spread.T, problem.divergence(y))
 
 
-def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, int]:
-    """Return the minimum to within `decrement` times the barrier, from `y`, and Newton's steps."""
+def _descend(problem: "_Problem", y: Array, decrement: float) -> Array:
+    """Return the minimum to within `decrement` times the barrier, from `y`, by Newton's method."""
     fall = np.inf
     for step in range(_MAX_STEPS):
         try:
@@ -227,11 +217,11 @@ def _descend(problem: "_Problem", y: Array, decrement: float) -> tuple[Array, in
             ) from error
         fall = float(-gradient @ down)
         if fall < 2.0 * decrement * problem.barrier:
-            return y, step
+            return y
         length = problem.best_length(y, down)
         if not length > 0.0:
             # The rest is rounding: no lower objective is resolved.
-            return y, step
+            return y
         y = y + length * down
     raise NotSolvedError(
         f"no consistent bodies were found in {_MAX_STEPS} steps; the last decrement is {fall:.2g}"
@@ -346,13 +336,7 @@ def _problem(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float
     )
 
 
-def _common_sigma(information: Sequence[JointInformation], fit: InertialFit, size: float) -> Array:
-    least = _FINEST * size / np.sqrt(sum(piece.samples for piece in information))
-    common = max(float(np.sqrt(np.mean(fit.torque_sigma_nm**2))), least)
-    return np.full(len(information), common)
-
-
-def _relative_error(information: Sequence[JointInformation], phi: Array, size: float) -> float:
+def _relative_error(information: Sequence[JointInformation], size: float, phi: Array) -> float:
     misfit = [piece.r @ phi - piece.z for piece in information]
     total = sum(float(e @ e) + piece.rest for e, piece in zip(misfit, information, strict=True))
     return float(np.sqrt(total)) / size

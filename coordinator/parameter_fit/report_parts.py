@@ -7,6 +7,9 @@ from pydantic import BaseModel, ConfigDict
 
 from coordinator.dynamics.pseudo_inertia import Body
 from coordinator.parameter_fit.base_parameters import BaseParameters
+from module_agent.model.chain import Array
+
+Triple = tuple[float, float, float]
 
 
 class Part(BaseModel):
@@ -68,3 +71,9 @@ def body_part(body: Body) -> BodyPart:
 def finite(value: float) -> float | None:
     """Return a number, or None for what JSON does not have: NaN and infinity."""
     return value if np.isfinite(value) else None
+
+
+def triple(values: Array) -> Triple:
+    """Return the three elements of an array."""
+    x, y, z = values.tolist()
+    return x, y, z

@@ -140,15 +140,9 @@ def fit_weighted(
             break
     residual = np.where(counted, tau - y @ solution.parameters, np.nan)
     correlation = np.maximum(correlation_times(residual), min_correlation)
-    return _fit(solution, counted, weights, sigma, correlation)
-
-
-def _fit(
-    solution: _Solution, used: NDArray[np.bool_], weights: Array, sigma: Array, correlation: Array
-) -> WeightedFit:
     # The noise of the rows is 1, but several of them count as one.
     along = spread(solution.spread, correlation)
-    samples = used.sum(axis=0, dtype=np.int64)
+    samples = counted.sum(axis=0, dtype=np.int64)
     fit = WeightedFit(
         parameters=solution.parameters,
         covariance=solution.inverse @ along @ solution.inverse.T,
@@ -159,7 +153,7 @@ def _fit(
         sigma_nm=sigma,
         correlation=correlation,
         samples=samples,
-        downweighted=np.sum(used & (weights < 1.0), axis=0) / samples,
+        downweighted=np.sum(counted & (weights < 1.0), axis=0) / samples,
     )
     make_read_only(fit)
     return fit
@@ -204,55 +198,45 @@ def _solution(joints: list[_JointRows], sigma: Array, scale: Array, with_instrum
     rows, target = whole[:, :-1], whole[:, -1]
     within = spectrum(rows * scale)
     kept = within.determined(RANK_TOLERANCE)
-    inverse, condition = scale[:, None] * within.inverse(kept), within.condition(kept)
+    inverse = scale[:, None] * within.inverse(kept)
     hat = [joint.y @ inverse / own for joint, own in zip(joints, sigma, strict=True)]
-    if not with_instruments:
-        parameters = inverse @ ((rows @ inverse).T @ target)
-        return _Solution(
-            parameters=parameters,
-            inverse=inverse,
-            hat=hat,
-            spread=hat,
-            rows=rows,
-            target=target,
-            condition=condition,
-        )
-    # Along the regressor's own directions, so that undetermined ones stay zero: Z^T U c = Z^T tau.
-    tools = np.vstack([joint.z @ inverse / own for joint, own in zip(joints, sigma, strict=True)])
-    torques = np.concatenate([joint.tau / own for joint, own in zip(joints, sigma, strict=True)])
-    through = np.linalg.solve(tools.T @ np.vstack(hat), tools.T).T
-    parameters = inverse @ (through.T @ torques)
-    ends = np.cumsum([len(joint.tau) for joint in joints])[:-1]
+    if with_instruments:
+        # Along the regressor's own directions, so that undetermined ones stay zero: Z^T U c = Z^T tau.
+        tools = np.vstack([joint.z @ inverse / own for joint, own in zip(joints, sigma, strict=True)])
+        torques = np.concatenate([joint.tau / own for joint, own in zip(joints, sigma, strict=True)])
+        answer = np.linalg.solve(tools.T @ np.vstack(hat), tools.T).T
+        parameters = inverse @ (answer.T @ torques)
+        spread = np.split(answer, np.cumsum([len(joint.tau) for joint in joints])[:-1])
+        target = rows @ parameters
+    else:
+        parameters, spread = inverse @ ((rows @ inverse).T @ target), hat
     return _Solution(
         parameters=parameters,
         inverse=inverse,
         hat=hat,
-        spread=np.split(through, ends),
+        spread=spread,
         rows=rows,
-        target=rows @ parameters,
-        condition=condition,
+        target=target,
+        condition=within.condition(kept),
     )
 
 
 def _huber(off: Array) -> Array:
     """Return the square roots of Huber's weights of residuals in standard deviations."""
-    roots: Array = np.sqrt(HUBER_LIMIT / np.maximum(np.abs(off), HUBER_LIMIT))
-    return roots
+    return np.asarray(np.sqrt(HUBER_LIMIT / np.maximum(np.abs(off), HUBER_LIMIT)))
 
 
 def _noise(joints: list[_JointRows], solution: _Solution, used: NDArray[np.bool_]) -> Array:
     """Return the rms of each joint's residual (n,)."""
     left = [float(np.sum((joint.tau - joint.y @ solution.parameters) ** 2)) for joint in joints]
     # Without noise the residual is rounding; weights must stay finite.
-    rms: Array = np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _MIN_NM)
-    return rms
+    return np.asarray(np.maximum(np.sqrt(np.array(left) / used.sum(axis=0)), _MIN_NM))
 
 
 def _robust_noise(residual: Array, used: NDArray[np.bool_]) -> Array:
     """Return each joint's noise (n,) by the median of its residuals."""
     middle = np.nanmedian(np.where(used, np.abs(residual), np.nan), axis=0)
-    sigma: Array = np.maximum(_MAD_TO_SIGMA * middle, _MIN_NM)
-    return sigma
+    return np.asarray(np.maximum(_MAD_TO_SIGMA * middle, _MIN_NM))
 
 
 def _freedom(solution: _Solution, used: NDArray[np.bool_]) -> Array:

@@ -32,8 +32,7 @@ def error_directions(covariance: Array) -> Array:
     """
     values, vectors = np.linalg.eigh(covariance)
     kept = np.flatnonzero(values > _NEGLIGIBLE * max(values[-1], 0.0))[-_MAX_DIRECTIONS:]
-    directions = np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
-    return read_only(directions)
+    return read_only(np.asarray(vectors[:, kept] * np.sqrt(values[kept])))
 
 
 def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: JointMotion) -> Array:
@@ -47,13 +46,12 @@ def chain_effects(chain: Chain, covariance: Array, phi: ArrayLike, motion: Joint
         phi: (10 n,) bodies.
         motion: (m, n).
     """
-    joints = motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2
+    joints, directions = (motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2), error_directions(covariance)
     here = inverse_dynamics(chain, phi, *joints)
-    effects = [
-        inverse_dynamics(apply_perturbation(chain, one), phi, *joints) - here
-        for one in error_directions(covariance).T
-    ]
-    return np.stack(effects, axis=2) if effects else np.zeros((*here.shape, 0))
+    effects = np.empty((*here.shape, directions.shape[1]))
+    for k, one in enumerate(directions.T):
+        effects[..., k] = inverse_dynamics(apply_perturbation(chain, one), phi, *joints) - here
+    return effects
 
 
 def body_shifts(chain: Chain, directions: ArrayLike, phi_parts: ArrayLike) -> Array:

@@ -15,8 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
+from coordinator.parameter_fit.base_parameters import whitened
 from coordinator.parameter_fit.spectrum import without_range
 from module_agent.model.catalogue import TorqueKind
 from module_agent.model.chain import Array
@@ -77,17 +79,10 @@ def refine_scale(
     """
     joints = len(information)
     weights = np.sqrt(independent_fraction) / np.asarray(noise_nm, dtype=float)
-    size = parameter_scale(joints)
-    rows = np.vstack(
-        [w * piece.r[:, : len(size)] * size for w, piece in zip(weights, information, strict=True)]
-    )
-    columns = np.zeros((len(rows), joints))
-    readings = np.concatenate([w * piece.z for w, piece in zip(weights, information, strict=True)])
-    begin = 0
-    for i, piece in enumerate(information):
-        end = begin + len(piece.z)
-        columns[begin:end, i] = weights[i] * (piece.r @ phi)
-        begin = end
+    rows, readings = whitened(information, noise_nm, independent_fraction)
+    predicted = [w * (piece.r @ phi) for w, piece in zip(weights, information, strict=True)]
+    columns = block_diag(*(one[:, None] for one in predicted))
+    rows = rows * parameter_scale(joints)
     (slopes, target), _ = without_range(rows, tolerance, (columns, readings))
     curvature = slopes.T @ slopes + np.eye(joints) / prior_sigma**2
     covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
