@@ -3,14 +3,17 @@
 CSV, a line of names and a line per sample: `t_s`, and per joint `q_<joint>_rad`, `tau_<joint>_nm` and, for
 all joints or none, `qd_<joint>_rad_s`; <joint> as in the URDF, columns in any order, others are ignored.
 
+With torque constants, `i_<joint>_a` takes the place of `tau_<joint>_nm`.
+
 npz: `position_rad` (m, n); `torque` or `torque_nm` (m, n); `sample_rate_hz` () or `t_s` (m,); optionally
 `velocity_rad_s` (m, n) and `joint_names` (n,), without which the joints are in the URDF's order.
 """
 
 import csv
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, NamedTuple, NoReturn
 from zipfile import BadZipFile
 
@@ -32,6 +35,9 @@ _MAX_REPEATED = 3
 _COARSE = 0.1
 
 
+_NOTHING: Mapping[str, float] = MappingProxyType({})
+
+
 class DataFileError(UsageError):
     """A recording that cannot be read, or does not fit the robot."""
 
@@ -42,7 +48,7 @@ class JointLog(NamedTuple):
     rate_hz: sampling rate. q_rad: (m, n) joint positions. qd_rad_s: (m, n) joint velocities, None if they
     were not measured. tau_nm: (m, n) joint torques. resampled: whether the times of the file were not
     uniform. breaks: samples before which there is a hole, or where another recording begins. repeated: rows
-    like the one before, left out. file: where it was read from.
+    like the one before, left out. file: where it was read from. others: mean positions of further joints.
     """
 
     rate_hz: float
@@ -53,6 +59,7 @@ class JointLog(NamedTuple):
     breaks: tuple[int, ...] = ()
     repeated: int = 0
     file: str = "a recording in memory"
+    others: Mapping[str, float] = _NOTHING
 
     def column(self, signal: Literal["t", "q", "qd", "tau"], joint: str) -> str:
         """Return the file and the column of a joint's signal, for messages."""
@@ -92,6 +99,7 @@ class _Table(NamedTuple):
     t_s: Array
     signals: dict[str, Array]
     row: Callable[[int], str]
+    others: Mapping[str, float] = _NOTHING
 
 
 def joined(logs: Sequence[JointLog]) -> JointLog:
@@ -107,7 +115,23 @@ def joined(logs: Sequence[JointLog]) -> JointLog:
         any(log.resampled for log in logs),
         tuple(breaks[1:]),
         sum(log.repeated for log in logs),
+        ", ".join(dict.fromkeys(log.file for log in logs)),
+        logs[0].others,
     )
+
+
+def at_rate(log: JointLog, rate_hz: float) -> JointLog:
+    """Return a recording interpolated to another, higher rate."""
+    if log.rate_hz == rate_hz:
+        return log
+    pieces = []
+    for piece in log.pieces():
+        times = np.arange(len(piece.q_rad)) / log.rate_hz
+        even = np.arange(int(times[-1] * rate_hz) + 1) / rate_hz
+        q, tau = (_even(times, signal, even) for signal in (piece.q_rad, piece.tau_nm))
+        qd = None if piece.qd_rad_s is None else _even(times, piece.qd_rad_s, even)
+        pieces.append(JointLog(rate_hz, q, qd, tau, True))
+    return joined(pieces)._replace(repeated=log.repeated, file=log.file, others=log.others)
 
 
 def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
@@ -133,7 +157,12 @@ def _piece_in_two(log: JointLog) -> tuple[JointLog, JointLog]:
     )
 
 
-def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
+def read_log(
+    path: str | Path,
+    joints: Sequence[str],
+    gains: Mapping[str, float] = _NOTHING,
+    held: Sequence[str] = (),
+) -> JointLog:
     """Return the recording in a CSV or npz file, positions and torques (m, n), split at holes (`breaks`).
 
     CSV: a line of names and a line per sample; `t_s` [s], and per joint `q_<joint>_rad`, `tau_<joint>_nm` and
@@ -144,6 +173,10 @@ def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
         path: of the file; its name ends on .csv or .npz.
         joints: (n,) names of the joints in the order that the columns shall have, `robot.chain.serials` of
             `read_urdf`.
+        gains: torque constants [Nm/A], gear included, of the joints whose currents are in the file instead of
+            torques: `i_<joint>_a`, in an npz `current_a` (m, n).
+        held: joints whose mean positions are to be read if they are there: `q_<joint>_m` or `q_<joint>_rad`,
+            in an npz columns that `joint_names` names.
 
     Raises:
         DataFileError: neither CSV nor npz, columns or arrays that are missing or do not fit the joints, a
@@ -156,7 +189,7 @@ def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
     if path.suffix.lower() not in readers:
         raise DataFileError(f"{path}: its name ends on {path.suffix!r}; .csv and .npz are read")
     try:
-        return _log(readers[path.suffix.lower()](path, joints))._replace(file=str(path))
+        return _log(readers[path.suffix.lower()](path, joints, gains, held))._replace(file=str(path))
     except DataFileError as error:
         raise DataFileError(f"{path}: {error}") from None
 
@@ -164,25 +197,34 @@ def read_log(path: str | Path, joints: Sequence[str]) -> JointLog:
 # ---------------------------------------------------------------------- CSV
 
 
-def _read_csv(path: Path, joints: Sequence[str]) -> _Table:
+def _read_csv(path: Path, joints: Sequence[str], gains: Mapping[str, float], held: Sequence[str]) -> _Table:
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
             reader = csv.reader(file)
             header = [name.strip() for name in next(reader, [])]
-            names = _csv_columns(header, joints)
+            names = _csv_columns(header, joints, gains)
+            at = {joint: n for joint in held for n in (f"q_{joint}_m", f"q_{joint}_rad") if n in header}
             numbered = ((reader.line_num, cells) for cells in reader)
-            values, lines = _csv_values(numbered, header, [n for some in names.values() for n in some])
+            wanted = [*(n for some in names.values() for n in some), *at.values()]
+            values, lines = _csv_values(numbered, header, wanted)
         except (csv.Error, UnicodeDecodeError) as error:
             _refuse(f"not a CSV file: {error}")
     count = len(joints)
     signals = {key: values[:, 1 + count * i : 1 + count * (i + 1)] for i, key in enumerate(list(names)[1:])}
-    return _Table(values[:, 0], signals, lambda row: f"line {lines[row]}")
+    signals["tau"] = signals["tau"] * [gains.get(joint, 1.0) for joint in joints]
+    others = values[:, values.shape[1] - len(at) :].mean(axis=0) if len(values) else np.zeros(len(at))
+    means = dict(zip(at, others.tolist(), strict=True))
+    return _Table(values[:, 0], signals, lambda row: f"line {lines[row]}", means)
 
 
-def _csv_columns(header: Sequence[str], joints: Sequence[str]) -> dict[str, list[str]]:
-    wanted = {"t_s": ["t_s"]} | {
-        key: [pattern.format(joint) for joint in joints]
-        for key, pattern in (("q", "q_{}_rad"), ("tau", "tau_{}_nm"), ("qd", "qd_{}_rad_s"))
+def _csv_columns(
+    header: Sequence[str], joints: Sequence[str], gains: Mapping[str, float]
+) -> dict[str, list[str]]:
+    wanted = {
+        "t_s": ["t_s"],
+        "q": [f"q_{joint}_rad" for joint in joints],
+        "tau": [f"i_{joint}_a" if joint in gains else f"tau_{joint}_nm" for joint in joints],
+        "qd": [f"qd_{joint}_rad_s" for joint in joints],
     }
     if not any(name in header for name in wanted["qd"]):
         del wanted["qd"]
@@ -224,19 +266,26 @@ def _number(cell: str, line: int, column: str) -> float:
 # ---------------------------------------------------------------------- npz
 
 
-def _read_npz(path: Path, joints: Sequence[str]) -> _Table:
+def _read_npz(path: Path, joints: Sequence[str], gains: Mapping[str, float], held: Sequence[str]) -> _Table:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {key: file[key] for key in file.files}
     except (BadZipFile, ValueError, EOFError) as error:
         _refuse(f"not an npz file of plain arrays: {error}")
-    position = _array(arrays, "position_rad", joints)
-    order = _npz_order(arrays, joints)
+    names, order = _npz_order(arrays, joints)
+    position = _array(arrays, "position_rad", names)
+    signals = {"q": position[:, order]}
     torque = "torque_nm" if "torque_nm" in arrays else "torque"
-    signals = {"q": position[:, order], "tau": _array(arrays, torque, joints, len(position))[:, order]}
+    if len(gains) < len(joints):
+        signals["tau"] = _array(arrays, torque, names, len(position))[:, order]
+    if gains:
+        current = _array(arrays, "current_a", names, len(position))[:, order]
+        factors = np.array([gains.get(joint, np.nan) for joint in joints])
+        signals["tau"] = np.where(np.isnan(factors), signals.get("tau", current), factors * current)
     if "velocity_rad_s" in arrays:
-        signals["qd"] = _array(arrays, "velocity_rad_s", joints, len(position))[:, order]
-    return _Table(_npz_times(arrays, len(position)), signals, lambda row: f"row {row}")
+        signals["qd"] = _array(arrays, "velocity_rad_s", names, len(position))[:, order]
+    means = {n: float(position[:, i].mean()) for i, n in enumerate(names) if n in held and len(position)}
+    return _Table(_npz_times(arrays, len(position)), signals, lambda row: f"row {row}", means)
 
 
 def _array(arrays: dict[str, NDArray[np.generic]], key: str, joints: Sequence[str], rows: int = -1) -> Array:
@@ -275,13 +324,14 @@ def _npz_times(arrays: dict[str, NDArray[np.generic]], rows: int) -> Array:
     return np.arange(rows) / float(rate.reshape(()))
 
 
-def _npz_order(arrays: dict[str, NDArray[np.generic]], joints: Sequence[str]) -> list[int]:
+def _npz_order(arrays: dict[str, NDArray[np.generic]], joints: Sequence[str]) -> tuple[list[str], list[int]]:
+    """Return the names of the file's columns, and where the joints are among them."""
     if "joint_names" not in arrays:
-        return list(range(len(joints)))
+        return list(joints), list(range(len(joints)))
     names = [str(name) for name in arrays["joint_names"].reshape(-1)]
-    if sorted(names) != sorted(joints):
+    if not set(joints) <= set(names):
         _refuse(f"joint_names are {', '.join(names)}; the URDF's joints are {', '.join(joints)}")
-    return [names.index(joint) for joint in joints]
+    return names, [names.index(joint) for joint in joints]
 
 
 # ---------------------------------------------------------------------- times
@@ -303,7 +353,8 @@ def _log(table: _Table) -> JointLog:
         _refuse(f"{len(ends) - 2} holes in {times.size} samples leave no 4 in a row")
     spans = np.array([times[part.stop - 1] - times[part.start] for part in parts])
     rate_hz = float(np.round(spans / np.median(steps)).sum() / spans.sum())
-    return joined([_uniform(table, part, rate_hz) for part in parts])._replace(repeated=repeated)
+    log = joined([_uniform(table, part, rate_hz) for part in parts])
+    return log._replace(repeated=repeated, others=table.others)
 
 
 def _without_repeated(table: _Table) -> tuple[_Table, int]:
@@ -325,7 +376,9 @@ def _without_repeated(table: _Table) -> tuple[_Table, int]:
     if not coarse and after < 1.5 * usual and (table.t_s[last] > table.t_s[last - 1]).all():
         times = table.t_s[: kept.size]
     signals = {key: signal[kept] for key, signal in table.signals.items()}
-    return _Table(times, signals, lambda row: table.row(int(kept[row]))), int(repeated.sum())
+    return table._replace(t_s=times, signals=signals, row=lambda row: table.row(int(kept[row]))), int(
+        repeated.sum()
+    )
 
 
 def _uniform(table: _Table, part: slice, rate_hz: float) -> JointLog:

@@ -195,6 +195,7 @@ def _data_part(log: JointLog, curve: Sequence[CutoffPoint], problem: Problem) ->
         resampled=log.resampled,
         repeated_rows=log.repeated,
         pieces=len(log.breaks) + 1,
+        held=problem.robot.held,
         dropped_s=problem.log.dropped_s,
         cutoff_curve=[
             CutoffPart(cutoff_hz=point.cutoff_hz, filtered=point.filtered, raw=point.raw) for point in curve

@@ -1,20 +1,22 @@
 """The library's `fit_dynamics`: inertia, friction and motors of an arm from its URDF and a log of torques."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.arm_fit.checks import wrong_motion, wrong_torques
+from coordinator.arm_fit.checks import wrong_torques
 from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
 from coordinator.arm_fit.cutoff import chosen_cutoff_hz, cutoff_curve
-from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two, read_log
+from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two
 from coordinator.arm_fit.drive_choice import candidates, choose_drives, pairs
 from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
+from coordinator.arm_fit.recordings import Recordings, Source, read_other, read_recordings
 from coordinator.arm_fit.report import FitReport
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
 from coordinator.description.urdf_update import fitted_urdf_text, friction_of
@@ -24,6 +26,7 @@ from module_agent.model.errors import DataError, UsageError
 from module_agent.model.files import write_text
 
 _USUAL = ModelChoice()
+_NO_GAINS: Mapping[str, float] = MappingProxyType({})
 
 
 class ArmFit(NamedTuple):
@@ -62,9 +65,10 @@ class ArmFit(NamedTuple):
 
 def fit_dynamics(
     urdf: str | Path | UrdfRobot,
-    data: str | Path | JointLog,
+    data: Source | Sequence[Source],
     *,
-    held_out: str | Path | JointLog | None = None,
+    held_out: Source | None = None,
+    gains: Mapping[str, float] = _NO_GAINS,
     choice: ModelChoice = _USUAL,
     instruments: bool = False,
     cutoff_hz: float | None = None,
@@ -81,9 +85,11 @@ def fit_dynamics(
     (`consistent_bodies`).
 
     Args:
-        urdf: file of the arm, or what `read_urdf` returned for it; revolute, continuous and fixed joints.
-        data: CSV or npz file of the recording (see `read_log`), or the recording itself.
+        urdf: file of the arm, or what `read_urdf` returned for it.
+        data: CSV or npz file of the recording (see `read_log`), or the recording itself; or several. Joints
+            that stand still in all of them are held where they are: taken as fixed.
         held_out: another recording of the same arm, predicted by the fit to the whole of `data`.
+        gains: torque constants [Nm/A], gear included, of joints whose currents are in the files.
         choice: terms of the drives, joints that share a drive, robust weights, and the speeds below which
             friction fades and samples are masked.
         instruments: fit by instrumental variables, every other sample against the rest, so that the noise of
@@ -103,11 +109,16 @@ def fit_dynamics(
     """
     if not 0.0 < trust < np.inf:
         raise UsageError(f"trust {trust}: it must be a number above 0")
-    progress(f"read {_name(urdf)} and {_name(data)}")
+    sources = [data] if isinstance(data, str | Path | JointLog) else list(data)
+    names = ", ".join(_name(source) for source in sources)
+    progress(f"read {_name(urdf)} and {names}")
     robot = urdf if isinstance(urdf, UrdfRobot) else read_urdf(urdf, gravity)
-    log = _log(data, robot)
-    if checked:
-        _refuse(wrong_motion(robot, log))
+    recordings = read_recordings(robot, sources, gains, checked)
+    robot, log = recordings.robot, recordings.log
+    if choice.coupled is not None:
+        places = {joint: i for i, joint in enumerate(recordings.moving)}
+        moving = [pair for pair in choice.coupled if set(pair) <= set(places)]
+        choice = choice._replace(coupled=tuple((places[i], places[j]) for i, j in moving))
     progress("choose the low-pass")
     joints = len(robot.bodies)
     with_pairs = choice._replace(coupled=choice.coupled or pairs(choice, joints))
@@ -116,18 +127,20 @@ def fit_dynamics(
     posed = _posed(
         robot, log, choice._replace(extra=extra), cutoff_hz or chosen_cutoff_hz(curve), instruments
     )
-    if checked:
-        _refuse(wrong_torques(posed.with_drives(lambda drive: drive not in extra), log))
+    if checked and (texts := list(wrong_torques(posed.with_drives(lambda d: d not in extra), log))):
+        raise DataFileError("\n".join(texts))
     progress("choose the friction of each joint")
     posed, trials = choose_drives(posed)
-    elsewhere = None if held_out is None else Elsewhere(_name(held_out), _posed_like(posed, held_out))
+    elsewhere = (
+        None if held_out is None else Elsewhere(_name(held_out), _posed_like(posed, recordings, held_out))
+    )
     result = fit_and_test(
         posed,
         log,
         curve,
         trials,
         urdf_name=_name(urdf),
-        data_name=_name(data),
+        data_name=names,
         step=progress,
         trust=trust,
         elsewhere=elsewhere,
@@ -142,26 +155,10 @@ def fit_dynamics(
     )
 
 
-def _refuse(findings: Iterable[str]) -> None:
-    if texts := list(findings):
-        raise DataFileError("\n".join(texts))
-
-
 def _name(source: str | Path | UrdfRobot | JointLog) -> str:
     if isinstance(source, UrdfRobot):
         return str(source.path)
     return "a recording in memory" if isinstance(source, JointLog) else str(source)
-
-
-def _log(data: str | Path | JointLog, robot: UrdfRobot) -> JointLog:
-    if not isinstance(data, JointLog):
-        return read_log(data, robot.chain.serials)
-    if data.q_rad.shape != data.tau_nm.shape or data.q_rad.shape[1:] != (len(robot.bodies),):
-        raise UsageError(
-            f"positions {data.q_rad.shape} and torques {data.tau_nm.shape} of the recording do not fit the "
-            f"joints {', '.join(robot.chain.serials)}"
-        )
-    return data
 
 
 def _posed(robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff: float, instruments: bool) -> Problem:
@@ -172,11 +169,11 @@ def _posed(robot: UrdfRobot, log: JointLog, choice: ModelChoice, cutoff: float, 
     return problem(robot, one, choice, again)
 
 
-def _posed_like(posed: Problem, data: str | Path | JointLog) -> Problem:
+def _posed_like(posed: Problem, recordings: Recordings, data: Source) -> Problem:
     """Pose another recording with the cut-off and the top speeds of the first one."""
+    other = read_other(recordings, data)
     try:
-        log = filtered_log(_log(data, posed.robot), posed.log.cutoff_hz, max_samples(len(posed.robot.bodies)))
+        log = filtered_log(other, posed.log.cutoff_hz, max_samples(len(posed.robot.bodies)))
     except UsageError as error:
-        text = str(error)
-        raise UsageError(text if text.startswith(_name(data)) else f"{_name(data)}: {text}") from None
+        raise UsageError(f"{_name(data)}: {error}") from None
     return problem(posed.robot, log, posed.choice, top_rad_s=posed.log.top_rad_s)

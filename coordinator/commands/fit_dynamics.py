@@ -5,6 +5,7 @@ from itertools import count
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from coordinator.arm_fit import fit_dynamics as arm_fit
@@ -28,15 +29,23 @@ _TRIED = ",".join(_USUAL.tried)
 
 _Urdf = Annotated[Path, typer.Option(help="URDF file: revolute, continuous and fixed joints.")]
 _Data = Annotated[
-    Path,
+    list[Path],
     typer.Option(
         help="CSV with t_s, q_JOINT_rad, tau_JOINT_nm and, if measured, qd_JOINT_rad_s; or npz with "
-        "position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s and joint_names."
+        "position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s and joint_names. Repeat for "
+        "several recordings."
     ),
 ]
 _HeldOut = Annotated[
     Path | None,
     typer.Option(help="Another recording of the arm, CSV or npz, to test the fit to the whole of --data on."),
+]
+_Gain = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="JOINT=NM_PER_A: torque constant, gear included, of a joint whose current i_JOINT_a (current_a) "
+        "was recorded. Repeat for several."
+    ),
 ]
 _Json = Annotated[Path | None, typer.Option("--json", help="JSON file to write the report to.")]
 _FittedUrdf = Annotated[
@@ -86,6 +95,7 @@ def fit_dynamics(
     urdf: _Urdf,
     data: _Data,
     held_out: _HeldOut = None,
+    gain: _Gain = None,
     json_file: _Json = None,
     fitted_urdf: _FittedUrdf = None,
     trust: _Trust = USUAL_TRUST,
@@ -114,6 +124,7 @@ def fit_dynamics(
                 robot,
                 data,
                 held_out=held_out,
+                gains=_gains(gain or ()),
                 choice=ModelChoice(_terms(terms), _pairs(robot, coupled), robust, slow, mask, _terms(tried)),
                 instruments=instruments,
                 cutoff_hz=cutoff,
@@ -148,6 +159,19 @@ def _gravity(text: str) -> list[float]:
     if len(gravity) != 3 or not all(abs(part) < 100.0 for part in gravity):
         raise UsageError(f"gravity {text!r}: it must be three numbers below 100, like {_UP}")
     return gravity
+
+
+def _gains(texts: Sequence[str]) -> dict[str, float]:
+    gains = {}
+    for text in texts:
+        joint, _, number = text.rpartition("=")
+        try:
+            gains[joint] = float(number)
+        except ValueError:
+            gains[joint] = 0.0
+        if not joint or not 0.0 < abs(gains[joint]) < np.inf:
+            raise UsageError(f"gain {text!r}: it must be a joint and its Nm per A, like elbow=8.5")
+    return gains
 
 
 def _terms(text: str) -> tuple[Term, ...]:

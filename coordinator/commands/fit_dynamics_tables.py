@@ -40,7 +40,9 @@ def notes(report: FitReport) -> Iterator[str]:
     if data.repeated_rows:
         yield f"{data.repeated_rows} rows repeat the one before them and were left out"
     if data.pieces > 1:
-        yield f"split at {data.pieces - 1} holes; pieces too short for the low-pass: {data.dropped_s:.2f} s"
+        yield f"{data.pieces} pieces between holes or recordings; too short to filter: {data.dropped_s:.2f} s"
+    for joint, position in data.held.items():
+        yield f"{joint} is held at {position:.4g}: it does not move, slides or mimics; its torque is not used"
     if data.cutoff_curve:
         curve = ", ".join(f"{p.cutoff_hz:.3g} Hz {_percent(p.raw)} %" for p in data.cutoff_curve)
         yield f"low-pass chosen by the raw error of halves predicted by each other: {curve}"

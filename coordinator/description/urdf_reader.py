@@ -4,8 +4,9 @@ The root link's frame is the root frame. Links that a fixed joint joins are one 
 root link do not move and are left out. A body's own frame is that of the link right behind its joint.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, ParseError, parse
 
@@ -20,7 +21,10 @@ from module_agent.model.errors import UsageError
 from module_agent.model.read_only import make_read_only, read_only
 
 STANDARD_GRAVITY = (0.0, 0.0, 9.81)
-_MOVING, _FIXED = ("revolute", "continuous"), "fixed"
+_MOVING, _FIXED = ("revolute", "continuous"), ("fixed", "prismatic")
+
+
+_NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
 class UrdfError(UsageError):
@@ -38,6 +42,8 @@ class UrdfRobot(NamedTuple):
     phi: (10 n,) the inertias of the file, as in `torque_regressor`: in the root frame at q = 0, of all
         links of a body together. None if no moving link has one.
     limits: (n, 3) lowest and highest position [rad] and speed [rad/s], infinite where the file gives none.
+    held: joints that could move and are taken as fixed, prismatic and mimicking ones for example, with their
+        positions [rad, m].
     path: of the file.
     """
 
@@ -47,6 +53,7 @@ class UrdfRobot(NamedTuple):
     carried: frozenset[str]
     phi: Array | None
     limits: Array
+    held: dict[str, float]
     path: Path = Path()
 
 
@@ -58,6 +65,7 @@ class _Joint(NamedTuple):
     pose: Array
     axis: Array
     limits: tuple[float, float, float]
+    held: float | None
 
 
 class _Placed(NamedTuple):
@@ -67,16 +75,20 @@ class _Placed(NamedTuple):
     body: int
 
 
-def read_urdf(path: str | Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRobot:
+def read_urdf(
+    path: str | Path, gravity: ArrayLike = STANDARD_GRAVITY, held: Mapping[str, float] = _NOTHING
+) -> UrdfRobot:
     """Return the robot that a URDF file describes: its chain of n moving joints and its inertias.
 
     Args:
-        path: of the file. Joints are revolute, continuous or fixed and form a tree.
+        path: of the file. Joints are revolute, continuous, prismatic or fixed and form a tree; prismatic ones
+            and those that mimic another are taken as fixed.
         gravity: (3,) specific force at rest in the root link's frame [m/s^2]; it points upwards.
+        held: joints that are to be fixed, with their positions [rad, m]; others that are fixed are at zero.
 
     Raises:
-        UrdfError: no XML, no robot, no tree, or a joint that is neither revolute, continuous nor fixed; the
-            message names file and joint or link.
+        UrdfError: no XML, no robot, no tree, or a joint of another type; the message names file and joint or
+            link.
         OSError: the file cannot be read.
     """
     try:
@@ -86,14 +98,14 @@ def read_urdf(path: str | Path, gravity: ArrayLike = STANDARD_GRAVITY) -> UrdfRo
     if root.tag != "robot":
         raise UrdfError(f"{path}: its element is <{root.tag}>; a URDF begins with <robot>")
     try:
-        return _robot(root, np.array(gravity, dtype=float))._replace(path=Path(path))
+        return _robot(root, np.array(gravity, dtype=float), held)._replace(path=Path(path))
     except UrdfError as error:
         raise UrdfError(f"{path}: {error}") from None
 
 
-def _robot(root: Element, gravity: Array) -> UrdfRobot:
+def _robot(root: Element, gravity: Array, held: Mapping[str, float]) -> UrdfRobot:
     links = {_name(link): link for link in root.findall("link")}
-    joints = [_joint(element, links) for element in root.findall("joint")]
+    joints = [_joint(element, links, held) for element in root.findall("joint")]
     root_link = _root_link(joints, links)
     moving, placed = _placed(joints, root_link)
     if not moving:
@@ -119,17 +131,16 @@ def _robot(root: Element, gravity: Array) -> UrdfRobot:
         frozenset(carried),
         _inertias(links, carried, len(moving)),
         read_only(np.array([joint.limits for joint in moving])),
+        {joint.name: joint.held for joint in joints if joint.held is not None},
     )
 
 
-def _joint(element: Element, links: dict[str, Element]) -> _Joint:
+def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float]) -> _Joint:
     name, kind = _name(element), element.get("type", "")
-    if kind not in (*_MOVING, _FIXED):
+    if kind not in (*_MOVING, *_FIXED):
         raise UrdfError(
-            f"joint {name!r} is {kind or 'of no type'}; revolute, continuous and fixed joints are known"
+            f"joint {name!r} is {kind or 'of no type'}; revolute, continuous, prismatic and fixed are known"
         )
-    if element.find("mimic") is not None:
-        raise UrdfError(f"joint {name!r} mimics another; only joints that move by themselves are known")
     ends = []
     for end in ("parent", "child"):
         end_element = element.find(end)
@@ -142,12 +153,19 @@ def _joint(element: Element, links: dict[str, Element]) -> _Joint:
     if axis_element is not None:
         axis = _three(axis_element, "xyz", f"axis of joint {name!r}")
     length = float(np.linalg.norm(axis))
-    if kind in _MOVING and not length > 1e-9:
+    if kind != "fixed" and not length > 1e-9:
         raise UrdfError(f"axis of joint {name!r} is zero; it must be a direction")
     pose = _pose(element.find("origin"), f"origin of joint {name!r}")
-    return _Joint(
-        name, ends[0], ends[1], kind in _MOVING, pose, axis / max(length, 1e-9), _limits(element, name, kind)
-    )
+    axis, limits = axis / max(length, 1e-9), _limits(element, name, kind)
+    if kind == "fixed" or (kind in _MOVING and name not in held and element.find("mimic") is None):
+        return _Joint(name, ends[0], ends[1], kind in _MOVING, pose, axis, limits, None)
+    position = float(held.get(name, 0.0))
+    displaced = np.eye(4)
+    if kind == "prismatic":
+        displaced[:3, 3] = position * axis
+    else:
+        displaced[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
+    return _Joint(name, ends[0], ends[1], False, pose @ displaced, axis, limits, position)
 
 
 def _limits(element: Element, name: str, kind: str) -> tuple[float, float, float]:

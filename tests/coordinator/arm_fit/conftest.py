@@ -53,6 +53,7 @@ def recorded(
     noise_nm: float = 0.05,
     seed: int = 3,
     load: tuple[float, ...] = (0.0, 0.0, 0.0),
+    still: tuple[int, ...] = (),
 ) -> Recorded:
     """Record sums of sines; torques are pinocchio's, with friction that has a plain sign."""
     rng = default_rng(seed)
@@ -63,6 +64,7 @@ def recorded(
     q = np.sum(size * np.sin(angle), axis=1)
     qd = np.sum(size * rate * np.cos(angle), axis=1)
     qdd = -np.sum(size * rate**2 * np.sin(angle), axis=1)
+    q[:, still], qd[:, still], qdd[:, still] = 0.3, 0.0, 0.0
     rigid = _bodies(folder / "three.urdf", q, qd, qdd)
     tau = rigid + qdd * IA + qd * FV + np.sign(qd) * (FC + load * np.abs(rigid)) + OFFSET
     speed, pull = qd[:, 1:].sum(axis=1), qdd[:, 1:].sum(axis=1)

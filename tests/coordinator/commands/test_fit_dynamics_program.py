@@ -180,6 +180,8 @@ def test_gravity_is_what_one_says(tmp_path: Path) -> None:
         (("--gravity", "down"), "gravity 'down': it must be three numbers"),
         (("--gravity", "0,0,nan"), "gravity '0,0,nan': it must be three numbers"),
         (("--cutoff", "500"), "cutoff_hz 500.0 is outside 0 to 100.0"),
+        (("--gain", "swing"), "gain 'swing': it must be a joint and its Nm per A, like elbow=8.5"),
+        (("--gain", "swing=2"), "no column i_swing_a; the columns are t_s"),
         (("--trust", "0"), "trust 0.0: it must be a number above 0"),
         (("--mask", "2"), "the mask part of the top speed is 2.0; it must be between 0 and 1"),
         (("--data", "nowhere.csv"), "nowhere.csv: No such file or directory"),

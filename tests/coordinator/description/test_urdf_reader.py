@@ -1,5 +1,6 @@
 """A URDF as a chain: torques and regressor against pinocchio's own reading of the same file."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -135,9 +136,12 @@ def test_joints_written_in_any_order_give_the_same_tree(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('type="revolute"', 'type="prismatic"', "joint 'j0' is prismatic; revolute, continuous and fixed"),
+        (
+            'type="revolute"',
+            'type="planar"',
+            "joint 'j0' is planar; revolute, continuous, prismatic and fixed",
+        ),
         ('<parent link="base"/>', '<parent link="bed"/>', "joint 'j0' has parent 'bed', and no link has"),
-        ('<axis xyz="', '<mimic joint="j1"/><axis xyz="', "joint 'j0' mimics another"),
         ('<mass value="', '<mass value="heavy', "inertial of link 'link_0': value holds 'heavy"),
         ('<origin xyz="', '<origin xyz="nan ', "inertial of link 'link_0': xyz="),
         ("<robot", "<robots", "not XML"),
@@ -154,6 +158,33 @@ def test_what_is_no_tree_of_turning_joints_is_refused_by_name(
     with pytest.raises(UrdfError, match=message) as raised:
         read_urdf(path)
     assert str(raised.value).startswith(str(path))
+
+
+def test_what_slides_mimics_or_is_held_is_fixed_at_its_position(tmp_path: Path) -> None:
+    path, text = tmp_path / "robot.urdf", random_urdf(8, 3)
+    path.write_text(text)
+    free = read_urdf(path)
+    turned = read_urdf(path, held={"j2": 0.7})
+    assert turned.held == {"j2": 0.7}
+    assert turned.chain.serials == ("j0", "j1")
+    rng = default_rng(1)
+    q, qd, qdd = rng.uniform(-1.0, 1.0, (3, 5, 3))
+    q[:, 2], qd[:, 2], qdd[:, 2] = 0.7, 0.0, 0.0
+    assert free.phi is not None
+    assert turned.phi is not None
+    whole = inverse_dynamics(free.chain, free.phi, q, qd, qdd)
+    held = inverse_dynamics(turned.chain, turned.phi, q[:, :2], qd[:, :2], qdd[:, :2])
+    np.testing.assert_allclose(held, whole[:, :2], atol=1e-9)
+    path.write_text(re.sub(r'(name="j2" type=)"\w+"', r'\1"prismatic"', text))
+    closed, opened = read_urdf(path), read_urdf(path, held={"j2": 0.05})
+    assert (closed.held, opened.held) == ({"j2": 0.0}, {"j2": 0.05})
+    assert closed.phi is not None
+    assert opened.phi is not None
+    moved = (opened.phi - closed.phi).reshape(-1, PER_BODY)
+    # The sliding link's mass stays, its first moment moves by mass times 5 cm.
+    carrier = int(np.argmax(np.abs(moved).max(axis=1)))
+    assert moved[carrier, 0] == 0.0
+    assert np.linalg.norm(moved[carrier, 1:4]) > 0.0
 
 
 def test_a_urdf_without_inertias_claims_none(tmp_path: Path) -> None:
