@@ -6,6 +6,7 @@ Where the torques do not determine a body it stays as in the URDF (`physically_c
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import nnls
 
 from coordinator.arm_fit.problem import Problem
 from coordinator.description.urdf_reader import UrdfRobot
@@ -22,11 +23,14 @@ from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.model.read_only import make_read_only
 from module_agent.model.regressor import PER_BODY
+from module_agent.signals.torque_terms import Term
 
 # The belief that a link's mass distribution is known to about 30 % (`physically_consistent.WEIGHTS`).
 USUAL_TRUST = 10.0
 # Links are often given as points; no place of mass is known better than this.
 SMEAR_M = 0.02
+# What a URDF holds of a drive, in the order of `UrdfRobot.drives`.
+URDF_TERMS: tuple[Term, ...] = ("inertia", "viscous", "coulomb")
 
 
 class NoPriorError(DataError):
@@ -76,3 +80,30 @@ def consistent_bodies(problem: Problem, fit: WeightedFit, prior: Array, trust: f
     pseudo = np.stack([pseudo_inertia(one) for one in phi.reshape(-1, PER_BODY)])
     make_read_only((phi, drives, solution.divergence))
     return ConsistentBodies(phi, bodies_in_frames(pseudo, problem.robot.homes), drives, solution.divergence)
+
+
+def urdf_drives(problem: Problem, x: Array, some: slice) -> Array:
+    """Return rotor inertia, damping and friction (n, 3), as a URDF has them, nearest to fitted drives.
+
+    Where parameters x (p,) have nothing else these are the same; other terms of some samples are fitted by
+    these three, none below zero, and an offset, which a URDF has no place for.
+    """
+    rigid = problem.regressor[some][..., : problem.inertial] @ x[: problem.inertial]
+    further = problem.predicted(x, some) - rigid
+    drives = np.zeros((len(problem.robot.bodies), len(URDF_TERMS)))
+    for j, own in enumerate(drives):
+        at = {
+            URDF_TERMS.index(drive.term): problem.inertial + k
+            for k, drive in enumerate(problem.drives)
+            if drive.joints == (j,) and drive.term in URDF_TERMS
+        }
+        used = problem.moving[some][:, j]
+        columns = problem.regressor[some][used][:, j][:, list(at.values())]
+        sides = np.column_stack([columns, np.ones(used.sum()), -np.ones(used.sum())])
+        own[list(at)] = nnls(sides, further[used, j])[0][: len(at)]
+    return drives
+
+
+def lacking(problem: Problem) -> tuple[str, ...]:
+    """Return the names of the drives' parameters that a URDF has no place for."""
+    return tuple(d.name for d in problem.drives if d.term not in URDF_TERMS or d.joints[1:])

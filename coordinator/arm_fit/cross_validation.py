@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.arm_fit.consistent_bodies import consistent_bodies
+from coordinator.arm_fit.consistent_bodies import URDF_TERMS, consistent_bodies, urdf_drives
 from coordinator.arm_fit.problem import Problem
 from coordinator.dynamics.torque_prediction import TorqueError, torque_error
 from coordinator.parameter_fit.robust_least_squares import WeightedFit, fit_weighted
@@ -112,9 +112,25 @@ def by_consistent_bodies(problem: Problem, prior: Array, trust: float) -> Predic
     return predict
 
 
-def by_given_bodies(problem: Problem, phi: Array) -> Predictor:
-    """Return the predictor of given bodies (10 n,) without drives."""
-    return lambda _, tried: problem.regressor[tried][..., : problem.inertial] @ phi
+def by_urdf(problem: Problem, prior: Array, trust: float) -> Predictor:
+    """Return the predictor of the URDF that is written of consistent bodies: `urdf_drives` and no more."""
+
+    def predict(seen: slice, tried: slice) -> Array:
+        fit = consistent_bodies(problem, fit_part(problem, seen), prior, trust)
+        drives = urdf_drives(problem, np.concatenate([fit.phi, fit.drives]), seen)
+        return by_given_bodies(problem, fit.phi, drives)(seen, tried)
+
+    return predict
+
+
+def by_given_bodies(problem: Problem, phi: Array, drives: Array) -> Predictor:
+    """Return the predictor of given bodies (10 n,) and drives (n, 3) of a URDF."""
+    x = np.zeros(len(problem.columns.names))
+    x[: problem.inertial] = phi
+    for k, drive in enumerate(problem.drives):
+        if drive.term in URDF_TERMS and not drive.joints[1:]:
+            x[problem.inertial + k] = drives[drive.joints[0], URDF_TERMS.index(drive.term)]
+    return lambda _, tried: problem.predicted(x, tried)
 
 
 def mean_torque(problem: Problem) -> Predictor:

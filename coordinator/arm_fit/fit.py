@@ -10,6 +10,7 @@ from coordinator.arm_fit.consistent_bodies import (
     ConsistentBodies,
     NoPriorError,
     consistent_bodies,
+    lacking,
     urdf_prior,
 )
 from coordinator.arm_fit.cross_validation import (
@@ -17,6 +18,7 @@ from coordinator.arm_fit.cross_validation import (
     Predictor,
     by_consistent_bodies,
     by_given_bodies,
+    by_urdf,
     errors_elsewhere,
     fit_part,
     fitted,
@@ -160,8 +162,10 @@ def _predictors(problem: Problem, trust: float | None) -> list[tuple[Model, tupl
     if trust is not None:
         prior = urdf_prior(problem.robot)
         tried.append(("bodies", (problem, by_consistent_bodies(problem, prior, trust))))
+        tried.append(("fitted_urdf", (problem, by_urdf(problem, prior, trust))))
     if problem.robot.phi is not None:
-        tried.append(("urdf", (problem, by_given_bodies(problem, problem.robot.phi))))
+        robot = problem.robot
+        tried.append(("urdf", (problem, by_given_bodies(problem, problem.robot.phi, robot.drives))))
     if problem.drives:
         alone = problem.with_drives(lambda drive: drive.term != "load", bodies=False)
         tried.append(("drives_only", (alone, fitted(alone))))
@@ -223,7 +227,8 @@ def _fit_part(problem: Problem, fit: WeightedFit, bodies: ConsistentBodies | Non
         base_parameters=_base_parts(problem, base),
         bodies=_bodies(problem, base, bodies),
         bodies_note=note,
-        drives=[_term_part(problem, fit, base, k) for k in range(len(problem.drives))],
+        not_in_urdf=list(lacking(problem)),
+        drives=[_term_part(problem, fit, base, k, bodies) for k in range(len(problem.drives))],
         residuals=[
             JointNoisePart(
                 joint=name,
@@ -281,7 +286,9 @@ def _claims(problem: Problem, base: BaseParameters) -> Array | None:
     return np.where(np.abs(claims) > _ROUNDING * size, claims, 0.0)
 
 
-def _term_part(problem: Problem, fit: WeightedFit, base: BaseParameters, k: int) -> TermPart:
+def _term_part(
+    problem: Problem, fit: WeightedFit, base: BaseParameters, k: int, bodies: ConsistentBodies | None
+) -> TermPart:
     """Test a parameter of a drive: the F of the model without it is (value / sigma)^2 for a single one."""
     drive, column = problem.drives[k], problem.inertial + k
     # A drive's columns are tried first, so in most cases one begins its own group; else it is within others.
@@ -298,6 +305,7 @@ def _term_part(problem: Problem, fit: WeightedFit, base: BaseParameters, k: int)
         unit=drive.unit,
         value=value,
         sigma=sigma,
+        with_bodies=None if bodies is None else float(bodies.drives[k]),
         f=f,
         chance=chance,
         significant=chance < SIGNIFICANT_CHANCE and not others,

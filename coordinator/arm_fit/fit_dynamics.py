@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.arm_fit.checks import wrong_torques
-from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
+from coordinator.arm_fit.consistent_bodies import USUAL_TRUST, lacking, urdf_drives
 from coordinator.arm_fit.cutoff import chosen_cutoff_hz, cutoff_curve
 from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two
 from coordinator.arm_fit.drive_choice import candidates, choose_drives, pairs
@@ -19,11 +19,12 @@ from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.recordings import Recordings, Source, read_other, read_recordings
 from coordinator.arm_fit.report import FitReport
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
-from coordinator.description.urdf_update import fitted_urdf_text, friction_of
+from coordinator.description.urdf_update import fitted_urdf_text
 from coordinator.dynamics.pseudo_inertia import Body
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError, UsageError
 from module_agent.model.files import write_text
+from module_agent.model.read_only import read_only
 
 _USUAL = ModelChoice()
 _NO_GAINS: Mapping[str, float] = MappingProxyType({})
@@ -36,16 +37,17 @@ class ArmFit(NamedTuple):
         and torque errors on samples that were not fitted to.
     bodies: (n,) physically consistent bodies in the frames of the links `robot.bodies`, centre of mass and
         the inertia about it. phi: (10 n,) the same in the root frame at q = 0, as `torque_regressor` takes
-        them. friction: (n, 2) viscous [Nm s/rad] and Coulomb [Nm], none below zero. urdf: the text of the
-        URDF with bodies and friction. The four are None if the URDF gives a link no mass, so that there is no
-        prior for what the torques do not determine; `report.fit.bodies_note` says so.
+        them. drives: (n, 3) rotor inertia behind the gear [kg m^2], viscous [Nm s/rad] and Coulomb [Nm], as a
+        URDF holds them (`urdf_drives`). urdf: the text of the URDF with bodies and drives. The four are None
+        if the URDF gives a link no mass, so that there is no prior for what the torques do not determine;
+        `report.fit.bodies_note` says so.
     """
 
     robot: UrdfRobot
     report: FitReport
     bodies: tuple[Body, ...] | None
     phi: Array | None
-    friction: Array | None
+    drives: Array | None
     urdf: str | None
 
     def write_urdf(self, path: str | Path) -> None:
@@ -146,12 +148,13 @@ def fit_dynamics(
         elsewhere=elsewhere,
     )
     if result.consistent is None:
-        return ArmFit(robot=robot, report=result.report, bodies=None, phi=None, friction=None, urdf=None)
+        return ArmFit(robot=robot, report=result.report, bodies=None, phi=None, drives=None, urdf=None)
     fitted = result.consistent
-    friction = friction_of(posed.drives, fitted.drives.tolist(), len(robot.bodies))
-    text = fitted_urdf_text(robot, fitted.bodies, friction)
+    x = np.concatenate([fitted.phi, fitted.drives])
+    drives = read_only(urdf_drives(posed, x, slice(0, len(posed.log.tau_nm))))
+    text = fitted_urdf_text(robot, fitted.bodies, drives, lacking(posed))
     return ArmFit(
-        robot=robot, report=result.report, bodies=fitted.bodies, phi=fitted.phi, friction=friction, urdf=text
+        robot=robot, report=result.report, bodies=fitted.bodies, phi=fitted.phi, drives=drives, urdf=text
     )
 
 

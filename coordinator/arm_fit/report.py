@@ -8,9 +8,9 @@ from coordinator.parameter_fit.identifiability import Precision
 from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part
 from module_agent.model.files import write_json
 
-SCHEMA = 2
+SCHEMA = 3
 
-Model = Literal["fitted", "bodies", "urdf", "drives_only", "mean"]
+Model = Literal["fitted", "bodies", "fitted_urdf", "urdf", "drives_only", "mean"]
 
 
 class CutoffPart(Part):
@@ -51,8 +51,8 @@ class ErrorPart(Part):
     """A relative torque error |e| / |tau| on samples that were not fitted to; null where |tau| is zero.
 
     model: `fitted` (least squares), `bodies` (physically consistent bodies near the URDF's, and drives),
-    `urdf` (the inertias of the URDF, no friction), `drives_only` (friction, offset and motors without
-    bodies), `mean` (the constant mean of the other half).
+    `fitted_urdf` (what a URDF holds of these: see `not_in_urdf`), `urdf` (the given one), `drives_only`
+    (friction, offset and motors without bodies), `mean` (the constant mean of the other half).
     """
 
     model: Model
@@ -101,6 +101,7 @@ class TermPart(Part):
     f: (value / sigma)^2, the F-test of the model without it; only `independent_samples` of the residuals
     count. chance: the probability of an F as large if the parameter were zero. lumped_with: the bodies'
     parameters that are only determined in combination with it; then the test is of all of them together.
+    with_bodies: the value next to the physically consistent bodies, where the URDF's divide combinations.
     """
 
     name: str
@@ -109,6 +110,7 @@ class TermPart(Part):
     unit: str
     value: float
     sigma: float
+    with_bodies: float | None
     f: float
     chance: float
     significant: bool
@@ -159,7 +161,8 @@ class JointNoisePart(Part):
 class FitPart(Part):
     """The fit to the whole recording: rank and condition of the weighted regressor, parameters, residuals.
 
-    bodies_note: why there are no physically consistent bodies, if there are none. robust: by Huber's
+    bodies_note: why there are no physically consistent bodies, if there are none. not_in_urdf: the drives'
+    parameters that a URDF has no place for. robust: by Huber's
     weights. instruments: by instrumental variables (`fit_weighted`).
     """
 
@@ -174,6 +177,7 @@ class FitPart(Part):
     base_parameters: list[ArmParameterPart]
     bodies: list[LinkBodyPart]
     bodies_note: str
+    not_in_urdf: list[str]
     drives: list[TermPart]
     residuals: list[JointNoisePart]
 
@@ -181,8 +185,9 @@ class FitPart(Part):
 class FitReport(Part):
     """Everything that `x5-coordinator fit-dynamics` reports; errors are fractions, SI units.
 
-    Schema 2 names `summary`, `identifiability` and `rigid_body` (in schema 1 `words`, `verdict`, and the
-    body's fields by themselves).
+    Schema 3 adds the choice of low-pass and drives, held joints and what a URDF cannot hold. Schema 2 names
+    `summary`, `identifiability` and `rigid_body` (in schema 1 `words`, `verdict`, and the body's fields by
+    themselves).
     """
 
     schema_version: int = SCHEMA

@@ -10,7 +10,8 @@ from coordinator.runtime.terminal import figure, new_table
 _MODEL_WORDS: dict[Model, str] = {
     "fitted": "least squares",
     "bodies": "consistent bodies near the URDF's",
-    "urdf": "the URDF's inertias, no friction",
+    "fitted_urdf": "the fitted URDF alone",
+    "urdf": "the given URDF alone",
     "drives_only": "friction and motors only",
     "mean": "constant mean",
 }
@@ -59,6 +60,8 @@ def notes(report: FitReport) -> Iterator[str]:
                 f"{trial.name} is significant and {'kept' if trial.kept else 'left out'}: held-out error of "
                 f"{trial.joint} {_percent(trial.before)} % without it, {_percent(trial.after)} % with it"
             )
+    if fit.not_in_urdf:
+        yield f"a URDF has no place for {', '.join(fit.not_in_urdf)}; the fitted URDF alone is without them"
     if fit.bodies_note:
         yield f"no physically consistent bodies: {fit.bodies_note}"
 

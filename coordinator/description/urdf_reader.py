@@ -24,6 +24,8 @@ STANDARD_GRAVITY = (0.0, 0.0, 9.81)
 _MOVING, _FIXED = ("revolute", "continuous"), ("fixed", "prismatic")
 
 
+# The inertia of a rotor is no part of URDF; Drake's extension of the transmission has it.
+DRAKE = "http://drake.mit.edu"
 _NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
@@ -42,6 +44,8 @@ class UrdfRobot(NamedTuple):
     phi: (10 n,) the inertias of the file, as in `torque_regressor`: in the root frame at q = 0, of all
         links of a body together. None if no moving link has one.
     limits: (n, 3) lowest and highest position [rad] and speed [rad/s], infinite where the file gives none.
+    drives: (n, 3) inertia of the rotor behind the gear [kg m^2], damping [Nm s/rad] and friction [Nm] of the
+        joints, zero where the file gives none.
     held: joints that could move and are taken as fixed, prismatic and mimicking ones for example, with their
         positions [rad, m].
     path: of the file.
@@ -53,6 +57,7 @@ class UrdfRobot(NamedTuple):
     carried: frozenset[str]
     phi: Array | None
     limits: Array
+    drives: Array
     held: dict[str, float]
     path: Path = Path()
 
@@ -131,6 +136,7 @@ def _robot(root: Element, gravity: Array, held: Mapping[str, float]) -> UrdfRobo
         frozenset(carried),
         _inertias(links, carried, len(moving)),
         read_only(np.array([joint.limits for joint in moving])),
+        _drives(root, [joint.name for joint in moving]),
         {joint.name: joint.held for joint in joints if joint.held is not None},
     )
 
@@ -166,6 +172,29 @@ def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float
     else:
         displaced[:3, :3] = Rotation.from_rotvec(position * axis).as_matrix()
     return _Joint(name, ends[0], ends[1], False, pose @ displaced, axis, limits, position)
+
+
+def _drives(root: Element, names: Sequence[str]) -> Array:
+    """Return rotor inertia, damping and friction of the joints (n, 3)."""
+    drives = np.zeros((len(names), 3))
+    for joint in root.findall("joint"):
+        dynamics = joint.find("dynamics")
+        if dynamics is not None and joint.get("name") in names:
+            where = f"dynamics of joint {joint.get('name')!r}"
+            drives[names.index(_name(joint)), 1:] = [
+                _float(dynamics.get(key, "0"), key, where) for key in ("damping", "friction")
+            ]
+    for transmission in root.findall("transmission"):
+        driven, actuator = transmission.find("joint"), transmission.find("actuator")
+        if driven is None or actuator is None or driven.get("name") not in names:
+            continue
+        where = f"transmission of joint {driven.get('name')!r}"
+        rotor, gear = (actuator.find(f"{{{DRAKE}}}{key}") for key in ("rotor_inertia", "gear_ratio"))
+        ratio = 1.0 if gear is None else _float(gear.get("value", ""), "gear_ratio", where)
+        if rotor is not None:
+            inertia = _float(rotor.get("value", ""), "rotor_inertia", where)
+            drives[names.index(_name(driven)), 0] = inertia * ratio**2
+    return read_only(drives)
 
 
 def _limits(element: Element, name: str, kind: str) -> tuple[float, float, float]:

@@ -9,29 +9,34 @@ from xml.etree.ElementTree import (
     XMLParser,
     indent,
     parse,
+    register_namespace,
     tostring,
 )
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coordinator.description.urdf_reader import UrdfRobot
+from coordinator.description.urdf_reader import DRAKE, UrdfRobot
 from coordinator.description.urdf_writer import inertial_element
-from coordinator.dynamics.drive_model import DriveColumn
 from coordinator.dynamics.pseudo_inertia import Body
-from module_agent.model.chain import Array
-from module_agent.model.read_only import read_only
 
 
-def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLike) -> str:
-    """Return the text of a robot's URDF with other bodies and friction.
+def fitted_urdf_text(
+    robot: UrdfRobot, bodies: Sequence[Body], drives: ArrayLike, lacking: Sequence[str] = ()
+) -> str:
+    """Return the text of a robot's URDF with other bodies, friction and rotors.
 
     The inertia of a body is in the link right behind its joint; links fixed to that lose their own, which is
-    contained in it. Joints get viscous and Coulomb friction.
+    contained in it. Joints get viscous and Coulomb friction, and a transmission with the rotor's inertia
+    behind the gear, as Drake reads it.
 
-    robot: its file is read again. bodies: (n,) in the frames of the links `robot.bodies`. friction: (n, 2)
-    viscous [Nm s/rad] and Coulomb [Nm] of every joint.
+    Args:
+        robot: of `read_urdf`, whose file is read again. bodies: (n,) in the frames of the links
+        `robot.bodies`.
+        drives: (n, 3) rotor inertia [kg m^2], viscous [Nm s/rad] and Coulomb [Nm] of every joint.
+        lacking: what was identified and has no place in a URDF, for the comment.
     """
+    register_namespace("drake", DRAKE)
     # Comments of the given file are kept.
     root = parse(robot.path, XMLParser(target=TreeBuilder(insert_comments=True))).getroot()
     heads = dict(zip(robot.bodies, bodies, strict=True))
@@ -42,31 +47,40 @@ def fitted_urdf_text(robot: UrdfRobot, bodies: Sequence[Body], friction: ArrayLi
                 link.remove(old)
         if name in heads:
             link.insert(0, inertial_element(heads[name], _exact))
-    drives = dict(zip(robot.chain.serials, np.asarray(friction).tolist(), strict=True))
+    transmissions = {
+        joint.get("name"): one
+        for one in root.findall("transmission")
+        if (joint := one.find("joint")) is not None
+    }
+    values = dict(zip(robot.chain.serials, np.asarray(drives).tolist(), strict=True))
     for joint in root.findall("joint"):
-        if joint.get("name", "") in drives:
-            _set_friction(joint, *drives[joint.get("name", "")])
+        name = joint.get("name", "")
+        if name in values:
+            rotor, damping, friction = values[name]
+            for old in joint.findall("dynamics"):
+                joint.remove(old)
+            SubElement(joint, "dynamics", damping=_exact(damping), friction=_exact(friction))
+            if rotor > 0.0 or name in transmissions:
+                _set_rotor(root, transmissions.get(name), name, rotor)
     indent(root)
-    root.insert(0, Comment(" Inertias and friction were identified from torques. "))
+    comment = "Inertias, friction and rotors (kg m^2, behind the gear) were identified from torques."
+    lacks = f" Identified, but not in this file: {', '.join(lacking)}." if lacking else ""
+    root.insert(0, Comment(f" {comment}{lacks} "))
     return str(tostring(root, encoding="utf-8", xml_declaration=True), "utf-8")
 
 
-def friction_of(drives: Sequence[DriveColumn], values: Sequence[float], joints: int) -> Array:
-    """Return damping and friction of each joint as a URDF has them, (n, 2), none below zero, read-only.
-
-    A URDF has no element for what coupled joints share.
-    """
-    friction = np.zeros((joints, 2))
-    for drive, value in zip(drives, values, strict=True):
-        if len(drive.joints) == 1 and drive.term in ("viscous", "coulomb"):
-            friction[drive.joints[0], ("viscous", "coulomb").index(drive.term)] = max(0.0, float(value))
-    return read_only(friction)
-
-
-def _set_friction(joint: Element, damping: float, friction: float) -> None:
-    for old in joint.findall("dynamics"):
-        joint.remove(old)
-    SubElement(joint, "dynamics", damping=_exact(damping), friction=_exact(friction))
+def _set_rotor(root: Element, transmission: Element | None, joint: str, inertia: float) -> None:
+    if transmission is None:
+        transmission = SubElement(root, "transmission", name=f"{joint}_transmission")
+        SubElement(transmission, "type").text = "transmission_interface/SimpleTransmission"
+        SubElement(transmission, "joint", name=joint)
+    actuator = transmission.find("actuator")
+    if actuator is None:
+        actuator = SubElement(transmission, "actuator", name=f"{joint}_motor")
+    for key, value in (("rotor_inertia", inertia), ("gear_ratio", 1.0)):
+        for old in actuator.findall(f"{{{DRAKE}}}{key}"):
+            actuator.remove(old)
+        SubElement(actuator, f"{{{DRAKE}}}{key}", value=_exact(value))
 
 
 def _exact(values: ArrayLike) -> str:

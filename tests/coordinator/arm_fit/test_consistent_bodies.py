@@ -12,10 +12,13 @@ from coordinator.arm_fit.consistent_bodies import (
     ConsistentBodies,
     NoPriorError,
     consistent_bodies,
+    lacking,
+    urdf_drives,
     urdf_prior,
 )
 from coordinator.arm_fit.cross_validation import (
     by_consistent_bodies,
+    by_urdf,
     fit_part,
     fitted,
     held_out_errors,
@@ -25,11 +28,10 @@ from coordinator.arm_fit.data_file import read_log
 from coordinator.arm_fit.filtered_log import filtered_log
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.description.urdf_reader import read_urdf
-from coordinator.description.urdf_update import fitted_urdf_text, friction_of
-from coordinator.dynamics.drive_model import DriveColumn
+from coordinator.description.urdf_update import fitted_urdf_text
 from coordinator.dynamics.pseudo_inertia import is_consistent, pseudo_inertia
 
-SHARED = ModelChoice(coupled=((1, 2),))
+SHARED = ModelChoice(coupled=((1, 2),), tried=())
 
 
 @pytest.fixture
@@ -76,8 +78,10 @@ def test_the_fitted_urdf_gives_another_program_the_same_torques(
 ) -> None:
     posed, found = found_in(wrong, recording.npz)
     out = tmp_path / "fitted.urdf"
-    friction = friction_of(posed.drives, found.drives.tolist(), 3)
-    out.write_text(fitted_urdf_text(posed.robot, found.bodies, friction), encoding="utf-8")
+    whole = slice(0, len(posed.log.tau_nm))
+    x = np.concatenate([found.phi, found.drives])
+    drives = urdf_drives(posed, x, whole)
+    out.write_text(fitted_urdf_text(posed.robot, found.bodies, drives, lacking(posed)), encoding="utf-8")
     model = pin.buildModelFromUrdf(str(out))
     data = model.createData()
     log = posed.log
@@ -92,13 +96,38 @@ def test_the_fitted_urdf_gives_another_program_the_same_torques(
     assert "the plate" in text
     # The plate is within the hand.
     assert text.count("<inertial>") == 3
-    assert f'damping="{float(friction[0][0])!r}"' in text
+    assert f'damping="{float(drives[0][1])!r}"' in text
+    assert "not in this file: offset1, offset2, offset3, Ia2+3, Fv2+3, Fc2+3." in text
     # Of the robot in conftest.py: 0.8 Nm s/rad and 1.5 Nm at the waist.
-    assert friction[0] == pytest.approx((0.8, 1.5), rel=0.02)
+    assert drives[0][1:] == pytest.approx((0.8, 1.5), rel=0.02)
     assert not list(tmp_path.glob("*.part"))
     again = read_urdf(out)
     assert again.phi is not None
     np.testing.assert_allclose(again.phi, found.phi, atol=1e-9)
+    np.testing.assert_allclose(again.drives, drives, atol=1e-12)
+    # Written again, nothing is doubled.
+    twice = fitted_urdf_text(again, found.bodies, drives)
+    assert twice.count("<drake:rotor_inertia") == twice.count("<transmission") == 3
+
+
+def test_a_urdf_alone_predicts_as_well_as_the_fit_if_it_can_hold_it(recording: Any) -> None:
+    robot = read_urdf(recording.urdf)
+    log = filtered_log(read_log(recording.npz, robot.chain.serials), 8.0)
+    # Torques without the shared drive and without offsets.
+    shared = problem(robot, log, SHARED)
+    fit = fit_part(shared, slice(0, len(log.tau_nm)))
+    x = np.where([name in lacking(shared) for name in shared.columns.names], fit.parameters, 0.0)
+    plain = log._replace(tau_nm=log.tau_nm - shared.regressor @ x)
+    posed = problem(robot, plain, ModelChoice(coupled=(), tried=()))
+    prior = urdf_prior(robot)
+    bodies, alone = (
+        overall(held_out_errors(posed, by(posed, prior, USUAL_TRUST)))
+        for by in (by_consistent_bodies, by_urdf)
+    )
+    assert alone == pytest.approx(bodies, rel=0.05)
+    # What a URDF has no place for costs it more than a tenth of the torque here.
+    without = overall(held_out_errors(shared, by_urdf(shared, prior, USUAL_TRUST)))
+    assert without[0] > 10.0 * alone[0]
 
 
 def test_where_torques_are_silent_a_body_is_as_claimed(recording: Any) -> None:
@@ -128,16 +157,3 @@ def test_a_body_without_mass_is_named(recording: Any, tmp_path: Path) -> None:
     path.write_text(text.replace('<mass value="2.0"/>', '<mass value="0"/>'))
     with pytest.raises(NoPriorError, match="gives no mass to 'fore'"):
         urdf_prior(read_urdf(path))
-
-
-def test_a_urdf_says_of_drives_what_it_can() -> None:
-    drives = (
-        DriveColumn("viscous", (0,)),
-        DriveColumn("coulomb", (1,)),
-        DriveColumn("viscous", (1,)),
-        DriveColumn("viscous", (0, 1)),
-        DriveColumn("inertia", (0,)),
-    )
-    np.testing.assert_array_equal(
-        friction_of(drives, [0.5, 2.0, -0.1, 9.0, 9.0], 2), [(0.5, 0.0), (0.0, 2.0)]
-    )

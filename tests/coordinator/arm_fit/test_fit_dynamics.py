@@ -307,7 +307,7 @@ def test_the_library_takes_files_or_what_was_read_from_them(recording: Any, tmp_
     assert (fit.report.data, of_files.report.data) == ("a recording in memory", str(recording.npz))
     assert len(steps) == STEPS
     assert fit.bodies is not None
-    assert fit.friction is not None
+    assert fit.drives is not None
     assert [part.rigid_body.mass_kg for part in fit.report.fit.bodies if part.rigid_body] == [
         body.mass_kg for body in fit.bodies
     ]

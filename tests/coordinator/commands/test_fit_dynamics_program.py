@@ -75,7 +75,7 @@ def test_a_double_pendulum_is_known_from_its_torques(tmp_path: Path) -> None:
     ):
         assert words in done.output
     found = FitReport.model_validate_json((tmp_path / "fit.json").read_text())
-    assert found.schema_version == 2
+    assert found.schema_version == 3
     # Swinging in a plane: gravity's moment of each link and the inertia of each about its joint.
     sums = {part.summary: part for part in found.fit.base_parameters}
     hanging = sums["m2 c2z"]
