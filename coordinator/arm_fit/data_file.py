@@ -1,4 +1,4 @@
-"""Read recordings of joint positions and torques from CSV or npz onto a uniform time base.
+"""Read recordings of joint positions and torques from CSV, npz or MCAP onto a uniform time base.
 
 CSV, a line of names and a line per sample: `t_s`, and per joint `q_<joint>_rad`, `tau_<joint>_nm` and, for
 all joints or none, `qd_<joint>_rad_s`; <joint> as in the URDF, columns in any order, others are ignored.
@@ -7,6 +7,8 @@ With torque constants, `i_<joint>_a` takes the place of `tau_<joint>_nm`.
 
 npz: `position_rad` (m, n); `torque` or `torque_nm` (m, n); `sample_rate_hz` () or `t_s` (m,); optionally
 `velocity_rad_s` (m, n) and `joint_names` (n,), without which the joints are in the URDF's order.
+
+mcap: messages of `sensor_msgs/JointState` (`joint_state`) with position, effort and perhaps velocity.
 """
 
 import csv
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import binary_opening
 
+from coordinator.arm_fit.joint_state import joint_states
 from module_agent.model.chain import Array
 from module_agent.model.errors import UsageError
 from module_agent.model.read_only import frozen
@@ -49,6 +52,7 @@ class JointLog(NamedTuple):
     were not measured. tau_nm: (m, n) joint torques. resampled: whether the times of the file were not
     uniform. breaks: samples before which there is a hole, or where another recording begins. repeated: rows
     like the one before, left out. file: where it was read from. others: mean positions of further joints.
+    starts_s: times of the first samples of the pieces, zeros if empty.
     """
 
     rate_hz: float
@@ -60,6 +64,7 @@ class JointLog(NamedTuple):
     repeated: int = 0
     file: str = "a recording in memory"
     others: Mapping[str, float] = _NOTHING
+    starts_s: tuple[float, ...] = ()
 
     def column(self, signal: Literal["t", "q", "qd", "tau"], joint: str) -> str:
         """Return the file and the column of a joint's signal, for messages."""
@@ -81,15 +86,16 @@ class JointLog(NamedTuple):
 
     def pieces(self) -> tuple["JointLog", ...]:
         """Return the parts between the breaks."""
-        ends = (0, *self.breaks, len(self.q_rad))
+        ends, starts = (0, *self.breaks, len(self.q_rad)), self.starts_s or (0.0,) * (len(self.breaks) + 1)
         return tuple(
             self._replace(
                 q_rad=self.q_rad[a:b],
                 qd_rad_s=None if self.qd_rad_s is None else self.qd_rad_s[a:b],
                 tau_nm=self.tau_nm[a:b],
                 breaks=(),
+                starts_s=(start,),
             )
-            for a, b in pairwise(ends)
+            for (a, b), start in zip(pairwise(ends), starts, strict=True)
         )
 
 
@@ -117,6 +123,7 @@ def joined(logs: Sequence[JointLog]) -> JointLog:
         sum(log.repeated for log in logs),
         ", ".join(dict.fromkeys(log.file for log in logs)),
         logs[0].others,
+        tuple(start for log in logs for piece in log.pieces() for start in piece.starts_s),
     )
 
 
@@ -130,7 +137,7 @@ def at_rate(log: JointLog, rate_hz: float) -> JointLog:
         even = np.arange(int(times[-1] * rate_hz) + 1) / rate_hz
         q, tau = (_even(times, signal, even) for signal in (piece.q_rad, piece.tau_nm))
         qd = None if piece.qd_rad_s is None else _even(times, piece.qd_rad_s, even)
-        pieces.append(JointLog(rate_hz, q, qd, tau, True))
+        pieces.append(JointLog(rate_hz, q, qd, tau, True, starts_s=piece.starts_s))
     return joined(pieces)._replace(repeated=log.repeated, file=log.file, others=log.others)
 
 
@@ -150,7 +157,10 @@ def _piece_in_two(log: JointLog) -> tuple[JointLog, JointLog]:
 
     def half(of: Callable[[Array], Array]) -> JointLog:
         velocity = None if log.qd_rad_s is None else of(log.qd_rad_s)
-        return JointLog(0.5 * log.rate_hz, of(log.q_rad), velocity, of(log.tau_nm), log.resampled)
+        starts_s = (log.starts_s[0] + 1.0 / log.rate_hz,)
+        return JointLog(
+            0.5 * log.rate_hz, of(log.q_rad), velocity, of(log.tau_nm), log.resampled, starts_s=starts_s
+        )
 
     return half(lambda signal: frozen(signal[1 : 2 * count : 2])), half(
         lambda signal: _even(odd, signal[0 : 2 * count + 1 : 2], even)
@@ -163,14 +173,14 @@ def read_log(
     gains: Mapping[str, float] = _NOTHING,
     held: Sequence[str] = (),
 ) -> JointLog:
-    """Return the recording in a CSV or npz file, positions and torques (m, n), split at holes (`breaks`).
+    """Return the recording in a CSV, npz or MCAP file, (m, n) positions and torques, split at holes.
 
     CSV: a line of names and a line per sample; `t_s` [s], and per joint `q_<joint>_rad`, `tau_<joint>_nm` and
     optionally `qd_<joint>_rad_s`. npz: `position_rad` (m, n), `torque_nm` (m, n), `t_s` (m,) or
     `sample_rate_hz` (), and optionally `velocity_rad_s` (m, n) and `joint_names` (n,).
 
     Args:
-        path: of the file; its name ends on .csv or .npz.
+        path: of the file; its name ends on .csv, .npz or .mcap.
         joints: (n,) names of the joints in the order that the columns shall have, `robot.chain.serials` of
             `read_urdf`.
         gains: torque constants [Nm/A], gear included, of the joints whose currents are in the file instead of
@@ -179,18 +189,18 @@ def read_log(
             in an npz columns that `joint_names` names.
 
     Raises:
-        DataFileError: neither CSV nor npz, columns or arrays that are missing or do not fit the joints, a
+        DataFileError: another file, columns or arrays that are missing or do not fit the joints, a
             value that is not a finite number, or times that do not increase; the message names
             file, column and row.
         OSError: the file cannot be read.
     """
     path = Path(path)
-    readers = {".csv": _read_csv, ".npz": _read_npz}
+    readers = {".csv": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}
     if path.suffix.lower() not in readers:
-        raise DataFileError(f"{path}: its name ends on {path.suffix!r}; .csv and .npz are read")
+        raise DataFileError(f"{path}: its name ends on {path.suffix!r}; {', '.join(readers)} are read")
     try:
         return _log(readers[path.suffix.lower()](path, joints, gains, held))._replace(file=str(path))
-    except DataFileError as error:
+    except UsageError as error:
         raise DataFileError(f"{path}: {error}") from None
 
 
@@ -334,6 +344,33 @@ def _npz_order(arrays: dict[str, NDArray[np.generic]], joints: Sequence[str]) ->
     return names, [names.index(joint) for joint in joints]
 
 
+# ---------------------------------------------------------------------- MCAP
+
+
+def _read_mcap(path: Path, joints: Sequence[str], gains: Mapping[str, float], held: Sequence[str]) -> _Table:
+    states = list(joint_states(path))
+    names = sorted({name for state in states for name in state.effort.keys() & state.position.keys()})
+    if missing := [joint for joint in joints if joint not in names]:
+        _refuse(
+            f"no JointState with position and effort of {', '.join(missing)}; there are {', '.join(names)}"
+        )
+    # A gripper's messages may come on a topic of their own.
+    whole = [s for s in states if all(joint in s.position and joint in s.effort for joint in joints)]
+    signals = {"q": np.array([[state.position[joint] for joint in joints] for state in whole])}
+    signals["tau"] = np.array([[s.effort[joint] * gains.get(joint, 1.0) for joint in joints] for s in whole])
+    if all(joint in state.velocity for state in whole for joint in joints):
+        signals["qd"] = np.array([[state.velocity[joint] for joint in joints] for state in whole])
+    for key, values in signals.items():
+        if not np.isfinite(values).all():
+            row, column = np.argwhere(~np.isfinite(values))[0]
+            _refuse(
+                f"message {row}, {key} of {joints[column]}: {values[row, column]}; a finite number is needed"
+            )
+    positions = {joint: [s.position[joint] for s in states if joint in s.position] for joint in held}
+    means = {joint: float(np.mean(values)) for joint, values in positions.items() if values}
+    return _Table(np.array([s.t_s for s in whole]), signals, lambda row: f"message {row}", means)
+
+
 # ---------------------------------------------------------------------- times
 
 
@@ -389,7 +426,8 @@ def _uniform(table: _Table, part: slice, rate_hz: float) -> JointLog:
         key: _even(times, values[part], even) if uneven else values[part]
         for key, values in table.signals.items()
     }
-    return JointLog(rate_hz, signals["q"], signals.get("qd"), signals["tau"], uneven)
+    start_s = float(table.t_s[part.start])
+    return JointLog(rate_hz, signals["q"], signals.get("qd"), signals["tau"], uneven, starts_s=(start_s,))
 
 
 def _even(times: Array, values: Array, even: Array) -> Array:

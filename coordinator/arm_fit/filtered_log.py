@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coordinator.arm_fit.data_file import JointLog
 from module_agent.model.chain import Array
@@ -28,6 +29,7 @@ class FilteredLog(NamedTuple):
         this bandwidth can explain. dropped_s: recorded in pieces that are too short for the low-pass.
     fine_qd_rad_s, fine_qdd_rad_s2: filtered at the recording's own rate, piece by piece, with the ends on
         which the low-pass has not settled; for nonlinear columns, see `low_passed`. edge: samples of an end.
+    t_s, piece: (m,) times of the samples, and the numbers of their pieces.
     """
 
     rate_hz: float
@@ -44,6 +46,8 @@ class FilteredLog(NamedTuple):
     fine_qd_rad_s: tuple[Array, ...]
     fine_qdd_rad_s2: tuple[Array, ...]
     edge: int
+    t_s: Array
+    piece: NDArray[np.int64]
 
     @property
     def top_rad_s(self) -> Array:
@@ -99,6 +103,8 @@ def filtered_log(
 
     raw, filtered = settled([piece.tau_nm for piece in pieces], 1), settled([m[3] for m in motions], 1)
     size = float(np.linalg.norm(raw))
+    at = [np.arange(edge, len(piece.q_rad) - edge, step) for piece in pieces]
+    times = [piece.starts_s[0] + rows / log.rate_hz for piece, rows in zip(pieces, at, strict=True)]
     q, qd, qdd, tau = (settled([motion[k] for motion in motions], step) for k in range(4))
     return FilteredLog(
         rate_hz=log.rate_hz / step,
@@ -115,6 +121,8 @@ def filtered_log(
         fine_qd_rad_s=tuple(motion[1] for motion in motions),
         fine_qdd_rad_s2=tuple(motion[2] for motion in motions),
         edge=edge,
+        t_s=read_only(np.concatenate(times)),
+        piece=read_only(np.repeat(np.arange(len(pieces)), [len(rows) for rows in at])),
     )
 
 

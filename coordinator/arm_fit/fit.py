@@ -30,6 +30,7 @@ from coordinator.arm_fit.cross_validation import (
 from coordinator.arm_fit.cutoff import CutoffPoint
 from coordinator.arm_fit.data_file import JointLog
 from coordinator.arm_fit.drive_choice import Trial
+from coordinator.arm_fit.predictions import Predictions, predictions
 from coordinator.arm_fit.problem import Problem, joined
 from coordinator.arm_fit.report import (
     ArmParameterPart,
@@ -68,10 +69,12 @@ STEPS = 7
 
 
 class FitResult(NamedTuple):
-    """The report, and the physically consistent bodies with the drives; None where there are none."""
+    """The report, the consistent bodies with the drives (None where there are none), and details."""
 
     report: FitReport
     consistent: ConsistentBodies | None
+    base: BaseParameters
+    torques: Predictions
 
 
 class Elsewhere(NamedTuple):
@@ -134,7 +137,7 @@ def fit_and_test(
         fit=_fit_part(problem, fit, bodies, note),
         trials=[TrialPart(**trial._asdict()) for trial in trials],
     )
-    return FitResult(report, bodies)
+    return FitResult(report, bodies, named(problem, fit), predictions(problem, fit.parameters))
 
 
 def named(problem: Problem, fit: WeightedFit) -> BaseParameters:

@@ -15,12 +15,14 @@ from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two
 from coordinator.arm_fit.drive_choice import candidates, choose_drives, pairs
 from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
+from coordinator.arm_fit.predictions import Predictions
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.recordings import Recordings, Source, read_other, read_recordings
 from coordinator.arm_fit.report import FitReport
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
 from coordinator.description.urdf_update import fitted_urdf_text
 from coordinator.dynamics.pseudo_inertia import Body
+from coordinator.parameter_fit.base_parameters import BaseParameters
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError, UsageError
 from module_agent.model.files import write_text
@@ -41,10 +43,14 @@ class ArmFit(NamedTuple):
         URDF holds them (`urdf_drives`). urdf: the text of the URDF with bodies and drives. The four are None
         if the URDF gives a link no mass, so that there is no prior for what the torques do not determine;
         `report.fit.bodies_note` says so.
+    base: the base parameters in the frames of the links, with covariance and grouping. torques: measured and
+        predicted.
     """
 
     robot: UrdfRobot
     report: FitReport
+    base: BaseParameters
+    torques: Predictions
     bodies: tuple[Body, ...] | None
     phi: Array | None
     drives: Array | None
@@ -147,15 +153,14 @@ def fit_dynamics(
         trust=trust,
         elsewhere=elsewhere,
     )
+    known = (robot, result.report, result.base, result.torques)
     if result.consistent is None:
-        return ArmFit(robot=robot, report=result.report, bodies=None, phi=None, drives=None, urdf=None)
+        return ArmFit(*known, bodies=None, phi=None, drives=None, urdf=None)
     fitted = result.consistent
     x = np.concatenate([fitted.phi, fitted.drives])
     drives = read_only(urdf_drives(posed, x, slice(0, len(posed.log.tau_nm))))
     text = fitted_urdf_text(robot, fitted.bodies, drives, lacking(posed))
-    return ArmFit(
-        robot=robot, report=result.report, bodies=fitted.bodies, phi=fitted.phi, drives=drives, urdf=text
-    )
+    return ArmFit(*known, bodies=fitted.bodies, phi=fitted.phi, drives=drives, urdf=text)
 
 
 def _name(source: str | Path | UrdfRobot | JointLog) -> str:

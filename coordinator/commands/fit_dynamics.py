@@ -11,14 +11,16 @@ import typer
 from coordinator.arm_fit import fit_dynamics as arm_fit
 from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
 from coordinator.arm_fit.fit import STEPS
+from coordinator.arm_fit.predictions import write_matrices, write_predictions
 from coordinator.arm_fit.problem import ModelChoice
 from coordinator.arm_fit.report import write_report
-from coordinator.commands.fit_dynamics_tables import notes, tables
+from coordinator.commands.fit_dynamics_tables import html, notes, tables
 from coordinator.commands.options import Quiet
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
 from coordinator.runtime.terminal import Terminal, print_table
 from module_agent.model.errors import UsageError
+from module_agent.model.files import write_text
 from module_agent.signals.torque_terms import DRIVE_TERMS, Term
 
 _UP = ",".join(f"{part:g}" for part in STANDARD_GRAVITY)
@@ -31,9 +33,9 @@ _Urdf = Annotated[Path, typer.Option(help="URDF file: revolute, continuous and f
 _Data = Annotated[
     list[Path],
     typer.Option(
-        help="CSV with t_s, q_JOINT_rad, tau_JOINT_nm and, if measured, qd_JOINT_rad_s; or npz with "
-        "position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s and joint_names. Repeat for "
-        "several recordings."
+        help="MCAP with JointState; CSV with t_s, q_JOINT_rad, tau_JOINT_nm and, if measured, "
+        "qd_JOINT_rad_s; or npz with position_rad, torque, sample_rate_hz or t_s, and perhaps velocity_rad_s "
+        "and joint_names. Repeat for several recordings."
     ),
 ]
 _HeldOut = Annotated[
@@ -48,6 +50,16 @@ _Gain = Annotated[
     ),
 ]
 _Json = Annotated[Path | None, typer.Option("--json", help="JSON file to write the report to.")]
+_Html = Annotated[
+    Path | None, typer.Option("--html", help="HTML file with the tables and a plot of each joint's torque.")
+]
+_Predictions = Annotated[
+    Path | None,
+    typer.Option(help="CSV file of torques: measured, filtered, fitted, and predicted by the other half."),
+]
+_Matrices = Annotated[
+    Path | None, typer.Option(help="npz file of base parameters with covariance and grouping matrix.")
+]
 _FittedUrdf = Annotated[
     Path | None,
     typer.Option(help="File to write the URDF with the fitted bodies and friction to."),
@@ -97,6 +109,9 @@ def fit_dynamics(
     held_out: _HeldOut = None,
     gain: _Gain = None,
     json_file: _Json = None,
+    html_file: _Html = None,
+    predictions: _Predictions = None,
+    matrices: _Matrices = None,
     fitted_urdf: _FittedUrdf = None,
     trust: _Trust = USUAL_TRUST,
     terms: _Terms = _USUAL_TERMS,
@@ -115,7 +130,7 @@ def fit_dynamics(
 
     Exit codes: 0 done, 1 the recording does not determine the parameters, 2 a file or an option is wrong.
     """
-    _check_folders(json_file, fitted_urdf)
+    _check_folders(json_file, html_file, predictions, matrices, fitted_urdf)
     numbers = count(1)
     try:
         with Terminal(quiet) as terminal:
@@ -138,6 +153,12 @@ def fit_dynamics(
             print_table(table)
         if json_file is not None:
             write_report(json_file, fit.report)
+        if html_file is not None:
+            write_text(html_file, html(fit.report, fit.torques))
+        if predictions is not None:
+            write_predictions(predictions, fit.torques)
+        if matrices is not None:
+            write_matrices(matrices, fit.base)
         if fitted_urdf is not None:
             fit.write_urdf(fitted_urdf)
     except OSError as error:

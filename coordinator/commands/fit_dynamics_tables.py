@@ -1,9 +1,13 @@
 """The report of a recording as tables for the terminal."""
 
 from collections.abc import Iterator
+from html import escape
+from io import StringIO
 
+from rich.console import Console
 from rich.table import Table
 
+from coordinator.arm_fit.predictions import Predictions, svg_plot
 from coordinator.arm_fit.report import ErrorPart, FitReport, Model, TermPart
 from coordinator.runtime.terminal import figure, new_table
 
@@ -15,6 +19,7 @@ _MODEL_WORDS: dict[Model, str] = {
     "drives_only": "friction and motors only",
     "mean": "constant mean",
 }
+_PAGE_WIDTH = 170
 _KINDS = (("filtered", "all"), ("filtered", "masked"), ("raw", "all"), ("raw", "masked"))
 
 
@@ -28,6 +33,18 @@ def tables(report: FitReport) -> Iterator[Table]:
         yield _drives(report)
     yield _base(report)
     yield _bodies(report)
+
+
+def html(report: FitReport, torques: Predictions) -> str:
+    """Return a page with the notes, a plot of each joint and the tables."""
+    console = Console(record=True, width=_PAGE_WIDTH, file=StringIO())
+    for line in notes(report):
+        console.print(line, markup=False)
+    for table in tables(report):
+        console.print(table)
+    plots = "".join(svg_plot(torques, i) for i in range(len(torques.joints)))
+    title = f"<h1>{escape(report.data)}</h1><p>Torques of the half that was not fitted to.</p>{plots}"
+    return console.export_html(inline_styles=True).replace("<body>", f"<body>{title}", 1)
 
 
 def notes(report: FitReport) -> Iterator[str]:

@@ -196,7 +196,7 @@ def test_files_of_another_kind_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.npz").write_bytes(b"no zip")
     (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00")
     for name, words in (
-        ("a.mat", ".csv and .npz are read"),
+        ("a.mat", ".csv, .npz, .mcap are read"),
         ("a.npz", "npz file"),
         ("a.csv", "not a CSV file"),
     ):

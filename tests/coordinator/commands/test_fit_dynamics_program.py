@@ -104,6 +104,20 @@ def test_the_tables_say_what_the_file_says(tmp_path: Path) -> None:
     assert [gain["without"] for gain in report["gains"]] == ["viscous"]
 
 
+def test_page_torques_and_matrices_are_written(tmp_path: Path) -> None:
+    files = write_files(tmp_path)
+    out = [str(tmp_path / name) for name in ("fit.html", "torques.csv", "fit.npz")]
+    done = called(*files, "--html", out[0], "--predictions", out[1], "--matrices", out[2])
+    assert done.exit_code == 0, done.output
+    page = (tmp_path / "fit.html").read_text()
+    assert page.count("<svg") == 2
+    for words in ("Held-out torque error", "swing", "low-pass chosen by", "log.csv</h1>"):
+        assert words in page
+    assert (tmp_path / "torques.csv").read_text().startswith("t_s,piece,tau_swing_nm")
+    assert (tmp_path / "fit.npz").is_file()
+    assert not list(tmp_path.glob("*.part"))
+
+
 def test_instruments_are_used_when_asked_for(tmp_path: Path) -> None:
     files = write_files(tmp_path)
     done = called(*files, "--instruments", "--json", str(tmp_path / "fit.json"))
