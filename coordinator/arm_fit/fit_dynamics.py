@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from coordinator.arm_fit.checks import wrong_torques
 from coordinator.arm_fit.consistent_bodies import USUAL_TRUST, lacking, urdf_drives
-from coordinator.arm_fit.cutoff import chosen_cutoff_hz, cutoff_curve
+from coordinator.arm_fit.cutoff import CutoffPoint, chosen_cutoff_hz, cutoff_curve
 from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two
-from coordinator.arm_fit.drive_choice import candidates, choose_drives, pairs
+from coordinator.arm_fit.drive_choice import Trial, candidates, choose_drives, pairs
 from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
 from coordinator.arm_fit.predictions import Predictions
@@ -127,18 +127,9 @@ def fit_dynamics(
         places = {joint: i for i, joint in enumerate(recordings.moving)}
         moving = [pair for pair in choice.coupled if set(pair) <= set(places)]
         choice = choice._replace(coupled=tuple((places[i], places[j]) for i, j in moving))
-    progress("choose the low-pass")
-    joints = len(robot.bodies)
-    with_pairs = choice._replace(coupled=choice.coupled or pairs(choice, joints))
-    curve = cutoff_curve(robot, log, with_pairs) if cutoff_hz is None else ()
-    extra = candidates(choice, joints)
-    posed = _posed(
-        robot, log, choice._replace(extra=extra), cutoff_hz or chosen_cutoff_hz(curve), instruments
+    posed, curve, trials = _chosen(
+        robot, log, choice, cutoff_hz=cutoff_hz, instruments=instruments, checked=checked, progress=progress
     )
-    if checked and (texts := list(wrong_torques(posed.with_drives(lambda d: d not in extra), log))):
-        raise DataFileError("\n".join(texts))
-    progress("choose the friction of each joint")
-    posed, trials = choose_drives(posed)
     elsewhere = (
         None if held_out is None else Elsewhere(_name(held_out), _posed_like(posed, recordings, held_out))
     )
@@ -161,6 +152,38 @@ def fit_dynamics(
     drives = read_only(urdf_drives(posed, x, slice(0, len(posed.log.tau_nm))))
     text = fitted_urdf_text(robot, fitted.bodies, drives, lacking(posed))
     return ArmFit(*known, bodies=fitted.bodies, phi=fitted.phi, drives=drives, urdf=text)
+
+
+def _chosen(
+    robot: UrdfRobot,
+    log: JointLog,
+    choice: ModelChoice,
+    *,
+    cutoff_hz: float | None,
+    instruments: bool,
+    checked: bool,
+    progress: Callable[[str], None],
+) -> tuple[Problem, tuple[CutoffPoint, ...], tuple[Trial, ...]]:
+    """Choose the low-pass, the friction of each joint, and with that the low-pass once more.
+
+    Raises:
+        DataFileError: if `checked`, torques that are not what they should be.
+    """
+    progress("choose the low-pass")
+    joints = len(robot.bodies)
+    with_pairs = choice._replace(coupled=choice.coupled or pairs(choice, joints))
+    curve = cutoff_curve(robot, log, with_pairs) if cutoff_hz is None else ()
+    extra = candidates(choice, joints)
+    cutoff = cutoff_hz or chosen_cutoff_hz(curve)
+    posed = _posed(robot, log, choice._replace(extra=extra), cutoff, instruments)
+    if checked and (texts := list(wrong_torques(posed.with_drives(lambda d: d not in extra), log))):
+        raise DataFileError("\n".join(texts))
+    progress("choose the friction of each joint")
+    posed, trials = choose_drives(posed)
+    if cutoff_hz is None and any(trial.kept for trial in trials):
+        curve = cutoff_curve(robot, log, posed.choice)
+        posed = _posed(robot, log, posed.choice, chosen_cutoff_hz(curve), instruments)
+    return posed, curve, trials
 
 
 def _name(source: str | Path | UrdfRobot | JointLog) -> str:
