@@ -21,11 +21,11 @@ class MonitorScreen(Displayed):
     def __init__(self, monitor: Monitor, json_file: Path | None, quiet: bool = False):
         self.start_ns = 0
         self._monitor = monitor
+        self._notes: list[str] = []
         self._file: TextIO | None = json_file.open("w", encoding="utf-8") if json_file else None
         console = Console(highlight=False, quiet=quiet)
         self._live = Live(get_renderable=self._shown, console=console, refresh_per_second=4.0)
         super().__init__(console, self._live)
-        self._notes: list[str] = []
 
     def __exit__(self, *_: object) -> None:
         super().__exit__()

@@ -99,7 +99,7 @@ class FindingLog:
         """Take in a finding; return it if it is worth saying."""
         earlier = self.held.get(finding.key)
         if earlier is not None and earlier.kind == finding.kind:
-            known = {"since_ns": earlier.since_ns, "found_ns": earlier.detected_ns}
+            known = {"since_ns": earlier.since_ns, "detected_ns": earlier.detected_ns}
             finding = finding.model_copy(update=known)
         self._observed_ns[finding.key] = finding.reported_ns
         self.held[finding.key] = finding

