@@ -9,6 +9,7 @@ from coordinator.dynamics.torque_prediction import TorqueError
 from coordinator.identification.inertia.inertia import Inertia
 from coordinator.identification.inertia.robot_bodies import RobotBodies
 from coordinator.identification.result import Result
+from coordinator.identification.sensor_checks import Finding
 from coordinator.kinematics.assembly import ChainFit
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.topology.topology import Topology
@@ -22,13 +23,17 @@ class IdentificationError(DataError):
 
 
 class Kinematics(NamedTuple):
-    """Topology and chain: `first` as assembled from the circles, `refinement` by the batch estimator."""
+    """Topology and chain: `first` as assembled from the circles, `refinement` by the batch estimator.
+
+    findings: sensors that contradict the catalogue or the others.
+    """
 
     topology: Topology
     first: ChainFit
     refinement: Refinement
     clocks: dict[str, ClockMap]
     notes: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
 
     @property
     def fit(self) -> ChainEstimate:
@@ -36,7 +41,7 @@ class Kinematics(NamedTuple):
         return self.refinement.estimate
 
     def summary(self) -> list[str]:
-        """Return the tree and the links as lines of text."""
+        """Return the tree, the links and the findings on sensors as lines of text."""
         lines = []
         for k, serial in enumerate(self.topology.serials):
             parent = self.topology.parent[k]
@@ -47,7 +52,7 @@ class Kinematics(NamedTuple):
             length, sigma = 1e3 * self.fit.link_length_m[k], 1e3 * self.fit.link_length_sigma_m[k]
             on = f"{serial} on {self.topology.serials[parent]}{mounted}"
             lines.append(f"{on}: {length:.1f} +- {sigma:.1f} mm")
-        return lines
+        return lines + [finding.summary for finding in self.findings]
 
 
 class HeldOutMotion(NamedTuple):

@@ -22,6 +22,14 @@ from coordinator.identification.inertia.inertia import find_inertia, without_ter
 from coordinator.identification.inertia.robot_bodies import robot_bodies
 from coordinator.identification.result_builder import build_result
 from coordinator.identification.robot_refinement import refine_robot
+from coordinator.identification.sensor_checks import (
+    check_effort_signs,
+    check_encoder_signs,
+    check_encoder_travels,
+    effort_signs,
+    encoder_signs,
+    encoder_travels,
+)
 from coordinator.identification.topology_observations import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import assemble
@@ -35,6 +43,7 @@ from coordinator.synchronisation.motion_windows import (
     INDEPENDENT_FRACTION,
     Window,
     dynamic_windows,
+    filtered_window,
     joined_motions,
     noise_floor,
     window,
@@ -105,21 +114,28 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     serials = _explored(recording)
     try:
         clocks = map_clocks({s: recording.modules[s].trips for s in serials})
+        check_encoder_travels(encoder_travels(recording, clocks, serials))
         search = search_topology(recording, serials)
         topology = search.topology
+        rest = recording.rest_observation(topology.serials, MIN_REST_ROWS)
+        signs = encoder_signs(topology, search.observations, rest.specific_force_m_s2)
+        check_encoder_signs(signs)
         types = [recording.module_type(s) for s in topology.serials]
         explored = _exploration(recording, clocks, topology.serials)
         first = assemble(
             topology,
             types,
             _pairs(recording, clocks, topology.serials, *explored),
-            [recording.rest_observation(topology.serials, MIN_REST_ROWS)],
+            [rest],
         )
         clocks |= refine_clocks(first.chain, clocks, explored[1]).clocks
         _, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
         refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
+        motion = joined_motions([filtered_window(one) for one in windows])
+        findings = tuple(effort_signs(refined.chain, types, motion))
+        check_effort_signs(findings, signs)
     except (DataError, np.linalg.LinAlgError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
@@ -130,7 +146,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         if estimate.note
     )
     notes += (*search.notes, *_imu_outliers(topology.serials, refined, prior))
-    return Kinematics(topology, first, refined, clocks, notes)
+    return Kinematics(topology, first, refined, clocks, notes, findings)
 
 
 def _imu_outliers(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:

@@ -249,6 +249,19 @@ class DynamicsPart(Part):
     gathered_difference: float | None = None
 
 
+class SensorPart(Part):
+    """A sensor that contradicts its catalogue or the others; measured and expected in `unit`."""
+
+    serial: str
+    motion: str
+    what: str
+    measured: float
+    expected: float
+    sigmas: float
+    unit: str
+    summary: str
+
+
 class Result(Part):
     """All results of one session.
 
@@ -275,6 +288,7 @@ class Result(Part):
     denavit_hartenberg: list[DhPart]
     dynamics: DynamicsPart | None
     notes: list[str]
+    sensors: list[SensorPart] = Field(default_factory=list)
     robot_time_s: float
     wall_time_s: float | None
     trace_hash: str

@@ -17,6 +17,7 @@ from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.next_motion import NextMotion, next_motions
 from coordinator.topology.topology import (
     MotionObservation,
+    Observations,
     Topology,
     TopologyError,
     combined_observation,
@@ -27,9 +28,10 @@ from module_agent.model.errors import DataError
 
 
 class TopologyFound(NamedTuple):
-    """The topology of the modules with observations, and notes on the others and on doubts."""
+    """The topology of the modules with observations, these, and notes on the others and on doubts."""
 
     topology: Topology
+    observations: Observations
     notes: tuple[str, ...]
 
 
@@ -48,9 +50,10 @@ def search_topology(recording: Recording, serials: Sequence[str]) -> TopologyFou
         raise TopologyError(
             f"no module observed any motion: the topology cannot be identified. {reasons}", tuple(serials)
         )
-    topology = find_topology(*_usable(observed))
+    observations, unmoved = _usable(observed)
+    topology = find_topology(observations, unmoved)
     excluded = [f"{s} took no part: {why}" for s, why in excluded_modules(recording.journal).items()]
-    return TopologyFound(topology, (*excluded, *_notes(observed, topology)))
+    return TopologyFound(topology, observations, (*excluded, *_notes(observed, topology)))
 
 
 def doubtful_motions(recording: Recording) -> tuple[NextMotion, ...]:

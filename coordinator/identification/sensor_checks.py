@@ -1,0 +1,265 @@
+"""Sick and mislabelled sensors: what contradicts the catalogue or the other sensors, by serial and motion.
+
+An encoder's sign and its exchange with another one show before any fit, and stop the identification. What
+the fit can estimate instead, an encoder's scale and where an IMU sits, is estimated where it is an outlier of
+its prior, and named.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from coordinator.dynamics.inertia_prior import module_prior
+from coordinator.dynamics.pseudo_inertia import parameters
+from coordinator.recording.recording import Recording
+from coordinator.synchronisation.motion_windows import STEP_NS
+from coordinator.topology.topology import Observations, Topology
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.errors import DataError
+from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.clock_map import ClockMap
+from module_agent.signals.filtering import JointMotion
+
+# Sigma of a direction in the frame of an IMU as delivered: axes turned by 1 deg, 20 mg, joints that give way.
+DIRECTION_SIGMA_RAD = 0.05
+# Of some 30 checks of a robot none is beyond this by chance in 500 robots.
+NAMED_ABOVE = 4.0
+# A joint that was moved alone travels at least this far, and any other less than the share of it.
+TRAVEL_RAD, HELD_SHARE = 0.05, 0.3
+
+# The load of a joint by the catalogue against its effort: links weigh what they weigh, springs have friction.
+LOAD_SIGMA = 0.3
+# Efforts are compared with loads that vary by more than this, and must follow them this closely.
+LOAD_NM, ALIKE_ABOVE = 0.05, 0.8
+_BACKWARDS = "its encoder counts backwards, or the module is mounted the other way round"
+_OPPOSED = "the sign of its effort or of its encoder is wrong"
+
+
+class Finding(NamedTuple):
+    """A sensor that contradicts its catalogue or the others.
+
+    motion: those in which it shows. measured, expected: in `unit`. sigmas: how far apart they are. remedy:
+    what to check, as a phrase.
+    """
+
+    serial: str
+    motion: str
+    what: str
+    measured: float
+    expected: float
+    sigmas: float
+    unit: str = ""
+    remedy: str = ""
+
+    @property
+    def summary(self) -> str:
+        """The finding as a sentence."""
+        unit = f" {self.unit}" if self.unit else ""
+        text = (
+            f"{self.serial}: {self.what} is {self.measured:.4g}{unit} in {self.motion}, "
+            f"{self.expected:.4g}{unit} is expected ({self.sigmas:.0f} sigmas apart)"
+        )
+        return f"{text}: {self.remedy}" if self.remedy else text
+
+
+class SensorError(DataError):
+    """Sensors whose readings cannot be used as they are; the message names them."""
+
+
+class Travel(NamedTuple):
+    """A motion of one joint, and how far every encoder turned along with it.
+
+    asked_rad: how far the joint was to go. by_encoder_rad: in that direction; without a sign if the recording
+    has no commands.
+    """
+
+    serial: str
+    motion: str
+    asked_rad: float
+    by_encoder_rad: Mapping[str, float]
+
+
+def encoder_travels(
+    recording: Recording, clocks: Mapping[str, ClockMap], serials: Sequence[str]
+) -> list[Travel]:
+    """Return how far all encoders turned in the exploration, by regression on the moving joint's command."""
+    travels = []
+    for event in recording.latest_motions("constant", "windowed_sine", "whole"):
+        if event.motion is None or event.motion.end_row is None or event.serial not in serials:
+            continue
+        rows = recording.rows(event.serial, event.motion.start_row, event.motion.end_row)
+        command = rows["position_command_rad"].astype(float)
+        commanded = bool(len(rows)) and bool(np.isfinite(command).all()) and float(np.ptp(command)) > 0.0
+        if not len(rows) or (event.purpose == "whole" and not commanded):
+            continue
+        t_ns = clocks[event.serial].to_session(rows["t_ns"].astype(np.int64))
+        turned = {}
+        for serial in serials:
+            clock = clocks[serial]
+            between = clock.module_span(int(t_ns[0]), int(t_ns[-1]), STEP_NS)
+            track = recording.modules[serial].rows.between(*between)
+            if len(track):
+                at_ns = clock.to_session(track["t_ns"].astype(np.int64))
+                q = np.interp(t_ns, at_ns, track["position_rad"])
+                turned[serial] = _along(q, command) if commanded else float(np.ptp(q))
+        asked = float(np.ptp(command)) if commanded else turned.get(event.serial, 0.0)
+        travels.append(Travel(event.serial, event.purpose, asked, turned))
+    return travels
+
+
+def _along(q_rad: Array, command_rad: Array) -> float:
+    """Return how far positions (m,) went with a command (m,)."""
+    aim = command_rad - command_rad.mean()
+    return float(np.ptp(aim) * (aim @ q_rad) / (aim @ aim))
+
+
+def check_encoder_travels(travels: Sequence[Travel]) -> None:
+    """Check that every joint's motion turned its own encoder, and forwards.
+
+    Raises:
+        SensorError: two encoders are exchanged, or one counts backwards; with the serials and what travelled.
+    """
+    turned: dict[str, str] = {}
+    cases: dict[str, str] = {}
+    for joint, motion, asked, by_encoder in travels:
+        if joint not in by_encoder:
+            continue
+        own, most = by_encoder[joint], max(by_encoder, key=lambda s: abs(by_encoder[s]))
+        if own < -max(TRAVEL_RAD, HELD_SHARE * asked):
+            raise SensorError(
+                f"{joint}: its encoder turned by {own:.2g} rad in its {motion} motion, {asked:.2g} rad were "
+                "commanded: its encoder counts backwards"
+            )
+        far = abs(by_encoder[most])
+        if far > TRAVEL_RAD and abs(own) < HELD_SHARE * far:
+            cases[joint] = (
+                f"moving {joint} turned its encoder by {own:.2g} rad and that of {most} by {far:.2g}"
+            )
+            turned[joint] = most
+        else:
+            turned.setdefault(joint, joint)
+    # A joint that is stuck turns another's encoder as well, but no other joint turns its own.
+    cycle = sorted(s for s, other in turned.items() if other != s and s in _followed(turned, s))
+    if cycle:
+        raise SensorError(
+            f"the encoders of {' and '.join(cycle)} are exchanged ({'; '.join(cases[s] for s in cycle)}): "
+            "check which serial is where, and the columns of the recording"
+        )
+
+
+def _followed(turned: Mapping[str, str], serial: str) -> list[str]:
+    """Return where a serial leads, step by step."""
+    steps = [turned[serial]]
+    while len(steps) <= len(turned) and steps[-1] in turned:
+        steps.append(turned[steps[-1]])
+    return steps
+
+
+def encoder_signs(
+    topology: Topology, seen: Observations, force_m_s2: Array
+) -> dict[str, tuple[float, float]]:
+    """Return the sign of every encoder that another IMU than the joint's observes: {serial: (sign, sigma)}.
+
+    The IMU in a module's housing and one beyond its joint see the same directions d, gravity and the axes of
+    the joints below, and turning about the joint's axis does not change their component along it:
+    z^T d = s j^T d', with z the axis by the catalogue, j the gyro's answer to the encoder's rate and s the
+    sign. Where all directions are across the axis, sigma is large. Of reversed modules, the topology has
+    compared the own axis.
+
+    Args:
+        topology: n modules.
+        seen: which joint moved which IMU, and about which axis.
+        force_m_s2: (n, 3) specific forces of rest.
+    """
+    up = _units(force_m_s2)
+    signs = {}
+    for j, serial in enumerate(topology.serials):
+        if topology.reversed[j]:
+            signs[serial] = 1.0, DIRECTION_SIGMA_RAD
+        elif pairs := _components(topology, seen, up, j):
+            here, there = np.array(pairs).T
+            power = max(float(here @ here), 1e-9)
+            signs[serial] = float(here @ there) / power, DIRECTION_SIGMA_RAD / power**0.5
+    return signs
+
+
+def check_encoder_signs(signs: Mapping[str, tuple[float, float]]) -> None:
+    """Raise a SensorError that names the encoders that count backwards, if there are any."""
+    findings = [
+        Finding(
+            serial, "its slow motions", "the encoder's sign", sign, 1.0, (1.0 - sign) / sigma, "", _BACKWARDS
+        )
+        for serial, (sign, sigma) in signs.items()
+        if sign < -NAMED_ABOVE * sigma
+    ]
+    if findings:
+        raise SensorError("; ".join(finding.summary for finding in findings))
+
+
+def effort_signs(chain: Chain, kinds: Sequence[ModuleType], motion: JointMotion) -> list[Finding]:
+    """Return the joints whose efforts oppose their load: the sign of effort or encoder is wrong.
+
+    The load is that of the catalogue's bodies on links as a kit has them, good to `LOAD_SIGMA`.
+
+    Args:
+        chain: n modules, roughly right.
+        kinds: (n,) their types.
+        motion: of all joints, with their efforts.
+    """
+    phi = np.concatenate([parameters(body) for body in module_prior(chain, kinds)])
+    load = inverse_dynamics(chain, phi, motion.q_rad, motion.qd_rad_s, motion.qdd_rad_s2)
+    load, effort = load - load.mean(axis=0), motion.tau_nm - motion.tau_nm.mean(axis=0)
+    size, power = np.sqrt((load**2).mean(axis=0)), (load**2).mean(axis=0)
+    slope = (load * effort).mean(axis=0) / np.maximum(power, 1e-12)
+    alike = slope * size / np.maximum(np.sqrt((effort**2).mean(axis=0)), 1e-9)
+    return [
+        Finding(
+            serial,
+            "its exploration",
+            "effort over load",
+            float(s),
+            1.0,
+            float((1.0 - s) / LOAD_SIGMA),
+            "",
+            _OPPOSED,
+        )
+        for serial, s, c, rms in zip(chain.serials, slope, alike, size, strict=True)
+        if c < -ALIKE_ABOVE and rms > LOAD_NM
+    ]
+
+
+def check_effort_signs(findings: Sequence[Finding], signs: Mapping[str, tuple[float, float]]) -> None:
+    """Raise a SensorError with the findings on joints whose encoder's sign no other IMU observes."""
+    open_ = [f for f in findings if signs.get(f.serial, (1.0, np.inf))[1] * NAMED_ABOVE > 1.0]
+    if open_:
+        raise SensorError("; ".join(finding.summary for finding in open_))
+
+
+def _components(topology: Topology, seen: Observations, up: Array, j: int) -> list[tuple[float, float]]:
+    """Return the components of directions along axis j, by the module's own IMU and by those beyond it."""
+    serials, pairs = topology.serials, []
+    below: list[int] = []
+    while (parent := topology.parent[below[-1] if below else j]) >= 0:
+        below.append(parent)
+    for k in [k for k, parent in enumerate(topology.parent) if parent == j]:
+        axis = _axis(seen, serials[j], serials[k])
+        if axis is None:
+            continue
+        pairs.append((float(up[j, 2]), float(up[k] @ axis)))
+        for p in below:
+            here, there = _axis(seen, serials[p], serials[j]), _axis(seen, serials[p], serials[k])
+            if here is not None and there is not None:
+                pairs.append((float(here[2]), float(there @ axis)))
+    return pairs
+
+
+def _axis(seen: Observations, joint: str, observer: str) -> Array | None:
+    one = seen.get((joint, observer))
+    return None if one is None or not one.moved or one.axis is None else np.asarray(one.axis)
+
+
+def _units(vectors: Array) -> Array:
+    size = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.maximum(size, 1e-9))

@@ -1,0 +1,101 @@
+"""Recordings with altered sensors, made by a virtual run: what is wrong is named, or the claim covers it."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.identification.identified import IdentificationError
+from coordinator.identification.identify import identify_kinematics
+from coordinator.recording.recording import Entry, Recording
+from coordinator.recording.session_file import read_session
+from module_agent.wire.codec import decode, encode
+from module_agent.wire.feedback_rows import ROW, Rows
+from module_agent.wire.keys import Leaf, parse
+from module_agent.wire.messages import Feedback
+
+YAW, LIFT, ELBOW = "shoulder-yaw", "shoulder-lift", "elbow"
+ENCODER = ("position_rad", "velocity_rad_s", "position_command_rad", "velocity_command_rad_s")
+Alteration = Callable[[str, int, Rows], None]
+# One process makes the recording that all tests here alter.
+pytestmark = pytest.mark.xdist_group("altered")
+
+
+@pytest.fixture(scope="module")
+def entries() -> list[Entry]:
+    return []
+
+
+@pytest.fixture
+def run(entries: list[Entry], rigs: Callable[..., Any], quick_plan: Any, tmp_path: Path) -> list[Entry]:
+    """A run of the kit arm of three joints with calibrated IMUs; made once."""
+    if not entries:
+        plan = quick_plan.model_copy(update={"imu": "calibrated"})
+        rigs("a2085_03", "lan", 3, noise="x5").session(tmp_path / "run", plan)
+        entries.extend(read_session(tmp_path / "run" / "session.mcap"))
+    return list(entries)
+
+
+def _altered(entries: list[Entry], alter: Alteration) -> Recording:
+    """The recording with the rows of every feedback as `alter(serial, first row, rows)` leaves them."""
+    recording = Recording()
+    for entry in entries:
+        if entry.kind != "journal" and entry.kind != "request" and parse(entry.topic).leaf is Leaf.FEEDBACK:
+            message = decode(Feedback, entry.payload)
+            rows = np.frombuffer(message.rows, ROW).copy()
+            alter(message.serial, message.first_row, rows)
+            message = message.model_copy(update={"rows": rows.tobytes()})
+            entry = entry._replace(payload=encode(message))
+        recording.add(entry)
+    return recording
+
+
+def _backwards(wrong: str, fields: tuple[str, ...]) -> Alteration:
+    def alter(serial: str, first: int, rows: Rows) -> None:
+        if serial == wrong:
+            for field in fields:
+                rows[field] *= -1.0
+
+    return alter
+
+
+def test_a_healthy_robot_has_no_findings(run: list[Entry]) -> None:
+    kinematics = identify_kinematics(_altered(run, lambda *_: None))
+    assert kinematics.findings == ()
+
+
+@pytest.mark.parametrize("wrong", [YAW, LIFT, ELBOW])
+def test_an_encoder_that_runs_against_its_command_is_refused_by_name(run: list[Entry], wrong: str) -> None:
+    recording = _altered(run, _backwards(wrong, ENCODER[:2]))
+    with pytest.raises(IdentificationError, match=rf"{wrong}: its encoder turned by -.* counts backwards"):
+        identify_kinematics(recording)
+
+
+# The yaw axis is along gravity, which other IMUs see; the lift axis is across gravity and yaw: there only
+# the sign of the effort is left.
+@pytest.mark.parametrize(
+    ("wrong", "what"), [(YAW, "the encoder's sign is -1"), (LIFT, "effort over load is -")]
+)
+def test_a_joint_that_counts_backwards_is_refused_by_name(run: list[Entry], wrong: str, what: str) -> None:
+    with pytest.raises(IdentificationError, match=rf"{wrong}: {what}"):
+        identify_kinematics(_altered(run, _backwards(wrong, ENCODER)))
+
+
+def test_exchanged_encoders_are_refused_by_name(run: list[Entry]) -> None:
+    tracks: dict[tuple[str, int], Rows] = {}
+
+    def keep(serial: str, first: int, rows: Rows) -> None:
+        tracks.update({(serial, first + n): row for n, row in enumerate(rows)})
+
+    def exchange(serial: str, first: int, rows: Rows) -> None:
+        other = {YAW: ELBOW, ELBOW: YAW}.get(serial)
+        for n in range(len(rows)):
+            if other is not None and (other, first + n) in tracks:
+                for field in ("position_rad", "velocity_rad_s"):
+                    rows[field][n] = tracks[other, first + n][field]
+
+    _altered(run, keep)
+    with pytest.raises(IdentificationError, match=rf"encoders of {ELBOW} and {YAW} are exchanged"):
+        identify_kinematics(_altered(run, exchange))

@@ -1,0 +1,102 @@
+"""Sensors that contradict the catalogue or the others are named; healthy ones of random robots never are."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.dynamics.inertia_prior import module_prior
+from coordinator.dynamics.pseudo_inertia import parameters
+from coordinator.identification.sensor_checks import (
+    SensorError,
+    Travel,
+    check_effort_signs,
+    check_encoder_signs,
+    check_encoder_travels,
+    effort_signs,
+    encoder_signs,
+)
+from coordinator.topology.topology import MotionObservation
+from module_agent.model.catalogue import ModuleType
+from module_agent.model.chain import Array, Chain
+from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.filtering import JointMotion
+
+
+def _seen(robots: Any, chain: Chain, sign: Array) -> dict[tuple[str, str], MotionObservation]:
+    q = np.tile(robots.positions(chain, 0)[0], (len(chain.serials), 1))
+    sense = dict(zip(chain.serials, sign.tolist(), strict=True))
+    return {
+        (one.joint, one.observer): MotionObservation(True, 1.0, sense[one.joint] * one.axis)
+        for one in robots.observe(chain, q)
+    }
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_encoder_that_counts_backwards_is_named(robots: Any, seed: int) -> None:
+    chain, _ = robots.random(seed, joints=4, serial=True)
+    count = len(chain.serials)
+    force = robots.rest(chain, robots.positions(chain, 0)[0]).specific_force_m_s2
+    topology = robots.topology(chain)
+    check_encoder_signs(encoder_signs(topology, _seen(robots, chain, np.ones(count)), force))
+    for joint in range(count - 1):
+        # The base joint sees gravity alone, and an axis across gravity tells no sign.
+        if chain.reversed[joint] or (joint == 0 and abs(chain.gravity[2]) < 2.5):
+            continue
+        sign = np.ones(count)
+        sign[joint] = -1.0
+        signs = encoder_signs(topology, _seen(robots, chain, sign), force)
+        assert signs[chain.serials[joint]][0] == pytest.approx(-1.0)
+        with pytest.raises(SensorError, match=rf"^{chain.serials[joint]}: the encoder's sign is -1 [^;]*$"):
+            check_encoder_signs(signs)
+
+
+def _swing(robots: Any) -> tuple[Chain, list[ModuleType], JointMotion]:
+    chain, types = robots.random(4, joints=3, serial=True)
+    t = np.linspace(0.0, 4.0, 400)[:, None]
+    q = 0.5 * np.sin(2.0 * t * np.array([1.0, 1.7, 2.3]))
+    qd, qdd = np.gradient(q, 4.0 / 399, axis=0), np.zeros_like(q)
+    phi = np.concatenate([parameters(body) for body in module_prior(chain, types)])
+    # Bodies a third heavier than the catalogue's.
+    tau = 1.3 * inverse_dynamics(chain, phi, q, qd, qdd)
+    return chain, types, JointMotion(np.arange(400), q, qd, qdd, tau)
+
+
+def test_an_effort_that_opposes_its_load_is_named(robots: Any) -> None:
+    chain, types, motion = _swing(robots)
+    assert effort_signs(chain, types, motion) == []
+    (finding,) = effort_signs(chain, types, motion._replace(tau_nm=motion.tau_nm * [-1.0, 1.0, 1.0]))
+    assert (finding.serial, finding.measured) == ("M00", pytest.approx(-1.3))
+    # Where gyros tell the encoder's sign it is the effort's, and the chain holds.
+    check_effort_signs([finding], {"M00": (1.0, 0.05)})
+    with pytest.raises(SensorError, match=r"M00: effort over load is -1.3"):
+        check_effort_signs([finding], {})
+
+
+def _travels(turned: dict[str, dict[str, float]]) -> list[Travel]:
+    return [Travel(joint, "slow", 0.6, by_encoder) for joint, by_encoder in turned.items()]
+
+
+HEALTHY = {
+    "A": {"A": 0.6, "B": 0.02, "C": 0.01},
+    "B": {"A": -0.02, "B": 0.5, "C": 0.04},
+    "C": {"A": 0.0, "B": 0.0, "C": 0.7},
+}
+
+
+def test_encoders_that_turn_with_each_others_joints_are_named() -> None:
+    check_encoder_travels(_travels(HEALTHY))
+    exchanged = {joint: {"A": t["B"], "B": t["A"], "C": t["C"]} for joint, t in HEALTHY.items()}
+    with pytest.raises(SensorError, match=r"the encoders of A and B are exchanged \(moving A turned"):
+        check_encoder_travels(_travels(exchanged))
+
+
+def test_a_joint_that_is_stuck_is_not_an_exchanged_encoder() -> None:
+    check_encoder_travels(_travels(HEALTHY | {"B": {"A": 0.2, "B": 0.0, "C": 0.01}}))
+
+
+def test_an_encoder_that_runs_against_its_command_is_named() -> None:
+    with pytest.raises(
+        SensorError, match=r"B: its encoder turned by -0.5 rad in its slow motion, 0.6 rad were"
+    ):
+        check_encoder_travels(_travels(HEALTHY | {"B": {"A": 0.0, "B": -0.5, "C": 0.01}}))
