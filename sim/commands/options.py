@@ -16,6 +16,7 @@ from sim.imperfections.noise_profile import NOISE_PROFILES
 from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import Robot, load_robot
 from sim.world.external_force import Push, check_pushed, parse_push
+from sim.world.world import check_imu_rate
 
 RobotArgument = Annotated[str, typer.Argument(help="Name of a shipped robot, or a TOML file.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all noise.")]
@@ -53,6 +54,9 @@ class WorldOptions(NoiseOptions):
     speed: Annotated[
         float, typer.Option(help="Times real time; slower helps a busy machine.", callback=check_speed)
     ] = 1.0
+    imu_rate_hz: Annotated[
+        float, typer.Option(help="Readings of an IMU per second.", callback=check_imu_rate)
+    ] = 250.0
 
     def pushes_on(self, robot: Robot) -> tuple[Push, ...]:
         """Return the external forces that were chosen.

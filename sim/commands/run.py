@@ -48,6 +48,7 @@ def run(
         network=launched.network or robot.network,
         noise=settings.choice().of(robot),
         pushes=settings.pushes_on(robot),
+        imu_rate_hz=settings.imu_rate_hz,
         plan=motions.chosen(),
         refined_previews=MAX_REFINED_MODULES,
         out=launched.new_folder(robot),
@@ -95,6 +96,7 @@ def _launch(
         endpoint=launched.endpoint,
         processes=launched.processes,
         pushes=tuple(settings.push or ()),
+        imu_rate_hz=settings.imu_rate_hz,
         # The robot ends with this run, so that there is nothing to resume.
         coordinator_options=("--no-advise", *coordinator_options, *motions.arguments()),
         out=launched.new_folder(robot),

@@ -35,7 +35,7 @@ def world(
     for each in SIGNALS:
         signal.signal(each, lambda number, _: stopping.append(number))
     try:
-        plant = World(robot, settings.seed, noise, pushes=pushes)
+        plant = World(robot, settings.seed, noise, pushes=pushes, imu_rate_hz=settings.imu_rate_hz)
         log = TruthLog(plant)
         server = BusServer(bus, log, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
     except OSError as error:

@@ -51,6 +51,7 @@ class LaunchConfig(NamedTuple):
     agent_options: tuple[str, ...] = ()
     within: Callable[[str], tuple[str, ...]] = lambda process: ()
     pushes: tuple[str, ...] = ()
+    imu_rate_hz: float = 250.0
 
 
 class Child(NamedTuple):
@@ -96,6 +97,7 @@ class Launcher:
         config = self.config
         arguments = ["sim.main", "world", config.robot_file, "--bus", self.bus, "--seed", str(config.seed)]
         arguments += ["--speed", str(config.speed), "--truth", str(config.out)]
+        arguments += ["--imu-rate-hz", str(config.imu_rate_hz)]
         arguments += config.noise.arguments
         for push in config.pushes:
             arguments += ["--push", push]

@@ -39,6 +39,7 @@ class VirtualSettings(NamedTuple):
     noise: str | NoiseProfile | None = None
     noise_seed: int | None = None
     pushes: tuple[Push, ...] = ()
+    imu_rate_hz: float = 250.0
 
 
 class _Wires:
@@ -93,8 +94,8 @@ class VirtualRobot:
         self.loop = loop
         self.robot = settings.robot
         self.serials = settings.robot.serials
-        seeds, pushes = (settings.seed, settings.noise_seed), settings.pushes
-        self.world = World(settings.robot, seeds[0], settings.noise, noise_seed=seeds[1], pushes=pushes)
+        options = {name: getattr(settings, name) for name in ("noise_seed", "pushes", "imu_rate_hz")}
+        self.world = World(settings.robot, settings.seed, settings.noise, **options)
         self.network = VirtualNetwork(loop) if network is None else network
         self.truth = TruthLog(self.world)
         self.pwm = [0.0] * len(self.serials)

@@ -38,6 +38,7 @@ class VirtualConfig(NamedTuple):
     refined_previews: int = 0
     baseline: Path | None = None
     pushes: tuple[Push, ...] = ()
+    imu_rate_hz: float = 250.0
 
 
 class SilentScreen:
@@ -68,6 +69,7 @@ def run_virtual(
         noise=config.noise,
         noise_seed=config.noise_seed,
         pushes=config.pushes,
+        imu_rate_hz=config.imu_rate_hz,
     )
     with virtual_robot(settings) as robot:
         run = Run(

@@ -60,6 +60,7 @@ def simulate(
     plan: Plan | None = None,
     dynamics: bool | None = None,
     pushes: tuple[Push, ...] = (),
+    imu_rate_hz: float = 250.0,
     out: Path | str | None = None,
 ) -> Simulation:
     """Simulate a robot, identify it in virtual time, and return result and truth.
@@ -72,6 +73,7 @@ def simulate(
         plan: the motions; by default the standard ones, with IMU priors that fit the noise profile.
         dynamics: whether to identify inertial parameters [kg, kg m, kg m^2] too; by default as planned.
         pushes: external forces [N] and torques [Nm] on modules.
+        imu_rate_hz: how often the IMUs are read, 1000 Hz by a whole number.
         out: folder to write the run to (`session.mcap`, `result.json`, `truth.json`, ...), as
             `x5-sim run --virtual` does; nothing is written when None.
 
@@ -91,7 +93,11 @@ def simulate(
         folder = Path(out)
         check_free(folder)
         run_virtual(
-            VirtualConfig(described, folder, seed, network, noise=profile, plan=planned, pushes=pushes)
+            VirtualConfig(
+                *(described, folder, seed, network, profile, planned),
+                pushes=pushes,
+                imu_rate_hz=imu_rate_hz,
+            )
         )
         truth, motion = read_truth(folder / "truth.json"), read_motion(folder / "truth.npz")
         return Simulation(described, folder, load_recording(folder / SESSION), truth, motion)
@@ -100,7 +106,7 @@ def simulate(
     def keep_truth(simulated: VirtualRobot) -> None:
         ended.append((truth_of(described, simulated.world), simulated.truth.motion()))
 
-    settings = VirtualSettings(described, network_profile(network), seed, profile, pushes=pushes)
+    settings = VirtualSettings(described, network_profile(network), seed, profile, None, pushes, imu_rate_hz)
     recording = record_session(settings, planned, keep_truth)
     simulation = Simulation(described, None, recording, *ended[0])
     # Compute at once, so that an identification error is raised by this call.

@@ -9,6 +9,7 @@ import numpy as np
 
 from module_agent.hardware.hardware import HardwareLost, SensorSample, WiredModule
 from module_agent.model.catalogue import module_type
+from module_agent.model.errors import UsageError
 from module_agent.model.read_only import read_only
 from sim.actuator.actuator import BUS_VOLTAGE_V, Actuators
 from sim.actuator.thermal import Windings
@@ -25,8 +26,17 @@ from sim.world.external_force import Push, check_pushed
 
 TICK_NS = 1_000_000
 TICK_S = 1e-3
-# Its IMU is read at 250 Hz.
-IMU_TICKS = 4
+
+
+def check_imu_rate(rate_hz: float) -> float:
+    """Return a rate at which an IMU can be read.
+
+    Raises:
+        UsageError: its period is not a whole number of ticks.
+    """
+    if not (rate_hz > 0.0 and math.isclose(1.0, TICK_S * rate_hz * round(1.0 / (TICK_S * rate_hz)))):
+        raise UsageError(f"IMU rate {rate_hz:g} Hz: it must be 1000 Hz by a whole number, as 50 or 500 Hz")
+    return rate_hz
 
 
 class Plant(NamedTuple):
@@ -64,8 +74,8 @@ class World:
     another day; the modules' parameters depend on `seed` alone. `pushes` are external wrenches.
 
     Raises:
-        UsageError: a push is on no module, the robot's base or links are too soft to carry it, or there is no
-            such noise profile.
+        UsageError: a push is on no module, the robot's base or links are too soft to carry it, there is no
+            such noise profile, or the IMU's rate is not a whole fraction of the ticks'.
     """
 
     def __init__(
@@ -76,11 +86,13 @@ class World:
         voltage_v: float = BUS_VOLTAGE_V,
         noise_seed: int | None = None,
         pushes: Sequence[Push] = (),
+        imu_rate_hz: float = 250.0,
     ):
+        imu_ticks = round(1.0 / (TICK_S * check_imu_rate(imu_rate_hz)))
         self.robot = robot
         self.profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or robot.noise)
         types = tuple(module_type(m.type) for m in robot.modules)
-        drawn = seed, robot.serials, types, self.profile, IMU_TICKS, TICK_S, noise_seed
+        drawn = seed, robot.serials, types, self.profile, imu_ticks, TICK_S, noise_seed
         self.sensors = Sensors(*drawn)
         self._skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
         self._joints = np.array(self._skeleton.module)
@@ -104,7 +116,7 @@ class World:
         q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.state.motor_rad
         self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.state.torque_nm, structure)
         self.modules = tuple(
-            WiredModule(m.serial, m.type, TICK_NS, IMU_TICKS * TICK_NS) for m in robot.modules
+            WiredModule(m.serial, m.type, TICK_NS, imu_ticks * TICK_NS) for m in robot.modules
         )
 
     @property

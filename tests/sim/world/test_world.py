@@ -61,6 +61,18 @@ def test_the_imu_is_read_every_fourth_tick_at_the_instant_of_the_position() -> N
     assert world.t_ns == 12_000_000
 
 
+def test_the_imu_rate_can_be_chosen() -> None:
+    world = World(load_robot(IDEAL_ARM), seed=1, imu_rate_hz=50.0)
+    assert len({samples[0].imu_t_ns for samples in _waving(world, 40)}) == 2
+    assert world.modules[0].imu_period_ns == 20_000_000
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, 300.0, 2000.0, math.nan, math.inf])
+def test_an_imu_rate_that_misses_the_ticks_is_refused(rate_hz: float) -> None:
+    with pytest.raises(UsageError, match="must be 1000 Hz by a whole number"):
+        World(load_robot(IDEAL_ARM), seed=1, imu_rate_hz=rate_hz)
+
+
 @pytest.mark.parametrize("name", ["thesis_484_horizontal", "thesis_350_vertical", "arm6", "snake16"])
 def test_every_imu_at_rest_feels_gravity_where_the_true_chain_has_it(name: str) -> None:
     robot = load_robot(name)
