@@ -24,7 +24,7 @@ from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, re
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, undone
 from coordinator.identification.robot_refinement import KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
-from coordinator.synchronisation.motion_windows import Window, filtered, thinned, window
+from coordinator.synchronisation.motion_windows import Window, filtered, thinned, unbroken_windows
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import UNCALIBRATED
 from module_agent.model.perturbation import adjoint, perturbation_between
@@ -63,7 +63,11 @@ def exploration(run: BaselineRobot, serials: Sequence[str]) -> list[Window]:
     last = {("" if e.purpose == "whole" else e.serial, e.purpose): e for e in moving}
     events = [*last.values(), *run.recording.motions("repeat")]
     clocks = run.kinematics.clocks
-    return [window(run.recording, clocks, serials, e, REFINEMENT_CUTOFF_HZ) for e in events]
+    return [
+        one
+        for event in events
+        for one in unbroken_windows(run.recording, clocks, serials, event, REFINEMENT_CUTOFF_HZ)
+    ]
 
 
 def corrected(windows: Sequence[Window], imus: ImuIntrinsics) -> list[Window]:

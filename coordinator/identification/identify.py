@@ -46,7 +46,8 @@ from coordinator.synchronisation.motion_windows import (
     filtered_window,
     joined_motions,
     noise_floor,
-    window,
+    sampling_notes,
+    unbroken_windows,
 )
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import Topology
@@ -115,6 +116,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
     try:
         clocks = map_clocks({s: recording.modules[s].trips for s in serials})
         check_encoder_travels(encoder_travels(recording, clocks, serials))
+        sampling = sampling_notes(recording, clocks, serials, _moving(recording), REFINEMENT_CUTOFF_HZ)
         search = search_topology(recording, serials)
         topology = search.topology
         rest = recording.rest_observation(topology.serials, MIN_REST_ROWS)
@@ -145,7 +147,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         for estimate in list(estimates.values())
         if estimate.note
     )
-    notes += (*search.notes, *_imu_outliers(topology.serials, refined, prior))
+    notes += (*search.notes, *sampling, *_imu_outliers(topology.serials, refined, prior))
     return Kinematics(topology, first, refined, clocks, notes, findings)
 
 
@@ -207,19 +209,27 @@ def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topo
     if topology.reversed[0]:
         return None
     still = [e for e in recording.latest_motions("rest") if e.serial == topology.serials[0]]
-    return noise_floor(window(recording, clocks, topology.serials, still[0]), REFINEMENT_CUTOFF_HZ)
+    parts = unbroken_windows(recording, clocks, topology.serials, still[0])
+    return noise_floor(max(parts, key=lambda part: len(part.t_ns)), REFINEMENT_CUTOFF_HZ)
+
+
+def _moving(recording: Recording) -> list[JournalEvent]:
+    """Return all motions that something is identified from."""
+    latest = recording.latest_motions("constant", "windowed_sine", "whole")
+    return [*latest, *recording.motions("repeat", "dynamic", "held_out")]
 
 
 def _exploration(
     recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]
 ) -> tuple[list[JournalEvent], list[Window]]:
-    """Return the motions to which the chain is fitted, of the modules in it, and their windows."""
+    """Return the motions to which the chain is fitted, of the modules in it, one for each window."""
     alone = recording.latest_motions("constant", "windowed_sine")
     whole, repeats = recording.latest_motions("whole"), recording.motions("repeat")
     alone, whole, repeats = ([e for e in some if e.serial in serials] for some in (alone, whole, repeats))
     # The window of any one joint of a simultaneous motion holds all joints.
     motions = [*alone, *whole[:1], *repeats]
-    return motions, [window(recording, clocks, serials, e, REFINEMENT_CUTOFF_HZ) for e in motions]
+    parts = [(e, unbroken_windows(recording, clocks, serials, e, REFINEMENT_CUTOFF_HZ)) for e in motions]
+    return [e for e, windows in parts for _ in windows], [one for _, windows in parts for one in windows]
 
 
 def _held_out(kinematics: Kinematics, motion: JointMotion, phi: Array, means: Array) -> HeldOutMotion:

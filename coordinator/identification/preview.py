@@ -19,7 +19,7 @@ from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.chain_observations import PairObservation, circle_observation
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
-from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, window
+from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, unbroken_windows
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.topology import MotionObservation, Topology, likely_topology
 from module_agent.model.chain import BASE, Array, Chain
@@ -209,8 +209,9 @@ class Previewer:
         key = (event.serial, event.motion.motion_id, serials)
         if key not in self._parts:
             clocks = map_clocks({s: self._recording.modules[s].round_trips for s in serials})
-            one = window(self._recording, clocks, serials, event, REFINEMENT_CUTOFF_HZ)
-            self._parts[key] = thinned([filtered(one, REFINEMENT_CUTOFF_HZ)], RETAINED_EVERY)
+            windows = unbroken_windows(self._recording, clocks, serials, event, REFINEMENT_CUTOFF_HZ)
+            parts = [filtered(one, REFINEMENT_CUTOFF_HZ) for one in windows]
+            self._parts[key] = thinned(parts, RETAINED_EVERY)
         return self._parts[key]
 
 

@@ -20,7 +20,7 @@ from coordinator.kinematics.simultaneous_motion import (
 )
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
-from coordinator.synchronisation.motion_windows import RATE_HZ, window
+from coordinator.synchronisation.motion_windows import RATE_HZ, unbroken_windows, window
 from coordinator.synchronisation.round_trips import map_clocks
 from coordinator.topology.motion_evidence import NotMoved, motion_evidence
 from coordinator.topology.topology import (
@@ -36,6 +36,8 @@ from module_agent.signals.filtering import SIMULTANEOUS_CUTOFF_HZ, TOPOLOGY_CUTO
 from module_agent.wire.feedback_rows import Rows
 
 KEEP_EVERY = 5
+# The longest hole in a motion of all joints at once that is bridged: a tenth of its fastest period is lost.
+BRIDGED_NS = 100_000_000
 # Up to this rotation of the joints in between, an axis counts as unchanged: the residual is some tenths of it
 # (`motion_evidence.RESIDUAL_GIVE`).
 TURNED_RAD = 0.3
@@ -63,7 +65,8 @@ def respond(
     Raises:
         DataError: see `simultaneous_response`; also a hole in the recording, or no rest.
     """
-    one = window(recording, clocks, serials, event, SIMULTANEOUS_CUTOFF_HZ)
+    # Gravity is followed from rest on, so that this motion cannot be split.
+    one = window(recording, clocks, serials, event, SIMULTANEOUS_CUTOFF_HZ, BRIDGED_NS)
     others = [one.gyro_rad_s, one.accel_m_s2]
     signals = filtered_signals(one.q_rad, others, RATE_HZ, SIMULTANEOUS_CUTOFF_HZ)
     rests = [recording.rest_rows(serial) for serial in serials]
@@ -154,9 +157,11 @@ def _of_motion(source: _Source, event: JournalEvent) -> MotionFeedback:
     observers = _observers(source, event)
     if event.serial not in observers:
         return MotionFeedback(event, (), np.empty(0), np.empty((0, 0)), np.empty((0, 0, 3)), np.empty((0, 3)))
-    one = window(source.recording, source.clocks, observers, event, TOPOLOGY_CUTOFF_HZ)
-    signals = filtered_signals(one.q_rad, [one.gyro_rad_s], RATE_HZ, TOPOLOGY_CUTOFF_HZ, KEEP_EVERY)
-    q, qd, _, gyro = signals.settled()
+    parts = [
+        filtered_signals(one.q_rad, [one.gyro_rad_s], RATE_HZ, TOPOLOGY_CUTOFF_HZ, KEEP_EVERY).settled()
+        for one in unbroken_windows(source.recording, source.clocks, observers, event, TOPOLOGY_CUTOFF_HZ)
+    ]
+    q, qd, _, gyro = (np.concatenate(signal) for signal in zip(*parts, strict=True))
     offset = np.array([source.offsets[s] for s in observers])
     return MotionFeedback(event, tuple(observers), q.mean(axis=0), qd, gyro, offset)
 
@@ -242,12 +247,17 @@ def _observers(source: _Source, event: JournalEvent) -> list[str]:
 
 def _covered(source: _Source, serials: Sequence[str], event: JournalEvent) -> bool:
     try:
-        joint_window = window(source.recording, source.clocks, serials, event, TOPOLOGY_CUTOFF_HZ)
+        of_all, of_joint = (
+            sum(
+                len(one.t_ns)
+                for one in unbroken_windows(source.recording, source.clocks, some, event, TOPOLOGY_CUTOFF_HZ)
+            )
+            for some in (serials, [event.serial])
+        )
     except DataError:
         return False
     # A window is cut to the rows of all modules: one that stopped sending must not shorten the others'.
-    whole = window(source.recording, source.clocks, [event.serial], event, TOPOLOGY_CUTOFF_HZ)
-    return len(joint_window.t_ns) > 0.9 * len(whole.t_ns)
+    return of_all > 0.8 * of_joint
 
 
 def _with_own(

@@ -1,6 +1,7 @@
 """Motions of a recording for the estimators: all modules resampled on one time base and filtered alike."""
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import (
     DYNAMIC_CUTOFF_HZ,
     INSTRUMENT_CUTOFF_HZ,
+    MAX_GAP_NS,
+    NS_PER_S,
     JointMotion,
     differentiate,
     filtered_motion,
@@ -28,6 +31,9 @@ RATE_HZ = 250.0
 STEP_NS = 4_000_000
 # A joint whose position scatters by fewer steps of its encoder than this is taken to stand still.
 MOVING_STEPS = 20.0
+# Samples in a period of the cut-off: what lies above half their rate is folded into the motion, and with two
+# of them all that the low-pass lets through is; with six nothing below five times the cut-off.
+FEWEST, FEW = 3.0, 6.0
 
 
 class Window(NamedTuple):
@@ -51,22 +57,89 @@ def window(
     serials: Sequence[str],
     event: JournalEvent,
     cutoff_hz: float | None = None,
+    bridged_ns: int = MAX_GAP_NS,
 ) -> Window:
     """Resample all modules over one motion, at 250 Hz of session time.
 
     The margins on either side are those in which a low-pass of `cutoff_hz` settles; None for none. The window
-    is cut to what all modules have recorded.
+    is cut to what all modules have recorded. Holes up to `bridged_ns` are bridged.
 
     Raises:
         DataError: a hole in the recording, with the module or its column.
     """
-    start_ns, end_ns = span(recording, clocks, event, cutoff_hz)
-    tracks = [_track(recording, clocks[s], s, event, start_ns, end_ns) for s in serials]
+    times = span(recording, clocks, event, cutoff_hz)
+    return _aligned([_track(recording, clocks[s], s, event, *times) for s in serials], *times, bridged_ns)
+
+
+def unbroken_windows(
+    recording: Recording,
+    clocks: Mapping[str, ClockMap],
+    serials: Sequence[str],
+    event: JournalEvent,
+    cutoff_hz: float | None = None,
+) -> list[Window]:
+    """Return `window`, split where a module has a hole; parts too short for the low-pass are dropped.
+
+    Raises:
+        DataError: a module has no row, or no part is long enough.
+    """
+    times = span(recording, clocks, event, cutoff_hz)
+    tracks = [_track(recording, clocks[s], s, event, *times) for s in serials]
+    holes = np.array(sorted(hole for track in tracks for hole in track.holes())).reshape(-1, 2)
+    starts = np.maximum.accumulate([times[0], *holes[:, 1]])
+    shortest_ns = 3 * settling_samples(RATE_HZ, cutoff_hz or DYNAMIC_CUTOFF_HZ) * STEP_NS
+    spans = zip(starts, [*holes[:, 0], times[1]], strict=True)
+    parts = [(start, end) for start, end in spans if end - start > shortest_ns]
+    if not len(holes) or not parts:
+        return [_aligned(tracks, *times)]
+    return [_aligned([track.between(*part) for track in tracks], *part) for part in parts]
+
+
+def sampling_notes(
+    recording: Recording,
+    clocks: Mapping[str, ClockMap],
+    serials: Sequence[str],
+    events: Sequence[JournalEvent],
+    cutoff_hz: float,
+) -> tuple[str, ...]:
+    """Return notes on holes and low rates of joints' and IMUs' samples in some motions.
+
+    Raises:
+        DataError: a rate too low for the low-pass, with serial, motion, rate and what is needed.
+    """
+    notes: list[str] = []
+    for event, serial in product(events, serials):
+        motion = f"the {event.purpose} motion of {event.serial}"
+        try:
+            times = span(recording, clocks, event, cutoff_hz)
+            track = _track(recording, clocks[serial], serial, event, *times)
+        except DataError:
+            continue  # It is raised again where the rows are needed.
+        for what, t_ns in (("joint", track.t_ns), ("IMU", track.imu_t_ns)):
+            rate_hz = NS_PER_S / float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+            if rate_hz < FEWEST * cutoff_hz:
+                raise DataError(
+                    f"{serial}: its {what} has {rate_hz:.1f} samples per second in {motion}; a low-pass of "
+                    f"{cutoff_hz:g} Hz needs at least {FEWEST * cutoff_hz:g}"
+                )
+            if rate_hz < FEW * cutoff_hz:
+                notes.append(
+                    f"{serial}: its {what} has {rate_hz:.0f} samples per second; with fewer than "
+                    f"{FEW * cutoff_hz:g} vibration above {rate_hz - cutoff_hz:.0f} Hz looks like motion"
+                )
+        notes += [
+            f"{serial}: a hole of {1e-6 * (end - start):.0f} ms in {motion}, which is split there"
+            for start, end in track.holes()
+        ]
+    return tuple(dict.fromkeys(notes))
+
+
+def _aligned(tracks: Sequence["_Track"], start_ns: int, end_ns: int, bridged_ns: int = MAX_GAP_NS) -> Window:
     start_ns = max(start_ns, *(int(t[0]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
     end_ns = min(end_ns, *(int(t[-1]) for track in tracks for t in (track.t_ns, track.imu_t_ns)))
     common = np.arange(start_ns, end_ns, STEP_NS, dtype=np.int64)
-    joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common)
-    imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common)
+    joint = resample([track.t_ns for track in tracks], [track.joint for track in tracks], common, bridged_ns)
+    imu = resample([track.imu_t_ns for track in tracks], [track.imu for track in tracks], common, bridged_ns)
     changes = [np.diff(np.unique(track.joint[:, 0])) for track in tracks]
     step = np.array([float(change.min()) if change.size else 0.0 for change in changes])
     return Window(common, joint[..., 0], joint[..., 1], imu[..., :3], imu[..., 3:], step)
@@ -79,6 +152,19 @@ class _Track(NamedTuple):
     imu_t_ns: NDArray[np.int64]
     joint: Array
     imu: Array
+
+    def holes(self) -> set[tuple[int, int]]:
+        """Return the times around what `resample` does not bridge."""
+        return {
+            (int(t[k]), int(t[k + 1]))
+            for t in (self.t_ns, self.imu_t_ns)
+            for k in np.flatnonzero(np.diff(t) > MAX_GAP_NS)
+        }
+
+    def between(self, start_ns: int, end_ns: int) -> "_Track":
+        """Return the samples within a span, both ends included."""
+        of_joint, of_imu = ((t >= start_ns) & (t <= end_ns) for t in (self.t_ns, self.imu_t_ns))
+        return _Track(self.t_ns[of_joint], self.imu_t_ns[of_imu], self.joint[of_joint], self.imu[of_imu])
 
 
 def _track(
@@ -187,16 +273,20 @@ def dynamic_windows(
 ) -> list[Window]:
     """Return all motions of some purposes, columns in the order of `serials`, with the low-pass' margins.
 
-    Of a repeated step the latest counts.
+    Of a repeated step the latest counts. Motions are split at holes (`unbroken_windows`).
 
     Raises:
-        DataError: there is no such motion, or the recording has a hole in it.
+        DataError: there is no such motion, or nothing is left of one between holes.
     """
     # Joints that move at once share their step, and its window.
     steps = {event.step: event for event in recording.motions(*purposes)}
     if not steps:
         raise DataError(f"the recording holds no motion for {' or '.join(purposes)}")
-    return [window(recording, clocks, serials, event, DYNAMIC_CUTOFF_HZ) for event in steps.values()]
+    return [
+        one
+        for event in steps.values()
+        for one in unbroken_windows(recording, clocks, serials, event, DYNAMIC_CUTOFF_HZ)
+    ]
 
 
 def dynamic_motion(

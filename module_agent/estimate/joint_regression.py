@@ -29,7 +29,7 @@ from module_agent.estimate.joint_model import (
     predict,
 )
 from module_agent.estimate.observed_motion import ObservedMotion
-from module_agent.estimate.smoothing import COSINE, SINE, SQUARED, SmoothMotion, white_ratio
+from module_agent.estimate.smoothing import COSINE, SINE, SMOOTH_S, SQUARED, SmoothMotion, white_ratio
 from module_agent.estimate.windows import Array
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.errors import DataError
@@ -37,8 +37,6 @@ from module_agent.model.imu_prior import CALIBRATED, GYRO_BIAS_DRIFT_RAD_S, ImuP
 from module_agent.model.read_only import frozen
 from module_agent.wire.messages import RegressionEstimate
 
-# The low-pass makes neighbours alike: with every seventh sample of 250 Hz nothing is lost.
-STRIDE = 7
 ITERATIONS = 12
 SETTLED = 0.03  # of every parameter's deviation, were it the only one
 MIN_RATE_SHARE = 0.25
@@ -90,13 +88,15 @@ class _State(NamedTuple):
 class _Rows(NamedTuple):
     """One motion and the readings of it (n, 6), gyro first, at times since the joint's first sample.
 
-    white: the variance of white noise in a sample of the IMU over that of `_slow` residuals.
+    white: the variance of white noise in a sample of the IMU over that of `_slow` residuals. stride: the
+    samples of the IMU for each of these: the low-pass makes neighbours alike, so that nothing is lost.
     """
 
     motion: Motion
     readings: Array
     t_s: Array
     white: float
+    stride: int
     instrument: SmoothMotion | None
 
 
@@ -207,13 +207,15 @@ def _rows(observed: ObservedMotion) -> _Rows:
     t_s = since_ns.astype(np.float64) * 1e-9
     # 10 ms at either end leave room for the delay to change.
     begin, end = observed.joint.start_s + 0.01, observed.joint.end_s - 0.01
-    inside = np.flatnonzero((t_s > begin) & (t_s < end))[::STRIDE]
+    step_s = 1e-9 * float(observed.imu.t_ns[-1] - observed.imu.t_ns[0]) / (observed.imu.t_ns.size - 1)
+    # Every seventh of 250 Hz.
+    stride = max(1, round(SMOOTH_S / step_s))
+    inside = np.flatnonzero((t_s > begin) & (t_s < end))[::stride]
     if inside.size < 20:
         raise DataError(f"{inside.size} IMU samples fall into the joint's motion: at least 20 are needed")
     readings = np.hstack([observed.imu.gyro_rad_s[inside], observed.imu.accel_m_s2[inside]])
-    step_s = 1e-9 * float(observed.imu.t_ns[-1] - observed.imu.t_ns[0]) / (observed.imu.t_ns.size - 1)
-    white = white_ratio(observed.imu.t_ns, float(np.hypot(observed.imu.smooth_s, STRIDE * step_s)))
-    return _Rows(Motion(observed.joint, None), readings, t_s[inside], white, observed.instrument)
+    white = white_ratio(observed.imu.t_ns, float(np.hypot(observed.imu.smooth_s, stride * step_s)))
+    return _Rows(Motion(observed.joint, None), readings, t_s[inside], white, stride, observed.instrument)
 
 
 def _first_guess(rows: Sequence[_Rows], mean: Array) -> _State:
@@ -267,7 +269,7 @@ def _equations(problem: _Problem, state: _State, noise: Array) -> _Equations:
             _, weighing = predict(clean, row.t_s, state.values, DELAY + i)
         for sensor in range(2):
             part = slice(3 * sensor, 3 * sensor + 3)
-            weight = STRIDE / noise[sensor] ** 2
+            weight = row.stride / noise[sensor] ** 2
             square = row.white * np.mean(_slow(residual[:, part]) ** 2, axis=1)
             by_weight, by_slope = _flat(weighing[:, part]), _flat(slopes[:, part])
             normal += weight * by_weight.T @ by_slope

@@ -7,7 +7,11 @@ import numpy as np
 
 from module_agent.estimate.base_shake import BaseMotion
 from module_agent.estimate.smoothing import SMOOTH_S, SmoothImu, SmoothMotion, smooth_imu
-from module_agent.estimate.windows import ImuWindow, JointWindow
+from module_agent.estimate.windows import ImuWindow, JointWindow, Samples, even
+from module_agent.signals.filtering import MAX_GAP_NS
+
+# A shorter part of a motion, between two holes, is not used: the low-pass settles for half as long.
+SHORTEST_NS = 1_000_000_000
 
 
 class ObservedMotion(NamedTuple):
@@ -38,7 +42,7 @@ class MotionWindows(NamedTuple):
 
 
 def observed_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_S) -> list[ObservedMotion]:
-    """Low-pass the motions of one joint.
+    """Low-pass the motions of one joint, split at holes.
 
     Raises:
         ValueError: too few samples for the low-pass, or unevenly spaced ones.
@@ -50,10 +54,37 @@ def observed_motions(windows: Sequence[MotionWindows], smooth_s: float = SMOOTH_
     still = np.hstack([longest.gyro_rad_s, longest.accel_m_s2]).mean(axis=0)
     return [
         ObservedMotion(
-            smooth_imu(window.imu, smooth_s),
-            SmoothMotion(window.joint, smooth_s),
-            window.offset_ns,
-            BaseMotion(window.joint, window.carrier, still, smooth_s),
+            smooth_imu(part.imu, smooth_s),
+            SmoothMotion(part.joint, smooth_s),
+            part.offset_ns,
+            BaseMotion(part.joint, part.carrier, still, smooth_s),
         )
         for window in windows
+        for part in _parts(window)
     ]
+
+
+def _parts(window: MotionWindows) -> list[MotionWindows]:
+    """Return the parts between holes that are long enough, with evenly spaced samples."""
+    imu, joint, carrier, offset_ns = window
+    times = joint.t_ns, carrier.t_ns, imu.t_ns - offset_ns
+    holes = [(t[k], t[k + 1]) for t in times for k in np.flatnonzero(np.diff(t) > MAX_GAP_NS)]
+    starts = np.maximum.accumulate([min(t[0] for t in times), *(end for _, end in sorted(holes))])
+    ends = [*(start for start, _ in sorted(holes)), max(t[-1] for t in times)]
+    return [
+        MotionWindows(
+            _between(imu, start + offset_ns, end + offset_ns),
+            _between(joint, start, end),
+            _between(carrier, start, end),
+            offset_ns,
+        )
+        for start, end in zip(starts, ends, strict=True)
+        if not holes or end - start > SHORTEST_NS
+    ]
+
+
+def _between(window: Samples, start_ns: int, end_ns: int) -> Samples:
+    t_ns, *signals = window
+    inside = (t_ns >= start_ns) & (t_ns <= end_ns)
+    part = type(window)(t_ns[inside], *(signal[inside] for signal in signals))
+    return even(part, float(np.median(np.diff(part.t_ns))))

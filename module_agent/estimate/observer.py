@@ -10,7 +10,7 @@ from module_agent.estimate.clock_delay import clock_delay
 from module_agent.estimate.joint_regression import regress_joint, regression_estimate
 from module_agent.estimate.motion_detection import detect_motion
 from module_agent.estimate.observed_motion import MotionWindows, observed_motions
-from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, imu_window, joint_window
+from module_agent.estimate.windows import AlignedMotion, ImuWindow, align, even, imu_window, joint_window
 from module_agent.firmware.feedback import History
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import UNCALIBRATED, ImuPrior
@@ -82,8 +82,9 @@ class Observer:
             x, y, z = still.specific_force_m_s2.tolist()
             found = found._replace(gravity_m_s2=(x, y, z))
             joint = joint_window(motion.rows)
-            delay = clock_delay(own, joint, motion.rough_offset_ns.get(self.serial, 0))
-            aligned = align(own, joint, delay.offset_ns)
+            smooth = even(own), even(joint)
+            delay = clock_delay(*smooth, motion.rough_offset_ns.get(self.serial, 0))
+            aligned = align(*smooth, delay.offset_ns)
             windows = MotionWindows(own, joint, imu_window(motion.rows), delay.offset_ns)
             moved, ratio, *_ = detect_motion([aligned], still.gyro_offset_rad_s)
             found = found._replace(moved=moved, rate_ratio=ratio)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from module_agent.estimate.windows import Array, ImuWindow, JointWindow, Times
+from module_agent.estimate.windows import EVEN_WITHIN, STEP_NS, Array, ImuWindow, JointWindow, Times, even
 from module_agent.model.errors import DataError
 
 # Passes 2 Hz with 0.969 and 4 Hz with 0.88. Encoder counts of 2 pi / 2^16 at 250 Hz become 0.014 rad/s^2 of
@@ -20,8 +20,6 @@ SMOOTH_S = 0.028
 # The low-pass of the rate that is then squared.
 BRIEF_S = 0.008
 REACH = 5.0  # half the kernel's length, in its own deviations
-# Beyond this much of the time step the samples do not count as evenly spaced.
-EVEN_WITHIN = 0.05
 
 # The columns of `SmoothMotion.values`: the angle's derivatives from the first to the sixth, and the angle's
 # cosine and sine, and its rate squared.
@@ -47,6 +45,9 @@ class SmoothMotion:
 
     def __init__(self, joint: JointWindow, smooth_s: float = SMOOTH_S):
         step_s = _step_s(joint.t_ns, "joint", smooth_s)
+        if step_s > 1e-9 * STEP_NS * (1.0 + EVEN_WITHIN):
+            # The brief low-pass needs as many samples.
+            joint, step_s = even(joint), 1e-9 * STEP_NS
         q = joint.position_rad
         # The brief low-pass attenuates a rate by s^2 / 2 q''' to second order, which would bias its square.
         rate = _filtered(q, step_s, BRIEF_S, 1) - 0.5 * BRIEF_S**2 * _filtered(q, step_s, BRIEF_S, 3)
@@ -137,6 +138,11 @@ def _step_s(t_ns: Times, whose: str, smooth_s: float) -> float:
         raise DataError(
             f"the {whose} samples are {1e3 * steps.min():.2f} to {1e3 * steps.max():.2f} ms apart; the local "
             "estimate needs evenly spaced ones"
+        )
+    if step_s > smooth_s:
+        raise DataError(
+            f"the {whose} has {1.0 / step_s:.1f} samples per second; the low-pass of {1e3 * smooth_s:.0f} ms "
+            f"needs at least {1.0 / smooth_s:.1f}"
         )
     least = 2 * (_reach(step_s, smooth_s) + _reach(step_s, BRIEF_S)) + 8
     if t_ns.size < least:

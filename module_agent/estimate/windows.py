@@ -1,6 +1,6 @@
 """Windows of samples for the local estimates, and their alignment onto one time axis."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,10 @@ from module_agent.wire.feedback_rows import Rows
 
 Array = NDArray[np.float64]
 Times = NDArray[np.int64]
+# The time step of the estimates from aligned samples, and how far from it samples count as evenly spaced.
+STEP_NS, EVEN_WITHIN = 4_000_000, 0.05
+# A longer hole is not bridged.
+MAX_HOLE_NS = 100_000_000
 
 
 class ImuWindow(NamedTuple):
@@ -39,6 +43,9 @@ class AlignedMotion(NamedTuple):
     velocity_rad_s: Array
 
 
+Samples = TypeVar("Samples", ImuWindow, JointWindow)
+
+
 def imu_window(rows: Rows) -> ImuWindow:
     """Take the IMU's samples out of feedback rows (`feedback_rows.ROW`).
 
@@ -55,6 +62,27 @@ def joint_window(rows: Rows) -> JointWindow:
 def _columns(rows: Rows, time: str, one: str, other: str) -> tuple[Times, Array, Array]:
     t_ns, first = np.unique(rows[time].astype(np.int64), return_index=True)
     return t_ns, rows[one][first].astype(np.float64), rows[other][first].astype(np.float64)
+
+
+def even(window: Samples, step_ns: float = STEP_NS) -> Samples:
+    """Return a window at even steps: interpolated by a cubic spline, unless it is so already.
+
+    Raises:
+        DataError: fewer than 4 samples, or a hole over `MAX_HOLE_NS`.
+    """
+    t_ns, *signals = window
+    steps = np.diff(t_ns)
+    if steps.size < 3:
+        raise DataError(f"{t_ns.size} samples: at least 4 are needed to interpolate")
+    if np.abs(steps - step_ns).max() <= EVEN_WITHIN * step_ns:
+        return window
+    if steps.max() > MAX_HOLE_NS:
+        raise DataError(
+            f"a hole of {1e-6 * steps.max():.0f} ms; at most {1e-6 * MAX_HOLE_NS:.0f} are bridged"
+        )
+    at_ns = np.arange(t_ns[0], t_ns[-1] + 1, round(step_ns))
+    knots, at = 1e-9 * (t_ns - t_ns[0]), 1e-9 * (at_ns - t_ns[0])
+    return type(window)(at_ns, *(np.asarray(CubicSpline(knots, signal)(at)) for signal in signals))
 
 
 def align(imu: ImuWindow, joint: JointWindow, offset_ns: int) -> AlignedMotion:

@@ -36,6 +36,8 @@ SIMULTANEOUS_CUTOFF_HZ = 15.0
 CLOCK_CUTOFF_HZ = 15.0
 
 NS_PER_S = 1_000_000_000
+# The longest hole between samples that is bridged: 10 samples at 250 Hz.
+MAX_GAP_NS = 40_000_000
 
 
 class JointMotion(NamedTuple):
@@ -69,7 +71,7 @@ def resample(
     t_ns: Sequence[ArrayLike],
     signals: Sequence[ArrayLike],
     t_common_ns: ArrayLike,
-    max_gap_ns: int = 40_000_000,
+    max_gap_ns: int = MAX_GAP_NS,
 ) -> Array:
     """Interpolate the signal of every module onto one time base, by a cubic spline (0.005 % off at 10 Hz).
 
@@ -77,7 +79,7 @@ def resample(
         t_ns: per module the times (m_i,) of its samples, increasing, already mapped into one clock.
         signals: per module the values (m_i,), or (m_i, k) of k signals that were sampled together.
         t_common_ns: (m,) times to interpolate to.
-        max_gap_ns: the longest hole between samples that is bridged (10 samples at 250 Hz by default).
+        max_gap_ns: the longest hole between samples that is bridged.
 
     Returns:
         (m, n), or (m, n, k), read-only.

@@ -13,7 +13,9 @@ from coordinator.synchronisation.motion_windows import (
     Window,
     encoder_steps,
     filtered,
+    sampling_notes,
     thinned,
+    unbroken_windows,
     window,
 )
 from module_agent.model.errors import DataError
@@ -127,6 +129,43 @@ def test_repeated_rows_and_samples_do_not_change_the_window(wire: SimpleNamespac
 def test_a_hole_is_named_by_its_module_and_not_bridged(wire: SimpleNamespace) -> None:
     with pytest.raises(DataError, match=r"column 1 has a hole of 84\.0 ms"):
         window(_recording(wire, {"B": (600, 620)}), CLOCKS, SERIALS, _event(wire))
+
+
+def test_a_motion_is_split_at_holes_of_any_module(wire: SimpleNamespace) -> None:
+    gaps = {"A": (600, 650), "B": (690, 730), "C": (710, 720)}
+    recording, event = _recording(wire, gaps), _event(wire)
+    one, two = unbroken_windows(recording, CLOCKS, SERIALS, event, cutoff_hz=12.0)
+    # With margins of 42 steps; the 40 samples from A's hole to B's are too few for the low-pass.
+    assert [len(part.t_ns) for part in (one, two)] == pytest.approx([241, 311], abs=2)
+    for part in (one, two):
+        np.testing.assert_allclose(part.q_rad[:, 2], _signal(part.t_ns * 1e-9, "C"), atol=1e-7)
+    notes = sampling_notes(recording, CLOCKS, SERIALS, [event], 12.0)
+    assert "A: a hole of 204 ms in the constant motion of A, which is split there" in notes
+    assert {note[0] for note in notes} == set(SERIALS)
+
+
+def test_a_motion_without_holes_is_one_window(wire: SimpleNamespace) -> None:
+    recording, event = _recording(wire), _event(wire)
+    (part,) = unbroken_windows(recording, CLOCKS, SERIALS, event, cutoff_hz=12.0)
+    for mine, theirs in zip(part, window(recording, CLOCKS, SERIALS, event, 12.0), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert sampling_notes(recording, CLOCKS, SERIALS, [event], 12.0) == ()
+
+
+def test_a_motion_of_holes_alone_is_refused(wire: SimpleNamespace) -> None:
+    recording = _recording(wire, {"B": (450, 950)})
+    with pytest.raises(DataError, match=r"column 1 has a hole of 2004\.0 ms"):
+        unbroken_windows(recording, CLOCKS, SERIALS, _event(wire), cutoff_hz=12.0)
+
+
+def test_rates_too_low_for_the_low_pass_are_named(wire: SimpleNamespace) -> None:
+    recording, event = _recording(wire), _event(wire)
+    first, *_ = sampling_notes(recording, CLOCKS, SERIALS, [event], 42.0)
+    assert first.startswith(
+        "A: its joint has 250 samples per second; with fewer than 252 vibration above 208"
+    )
+    with pytest.raises(DataError, match=r"A: its joint has 250\.0 samples per second in .* at least 252"):
+        sampling_notes(recording, CLOCKS, SERIALS, [event], 84.0)
 
 
 def test_a_module_without_any_row_in_the_motion_is_named(wire: SimpleNamespace) -> None:

@@ -26,9 +26,10 @@ class Hinge(NamedTuple):
     imu_ahead_s: float = 0.0  # what the IMU's clock shows more than the joint's
     drift: float = 0.0  # relative rate error of the IMU's clock
     carried: float = 1.0  # the part of the joint's motion that the IMU follows
+    rate_hz: float = RATE_HZ
 
     def rest(self, rng: np.random.Generator, duration_s: float = 2.0) -> ImuWindow:
-        return self.imu(np.arange(0.0, duration_s, 1 / RATE_HZ), np.zeros(4), np.arange(4.0), rng)
+        return self.imu(np.arange(0.0, duration_s, 1 / self.rate_hz), np.zeros(4), np.arange(4.0), rng)
 
     def imu(self, t_s: np.ndarray, phi: np.ndarray, knots: np.ndarray, rng: np.random.Generator) -> ImuWindow:
         path = CubicSpline(knots, self.carried * phi)
@@ -60,7 +61,7 @@ class Hinge(NamedTuple):
         """Both windows hold 0.3 s of rest before the motion and after it; their samples interleave."""
         rng = np.random.default_rng(seed)
         knots = np.arange(-0.3, end_s + 0.3, 5e-4)
-        t_s = np.arange(-0.29, end_s + 0.28, 1 / RATE_HZ)
+        t_s = np.arange(-0.29, end_s + 0.28, 1 / self.rate_hz)
         path = phi(knots)
         return self.imu(t_s + 1.3e-3, path, knots, rng), self.joint(t_s, path, knots, rng)
 
