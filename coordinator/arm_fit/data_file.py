@@ -31,11 +31,12 @@ from module_agent.model.read_only import frozen
 
 # Of a sampling interval; a fiftieth at 0.1 of the sampling rate is 1.3 % of the amplitude, between samples.
 _JITTER = 0.02
-# Longer gaps than this, in usual intervals, are not interpolated: the recording is split there.
-_BRIDGED = 5.0
+# Longer gaps than this, in usual intervals, are holes. Up to a quarter of a period of 25 Hz, which arms do
+# not reach, they are bridged; at longer ones the recording is split.
+_GAP, _BRIDGED_S = 5.0, 0.010
 _MAX_REPEATED = 3
-# Share of positions that stay between samples: the encoder's resolution shows.
-_COARSE = 0.1
+# Share of positions that stay while another joint moves: the encoder's resolution shows.
+_COARSE = 0.3
 
 
 _NOTHING: Mapping[str, float] = MappingProxyType({})
@@ -51,8 +52,9 @@ class JointLog(NamedTuple):
     rate_hz: sampling rate. q_rad: (m, n) joint positions. qd_rad_s: (m, n) joint velocities, None if they
     were not measured. tau_nm: (m, n) joint torques. resampled: whether the times of the file were not
     uniform. breaks: samples before which there is a hole, or where another recording begins. repeated: rows
-    like the one before, left out. file: where it was read from. others: mean positions of further joints.
-    starts_s: times of the first samples of the pieces, zeros if empty.
+    like the one before, left out. bridged: holes of up to 10 ms, interpolated. file: where it was read from.
+    others: mean positions of further joints. starts_s: times of the first samples of the pieces, zeros if
+    empty.
     """
 
     rate_hz: float
@@ -62,6 +64,7 @@ class JointLog(NamedTuple):
     resampled: bool = False
     breaks: tuple[int, ...] = ()
     repeated: int = 0
+    bridged: int = 0
     file: str = "a recording in memory"
     others: Mapping[str, float] = _NOTHING
     starts_s: tuple[float, ...] = ()
@@ -86,7 +89,8 @@ class JointLog(NamedTuple):
 
     def pieces(self) -> tuple["JointLog", ...]:
         """Return the parts between the breaks."""
-        ends, starts = (0, *self.breaks, len(self.q_rad)), self.starts_s or (0.0,) * (len(self.breaks) + 1)
+        ends = (0, *self.breaks, len(self.q_rad))
+        starts = self.starts_s if len(self.starts_s) == len(ends) - 1 else (0.0,) * (len(ends) - 1)
         return tuple(
             self._replace(
                 q_rad=self.q_rad[a:b],
@@ -121,6 +125,7 @@ def joined(logs: Sequence[JointLog]) -> JointLog:
         any(log.resampled for log in logs),
         tuple(breaks[1:]),
         sum(log.repeated for log in logs),
+        sum(log.bridged for log in logs),
         ", ".join(dict.fromkeys(log.file for log in logs)),
         logs[0].others,
         tuple(start for log in logs for piece in log.pieces() for start in piece.starts_s),
@@ -138,7 +143,9 @@ def at_rate(log: JointLog, rate_hz: float) -> JointLog:
         q, tau = (_even(times, signal, even) for signal in (piece.q_rad, piece.tau_nm))
         qd = None if piece.qd_rad_s is None else _even(times, piece.qd_rad_s, even)
         pieces.append(JointLog(rate_hz, q, qd, tau, True, starts_s=piece.starts_s))
-    return joined(pieces)._replace(repeated=log.repeated, file=log.file, others=log.others)
+    return joined(pieces)._replace(
+        repeated=log.repeated, bridged=log.bridged, file=log.file, others=log.others
+    )
 
 
 def in_two(log: JointLog) -> tuple[JointLog, JointLog]:
@@ -384,14 +391,17 @@ def _log(table: _Table) -> JointLog:
     if (steps <= 0.0).any():
         row = int(np.argmax(steps <= 0.0)) + 1
         _refuse(f"{table.row(row)}: its time {times[row]} s is not after that of the sample before it")
-    ends = (0, *(np.flatnonzero(steps > _BRIDGED * np.median(steps)) + 1).tolist(), times.size)
+    usual = float(np.median(steps))
+    holes = np.flatnonzero(steps > _GAP * usual)
+    split = holes[steps[holes] > max(_BRIDGED_S, _GAP * usual)]
+    ends = (0, *(split + 1).tolist(), times.size)
     parts = [slice(a, b) for a, b in pairwise(ends) if b - a >= 4]
     if not parts:
         _refuse(f"{len(ends) - 2} holes in {times.size} samples leave no 4 in a row")
     spans = np.array([times[part.stop - 1] - times[part.start] for part in parts])
-    rate_hz = float(np.round(spans / np.median(steps)).sum() / spans.sum())
+    rate_hz = float(np.round(spans / usual).sum() / spans.sum())
     log = joined([_uniform(table, part, rate_hz) for part in parts])
-    return log._replace(repeated=repeated, others=table.others)
+    return log._replace(repeated=repeated, bridged=len(holes) - len(split), others=table.others)
 
 
 def _without_repeated(table: _Table) -> tuple[_Table, int]:
@@ -409,7 +419,8 @@ def _without_repeated(table: _Table) -> tuple[_Table, int]:
     after, usual = (
         np.abs(table.signals["q"][last + k] - table.signals["q"][last + k - 1]).sum() for k in (1, 2)
     )
-    coarse = (np.diff(table.signals["q"][kept], axis=0) == 0.0).mean() > _COARSE
+    stays = np.diff(table.signals["q"][kept], axis=0) == 0.0
+    coarse = np.mean(stays[~stays.all(axis=1)]) > _COARSE if not stays.all() else True
     if not coarse and after < 1.5 * usual and (table.t_s[last] > table.t_s[last - 1]).all():
         times = table.t_s[: kept.size]
     signals = {key: signal[kept] for key, signal in table.signals.items()}
@@ -426,6 +437,12 @@ def _uniform(table: _Table, part: slice, rate_hz: float) -> JointLog:
         key: _even(times, values[part], even) if uneven else values[part]
         for key, values in table.signals.items()
     }
+    # A curve through the noise on either side of a hole would swing out in it.
+    after = np.clip(np.searchsorted(times, even), 1, times.size - 1)
+    hole = np.diff(times)[after - 1] > _GAP / rate_hz
+    for key in signals.keys() & {"tau", "qd"} if hole.any() else ():
+        straight = make_interp_spline(times, table.signals[key][part], k=1)
+        signals[key] = np.where(hole[:, None], straight(np.minimum(even, times[-1])), signals[key])
     start_s = float(table.t_s[part.start])
     return JointLog(rate_hz, signals["q"], signals.get("qd"), signals["tau"], uneven, starts_s=(start_s,))
 

@@ -201,6 +201,7 @@ def _data_part(log: JointLog, curve: Sequence[CutoffPoint], problem: Problem) ->
         recorded_hz=log.rate_hz,
         resampled=log.resampled,
         repeated_rows=log.repeated,
+        bridged_holes=log.bridged,
         pieces=len(log.breaks) + 1,
         held=problem.robot.held,
         dropped_s=problem.log.dropped_s,

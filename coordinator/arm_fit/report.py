@@ -24,9 +24,10 @@ class CutoffPart(Part):
 class DataPart(Part):
     """The recording, and how it was filtered.
 
-    repeated_rows: rows like the one before, left out. pieces: parts between holes; dropped_s: time in those
-    that are too short for the low-pass. held: joints that are taken as fixed at a position [rad, m].
-    cutoff_curve: what the low-pass was chosen by, empty if it was given.
+    repeated_rows: rows like the one before, left out. bridged_holes: of up to 10 ms, interpolated. pieces:
+    parts between longer holes; dropped_s: time in those that are too short for the low-pass. held: joints
+    that are taken as fixed at a position [rad, m]. cutoff_curve: what the low-pass was chosen by, empty if it
+    was given.
     noise: |raw - filtered| / |raw| of the torque, which no model of this bandwidth can predict. mask_rad_s:
     per joint the speed below which a sample is masked, and not fitted to.
     """
@@ -36,6 +37,7 @@ class DataPart(Part):
     recorded_hz: float
     resampled: bool
     repeated_rows: int
+    bridged_holes: int
     pieces: int
     held: dict[str, float]
     dropped_s: float

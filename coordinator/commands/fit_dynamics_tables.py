@@ -57,6 +57,8 @@ def notes(report: FitReport) -> Iterator[str]:
     )
     if data.repeated_rows:
         yield f"{data.repeated_rows} rows repeat the one before them and were left out"
+    if data.bridged_holes:
+        yield f"{data.bridged_holes} holes of up to 10 ms were interpolated"
     if data.pieces > 1:
         yield f"{data.pieces} pieces between holes or recordings; too short to filter: {data.dropped_s:.2f} s"
     for joint, position in data.held.items():

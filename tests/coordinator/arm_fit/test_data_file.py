@@ -89,6 +89,19 @@ def test_a_recording_is_split_at_its_holes(tmp_path: Path, rng: Generator) -> No
     assert [len(half.breaks) for half in in_two(log)] == [1, 1]
 
 
+def test_a_short_hole_is_bridged_without_swinging_out(tmp_path: Path, rng: Generator) -> None:
+    t = np.arange(2000) / 1000.0
+    wave = np.stack([np.sin(2.0 * np.pi * 1.5 * t), np.cos(2.0 * np.pi * 1.5 * t)], axis=1)
+    kept = np.r_[0:1000, 1008:2000]
+    noisy = wave + 0.1 * rng.normal(size=wave.shape)
+    np.savez(tmp_path / "a.npz", t_s=t[kept], position_rad=wave[kept], torque=noisy[kept])
+    log = read_log(tmp_path / "a.npz", JOINTS)
+    assert (log.bridged, log.breaks) == (1, ())
+    np.testing.assert_allclose(log.q_rad, wave, atol=1e-6)
+    # The noise on either side, and no more.
+    assert np.abs(log.tau_nm - wave)[1000:1008].max() < 0.35
+
+
 @pytest.mark.parametrize("inserted", [False, True])
 def test_rows_that_repeat_the_one_before_are_left_out(tmp_path: Path, rng: Generator, inserted: bool) -> None:
     t = np.arange(2000) / 1000.0
