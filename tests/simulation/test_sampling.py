@@ -1,0 +1,67 @@
+"""Whole runs whose IMUs are read at other rates than 250 Hz, or whose rows have a hole in a motion."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from coordinator.excitation.plan import Plan
+from sim import simulate
+from sim.robot.robot_file import load_robot
+from sim.scoring.score import score
+from sim.virtual_time.robot import VirtualRobot
+from sim.virtual_time.run import VirtualConfig, run_virtual
+
+ARM, BASE, TIP = "thesis_171_horizontal", "X-00009", "X-00010"
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 500.0, 1000.0])
+def test_links_are_within_their_claim_at_any_rate_of_the_imus(rate_hz: float) -> None:
+    run = simulate("a2085_03", seed=1, dynamics=False, imu_rate_hz=rate_hz)
+    result, links = run.identified.result, run.score().links
+    for claimed, found in zip(result.links, links, strict=True):
+        assert found.link_length_error_mm is not None
+        assert abs(found.link_length_error_mm) < 3.0 * claimed.link_length_sigma_mm
+    # Agents know a distance too, by samples of their own rate.
+    estimates = [e for of_pair in run.recording.estimates.values() for e in of_pair.values()]
+    assert not [e.note for e in estimates if e.note]
+    slow = [note for note in run.identified.kinematics.notes if "vibration" in note]
+    assert len(slow) == (3 if rate_hz == 50.0 else 0)
+
+
+# About the middle of a motion, after its beginning.
+MIDDLE_NS = {"constant": 700_000_000, "windowed_sine": 2_800_000_000}
+
+
+def _without_rows(serial: str, kind: str) -> Callable[[VirtualRobot], None]:
+    """Make a module lose ten rows in the middle of the base module's motion of a kind."""
+
+    def prepare(robot: VirtualRobot) -> None:
+        rows = robot.hosts[serial].modules[0].firmware._rows
+        due, begins = rows.due, list[int]()
+
+        def sometimes(now_ns: int, imu_t_ns: int) -> bool:
+            record = robot.hosts[BASE].modules[0].firmware._record
+            if not begins and record is not None and record.pattern.kind == kind and record.end_row is None:
+                begins.append(now_ns + MIDDLE_NS[kind])
+            lost = bool(begins) and 0 <= now_ns - begins[0] < 40_000_000
+            return due(now_ns, imu_t_ns) and not lost
+
+        rows.due = sometimes  # type: ignore[method-assign]
+
+    return prepare
+
+
+@pytest.mark.parametrize("serial", [BASE, TIP])
+@pytest.mark.parametrize("kind", ["constant", "windowed_sine"])
+def test_a_hole_in_a_motion_costs_the_samples_around_it(tmp_path: Path, serial: str, kind: str) -> None:
+    out = tmp_path / "run"
+    config = VirtualConfig(load_robot(ARM), out, seed=1, network="none", plan=Plan(dynamics=False))
+    run_virtual(config, between=_without_rows(serial, kind))
+    (link,) = score(out).links
+    assert link.link_length_error_mm is not None
+    result = json.loads((out / "result.json").read_text())
+    assert abs(link.link_length_error_mm) < 3.0 * result["links"][0]["link_length_sigma_mm"]
+    (note,) = [note for note in result["notes"] if "a hole" in note]
+    assert note == f"{serial}: a hole of 44 ms in the {kind} motion of {BASE}, which is split there"
