@@ -39,6 +39,11 @@ _MAX_REPEATED = 3
 _COARSE = 0.3
 
 
+# What a signal is called where a column has those of all joints.
+_FIELDS = {
+    ".npz": {"t": "t_s or sample_rate_hz", "q": "position_rad", "qd": "velocity_rad_s", "tau": "torque"},
+    ".mcap": {"t": "header.stamp", "q": "position", "qd": "velocity", "tau": "effort"},
+}
 _NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
@@ -71,14 +76,8 @@ class JointLog(NamedTuple):
 
     def column(self, signal: Literal["t", "q", "qd", "tau"], joint: str) -> str:
         """Return the file and the column of a joint's signal, for messages."""
-        if self.file.lower().endswith(".npz"):
-            arrays = {
-                "t": "t_s or sample_rate_hz",
-                "q": "position_rad",
-                "qd": "velocity_rad_s",
-                "tau": "torque",
-            }
-            return f"{self.file}: {arrays[signal]}{'' if signal == 't' else ' of ' + joint}"
+        if (fields := _FIELDS.get(Path(self.file).suffix.lower())) is not None:
+            return f"{self.file}: {fields[signal]}" + (f" of {joint}" if signal != "t" else "")
         names = {"t": "t_s", "q": f"q_{joint}_rad", "qd": f"qd_{joint}_rad_s", "tau": f"tau_{joint}_nm"}
         return f"{self.file}: column {names[signal]}"
 
@@ -247,7 +246,11 @@ def _csv_columns(
         del wanted["qd"]
     missing = [name for names in wanted.values() for name in names if name not in header]
     if missing:
-        _refuse(f"line 1: no column {', '.join(missing)}; the columns are {', '.join(header) or 'none'}")
+        currents = [joint for joint in joints if joint not in gains and f"i_{joint}_a" in header]
+        hint = f"; i_{currents[0]}_a needs --gain {currents[0]}=NM_PER_A" if currents else ""
+        _refuse(
+            f"line 1: no column {', '.join(missing)}; the columns are {', '.join(header) or 'none'}{hint}"
+        )
     twice = [name for names in wanted.values() for name in names if header.count(name) > 1]
     if twice:
         _refuse(f"line 1: column {twice[0]} appears twice")

@@ -75,6 +75,7 @@ def test_joint_states_are_a_recording(tmp_path: Path, encoding: str, velocity: b
     np.testing.assert_array_equal(log.tau_nm, tau * [1.0, 2.0])
     # 1e18 ns are known to 128 ns in seconds.
     assert log.rate_hz == pytest.approx(500.0, rel=1e-4)
+    assert log.column("tau", "elbow") == f"{tmp_path / 'a.mcap'}: effort of elbow"
     assert log.others == {"grip": pytest.approx(0.03)}
     if velocity:
         np.testing.assert_array_equal(log.qd_rad_s, np.tile([8.0, 9.0], (50, 1)))

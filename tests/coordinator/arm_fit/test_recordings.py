@@ -114,7 +114,7 @@ def test_currents_become_torques_by_their_constants(recording: Any, tmp_path: Pa
     for name in ("log.csv", "log.npz"):
         log = read_log(tmp_path / name, JOINTS, gains)
         np.testing.assert_allclose(log.tau_nm, recording.tau_nm[:400], atol=1e-9)
-    with pytest.raises(DataFileError, match="no column tau_waist_nm"):
+    with pytest.raises(DataFileError, match=r"no column tau_waist_nm.*i_waist_a needs --gain waist=NM_PER_A"):
         read_log(tmp_path / "log.csv", JOINTS)
     with pytest.raises(UsageError, match="gain of 'hip': the joints are waist, elbow, wrist"):
         read_recordings(read_urdf(recording.urdf), [tmp_path / "log.csv"], {"hip": 1.0}, checked=True)
