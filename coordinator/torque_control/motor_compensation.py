@@ -10,7 +10,9 @@ efficiency and the back-EMF; the loops compensate the rest, which shows as track
     u = (R i + K N thd) / 48 V                   R at the winding's temperature
 
 and the torque set-point is raised until the effort loop, whose response to a target is E + F (gain and
-feed-forward), adds the missing PWM. The loops compensate what single modules deviate from the catalogue.
+feed-forward), adds the missing PWM. A velocity loop that is closed on the motor takes the spring's own speed
+tau' / k for an error, which is made up for too. The loops compensate what single modules deviate from the
+catalogue.
 
 Thermal model of R: winding, housing and body are three heat capacities in a row, the manufacturer's. Within
 the seconds of a motion the winding follows its losses, the housing warms a little, and the body does not.
@@ -22,7 +24,12 @@ from typing import TypeVar
 import numpy as np
 
 from coordinator.torque_control.feed_forward import RATE_HZ, SetPoints
-from module_agent.control.controller import NOMINAL_VOLTAGE_V, pwm_per_rad_s, torque_at_full_pwm_nm
+from module_agent.control.controller import (
+    NOMINAL_VOLTAGE_V,
+    closes_on_motor,
+    pwm_per_rad_s,
+    torque_at_full_pwm_nm,
+)
 from module_agent.model.catalogue import AMBIENT_C, CAPACITIES_J_K, COPPER_PER_K, RESISTANCES_K_W, ModuleType
 from module_agent.model.chain import Array
 from module_agent.model.read_only import read_only
@@ -86,12 +93,24 @@ def with_motor_compensation(
         rate = points.reference.qd_rad_s[:, column]
         tau = points.effort_nm[:, column]
         known = own.effort.feed_forward / torque_at_full_pwm_nm(kind) * tau
-        if own.strategy != 2:
-            known = known + own.velocity.feed_forward * pwm_per_rad_s(kind) * rate
+        braking = _braking_by_spring(kind, own, tau)
+        if own.strategy == 2:
+            effort[:, column] += braking
+        else:
+            known = known + own.velocity.feed_forward * pwm_per_rad_s(kind) * rate - braking
         missing = motor_pwm(kind, tau, rate, begin_c) - known
         answer = own.effort.kp + own.effort.feed_forward / torque_at_full_pwm_nm(kind)
         effort[:, column] += missing / answer
     return SetPoints(points.reference, read_only(effort))
+
+
+def _braking_by_spring(kind: ModuleType, gains: GainSet, tau_nm: Array) -> Array:
+    """Return what the velocity loop subtracts (m,), in its unit, as the motor turns when the spring bends."""
+    if not closes_on_motor(kind, gains.strategy):
+        return np.zeros_like(tau_nm)
+    bending = differentiate(tau_nm, RATE_HZ) / kind.spring_nm_rad
+    loop = gains.velocity
+    return np.asarray(loop.kp * bending + loop.kd * differentiate(bending, RATE_HZ))
 
 
 def motor_pwm(kind: ModuleType, tau_nm: Array, qd_rad_s: Array, winding_start_c: float = AMBIENT_C) -> Array:

@@ -54,14 +54,21 @@ def torque_at_full_pwm_nm(kind: ModuleType) -> float:
     return stalled_a * motor.torque_constant_nm_a * kind.gear_ratio * motor.efficiency
 
 
+def closes_on_motor(kind: ModuleType, strategy: int) -> bool:
+    """Return whether the velocity loop of a strategy is closed on the motor's side of the spring."""
+    return kind.velocity_loop == "motor" and strategy in (2, 3)
+
+
 class Controller:
     """The three loops of one module under its control strategy.
 
+    `follows_motor` is whether velocity_rad_s is to be the motor's, seen at the output, and not the output's.
     `update(command, position_rad, velocity_rad_s, effort_nm)` returns the PWM of this tick.
     """
 
     def __init__(self, kind: ModuleType, gains: GainSet, dt_s: float):
         self.gains = gains
+        self.follows_motor = closes_on_motor(kind, gains.strategy)
         self._loops = (
             Pid(gains.position, dt_s),
             Pid(gains.velocity, dt_s, 1.0 if gains.strategy == 2 else pwm_per_rad_s(kind)),

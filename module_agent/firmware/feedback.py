@@ -104,7 +104,7 @@ class FeedbackStream:
         voltage_v = sample.voltage_v
         duty = pwm * NOMINAL_VOLTAGE_V / voltage_v if voltage_v else 0.0
         history = self.history
-        # From the deflection on, a sample's fields are in the order of a row's.
+        # From the deflection to the IMU, a sample's fields are in the order of a row's.
         history.append(
             (
                 sample.t_ns,
@@ -116,7 +116,7 @@ class FeedbackStream:
                 sample.effort_nm,
                 *command[:3],
                 min(max(duty, -1.0), 1.0),
-                *sample[5:],
+                *sample[5:16],
             )
         )
         first, end = self._sent_row, history.next_row

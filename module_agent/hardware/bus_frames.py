@@ -9,7 +9,7 @@ hello      agent to world     msgpack {"v": 1, "serials": [...]}
 welcome    world to agent     msgpack {"v": 1, "tick": n, "modules": [[serial, type, tick_ns,
                               imu_period_ns], ...]}, or {"v": 1, "error": text} and the socket closes
 pwm        agent to world     u64 tick number, one f64 per module: the answer to that tick
-samples    world to agent     u64 tick number, per module 2 i64 and 14 f64 in the order of
+samples    world to agent     u64 tick number, per module 2 i64 and 15 f64 in the order of
                               `SensorSample`
 =========  =================  =====================================================================
 
@@ -26,10 +26,10 @@ import msgpack
 from module_agent.hardware.hardware import SensorSample, WiredModule
 from module_agent.model.errors import RobotError
 
-BUS_VERSION = 1
+BUS_VERSION = 2
 MAX_HANDSHAKE_BYTES = 64 * 1024
 _TICK = struct.Struct("<Q")
-_SAMPLE = struct.Struct("<qq14d")
+_SAMPLE = struct.Struct("<qq15d")
 
 
 class FrameError(RobotError):
@@ -45,7 +45,7 @@ class TickFrames(NamedTuple):
     @classmethod
     def of(cls, modules: int) -> "TickFrames":
         """Return the layouts for `modules` modules."""
-        return cls(struct.Struct("<Q" + "qq14d" * modules), struct.Struct(f"<Q{modules}d"))
+        return cls(struct.Struct("<Q" + "qq15d" * modules), struct.Struct(f"<Q{modules}d"))
 
     def pack_samples(self, tick: int, samples: Sequence[SensorSample]) -> bytes:
         """Return the samples frame of a tick."""

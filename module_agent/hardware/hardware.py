@@ -21,6 +21,8 @@ class SensorSample(NamedTuple):
     The accelerometer reads specific force (+g on the axis that points up at rest). Gyro and accelerometer are
     in the IMU frame. Position, velocity and effort are those of the output relative to the housing about the
     module's +z; effort is the torque that the output exerts on what it is mounted to, read from the spring.
+    deflection_velocity_rad_s is the output's speed less the motor's seen at the output; only loops that are
+    closed outside the module need it.
     """
 
     t_ns: int
@@ -39,6 +41,7 @@ class SensorSample(NamedTuple):
     accel_x_m_s2: float
     accel_y_m_s2: float
     accel_z_m_s2: float
+    deflection_velocity_rad_s: float = 0.0
 
 
 class LimitState(IntFlag):

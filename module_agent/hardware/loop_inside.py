@@ -52,9 +52,10 @@ class _Drive:
         position, velocity, effort, brake = command
         if not brake and (position == position or velocity == velocity or effort == effort):
             self._running = True
-            pwm = self.controller.update(
-                command, sensors.position_rad, sensors.velocity_rad_s, sensors.effort_nm
-            )
+            speed = sensors.velocity_rad_s
+            if self.controller.follows_motor:
+                speed -= sensors.deflection_velocity_rad_s
+            pwm = self.controller.update(command, sensors.position_rad, speed, sensors.effort_nm)
             return self.guard.limit(pwm, sensors)
         if self._running:
             self._running = False

@@ -39,7 +39,8 @@ class ModuleType(NamedTuple):
     and `output_xyz` are positions in the housing; the axes of IMU and output are parallel to its own.
     `vibration` is the size of the module's own vibration that its IMU measures, relative to a module of the
     present generation. `housing_min_xyz` and `housing_max_xyz` are the corners of the housing's envelope.
-    `hrdf_actuator` is the type of HRDF's actuator element, empty if HRDF has none.
+    `hrdf_actuator` is the type of HRDF's actuator element, empty if HRDF has none. `velocity_loop` is the
+    side of the spring whose speed the velocity loop of strategies 2 and 3 is closed on.
     """
 
     name: str
@@ -59,6 +60,7 @@ class ModuleType(NamedTuple):
     housing_max_xyz: Vector
     colour: str
     hrdf_actuator: str
+    velocity_loop: Literal["motor", "output"]
     range_rad: tuple[float, float] | None = None
     vibration: float = 1.0
 

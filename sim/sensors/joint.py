@@ -2,8 +2,10 @@
 
 Encoder: whole counts. Velocity: the module's own estimate, a first-order low-pass of the encoder readings'
 differences over the nominal tick, so that counts and sampling jitter show in it; the real X5-1's lags its
-encoder by 1.3 to 1.7 ms. The motor's speed comes from its commutation and is smoothed far more: in the same
-log it lags by 11 ms. The log is feedback; whether the module's control uses a speed as late is not known.
+encoder by 1.3 to 1.7 ms. The deflection's velocity is as late and, an assumption, without noise. The motor's
+speed comes from its commutation and is smoothed far more: in the same log it lags by 11 ms. The module's
+control does not use it: the recorded PWM shows a velocity loop on velocity less deflection velocity, which is
+the motor's speed too (`tests/module_agent/control/test_pid.py`).
 
 Torque: the sensor reads the deflection and multiplies it by a constant stiffness, but part of the torque that
 rubber transmits is inner friction, which does not show in the deflection. That part is a Dahl element driven
@@ -72,13 +74,14 @@ class JointSensors:
         )
         self._noise = StandardNormals(seed, serials, "joint", 2)
         self._jitter = StandardNormals(seed, serials, "joint jitter", 1)
-        # Columns: encoder reading, velocity, motor speed, torque, inner friction.
-        self._memory = np.zeros((0, 5))
+        # Columns: encoder reading, velocity, motor speed, torque, inner friction, deflection velocity.
+        self._memory = np.zeros((0, 6))
 
     def read(self, q_rad: Array, qd_rad_s: Array, motor_rad_s: Array, elastic_nm: Array) -> Array:
-        """Return a reading (n, 5): position, velocity, effort, deflection, motor speed seen at the output.
+        """Return a reading (n, 6): position, velocity, effort, deflection, motor speed, deflection velocity.
 
-        All arguments are (n,) and true; elastic_nm is the springs' torque on the outputs.
+        The motor's speed is seen at the output. All arguments are (n,) and true; elastic_nm is the springs'
+        torque on the outputs.
         """
         if not len(self._memory):
             # The steady state of this speed and torque.
@@ -86,7 +89,9 @@ class JointSensors:
             before = q_rad - qd_rad_s * tick_s
             counted = np.rint(before / step) * step if step else before
             still = np.zeros_like(q_rad)
-            self._memory = np.column_stack((counted, qd_rad_s, motor_rad_s, elastic_nm, still))
+            self._memory = np.column_stack(
+                (counted, qd_rad_s, motor_rad_s, elastic_nm, still, qd_rad_s - motor_rad_s)
+            )
         return _read(
             self._settings,
             self._fixed,
@@ -128,7 +133,7 @@ def _read(
 ) -> Array:
     """Return `JointSensors.read`; noise and jitter are in standard deviations, `memory` is carried on."""
     tick_s, step, velocity_share, motor_share, velocity_white, jitter_s = settings
-    values = np.empty((q.shape[0], 5))
+    values = np.empty((q.shape[0], 6))
     for i in range(q.shape[0]):
         off_s = jitter_s * jitter[i, 0]
         angle = q[i] + qd[i] * off_s
@@ -152,4 +157,6 @@ def _read(
         effort = fixed[i, 1] * torque + fixed[i, 2] + fixed[i, 3] * noise[i, 1]
         values[i, 0], values[i, 1] = angle, velocity + velocity_white * noise[i, 0]
         values[i, 2], values[i, 3], values[i, 4] = effort, effort / -fixed[i, 0], memory[i, 2]
+        memory[i, 5] += velocity_share * (qd[i] - motor[i] - memory[i, 5])
+        values[i, 5] = memory[i, 5]
     return values

@@ -80,10 +80,10 @@ class Sensors:
             self._imu_values = self._imus.read(truth.motor_rad_s)
             self._imu_ns = now
         joint = self._joints.read(truth.q_rad, truth.qd_rad_s, truth.motor_rad_s, truth.elastic_nm)
-        values = np.empty((len(joint), 14))
-        values[:, :5] = joint
+        values = np.empty((len(joint), 15))
+        values[:, :5], values[:, 14] = joint[:, :5], joint[:, 5]
         values[:, 4] *= self._gear
         values[:, 5], values[:, 6], values[:, 7] = truth.current_a, truth.winding_c, truth.voltage_v
-        values[:, 8:] = self._imu_values
+        values[:, 8:14] = self._imu_values
         rows = values.tolist()
         return [SensorSample(t, imu, *row) for t, imu, row in zip(now, self._imu_ns, rows, strict=True)]

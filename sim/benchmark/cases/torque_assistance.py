@@ -7,8 +7,8 @@ from sim.benchmark.case import Case, Summary, Trial
 from sim.benchmark.row import Row, count
 from sim.imperfections.noise_profile import noise_profile
 from sim.thesis.torque_assistance import identified_model, standing_robot
+from sim.thesis.torque_assistance_cases import ABOUT_AS_WELL, Combination, robots_of, try_case
 from sim.thesis.torque_assistance_cases import Case as Combined
-from sim.thesis.torque_assistance_cases import Combination, robots_of, try_case
 from sim.thesis.torque_assistance_cases import cases as combinations
 from sim.thesis.torque_assistance_report import MIN_GAIN, true_model
 
@@ -60,7 +60,7 @@ def _limit(combined: Combined) -> float | None:
     """Return what the error by calculated torque must not exceed of that without."""
     if combined.alignment is None:
         return 1.0 / MIN_GAIN
-    return 1.0 if combined.gains.setting is not None else None
+    return ABOUT_AS_WELL if combined.gains.setting is not None else None
 
 
 def _summary(limit: float | None, trials: Sequence[list[Combination]]) -> Summary:
@@ -71,6 +71,6 @@ def _summary(limit: float | None, trials: Sequence[list[Combination]]) -> Summar
         Row("error by calculated torque over that without, most", most, limit),
         Row(f"unstable with it, of {len(tried)}", float(len(tried) - len(stable))),
     ]
-    if limit == 1.0:
+    if limit == ABOUT_AS_WELL:
         rows.insert(0, count("stable, and not the best of three modes", [not each.helps for each in stable]))
     return Summary(rows)

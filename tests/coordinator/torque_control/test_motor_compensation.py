@@ -1,5 +1,7 @@
 """The motor compensation, compared with the simulated motor, which has equations of its own."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -97,16 +99,25 @@ def points(tau_nm: Array, qd_rad_s: Array) -> SetPoints:
     return SetPoints(Reference(t_s, *columns), tau_nm[:, None])
 
 
+@pytest.mark.parametrize("side", ["motor", "output"])
 @pytest.mark.parametrize("strategy", [2, 3, 4])
-def test_loops_that_are_without_error_put_out_the_pwm_that_the_motor_needs(strategy: int) -> None:
+def test_loops_that_are_without_error_put_out_the_pwm_that_the_motor_needs(
+    strategy: int, side: Literal["motor", "output"]
+) -> None:
+    kind = X5_4._replace(velocity_loop=side)
     t_s = np.arange(1000) * TICK_S
     tau, rate = 2.0 + np.sin(6.0 * t_s), 0.7 * np.cos(4.0 * t_s)
     gains = default_gains(X5_4, strategy)
-    given = with_motor_compensation(points(tau, rate), [X5_4], [gains])
-    controller = Controller(X5_4, gains, TICK_S)
+    # Ten times the factory's, so that a spring's speed left out would show.
+    gains = gains.model_copy(
+        update={"velocity": gains.velocity.model_copy(update={"kp": 10.0 * gains.velocity.kp})}
+    )
+    given = with_motor_compensation(points(tau, rate), [kind], [gains])
+    controller = Controller(kind, gains, TICK_S)
     q = given.reference.q_rad[:, 0]
+    speed = rate + np.gradient(tau, TICK_S) / X5_4.spring_nm_rad if controller.follows_motor else rate
     pwm = [
-        controller.update(Command(q[k], rate[k], given.effort_nm[k, 0]), q[k], rate[k], tau[k])
+        controller.update(Command(q[k], rate[k], given.effort_nm[k, 0]), q[k], speed[k], tau[k])
         for k in range(1000)
     ]
     # Their low-passes are a tick or two late; the derivative of the measured torque is not compensated.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from module_agent.control.controller import MOTOR_OFF, Command, Controller
 from module_agent.control.gains import default_gains
@@ -17,6 +18,9 @@ from module_agent.wire.messages import PidGains
 
 REAL_LOG = Path(__file__).parents[4] / "shared/data/x5-1-sine-log.csv"
 DT = 0.001
+LOOPS, UNITS = ("position", "velocity", "effort"), ("rad", "rad_s", "nm")
+
+Array = NDArray[np.float64]
 
 
 def loop(**parameters: object) -> Pid:
@@ -136,37 +140,51 @@ def test_strategy_2_and_4_differ_in_where_velocity_enters() -> None:
     assert second == pytest.approx(0.25 * 0.2 + 0.2 / full)
 
 
-@pytest.mark.skipif(not REAL_LOG.exists(), reason="the recorded X5-1 log is not on this machine")
-def test_strategy_3_gives_the_real_module_s_pwm_command() -> None:
-    """The recorded command before voltage normalisation, sample by sample, from the recorded signals."""
+def recorded() -> dict[str, Array]:
     with REAL_LOG.open() as file:
         table = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in table]) for name in table[0]}
 
-    def column(name: str) -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
-        return np.array([float(row[name]) for row in table])
 
+def replayed(log: dict[str, Array], velocity_rad_s: Array) -> Array:
+    """The PWM command of strategy 3 before voltage normalisation, sample by sample, from recorded signals."""
     kind = CATALOGUE["X5-1"]
     # One sample in ten of the module's loop is recorded, so its output filter cannot be replayed: left out.
     gains = default_gains(kind, 3)
     bare = {"output_lowpass": 1.0, "kd": 0.0}
-    gains = gains.model_copy(
-        update={n: getattr(gains, n).model_copy(update=bare) for n in ("position", "velocity", "effort")}
-    )
+    gains = gains.model_copy(update={name: getattr(gains, name).model_copy(update=bare) for name in LOOPS})
     controller = Controller(kind, gains, DT)
-    ours = np.array(
-        [
-            controller.update(Command(p, v, e), *state)
-            for p, v, e, *state in zip(
-                *(column(f"{n}_command_{u}") for n, u in (("position", "rad"), ("velocity", "rad_s"))),
-                column("effort_command_nm"),
-                column("position_rad"),
-                column("velocity_rad_s"),
-                column("effort_nm"),
-                strict=True,
-            )
-        ]
-    )
-    theirs = column("inner_effort_command")
+    commands = (log[f"{name}_command_{unit}"] for name, unit in zip(LOOPS, UNITS, strict=True))
+    rows = zip(*commands, log["position_rad"], velocity_rad_s, log["effort_nm"], strict=True)
+    return np.array([controller.update(Command(p, v, e), *state) for p, v, e, *state in rows])
+
+
+needs_log = pytest.mark.skipif(not REAL_LOG.exists(), reason="the recorded X5-1 log is not on this machine")
+
+
+@needs_log
+def test_strategy_3_gives_the_real_module_s_pwm_command() -> None:
+    log = recorded()
+    motor_rad_s = log["velocity_rad_s"] - log["deflection_velocity_rad_s"]
+    ours, theirs = replayed(log, motor_rad_s), log["inner_effort_command"]
     # The residual is what the unrecorded nine samples in ten and the filters do.
     assert np.corrcoef(ours, theirs)[0, 1] ** 2 > 0.98
     assert np.polyfit(theirs, ours, 1)[0] == pytest.approx(1.0, abs=0.03)
+
+
+@needs_log
+def test_a_real_module_closes_its_velocity_loop_on_the_motor_s_side_of_the_spring() -> None:
+    """Beyond a loop on the output's speed, the recorded PWM answers to the deflection's by the loop's kp."""
+    log, gains = recorded(), default_gains(CATALOGUE["X5-1"], 3)
+    slope = log["deflection_velocity_rad_s"]
+    # The effort's derivative answers to it too, which `replayed` leaves out: effort is - k deflection.
+    derivative = gains.effort.kd * CATALOGUE["X5-1"].spring_nm_rad * slope
+    left = log["inner_effort_command"] - replayed(log, log["velocity_rad_s"]) - derivative
+    # The motor's speed of the feedback, 11 ms late, would be answered to by - kp.
+    late = log["motor_velocity_rad_s"] / CATALOGUE["X5-1"].gear_ratio - log["velocity_rad_s"]
+    columns = np.column_stack([slope, late, np.ones_like(slope)])[50:]
+    (of_deflection, of_late, _), *_ = np.linalg.lstsq(columns, left[50:], rcond=None)
+    sigma = left[50:].std() * np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)))
+    # Measured 0.0589 and -0.0026 with sigmas of 0.0044 and 0.0011; on the output's side the first would be 0.
+    assert of_deflection == pytest.approx(gains.velocity.kp, abs=3.0 * sigma[0])
+    assert abs(of_late) < 0.1 * gains.velocity.kp

@@ -90,6 +90,19 @@ def test_the_brake_is_proportional_to_the_motor_s_speed_and_bounded() -> None:
     assert pwm == DAMPING_LIMIT_PWM
 
 
+@pytest.mark.parametrize(("strategy", "follows_motor"), [(2, True), (3, True), (4, False)])
+def test_the_velocity_loop_of_strategies_2_and_3_follows_the_motor(
+    strategy: int, follows_motor: bool
+) -> None:
+    def damping(**readings: float) -> float:
+        bench = Bench("X5-9")
+        bench.modules.set_gains(0, default_gains(CATALOGUE["X5-9"], strategy))
+        return bench.drive(Command(NAN, 0.0, NAN), **readings)[0]
+
+    assert (damping(velocity_rad_s=0.4, deflection_velocity_rad_s=0.4) == 0.0) is follows_motor
+    assert (damping(velocity_rad_s=0.0, deflection_velocity_rad_s=-0.4) < 0.0) is follows_motor
+
+
 @pytest.mark.parametrize("between", [MOTOR_OFF, BRAKE])
 def test_loops_forget_their_past_while_the_motor_is_off_or_brakes(between: Command) -> None:
     bench = Bench()

@@ -22,7 +22,7 @@ def only(*effects: str) -> NoiseProfile:
 
 
 def imu(samples: np.ndarray) -> np.ndarray:
-    return samples[..., -6:]
+    return samples[..., -7:-1]
 
 
 def allan(records: np.ndarray, rate_hz: float, taus_s: list[float]) -> tuple[np.ndarray, np.ndarray]:

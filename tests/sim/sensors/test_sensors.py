@@ -12,7 +12,7 @@ from sim.imperfections.random_streams import generator
 from sim.sensors.module_clock import module_time
 
 FIELDS = SensorSample._fields
-IMU = FIELDS[-6:]
+IMU = FIELDS[-7:-1]
 GYRO, ACCEL = IMU[:3], IMU[3:]
 EFFORT = ("effort_nm", "deflection_rad")
 # What each effect of sensors and clocks may change in a sample.
@@ -30,7 +30,7 @@ TOUCHES: dict[str, tuple[str, ...]] = {
     "imu-steps": IMU,
     "vibration": IMU,
     "encoder": ("position_rad", "velocity_rad_s"),
-    "velocity-estimate": ("velocity_rad_s",),
+    "velocity-estimate": ("velocity_rad_s", "deflection_velocity_rad_s"),
     "motor-speed-estimate": ("motor_velocity_rad_s",),
     "torque-noise": EFFORT,
     "torque-calibration": EFFORT,
@@ -111,7 +111,7 @@ def test_an_added_module_does_not_change_the_readings_of_the_others(bench: Any) 
     few = bench(NOISE_PROFILES["poor"], ("a", "b")).read(600)
     many = bench(NOISE_PROFILES["poor"], ("new", "a", "b")).read(600)
     np.testing.assert_array_equal(few, many[:, 1:])
-    assert not np.array_equal(many[:, 0, -6:], many[:, 1, -6:])
+    assert not np.array_equal(many[:, 0, -7:-1], many[:, 1, -7:-1])
     assert generator(3, "a", "clock").random() != generator(3, "b", "clock").random()
 
 

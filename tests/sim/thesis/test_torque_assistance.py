@@ -38,6 +38,7 @@ from sim.thesis.torque_assistance_cases import (
     HOSTS,
     Case,
     Combination,
+    Motion,
     cases,
     robots_of,
     stage_of,
@@ -90,11 +91,20 @@ def test_the_factory_s_position_control_gains_by_calculated_torque_too() -> None
     assert second.rms_error_rad > 9.0 * third.rms_error_rad
 
 
-def test_the_thesis_settings_of_strategy_3_ring_even_with_calculated_torque() -> None:
-    gains = Gains(3, "#1", "per tick")
-    found = follow(stage_of(CASE_4, SEED), gains, 3, ON_MODULE, vertical(), X5, SEED)
-    # 6.7 mrad at 6 Hz: the loops close around the spring, whose far side the encoder reads.
-    assert "rings by" in found.unstable
+@pytest.mark.parametrize(
+    ("setting_", "motion", "most_rad"), [("#1", "windowed sine", 8e-3), ("#3", "sine", 3.5e-3)]
+)
+def test_the_thesis_settings_of_strategy_3_need_a_velocity_loop_as_in_figures_52_and_54(
+    setting_: str, motion: Motion, most_rad: float
+) -> None:
+    case = CASE_4._replace(motion=motion, gains=Gains(3, setting_, "per tick"))
+    first, second, third = tried(case).follows
+    # The position's derivative alone drives the spring into oscillation: only the motor's speed damps it.
+    assert "rings by" in first.unstable
+    # Measured 6.1 and 6.2 mrad, and 2.5 and 2.8; on the output's side of the spring all of them ring.
+    for each in (second, third):
+        assert not each.unstable
+        assert each.rms_error_rad < most_rad
 
 
 def test_set_points_from_a_host_cost_what_the_network_is_late_and_no_more() -> None:
@@ -265,7 +275,7 @@ def test_the_command_identifies_follows_prints_and_draws(
     done = CliRunner().invoke(app, ["assistance", "--json", str(file), "--picture", str(picture)])
     assert done.exit_code == 0, done.output
     assert asked == [(VERTICAL, 0)]
-    assert "the thesis' gains: mode 3 has the lowest rms error: holds, in 1 of 1 stable" in done.output
+    assert "times): holds, in 1 of 1 stable" in done.output
     written = json.loads(file.read_text(encoding="utf-8"))
     assert written["settings"] == {"seed": 0, "noise": "x5", "with": [], "without": [], "quick": False}
     (row,) = written["rows"]

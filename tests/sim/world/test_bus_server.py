@@ -376,7 +376,7 @@ def test_a_speed_is_positive(path, speed) -> None:
 # ------------------------------------------------------------------------------- frames
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
-SAMPLES = st.builds(SensorSample, INT64, INT64, *(st.floats(allow_nan=False),) * 14)
+SAMPLES = st.builds(SensorSample, INT64, INT64, *(st.floats(allow_nan=False),) * 15)
 
 
 @settings(deadline=None)
@@ -384,7 +384,7 @@ SAMPLES = st.builds(SensorSample, INT64, INT64, *(st.floats(allow_nan=False),) *
 def test_samples_survive_the_wire_exactly(tick, samples) -> None:
     frames = TickFrames.of(len(samples))
     packed = frames.pack_samples(tick, samples)
-    assert len(packed) == 8 + 128 * len(samples)
+    assert len(packed) == 8 + 136 * len(samples)
     assert frames.unpack_samples(packed) == (tick, samples)
     with pytest.raises(FrameError, match="bytes"):
         frames.unpack_samples(packed + b"\0")
