@@ -12,6 +12,7 @@ from module_agent.estimate.observer import Finding, Observer
 from module_agent.firmware.config import FirmwareConfig
 from module_agent.firmware.firmware import Answer, Firmware, Incoming, Outgoing, acknowledgement
 from module_agent.hardware.hardware import Modules, ModuleSample
+from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.peers.motion_listener import AskHistory, JointMotion, Listen, MotionListener
 from module_agent.peers.row_collection import MotionCollection, OwnRows
 from module_agent.torque_information.service import InformationService, Worker
@@ -67,7 +68,7 @@ class HostedModule:
         self._information = InformationService(config.serial, host.collection, host.worker)
         self.serial = config.serial
         self.firmware = Firmware(config, modules, index)
-        self.observer = Observer(config.serial, config.boot)
+        self.observer = Observer(config.serial, config.boot, IMU_PRIORS[config.imu])
         self.inbox = Inbox()
         # Apart from all else, so that no flood can keep a stop out.
         self.stops = Inbox(capacity=16)

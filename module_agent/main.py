@@ -15,6 +15,7 @@ from module_agent.firmware.config import config_of
 from module_agent.hardware.bus_client import BusClient
 from module_agent.hardware.hardware import HardwareLost
 from module_agent.hardware.loop_inside import LoopInside
+from module_agent.model.catalogue import ImuKind
 from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
 from module_agent.network_emulation.impaired_transport import inject
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile
@@ -88,6 +89,7 @@ def main(
     lifetime_ms: Annotated[float, typer.Option(min=1.0, max=1000.0, help="Command lifetime [ms].")] = 250.0,
     expiry: Annotated[str, typer.Option(help="On expiry: motor_off, hold or damping.")] = "motor_off",
     strategy: Annotated[int, typer.Option(min=0, max=4, help="Control strategy at start.")] = 3,
+    imu: Annotated[ImuKind, typer.Option(help="Calibration of the modules' IMUs.")] = "uncalibrated",
 ) -> None:
     """Run the agent of one or several modules until the world ends or a signal comes."""
     # Imported here: it brings the estimators, which `--help` does not need.
@@ -120,6 +122,7 @@ def main(
                     lifetime_ns=round(lifetime_ms * 1e6),
                     expiry_action=expiry,
                     strategy=strategy,
+                    imu=imu,
                 )
                 for module in modules.information
             ]

@@ -1,6 +1,6 @@
 """Identification from a recording, without side effects: a replay computes the same.
 
-Topology from observed motions, a first chain from the agents' circle point analyses, one batch refinement
+Topology from observed motions, a first chain from the agents' joint regressions, one batch refinement
 over all exploration motions, then the inertial parameters, checked on held-out motions.
 """
 
@@ -33,7 +33,7 @@ from coordinator.identification.sensor_checks import (
 from coordinator.identification.topology_observations import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
 from coordinator.kinematics.assembly import assemble
-from coordinator.kinematics.chain_observations import PairObservation, circle_observation
+from coordinator.kinematics.chain_observations import PairObservation, joint_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circle_observations
 from coordinator.recording.journal import JournalEvent, excluded_modules
@@ -187,7 +187,7 @@ def _pairs(
     motions: Sequence[JournalEvent],
     windows: Sequence[Window],
 ) -> list[PairObservation]:
-    """Return the circles as observations."""
+    """Return the modules' own estimates as observations."""
     whole = simultaneous_motion(recording, serials)
     if whole is not None:
         return circle_observations(serials, respond(recording, clocks, serials, whole))
@@ -199,7 +199,7 @@ def _pairs(
         for observer in [s for s in serials if s != joint and motion is not None]:
             estimates = list(recording.estimates.get((joint, observer), {}).items())
             of_motion = [e for ids, e in estimates if motion is not None and ids[-1] == motion.motion_id]
-            pair = circle_observation(of_motion[0], one.q_rad.mean(axis=0)) if of_motion else None
+            pair = joint_observation(of_motion[0], one.q_rad.mean(axis=0)) if of_motion else None
             pairs += [] if pair is None else [pair]
     return pairs
 

@@ -1,8 +1,8 @@
-"""Previews of a robot while its joints are being explored: assembled from circles, refined by a few samples.
+"""Previews of a robot while its joints are being explored: assembled from own estimates, then refined.
 
 Joints that have not moved yet count as locked: a module is mounted on the nearest explored joint that moves
 it, and modules without a link to another one yet are excluded. The chain is assembled from the modules'
-circle point analyses (`kinematics.assembly`); the batch estimate follows at the end of the run. Every motion
+joint regressions (`kinematics.assembly`); the batch estimate follows at the end of the run. Every motion
 is filtered once and its thinned samples retained, so that a preview costs little more than its refinement.
 """
 
@@ -16,7 +16,7 @@ from coordinator.batch_estimation.link_compliance import compliance_jacobian, jo
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
-from coordinator.kinematics.chain_observations import PairObservation, circle_observation
+from coordinator.kinematics.chain_observations import PairObservation, joint_observation
 from coordinator.recording.journal import JournalEvent, Purpose
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.motion_windows import RATE_HZ, filtered, thinned, unbroken_windows
@@ -91,27 +91,27 @@ def _observation(recording: Recording, joint: str, observer: str) -> MotionObser
         return None
     slow_ids = {motion.motion_id for purpose, motion in _motions(recording, joint) if purpose == "constant"}
     slow = [e for e in estimates if e.motion_ids[-1] in slow_ids]
-    estimate, turned = (slow or estimates)[-1], _circle(estimates)
-    axis = np.array(turned.circle.axis) if turned is not None and turned.circle is not None else None
+    estimate, turned = (slow or estimates)[-1], _fitted(estimates)
+    axis = np.array(turned.best.axis) if turned is not None and turned.best is not None else None
     return MotionObservation(estimate.moved, estimate.rate_ratio, axis)
 
 
-def _circle(estimates: Sequence[Estimate]) -> Estimate | None:
-    circles = [e for e in estimates if e.circle is not None]
-    return circles[-1] if circles else None
+def _fitted(estimates: Sequence[Estimate]) -> Estimate | None:
+    fitted = [e for e in estimates if e.best is not None]
+    return fitted[-1] if fitted else None
 
 
 def _pair(
     recording: Recording, joint: str, observer: str, topology: Topology, q_rad: Array
 ) -> PairObservation | None:
-    """Return a circle as an observation."""
-    estimate = _circle(list(recording.estimates.get((joint, observer), {}).values()))
+    """Return an estimate as an observation."""
+    estimate = _fitted(list(recording.estimates.get((joint, observer), {}).values()))
     if estimate is None:
         return None
     # The others hold where they rested.
     at = q_rad.copy()
     at[topology.serials.index(joint)] = _mean_position(recording, joint, estimate.motion_ids)
-    return circle_observation(estimate, at)
+    return joint_observation(estimate, at)
 
 
 def _motions(recording: Recording, serial: str) -> list[tuple[Purpose, MotionRecord]]:

@@ -121,7 +121,7 @@ class MountingPart(Part):
 
 
 class PairPart(Part):
-    """The agent's circle point analysis of one joint by one IMU."""
+    """The agent's estimate of one joint by one IMU: its regression, or its circle point analysis."""
 
     joint: str
     observer: str

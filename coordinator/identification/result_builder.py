@@ -163,14 +163,14 @@ def _pairs(recording: Recording) -> list[PairPart]:
     parts = []
     for (_, observer), estimates in sorted(recording.estimates.items()):
         estimate = list(estimates.values())[-1]
-        circle = estimate.circle
+        fit = estimate.best
         parts.append(
             PairPart.of(
                 estimate,
                 observer=observer,
-                distance_mm=1e3 * circle.distance_m if circle else None,
-                distance_sigma_mm=1e3 * circle.sigma_distance_m if circle else None,
-                axis=circle.axis if circle else None,
+                distance_mm=1e3 * fit.distance_m if fit else None,
+                distance_sigma_mm=1e3 * fit.sigma_distance_m if fit else None,
+                axis=fit.axis if fit else None,
             )
         )
     return parts

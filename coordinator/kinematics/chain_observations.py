@@ -1,7 +1,7 @@
 """Observations of joints by IMUs, what a chain predicts of them, residuals and their Jacobian.
 
 Everything is vectorised over observations; the base is body -1, kept in the last place of every array of
-bodies. `circle_observation` makes an observation of a module's local estimate, with a sigma that counts its
+bodies. `joint_observation` makes an observation of a module's own estimate, with a sigma that counts its
 systematic errors.
 """
 
@@ -15,7 +15,7 @@ from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.perturbation import adjoint, skew
-from module_agent.wire.messages import Estimate
+from module_agent.wire.messages import CircleEstimate, Estimate, RegressionEstimate
 
 # Floors of the sigmas, added in squares to the stated ones, which do not include the sensors' systematic
 # errors: an accelerometer's scale is good to 0.5 %, its place in the housing to 0.3 mm, a gyro's axes to 2
@@ -282,25 +282,37 @@ def _across(directions: Array) -> Array:
 
 
 def circle_observation(estimate: Estimate, q_rad: Array) -> PairObservation | None:
-    """Return the circle of an estimate as an observation; None without one.
-
-    An IMU that turned by more or by less than the joint was also moved by something else, mostly by compliant
-    held joints between the two. The sigmas of axis and distance grow by that share.
+    """Return the circle point analysis of an estimate as an observation; None without one.
 
     Args:
         estimate: by the module `serial`, of `joint`.
         q_rad: (n,) mean positions of all joints meanwhile.
     """
-    circle = estimate.circle
-    if circle is None:
+    return _observation(estimate, estimate.circle, q_rad)
+
+
+def joint_observation(estimate: Estimate, q_rad: Array) -> PairObservation | None:
+    """Return the best fit of an estimate as an observation, mostly the regression; None without one."""
+    return _observation(estimate, estimate.best, q_rad)
+
+
+def _observation(
+    estimate: Estimate, fit: RegressionEstimate | CircleEstimate | None, q_rad: Array
+) -> PairObservation | None:
+    """Return a fit as an observation.
+
+    An IMU that turned by more or by less than the joint was also moved by something else, mostly by compliant
+    held joints between the two. The sigmas of axis and distance grow by that share.
+    """
+    if fit is None:
         return None
     excess = abs(estimate.rate_ratio - 1.0)
     return PairObservation(
         estimate.joint,
         estimate.serial,
-        np.array(circle.axis),
-        np.array(circle.radial_m),
-        circle.sigma_axis_rad + excess,
-        circle.sigma_distance_m + excess * circle.distance_m,
+        np.array(fit.axis),
+        np.array(fit.radial_m),
+        fit.sigma_axis_rad + excess,
+        fit.sigma_distance_m + excess * fit.distance_m,
         q_rad,
     )

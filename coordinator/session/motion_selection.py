@@ -120,13 +120,13 @@ class MotionChoice:
 
     def _radius_m(self, serial: str) -> float:
         """Return the largest estimated radius about this joint; a likely one before there is any estimate."""
-        circles = [
-            estimate.circle.distance_m
+        radii = [
+            estimate.best.distance_m
             for (joint, observer), estimates in self._recording.estimates.items()
             for estimate in estimates.values()
-            if joint == serial and observer != serial and estimate.circle is not None
+            if joint == serial and observer != serial and estimate.best is not None
         ]
-        return max(circles, default=LIKELY_RADIUS_M)
+        return max(radii, default=LIKELY_RADIUS_M)
 
     def _unmoved_limits(self, serial: str) -> JointLimits:
         return self._limits(serial, likely_inertia_kg_m2([self._kind(s) for s in self._serials()]))

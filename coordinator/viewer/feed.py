@@ -182,12 +182,12 @@ class ViewerFeed:
     def estimates(self, joint: str, session_ns: int) -> None:
         """Show the modules' own estimates of their distance from a joint, unless another one is nearer."""
         for (moved, observer), messages in self._recording.estimates.items():
-            circle = list(messages.values())[-1].circle if moved == joint and observer != joint else None
-            if circle is None:
+            fit = list(messages.values())[-1].best if moved == joint and observer != joint else None
+            if fit is None:
                 continue
             known = self._shown.get((OWN_DISTANCE, observer))
-            if known is None or 1e3 * circle.distance_m <= known.value:
-                distance_mm, sigma_mm = 1e3 * circle.distance_m, 1e3 * circle.sigma_distance_m
+            if known is None or 1e3 * fit.distance_m <= known.value:
+                distance_mm, sigma_mm = 1e3 * fit.distance_m, 1e3 * fit.sigma_distance_m
                 shown = Estimate(OWN_DISTANCE, observer, distance_mm, sigma_mm, "mm")
                 self._show(session_ns - self._origin_ns, shown)
 

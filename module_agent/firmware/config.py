@@ -3,13 +3,16 @@
 from typing import Any, NamedTuple
 
 from module_agent.hardware.hardware import ModuleInformation
-from module_agent.model.catalogue import ModuleType, module_type
+from module_agent.model.catalogue import ImuKind, ModuleType, module_type
 from module_agent.model.errors import UsageError
 from module_agent.wire.messages import ExpiryAction, Limits
 
 
 class FirmwareConfig(NamedTuple):
-    """The settings of one module's firmware; times and rates in the module's own clock."""
+    """The settings of one module's firmware; times and rates in the module's own clock.
+
+    imu: how well the module's IMU is calibrated, the prior of the module's own estimates.
+    """
 
     serial: str
     kind: ModuleType
@@ -23,6 +26,7 @@ class FirmwareConfig(NamedTuple):
     lifetime_ns: int = 250_000_000
     expiry_action: ExpiryAction = "motor_off"
     strategy: int = 3
+    imu: ImuKind = "uncalibrated"
 
     @property
     def history_rows(self) -> int:

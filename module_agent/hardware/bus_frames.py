@@ -5,9 +5,9 @@ One packet is one frame, little-endian:
 =========  =================  =====================================================================
 frame      direction          contents
 =========  =================  =====================================================================
-hello      agent to world     msgpack {"v": 1, "serials": [...]}
-welcome    world to agent     msgpack {"v": 1, "tick": n, "modules": [[serial, type, tick_ns,
-                              imu_period_ns], ...]}, or {"v": 1, "error": text} and the socket closes
+hello      agent to world     msgpack {"v": 2, "serials": [...]}
+welcome    world to agent     msgpack {"v": 2, "tick": n, "modules": [[serial, type, tick_ns,
+                              imu_period_ns], ...]}, or {"v": 2, "error": text} and the socket closes
 pwm        agent to world     u64 tick number, one f64 per module: the answer to that tick
 samples    world to agent     u64 tick number, per module 2 i64 and 15 f64 in the order of
                               `SensorSample`

@@ -281,6 +281,11 @@ class Estimate(Message):
     regression: RegressionEstimate | None = None
     note: Text = ""
 
+    @property
+    def best(self) -> RegressionEstimate | CircleEstimate | None:
+        """The regression, or where there is none the circle point analysis."""
+        return self.circle if self.regression is None else self.regression
+
 
 class Ack(Message):
     """The answer to a command, whose sequence number is `re`."""

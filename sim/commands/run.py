@@ -83,7 +83,7 @@ def _launch(
     launched.check()
     # The noise, the plan and the pushes are checked here; coordinator and world read them again.
     settings.choice().of(robot)
-    motions.chosen()
+    plan = motions.chosen()
     settings.pushes_on(robot)
     config = LaunchConfig(
         robot_file=settings.robot,
@@ -97,6 +97,7 @@ def _launch(
         processes=launched.processes,
         pushes=tuple(settings.push or ()),
         imu_rate_hz=settings.imu_rate_hz,
+        agent_options=("--imu", plan.imu),
         # The robot ends with this run, so that there is nothing to resume.
         coordinator_options=("--no-advise", *coordinator_options, *motions.arguments()),
         out=launched.new_folder(robot),

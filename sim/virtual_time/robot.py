@@ -61,9 +61,9 @@ class _Wires:
 
 
 @contextmanager
-def virtual_robot(settings: VirtualSettings) -> "Iterator[VirtualRobot]":
-    """Yield a robot in a loop of its own; both end with the context."""
-    robot = VirtualRobot(settings, VirtualLoop())
+def virtual_robot(settings: VirtualSettings, **firmware: Any) -> "Iterator[VirtualRobot]":
+    """Yield a robot in a loop of its own, see `VirtualRobot`; both end with the context."""
+    robot = VirtualRobot(settings, VirtualLoop(), **firmware)
     try:
         yield robot
     finally:

@@ -71,7 +71,7 @@ def run_virtual(
         pushes=config.pushes,
         imu_rate_hz=config.imu_rate_hz,
     )
-    with virtual_robot(settings) as robot:
+    with virtual_robot(settings, imu=config.plan.imu) as robot:
         run = Run(
             RunConfig(
                 robot=config.robot.name,

@@ -35,7 +35,7 @@ def record_session(
     """
     recorder = _MemoryRecorder(plan)
     recording = recorder.recording
-    with virtual_robot(settings) as robot:
+    with virtual_robot(settings, imu=plan.imu) as robot:
         name, loop = settings.robot.name, robot.loop
         endpoint = robot.endpoint(COORDINATOR)
         messenger = Messenger(endpoint, name, lambda: loop.now_ns, loop.call_soon, recording.accept)

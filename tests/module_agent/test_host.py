@@ -86,6 +86,21 @@ def test_a_module_finds_the_circle_of_another_joint_through_a_network_that_loses
     assert estimates_of[BASE][1].circle is None
 
 
+def test_a_module_that_knows_its_imu_to_be_calibrated_claims_a_closer_distance(
+    rigs: Callable[..., Any],
+) -> None:
+    sigma_m = []
+    for imu in ("uncalibrated", "calibrated"):
+        rig = rigs(ARM, lifetime_ns=500_000_000, imu=imu)
+        _, recording, group = rig.group()
+        rig.run(_explore(group, BASE))
+        fit = list(recording.estimates[BASE, TIP].values())[-1].regression
+        assert abs(fit.distance_m - 0.171) < 4.0 * fit.sigma_distance_m + 3e-4
+        sigma_m.append(fit.sigma_distance_m)
+    # One is left with 1 % of the scale of its accelerometer, the other with noise and bias.
+    assert sigma_m[1] < 0.5 * sigma_m[0]
+
+
 def test_a_motion_of_a_single_tick_does_not_end_the_agents(rigs: Callable[..., Any]) -> None:
     rig = rigs(ARM)
     _, recording, group = rig.group()

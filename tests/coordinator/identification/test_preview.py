@@ -61,6 +61,7 @@ class Seen(Recording):
             moved=moved,
             rate_ratio=float(moved),
             circle=circle,
+            best=circle,
             motion_ids=(2,),
         )
 

@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coordinator.kinematics.chain_observations import circle_observation, jacobian, pack, predict, residuals
+from coordinator.kinematics.chain_observations import (
+    circle_observation,
+    jacobian,
+    joint_observation,
+    pack,
+    predict,
+    residuals,
+)
 from module_agent.model.perturbation import apply_perturbation
-from module_agent.wire.messages import CircleEstimate, Estimate
+from module_agent.wire.messages import CircleEstimate, Estimate, RegressionEstimate
 
 CIRCLE = CircleEstimate(
     axis=(0.0, 0.0, 1.0),
@@ -50,6 +57,30 @@ def test_a_circle_is_believed_as_far_as_it_claims() -> None:
 
 def test_without_a_circle_there_is_nothing_to_observe() -> None:
     assert circle_observation(estimate(None), Q_RAD) is None
+
+
+def test_a_regression_is_preferred_to_a_circle() -> None:
+    known: dict[str, Any] = {"axis": (0.0, 0.0, 1.0), "radial_m": (0.350, 0.0, 0.0), "distance_m": 0.350}
+    none = (0.0, 0.0, 0.0)
+    regression = RegressionEstimate(
+        **known,
+        sigma_axis_rad=1e-4,
+        sigma_distance_m=2e-4,
+        covariance=(0.0,) * 21,
+        gravity_m_s2=none,
+        gyro_bias_rad_s=none,
+        accel_bias_m_s2=none,
+        compliance_s2=0.0,
+        delay_s=0.0,
+        base_shakes=False,
+        samples=200,
+    )
+    found = joint_observation(estimate(CIRCLE).model_copy(update={"regression": regression}), Q_RAD)
+    assert found is not None
+    assert (found.radial_m[0], found.sigma_distance_m) == (0.350, 2e-4)
+    by_circle = joint_observation(estimate(CIRCLE), Q_RAD)
+    assert by_circle is not None
+    assert by_circle.radial_m[0] == 0.353
 
 
 @pytest.mark.parametrize("rate_ratio", [0.98, 1.02])

@@ -74,7 +74,7 @@ class Reference:
 
 
 def _read(samples: list[SensorSample]) -> Array:
-    return np.array([s[-6:] for s in samples])
+    return np.array([s[-7:-1] for s in samples])
 
 
 def _moving(world: World, ticks: int, amplitude: float) -> Any:

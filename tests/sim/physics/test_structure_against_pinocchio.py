@@ -237,7 +237,7 @@ def test_seven_modules_imus_feel_what_an_exact_integration_of_the_whole_robot_sa
         samples = world.step(exact.pwm(k * TICK_S).tolist())
         if k in instants:
             felt = exact.felt(k * TICK_S, found.y[:, k // 4])
-            errors.append(np.array([s[-6:] for s in samples]) - felt)
+            errors.append(np.array([s[-7:-1] for s in samples]) - felt)
     world.close()
     q = found.y[exact.own]
     assert np.ptp(q, axis=1).max() > 0.5

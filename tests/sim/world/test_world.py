@@ -15,7 +15,7 @@ IDEAL_ARM = "a2085_03"
 
 
 def _imu(samples: list[SensorSample]) -> np.ndarray:
-    return np.array([s[-6:] for s in samples])
+    return np.array([s[-7:-1] for s in samples])
 
 
 def _waves(world: World, ticks: int, amplitude: float = 0.2) -> Iterator[list[SensorSample]]:
@@ -56,7 +56,7 @@ def test_the_imu_is_read_every_fourth_tick_at_the_instant_of_the_position() -> N
             read = trace[k - k % 4][i]
             assert sample.t_ns == module_time(world.sensors.clocks[i], k * 1_000_000)
             assert sample.imu_t_ns == read.t_ns
-            assert sample[-6:] == read[-6:]
+            assert sample[-7:-1] == read[-7:-1]
     assert world.modules[0].imu_period_ns == 4_000_000
     assert world.t_ns == 12_000_000
 
