@@ -16,7 +16,7 @@ from coordinator.batch_estimation.imu_intrinsics import beyond
 from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.torque_prediction import check_held_out
 from coordinator.identification.identified import HeldOutMotion, IdentificationError, Identified, Kinematics
-from coordinator.identification.inertia.agent_information import gathered
+from coordinator.identification.inertia.agent_information import answers
 from coordinator.identification.inertia.body_motion import Robot
 from coordinator.identification.inertia.inertia import find_inertia, without_terms
 from coordinator.identification.inertia.robot_bodies import robot_bodies
@@ -89,7 +89,7 @@ def identify(
         covariance = kinematics.fit.covariance
         robot = Robot(chain, types, kinematics.refinement, covariance, floor, recording.torque)
         windows = dynamic_windows(recording, clocks, serials, "dynamic")
-        inertia = find_inertia(robot, windows, lambda own: gathered(recording, chain, clocks, own))
+        inertia = find_inertia(robot, windows, answers(recording, chain, clocks))
         estimate = inertia.instrumental
         bodies = robot_bodies(
             estimate.information, chain, types, estimate.fit, INDEPENDENT_FRACTION, inertia.effects

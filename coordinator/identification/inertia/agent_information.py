@@ -1,7 +1,8 @@
 """The information that agents gathered from their own torques: request, collect and check it.
 
 A module's answer replaces the coordinator's rows of its joint if it is complete, of the boot that measured
-the rows, and computed with the same chain and clocks. Otherwise the coordinator's rows are used.
+the rows, computed with the same chain and clocks, and agrees with those rows along a random direction.
+Otherwise the coordinator's rows are used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,7 @@ from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import ModuleRecord, Recording
 from coordinator.synchronisation.motion_windows import STEP_NS, span, window
 from coordinator.synchronisation.round_trips import map_clocks
-from module_agent.model.chain import Chain
+from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.signals.clock_map import ClockMap
@@ -29,15 +30,39 @@ AGREES_BELOW = 1e-10
 _SPARE_NS = 100_000_000
 
 
-class AgentInformation(NamedTuple):
-    """The information of n joints, and who gathered it.
+class Answers(NamedTuple):
+    """The agents' information by joint, and the reasons why some have none."""
 
-    by_agents: serials whose information is the module's own. difference: the largest relative difference
-    between an agent's and the coordinator's information of a joint; None without any answer. note: why some
-    are not the agents'; empty if all are or no agent was asked.
+    joints: Mapping[int, JointInformation]
+    reasons: tuple[str, ...]
+
+
+class Products(NamedTuple):
+    """Of a joint's rows A (m, p) and torques tau (m,): A^T A d with d of `direction`, A^T tau, |tau|^2, m."""
+
+    along: Array
+    target: Array
+    square: Array
+    samples: int
+
+    def plus(self, other: "Products") -> "Products":
+        """Return the products of both stretches of samples."""
+        return Products(
+            self.along + other.along,
+            self.target + other.target,
+            self.square + other.square,
+            self.samples + other.samples,
+        )
+
+
+class AgentInformation(NamedTuple):
+    """Who gathered the information of the joints.
+
+    by_agents: serials whose information is the module's own. difference: the largest relative difference of
+    an agent's information from the coordinator's rows; None without any answer. note: why some are not the
+    agents'; empty if all are or no agent was asked.
     """
 
-    joints: tuple[JointInformation, ...]
     by_agents: tuple[str, ...]
     difference: float | None
     note: str
@@ -98,50 +123,57 @@ def question(
     )
 
 
-def gathered(
-    recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap], own: Sequence[JointInformation]
-) -> AgentInformation:
-    """Return the agents' information where they have answered, else the coordinator's `own`, joint by joint.
-
-    If the coordinator's own rows have further columns than the agents', the two are compared in the columns
-    that both have, and the own rows are used.
-    """
+def answers(recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap]) -> Answers:
+    """Return the agents' complete answers to a request with this chain and these clocks."""
     digest, why = _asked(recording, chain, clocks)
     if digest is None:
-        return AgentInformation(tuple(own), (), None, why)
-    joints, by_agents, apart, reasons = list(own), list[str](), list[float](), list[str]()
+        return Answers({}, (why,) if why else ())
+    joints, reasons = dict[int, JointInformation](), list[str]()
     for k, serial in enumerate(chain.serials):
         try:
-            theirs = _answer(recording.modules[serial], digest)
+            joints[k] = _answer(recording.modules[serial], digest)
         except DataError as error:
             reasons.append(f"{serial}: {error}")
-            continue
-        apart.append(difference(theirs, own[k]))
-        if apart[-1] > AGREES_BELOW:
-            reasons.append(f"{serial}: its own differs by {apart[-1]:.1e}")
-        elif theirs.r.shape[1] == own[k].r.shape[1]:
-            joints[k] = theirs
-            by_agents.append(serial)
-    note = f"torques by the rows of the coordinator, not the agent: {'; '.join(reasons)}" if reasons else ""
-    return AgentInformation(tuple(joints), tuple(by_agents), max(apart, default=None), note)
+    return Answers(joints, tuple(reasons))
 
 
-def difference(one: JointInformation, other: JointInformation) -> float:
-    """Return the relative difference of two pieces of information in the columns that both have.
+def direction(columns: int) -> Array:
+    """Return the direction (columns,) along which answers are compared with the coordinator's rows."""
+    return np.random.default_rng(0).standard_normal(columns)
 
-    R^T R, R^T z and |tau|^2 are compared; the rows themselves are unique up to their signs only.
+
+def products(rows: Array, tau_nm: Array) -> Products:
+    """Return the products of the rows (m, p) of a joint and its torques (m,)."""
+    square = np.array([tau_nm @ tau_nm])
+    along = rows.T @ (rows @ direction(rows.shape[1]))
+    return Products(along, rows.T @ tau_nm, square, len(tau_nm))
+
+
+def difference(answer: JointInformation, own: Products) -> float:
+    """Return the relative difference of an answer from the rows that it should be the factor of.
+
+    A^T A d for one random d tells two different A^T A apart but for rounding (Freivalds, 1977), at the cost
+    of two products with the rows in place of their QR.
     """
-    if one.samples != other.samples:
+    if answer.samples != own.samples or answer.r.shape[1] != len(own.target):
         return float("inf")
-    both = min(one.r.shape[1], other.r.shape[1])
-    products = [
-        (i.r[:, :both].T @ i.r[:, :both], i.r[:, :both].T @ i.z, np.array([i.z @ i.z + i.rest]))
-        for i in (one, other)
-    ]
-    return max(
-        float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), 1e-300)
-        for a, b in zip(*products, strict=True)
-    )
+    r, z = answer.r, answer.z
+    theirs = (r.T @ (r @ direction(r.shape[1])), r.T @ z, np.array([z @ z + answer.rest]))
+    pairs = zip(theirs, own[:3], strict=True)
+    return max(float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), 1e-300) for a, b in pairs)
+
+
+def compared(
+    asked: Answers, own: Mapping[int, Products], serials: Sequence[str]
+) -> tuple[dict[int, JointInformation], AgentInformation]:
+    """Return the answers that agree with the coordinator's rows by joint, and a report."""
+    apart = {k: difference(answer, own[k]) for k, answer in asked.joints.items()}
+    good = {k: asked.joints[k] for k, value in apart.items() if value <= AGREES_BELOW}
+    reasons = list(asked.reasons)
+    reasons += [f"{serials[k]}: its own differs by {apart[k]:.1e}" for k in apart if k not in good]
+    note = f"torques by the rows of the coordinator, not the agent: {'; '.join(reasons)}" if reasons else ""
+    by_agents = tuple(serials[k] for k in sorted(good))
+    return good, AgentInformation(by_agents, max(apart.values(), default=None), note)
 
 
 def _asked(recording: Recording, chain: Chain, clocks: Mapping[str, ClockMap]) -> tuple[bytes | None, str]:

@@ -5,7 +5,7 @@ base and the compliance of the links; additionally the residual of every IMU. Th
 residual is used.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import reduce
 from typing import NamedTuple, get_args
 
@@ -15,7 +15,13 @@ from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.dynamics.body_regressor import track_regressor
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
-from coordinator.identification.inertia.agent_information import AgentInformation
+from coordinator.identification.inertia.agent_information import (
+    AgentInformation,
+    Answers,
+    Products,
+    compared,
+    products,
+)
 from coordinator.identification.inertia.body_motion import MotionSource, Robot, body_motion_tracks, readings
 from coordinator.parameter_fit.instrumental_variables import (
     InstrumentalFit,
@@ -49,8 +55,6 @@ _SHOWN: dict[Term, tuple[str, str, float]] = {
     "viscous": ("viscous friction", "Nm s/rad", 1.0),
     "coulomb": ("Coulomb friction", "Nm", 1.0),
 }
-
-Agents = Callable[[tuple[JointInformation, ...]], AgentInformation]
 
 
 class Inertia(NamedTuple):
@@ -89,28 +93,25 @@ class Inertia(NamedTuple):
         return float(np.exp(_level(self.noise_nm["encoders"]) - _level(self.noise_nm[self.motion_source])))
 
 
-def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None = None) -> Inertia:
+def find_inertia(robot: Robot, windows: Sequence[Window], asked: Answers | None = None) -> Inertia:
     """Identify the inertial parameters from windows of motion.
 
     Args:
         robot: chain, types and refinement.
         windows: stretches of motion without a gap.
-        agents: replaces the coordinator's rows from encoders by those that the modules have gathered; the
-            effects of the other motion sources are subtracted by the coordinator.
+        asked: the agents' answers, which replace the coordinator's rows from encoders where they agree with
+            them; the effects of the other motion sources are subtracted by the coordinator.
 
     Raises:
         DataError: too few samples, or motions that do not determine any inertia.
     """
+    by_encoders, shared = _by_encoders(robot, windows, asked)
     pieces = [_information(robot, one) for one in windows]
     prior = np.concatenate([parameters(one) for one in module_prior(robot.chain, robot.kinds)])
     fits: dict[MotionSource, InstrumentalFit] = {}
-    shared: AgentInformation | None = None
-    gathered: tuple[JointInformation, ...] = ()
     for source in MOTION_SOURCES:
-        total = reduce(merge, (piece[source] for piece in pieces))
-        if source == "encoders":
-            shared = agents(total) if agents is not None else None
-            gathered = total = shared.joints if shared is not None else total
+        own = source == "encoders"
+        total = by_encoders if own else reduce(merge, (piece[source] for piece in pieces))
         scale_sigma = SCALE_SIGMA[robot.torque]
         fits[source] = solve_instrumental_variables(total, prior, INDEPENDENT_FRACTION, scale_sigma)
     noise = {source: fit.fit.torque_sigma_nm for source, fit in fits.items()}
@@ -118,7 +119,7 @@ def find_inertia(robot: Robot, windows: Sequence[Window], agents: Agents | None 
     for source in MOTION_SOURCES[1:]:
         if _level(noise[source]) < _level(noise[best]) - BETTER_BY:
             best = source
-    chosen, effects = _considered(robot, windows, gathered, fits[best], best)
+    chosen, effects = _considered(robot, windows, by_encoders, fits[best], best)
     return Inertia(chosen, best, noise, effects, shared)
 
 
@@ -139,9 +140,35 @@ def _encoder_rows(robot: Robot, one: Window) -> tuple[JointMotion, Array, Array]
     return motion, rigid, np.concatenate([rigid, terms], axis=2)
 
 
+def _by_encoders(
+    robot: Robot, windows: Sequence[Window], asked: Answers | None
+) -> tuple[tuple[JointInformation, ...], AgentInformation | None]:
+    """Return the information from encoders: the agents', where it agrees with the rows, or from the rows."""
+    good: dict[int, JointInformation] = {}
+    shared: AgentInformation | None = None
+    if asked is not None:
+        probed: dict[int, Products] = {}
+        for one in windows if asked.joints else ():
+            motion, _, rows = _encoder_rows(robot, one)
+            for k in asked.joints:
+                part = products(rows[:, k], motion.tau_nm[:, k])
+                probed[k] = probed[k].plus(part) if k in probed else part
+        good, shared = compared(asked, probed, robot.chain.serials)
+    missing = [k for k in range(len(robot.kinds)) if k not in good]
+    if missing:
+        parts: list[tuple[JointInformation, ...]] = []
+        for one in windows:
+            motion, _, rows = _encoder_rows(robot, one)
+            parts.append(compress(rows[:, missing], motion.tau_nm[:, missing]))
+        own = reduce(merge, parts)
+        good |= dict(zip(missing, own, strict=True))
+    return tuple(good[k] for k in range(len(robot.kinds))), shared
+
+
 def _information(robot: Robot, one: Window) -> dict[MotionSource, tuple[JointInformation, ...]]:
+    """Return a window's information from every motion source but the encoders."""
     motion, rigid, rows = _encoder_rows(robot, one)
-    information = {MOTION_SOURCES[0]: compress(rows, motion.tau_nm)}
+    information = {}
     read = readings(one, robot.refined, DYNAMIC_CUTOFF_HZ)
     for source in MOTION_SOURCES[1:]:
         apart = _regressor(robot, read, source) - rigid
