@@ -1,6 +1,6 @@
 """The parts of a benchmark: cases, their trials, and the rows computed from the trials' results."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 from zlib import crc32
 
@@ -30,18 +30,26 @@ class Summary(NamedTuple):
     """What follows from the trials of a case.
 
     sigmas_off: |error| / claimed sigma of every interval that was claimed, for the coverage over all cases.
+    over_bound: |error| / its least standard deviation by the physical limit, by what was measured where; a
+        case has too few for a bar, all cases together have not.
     """
 
     rows: Sequence[Row]
     sigmas_off: Sequence[float] = ()
+    over_bound: Mapping[str, Sequence[float]] = {}
 
 
 class Case(NamedTuple):
-    """Trials that belong together; `summarise` is given the results of those that did not fail, in order."""
+    """Trials that belong together; `summarise` is given the results of those that did not fail, in order.
+
+    profile: the noise profile of its robots. known: what the estimators know beforehand.
+    """
 
     name: str
     trials: Sequence[Trial]
     summarise: Callable[[Sequence[Any]], Summary]
+    profile: str = ""
+    known: str = ""
 
 
 class CaseResult(NamedTuple):
@@ -59,7 +67,10 @@ def concluded(case: Case, results: Sequence[Any], cpu_s: float = 0.0) -> CaseRes
     failures = tuple(result.text for result in results if isinstance(result, Failed))
     summary = case.summarise([result for result in results if not isinstance(result, Failed)])
     failed = [Row(f"trials that failed, of {len(results)}", float(len(failures)), 0.0)] if failures else []
-    rows = [row._replace(case=case.name) for row in (*failed, *summary.rows)]
+    rows = [
+        row._replace(case=case.name, profile=case.profile, known=case.known)
+        for row in (*failed, *summary.rows)
+    ]
     return CaseResult(case.name, len(results), summary._replace(rows=rows), failures, cpu_s)
 
 

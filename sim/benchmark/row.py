@@ -5,7 +5,6 @@ from math import isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaincinv
 
 # A range of per cent in which the share of 95 % intervals that cover must lie.
 COVERAGE = (92.0, 98.0)
@@ -13,7 +12,7 @@ COVERAGE = (92.0, 98.0)
 FEW_INTERVALS = 200
 SIGMAS_95 = 1.96
 _SIGMAS_99 = 2.58
-# The trials of a case that the bars of means are meant for.
+# Ratios of errors have a bar from so many trials on.
 ENOUGH_TRIALS = 13
 
 Limit = float | tuple[float, float] | None
@@ -23,7 +22,7 @@ class Row(NamedTuple):
     """A figure of a case; None where there is none.
 
     limit: what `ours` must not exceed, or a range that it must lie in; None for a figure without a bar.
-    case: filled in when the trials of a case are concluded.
+    case, profile, known: as of `Case`, filled in when its trials are concluded.
     """
 
     figure: str
@@ -32,6 +31,8 @@ class Row(NamedTuple):
     thesis: float | None = None
     bound: float | None = None
     case: str = ""
+    profile: str = ""
+    known: str = ""
 
     @property
     def holds(self) -> bool | None:
@@ -46,7 +47,8 @@ class Row(NamedTuple):
     def plain(self) -> dict[str, object]:
         """Return the row as it stands in JSON."""
         figures = {name: _finite(getattr(self, name)) for name in ("thesis", "ours", "bound")}
-        return {"case": self.case, "figure": self.figure, **figures, "limit": self.limit, "holds": self.holds}
+        about = {name: getattr(self, name) for name in ("case", "profile", "known", "figure")}
+        return {**about, **figures, "limit": self.limit, "holds": self.holds}
 
 
 def _finite(value: float | None) -> float | None:
@@ -85,18 +87,6 @@ def scaled(value: float | None, factor: float) -> float | None:
 def count(figure: str, hits: Sequence[bool]) -> Row:
     """Return a row that counts what must never happen, with a bar of 0; None without any trial."""
     return Row(f"{figure}, of {len(hits)}", float(sum(hits)) if hits else None, 0.0)
-
-
-def for_few(limit: float | None, trials: int) -> float | None:
-    """Return the bar of a mean or rms over fewer trials than it is meant for: wider, by what chance does.
-
-    The rms of n Gaussian errors exceeds sigma sqrt(chi2(n) / n) in one of 200 cases; the bar grows as that
-    does from `ENOUGH_TRIALS` down to n.
-    """
-    if limit is None or not 0 < trials < ENOUGH_TRIALS:
-        return limit
-    few, enough = (sqrt(2.0 * float(gammaincinv(0.5 * n, 0.995)) / n) for n in (trials, ENOUGH_TRIALS))
-    return limit * few / enough
 
 
 def coverage(sigmas_off: Sequence[float]) -> Row:

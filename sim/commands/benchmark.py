@@ -166,7 +166,7 @@ _OUTCOMES = {None: "", True: "[green]holds[/]", False: "[bold red]MISSED[/]"}
 
 
 def table(rows: Sequence[Row], title: str) -> Table:
-    """Return the rows, every case with its name once."""
+    """Return the rows, every case with its name, profile and knowledge once."""
     columns = "case | figure | >thesis | >ours | >bound | >bar | "
     shown = new_table(title, columns, title_justify="left")
     before = ""
@@ -175,10 +175,14 @@ def table(rows: Sequence[Row], title: str) -> Table:
             shown.add_section()
         cells = (_number(row.thesis), _number(row.ours), _number(row.bound), _bar(row.limit))
         # Units stand in brackets, which are markup to rich.
-        name = escape(row.case) if row.case != before else ""
+        name = escape(_about(row)) if row.case != before else ""
         shown.add_row(name, escape(row.figure), *cells, _OUTCOMES[row.holds])
         before = row.case
     return shown
+
+
+def _about(row: Row) -> str:
+    return f"{row.case}\n  {row.profile}; known: {row.known}" if row.profile else row.case
 
 
 def _bar(limit: Limit) -> str:

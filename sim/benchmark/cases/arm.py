@@ -20,24 +20,23 @@ from coordinator.recording.recording import Recording
 from module_agent.model.catalogue import ImuKind
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import RobotError
-from module_agent.model.perturbation import apply_perturbation
+from module_agent.model.imu_prior import IMU_PRIORS
 from module_agent.network_emulation.profile_file import network as named_network
 from module_agent.signals.clock_map import ClockMap
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
-from sim.benchmark.row import Row, count, for_few, largest, mean_abs, rms, scaled
+from sim.benchmark.chain_bound import Bounds, chain_bounds, tip_bound
+from sim.benchmark.row import Row, count, largest, mean_abs, ratio, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.robot.variants import at_random_site
 from sim.scoring.chain_score import LinkErrors, link_errors, tip_errors, topology_differences
-from sim.scoring.gauge_alignment import tip_error
 from sim.sensors.module_clock import ModuleClock, module_time
 from sim.thesis.circle_chain import thesis_chain
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.session import record_session
+from sim.world.truth import Motion
 
-# The rms over so many draws scatters by some 15 %, more poses would not make it less.
-BOUND_DRAWS, BOUND_POSES = 24, 100
 # Instants of a session at which the clocks' maps are compared with one another.
 INSTANTS = 200
 
@@ -45,7 +44,7 @@ INSTANTS = 200
 class ArmLink(NamedTuple):
     """The errors of one true link, by our chain and by the thesis'; None where a chain has no such link.
 
-    sigma_m: as claimed for our length. bound_m: what it would be if there were the sensors' noise alone.
+    sigma_m: as claimed for our length. bound_m: the least that it can be (`chain_bounds`, Bayesian).
     """
 
     ours: LinkErrors | None
@@ -70,10 +69,11 @@ class ArmTrial(NamedTuple):
     """The result of one trial; of one that failed only the first five fields are set.
 
     why: the reason for a failure, empty without one. differences: errors of the topology, described; tips are
-    not compared then. tip_bound: errors expected from the sensors' noise alone (Cramer-Rao, by the curvature
-    of the fit at its residual noise). identify_s: processor time from the recording to the chain.
-    clock_error_s: root mean square, over modules and times, of the differences between the modules' mapped
-    clocks; clock_sigma_s: as claimed.
+    not compared then. tip_bound, strict_tip_bound: the least errors that the recording allows, with the
+    estimator's priors and without any (`chain_bounds`); None without pinocchio, the latter also if priors
+    alone resolve a direction. identify_s: processor time from the recording to the chain. clock_error_s: root
+    mean square, over modules and times, of the differences between the modules' mapped clocks; clock_sigma_s:
+    as claimed.
     """
 
     network: str
@@ -86,6 +86,7 @@ class ArmTrial(NamedTuple):
     tip: TipErrors | None = None
     thesis_tip: TipErrors | None = None
     tip_bound: TipErrors | None = None
+    strict_tip_bound: TipErrors | None = None
     robot_time_s: float = 0.0
     identify_s: float = 0.0
     clock_error_s: float | None = None
@@ -120,18 +121,22 @@ def arm_trial(
     settings = VirtualSettings(described, named_network(network), seed, profile)
     begun = ArmTrial(network, mode, seed, len(described.modules), "")
     clocks: dict[str, ModuleClock] = {}
+    motions: list[Motion] = []
 
-    def keep_clocks(simulated: VirtualRobot) -> None:
+    def keep_truth(simulated: VirtualRobot) -> None:
         clocks.update(zip(simulated.serials, simulated.world.sensors.clocks, strict=True))
+        motions.append(simulated.truth.motion())
 
     try:
-        recording = record_session(settings, plan or arm_plan(mode, imu_kind(profile)), keep_clocks)
+        recording = record_session(settings, plan or arm_plan(mode, imu_kind(profile)), keep_truth)
         start_s = time.process_time()
         kinematics = identify_kinematics(recording)
         begun = begun._replace(identify_s=time.process_time() - start_s)
     except RobotError as error:
         return begun._replace(why=str(error))
-    return _scored(begun, true_chain(described), recording, kinematics, clocks)
+    truth, types = true_chain(described), [module.type for module in described.modules]
+    bounds = chain_bounds(truth, types, motions[0], profile, IMU_PRIORS[recording.imu])
+    return _scored(begun, truth, recording, kinematics, clocks, bounds)
 
 
 def arm_plan(mode: Mode, imu: ImuKind, motions: Motions | None = None) -> Plan:
@@ -146,16 +151,24 @@ def _scored(
     recording: Recording,
     kinematics: Kinematics,
     clocks: Mapping[str, ModuleClock],
+    bounds: Bounds | None,
 ) -> ArmTrial:
     fit, first = kinematics.fit, thesis_chain(recording, kinematics.topology)
     differences = topology_differences(fit.chain, truth)
     time_s = float(np.ptp([event.t_ns for event in recording.journal])) * 1e-9
+    if bounds is not None:
+        bayesian, strict = bounds
+        begun = begun._replace(
+            tip_bound=TipErrors(*tip_bound(truth, bayesian)),
+            strict_tip_bound=TipErrors(*tip_bound(truth, strict))
+            if strict.null_basis.shape[1] == bayesian.null_basis.shape[1]
+            else None,
+        )
     return begun._replace(
         differences=tuple(differences),
-        links=_links(truth, kinematics, None if first is None else first.chain),
+        links=_links(truth, kinematics, None if first is None else first.chain, bounds),
         tip=None if differences else _tip(fit.chain, truth, fit.null_basis),
         thesis_tip=None if differences or first is None else _tip(first.chain, truth, first.null_basis),
-        tip_bound=expected_tip(fit.chain, kinematics.refinement.noise_covariance, begun.seed),
         robot_time_s=time_s,
         clock_error_s=clock_error_s(kinematics.clocks, clocks, time_s),
         clock_sigma_s=rms([1e-9 * clock.sigma_ns for clock in kinematics.clocks.values()]),
@@ -165,18 +178,6 @@ def _scored(
 def _tip(chain: Chain, truth: Chain, null_basis: Array) -> TipErrors:
     position_mm, orientation_deg = tip_errors(chain, truth, null_basis)
     return TipErrors(1e-3 * position_mm, orientation_deg)
-
-
-def expected_tip(chain: Chain, covariance: Array, seed: int) -> TipErrors:
-    """Return the tips' errors for a covariance (6 n, 6 n) of perturbations, by random draws."""
-    rng = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(covariance)
-    spread = vectors * np.sqrt(np.maximum(values, 0.0))
-    q = rng.uniform(-np.pi, np.pi, (BOUND_POSES, len(chain.serials)))
-    drawn = rng.standard_normal((BOUND_DRAWS, len(covariance)))
-    errors = [tip_error(apply_perturbation(chain, spread @ each), chain, q) for each in drawn]
-    squares = np.mean(np.square(errors), axis=0)
-    return TipErrors(float(np.sqrt(squares[0])), float(np.degrees(np.sqrt(squares[1]))))
 
 
 def clock_error_s(estimated: Mapping[str, ClockMap], true: Mapping[str, ModuleClock], end_s: float) -> float:
@@ -197,9 +198,11 @@ def clock_error_s(estimated: Mapping[str, ClockMap], true: Mapping[str, ModuleCl
     return float(np.sqrt(np.mean(np.square(1e-9 * (relative - relative.mean(axis=1, keepdims=True))))))
 
 
-def _links(truth: Chain, kinematics: Kinematics, thesis: Chain | None) -> tuple[ArmLink, ...]:
+def _links(
+    truth: Chain, kinematics: Kinematics, thesis: Chain | None, bounds: Bounds | None
+) -> tuple[ArmLink, ...]:
     fit = kinematics.fit
-    _, bounds = link_lengths(fit.chain, kinematics.refinement.noise_covariance)
+    least_m = None if bounds is None else link_lengths(truth, bounds.bayesian.covariance)[1]
     links = []
     for child, parent in enumerate(truth.parent):
         if parent < 0:
@@ -208,7 +211,8 @@ def _links(truth: Chain, kinematics: Kinematics, thesis: Chain | None) -> tuple[
         # A link that was not identified is not in our chain either.
         if ours is not None:
             own = fit.chain.serials.index(truth.serials[child])
-            sigma_m, bound_m = float(fit.link_length_sigma_m[own]), float(bounds[own])
+            sigma_m = float(fit.link_length_sigma_m[own])
+            bound_m = None if least_m is None else float(least_m[child])
         theirs = None if thesis is None else link_errors(thesis, truth, child)
         links.append(ArmLink(ours, theirs, sigma_m, bound_m))
     return tuple(links)
@@ -217,7 +221,11 @@ def _links(truth: Chain, kinematics: Kinematics, thesis: Chain | None) -> tuple[
 ARMS = ("a2085_04", "a2085_06", "arm7")
 WHOLE_ARM = COST_ARM = "a2085_06"
 PROFILES = ("x5", "x5-uncalibrated")
-TIP_MM = {"x5": 1.0, "x5-uncalibrated": 4.0}
+KNOWN: dict[ImuKind, str] = {"calibrated": "IMU scale and axes", "uncalibrated": "nothing"}
+TIP_MM = {"x5": 0.5, "x5-uncalibrated": 4.0}
+# Of motions that are shortened.
+SHORT_TIP_MM = {"x5": 1.0, "x5-uncalibrated": 4.0}
+LENGTHS, TIP = "link lengths of arms, x5", "tips of arms, x5"
 # Where the IMU's own axes are only known to a degree, no axis and no tip's orientation is known better.
 ANGLE_DEG = {"x5": 0.1, "x5-uncalibrated": None}
 JOINT_TIME_S, THESIS_JOINT_TIME_S = 10.0, 18.0
@@ -267,13 +275,13 @@ def _case(arm: str, noise: str, plan: Plan, trials: int, seed: int, shortened: b
         for own in trial_seeds(seed, arm, trials)
     ]
     name = f"{arm}, {noise}, {'joint by joint' if by_joint else 'all joints at once'}"
-    return Case(name, work, partial(_summary, arm, noise, plan.mode, shortened))
+    return Case(name, work, partial(_summary, arm, noise, plan.mode, shortened), noise, KNOWN[plan.imu])
 
 
 def _summary(arm: str, noise: str, mode: Mode, shortened: bool, trials: Sequence[ArmTrial]) -> Summary:
     """Return the rows of an arm; a trial that failed, or has another topology, is counted as wrong."""
     done = [trial for trial in trials if not trial.why]
-    rows = [wrong_row(trials), *_tip_rows(noise, trials), *_link_rows(noise, trials)]
+    rows = [wrong_row(trials), *_tip_rows(noise, shortened, trials), *_link_rows(noise, trials)]
     if mode == "simultaneous":
         spent = largest([trial.robot_time_s for trial in done])
         rows.append(Row("robot time in all, longest [s]", spent, WHOLE_TIME_S))
@@ -285,7 +293,15 @@ def _summary(arm: str, noise: str, mode: Mode, shortened: bool, trials: Sequence
     if mode == "joint" and arm == COST_ARM:
         took = median([trial.identify_s for trial in done]) if done else None
         rows.append(Row("refinement and all before it, median [s of a core]", took, REFINEMENT_S))
-    return Summary(rows, sigmas_off(trials))
+    return Summary(rows, sigmas_off(trials), _over_bound(trials) if noise == "x5" and not shortened else {})
+
+
+def _over_bound(trials: Sequence[ArmTrial]) -> dict[str, list[float]]:
+    """Return |error| over its least standard deviation, of links and tips; nothing without pinocchio."""
+    links = [link for trial in trials for link in trial.links]
+    lengths = [abs(e) / link.bound_m for link in links if (e := link.error_m) is not None and link.bound_m]
+    tips = [t.tip.position_m / t.tip_bound.position_m for t in trials if t.tip and t.tip_bound]
+    return {LENGTHS: lengths, TIP: tips} if tips else {}
 
 
 def sigmas_off(trials: Sequence[ArmTrial]) -> list[float]:
@@ -299,17 +315,21 @@ def wrong_row(trials: Sequence[ArmTrial]) -> Row:
     return count("runs without the right topology", [not trial.right for trial in trials])
 
 
-def _tip_rows(noise: str, trials: Sequence[ArmTrial]) -> list[Row]:
+def _tip_rows(noise: str, shortened: bool, trials: Sequence[ArmTrial]) -> list[Row]:
     rows = []
-    for figure, k, factor, limit in (
-        ("tip position, rms [mm]", 0, 1e3, TIP_MM[noise]),
-        ("tip orientation, rms [deg]", 1, 1.0, ANGLE_DEG[noise]),
+    for figure, k, unit, factor, limit in (
+        ("tip position", 0, "mm", 1e3, (SHORT_TIP_MM if shortened else TIP_MM)[noise]),
+        ("tip orientation", 1, "deg", 1.0, ANGLE_DEG[noise]),
     ):
-        ours, thesis, bound = (
+        ours, thesis, bound, strict = (
             rms([factor * tip[k] for trial in trials if (tip := getattr(trial, name)) is not None])
-            for name in ("tip", "thesis_tip", "tip_bound")
+            for name in ("tip", "thesis_tip", "tip_bound", "strict_tip_bound")
         )
-        rows.append(Row(figure, ours, for_few(limit, len(trials)), thesis, bound))
+        rows += [
+            Row(f"{figure}, rms [{unit}]", ours, limit, thesis, bound),
+            Row(f"{figure}, rms error over the bound with priors", ratio(ours, bound), bound=1.0),
+            Row(f"{figure}, rms error over the bound without priors", ratio(ours, strict), bound=1.0),
+        ]
     return rows
 
 

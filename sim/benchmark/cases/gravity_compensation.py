@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.torque_control.gravity_model import GravityModel
+from coordinator.identification.identify import identify
+from coordinator.torque_control.gravity_model import GravityModel, gravity_model_of_result
 from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
 from coordinator.torque_control.summary import CompensationSummary
 from module_agent.model.chain import Array, Chain
@@ -17,13 +18,15 @@ from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.read_only import read_only
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
+from sim.benchmark.cases.inertia import known_of, plan_of
 from sim.benchmark.row import Row, largest, ratio
-from sim.imperfections.noise_profile import NoiseProfile
+from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import at_random_site
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings, virtual_robot
 from sim.virtual_time.run import SilentScreen
+from sim.virtual_time.session import record_session
 from sim.world.external_force import Push
 
 COORDINATOR = "coordinator"
@@ -209,21 +212,32 @@ DRIFT_S, QUICK_DRIFT_S = 10.0, 3.0
 DRIFT_DEG, LIGHT = 2.0, 0.25
 # Seeds follow from this name, so that results stay comparable.
 _SEED_NAME = f"{ROBOT}, x5, floating, known without error"
-_COST_S, _QUICK_COST_S = 10.0, 5.0
+PROFILES = ("x5", "x5-uncalibrated")
+_COST_S, _QUICK_COST_S = 20.0, 10.0
 
 
 def compensation_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return the one case; `shortened`: of one pose, and for some seconds."""
+    """Return a case for each profile; `shortened`: of one pose, and for some seconds."""
     cost_s = _QUICK_COST_S if shortened else _COST_S
-    work = [Trial(compensated, (own, shortened), cost_s) for own in trial_seeds(seed, _SEED_NAME, trials)]
-    return [Case(f"{ROBOT}, x5, gravity compensation, true model", work, _summary)]
+    cases = []
+    for profile in PROFILES:
+        noise = noise_profile(profile)
+        work = [
+            Trial(compensated, (own, noise, shortened), cost_s)
+            for own in trial_seeds(seed, _SEED_NAME, trials)
+        ]
+        name, known = f"{ROBOT}, {profile}, gravity compensation", f"a run, {known_of(noise)}"
+        cases.append(Case(name, work, _summary, profile, known))
+    return cases
 
 
-def compensated(seed: int, shortened: bool) -> CompensationTrial:
-    """Compensate gravity with the true model: the remaining error is that of the modules themselves."""
+def compensated(seed: int, noise: NoiseProfile, shortened: bool) -> CompensationTrial:
+    """Identify a robot, and compensate its gravity by the result on another day."""
     robot = at_random_site(load_robot(ROBOT), seed)
+    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
+    weight = gravity_model_of_result(identify(record_session(settings, plan_of(noise, shortened))).result)
     drift_s, poses = (QUICK_DRIFT_S, POSES[1:2]) if shortened else (DRIFT_S, POSES)
-    return compensation_trial(seed, robot, true_weight(robot), "x5", drift_s, poses)
+    return compensation_trial(seed, robot, weight, noise, drift_s, poses)
 
 
 def _summary(trials: Sequence[CompensationTrial]) -> Summary:

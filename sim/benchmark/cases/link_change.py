@@ -172,7 +172,7 @@ def link_change_cases(changed: int, unchanged: int, seed: int, shortened: bool =
         plan, share = (AT_ONCE, _AT_ONCE_SHARE) if shortened else (None, 1.0)
         work.append(Trial(checks_of_one_robot, (tuple(changed_on), tuple(same), plan), share * cost_s))
     name = f"{ROBOT}, link change" + (", by all joints at once" if shortened else "")
-    return [Case(name, work, _summary)]
+    return [Case(name, work, _summary, NOISE, "a baseline run")]
 
 
 def checks_of_one_robot(changed: Sequence[int], unchanged: Sequence[int], plan: Plan | None = None) -> Checks:

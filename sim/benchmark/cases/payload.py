@@ -12,11 +12,11 @@ from coordinator.excitation.plan import Plan
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
-from sim.benchmark.cases.inertia import PLAN, QUICK_PLAN
+from sim.benchmark.cases.inertia import known_of, plan_of
 from sim.benchmark.cases.link_change import known_robot
 from sim.benchmark.row import Row, count, largest, scaled
 from sim.geometry.link_parts import FreePose
-from sim.imperfections.noise_profile import NoiseProfile
+from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import at_random_site, loaded
@@ -99,23 +99,28 @@ def _from_axis(chain: Chain, point_m: Array) -> Array:
 
 
 ROBOT = "a2085_06"
+PROFILES = ("x5", "x5-uncalibrated")
 MASS_PERCENT, COM_MM, MOTION_S = 3.0, 5.0, 15.0
 _COST_S, _QUICK_COST_S = 26.0, 15.0
 
 
 def payload_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return the case of a payload, and with more than one trial that of none."""
-    plan, cost_s = (QUICK_PLAN, _QUICK_COST_S) if shortened else (PLAN, _COST_S)
+    """Return the case of a payload under each profile, and with more than one trial that of none."""
+    cost_s = _QUICK_COST_S if shortened else _COST_S
 
-    def case(name: str, carries: bool, summarise: Callable[[Sequence[PayloadTrial]], Summary]) -> Case:
+    def case(
+        name: str, profile: str, carries: bool, rows: Callable[[Sequence[PayloadTrial]], Summary]
+    ) -> Case:
+        noise = noise_profile(profile)
         work = [
-            Trial(payload_trial, (ROBOT, "x5", own, plan, carries), cost_s)
+            Trial(payload_trial, (ROBOT, noise, own, plan_of(noise, shortened), carries), cost_s)
             for own in trial_seeds(seed, name, trials)
         ]
-        return Case(name, work, summarise)
+        label = name if profile == "x5" else f"{name}, {profile}"
+        return Case(label, work, rows, profile, f"a run without it, {known_of(noise)}")
 
-    cases = [case(f"{ROBOT}, payload of 0.2 kg", True, _loaded_rows)]
-    return cases if shortened else [*cases, case(f"{ROBOT}, no payload", False, _unloaded_rows)]
+    cases = [case(f"{ROBOT}, payload of 0.2 kg", profile, True, _loaded_rows) for profile in PROFILES]
+    return cases if shortened else [*cases, case(f"{ROBOT}, no payload", "x5", False, _unloaded_rows)]
 
 
 def _loaded_rows(trials: Sequence[PayloadTrial]) -> Summary:

@@ -18,6 +18,7 @@ from coordinator.merge.merge_runs import merge_runs
 from coordinator.recording.run_folder import INFORMATION
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
 from sim.benchmark.row import Row, largest
+from sim.imperfections.noise_profile import DEFAULT_PROFILE
 from sim.robot.robot_file import BASE, Robot, load_robot
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
@@ -112,7 +113,7 @@ def reassembly_cases(trials: int, seed: int) -> list[Case]:
     """Return the one case: an arm as it is, on a wall, and with its modules in another order."""
     name = f"{ROBOT}, three assemblies"
     work = [Trial(reassembly_in_folder, (own,), _COST_S) for own in trial_seeds(seed, name, trials)]
-    return [Case(name, work, _summary)]
+    return [Case(name, work, _summary, DEFAULT_PROFILE, "nothing")]
 
 
 def reassembly_in_folder(seed: int) -> Reassembly:

@@ -134,7 +134,7 @@ _REPEATS = 9
 def regressor_cases(seed: int) -> list[Case]:
     """Return the one case; it compares with pinocchio where that is installed."""
     name = f"regressor, {JOINTS} joints, {SAMPLES} samples"
-    return [Case(name, [Trial(regressor_trial, (seed, _REPEATS), 4.0)], _summary)]
+    return [Case(name, [Trial(regressor_trial, (seed, _REPEATS), 4.0)], _summary, "none", "the true model")]
 
 
 def _summary(trials: Sequence[RegressorTrial]) -> Summary:

@@ -18,7 +18,9 @@ _COUPLED = ((4, 5),)
 
 def recorded_cases(folder: Path) -> list[Case]:
     """Return the one case, of a Staubli TX40: `tx40.urdf` and `motion.npz` in a folder."""
-    return [Case("TX40, halves of the run", [Trial(fitted, (folder,), 6.0)], _summary)]
+    return [
+        Case("TX40, halves of the run", [Trial(fitted, (folder,), 6.0)], _summary, "a real arm", "its URDF")
+    ]
 
 
 def fitted(folder: Path) -> FitReport:

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 from coordinator.excitation.plan import Motions
 from sim.benchmark.case import Case, CaseResult
-from sim.benchmark.cases.arm import SHORTENED, arm_cases, arm_plan
+from sim.benchmark.cases.arm import LENGTHS, SHORTENED, TIP, arm_cases, arm_plan
 from sim.benchmark.cases.gravity_compensation import compensation_cases
 from sim.benchmark.cases.inertia import inertia_cases
-from sim.benchmark.cases.joint import joint_cases
+from sim.benchmark.cases.joint import LENGTH_OF_ONE, joint_cases
 from sim.benchmark.cases.link_change import link_change_cases
 from sim.benchmark.cases.monitoring import monitoring_cases
 from sim.benchmark.cases.network import network_cases
@@ -20,10 +20,13 @@ from sim.benchmark.cases.regressor import regressor_cases
 from sim.benchmark.cases.staubli_tx40 import recorded_cases
 from sim.benchmark.cases.topology import topology_cases
 from sim.benchmark.cases.torque_assistance import assistance_cases
-from sim.benchmark.row import Row, coverage
+from sim.benchmark.row import Row, coverage, rms
 
 KINEMATIC_TRIALS = 13
 ALL = "all cases"
+# The rms of errors over the physical limit; `Summary.over_bound`.
+# A whole arm's bound knows how its links give, and uses travel too.
+OVER_BOUND = {LENGTH_OF_ONE: 1.2, LENGTHS: 3.0, TIP: 3.0}
 
 
 class KinematicEffort(NamedTuple):
@@ -69,7 +72,17 @@ def chosen(cases: Sequence[Case], pattern: str) -> list[Case]:
 def over_all(results: Sequence[CaseResult]) -> list[Row]:
     """Return the rows over all cases; none if no case claimed an interval."""
     off = [value for result in results for value in result.summary.sigmas_off]
-    return [coverage(off)._replace(case=ALL)] if off else []
+    rows = [coverage(off)._replace(case=ALL)] if off else []
+    over: dict[str, list[float]] = {}
+    for result in results:
+        for what, values in result.summary.over_bound.items():
+            over.setdefault(what, []).extend(values)
+    return rows + [
+        Row(
+            f"{what}, rms error over the bound, of {len(values)}", rms(values), OVER_BOUND[what], bound=1.0
+        )._replace(case=ALL)
+        for what, values in over.items()
+    ]
 
 
 DYNAMIC_TRIALS = 5

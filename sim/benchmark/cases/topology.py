@@ -15,6 +15,7 @@ from coordinator.topology.topology import TopologyError
 from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network as named_network
 from sim.benchmark.case import Case, Summary, Trial
+from sim.benchmark.cases.arm import KNOWN
 from sim.benchmark.row import Row, count, largest
 from sim.robot.random_robot import random_robot
 from sim.robot.robot_tree import true_chain
@@ -86,7 +87,8 @@ def topology_cases(robots: int, seed: int, small: bool = False) -> list[Case]:
     first = robots * among * seed
     drawn = [range(first + among * number, first + among * (number + 1)) for number in range(robots)]
     work = [Trial(topology_trial, (_smallest(seeds),), _COST_S) for seeds in drawn]
-    return [Case(f"random robots, {NOISE}" + (f", the smallest of {AMONG}" if small else ""), work, _summary)]
+    name = f"random robots, {NOISE}" + (f", the smallest of {AMONG}" if small else "")
+    return [Case(name, work, _summary, NOISE, KNOWN["uncalibrated"])]
 
 
 def _smallest(seeds: Sequence[int]) -> int:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from sim.benchmark.case import Case, Summary, Trial
+from sim.benchmark.cases.arm import KNOWN
 from sim.benchmark.row import Row, count
 from sim.imperfections.noise_profile import noise_profile
 from sim.thesis.torque_assistance import identified_model, standing_robot
@@ -34,7 +35,8 @@ def assistance_cases(seed: int, shortened: bool = False) -> list[Case]:
         shares = [(robot, tuple(one for one in chosen if one.robot == robot)) for robot in robots_of(chosen)]
         work = [Trial(assistance_of_robot, (*share, seed, shortened), cost_s) for share in shares]
         name += ", true model" if shortened else ""
-        found.append(Case(name, work, partial(_summary, _limit(chosen[0]))))
+        known = "the true model" if shortened else KNOWN["calibrated"]
+        found.append(Case(name, work, partial(_summary, _limit(chosen[0])), NOISE, known))
     return found
 
 

@@ -2,19 +2,16 @@
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from sim.benchmark.row import (
     COVERAGE,
-    ENOUGH_TRIALS,
     FEW_INTERVALS,
     Row,
     count,
     coverage,
-    for_few,
     largest,
     mean_abs,
     ratio,
@@ -45,7 +42,9 @@ def test_a_bar_is_met_up_to_its_limit_and_missed_without_a_figure(
 
 def test_a_row_in_json_has_the_agreed_fields_and_no_number_that_json_lacks() -> None:
     found = Row("error [mm]", math.nan, 0.5, math.inf, 0.1, "arm").plain()
-    assert list(found) == ["case", "figure", "thesis", "ours", "bound", "limit", "holds"]
+    assert list(found) == [
+        *("case", "profile", "known", "figure", "thesis", "ours", "bound", "limit", "holds")
+    ]
     assert (found["thesis"], found["ours"], found["bound"], found["holds"]) == (None, None, 0.1, False)
 
 
@@ -77,25 +76,6 @@ def test_what_must_never_be_is_counted_and_of_no_cases_nothing_is_known() -> Non
     assert (found.figure, found.ours, found.holds) == ("wrong, of 3", 2.0, False)
     assert count("wrong", [False]).holds
     assert count("wrong", []).holds is False
-
-
-def test_a_bar_of_means_is_the_stated_one_from_thirteen_trials_on_and_wider_below() -> None:
-    assert for_few(0.5, ENOUGH_TRIALS) == for_few(0.5, 40) == 0.5
-    wider = [for_few(0.5, trials) for trials in range(1, ENOUGH_TRIALS + 1)]
-    assert all(few > more for few, more in pairwise(wider) if few and more)
-    assert for_few(None, 1) is None
-
-
-@pytest.mark.parametrize("trials", [1, 4])
-def test_an_rms_that_holds_over_thirteen_trials_holds_as_surely_over_fewer(trials: int) -> None:
-    """Of errors whose rms exceeds a bar in one of 200 cases, fewer exceed the wider bar as rarely."""
-    rng = np.random.default_rng(trials)
-    rms_of_many = np.sqrt(np.mean(rng.standard_normal((100_000, trials)) ** 2, axis=1))
-    bar = np.quantile(np.sqrt(np.mean(rng.standard_normal((100_000, ENOUGH_TRIALS)) ** 2, axis=1)), 0.995)
-    few = for_few(float(bar), trials)
-    assert few is not None
-    # 500 of 100 000 are expected, with a standard deviation of 22, and as much for the quantile.
-    assert 0.0040 < np.mean(rms_of_many > few) < 0.0060
 
 
 def test_honest_intervals_of_any_number_meet_the_bar_of_coverage_and_shy_or_bold_ones_do_not() -> None:

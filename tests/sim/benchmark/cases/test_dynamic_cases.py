@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from sim.benchmark.case import Case, Summary
-from sim.benchmark.cases.gravity_compensation import CompensationTrial
 from sim.benchmark.cases.inertia import InertiaTrial
 from sim.benchmark.cases.monitoring import Alarms, MonitoredSegments, MonitoringTrial
 from sim.benchmark.cases.payload import PayloadTrial
-from sim.benchmark.cases.reassembly import Reassembly
 from sim.benchmark.cases.regressor import RegressorTrial
 from sim.benchmark.cases.suites import DYNAMIC_TRIALS, QUICK_DYNAMICS, dynamic_cases, full_dynamics
 from sim.benchmark.row import Row
@@ -54,10 +52,9 @@ def inertia(**changed: Any) -> InertiaTrial:
     good: dict[str, Any] = {
         "rank": 36,
         "max_rank": 36,
-        "known": 12,
         "sigmas_off": (0.5, -1.0, 2.0),
-        "largest": (0.001, 0.002, 0.04),
-        "largest_sigma": (0.001, 0.002, 0.03),
+        "largest": (0.001, 0.002),
+        "largest_sigma": (0.001, 0.002),
         "held_out": 0.007,
         "with_true_chain": 0.0065,
         "thesis": 0.01,
@@ -65,24 +62,6 @@ def inertia(**changed: Any) -> InertiaTrial:
         "poses": 10,
     }
     return InertiaTrial("a2085_06", "x5", 0, "")._replace(**(good | changed))
-
-
-@pytest.mark.parametrize(
-    ("changed", "figure"),
-    [
-        ({"rank": 35}, "runs with fewer parameters than there are, of 1"),
-        ({"sigmas_off": (0.1, 3.4)}, "base parameters known to 10 %, beyond 3 sigma, of 2"),
-        ({"largest": (0.012, 0.0, 0.0)}, "largest ten, of those noise tells to 1 %: worst error [%]"),
-        ({"held_out": 0.031, "with_true_chain": 0.03, "bodies": 0.03}, "held-out torque, worst [%]"),
-        ({"with_true_chain": 0.005}, "the same over that with the true chain"),
-        ({"bodies": 0.0085}, "real bodies worse by [points]"),
-        ({"not_definite": 1}, "poses with a mass matrix that is not definite, of 10"),
-    ],
-)
-def test_each_bar_of_inertia_is_missed_by_what_it_is_about(changed: dict[str, Any], figure: str) -> None:
-    name = "a2085_06, x5, inertia"
-    assert missed(rows(name, inertia())) == []
-    assert missed(rows(name, inertia(**changed))) == [figure]
 
 
 def test_a_session_that_did_not_come_to_its_end_is_counted() -> None:
@@ -124,18 +103,6 @@ def test_without_pinocchio_only_our_own_cost_is_judged() -> None:
     ]
 
 
-def test_assemblies_that_tell_nothing_new_together_miss() -> None:
-    name = "a2085_03, three assemblies"
-    told = Reassembly(60, (15, 15, 15), 29, 0.7, (0.7, 0.7, 0.7), 1e-15, (1.0, 1.0, 1.0))
-    assert missed(rows(name, told)) == []
-    assert missed(rows(name, told._replace(rank_merged=15))) == [
-        "rank of the best alone less that of all merged"
-    ]
-    assert missed(rows(name, told._replace(difference=1e-9))) == [
-        "agents' information against the coordinator's [relative]"
-    ]
-
-
 def assisted(rms: tuple[float, float, float], unstable: str = "") -> Combination:
     nothing = np.empty((0, 1))
     first, second, third = (
@@ -160,38 +127,22 @@ def test_calculated_torque_must_help_where_it_is_stable() -> None:
     )
 
 
-def test_compensation_that_is_as_stiff_as_holding_misses() -> None:
-    name = "a2085_04, x5, gravity compensation, true model"
-    light = CompensationTrial(0.1, 10.0, 5.0, 0.1, 0.7, 8.0)
-    assert missed(rows(name, light)) == []
-    assert missed(rows(name, light._replace(drift_deg=3.0))) == ["drift without a hand, largest [deg]"]
-    assert missed(rows(name, light._replace(guiding_n=4.0))) == [
-        "the same over that of an arm held in position"
-    ]
-
-
 def monitored(**changed: Any) -> MonitoringTrial:
     good = MonitoringTrial("payload", "payload", True, 0.5, 1.5, 0.2, 0.01, 0, 20.0, ())
     return good._replace(**changed)
 
 
-def test_what_is_missed_misplaced_or_imagined_is_counted() -> None:
+def test_a_fifth_of_the_events_may_be_missed_and_of_few_none() -> None:
     (name,) = (name for name in CASES if name.endswith("monitored"))
     quiet = (Alarms(0, 3600.0),)
-    assert missed(rows(name, MonitoredSegments((monitored(),) * 13, quiet))) == []
-    wrong = (monitored(found="wear"), monitored(located=False), monitored(found="nothing")) + (
-        monitored(),
-    ) * 10
-    assert missed(rows(name, MonitoredSegments(wrong, quiet))) == []
-    more = (monitored(found="collision"),) * 7
-    assert missed(rows(name, MonitoredSegments(wrong + more, quiet))) == [
-        "payload: missed or misplaced, of 20"
-    ]
-    lavish = rows(name, MonitoredSegments((monitored(false_alarms=2),) * 13, quiet))
-    assert lavish["additional findings, in 13 trials"].ours == 26.0
-    assert missed(rows(name, MonitoredSegments((monitored(),) * 13, (Alarms(3, 3600.0),)))) == [
-        "false alarms, 95 % sure to be above [1/h]"
-    ]
+
+    def lost(missing: int, of: int) -> list[str]:
+        events = (monitored(found="nothing"),) * missing + (monitored(),) * (of - missing)
+        return missed(rows(name, MonitoredSegments(events, quiet)))
+
+    assert lost(2, 10) == []
+    assert lost(3, 10) == ["payload: missed or misplaced, of 10"]
+    assert lost(1, 1) == ["payload: missed or misplaced, of 1"]
 
 
 def test_every_case_is_named_once() -> None:

@@ -1,0 +1,126 @@
+"""The second model agrees with the first where it must, and its bound with another way to compute it."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coordinator.batch_estimation.imu_prediction import imu_readings
+from module_agent.model.chain import Array, Chain
+from module_agent.model.imu_prior import CALIBRATED
+from module_agent.model.perturbation import apply_perturbation
+from sim.benchmark.chain_bound import (
+    ChainBound,
+    ChainModel,
+    Slopes,
+    _without_motion,
+    available,
+    chain_bounds,
+    tip_bound,
+)
+from sim.imperfections.noise_profile import noise_profile
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
+from sim.world.truth import Motion
+
+pytestmark = pytest.mark.skipif(not available(), reason="pinocchio is not installed")
+
+STEP = 1e-6
+
+
+def readings(chain: Chain, *motion: Array) -> Array:
+    return np.concatenate(imu_readings(chain, *motion), axis=2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_readings_and_slopes_are_those_of_the_product_of_exponentials(robots: Any, seed: int) -> None:
+    chain, _ = robots.random(seed, joints=4)
+    motion = np.random.default_rng(seed).normal(size=(3, 20, 4))
+    model = ChainModel(chain)
+    np.testing.assert_allclose(model.readings(*motion), readings(chain, *motion), atol=1e-11)
+    found = model.slopes(list(motion), 0.01)
+
+    def slope(ahead: Array, behind: Array) -> Array:
+        return (ahead - behind) / (2.0 * STEP)
+
+    for k, unit in enumerate(STEP * np.eye(24)):
+        ahead, behind = (readings(apply_perturbation(chain, sign * unit), *motion) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(found.unknown[..., k], slope(ahead, behind), atol=1e-6)
+    for which, joint in np.ndindex(3, 4):
+        change = np.zeros_like(motion)
+        change[which, :, joint] = STEP
+        ahead, behind = (readings(chain, *(motion + sign * change)) for sign in (1.0, -1.0))
+        np.testing.assert_allclose(found[1 + which][..., joint], slope(ahead, behind), atol=1e-6)
+
+
+def test_eliminating_the_motion_in_bands_is_eliminating_it_at_once() -> None:
+    rng = np.random.default_rng(1)
+    samples, joints, unknowns, step_s = 12, 2, 5, 0.1
+    slopes = Slopes(*(rng.normal(size=(samples, joints, 6, k)) for k in (unknowns, joints, joints, joints)))
+    imu = rng.uniform(0.5, 1.0, (samples, joints, 6))
+    encoder = rng.uniform(0.01, 0.02, (samples, joints))
+    rows = []
+    for t in range(1, samples - 1):
+        by_motion = np.zeros((6 * joints, samples, joints))
+        speed, change = slopes.qd[t] / (2.0 * step_s), slopes.qdd[t] / step_s**2
+        parts = (change - speed, slopes.q[t] - 2.0 * change, change + speed)
+        for at, part in zip((t - 1, t, t + 1), parts, strict=True):
+            by_motion[:, at] = part.reshape(-1, joints)
+        full = np.hstack([slopes.unknown[t].reshape(-1, unknowns), by_motion.reshape(6 * joints, -1)])
+        rows.append(full / imu[t].reshape(-1, 1))
+    jacobian = np.vstack(rows)
+    information = jacobian.T @ jacobian
+    information[unknowns:, unknowns:] += np.diag(encoder.ravel() ** -2.0)
+    expected = np.linalg.inv(np.linalg.inv(information)[:unknowns, :unknowns])
+    np.testing.assert_allclose(_without_motion(slopes, imu, encoder, step_s), expected, rtol=1e-8, atol=1e-8)
+
+
+def swing(serials: tuple[str, ...], seconds: float) -> Motion:
+    t = np.arange(0.0, seconds, 0.004)
+    rates = 2.0 * np.pi * (0.4 + 0.17 * np.arange(len(serials)))
+    q, qd = 0.5 * np.sin(np.outer(t, rates)), 0.5 * rates * np.cos(np.outer(t, rates))
+    t_ns = np.round(1e9 * t).astype(np.int64)
+    return Motion(serials, t_ns, np.tile(t_ns[:, None], len(serials)), q, qd, np.zeros_like(q))
+
+
+def bounds_of(seconds: float, **changed: float) -> Any:
+    robot = load_robot("a2085_03")
+    profile = noise_profile("x5").model_copy(update=changed)
+    types = [module.type for module in robot.modules]
+    found = chain_bounds(true_chain(robot), types, swing(robot.serials, seconds), profile, CALIBRATED)
+    assert found is not None
+    return found
+
+
+def test_more_noise_and_less_motion_make_the_bound_larger() -> None:
+    chain = true_chain(load_robot("a2085_03"))
+    tips = [
+        tip_bound(chain, found.strict)[0]
+        for found in (
+            bounds_of(20.0),
+            bounds_of(5.0),
+            bounds_of(20.0, accel_white_m_s2=0.05, gyro_white_rad_s=3e-3),
+        )
+    ]
+    assert tips[1] > 1.5 * tips[0]
+    assert tips[2] > 2.0 * tips[0]
+
+
+def test_errors_that_the_profile_has_count_without_priors() -> None:
+    chain = true_chain(load_robot("a2085_03"))
+    known, scaled = bounds_of(20.0), bounds_of(20.0, accel_scale=0.01, gyro_scale=0.01)
+    assert tip_bound(chain, scaled.strict)[0] > 2.0 * tip_bound(chain, known.strict)[0]
+    np.testing.assert_allclose(scaled.bayesian.covariance, known.bayesian.covariance)
+
+
+def test_the_tips_bound_is_the_shift_that_a_covariance_allows() -> None:
+    chain = true_chain(load_robot("thesis_245_vertical"))
+    covariance = np.zeros((12, 12))
+    # The second module, which is the tip, may be 2 mm off along x and turned by nothing.
+    covariance[9, 9] = 4e-6
+    position_m, orientation_deg = tip_bound(chain, ChainBound(covariance, np.zeros((12, 0))))
+    assert position_m == pytest.approx(2e-3, rel=1e-6)
+    assert orientation_deg == pytest.approx(0.0, abs=1e-9)
+    # A chain that may be moved along x for nothing has no error there.
+    free = np.eye(12)[:, 9:10]
+    assert tip_bound(chain, ChainBound(covariance, free))[0] == pytest.approx(0.0, abs=1e-9)
