@@ -179,8 +179,9 @@ class ComplianceJacobian(NamedTuple):
 
 # One unit of compliance; that of a metre of light aluminium tube.
 UNIT_RAD_NM = 1e-4
-# Tubes of the manufacturer's kits have 1.2e-4 rad/Nm; anything ten times as soft is no link of a robot.
-COMPLIANCE_SIGMA = 5.0
+# The manufacturer's tubes bend by 1.2e-4 rad/Nm and twist by 3.6e-4 on 325 mm, 3.7e-4 and 11e-4 on a metre;
+# links of 400 Nm/rad give 25e-4. Such a prior costs stiff robots nothing: slow and fast motions tell.
+COMPLIANCE_SIGMA = 30.0
 
 
 def compliance_jacobian(
