@@ -17,9 +17,10 @@ GYRO_BIAS_SIGMA_RAD_S = 0.05
 # Bias instability within the minute between rest and motion. Data sheets of the class: 10 deg/h, which
 # is 0.05 mrad/s.
 GYRO_BIAS_DRIFT_RAD_S = 1e-4
-# 20 mg, data sheets of the class. A calibrated IMU keeps less (2 mg in a real X5-1's log), but gravity
-# and motion estimate the bias wherever they can: a prior that is too wide costs nothing there.
+# 20 mg, data sheets of the class; 2 mg after calibration, as in a real X5-1's log. It tilts gravity where an
+# IMU never turns, and with it all that hangs on that module.
 ACCEL_BIAS_SIGMA_M_S2 = 0.2
+CALIBRATED_ACCEL_BIAS_SIGMA_M_S2 = 0.02
 # Data sheets of the class: 0.1 deg/s per g. Calibrating scale and axes leaves it as it is.
 G_SENSITIVITY_SIGMA_S_M = 1.8e-4
 # A second-order Butterworth low-pass delays by 0.225 over its corner: 2.4 ms at 92 Hz, the setting below
@@ -65,7 +66,7 @@ class ImuPrior(NamedTuple):
 # -2.2 %), cross-axis sensitivity below 2 % = 1.1 deg.
 UNCALIBRATED = ImuPrior(scale=0.01, misalignment_rad=radians(1.0))
 # Calibrated on a rate table and by gravity: what is left of scale and axes is below what motions can measure.
-CALIBRATED = ImuPrior(scale=1e-4, misalignment_rad=1e-4)
+CALIBRATED = ImuPrior(scale=1e-4, misalignment_rad=1e-4, accel_bias_m_s2=CALIBRATED_ACCEL_BIAS_SIGMA_M_S2)
 # For motions that tell neither scale nor axes.
 BIASES_ONLY = ImuPrior(scale=0.0, misalignment_rad=0.0, delay_s=0.0, g_sensitivity_s_m=0.0)
 
