@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from coordinator.baseline.baseline_robot import BaselineRobot
-from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain
+from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain, with_placement
 from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, undone
 from coordinator.identification.robot_refinement import KEEP_EVERY, MAX_IMU_SAMPLES
 from coordinator.recording.journal import Purpose
@@ -51,7 +51,8 @@ def tied_fits(known: BaselineRobot, later: BaselineRobot) -> TiedFits:
     Raises:
         ValueError: a hole in a recording, or too few samples.
     """
-    chain, imus = known.chain, known.kinematics.refinement.intrinsics
+    refinement = known.kinematics.refinement
+    chain, imus = with_placement(known.chain, refinement.placement), refinement.intrinsics
     first, second = (_fit(chain, corrected(exploration(run, chain.serials), imus)) for run in (known, later))
     return TiedFits(first, second)
 

@@ -10,8 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from coordinator.batch_estimation.imu_intrinsics import ImuIntrinsics, mixing, perfect, read, slopes
+from coordinator.batch_estimation.imu_intrinsics import SIZE, ImuIntrinsics, mixing, read, slopes
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import ComplianceJacobian, rigid
@@ -49,6 +50,8 @@ class Refinement(NamedTuple):
         systematic errors, which two sessions with the same motions share.
     residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis.
     intrinsics: the IMUs' own errors; the prior's mean where no observation resolves them.
+    placement, placement_sigma: (n, 6) every IMU's turn [rad] and displacement [m] against its place by the
+        catalogue, in its own axes, and their standard deviations.
     compliance: of the links, in the order and units of `ComplianceJacobian`.
     late_s: delay common to all IMUs, in addition to their own delays in `intrinsics`.
     """
@@ -58,12 +61,14 @@ class Refinement(NamedTuple):
     residual_gyro_rad_s: Array
     residual_accel_m_s2: Array
     intrinsics: ImuIntrinsics
+    placement: Array
+    placement_sigma: Array
     compliance: Array
     late_s: float = 0.0
 
     @property
     def chain(self) -> Chain:
-        """The refined chain."""
+        """The refined chain, with the IMUs where the catalogue has them in their housings."""
         return self.estimate.chain
 
 
@@ -75,15 +80,30 @@ class _Problem(NamedTuple):
     flex: ComplianceJacobian
 
     @property
+    def sigmas(self) -> Array:
+        """The prior of an IMU's errors and of its placement."""
+        return np.concatenate([self.prior.sigmas, self.prior.placement_sigmas])
+
+    @property
     def free(self) -> Mask:
-        """Which of an IMU's errors are estimated."""
-        return self.prior.sigmas > 0.0
+        """Which of them are estimated."""
+        return self.sigmas > 0.0
 
 
 class _State(NamedTuple):
+    """Chain, every IMU's errors and placement (n, SIZE + 6), and the links' compliances."""
+
     chain: Chain
-    imus: ImuIntrinsics
+    own: Array
     compliance: Array
+
+    @property
+    def imus(self) -> ImuIntrinsics:
+        return ImuIntrinsics(self.own[:, :SIZE])
+
+    @property
+    def placement(self) -> Array:
+        return self.own[:, SIZE:]
 
 
 class _Expected(NamedTuple):
@@ -126,7 +146,7 @@ def refine_chain(
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
     problem = _Problem(data, prior, flex if flex is not None else rigid(count, len(data.q_rad)))
-    state = _State(chain, perfect(count), np.zeros(len(problem.flex.links)))
+    state = _State(chain, np.zeros((count, len(problem.sigmas))), np.zeros(len(problem.flex.links)))
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
     for used in range(1, ITERATIONS + 1):
@@ -149,13 +169,44 @@ def refine_chain(
     believed = [
         spread * _repeats(data, residual) for spread, residual in zip(white, expected.residuals, strict=True)
     ]
-    spectrum = _solve(_normal_equations(problem, state, expected, believed))[2]
+    normal = _normal_equations(problem, state, expected, believed)
+    spectrum = _solve(normal)[2]
+    placement_sigma = _placement_sigma(problem, normal, spectrum)
     by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
-    return _report(state, spectrum, by_noise, [_rms(residual) for residual in expected.residuals])
+    rms = [_rms(residual) for residual in expected.residuals]
+    return _report(state, spectrum, placement_sigma, by_noise, rms)
+
+
+def with_placement(chain: Chain, placement: Array) -> Chain:
+    """Return the chain with every IMU turned about itself and displaced, (n, 6) in its own axes.
+
+    Of `Refinement.placement` this is the chain that predicts the IMUs' readings.
+    """
+    if not placement.any():
+        return chain
+    moved = np.tile(np.eye(4), (len(placement), 1, 1))
+    moved[:, :3, :3] = Rotation.from_rotvec(placement[:, :3]).as_matrix()
+    moved[:, :3, 3] = placement[:, 3:]
+    return chain._replace(imu_home=frozen(chain.imu_home @ moved))
+
+
+def _placement_sigma(problem: _Problem, normal: _Normal, spectrum: "_Spectrum") -> Array:
+    """Return the standard deviations (n, 6) of the IMUs' placement; the prior's where it is not free."""
+    free = problem.prior.placement_sigmas > 0.0
+    size, count = int(problem.free.sum()), problem.data.q_rad.shape[1]
+    own = np.arange(len(normal.nuisance))[-count * size :].reshape(count, size)
+    wanted = own[:, size - int(free.sum()) :].ravel()
+    inverse = np.linalg.inv(normal.nuisance)[wanted]
+    kept = spectrum.vectors[:, spectrum.known] * spectrum.sigmas[spectrum.known]
+    by_poses = inverse @ (normal.cross.T @ kept)
+    variance = inverse[np.arange(len(wanted)), wanted] + (by_poses**2).sum(axis=1)
+    sigma = np.tile(problem.prior.placement_sigmas, (count, 1))
+    sigma[:, free] = np.sqrt(variance).reshape(count, -1)
+    return sigma
 
 
 def _expected(problem: _Problem, state: _State) -> _Expected:
-    data, chain, base = problem.data, state.chain, problem.data.base
+    data, chain, base = problem.data, with_placement(state.chain, state.placement), problem.data.base
     bodies = body_motions(chain, *data.smooth)
     shaken = None if base is None else body_motions(chain, *data.smooth, base)
     carried = readings_on(chain, body_motions(chain, *data.joints, base))
@@ -186,20 +237,24 @@ def _normal_equations(
     problem: _Problem, state: _State, expected: _Expected, sigmas: Sequence[Array]
 ) -> _Normal:
     """Build the weighted normal equations, IMU by IMU; the root stays."""
-    data, flex, free, ideal = problem.data, problem.flex, problem.free, expected.ideal
+    data, flex, ideal = problem.data, problem.flex, expected.ideal
+    free, placed = np.split(problem.free, [SIZE])
+    chain = with_placement(state.chain, state.placement)
     count, samples = len(state.chain.serials), len(data.q_rad)
     poses = 6 * count
     information, rhs = _before(problem, state)
     motion = np.zeros(samples, dtype=np.int64) if data.motion is None else data.motion
     for k in range(count):
-        jacobian = imu_jacobian(state.chain, expected.bodies, *data.smooth[:2], k)
-        true = mixing(state.imus, k) @ np.concatenate([jacobian.poses, jacobian.gravity, flex.slopes[..., k]])
+        jacobian, mixed = imu_jacobian(chain, expected.bodies, *data.smooth[:2], k), mixing(state.imus, k)
+        true = mixed @ np.concatenate([jacobian.poses, jacobian.gravity, flex.slopes[..., k]])
         rates = None if data.imu_rates is None else data.imu_rates[:, k]
         own = slopes(ideal.gyro_rad_s[:, k], ideal.accel_m_s2[:, k], rates, free)
         weight = 1.0 / np.repeat([sigma[:, k] for sigma in sigmas], 3, axis=0)[:, motion]
-        rows = (np.concatenate([true, own]) * weight).reshape(-1, 6 * samples)
+        rows = (np.concatenate([true, own, mixed @ jacobian.placement[placed]]) * weight).reshape(
+            -1, 6 * samples
+        )
         target = (np.concatenate([part[:, k] for part in expected.residuals], axis=1).T * weight).ravel()
-        at = _places(jacobian.modules, k, count, len(flex.links), int(free.sum()))
+        at = _places(jacobian.modules, k, count, len(flex.links), int(problem.free.sum()))
         information[np.ix_(at, at)] += rows @ rows.T
         rhs[at] += rows @ target
     nuisance = information[poses:, poses:]
@@ -209,14 +264,14 @@ def _normal_equations(
 
 
 def _before(problem: _Problem, state: _State) -> tuple[Array, Array]:
-    """Return the information on [perturbations (6 n), gravity (3), free IMU errors], and its right-hand side.
+    """Return the information on [perturbations (6 n), gravity (3), compliances, what is free of the IMUs].
 
     Gravity's magnitude makes the accelerometers' scales observable.
     """
     count, free, flex = len(state.chain.serials), problem.free, problem.flex
     nothing = np.zeros(6 * count + 3)
-    known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(problem.prior.sigmas[free] ** -2.0, count)])
-    held = np.concatenate([nothing, state.compliance + flex.taken, state.imus.errors[:, free].ravel()])
+    known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(problem.sigmas[free] ** -2.0, count)])
+    held = np.concatenate([nothing, state.compliance + flex.taken, state.own[:, free].ravel()])
     information, rhs = np.diag(known), -known * held
     size = float(np.linalg.norm(state.chain.gravity))
     up, at = state.chain.gravity / size, slice(6 * count, 6 * count + 3)
@@ -279,18 +334,24 @@ def _along_unknown(normal: _Normal, spectrum: _Spectrum) -> Array:
 
 
 def _moved(problem: _Problem, state: _State, step: Array, nuisance: Array) -> _State:
-    change = np.zeros_like(state.imus.errors)
+    change = np.zeros_like(state.own)
     links = 3 + len(state.compliance)
     change[:, problem.free] = nuisance[links:].reshape(len(change), -1)
     chain = apply_perturbation(state.chain, step)
     return _State(
         chain._replace(gravity=frozen(chain.gravity + nuisance[:3])),
-        ImuIntrinsics(state.imus.errors + change),
+        state.own + change,
         state.compliance + nuisance[3:links],
     )
 
 
-def _report(state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[Array]) -> Refinement:
+def _report(
+    state: _State,
+    spectrum: _Spectrum,
+    placement_sigma: Array,
+    by_noise: Array,
+    rms: Sequence[Array],
+) -> Refinement:
     known = spectrum.known
     kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
@@ -312,5 +373,7 @@ def _report(state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[A
         residual_gyro_rad_s=frozen(rms[0]),
         residual_accel_m_s2=frozen(rms[1]),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
+        placement=frozen(state.placement),
+        placement_sigma=frozen(placement_sigma),
         compliance=frozen(state.compliance),
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from coordinator.batch_estimation.imu_prediction import BodyMotion, acceleration_at, turned
 from module_agent.model.chain import Array, Chain
-from module_agent.model.perturbation import cross
+from module_agent.model.perturbation import cross, skew
 
 
 class ImuJacobian(NamedTuple):
@@ -21,12 +21,13 @@ class ImuJacobian(NamedTuple):
 
     modules: k modules on whose perturbations it depends, in the order of the chain. poses: (6 k, 6, m) slopes
     by the perturbations (`apply_perturbation`) of those modules. gravity: (3, 6, m) slopes by
-    `chain.gravity`.
+    `chain.gravity`. placement: (6, 6, m) slopes by the IMU's own turn and displacement in its own frame.
     """
 
     modules: tuple[int, ...]
     poses: Array
     gravity: Array
+    placement: Array
 
 
 class _Seen(NamedTuple):
@@ -62,7 +63,11 @@ def imu_jacobian(
     modules = tuple(sorted(poses))
     gravity = np.zeros((3, 6, samples))
     gravity[:, 3:] = seen.frame
-    return ImuJacobian(modules, np.concatenate([poses[joint] for joint in modules]), gravity)
+    turn, place = chain.imu_home[module, :3, :3], chain.imu_home[module, :3, 3]
+    # A turn about the IMU itself is one about the frame's origin, and a displacement back.
+    about_itself = np.block([[turn.T, -turn.T @ skew(place)], [np.zeros((3, 3)), turn.T]])
+    placement = np.einsum("ij,jcm->icm", about_itself, moved[body])
+    return ImuJacobian(modules, np.concatenate([poses[joint] for joint in modules]), gravity, placement)
 
 
 def _from_below(chain: Chain, joint: int, q: Array, qd: Array, seen: _Seen) -> _Seen:

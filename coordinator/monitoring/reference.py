@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from coordinator.baseline.baseline_robot import BaselineRobot
+from coordinator.batch_estimation.estimator import with_placement
 from coordinator.batch_estimation.imu_intrinsics import DELAY, ImuIntrinsics
 from coordinator.monitoring.contact import ContactModel, FastPart, contact_model
 from coordinator.monitoring.likelihood_ratio import (
@@ -173,9 +174,10 @@ def _torque(
 
 
 def _imu(known: BaselineRobot, segments: Sequence[DataSegment]) -> tuple[ImuModel, BaselineTest]:
-    chain, count = known.chain, len(known.chain.serials)
+    refinement, count = known.kinematics.refinement, len(known.chain.serials)
+    chain = with_placement(known.chain, refinement.placement)
     # Delays are each segment's own.
-    errors = known.kinematics.refinement.intrinsics.errors.copy()
+    errors = refinement.intrinsics.errors.copy()
     errors[:, DELAY] = 0.0
     rough = ImuModel(chain, ImuIntrinsics(errors), IMU_PRIORS[known.imu], np.full((count, 6), 0.05))
     sigma, counted = noise_level(lasting_residual(rough, segments))

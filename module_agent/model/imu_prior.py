@@ -31,6 +31,13 @@ DELAY_SPREAD_S = 1e-4
 # The same prior for an estimator that expects a delay of zero: its root mean square.
 DELAY_RMS_S = hypot(DELAY_S, DELAY_SIGMA_S)
 
+# The place of an IMU in its housing. The manufacturer gives it as a hint only: tolerances of the board in its
+# housing, and of the sensor on the board.
+PLACE_SIGMA_M = 1e-3
+# How far the axes of gyro and accelerometer are turned together against the joint's: the faces by which a
+# module is clamped on the rate table that calibrates it, 0.1 deg. An IMU as delivered is turned by more.
+MOUNTING_SIGMA_RAD = radians(0.1)
+
 # Where the hinge of a bending link is, as a share of its length: 0 for a clamp that gives, 0.15 for a
 # clamped beam (Howell, Compliant Mechanisms, 2001, section 5), up to a third where the end's slope counts
 # more than its place.
@@ -46,6 +53,8 @@ class ImuPrior(NamedTuple):
     accel_bias_m_s2: float = ACCEL_BIAS_SIGMA_M_S2
     delay_s: float = DELAY_RMS_S
     g_sensitivity_s_m: float = G_SENSITIVITY_SIGMA_S_M
+    place_m: float = PLACE_SIGMA_M
+    mounting_rad: float = MOUNTING_SIGMA_RAD
 
     @property
     def sigmas(self) -> Array:
@@ -61,6 +70,11 @@ class ImuPrior(NamedTuple):
             [matrix.ravel(), matrix.ravel(), biases, [self.delay_s], np.full(9, self.g_sensitivity_s_m)]
         )
 
+    @property
+    def placement_sigmas(self) -> Array:
+        """The standard deviations of an IMU's turn (3) [rad] and place (3) [m] in its housing, (6,)."""
+        return np.repeat([self.mounting_rad, self.place_m], 3)
+
 
 # As delivered. Data sheets of the class: scale within 0.5-3 % (steps in a real X5-1's log were off by -0.7 to
 # -2.2 %), cross-axis sensitivity below 2 % = 1.1 deg.
@@ -68,6 +82,8 @@ UNCALIBRATED = ImuPrior(scale=0.01, misalignment_rad=radians(1.0))
 # Calibrated on a rate table and by gravity: what is left of scale and axes is below what motions can measure.
 CALIBRATED = ImuPrior(scale=1e-4, misalignment_rad=1e-4, accel_bias_m_s2=CALIBRATED_ACCEL_BIAS_SIGMA_M_S2)
 # For motions that tell neither scale nor axes.
-BIASES_ONLY = ImuPrior(scale=0.0, misalignment_rad=0.0, delay_s=0.0, g_sensitivity_s_m=0.0)
+BIASES_ONLY = ImuPrior(
+    scale=0.0, misalignment_rad=0.0, delay_s=0.0, g_sensitivity_s_m=0.0, place_m=0.0, mounting_rad=0.0
+)
 
 IMU_PRIORS: dict[ImuKind, ImuPrior] = {"calibrated": CALIBRATED, "uncalibrated": UNCALIBRATED}

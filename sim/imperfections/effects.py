@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from math import pi, radians
 from typing import Literal, NamedTuple
 
-Part = Literal["actuator", "IMU", "encoder and torque", "clock", "structure"]
+Part = Literal["actuator", "IMU", "encoder and torque", "clock", "module", "structure"]
 
 
 class Effect(NamedTuple):
@@ -159,6 +159,33 @@ _TABLE: dict[Part, dict[str, tuple[str, dict[str, float], str]]] = {
             "a reading is taken a little before or after its time stamp",
             {"sampling_jitter_s": 2e-5},
             "an assumption: the growth of the velocity's noise with speed in a real X5-1 log allows 5e-5",
+        ),
+    },
+    "module": {
+        "imu-place": (
+            "the IMU sits off its catalogued place in the housing, along all three axes",
+            {"imu_place_m": 1e-3},
+            "an assumption: the manufacturer gives the places as hints; a board's tolerances",
+        ),
+        "imu-mounting": (
+            "gyro and accelerometer are turned together against the housing",
+            {"imu_mounting_rad": radians(0.1)},
+            "an assumption: how well a housing can be clamped on the rate table that calibrates its IMU",
+        ),
+        "body-mass": (
+            "mass and moments of inertia differ from the catalogue's by a factor",
+            {"body_mass": 0.02},
+            "an assumption: published masses are rounded to 5 g, cables and screws weigh as much",
+        ),
+        "body-centre": (
+            "the centre of mass is off its catalogued place, along all three axes",
+            {"body_centre_m": 1e-3},
+            "an assumption: published centres come from drawings without cables, grease and screws",
+        ),
+        "housing-axis": (
+            "the joint's axis is tilted and displaced against the faces of the housing, across itself",
+            {"housing_axis_m": 1e-4, "housing_axis_rad": radians(0.05)},
+            "general tolerances for machined parts of this size (ISO 2768-m: 0.1 to 0.2 mm over 70 mm)",
         ),
     },
     "structure": {

@@ -34,6 +34,8 @@ class NoiseProfile(Strict):
     The spreads are relative differences between modules of a type. spring_stiffening is the share of the
     spring that is of the stiffening kind (0 = linear, 1 = as in modules made since 2019).
 
+    Modules: how each differs from its type's entry in the catalogue; body_mass is relative.
+
     Structure: base_shake and link_flex multiply the compliance of the robot's base and links (1 = as
     described by the robot file, 0 = rigid).
     """
@@ -82,6 +84,13 @@ class NoiseProfile(Strict):
     spring_spread: Share = 0.0
     backlash_rad: Amount = 0.0
     spring_stiffening: Share = 0.0
+    # module
+    imu_place_m: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
+    imu_mounting_rad: Amount = 0.0
+    body_mass: Annotated[float, Field(ge=0.0, le=0.2)] = 0.0
+    body_centre_m: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
+    housing_axis_m: Annotated[float, Field(ge=0.0, le=0.1)] = 0.0
+    housing_axis_rad: Amount = 0.0
     # structure
     base_shake: Amount = 0.0
     link_flex: Amount = 0.0
@@ -92,6 +101,7 @@ _X5 = (
     *_BODY,
     *("variation", "imu-white", "imu-bias", "imu-drift", "g-sensitivity", "imu-bandwidth", "imu-range"),
     *("imu-steps", "vibration", "encoder", "velocity-estimate", "torque-noise", "clock", "sampling-jitter"),
+    *("imu-place", "imu-mounting", "body-mass", "body-centre", "housing-axis"),
 )
 _UNCALIBRATED = (*_X5, "imu-scale", "imu-misalignment", "torque-calibration", "torque-hysteresis")
 

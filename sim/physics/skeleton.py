@@ -83,7 +83,6 @@ def build_skeleton(robot: Robot, base_shake: float = 0.0, link_flex: float = 0.0
             _Joint(tree.serials[i], held, tree.output[i], [tree.moved[i]], sign=float(tree.axis_sign[i]))
         )
     imu_body = [own if back else c for own, c, back in zip(module, carrier, tree.reversed, strict=True)]
-    imus = zip(imu_body, tree.housing, tree.types, strict=True)
     springs = [joint.spring for joint in joints if joint.spring is not None]
 
     def relative_to(body: int, transform: Array) -> Array:
@@ -103,7 +102,9 @@ def build_skeleton(robot: Robot, base_shake: float = 0.0, link_flex: float = 0.0
         stiffness=read_only(np.array([stiffness for stiffness, _ in springs])),
         damping=read_only(np.array([damping for _, damping in springs])),
         imu_body=tuple(imu_body),
-        imu_pose=read_only(np.array([relative_to(b, h @ pose(kind.imu_xyz)) for b, h, kind in imus])),
+        imu_pose=read_only(
+            np.array([relative_to(b, h) for b, h in zip(imu_body, tree.imu_home, strict=True)])
+        ),
         gravity_m_s2=tree.gravity_m_s2,
     )
 

@@ -140,11 +140,28 @@ class Base(Strict):
         return pose(rpy_rad=np.radians(self.rpy_deg or MOUNTS[self.mount or "floor"]))
 
 
+class Build(Strict):
+    """How one module differs from the catalogue's entry of its type, in the axes of its housing.
+
+    `imu_xyz_m` and `imu_turn_rad` (a rotation vector) displace the IMU in the housing, `axis_xyz_m` and
+    `axis_turn_rad` the joint's axis with the output. `mass_factor` multiplies mass and inertia of the
+    module, `com_xyz_m` displaces its centre of mass.
+    """
+
+    imu_xyz_m: Xyz = (0.0, 0.0, 0.0)
+    imu_turn_rad: Xyz = (0.0, 0.0, 0.0)
+    axis_xyz_m: Xyz = (0.0, 0.0, 0.0)
+    axis_turn_rad: Xyz = (0.0, 0.0, 0.0)
+    mass_factor: Annotated[float, Field(ge=0.5, le=2.0)] = 1.0
+    com_xyz_m: Xyz = (0.0, 0.0, 0.0)
+
+
 class Module(Strict):
     """One module and the link that holds it: a list of parts, from the parent on.
 
     Without `flex` tubes are compliant by beam theory, and all else is rigid. `payload` is fixed to the distal
     side of the joint: mass, centre and inertia in the output's frame, or the housing's if mounted reversed.
+    Without `build` the noise profile draws how the module differs from its type.
     """
 
     serial: Annotated[str, _known(_check_serial)]
@@ -155,6 +172,7 @@ class Module(Strict):
     link: Annotated[tuple[Part, ...], BeforeValidator(_in_a_list)] = ()
     payload: FreePose | None = None
     flex: Flex | None = None
+    build: Build | None = None
 
 
 def _resolved(name: str, info: ValidationInfo) -> str:

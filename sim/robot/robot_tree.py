@@ -7,6 +7,7 @@ axis and is parallel to the module's output frame at q = 0; the world has z up.
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.model.chain import Chain
@@ -14,7 +15,9 @@ from module_agent.model.read_only import read_only
 from sim.geometry.link_parts import Hinge, placed
 from sim.geometry.pose import Array, inverse, pose
 from sim.geometry.rigid_body import RigidBody, joined, moved, negative, parameters, tensor
-from sim.robot.robot_file import Module, Robot
+from sim.robot.robot_file import Build, Module, Robot
+
+AS_CATALOGUED = Build()
 
 
 def _disc(mass_kg: float, radius_m: float, height_m: float) -> RigidBody:
@@ -48,6 +51,7 @@ class RobotTree(NamedTuple):
     axis_sign: (n,) the joint's axis is this times the z axis of the output's frame.
     bodies: every body's mass and inertia in its own frame, which is that of the module's output.
     housing: (n, 4, 4) the modules' housing frames. output: (n, 4, 4) their output frames.
+    imu_home: (n, 4, 4) the IMUs.
     way: for every module the corners of its link, (k, 3), from the parent's distal frame to its own.
     moved: for every module what its joint alone turns (flange, or housing if reversed), in the world.
     segments: for every module the segments of its link, its own held part in the last of them.
@@ -62,15 +66,17 @@ class RobotTree(NamedTuple):
     bodies: tuple[RigidBody, ...]
     housing: Array
     output: Array
+    imu_home: Array
     way: tuple[Array, ...]
     moved: tuple[RigidBody, ...]
     segments: tuple[tuple[Segment, ...], ...]
     gravity_m_s2: float
 
 
-def housing(kind: ModuleType) -> RigidBody:
-    """Return a module without its flange, in the housing frame; the sum of both is the catalogue's body."""
-    whole = RigidBody(kind.mass_kg, read_only(np.array(kind.com_xyz)), tensor(*kind.inertia))
+def housing(kind: ModuleType, build: Build = AS_CATALOGUED) -> RigidBody:
+    """Return a module without its flange, in the housing frame; the sum of both is the whole module."""
+    centre, factor = read_only(np.add(kind.com_xyz, build.com_xyz_m)), build.mass_factor
+    whole = RigidBody(factor * kind.mass_kg, centre, read_only(factor * tensor(*kind.inertia)))
     return joined([whole, negative(moved(FLANGE, pose(kind.output_xyz)))])
 
 
@@ -78,25 +84,30 @@ def build_tree(robot: Robot) -> RobotTree:
     """Return the tree of a robot."""
     parent, types = robot.parents, tuple(module_type(m.type) for m in robot.modules)
     backwards = tuple(m.mounted == "reversed" for m in robot.modules)
+    builds = [module.build or AS_CATALOGUED for module in robot.modules]
     housings: list[Array] = []
     outputs: list[Array] = []
     links: list[_Link] = []
     own: list[RigidBody] = []
-    for module, p, kind, back in zip(robot.modules, parent, types, backwards, strict=True):
+    for module, p, kind, build, back in zip(robot.modules, parent, types, builds, backwards, strict=True):
         start = robot.base.world_pose
         if p >= 0:
             start = housings[p] if backwards[p] else outputs[p]
         link = _Link(start, module)
-        across = pose(kind.output_xyz)
+        across = _displaced(build.axis_xyz_m, build.axis_turn_rad) @ pose(kind.output_xyz)
         housings.append(link.end @ inverse(across) if back else link.end)
         outputs.append(link.end if back else link.end @ across)
-        both = moved(housing(kind), housings[-1]), moved(FLANGE, outputs[-1])
+        both = moved(housing(kind, build), housings[-1]), moved(FLANGE, outputs[-1])
         held, turned = reversed(both) if back else both
         link.add(held)
         end = housings[-1] if back else outputs[-1]
         carried = [] if module.payload is None else [moved(module.payload.body, end)]
         own.append(joined([turned, *carried]))
         links.append(link)
+    imus = [
+        home @ pose(kind.imu_xyz) @ _displaced(build.imu_xyz_m, build.imu_turn_rad)
+        for home, kind, build in zip(housings, types, builds, strict=True)
+    ]
     segments = tuple(link.segments() for link in links)
     pieces = [[body] for body in own]
     for p, link_segments in zip(parent, segments, strict=True):
@@ -111,6 +122,7 @@ def build_tree(robot: Robot) -> RobotTree:
         bodies=tuple(moved(joined(b), inverse(home)) for b, home in zip(pieces, outputs, strict=True)),
         housing=read_only(np.array(housings)),
         output=read_only(np.array(outputs)),
+        imu_home=read_only(np.array(imus)),
         way=tuple(read_only(np.array(link.way)) for link in links),
         moved=tuple(own),
         segments=segments,
@@ -146,10 +158,27 @@ class _Link:
         return tuple(Segment(joined(bodies), hinge) for bodies, hinge in self._pieces)
 
 
+def _displaced(xyz_m: tuple[float, float, float], turn_rad: tuple[float, float, float]) -> Array:
+    """Return a pose from a displacement and a rotation vector."""
+    moved_by = np.eye(4)
+    moved_by[:3, :3], moved_by[:3, 3] = Rotation.from_rotvec(turn_rad).as_matrix(), xyz_m
+    return moved_by
+
+
+def _nominal_housings(tree: RobotTree) -> Array:
+    """Return the poses (n, 4, 4) of housings as catalogued on the modules' true axes, in the world."""
+    return np.asarray(tree.output @ np.array([inverse(pose(kind.output_xyz)) for kind in tree.types]))
+
+
 def true_chain(robot: Robot) -> Chain:
-    """Return the kinematic truth in the root frame: the housing frame of the first module at q = 0."""
+    """Return the kinematic truth in the root frame: the housing frame of the first module at q = 0.
+
+    What is true of a module is its axis: its housing's frame is where a housing as catalogued would have that
+    axis, and `imu_home` is the catalogued place in that frame, wherever the IMU sits.
+    """
     tree = build_tree(robot)
-    to_root = inverse(tree.housing[0])
+    housings = _nominal_housings(tree)
+    to_root = inverse(housings[0])
     joints = to_root @ tree.output
     imu_in_housing = np.array([pose(kind.imu_xyz) for kind in tree.types])
     return Chain(
@@ -158,7 +187,7 @@ def true_chain(robot: Robot) -> Chain:
         reversed=tree.reversed,
         axis=read_only(joints[:, :3, 2] * tree.axis_sign[:, None]),
         point=read_only(joints[:, :3, 3]),
-        imu_home=read_only(to_root @ tree.housing @ imu_in_housing),
+        imu_home=read_only(to_root @ housings @ imu_in_housing),
         gravity=read_only(to_root[:3, :3] @ np.array([0.0, 0.0, robot.base.gravity_m_s2])),
     )
 
@@ -169,6 +198,6 @@ def true_inertia(robot: Robot) -> Array:
     In the root frame and about its origin, in the order of the thesis' eq. 25.
     """
     tree = build_tree(robot)
-    to_root = inverse(tree.housing[0])
+    to_root = inverse(_nominal_housings(tree)[0])
     pairs = zip(tree.bodies, tree.output, strict=True)
     return read_only(np.array([parameters(moved(body, to_root @ home)) for body, home in pairs]))

@@ -87,7 +87,7 @@ def run_virtual(
             lambda: robot.loop.now_ns,
             robot.loop.call_soon,
             screen,
-            TruthView(true_chain(config.robot), [module.type for module in config.robot.modules]),
+            TruthView(true_chain(robot.world.robot), [module.type for module in config.robot.modules]),
         )
         if between is not None:
             between(robot)

@@ -58,7 +58,8 @@ class Motion(NamedTuple):
 
 
 def truth_of(robot: Robot, world: World | None = None) -> Truth:
-    """Return the constants of a robot, and of the world it lives in if there is one."""
+    """Return the constants of a robot, as built in the world it lives in if there is one."""
+    robot = robot if world is None else world.robot
     return Truth(
         robot=robot.name,
         module_types=tuple(m.type for m in robot.modules),

@@ -21,6 +21,7 @@ from sim.physics.multibody import Multibody
 from sim.physics.rigid_tree import RigidTree
 from sim.physics.skeleton import build_skeleton
 from sim.robot.robot_file import Robot
+from sim.robot.variants import as_built
 from sim.sensors.sensors import Instant, Sensors
 from sim.world.external_force import Push, check_pushed
 
@@ -89,8 +90,9 @@ class World:
         imu_rate_hz: float = 250.0,
     ):
         imu_ticks = round(1.0 / (TICK_S * check_imu_rate(imu_rate_hz)))
-        self.robot = robot
         self.profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or robot.noise)
+        self._seed = seed
+        self.robot = robot = as_built(robot, seed, self.profile)
         types = tuple(module_type(m.type) for m in robot.modules)
         drawn = seed, robot.serials, types, self.profile, imu_ticks, TICK_S, noise_seed
         self.sensors = Sensors(*drawn)
@@ -151,6 +153,7 @@ class World:
         Raises:
             ValueError: other modules, or another number of joints that give.
         """
+        robot = as_built(robot, self._seed, self.profile)
         skeleton = build_skeleton(robot, self.profile.base_shake, self.profile.link_flex)
         if robot.serials != self.robot.serials or skeleton.names != self._skeleton.names:
             raise ValueError(

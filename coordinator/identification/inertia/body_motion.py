@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from coordinator.batch_estimation.estimator import Refinement
+from coordinator.batch_estimation.estimator import Refinement, with_placement
 from coordinator.batch_estimation.imu_intrinsics import DELAY, undone
 from coordinator.batch_estimation.imu_prediction import (
     BodyMotion,
@@ -82,8 +82,9 @@ def body_motion_tracks(robot: Robot, measured: SensorData, imus: bool) -> list[B
         return tracks
     # Of several IMUs on a body the first counts.
     riders = {robot.chain.carrier(k): k for k in reversed(range(len(tracks)))}
+    measuring = with_placement(robot.chain, robot.refined.placement)
     return [
-        _corrected(robot.chain, bodies, turns, measured, track, riders[i]) if i in riders else track
+        _corrected(measuring, bodies, turns, measured, track, riders[i]) if i in riders else track
         for i, track in enumerate(tracks)
     ]
 

@@ -29,7 +29,7 @@ from sim.benchmark.row import Row, count, largest, mean_abs, ratio, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
-from sim.robot.variants import at_random_site
+from sim.robot.variants import as_built, at_random_site
 from sim.scoring.chain_score import LinkErrors, link_errors, tip_errors, topology_differences
 from sim.sensors.module_clock import ModuleClock, module_time
 from sim.thesis.circle_chain import thesis_chain
@@ -116,8 +116,8 @@ def arm_trial(
         network: a network profile or file.
         plan: motions; those of the mode when None.
     """
-    described = at_random_site(load_robot(robot), seed)
     profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise)
+    described = at_random_site(as_built(load_robot(robot), seed, profile), seed)
     settings = VirtualSettings(described, named_network(network), seed, profile)
     begun = ArmTrial(network, mode, seed, len(described.modules), "")
     clocks: dict[str, ModuleClock] = {}

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from coordinator.batch_estimation import estimator
-from coordinator.batch_estimation.estimator import refine_chain
+from coordinator.batch_estimation.estimator import Refinement, refine_chain, with_placement
 from coordinator.batch_estimation.imu_intrinsics import (
     DELAY,
     SIZE,
@@ -25,7 +25,7 @@ from coordinator.kinematics.null_space import name_null_space
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
-from module_agent.model.imu_prior import BIASES_ONLY, UNCALIBRATED
+from module_agent.model.imu_prior import BIASES_ONLY, CALIBRATED, UNCALIBRATED, ImuPrior
 from module_agent.model.perturbation import apply_perturbation
 
 GYRO_NOISE, ACCEL_NOISE = 2e-3, 0.03
@@ -220,13 +220,15 @@ def test_scipy_finds_the_same_minimum(robots: Any) -> None:
     assert np.abs((poses.T @ apart[6:]) / sigma).max() < 0.01
 
 
-def _uncalibrated(data: SensorData, seed: int) -> tuple[SensorData, ImuIntrinsics]:
+def _uncalibrated(
+    data: SensorData, seed: int, prior: ImuPrior = UNCALIBRATED
+) -> tuple[SensorData, ImuIntrinsics]:
     """The same motion as read by IMUs whose errors are drawn from what is allowed beforehand."""
     rates = np.concatenate(
         [np.gradient(part, 4.0 / 299, axis=0) for part in (data.gyro_rad_s, data.accel_m_s2)], axis=2
     )
     count = data.q_rad.shape[1]
-    errors = np.random.default_rng(seed).normal(size=(count, SIZE)) * UNCALIBRATED.sigmas
+    errors = np.random.default_rng(seed).normal(size=(count, SIZE)) * prior.sigmas
     imus = ImuIntrinsics(errors)
     gyro, accel = read(imus, data.gyro_rad_s, data.accel_m_s2, rates)
     return data._replace(gyro_rad_s=gyro, accel_m_s2=accel, imu_rates=rates), imus
@@ -253,6 +255,50 @@ def test_the_intervals_hold_with_imus_as_delivered(robots: Any) -> None:
         freedom += int(np.count_nonzero(kept))
     # Chi-square with some 275 degrees of freedom: one sigma is 0.085; four sigma for what the seeds share.
     assert 0.66 < squares / freedom < 1.34
+
+
+def _displaced_fits(robots: Any, backwards: bool) -> list[tuple[Chain, Refinement, Array]]:
+    """The truth, the fit and the true placement of 40 robots whose calibrated IMUs sit off their places."""
+    truth, types = robots.random(4, joints=3, serial=True)
+    if backwards:
+        truth = robots.build(
+            list(truth.parent),
+            [False, True, True],
+            np.array(truth.imu_home),
+            types,
+            np.array([0.0, 0.6, 0.8]),
+        )
+    fits = []
+    for seed in range(40):
+        drawn = np.random.default_rng(seed).normal(size=(3, 6)) * CALIBRATED.placement_sigmas
+        data, _ = _uncalibrated(_sensed(with_placement(truth, drawn)), seed, CALIBRATED)
+        fits.append((truth, refine_chain(truth, _with_noise(data, 100 + seed), CALIBRATED), drawn))
+    return fits
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_the_intervals_hold_with_imus_off_their_places(robots: Any, backwards: bool) -> None:
+    squares, freedom, placed = 0.0, 0, []
+    for truth, fit, drawn in _displaced_fits(robots, backwards):
+        values, vectors = np.linalg.eigh(fit.estimate.covariance)
+        kept = values > values.max() * 1e-12
+        along = vectors[:, kept].T @ _increment(fit.chain, truth)
+        squares += float(np.sum(along**2 / values[kept]))
+        freedom += int(np.count_nonzero(kept))
+        placed.append((fit.placement - drawn) / fit.placement_sigma)
+    # 40 times 10 to 12 degrees of freedom: one sigma is 0.07; four sigma for what the parameters share.
+    assert 0.72 < squares / freedom < 1.28
+    assert 0.72 < np.mean(np.square(placed)) < 1.28
+
+
+def test_a_module_that_turns_itself_tells_where_its_imu_is(robots: Any) -> None:
+    (_, fit, _), *_ = _displaced_fits(robots, backwards=True)
+    (_, forward, _), *_ = _displaced_fits(robots, backwards=False)
+    # The IMU of a reversed module runs on a circle about its own axis: the catalogue's radius is measured.
+    across = fit.placement_sigma[1:, 3:].min(axis=1)
+    assert across.max() < 0.2 * CALIBRATED.place_m
+    # The first module's, on the base, never moves: its prior stays.
+    np.testing.assert_allclose(forward.placement_sigma[0, 3:], CALIBRATED.place_m, rtol=0.01)
 
 
 def test_scale_and_axes_of_an_imu_are_found_where_distal_joints_turn_it(robots: Any) -> None:

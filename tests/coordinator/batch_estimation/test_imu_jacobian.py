@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.batch_estimation.estimator import with_placement
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import body_motions, imu_readings
 from module_agent.model.chain import Array, Chain
@@ -61,6 +62,22 @@ def test_slopes_are_the_differences_of_the_readings(robots: Any, seed: int) -> N
     found, expected = _analytic(chain, motion), _differences(chain, motion)
     # Readings of up to 200 m/s^2: rounding leaves 200 * 1e-16 / 1e-5 = 2e-9, the third derivative 2e-8.
     np.testing.assert_allclose(found, expected, atol=2e-7)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_slopes_by_the_placement_of_an_imu_are_the_differences_of_its_readings(
+    robots: Any, seed: int
+) -> None:
+    chain, _ = robots.random(seed, joints=3)
+    motion = _motion(3, seed)
+    bodies = body_motions(chain, *motion)
+    for k, unit in np.ndindex(3, 6):
+        step = np.zeros((3, 6))
+        step[k, unit] = STEP
+        ahead, behind = (_read(with_placement(chain, sign * step), motion) for sign in (1.0, -1.0))
+        expected = (ahead - behind)[:, k] / (2 * STEP)
+        found = imu_jacobian(chain, bodies, *motion[:2], k).placement[unit].T
+        np.testing.assert_allclose(found, expected, atol=2e-7)
 
 
 def test_the_random_trees_hold_branches_and_both_mountings(robots: Any) -> None:
