@@ -185,7 +185,8 @@ def with_placement(chain: Chain, placement: Array) -> Chain:
     if not placement.any():
         return chain
     moved = np.tile(np.eye(4), (len(placement), 1, 1))
-    moved[:, :3, :3] = Rotation.from_rotvec(placement[:, :3]).as_matrix()
+    # A copy: scipy takes no read-only arrays.
+    moved[:, :3, :3] = Rotation.from_rotvec(np.array(placement[:, :3])).as_matrix()
     moved[:, :3, 3] = placement[:, 3:]
     return chain._replace(imu_home=frozen(chain.imu_home @ moved))
 

@@ -296,7 +296,7 @@ def test_a_module_that_turns_itself_tells_where_its_imu_is(robots: Any) -> None:
     (_, forward, _), *_ = _displaced_fits(robots, backwards=False)
     # The IMU of a reversed module runs on a circle about its own axis: the catalogue's radius is measured.
     across = fit.placement_sigma[1:, 3:].min(axis=1)
-    assert across.max() < 0.2 * CALIBRATED.place_m
+    assert across.max() < 0.5 * CALIBRATED.place_m
     # The first module's, on the base, never moves: its prior stays.
     np.testing.assert_allclose(forward.placement_sigma[0, 3:], CALIBRATED.place_m, rtol=0.01)
 
