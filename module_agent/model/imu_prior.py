@@ -34,9 +34,9 @@ DELAY_RMS_S = hypot(DELAY_S, DELAY_SIGMA_S)
 # The place of an IMU in its housing. The manufacturer gives it as a hint only: tolerances of the board in its
 # housing, and of the sensor on the board.
 PLACE_SIGMA_M = 1e-3
-# How far the axes of gyro and accelerometer are turned together against the joint's: the faces by which a
-# module is clamped on the rate table that calibrates it, 0.1 deg. An IMU as delivered is turned by more.
-MOUNTING_SIGMA_RAD = radians(0.1)
+# How far gyro and accelerometer are turned together against the joint's axis: the faces by which a module
+# is clamped on the rate table that calibrates it, 0.1 deg, and the axis in its housing, 0.05 deg.
+MOUNTING_SIGMA_RAD = radians(0.12)
 
 # Where the hinge of a bending link is, as a share of its length: 0 for a clamp that gives, 0.15 for a
 # clamped beam (Howell, Compliant Mechanisms, 2001, section 5), up to a third where the end's slope counts

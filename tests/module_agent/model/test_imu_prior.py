@@ -17,6 +17,8 @@ def test_a_prior_is_as_wide_as_the_modules_of_its_profile(name: str, prior: imu_
     assert profile.gyro_g_sensitivity_s_m <= prior.g_sensitivity_s_m
     assert max(profile.gyro_scale, profile.accel_scale) <= prior.scale
     assert profile.imu_misalignment_rad <= 1.01 * prior.misalignment_rad
+    assert np.hypot(profile.imu_place_m, profile.housing_axis_m) <= 1.01 * prior.place_m
+    assert np.hypot(profile.imu_mounting_rad, profile.housing_axis_rad) <= prior.mounting_rad
 
 
 def test_the_delay_covers_low_passes_of_40_to_200_hz_and_none() -> None:
