@@ -40,10 +40,11 @@ class UrdfRobot(NamedTuple):
         before its children.
     bodies: names of the links right behind the joints.
     homes: (n, 4, 4) pose of every such link's frame at q = 0 in the root frame.
-    carried: all links that move with some joint.
+    links: every link's place; `carried` are those that move with some joint.
     phi: (10 n,) the inertias of the file, as in `torque_regressor`: in the root frame at q = 0, of all
         links of a body together. None if no moving link has one.
     limits: (n, 3) lowest and highest position [rad] and speed [rad/s], infinite where the file gives none.
+    effort_nm: (n,) largest torque, infinite where the file gives none.
     drives: (n, 3) inertia of the rotor behind the gear [kg m^2], damping [Nm s/rad] and friction [Nm] of the
         joints, zero where the file gives none.
     held: joints that could move and are taken as fixed, prismatic and mimicking ones for example, with their
@@ -54,12 +55,25 @@ class UrdfRobot(NamedTuple):
     chain: Chain
     bodies: tuple[str, ...]
     homes: Array
-    carried: frozenset[str]
+    links: Mapping[str, "PlacedLink"]
     phi: Array | None
     limits: Array
+    effort_nm: Array
     drives: Array
     held: dict[str, float]
     path: Path = Path()
+
+    @property
+    def carried(self) -> frozenset[str]:
+        """The links that move with some joint."""
+        return frozenset(name for name, place in self.links.items() if place.body != BASE)
+
+
+class PlacedLink(NamedTuple):
+    """A link: the pose of its frame at q = 0 in the root frame, and the body that it belongs to."""
+
+    pose: Array
+    body: int
 
 
 class _Joint(NamedTuple):
@@ -69,15 +83,8 @@ class _Joint(NamedTuple):
     moves: bool
     pose: Array
     axis: Array
-    limits: tuple[float, float, float]
+    limits: tuple[float, float, float, float]
     held: float | None
-
-
-class _Placed(NamedTuple):
-    """A link: the pose of its frame at q = 0 in the root frame, and the body that it belongs to."""
-
-    pose: Array
-    body: int
 
 
 def read_urdf(
@@ -133,9 +140,10 @@ def _robot(root: Element, gravity: Array, held: Mapping[str, float]) -> UrdfRobo
         chain,
         tuple(joint.child for joint in moving),
         homes,
-        frozenset(carried),
+        placed,
         _inertias(links, carried, len(moving)),
-        read_only(np.array([joint.limits for joint in moving])),
+        read_only(np.array([joint.limits[:3] for joint in moving])),
+        read_only(np.array([joint.limits[3] for joint in moving])),
         _drives(root, [joint.name for joint in moving]),
         {joint.name: joint.held for joint in joints if joint.held is not None},
     )
@@ -157,11 +165,11 @@ def _joint(element: Element, links: dict[str, Element], held: Mapping[str, float
     axis_element = element.find("axis")
     axis = np.array([1.0, 0.0, 0.0])
     if axis_element is not None:
-        axis = _three(axis_element, "xyz", f"axis of joint {name!r}")
+        axis = numbers(axis_element, "xyz", f"axis of joint {name!r}", 3)
     length = float(np.linalg.norm(axis))
     if kind != "fixed" and not length > 1e-9:
         raise UrdfError(f"axis of joint {name!r} is zero; it must be a direction")
-    pose = _pose(element.find("origin"), f"origin of joint {name!r}")
+    pose = element_pose(element.find("origin"), f"origin of joint {name!r}")
     axis, limits = axis / max(length, 1e-9), _limits(element, name, kind)
     if kind == "fixed" or (kind in _MOVING and name not in held and element.find("mimic") is None):
         return _Joint(name, ends[0], ends[1], kind in _MOVING, pose, axis, limits, None)
@@ -197,15 +205,17 @@ def _drives(root: Element, names: Sequence[str]) -> Array:
     return read_only(drives)
 
 
-def _limits(element: Element, name: str, kind: str) -> tuple[float, float, float]:
-    """Return the lowest and the highest position and the speed; what is not given is unlimited."""
+def _limits(element: Element, name: str, kind: str) -> tuple[float, float, float, float]:
+    """Return the lowest and the highest position, the speed and the effort; infinite if not given."""
     limit, where = element.find("limit"), f"limit of joint {name!r}"
     if limit is None:
-        return -np.inf, np.inf, np.inf
-    low, high, speed = (_float(limit.get(key, "0"), key, where) for key in ("lower", "upper", "velocity"))
+        return -np.inf, np.inf, np.inf, np.inf
+    low, high, speed, effort = (
+        _float(limit.get(key, "0"), key, where) for key in ("lower", "upper", "velocity", "effort")
+    )
     if kind == "continuous" or not low < high:
         low, high = -np.inf, np.inf
-    return low, high, speed if speed > 0.0 else np.inf
+    return low, high, speed if speed > 0.0 else np.inf, effort if effort > 0.0 else np.inf
 
 
 def _root_link(joints: Sequence[_Joint], links: dict[str, Element]) -> str:
@@ -220,22 +230,22 @@ def _root_link(joints: Sequence[_Joint], links: dict[str, Element]) -> str:
     return roots[0]
 
 
-def _placed(joints: Sequence[_Joint], root_link: str) -> tuple[list[_Joint], dict[str, _Placed]]:
+def _placed(joints: Sequence[_Joint], root_link: str) -> tuple[list[_Joint], dict[str, PlacedLink]]:
     """Return the moving joints in the file's order, but parents before children, and all links' places."""
-    placed, waiting, moving = {root_link: _Placed(np.eye(4), BASE)}, list(joints), list[_Joint]()
+    placed, waiting, moving = {root_link: PlacedLink(np.eye(4), BASE)}, list(joints), list[_Joint]()
     while waiting:
         joint = next((one for one in waiting if one.parent in placed), None)
         if joint is None:
             raise UrdfError(f"joint {waiting[0].name!r} is part of a ring; a tree is needed")
         waiting.remove(joint)
         below = placed[joint.parent]
-        placed[joint.child] = _Placed(below.pose @ joint.pose, len(moving) if joint.moves else below.body)
+        placed[joint.child] = PlacedLink(below.pose @ joint.pose, len(moving) if joint.moves else below.body)
         if joint.moves:
             moving.append(joint)
     return moving, placed
 
 
-def _inertias(links: dict[str, Element], carried: dict[str, _Placed], joints: int) -> Array | None:
+def _inertias(links: dict[str, Element], carried: dict[str, PlacedLink], joints: int) -> Array | None:
     total = np.zeros((joints, 4, 4))
     claimed = False
     for name, (pose, body) in carried.items():
@@ -252,24 +262,34 @@ def _link_inertia(inertial: Element, where: str) -> Array:
         raise UrdfError(f"{where} lacks <mass> or <inertia>")
     about_centre = [_float(inertia.get(key, ""), key, where) for key in INERTIA]
     phi = np.array([_float(mass.get("value", ""), "value", where), 0.0, 0.0, 0.0, *about_centre])
-    pose = _pose(inertial.find("origin"), where)
+    pose = element_pose(inertial.find("origin"), where)
     return np.asarray(pose @ pseudo_inertia(phi) @ pose.T)
 
 
-def _pose(origin: Element | None, where: str) -> Array:
+def element_pose(origin: Element | None, where: str) -> Array:
+    """Return the pose (4, 4) of an origin element, or the identity.
+
+    Raises:
+        UrdfError: it holds something else than numbers.
+    """
     pose = np.eye(4)
     if origin is not None:
         # Roll, pitch and yaw are turns about fixed axes.
-        pose[:3, :3] = Rotation.from_euler("xyz", _three(origin, "rpy", where, "0 0 0")).as_matrix()
-        pose[:3, 3] = _three(origin, "xyz", where, "0 0 0")
+        pose[:3, :3] = Rotation.from_euler("xyz", numbers(origin, "rpy", where, 3, "0 0 0")).as_matrix()
+        pose[:3, 3] = numbers(origin, "xyz", where, 3, "0 0 0")
     return pose
 
 
-def _three(element: Element, key: str, where: str, default: str = "") -> Array:
-    numbers = element.get(key, default).split()
-    if len(numbers) != 3:
-        raise UrdfError(f"{where}: {key}={element.get(key)!r}; three numbers are needed")
-    return np.array([_float(word, key, where) for word in numbers])
+def numbers(element: Element, key: str, where: str, count: int, default: str = "") -> Array:
+    """Return the numbers (count,) of an attribute.
+
+    Raises:
+        UrdfError: there are others, or another number of them.
+    """
+    cells = element.get(key, default).split()
+    if len(cells) != count:
+        raise UrdfError(f"{where}: {key}={element.get(key)!r}; {count} finite numbers are needed")
+    return np.array([_float(cell, key, where) for cell in cells])
 
 
 def _float(word: str, key: str, where: str) -> float:
