@@ -12,6 +12,7 @@ COMMANDS = {
     "payload": ("measured_again.find_payload", "Measure the payload that a robot carries."),
     "merge": ("merge.merge", "Combine runs with the same modules."),
     "monitor": ("monitor.monitor_robot", "Report collisions, payloads and wear while a robot moves."),
+    "excite": ("excite.excite", "Design the motion from which fit-dynamics learns most about any arm."),
     "fit-dynamics": ("fit_dynamics.fit_dynamics", "Fit the inertia of any arm from its URDF and a log."),
     "compensate": ("compensate.compensate_robot", "Compensate gravity, so that the robot is led by hand."),
 }
