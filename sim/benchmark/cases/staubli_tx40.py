@@ -12,6 +12,8 @@ from sim.benchmark.row import Row, scaled
 URDF, MOTION = "tx40.urdf", "motion.npz"
 # What weighted least squares with the same terms reaches elsewhere on a Staubli TX40.
 ALL_PERCENT, MASKED_PERCENT = 12.3, 7.9
+# The bar for real bodies with the friction that is chosen here.
+BODIES_ALL_PERCENT, BODIES_MASKED_PERCENT = 7.5, 4.9
 # Its wrist's two motors share a drive.
 _COUPLED = ((4, 5),)
 
@@ -31,7 +33,10 @@ def fitted(folder: Path) -> FitReport:
 def _summary(reports: Sequence[FitReport]) -> Summary:
     rows = []
     for report in reports:
-        for samples, limit in (("all", ALL_PERCENT), ("masked", MASKED_PERCENT)):
+        for samples, limit, bodies_limit in (
+            ("all", ALL_PERCENT, BODIES_ALL_PERCENT),
+            ("masked", MASKED_PERCENT, BODIES_MASKED_PERCENT),
+        ):
             errors = {
                 (one.model, one.torque): scaled(one.overall, 100.0)
                 for one in report.held_out
@@ -40,7 +45,7 @@ def _summary(reports: Sequence[FitReport]) -> Summary:
             figure = f"held-out torque, {samples} samples"
             rows += [
                 Row(f"{figure} [%]", errors["fitted", "filtered"], limit),
-                Row(f"{figure}, real bodies [%]", errors["bodies", "filtered"], limit),
+                Row(f"{figure}, real bodies [%]", errors["bodies", "filtered"], bodies_limit),
                 Row(f"{figure}, raw [%]", errors["fitted", "raw"]),
             ]
     return Summary(rows)
