@@ -52,7 +52,9 @@ class Refinement(NamedTuple):
     intrinsics: the IMUs' own errors; the prior's mean where no observation resolves them.
     placement, placement_sigma: (n, 6) every IMU's turn [rad] and displacement [m] against its place by the
         catalogue, in its own axes, and their standard deviations.
-    compliance: of the links, in the order and units of `ComplianceJacobian`.
+    compliance, compliance_sigma: of the links, in the order and units of `ComplianceJacobian`.
+    encoder_scale, encoder_scale_sigma: (n,) true motion over measured, less 1, as far as estimated; the
+        chain takes the encoders as they are unless their scales were free.
     late_s: delay common to all IMUs, in addition to their own delays in `intrinsics`.
     """
 
@@ -64,6 +66,9 @@ class Refinement(NamedTuple):
     placement: Array
     placement_sigma: Array
     compliance: Array
+    compliance_sigma: Array
+    encoder_scale: Array
+    encoder_scale_sigma: Array
     late_s: float = 0.0
 
     @property
@@ -73,21 +78,26 @@ class Refinement(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """The samples, and what is known before of the IMUs' errors and of the links' compliances."""
+    """The samples, and what is known before of the IMUs' errors and placement and of the links' compliances.
+
+    placement: (n, 6) prior of the IMUs' placement.
+    """
 
     data: SensorData
     prior: ImuPrior
     flex: ComplianceJacobian
+    placement: Array
 
     @property
     def sigmas(self) -> Array:
-        """The prior of an IMU's errors and of its placement."""
-        return np.concatenate([self.prior.sigmas, self.prior.placement_sigmas])
+        """The prior of every IMU's errors and of its placement, (n, SIZE + 6)."""
+        errors = np.tile(self.prior.sigmas, (len(self.placement), 1))
+        return np.concatenate([errors, self.placement], axis=1)
 
     @property
     def free(self) -> Mask:
-        """Which of them are estimated."""
-        return self.sigmas > 0.0
+        """Which of an IMU's are estimated, (SIZE + 6,)."""
+        return np.asarray((self.sigmas > 0.0).all(axis=0))
 
 
 class _State(NamedTuple):
@@ -126,7 +136,11 @@ class _Normal(NamedTuple):
 
 
 def refine_chain(
-    chain: Chain, data: SensorData, prior: ImuPrior = BIASES_ONLY, flex: ComplianceJacobian | None = None
+    chain: Chain,
+    data: SensorData,
+    prior: ImuPrior = BIASES_ONLY,
+    flex: ComplianceJacobian | None = None,
+    placement: Array | None = None,
 ) -> Refinement:
     """Refine a chain that is roughly right (within about 0.2 rad and 0.1 m).
 
@@ -135,6 +149,7 @@ def refine_chain(
         data: m samples of all sensors.
         prior: of the IMUs' errors.
         flex: how the readings change with the links' compliances; None for rigid links.
+        placement: (n, 6) prior of the IMUs' placement; None for that of `prior`.
 
     Raises:
         DataError: fewer samples than parameters.
@@ -145,8 +160,9 @@ def refine_chain(
     count = len(chain.serials)
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
-    problem = _Problem(data, prior, flex if flex is not None else rigid(count, len(data.q_rad)))
-    state = _State(chain, np.zeros((count, len(problem.sigmas))), np.zeros(len(problem.flex.links)))
+    placed = np.tile(prior.placement_sigmas, (count, 1)) if placement is None else placement
+    problem = _Problem(data, prior, flex if flex is not None else rigid(count, len(data.q_rad)), placed)
+    state = _State(chain, np.zeros((count, len(problem.free))), np.zeros(len(problem.flex.links)))
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
     for used in range(1, ITERATIONS + 1):
@@ -171,10 +187,14 @@ def refine_chain(
     ]
     normal = _normal_equations(problem, state, expected, believed)
     spectrum = _solve(normal)[2]
-    placement_sigma = _placement_sigma(problem, normal, spectrum)
+    sigma = _nuisance_sigma(normal, spectrum)
     by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
     rms = [_rms(residual) for residual in expected.residuals]
-    return _report(state, spectrum, placement_sigma, by_noise, rms)
+    refined = _report(state, spectrum, by_noise, rms)
+    links = slice(3, 3 + len(state.compliance))
+    return refined._replace(
+        placement_sigma=frozen(_placement_sigma(problem, sigma)), compliance_sigma=frozen(sigma[links])
+    )
 
 
 def with_placement(chain: Chain, placement: Array) -> Chain:
@@ -191,19 +211,21 @@ def with_placement(chain: Chain, placement: Array) -> Chain:
     return chain._replace(imu_home=frozen(chain.imu_home @ moved))
 
 
-def _placement_sigma(problem: _Problem, normal: _Normal, spectrum: "_Spectrum") -> Array:
-    """Return the standard deviations (n, 6) of the IMUs' placement; the prior's where it is not free."""
-    free = problem.prior.placement_sigmas > 0.0
-    size, count = int(problem.free.sum()), problem.data.q_rad.shape[1]
-    own = np.arange(len(normal.nuisance))[-count * size :].reshape(count, size)
-    wanted = own[:, size - int(free.sum()) :].ravel()
-    inverse = np.linalg.inv(normal.nuisance)[wanted]
+def _nuisance_sigma(normal: _Normal, spectrum: "_Spectrum") -> Array:
+    """Return the standard deviations of the nuisance parameters."""
+    inverse = np.linalg.inv(normal.nuisance)
     kept = spectrum.vectors[:, spectrum.known] * spectrum.sigmas[spectrum.known]
     by_poses = inverse @ (normal.cross.T @ kept)
-    variance = inverse[np.arange(len(wanted)), wanted] + (by_poses**2).sum(axis=1)
-    sigma = np.tile(problem.prior.placement_sigmas, (count, 1))
-    sigma[:, free] = np.sqrt(variance).reshape(count, -1)
-    return sigma
+    return np.asarray(np.sqrt(np.diag(inverse) + (by_poses**2).sum(axis=1)))
+
+
+def _placement_sigma(problem: _Problem, sigma: Array) -> Array:
+    """Return the standard deviations (n, 6) of the IMUs' placement; the prior's where it is not free."""
+    free, count = problem.free[SIZE:], len(problem.placement)
+    own = sigma[len(sigma) - count * int(problem.free.sum()) :].reshape(count, -1)
+    placed = problem.placement.copy()
+    placed[:, free] = own[:, own.shape[1] - int(free.sum()) :]
+    return placed
 
 
 def _expected(problem: _Problem, state: _State) -> _Expected:
@@ -271,7 +293,7 @@ def _before(problem: _Problem, state: _State) -> tuple[Array, Array]:
     """
     count, free, flex = len(state.chain.serials), problem.free, problem.flex
     nothing = np.zeros(6 * count + 3)
-    known = np.concatenate([nothing, flex.sigmas**-2.0, np.tile(problem.sigmas[free] ** -2.0, count)])
+    known = np.concatenate([nothing, flex.sigmas**-2.0, (problem.sigmas[:, free] ** -2.0).ravel()])
     held = np.concatenate([nothing, state.compliance + flex.taken, state.own[:, free].ravel()])
     information, rhs = np.diag(known), -known * held
     size = float(np.linalg.norm(state.chain.gravity))
@@ -346,13 +368,7 @@ def _moved(problem: _Problem, state: _State, step: Array, nuisance: Array) -> _S
     )
 
 
-def _report(
-    state: _State,
-    spectrum: _Spectrum,
-    placement_sigma: Array,
-    by_noise: Array,
-    rms: Sequence[Array],
-) -> Refinement:
+def _report(state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[Array]) -> Refinement:
     known = spectrum.known
     kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
@@ -375,6 +391,9 @@ def _report(
         residual_accel_m_s2=frozen(rms[1]),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
         placement=frozen(state.placement),
-        placement_sigma=frozen(placement_sigma),
+        placement_sigma=frozen(np.zeros_like(state.placement)),
         compliance=frozen(state.compliance),
+        compliance_sigma=frozen(np.zeros_like(state.compliance)),
+        encoder_scale=frozen(np.zeros(len(state.own))),
+        encoder_scale_sigma=frozen(np.zeros(len(state.own))),
     )

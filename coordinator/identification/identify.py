@@ -21,11 +21,12 @@ from coordinator.identification.inertia.body_motion import Robot
 from coordinator.identification.inertia.inertia import find_inertia, without_terms
 from coordinator.identification.inertia.robot_bodies import robot_bodies
 from coordinator.identification.result_builder import build_result
-from coordinator.identification.robot_refinement import refine_robot
+from coordinator.identification.robot_refinement import refine_checked
 from coordinator.identification.sensor_checks import (
     check_effort_signs,
     check_encoder_signs,
     check_encoder_travels,
+    doubted_sensors,
     effort_signs,
     encoder_signs,
     encoder_travels,
@@ -134,10 +135,12 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         _, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
-        refined = _settled(refine_robot(first.chain, types, windows, prior, floor), first.chain)
+        refined, suspects = refine_checked(first.chain, types, windows, prior, floor)
+        refined = _settled(refined, first.chain)
         motion = joined_motions([filtered_window(one) for one in windows])
-        findings = tuple(effort_signs(refined.chain, types, motion))
-        check_effort_signs(findings, signs)
+        opposed = effort_signs(refined.chain, types, motion)
+        check_effort_signs(opposed, signs)
+        findings = (*opposed, *doubted_sensors(refined, prior, suspects.imus, suspects.encoders))
     except (DataError, np.linalg.LinAlgError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(

@@ -4,13 +4,16 @@ Base motion and link compliance are estimated in turn; each needs an approximate
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.batch_estimation.encoder_scale import with_encoder_scales
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
-from coordinator.batch_estimation.imu_intrinsics import DELAY
+from coordinator.batch_estimation.imu_intrinsics import DELAY, beyond
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import (
+    ComplianceJacobian,
     LinkLoad,
     compliance_jacobian,
     hinge_slopes,
@@ -19,6 +22,7 @@ from coordinator.batch_estimation.link_compliance import (
     turns_under,
     with_hinges_moved,
 )
+from coordinator.batch_estimation.link_compliance import rigid as without_links
 from coordinator.batch_estimation.sensor_data import NoiseFloor, SensorData
 from coordinator.kinematics.null_space import name_null_space
 from coordinator.synchronisation.motion_windows import RATE_HZ, Window, encoder_steps, filtered, thinned
@@ -35,6 +39,67 @@ KEEP_EVERY = 5
 MAX_IMU_SAMPLES = 40_000
 # All steps but the last use a quarter of them.
 COARSE = 4
+# Errors in standard deviations: from the first on the catalogue is doubted, from the second on it is wrong.
+SUSPICIOUS, SIGNIFICANT = 3.0, 4.0
+# Prior of the place of an IMU whose module's type may be another; smallest difference in scale that counts.
+ANYWHERE_M, MIN_SCALE = 0.05, 5e-4
+
+
+class Suspects(NamedTuple):
+    """Sensors of n modules that may contradict the catalogue: what is free of them beyond the prior.
+
+    imus: modules whose IMUs may sit anywhere in their housings. encoders: joints whose encoders may be off
+    in scale. scale: (n,) by how much these are off as far as it is known, true motion over measured, less 1.
+    """
+
+    imus: tuple[int, ...]
+    encoders: tuple[int, ...]
+    scale: Array
+
+
+def refine_checked(
+    chain: Chain,
+    kinds: Sequence[ModuleType],
+    windows: Sequence[Window],
+    prior: ImuPrior,
+    floor: NoiseFloor | None = None,
+) -> tuple[Refinement, Suspects]:
+    """Refine as `refine_robot`; what contradicts the catalogue is free, so that the claim covers it.
+
+    If errors of IMUs or scales of encoders are outliers, the chain is refined with all IMUs anywhere and all
+    scales free. Those that are significant then stay free in the fit that is returned.
+    """
+    refined = refine_robot(chain, kinds, windows, prior, floor)
+    count = len(chain.serials)
+    suspects = Suspects((), (), np.zeros(count))
+    if count == 1 or _outlier(refined, prior) < SUSPICIOUS:
+        return refined, suspects
+    everyone = tuple(range(count))
+    freed = Suspects(everyone, everyone, suspects.scale)
+    free = refine_robot(refined.chain, kinds, windows, prior, floor, freed)
+    away = np.abs(free.placement / np.hypot(free.placement_sigma, prior.placement_sigmas))[:, 3:].max(axis=1)
+    off = _scale_sigmas(free) > SIGNIFICANT
+    imus, encoders = (tuple(np.flatnonzero(some).tolist()) for some in (away > SIGNIFICANT, off))
+    if not imus and not encoders:
+        return refined, suspects
+    suspects = Suspects(imus, encoders, np.where(off, free.encoder_scale, 0.0))
+    return refine_robot(free.chain, kinds, windows, prior, floor, suspects), suspects
+
+
+def _outlier(refined: Refinement, prior: ImuPrior) -> float:
+    """Return the largest error of an IMU, its place included, or of an encoder, in standard deviations."""
+    placed = np.abs(refined.placement[:, 3:] / prior.place_m).max() if prior.place_m else 0.0
+    return float(max(placed, beyond(refined.intrinsics, prior).max(), _scale_sigmas(refined).max()))
+
+
+def _scale_sigmas(refined: Refinement) -> Array:
+    """Return how far the encoders' scales (n,) are from 1, in standard deviations."""
+    return np.asarray(np.abs(refined.encoder_scale / np.maximum(refined.encoder_scale_sigma, MIN_SCALE)))
+
+
+def _rescaled(one: Window, scale: Array) -> Window:
+    """Return a window whose joints moved by 1 + scale (n,) times as much."""
+    return one._replace(q_rad=one.q_rad * (1.0 + scale)) if scale.any() else one
 
 
 def refine_robot(
@@ -43,6 +108,7 @@ def refine_robot(
     windows: Sequence[Window],
     prior: ImuPrior,
     floor: NoiseFloor | None = None,
+    suspects: Suspects | None = None,
 ) -> Refinement:
     """Refine an approximate chain with all motions of its joints.
 
@@ -53,25 +119,34 @@ def refine_robot(
         prior: how well the IMUs are known.
         floor: the noise of the first module's IMU at rest, if that module is bolted to the base by its
             housing: its readings beyond this noise are the base's motion. None: the base rests.
+        suspects: what is free beyond the prior; None for nothing.
 
     Raises:
         DataError: as `refine_chain`.
     """
+    count = len(chain.serials)
+    suspects = suspects or Suspects((), (), np.zeros(count))
+    windows = [_rescaled(one, suspects.scale) for one in windows]
+    placement = np.tile(prior.placement_sigmas, (count, 1))
+    placement[list(suspects.imus), 3:] = ANYWHERE_M
     keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MAX_IMU_SAMPLES))
     parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor) for one in windows]
-    rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior)
+    rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior, None, placement)
     # The first IMU may have no motion to determine its delay; all IMUs are of one type.
     late_s = float(np.median(rigid.intrinsics.errors[1:, DELAY])) if len(chain.serials) > 1 else 0.0
     steps = encoder_steps(windows)
     parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor, late_s, steps) for one in windows]
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
-    giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep)
+    giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep, placement)
     if not giving.compliance.size:
-        return refine_chain(giving.chain, thinned(parts, keep), prior)._replace(late_s=late_s)
+        fine = thinned(parts, keep)
+        flex = without_links(count, len(fine.q_rad))
+        return _with_encoders(giving.chain, fine, prior, flex, placement, suspects)._replace(late_s=late_s)
     # The hinges' positions change the torques that turn them: first a coarse estimate, then the final one.
     coarse = thinned(parts, COARSE * keep)
     flex = hinge_slopes(giving.chain, coarse.smooth, joined(loads, COARSE * keep), giving.compliance)
-    hinged = refine_chain(giving.chain, coarse, prior, flex)
+    tested = Suspects((), tuple(range(count)), suspects.scale)
+    hinged = _with_encoders(giving.chain, coarse, prior, flex, placement, tested)
     links = len(giving.compliance)
     moved, joints = hinged.compliance[links:], flex.links[:links:2]
     loads = with_hinges_moved(loads, joints, moved)
@@ -81,13 +156,45 @@ def refine_robot(
     fine = thinned(parts, keep)
     compliance = hinged.compliance[:links]
     flex = hinge_slopes(hinged.chain, fine.smooth, joined(loads, keep), compliance, moved)
-    refined = refine_chain(hinged.chain, fine, prior, flex)
+    refined = _with_encoders(hinged.chain, fine, prior, flex, placement, suspects)
+    if not suspects.encoders:
+        refined = refined._replace(
+            encoder_scale=hinged.encoder_scale, encoder_scale_sigma=hinged.encoder_scale_sigma
+        )
     # The last step estimates the change of the hinges' positions.
     return refined._replace(compliance=frozen(refined.compliance + flex.taken), late_s=late_s)
 
 
+def _with_encoders(
+    chain: Chain,
+    data: SensorData,
+    prior: ImuPrior,
+    flex: ComplianceJacobian,
+    placement: Array,
+    suspects: Suspects,
+) -> Refinement:
+    """Refine with the scales of suspected encoders free, which are taken out of the compliances."""
+    links = len(flex.links)
+    flex = with_encoder_scales(flex, chain, data.smooth, suspects.encoders)
+    refined = refine_chain(chain, data, prior, flex, placement)
+    scale, sigma = suspects.scale.copy(), np.zeros(len(suspects.scale))
+    scale[list(suspects.encoders)] += refined.compliance[links:]
+    sigma[list(suspects.encoders)] = refined.compliance_sigma[links:]
+    return refined._replace(
+        compliance=frozen(refined.compliance[:links]),
+        compliance_sigma=frozen(refined.compliance_sigma[:links]),
+        encoder_scale=frozen(scale),
+        encoder_scale_sigma=frozen(sigma),
+    )
+
+
 def _giving(
-    rigid: Refinement, parts: list[SensorData], loads: Sequence[LinkLoad | None], prior: ImuPrior, keep: int
+    rigid: Refinement,
+    parts: list[SensorData],
+    loads: Sequence[LinkLoad | None],
+    prior: ImuPrior,
+    keep: int,
+    placement: Array,
 ) -> tuple[Refinement, list[SensorData]]:
     """Refine with compliant links, and with base motion if that reduces the other IMUs' residuals: not if the
     first module's own gears shake the IMU on the base.
@@ -95,12 +202,12 @@ def _giving(
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
     flex = compliance_jacobian(rigid.chain, resting.smooth, loads)
-    at_rest = refine_chain(rigid.chain, resting, prior, flex)
+    at_rest = refine_chain(rigid.chain, resting, prior, flex, placement)
     data = thinned(parts, keep)
     single_module = len(rigid.chain.serials) == 1
     if data.base_motion is None or not data.base_motion.any() or single_module:
         return at_rest, still
-    shaken = refine_chain(faced(rigid.chain, data, rigid.estimate.null_basis), data, prior, flex)
+    shaken = refine_chain(faced(rigid.chain, data, rigid.estimate.null_basis), data, prior, flex, placement)
     return (shaken, parts) if _misfit(shaken) < _misfit(at_rest) else (at_rest, still)
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.batch_estimation.estimator import Refinement
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.recording.recording import Recording
@@ -18,6 +19,7 @@ from coordinator.topology.topology import Observations, Topology
 from module_agent.model.catalogue import ModuleType
 from module_agent.model.chain import Array, Chain
 from module_agent.model.errors import DataError
+from module_agent.model.imu_prior import ImuPrior
 from module_agent.model.regressor import inverse_dynamics
 from module_agent.signals.clock_map import ClockMap
 from module_agent.signals.filtering import JointMotion
@@ -34,6 +36,9 @@ LOAD_SIGMA = 0.3
 # Efforts are compared with loads that vary by more than this, and must follow them this closely.
 LOAD_NM, ALIKE_ABOVE = 0.05, 0.8
 _BACKWARDS = "its encoder counts backwards, or the module is mounted the other way round"
+_EXPLORATION = "its exploration"
+_MISLABELLED = "it seems to be of another type than it reports; its place is estimated"
+_SCALED = "the scale is estimated; check its gear ratio and type"
 _OPPOSED = "the sign of its effort or of its encoder is wrong"
 
 
@@ -235,6 +240,35 @@ def check_effort_signs(findings: Sequence[Finding], signs: Mapping[str, tuple[fl
     open_ = [f for f in findings if signs.get(f.serial, (1.0, np.inf))[1] * NAMED_ABOVE > 1.0]
     if open_:
         raise SensorError("; ".join(finding.summary for finding in open_))
+
+
+def doubted_sensors(
+    refined: Refinement, prior: ImuPrior, imus: Sequence[int], encoders: Sequence[int]
+) -> list[Finding]:
+    """Return the IMUs that sit elsewhere than the catalogue has them, and the encoders that are off in scale.
+
+    Args:
+        refined: n modules.
+        prior: of the IMUs that agree with it.
+        imus, encoders: the modules of which places and scales were free.
+    """
+    serials, findings = refined.chain.serials, []
+    for k in imus:
+        off_m = refined.placement[k, 3:]
+        away = np.abs(off_m / np.hypot(refined.placement_sigma[k, 3:], prior.place_m))
+        worst = int(away.argmax())
+        what = f"the place of its IMU along {'xyz'[worst]} against its catalogued place"
+        if away[worst] > NAMED_ABOVE:
+            off = 1e3 * float(off_m[worst]), 0.0, float(away[worst])
+            findings.append(Finding(serials[k], _EXPLORATION, what, *off, "mm", _MISLABELLED))
+    for k in encoders:
+        scale, sigma = float(refined.encoder_scale[k]), float(refined.encoder_scale_sigma[k])
+        if abs(scale) > NAMED_ABOVE * sigma:
+            read = 1.0 / (1.0 + scale), 1.0, abs(scale) / max(sigma, 1e-9)
+            findings.append(
+                Finding(serials[k], _EXPLORATION, "its encoder's scale against the gyros", *read, "", _SCALED)
+            )
+    return findings
 
 
 def _components(topology: Topology, seen: Observations, up: Array, j: int) -> list[tuple[float, float]]:

@@ -7,14 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.identification.identified import IdentificationError
+from coordinator.identification.identified import IdentificationError, Kinematics
 from coordinator.identification.identify import identify_kinematics
 from coordinator.recording.recording import Entry, Recording
 from coordinator.recording.session_file import read_session
 from module_agent.wire.codec import decode, encode
 from module_agent.wire.feedback_rows import ROW, Rows
 from module_agent.wire.keys import Leaf, parse
-from module_agent.wire.messages import Feedback
+from module_agent.wire.messages import Feedback, Info
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
+from sim.scoring.chain_score import link_length_m
 
 YAW, LIFT, ELBOW = "shoulder-yaw", "shoulder-lift", "elbow"
 ENCODER = ("position_rad", "velocity_rad_s", "position_command_rad", "velocity_command_rad_s")
@@ -99,3 +102,45 @@ def test_exchanged_encoders_are_refused_by_name(run: list[Entry]) -> None:
     _altered(run, keep)
     with pytest.raises(IdentificationError, match=rf"encoders of {ELBOW} and {YAW} are exchanged"):
         identify_kinematics(_altered(run, exchange))
+
+
+def _scaled(wrong: str, factor: float) -> Alteration:
+    def alter(serial: str, first: int, rows: Rows) -> None:
+        if serial == wrong:
+            for field in ENCODER[:2]:
+                rows[field] *= factor
+
+    return alter
+
+
+def _covered(kinematics: Kinematics) -> None:
+    truth = true_chain(load_robot("a2085_03"))
+    for child, serial in enumerate(kinematics.topology.serials[1:], 1):
+        error_m = kinematics.fit.link_length_m[child] - link_length_m(truth, truth.serials.index(serial))
+        assert abs(error_m) < 3.0 * kinematics.fit.link_length_sigma_m[child]
+
+
+@pytest.mark.parametrize("wrong", [YAW, LIFT])
+def test_an_encoder_with_a_wrong_scale_is_named_and_its_scale_estimated(run: list[Entry], wrong: str) -> None:
+    kinematics = identify_kinematics(_altered(run, _scaled(wrong, 1.01)))
+    (finding,) = kinematics.findings
+    assert (finding.serial, finding.measured) == (wrong, pytest.approx(1.01, abs=1e-3))
+    _covered(kinematics)
+
+
+def test_a_module_that_reports_another_type_is_named_by_the_place_of_its_imu(run: list[Entry]) -> None:
+    mislabelled = []
+    for entry in run:
+        if (
+            entry.kind != "journal"
+            and entry.kind != "request"
+            and parse(entry.topic)[1:] == (LIFT, Leaf.INFO)
+        ):
+            info = decode(Info, entry.payload).model_copy(update={"module_type": "X5-9-old"})
+            entry = entry._replace(payload=encode(info))
+        mislabelled.append(entry)
+    kinematics = identify_kinematics(_altered(mislabelled, lambda *_: None))
+    (finding,) = kinematics.findings
+    # The IMU is at x = 25 mm, and by the other type at -30 mm.
+    assert (finding.serial, finding.measured) == (LIFT, pytest.approx(55.0, abs=5.0))
+    _covered(kinematics)
