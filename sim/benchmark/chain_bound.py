@@ -31,7 +31,7 @@ from sim.world.truth import Motion
 
 # Every fourth row of 250 Hz: joints and their springs move below 20 Hz.
 EVERY = 4
-# Rows of one banded system; the motion's knots at its ends are free of those beside it.
+# Rows of one banded system; the motion's knots at its ends are free of those next to it.
 _CHUNK = 1000
 # A prior so many times wider than the estimator's says nothing, and keeps the numbers finite.
 _WIDE = 100.0
