@@ -32,7 +32,7 @@ from module_agent.model.read_only import frozen
 from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ
 
 # Prior of corrected IMUs: scale and misalignment are the same in both sessions.
-TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5)
+TIED = UNCALIBRATED._replace(scale=1e-5, misalignment_rad=1e-5, place_m=0.0, mounting_rad=0.0)
 MOVING: tuple[Purpose, ...] = ("constant", "windowed_sine", "whole")
 
 

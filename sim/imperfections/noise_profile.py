@@ -101,7 +101,6 @@ _X5 = (
     *_BODY,
     *("variation", "imu-white", "imu-bias", "imu-drift", "g-sensitivity", "imu-bandwidth", "imu-range"),
     *("imu-steps", "vibration", "encoder", "velocity-estimate", "torque-noise", "clock", "sampling-jitter"),
-    *("imu-place", "imu-mounting", "body-mass", "body-centre", "housing-axis"),
 )
 _UNCALIBRATED = (*_X5, "imu-scale", "imu-misalignment", "torque-calibration", "torque-hysteresis")
 

@@ -143,9 +143,8 @@ def test_the_kit_arm_with_calibrated_imus_on_rigid_links_is_identified_to_a_mill
     found = runs("a2085_04", "lan", quick_plan.model_copy(update={"dynamics": True}), SOLID).score
     assert found.tip_position_rms_mm is not None
     assert found.torque_relative_error is not None
-    # IMUs are 1 mm off their places and axes tilted in their housings: 0.3 mm are measured with full motions,
-    # 3.0 mm with these, which are shorter.
-    assert found.tip_position_rms_mm < 5.0
+    # 0.3 mm are measured with full motions; these are shorter and tell less of the IMUs' places.
+    assert found.tip_position_rms_mm < 3.0
     for link in found.links:
         assert link.link_length_error_mm is not None
         assert abs(link.link_length_error_mm) < 1.0

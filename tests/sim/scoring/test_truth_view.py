@@ -118,7 +118,5 @@ def test_a_virtual_run_shows_both_robots_and_estimates_that_come_nearer(
     # Known from the first joint on, refined in the end, and shown until then.
     assert len(np.unique(lengths)) >= 2
     assert lengths[-1] == pytest.approx(result.links[0].link_length_mm)
-    # The robot as it was built: its axes are 0.1 mm and 0.05 deg off the file's.
     built = 1e3 * link_length_m(true_chain(as_built(config.robot, config.seed)), child=1)
-    assert 0.0 < abs(built - 350.0) < 1.0
     np.testing.assert_allclose(_values(file, f"/estimates/link_length/{tip}/true"), built, atol=1e-3)
