@@ -77,7 +77,9 @@ def test_no_other_frequency_or_sweep_within_the_limits_leaves_less_error() -> No
 
 def test_a_second_of_the_same_motion_makes_noise_less_by_the_root_of_two_and_errors_of_scale_not() -> None:
     sine = WindowedSine(amplitude=0.2, frequency_hz=0.8, centre_s=2.0, sigma_s=0.7)
-    once, twice = (predicted_sigma_m(TASK, [sine] * n) for n in (1, 2))
+    # Biases of which nothing is known beforehand: a prior would count once, and a second motion for less.
+    open_bias = TASK._replace(prior=TASK.prior._replace(accel_bias_m_s2=1.0))
+    once, twice = (predicted_sigma_m(open_bias, [sine] * n) for n in (1, 2))
     assert twice == pytest.approx(once / np.sqrt(2.0), rel=0.1)
     flat = TASK._replace(prior=UNCALIBRATED, along=1.0)
     once, twice = (predicted_sigma_m(flat, [sine] * n) for n in (1, 2))
