@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from coordinator.baseline.change_detection import FLOOR_M, FLOOR_RAD, TiedFits, find_changes
+from coordinator.baseline.change_detection import FLOOR_M, FLOOR_RAD, TIED, TiedFits, find_changes
 from coordinator.batch_estimation.estimator import Refinement
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from module_agent.model.chain import Chain
@@ -203,3 +203,8 @@ def test_what_would_be_found_is_found_in_the_worst_direction(draw: Draw) -> None
     # Two sigmas of margin: 98 of 100 are found, and of 60 at least 54 in all but one of 10^4 such draws.
     assert found >= 54
     assert np.isnan(find_changes(draw(ARM, rng)).would_find_m[0])
+
+
+def test_imus_stay_where_the_baseline_found_them_so_that_they_do_not_absorb_a_displaced_link() -> None:
+    # An IMU that may sit anywhere in its housing reads as a link that is displaced by as much.
+    assert not TIED.placement_sigmas.any()
