@@ -30,7 +30,7 @@ _CERTAIN, _DISSIPATED = 5.0, 0.01
 # share has another direction; a component that is less of it is not compared.
 _MASS_FACTOR, _GRAVITY_PART, _COMPARABLE_PART = 5.0, 0.5, 0.1
 # Weight below this share of all torques is not compared.
-_FELT_PART = 0.02
+_BORNE_PART = 0.02
 _KNOWN_FACTORS = (
     (180.0 / np.pi, "degrees per second; multiply by pi / 180"),
     (-1.0, "of the opposite sign; negate one of the two"),
@@ -158,7 +158,7 @@ def _against_masses(problem: Problem, phi: Array, log: JointLog) -> Iterator[str
     sigma = np.sqrt(np.diagonal(fit.covariance)[:4])
     size = float(np.linalg.norm(chain.gravity))
     # A vertical axis that is tilted by a hair bears a hair of the weight: it tells nothing.
-    felt = size * np.linalg.norm(pulls, axis=(1, 2)) > _FELT_PART * np.linalg.norm(problem.log.tau_nm)
+    felt = size * np.linalg.norm(pulls, axis=(1, 2)) > _BORNE_PART * np.linalg.norm(problem.log.tau_nm)
     given, shown = np.where(felt, chain.gravity, 0.0), np.where(felt, gravity, 0.0)
     # Where given gravity loads no joint there is nothing to compare the units with.
     comparable = float(np.linalg.norm(given)) > _COMPARABLE_PART * size
