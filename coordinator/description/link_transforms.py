@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from coordinator.kinematics.frames import distal_homes, proximal_homes
 from module_agent.model.catalogue import ModuleType
@@ -73,18 +73,20 @@ def _transform(
 ) -> LinkTransform:
     parent = chain.parent[child]
     pose = np.asarray(np.linalg.solve(from_face, to_face), dtype=np.float64)
-    turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
-    slope = np.zeros((6, covariance.shape[0]))
-    local = parameter_slope(pose) @ adjoint(np.asarray(np.linalg.inv(from_face), dtype=np.float64))
-    slope[:, 6 * child : 6 * child + 6] = local
-    slope[:, 6 * parent : 6 * parent + 6] -= local
-    null, unknown = _null_directions(slope / _UNITS[:, None] @ null_basis)
+    local = adjoint(np.asarray(np.linalg.inv(from_face), dtype=np.float64))
+    relative = np.zeros((6, covariance.shape[0]))
+    relative[:, 6 * child : 6 * child + 6] = local
+    relative[:, 6 * parent : 6 * parent + 6] -= local
+    slope = parameter_slope(pose) @ relative
+    null, near = _null_directions(slope / _UNITS[:, None] @ null_basis)
+    far = _changed_by_turning(pose, relative @ null_basis)
+    unknown = tuple(bool(one) for one in near | far)
     return LinkTransform(
         parent=chain.serials[parent],
         child=chain.serials[child],
         parent_face="housing" if chain.reversed[parent] else "output",
         child_face="output" if chain.reversed[child] else "housing",
-        values=frozen(_UNITS * np.concatenate([pose[:3, 3], turn])),
+        values=frozen(_UNITS * _parameters(pose)),
         covariance=frozen(slope @ covariance @ slope.T),
         unknown=unknown,
         null_directions=null,
@@ -107,10 +109,29 @@ def parameter_slope(pose: Array) -> Array:
     return np.asarray(_UNITS[:, None] * slope)
 
 
-def _null_directions(seen: Array) -> tuple[Array, tuple[bool, ...]]:
+def _null_directions(seen: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the changes (6, k) [mm, deg] of the six parameters by null vectors, and which they change."""
     u, size, _ = np.linalg.svd(seen, full_matrices=False)
     moving = u[:, size > TAKES_PART_ABOVE]
-    unknown = tuple(bool(part > TAKES_PART_ABOVE) for part in np.linalg.norm(moving, axis=1))
     columns = _UNITS[:, None] * moving
-    return frozen(columns / np.linalg.norm(columns, axis=0)), unknown
+    changed = np.linalg.norm(moving, axis=1) > TAKES_PART_ABOVE
+    return frozen(columns / np.linalg.norm(columns, axis=0)), np.asarray(changed)
+
+
+def _changed_by_turning(pose: Array, twists: Array) -> NDArray[np.bool_]:
+    """Return which parameters (6,) of a pose change when unobservable turns, (6, k), go on for a radian.
+
+    A place at the extreme of its circle has no slope: a face straight ahead in y keeps its y at first.
+    """
+    changed = np.zeros(6, dtype=bool)
+    for twist in twists.T:
+        angle = float(np.linalg.norm(twist[:3]))
+        if angle > TAKES_PART_ABOVE:
+            turned = RigidTransform.from_exp_coords(twist / angle).as_matrix() @ pose
+            changed |= np.abs(_parameters(turned) - _parameters(pose)) > TAKES_PART_ABOVE
+    return changed
+
+
+def _parameters(pose: Array) -> Array:
+    """Return place [m] and rotation vector [rad] of a pose, (6,)."""
+    return np.concatenate([pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_rotvec()])

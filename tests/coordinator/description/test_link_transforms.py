@@ -115,6 +115,19 @@ def test_an_unobservable_turn_about_the_parents_axis_leaves_z_known(robots: Any)
     assert not any(far.unknown)
 
 
+def test_a_place_that_only_a_finite_turn_changes_is_unknown_too(robots: Any) -> None:
+    # The child is straight ahead in its parent's y, where a small turn about z moves it along x alone.
+    chain, types = robots.random(2, joints=2, serial=True)
+    root, child = robots.root_pose(types[0]), robots.root_pose(types[1])
+    child[:3, 3] += types[0].output_xyz + np.array([0.0, 0.2, 0.0])
+    chain = robots.build([-1, 0], [False] * 2, np.stack([root, child]), types, chain.gravity)
+    axis, point = chain.axis[0], chain.point[0]
+    basis = np.r_[np.zeros(6), axis, np.cross(point, axis)][:, None]
+    (link,) = link_transforms(chain, types, np.zeros((12, 12)), basis)
+    np.testing.assert_allclose(link.values, [0, 200, 0, 0, 0, 0], atol=1e-9)
+    assert link.unknown == (True, True, False, False, False, True)
+
+
 def test_what_does_not_fit_the_chain_is_refused(robots: Any) -> None:
     chain, types = robots.random(1, joints=3)
     with pytest.raises(ValueError, match="for 3 modules"):
