@@ -1,10 +1,10 @@
 """The physical limit of a chain's estimate: the Cramer-Rao bound of all that a robot's sensors recorded.
 
 It shares neither model nor data with our estimator: readings and slopes are pinocchio's, of the true chain on
-its true motion, and the noise is the profile's. Known: how links and base give. Unknown: the modules' places,
-gravity, the errors of every IMU, and the joints' true motion, which encoders and IMUs measure together. That
-motion is eliminated exactly: of the readings' slopes by position, speed and acceleration, differences in time
-make a banded system. Biases count as constant.
+its true motion, and the noise is the profile's. Known: how links and base give. Unknown: the modules' poses,
+gravity, the errors of every IMU and its placement in its housing, and the joints' true motion, which encoders
+and IMUs measure together. That motion is eliminated exactly: of the readings' slopes by position, speed and
+acceleration, differences in time make a banded system. Biases count as constant.
 
 Pinocchio is a development dependency; without it there is no bound.
 """
@@ -35,6 +35,8 @@ EVERY = 4
 _CHUNK = 1000
 # A prior so many times wider than the estimator's says nothing, and keeps the numbers finite.
 _WIDE = 100.0
+# The same for an IMU's turn [rad] and place [m]: far beyond what counts as unresolved.
+_ANYWHERE = 10.0
 _POSES, _STEP = 100, 1e-5
 
 
@@ -48,7 +50,9 @@ class ChainBound(NamedTuple):
 class Bounds(NamedTuple):
     """The bounds with the estimator's priors (van Trees), and without any: strict.
 
-    Without priors the IMUs' errors that the profile does not have are known to be zero.
+    Without priors the errors of IMUs that the profile does not have are known to be zero. If IMUs are off
+    their places in it, readings alone tell where IMUs are, but of a leaf that does not turn its own IMU not
+    where its housing is: more directions are unresolved then than with priors, and tips have no strict bound.
     """
 
     bayesian: ChainBound
@@ -66,7 +70,7 @@ def chain_bounds(
     """Return the bounds for one recording, None without pinocchio.
 
     Args:
-        truth: the true chain of n joints.
+        truth: the true chain of n joints, with the IMUs where they sit (`sensing_chain`).
         types: (n,) module types.
         motion: the true motion, at the rate of the sensors.
         profile: the sensors' noise.
@@ -75,24 +79,32 @@ def chain_bounds(
     if not available():
         return None
     information = chain_information(truth, types, motion, profile)
-    own = prior.sigmas
+    own = np.concatenate([prior.sigmas, prior.placement_sigmas])
     up = truth.gravity / np.linalg.norm(truth.gravity)
     size = np.outer(up, up) / GRAVITY_SIGMA_M_S2**2
-    wide = _WIDE * np.where(_drawn(profile), own, 0.0)
+    wide = np.concatenate([_WIDE * prior.sigmas, np.full(6, _ANYWHERE)]) * _drawn(profile)
     return Bounds(_bound(truth, information, own, size), _bound(truth, information, wide, np.zeros((3, 3))))
 
 
 def _drawn(profile: NoiseProfile) -> NDArray[np.bool_]:
-    """Return which errors of an IMU (34,) the profile has, in the order of `ImuPrior.sigmas`."""
+    """Return which errors of an IMU the profile has (40,): those of `ImuPrior.sigmas`, then placement."""
     cross = profile.imu_misalignment_rad + profile.imu_skew_rad
     scales = [np.where(np.eye(3), scale, cross) for scale in (profile.gyro_scale, profile.accel_scale)]
     biases = per_axis(profile.gyro_bias_rad_s, profile.accel_bias_m_s2)
     rest = [profile.imu_bandwidth_hz], np.full(9, profile.gyro_g_sensitivity_s_m)
-    return np.asarray(np.concatenate([*(scale.ravel() for scale in scales), biases, *rest]) > 0.0)
+    # A housing whose axis is tilted and displaced carries its IMU along.
+    placed = np.repeat(
+        [
+            profile.imu_mounting_rad + profile.housing_axis_rad,
+            profile.imu_place_m + profile.housing_axis_m,
+        ],
+        3,
+    )
+    return np.asarray(np.concatenate([*(scale.ravel() for scale in scales), biases, *rest, placed]) > 0.0)
 
 
 def _bound(chain: Chain, information: Array, imu_sigmas: Array, gravity: Array) -> ChainBound:
-    """Add priors to the information on [perturbations (6 n), gravity (3), IMU errors (n, k)] and invert."""
+    """Add priors to the information on [perturbations (6 n), gravity (3), IMUs' own (n, k)] and invert."""
     poses, count = 6 * len(chain.serials), len(chain.serials)
     scale = np.concatenate([np.full(3, _WIDE), np.tile(imu_sigmas, count)])
     nuisance = information[poses:, poses:].copy()
@@ -134,7 +146,7 @@ def tip_bound(chain: Chain, bound: ChainBound, seed: int = 0) -> tuple[float, fl
 
 
 def chain_information(truth: Chain, types: Sequence[str], motion: Motion, profile: NoiseProfile) -> Array:
-    """Return the information on [perturbations (6 n), gravity (3), IMU errors (n, k)] without any prior."""
+    """Return the information on [perturbations (6 n), gravity (3), IMUs' own (n, k)] without any prior."""
     model = ChainModel(truth)
     step_s = 1e-9 * float(np.median(np.diff(motion.t_ns)))
     q, qd = motion.q_rad, motion.qd_rad_s
@@ -160,7 +172,9 @@ def chain_information(truth: Chain, types: Sequence[str], motion: Motion, profil
 class Slopes(NamedTuple):
     """Derivatives of m samples of n IMUs' readings, (m, n, 6, ...).
 
-    unknown: by [perturbations (6 n), gravity (3), IMU errors (n, k)]. q, qd, qdd: by the joints' motion (n).
+    unknown: by [perturbations (6 n), gravity (3), IMUs' own (n, k)]. q, qd, qdd: by the joints' motion (n).
+
+    An IMU's own are its errors in the order of `ImuPrior`, and its turn and displacement in its own axes.
     """
 
     unknown: Array
@@ -246,19 +260,20 @@ class ChainModel:
     def slopes(self, motion: Sequence[Array], step_s: float) -> Slopes:
         """Return the derivatives of the readings of IMUs without errors; samples are `step_s` apart."""
         q, qd, qdd = motion
-        readings, slopes, turns = self._kinematics(q, qd, qdd)
+        readings, slopes, turns, alpha = self._kinematics(q, qd, qdd)
         joints = len(self._chain.serials)
         gravity = np.concatenate([np.zeros_like(turns), turns.swapaxes(2, 3)], axis=2)
-        # An IMU's own errors change its own readings only.
-        errors = _error_slopes(readings, np.gradient(readings, step_s, axis=0))
+        # An IMU's own errors and its place change its own readings only.
+        by_error = _error_slopes(readings, np.gradient(readings, step_s, axis=0))
+        errors = np.concatenate([by_error, _placement_slopes(readings, alpha)], axis=3)
         own = np.zeros((*readings.shape, joints, errors.shape[3]))
         own[:, np.arange(joints), :, np.arange(joints)] = errors.swapaxes(0, 1)
         by_place = slopes[0] @ self._absolute
         unknown = np.concatenate([by_place, gravity, own.reshape(*readings.shape, -1)], axis=3)
         return Slopes(unknown, *(slope[..., self._joints] for slope in slopes))
 
-    def _kinematics(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, tuple[Array, ...], Array]:
-        """Return readings (m, n, 6), their slopes by all joints, turns (m, n, 3, 3)."""
+    def _kinematics(self, q: Array, qd: Array, qdd: Array) -> tuple[Array, tuple[Array, ...], Array, Array]:
+        """Return readings (m, n, 6), their slopes by all joints, turns (m, n, 3, 3), alpha (m, n, 3)."""
         pin, model, data = self._pin, self._model, self._data
         samples, joints = q.shape
         spatial = np.zeros((2, samples, joints, 6))
@@ -275,7 +290,7 @@ class ChainModel:
                 spatial[1, t, k] = pin.getFrameAcceleration(model, data, frame, pin.LOCAL).vector
                 found = pin.getFrameAccelerationDerivatives(model, data, frame, pin.LOCAL)
                 slopes[0, t, k], slopes[1:, t, k] = found[0], found[1:]
-        return self._readings(spatial, slopes, turns)
+        return *self._readings(spatial, slopes, turns), spatial[1, ..., 3:]
 
     def _readings(
         self, spatial: Array, slopes: Array, turns: Array
@@ -312,3 +327,15 @@ def _error_slopes(readings: Array, rates: Array) -> Array:
     found[..., 18:24] = np.eye(6)
     found[..., 24] = -rates
     return found
+
+
+def _placement_slopes(readings: Array, alpha: Array) -> Array:
+    """Return the derivatives (m, n, 6, 6) of readings by their IMU's turn and displacement in its own axes.
+
+    f = f_0 + (alpha x + omega x omega x) r (Craig, Introduction to Robotics, eq. 6.48), and a sensor that is
+    turned by d reads v - d x v; alpha (m, n, 3) is the angular acceleration in the IMU's axes.
+    """
+    omega, force = skew(readings[..., :3]), skew(readings[..., 3:])
+    by_turn = np.concatenate([omega, force], axis=-2)
+    by_place = np.concatenate([np.zeros_like(omega), skew(alpha) + omega @ omega], axis=-2)
+    return np.concatenate([by_turn, by_place], axis=-1)

@@ -174,7 +174,7 @@ def true_chain(robot: Robot) -> Chain:
     """Return the kinematic truth in the root frame: the housing frame of the first module at q = 0.
 
     What is true of a module is its axis: its housing's frame is where a housing as catalogued would have that
-    axis, and `imu_home` is the catalogued place in that frame, wherever the IMU sits.
+    axis, and `imu_home` is the catalogued place in that frame, wherever the IMU sits (`sensing_chain`).
     """
     tree = build_tree(robot)
     housings = _nominal_housings(tree)
@@ -190,6 +190,13 @@ def true_chain(robot: Robot) -> Chain:
         imu_home=read_only(to_root @ housings @ imu_in_housing),
         gravity=read_only(to_root[:3, :3] @ np.array([0.0, 0.0, robot.base.gravity_m_s2])),
     )
+
+
+def sensing_chain(robot: Robot) -> Chain:
+    """Return the true chain with the IMUs where they sit in their housings: its readings are the sensors'."""
+    tree = build_tree(robot)
+    to_root = inverse(_nominal_housings(tree)[0])
+    return true_chain(robot)._replace(imu_home=read_only(to_root @ tree.imu_home))
 
 
 def true_inertia(robot: Robot) -> Array:

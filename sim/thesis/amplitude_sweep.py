@@ -15,7 +15,7 @@ from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
 from module_agent.model.errors import DataError
 from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import Robot, load_robot
-from sim.robot.robot_tree import true_chain
+from sim.robot.robot_tree import sensing_chain
 from sim.scoring.chain_score import link_length_m
 from sim.test_bench.one_joint_rig import JOINT, OneJointRig, TrialRows, analyse
 from sim.thesis.published import ALIGNMENTS, Alignment, thesis_length
@@ -114,9 +114,9 @@ def run_series(series: Series) -> list[AmplitudeTrial]:
         KeyError, ValueError: no such noise profile or effect, no such robot.
     """
     robot = series.robot
-    true_mm = 1e3 * link_length_m(true_chain(robot), child=1)
     trials = []
     with OneJointRig(robot, series.seed, series.noise.of(robot)) as rig:
+        true_mm = 1e3 * link_length_m(sensing_chain(rig.world.robot), child=1)
         clamp_rad_s = rig.modules[JOINT].firmware.config.kind.velocity_clamp_rad_s
         for number, amplitude_rad in enumerate(series.amplitudes_rad):
             rows = rig.trial(Plan(sine_amplitude_rad=amplitude_rad))

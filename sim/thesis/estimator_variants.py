@@ -27,7 +27,7 @@ from module_agent.estimate.windows import Array, ImuWindow, JointWindow, imu_win
 from module_agent.model.errors import DataError
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_file import load_robot
-from sim.robot.robot_tree import true_chain
+from sim.robot.robot_tree import sensing_chain
 from sim.scoring.chain_score import link_length_m
 from sim.test_bench.one_joint_rig import IMU, OneJointRig, TrialRows, analyse, regress, windows
 from sim.thesis.joint_trial import bound_m, imu_knowledge, rms, trial_plan
@@ -67,7 +67,8 @@ def compare(length_mm: int, alignment: Alignment, profile: NoiseProfile, seed: i
     robot = load_robot(f"thesis_{length_mm}_{alignment}")
     with OneJointRig(robot, seed, profile) as rig:
         trial = rig.trial(trial_plan(thesis_length(alignment, length_mm), profile))
-    return compare_estimators(trial, profile, link_length_m(true_chain(robot), child=IMU))
+        true_m = link_length_m(sensing_chain(rig.world.robot), child=IMU)
+    return compare_estimators(trial, profile, true_m)
 
 
 def compare_estimators(trial: TrialRows, profile: NoiseProfile, true_m: float) -> Comparison:

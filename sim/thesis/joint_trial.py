@@ -23,7 +23,7 @@ from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import CALIBRATED, IMU_PRIORS, ImuPrior
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.robot_file import load_robot
-from sim.robot.robot_tree import true_chain
+from sim.robot.robot_tree import sensing_chain
 from sim.robot.variants import at_random_site
 from sim.scoring.chain_score import link_length_m
 from sim.test_bench.one_joint_rig import IMU, JOINT, OneJointRig, TrialRows, analyse, regress, windows
@@ -106,7 +106,8 @@ def joint_trial(length_mm: int, alignment: Alignment, profile: NoiseProfile, see
     with OneJointRig(robot, seed, profile) as rig:
         rows = rig.trial(trial_plan(thesis_length(alignment, length_mm), profile))
         robot_time_s = 1e-9 * rig.world.t_ns
-    chain = true_chain(robot)
+        # As built: a circle's radius ends where the IMU sits, wherever the catalogue has it.
+        chain = sensing_chain(rig.world.robot)
     true_m = link_length_m(chain, child=IMU)
     true_axis = chain.imu_home[IMU, :3, :3].T @ chain.axis[JOINT]
     try:

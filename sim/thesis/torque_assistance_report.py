@@ -13,7 +13,9 @@ import numpy as np
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_json
 from module_agent.model.read_only import read_only
+from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_tree import true_chain, true_inertia
+from sim.robot.variants import as_built
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
 from sim.thesis.torque_assistance import MODES, ON_MODULE, Model, standing_robot
 from sim.thesis.torque_assistance_cases import ABOUT_AS_WELL, Combination
@@ -121,9 +123,9 @@ def combination_text(each: Combination) -> str:
     return f"{robot_and_pose(each)}, {case.gains.name}{read}, {case.motion}{delivered}"
 
 
-def true_model(name: str, seed: int) -> Model:
-    """Return the true model of a shipped robot where the seed puts it, in place of an identified one."""
-    robot = standing_robot(name, seed)
+def true_model(name: str, seed: int, noise: NoiseProfile) -> Model:
+    """Return the true model of a shipped robot as the seed builds and places it, not an identified one."""
+    robot = as_built(standing_robot(name, seed), seed, noise)
     return Model(true_chain(robot), read_only(true_inertia(robot).reshape(-1)))
 
 

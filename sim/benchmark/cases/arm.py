@@ -28,7 +28,7 @@ from sim.benchmark.chain_bound import Bounds, chain_bounds, tip_bound
 from sim.benchmark.row import Row, count, largest, mean_abs, ratio, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
 from sim.robot.robot_file import load_robot
-from sim.robot.robot_tree import true_chain
+from sim.robot.robot_tree import sensing_chain, true_chain
 from sim.robot.variants import as_built, at_random_site
 from sim.scoring.chain_score import LinkErrors, link_errors, tip_errors, topology_differences
 from sim.sensors.module_clock import ModuleClock, module_time
@@ -135,7 +135,7 @@ def arm_trial(
     except RobotError as error:
         return begun._replace(why=str(error))
     truth, types = true_chain(described), [module.type for module in described.modules]
-    bounds = chain_bounds(truth, types, motions[0], profile, IMU_PRIORS[recording.imu])
+    bounds = chain_bounds(sensing_chain(described), types, motions[0], profile, IMU_PRIORS[recording.imu])
     return _scored(begun, truth, recording, kinematics, clocks, bounds)
 
 

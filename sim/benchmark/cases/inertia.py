@@ -37,7 +37,7 @@ from sim.benchmark.row import Row, count, largest, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile, switched
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
-from sim.robot.variants import at_random_site
+from sim.robot.variants import as_built, at_random_site
 from sim.scoring.score import true_torque
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session
@@ -99,7 +99,7 @@ def inertia_trial(
         plan: of the session.
         poses: number of random poses in which the mass matrix is checked.
     """
-    described = at_random_site(load_robot(robot), seed)
+    described = at_random_site(as_built(load_robot(robot), seed, noise), seed)
     trial = InertiaTrial(robot, label, seed, "")
     settings = VirtualSettings(described, network("lan"), seed, noise)
     motions: list[Motion] = []

@@ -19,7 +19,7 @@ from sim.geometry.link_parts import FreePose
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
-from sim.robot.variants import at_random_site, loaded
+from sim.robot.variants import as_built, at_random_site, loaded
 from sim.virtual_time.robot import VirtualSettings
 
 MASS_KG = 0.2
@@ -51,7 +51,7 @@ def payload_trial(
     Raises:
         PayloadError: the runs do not suffice for a search.
     """
-    unloaded = at_random_site(load_robot(robot), seed)
+    unloaded = at_random_site(as_built(load_robot(robot), seed, noise), seed)
     carrier = unloaded.serials[-1]
     full = loaded(unloaded, carrier, HELD)
     known = _recorded(unloaded, noise, seed, 0, plan)

@@ -46,7 +46,9 @@ def assistance_of_robot(
     """Identify a robot, or take it as known without error if `shortened`, and try combinations on it."""
     noise = noise_profile(NOISE)
     model = (
-        true_model(robot, seed) if shortened else identified_model(standing_robot(robot, seed), noise, seed)
+        true_model(robot, seed, noise)
+        if shortened
+        else identified_model(standing_robot(robot, seed), noise, seed)
     )
     return [try_case(case, model, noise, seed) for case in chosen]
 

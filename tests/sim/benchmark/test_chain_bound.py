@@ -5,11 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coordinator.batch_estimation.estimator import refine_chain, with_placement
 from coordinator.batch_estimation.imu_prediction import imu_readings
+from coordinator.batch_estimation.sensor_data import SensorData
+from coordinator.kinematics.chain_estimate import link_lengths
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import CALIBRATED
 from module_agent.model.perturbation import apply_perturbation
 from sim.benchmark.chain_bound import (
+    EVERY,
     ChainBound,
     ChainModel,
     Slopes,
@@ -18,7 +22,7 @@ from sim.benchmark.chain_bound import (
     chain_bounds,
     tip_bound,
 )
-from sim.imperfections.noise_profile import noise_profile
+from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import true_chain
 from sim.world.truth import Motion
@@ -46,6 +50,12 @@ def test_readings_and_slopes_are_those_of_the_product_of_exponentials(robots: An
     for k, unit in enumerate(STEP * np.eye(24)):
         ahead, behind = (readings(apply_perturbation(chain, sign * unit), *motion) for sign in (1.0, -1.0))
         np.testing.assert_allclose(found.unknown[..., k], slope(ahead, behind), atol=1e-6)
+    for imu, unit in np.ndindex(4, 6):
+        step = np.zeros((4, 6))
+        step[imu, unit] = STEP
+        ahead, behind = (readings(with_placement(chain, sign * step), *motion) for sign in (1.0, -1.0))
+        column = 24 + 3 + 40 * imu + 34 + unit
+        np.testing.assert_allclose(found.unknown[..., column], slope(ahead, behind), atol=1e-6)
     for which, joint in np.ndindex(3, 4):
         change = np.zeros_like(motion)
         change[which, :, joint] = STEP
@@ -111,6 +121,57 @@ def test_errors_that_the_profile_has_count_without_priors() -> None:
     known, scaled = bounds_of(20.0), bounds_of(20.0, accel_scale=0.01, gyro_scale=0.01)
     assert tip_bound(chain, scaled.strict)[0] > 2.0 * tip_bound(chain, known.strict)[0]
     np.testing.assert_allclose(scaled.bayesian.covariance, known.bayesian.covariance)
+
+
+# The places of IMUs, the profile's effects and the prior's.
+PLACED = {"imu_place_m": 1e-3, "imu_mounting_rad": 2e-3}
+
+
+def test_a_leaf_is_no_better_known_than_its_imu_is_placed() -> None:
+    chain = true_chain(load_robot("a2085_03"))
+    placed, catalogued = bounds_of(20.0, **PLACED), bounds_of(20.0)
+    # The prior holds whether the profile has the effect or not.
+    np.testing.assert_allclose(placed.bayesian.covariance, catalogued.bayesian.covariance)
+    assert tip_bound(chain, placed.bayesian)[0] > np.sqrt(3.0) * CALIBRATED.place_m
+    assert tip_bound(chain, catalogued.strict)[0] < 0.5 * CALIBRATED.place_m
+    # Readings alone do not tell where the housing of a leaf is.
+    assert placed.strict.null_basis.shape[1] >= catalogued.bayesian.null_basis.shape[1] + 6
+
+
+def test_the_estimator_claims_what_the_bound_allows() -> None:
+    robot = load_robot("a2085_04")
+    chain, motion = true_chain(robot), swing(robot.serials, 8.0)
+    # Encoders without noise, and gears that do not shake: what the estimator takes for granted.
+    changed = {"position_step_rad": 1e-9, "sampling_jitter_s": 0.0, "vibration_rad_s": 0.0}
+    profile = noise_profile("x5").model_copy(update=changed | {"vibration_m_s2": 0.0} | PLACED)
+    types = [module.type for module in robot.modules]
+    bounds = chain_bounds(chain, types, motion, profile, CALIBRATED)
+    assert bounds is not None
+    fit = refine_chain(chain, sensed(chain, motion, profile, 3), CALIBRATED)
+    covariances = fit.noise_covariance, bounds.bayesian.covariance
+    lengths = [link_lengths(chain, covariance)[1][1:] for covariance in covariances]
+    free = bounds.bayesian.null_basis
+    tips = [tip_bound(chain, ChainBound(covariance, free)) for covariance in covariances]
+    np.testing.assert_allclose(lengths[0], lengths[1], rtol=0.02)
+    np.testing.assert_allclose(tips[0], tips[1], rtol=0.02)
+
+
+def sensed(chain: Chain, motion: Motion, noise: NoiseProfile, seed: int) -> SensorData:
+    """Return what IMUs with the profile's white noise and random places read, at every `EVERY`th row."""
+    rng = np.random.default_rng(seed)
+    q, qd = motion.q_rad, motion.qd_rad_s
+    joints = q, qd, np.gradient(qd, 0.004, axis=0)
+    drawn = with_placement(chain, rng.normal(size=(len(chain.serials), 6)) * CALIBRATED.placement_sigmas)
+    ideal = readings(drawn, *joints)
+    white = np.hypot(
+        np.repeat([noise.gyro_white_rad_s, noise.accel_white_m_s2], 3),
+        np.repeat([noise.gyro_step_rad_s, noise.accel_step_m_s2], 3) / np.sqrt(12.0),
+    )
+    read = ideal + rng.normal(size=ideal.shape) * white / np.sqrt(EVERY)
+    kept = slice(None, None, EVERY)
+    rates = np.gradient(ideal, 0.004, axis=0)[kept]
+    q, qd, qdd = (part[kept] for part in joints)
+    return SensorData(q, qd, qdd, read[kept, :, :3], read[kept, :, 3:], rates)
 
 
 def test_the_tips_bound_is_the_shift_that_a_covariance_allows() -> None:

@@ -7,7 +7,7 @@ from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2, modul
 from module_agent.model.chain import Chain
 from sim.imperfections.noise_profile import noise_profile, switched
 from sim.robot.robot_file import Build, load_robot
-from sim.robot.robot_tree import build_tree, true_chain, true_inertia
+from sim.robot.robot_tree import build_tree, sensing_chain, true_chain, true_inertia
 from sim.robot.variants import MAX_M_S2, MIN_M_S2, as_built, at_random_site
 from sim.world.world import World
 
@@ -68,6 +68,11 @@ def test_the_truth_is_where_the_axes_are_and_not_where_the_imus_sit() -> None:
         np.testing.assert_array_equal(before, after, err_msg=name)
     there, here = build_tree(moved).imu_home[2], build_tree(robot).imu_home[2]
     np.testing.assert_allclose((np.linalg.inv(here) @ there)[:3, 3], build.imu_xyz_m, atol=1e-15)
+    catalogued, sensing = true_chain(moved).imu_home, sensing_chain(moved).imu_home
+    np.testing.assert_allclose(
+        (np.linalg.inv(catalogued[2]) @ sensing[2])[:3, 3], build.imu_xyz_m, atol=1e-15
+    )
+    np.testing.assert_allclose(sensing[[0, 1, 3]], catalogued[[0, 1, 3]], atol=1e-15)
     # The third module's body of 0.3 kg weighs a tenth more, wherever it is.
     heavier = true_inertia(moved)[:, 0] - true_inertia(robot)[:, 0]
     assert heavier.sum() == pytest.approx(0.1 * module_type(robot.modules[2].type).mass_kg, rel=1e-9)
@@ -82,6 +87,9 @@ def test_the_truth_is_where_the_axes_are_and_not_where_the_imus_sit() -> None:
         }
     )
     turned = np.degrees(np.arccos(np.sum(true_chain(changed).axis * true_chain(robot).axis, axis=1)))
+    # Its IMU stays where it is on its housing, of which the chain has the axis only.
+    displaced = np.linalg.inv(true_chain(changed).imu_home[2]) @ sensing_chain(changed).imu_home[2]
+    assert np.linalg.norm(displaced[:3, 3]) == pytest.approx(0.001, abs=2e-4)
     # Its own axis turns against those before it; the last module turns along with it.
     np.testing.assert_allclose(turned, np.degrees([0.0, 0.0, 0.002, 0.002]), atol=1e-6)
 

@@ -33,6 +33,14 @@ def test_on_a_solid_base_the_length_is_found_to_the_bound(length_mm: int, alignm
     assert 10.0 < found.robot_time_s < 20.0
 
 
+def test_the_length_ends_where_the_imu_sits_and_not_where_the_catalogue_has_it() -> None:
+    built = SOLID.model_copy(update={"imu_place_m": 0.02, "housing_axis_m": 1e-3, "housing_axis_rad": 0.01})
+    found = joint_trial(171, "vertical", built, seed=3)
+    judged(found)
+    assert abs(found.ours_error_m) < 4.0 * found.bound_m
+    assert found.axis_error_deg < 0.1
+
+
 def test_a_tall_base_that_rocks_is_seen_by_the_joints_own_module_and_taken_off() -> None:
     robot = load_robot("thesis_484_vertical")
     plan = trial_plan(thesis_length("vertical", 484), NOISE_PROFILES["x5"])

@@ -241,7 +241,9 @@ def test_what_was_broken_off_is_written_without_a_number(tmp_path: Path) -> None
 
 
 def test_what_a_robot_identifies_of_itself_helps_nearly_as_much_as_the_truth() -> None:
-    true = follow(stage_of(CASE_4, SEED), CASE_4.gains, 3, ON_MODULE, true_model(VERTICAL, SEED), X5, SEED)
+    true = follow(
+        stage_of(CASE_4, SEED), CASE_4.gains, 3, ON_MODULE, true_model(VERTICAL, SEED, X5), X5, SEED
+    )
     # Both are left with the friction of the single module; the model's error is under a percent of 2.3 Nm.
     assert tried(CASE_4).follows[2].rms_error_rad < 1.5 * true.rms_error_rad
 
