@@ -24,6 +24,7 @@ GROUPS = {
         "sim.actuator.thermal",
         "sim.sensors.imu",
         "sim.sensors.joint",
+        "sim.sensors.sensors",
     ),
     "regressor": ("module_agent.model.regressor_kernel",),
 }

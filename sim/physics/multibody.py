@@ -72,8 +72,8 @@ class Multibody:
         )
         pybullet.stepSimulation(physicsClientId=self._client)
         states = pybullet.getJointStates(self._body, self._indices, physicsClientId=self._client)
-        both = np.array([s[:2] for s in states])
-        return both[:, 0].copy(), both[:, 1].copy()
+        positions, velocities, *_ = zip(*states, strict=True)
+        return np.array(positions), np.array(velocities)
 
     def close(self) -> None:
         """Disconnect the physics client. May be called twice."""

@@ -94,6 +94,7 @@ class VirtualRobot:
         self.loop = loop
         self.robot = settings.robot
         self.serials = settings.robot.serials
+        self._index = {serial: index for index, serial in enumerate(self.serials)}
         options = {name: getattr(settings, name) for name in ("noise_seed", "pushes", "imu_rate_hz")}
         self.world = World(settings.robot, settings.seed, settings.noise, **options)
         self.network = VirtualNetwork(loop) if network is None else network
@@ -147,7 +148,7 @@ class VirtualRobot:
         self.samples = self.truth.step(self.pwm)
         for serial, host in list(self.hosts.items()):
             host.cycle()
-            (self.pwm[self.serials.index(serial)],) = self._loops[serial].pwm
+            (self.pwm[self._index[serial]],) = self._loops[serial].pwm
         for call in self.on_tick:
             call()
         self.loop.schedule_ns(self.loop.now_ns + TICK_NS, self._tick)

@@ -184,7 +184,7 @@ class World:
             ValueError: a PWM is missing, too many or not finite.
             HardwareLost: the world is closed.
         """
-        u = self._checked(pwm)
+        u, t_ns = self._checked(pwm), self._tick * TICK_NS
         actuators, q, qd = self._actuators, self._q, self._qd
         motor = actuators.state.motor_rad
         # The integrator is a leapfrog: its velocities live half a tick before its positions, but it takes
@@ -201,14 +201,14 @@ class World:
         rate = (qd + self._qd) * 0.5
         self._ahead = rate - qd
         change = (self._qd - qd) * (1.0 / TICK_S)
-        own = self._joints
+        own_q, own_rate, own_change = np.array((q, rate, change)).take(self._joints, axis=1)
         self._plant = (
-            *(self.t_ns, u, drives.duty, q[own], rate[own], change[own], motor),
-            *(drives.motor_rate_rad_s, drives.torque_nm, q[self._passive]),
+            *(t_ns, u, drives.duty, own_q, own_rate, own_change, motor),
+            *(drives.motor_rate_rad_s, drives.torque_nm, q.take(self._passive)),
         )
         if self.sensors.imu_due(self._tick):
             self._imu_readings = self._tree.imu_readings(q, rate, change)
-        samples = self.sensors.read(self._tick, self._instant(q, rate))
+        samples = self.sensors.read(self._tick, self._instant(t_ns, own_q, own_rate))
         self._windings.step(drives.copper_w)
         self._tick += 1
         return samples
@@ -227,7 +227,7 @@ class World:
         for module, value in zip(self.modules, pwm, strict=True):
             if not math.isfinite(value):
                 raise ValueError(f"PWM of module {module.serial} is {value}; it must be a number in [-1, 1]")
-        return np.minimum(np.maximum(np.array(pwm, dtype=np.float64), -1.0), 1.0)
+        return np.array([min(max(value, -1.0), 1.0) for value in pwm], dtype=np.float64)
 
     def _pushed(self, q: Array) -> Array:
         """Return the generalised forces (m,) of the pushes at this instant; drop those that have ended."""
@@ -248,14 +248,15 @@ class World:
         actuators = copy(self._actuators)
         actuators.step(idle, self._q, still, mass, biases[0], self._windings.resistance_factor)
         copy(self._windings).step(actuators.state.copper_w)
-        sensors.read(0, self._instant(self._q, still))
+        sensors.read(0, self._instant(0, self._q[self._joints], idle))
 
-    def _instant(self, q: Array, rate: Array) -> Instant:
+    def _instant(self, t_ns: int, q: Array, rate: Array) -> Instant:
+        """Return the truth for the sensors, from the modules' own joints (n,)."""
         drives = self._actuators.state
         return Instant(
-            t_ns=self.t_ns,
-            q_rad=q[self._joints],
-            qd_rad_s=rate[self._joints],
+            t_ns=t_ns,
+            q_rad=q,
+            qd_rad_s=rate,
             motor_rad_s=drives.motor_rate_rad_s,
             elastic_nm=drives.elastic_nm,
             current_a=drives.current_a,
