@@ -9,13 +9,24 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
 from module_agent.wire.feedback_rows import ROW
 from module_agent.wire.topics import TOPICS
+from sim.benchmark.cases.suites import (
+    QUICK_DYNAMICS,
+    chosen,
+    dynamic_cases,
+    full_kinematics,
+    kinematic_cases,
+)
 from sim.robot.robot_file import load_robot
 
 ROOT = Path(__file__).parents[1]
@@ -23,6 +34,28 @@ PAGES = {path.name: path.read_text() for path in (ROOT / "README.md", *sorted((R
 SCRIPTS = Path(sys.executable).parent
 # What a first-time user waits for at most; each of these takes well under a minute on two cores.
 PATIENCE_S = 240
+# What is added to commands of pages to run them in small form; the last one of an option counts. CI runs the
+# benchmarks and a whole run as they are.
+SHORTER = {
+    "x5-sim run": ("--plan", "shorter.toml"),
+    "x5-sim launch": ("--plan", "shorter.toml"),
+    "x5-coordinator run": ("--plan", "shorter.toml"),
+    "x5-coordinator excite": ("--tries", "30"),
+    "x5-sim benchmark kinematics": ("--trials", "1"),
+    "x5-sim benchmark dynamics": ("--only", "regressor"),
+    "x5-sim amplitudes": ("--amplitudes", "0.1"),
+}
+SHORTER_PLAN = """
+discover_s = 0.5
+link_s = 0.5
+settle_s = 0.3
+rest_s = 1.0
+travel_speed_rad_s = 1.5
+sine_centre_s = 1.2
+sine_sigma_s = 0.5
+dynamic_repeats = 1
+simultaneous_duration_s = 6.0
+"""
 
 
 def blocks(language: str, *pages: str) -> list[str]:
@@ -55,17 +88,41 @@ def test_all_commands_of_a_page_succeed_one_after_the_other(
     page: str, tmp_path: Path, background: "list[subprocess.Popen[bytes]]"
 ) -> None:
     (tmp_path / "runs").mkdir()
+    (tmp_path / "shorter.toml").write_text(SHORTER_PLAN)
     for line in (line for block in blocks("sh", page) for line in commands(block)):
         words = shlex.split(line)
         if words[-1] == "&":
             background.append(subprocess.Popen(words[:-1], cwd=tmp_path, env=environment()))
             continue
         done = subprocess.run(
-            words, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=PATIENCE_S
+            shorter(words),
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
         )
         assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     if page == "guide.md":
         check_promised_files(tmp_path / "runs" / "virtual")
+
+
+def shorter(words: list[str]) -> list[str]:
+    added = [more for start, more in SHORTER.items() if words[: len(start.split())] == start.split()]
+    return [*words, *(word for more in added for word in more)]
+
+
+def test_benchmarks_named_on_the_page_have_the_cases_that_they_name() -> None:
+    """They are run above with fewer trials and cases than the page has."""
+    suites = {
+        "kinematics": kinematic_cases(full_kinematics(2), 0, "optimised"),
+        "dynamics": dynamic_cases(QUICK_DYNAMICS, 0, None),
+    }
+    named = [shlex.split(line) for block in blocks("sh", "benchmarks.md") for line in commands(block)]
+    named = [words for words in named if words[:2] == ["x5-sim", "benchmark"]]
+    assert {words[2] for words in named} == suites.keys()
+    for words in named:
+        assert chosen(suites[words[2]], words[words.index("--only") + 1]), " ".join(words)
 
 
 def check_promised_files(run: Path) -> None:
@@ -85,20 +142,28 @@ def test_every_shell_block_is_run() -> None:
             assert re.search(rf"^{line}$", ci, flags=re.MULTILINE), f"{page}: CI does not run `{line}`"
 
 
+@cache
+def command_named(program: str, name: str) -> Any:
+    """Return a command of a program, or None; its module is imported only here."""
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    module, _, attribute = scripts[program].partition(":")
+    group: Any = typer.main.get_command(getattr(import_module(module), attribute))
+    return group.get_command(None, name)
+
+
 def test_commands_named_in_sentences_exist_with_their_options() -> None:
-    helps: dict[tuple[str, str], str] = {}
+    checked = 0
     for page, text in PAGES.items():
         for inline in re.findall(r"`((?:\.venv/bin/)?x5-[a-z]+\s[a-z]+[^`]*)`", text):
-            program, command, *rest = shlex.split(inline.removeprefix(".venv/bin/"))
-            if (program, command) not in helps:
-                shown = subprocess.run(
-                    [program, command, "--help"], env=environment(), capture_output=True, text=True
-                )
-                assert shown.returncode == 0, f"{page}: there is no `{program} {command}`"
-                helps[program, command] = shown.stdout
+            program, name, *rest = shlex.split(inline.removeprefix(".venv/bin/"))
+            command = command_named(program, name)
+            assert command is not None, f"{page}: there is no `{program} {name}`"
+            options = {word for each in command.params for word in (*each.opts, *each.secondary_opts)}
             for word in rest:
                 if word.startswith("--"):
-                    assert word in helps[program, command], f"{page}: {program} {command} has no {word}"
+                    checked += 1
+                    assert word in options, f"{page}: {program} {name} has no {word}"
+    assert checked > 10
 
 
 def test_links_lead_somewhere() -> None:
