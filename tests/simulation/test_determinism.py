@@ -18,11 +18,17 @@ from coordinator.session.run import write_outputs
 ROOT = Path(__file__).parents[2]
 
 
-def _run(out: Path, seed: int, hash_seed: str) -> str:
+def _run(out: Path, plan: Plan, seed: int, hash_seed: str) -> str:
     """Run in a process of its own; return the trace hash that it prints."""
+    settings = out.with_suffix(".toml")
+    durations = plan.model_dump(exclude_defaults=True, exclude={"dynamics"})
+    settings.write_text("".join(f"{name} = {value}\n" for name, value in durations.items()))
     command = [sys.executable, "-m", "sim.main", "run", "thesis_171_horizontal", "--virtual", "--no-dynamics"]
     done = subprocess.run(
-        [*command, "--network", "wifi", "--seed", str(seed), "--out", str(out), "--quiet"],
+        [
+            *(*command, "--network", "wifi", "--seed", str(seed)),
+            *("--plan", str(settings), "--out", str(out), "--quiet"),
+        ],
         cwd=ROOT,
         env={**os.environ, "PYTHONHASHSEED": hash_seed},
         capture_output=True,
@@ -42,10 +48,12 @@ def _without_wall_time(path: Path) -> dict[str, Any]:
 
 
 @pytest.mark.xdist_group("determinism")
-def test_two_processes_with_one_seed_do_the_same_and_another_seed_does_other(tmp_path: Path) -> None:
-    one = _run(tmp_path / "one", seed=3, hash_seed="1")
-    two = _run(tmp_path / "two", seed=3, hash_seed="2")
-    other = _run(tmp_path / "other", seed=4, hash_seed="1")
+def test_two_processes_with_one_seed_do_the_same_and_another_seed_does_other(
+    quick_plan: Plan, tmp_path: Path
+) -> None:
+    one = _run(tmp_path / "one", quick_plan, seed=3, hash_seed="1")
+    two = _run(tmp_path / "two", quick_plan, seed=3, hash_seed="2")
+    other = _run(tmp_path / "other", quick_plan, seed=4, hash_seed="1")
     assert one == two != other
     assert _without_wall_time(tmp_path / "one" / "result.json") == _without_wall_time(
         tmp_path / "two" / "result.json"

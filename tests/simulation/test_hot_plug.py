@@ -1,6 +1,7 @@
 """A module is added, taken off or swapped: only what is other is measured again, the rest is kept."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,8 +37,12 @@ Bring = Callable[[Robot, Robot], Updated]
 
 
 @pytest.fixture(scope="module")
-def bring(tmp_path_factory: pytest.TempPathFactory) -> Bring:
-    """Let a robot be known, and bring it up to date another day."""
+def bring(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bring]:
+    """Let a robot be known, and bring it up to date another day.
+
+    The known robot is identified once from its recording, for the tests and for all runs that begin with it.
+    """
+    loaded_once = cache(load_baseline)
     known: dict[tuple[str, ...], Path] = {}
     done: dict[tuple[tuple[str, ...], ...], Updated] = {}
     short = Plan(
@@ -60,10 +65,12 @@ def bring(tmp_path_factory: pytest.TempPathFactory) -> Bring:
             known[before.serials] = folder / "known"
             run(before, folder / "known", 0)
         lines = run(after, folder / "new", 1, known[before.serials])
-        done[case] = Updated(load_baseline(known[before.serials]), load_baseline(folder / "new"), lines)
+        done[case] = Updated(loaded_once(known[before.serials]), load_baseline(folder / "new"), lines)
         return done[case]
 
-    return make
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("coordinator.session.run.load_baseline", loaded_once)
+        yield make
 
 
 def _without_last(robot: Robot) -> Robot:

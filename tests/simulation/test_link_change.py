@@ -4,6 +4,7 @@ Modules are as delivered, with uncalibrated IMUs, on links that give.
 """
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,13 +16,17 @@ from coordinator.baseline.baseline_robot import BaselineError, BaselineRobot, lo
 from coordinator.baseline.check import check, check_plan
 from coordinator.commands.measured_again import CHECK
 from coordinator.excitation.plan import Plan
+from coordinator.identification.identify import identify_kinematics
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
 from module_agent.model.errors import EXIT_FINDING
+from module_agent.network_emulation.profile_file import network
 from sim.benchmark.cases.link_change import LinkChange, draw_link_change, with_link_change
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain
+from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.run import VirtualConfig, run_virtual
+from sim.virtual_time.session import record_session
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("check")
@@ -39,9 +44,17 @@ class Days(NamedTuple):
     change: LinkChange
 
 
+# A run's robot is identified once from its recording, for this file's tests and for the commands in them.
+loaded_once = cache(load_baseline)
+
+
 def _lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:
+    """Return the robot of a run, or of the same session without a folder where its motions are designed."""
+    if plan.motions == "optimised":
+        recording = record_session(VirtualSettings(robot, network("lan"), 5, noise_seed=day), plan)
+        return BaselineRobot(out, recording, identify_kinematics(recording))
     run_virtual(VirtualConfig(robot, out, seed=5, noise_seed=day, network="lan", plan=plan), Terminal(True))
-    return load_baseline(out)
+    return loaded_once(out)
 
 
 KNOWN_BY = {
@@ -100,7 +113,9 @@ def test_a_link_that_slipped_is_found_located_and_sized(days: Days) -> None:
     assert days.change.child in report.summary[0]
 
 
-def test_the_command_says_so_and_exits_with_4(days: Days) -> None:
+@pytest.mark.parametrize("days", ["thesis"], indirect=True)
+def test_the_command_says_so_and_exits_with_4(days: Days, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coordinator.commands.measured_again.load_baseline", loaded_once)
     arguments = ["check", str(days.known.folder), "--measured"]
     sound = CliRunner().invoke(app, [*arguments, str(days.sound.folder)])
     assert sound.exit_code == 0, sound.output

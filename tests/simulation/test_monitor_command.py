@@ -1,11 +1,14 @@
 """The command looks at a recording as if it happened now, and says by its exit code what it found."""
 
 import json
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
+from coordinator.baseline.baseline_robot import load_baseline
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
 from sim.benchmark.cases.monitoring import Subject
@@ -37,8 +40,11 @@ def lived(out: Path, day: int, grasps: bool, dynamics: bool = True) -> Path:
 
 
 @pytest.fixture(scope="module")
-def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return lived(tmp_path_factory.mktemp("watch") / "known", 0, False)
+def known(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The run that the robot is known from; the commands of this file identify its robot once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("coordinator.commands.monitor.load_baseline", cache(load_baseline))
+        yield lived(tmp_path_factory.mktemp("watch") / "known", 0, False)
 
 
 def watch(*words: str) -> tuple[int, str]:

@@ -1,6 +1,7 @@
-"""A known arm is handed something, and says what it is from one short motion."""
+"""A known arm with a tool is handed something, and says what it is from one short motion."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,38 +13,57 @@ from coordinator.baseline.payload import PayloadError, payload_plan, search_payl
 from coordinator.commands.measured_again import PAYLOAD
 from coordinator.description.urdf_writer import link_homes
 from coordinator.excitation.plan import Plan
+from coordinator.identification.identify import identify_kinematics
 from coordinator.main import app
 from coordinator.runtime.terminal import Terminal
 from module_agent.model.chain import Array, Chain
+from module_agent.network_emulation.profile_file import network
 from sim.geometry.link_parts import FreePose
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import loaded
+from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.run import VirtualConfig, run_virtual
+from sim.virtual_time.session import record_session
 
 # Tests of this group share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("payload")
 
 ARM = "a2085_03"
 HELD = FreePose(mass_kg=0.2, com_xyz_m=(0.04, 0.0, 0.02), inertia=(1e-4, 1e-4, 1e-4, 0.0, 0.0, 0.0))
+TWICE = FreePose(mass_kg=0.4, com_xyz_m=HELD.com_xyz_m, inertia=(2e-4, 2e-4, 2e-4, 0.0, 0.0, 0.0))
 PLAN = Plan(excitation="d-optimal", excitation_motions=3, excitation_s=4.0, imu="calibrated")
+# A run's robot is identified once from its recording, for this file's tests and for the commands in them.
+loaded_once = cache(load_baseline)
+
+
+def holding(held: FreePose) -> Robot:
+    robot = load_robot(ARM)
+    return loaded(robot, robot.serials[-1], held)
 
 
 def lived(robot: Robot, out: Path, day: int, plan: Plan) -> BaselineRobot:
     config = VirtualConfig(robot, out, seed=6, noise_seed=day, network="lan", noise="x5", plan=plan)
     run_virtual(config, Terminal(True))
-    return load_baseline(out)
+    return loaded_once(out)
+
+
+def remembered(robot: Robot, day: int, plan: Plan) -> BaselineRobot:
+    """The same without a folder."""
+    settings = VirtualSettings(robot, network("lan"), 6, "x5", noise_seed=day)
+    recording = record_session(settings, plan)
+    return BaselineRobot(Path("in memory"), recording, identify_kinematics(recording))
 
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory: pytest.TempPathFactory) -> BaselineRobot:
-    return lived(load_robot(ARM), tmp_path_factory.mktemp("payload") / "known", 0, PLAN)
+    """The robot with a tool: it is known once, for what is added to the tool and for what is taken off."""
+    return lived(holding(HELD), tmp_path_factory.mktemp("payload") / "known", 0, PLAN)
 
 
 @pytest.fixture(scope="module")
 def later(known: BaselineRobot, tmp_path_factory: pytest.TempPathFactory) -> BaselineRobot:
-    robot = loaded(load_robot(ARM), known.chain.serials[-1], HELD)
-    return lived(robot, tmp_path_factory.mktemp("payload") / "later", 1, payload_plan(known, Plan()))
+    return lived(holding(TWICE), tmp_path_factory.mktemp("payload") / "later", 1, payload_plan(known, Plan()))
 
 
 def test_mass_and_centre_are_found_from_one_motion(known: BaselineRobot, later: BaselineRobot) -> None:
@@ -55,7 +75,7 @@ def test_mass_and_centre_are_found_from_one_motion(known: BaselineRobot, later: 
     assert report.mass_kg == pytest.approx(0.2, abs=0.006)
     found = (link_homes(known.chain)[-1] @ np.append(1e-3 * np.array(report.com_mm), 1.0))[:3]
     # Across the axis and along it, from the module's own IMU: the true root frame is turned against ours.
-    added = true_inertia(loaded(load_robot(ARM), report.carrier, HELD)) - true_inertia(load_robot(ARM))
+    added = true_inertia(holding(TWICE)) - true_inertia(holding(HELD))
     truth = from_axis(true_chain(load_robot(ARM)), added[-1, 1:4] / added[-1, 0])
     across, along = from_axis(known.chain, found) - truth
     assert abs(across) < 5e-3
@@ -70,20 +90,15 @@ def from_axis(chain: Chain, place_m: Array) -> Array:
     return np.array([np.linalg.norm(off - axis * (axis @ off)), axis @ (place_m - imu)])
 
 
-def test_an_arm_that_was_handed_nothing_says_so(known: BaselineRobot, tmp_path: Path) -> None:
-    same = lived(load_robot(ARM), tmp_path / "same", 2, payload_plan(known, Plan()))
-    report = search_payload(known, same)
+def test_an_arm_that_was_handed_nothing_says_so(known: BaselineRobot) -> None:
+    report = search_payload(known, remembered(holding(HELD), 2, payload_plan(known, Plan())))
     assert not report.found
     assert report.explained
     assert "no payload detected" in report.summary[0]
 
 
-def test_what_was_taken_off_is_not_taken_for_something_added(known: BaselineRobot, tmp_path: Path) -> None:
-    """The robot is known with a load, and bare later: the same two runs the other way round."""
-    full = loaded(load_robot(ARM), known.chain.serials[-1], HELD)
-    carrying = lived(full, tmp_path / "carrying", 3, PLAN)
-    bare = lived(load_robot(ARM), tmp_path / "bare", 4, payload_plan(carrying, Plan()))
-    report = search_payload(carrying, bare)
+def test_what_was_taken_off_is_not_taken_for_something_added(known: BaselineRobot) -> None:
+    report = search_payload(known, remembered(load_robot(ARM), 4, payload_plan(known, Plan())))
     assert report.found
     assert report.taken_off
     assert report.carrier == known.chain.serials[-1]
@@ -91,7 +106,10 @@ def test_what_was_taken_off_is_not_taken_for_something_added(known: BaselineRobo
     assert "removed from" in report.summary[0]
 
 
-def test_the_command_writes_what_it_says(known: BaselineRobot, later: BaselineRobot) -> None:
+def test_the_command_writes_what_it_says(
+    known: BaselineRobot, later: BaselineRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coordinator.commands.measured_again.load_baseline", loaded_once)
     done = CliRunner().invoke(app, ["payload", str(known.folder), "--measured", str(later.folder)])
     assert done.exit_code == 0, done.output
     assert "kg were added" in done.output
@@ -101,8 +119,9 @@ def test_the_command_writes_what_it_says(known: BaselineRobot, later: BaselineRo
 
 
 def test_a_run_without_inertia_is_no_robot_to_compare_with(
-    known: BaselineRobot, later: BaselineRobot
+    known: BaselineRobot, later: BaselineRobot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("coordinator.commands.measured_again.load_baseline", loaded_once)
     with pytest.raises(PayloadError, match="no motions for inertia"):
         search_payload(later, known)
     done = CliRunner().invoke(app, ["payload", str(later.folder), "--measured", str(known.folder)])

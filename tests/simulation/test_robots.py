@@ -25,6 +25,10 @@ from sim.virtual_time.session import record_session
 
 THESIS = tuple(name for name in shipped_robots() if name.startswith("thesis"))
 OTHERS = tuple(name for name in shipped_robots() if name not in THESIS)
+# All of these are recognised over wifi, the poorer network; a chain and a tree over both. The thesis' arms
+# differ in length and alignment alone and are recognised over a LAN in whole runs: here two of them do.
+POORLY_CONNECTED = ("thesis_171_horizontal", "thesis_484_vertical", *OTHERS)
+WELL_CONNECTED = ("a2085_03", "tree_y")
 # Sixteen joints take long.
 SHORTER = {"settle_s": 0.2, "constant_duration_s": 0.4, "travel_speed_rad_s": 2.5}
 
@@ -74,7 +78,7 @@ def test_topology_and_mounting_of_the_thesis_arms_are_identified(
 
 @pytest.mark.parametrize(
     ("name", "network"),
-    [(name, "wifi") for name in THESIS] + [(name, network) for name in OTHERS for network in ("lan", "wifi")],
+    [(name, "wifi") for name in POORLY_CONNECTED] + [(name, "lan") for name in WELL_CONNECTED],
 )
 def test_topology_and_mounting_are_identified(quick_plan: Plan, name: str, network: str) -> None:
     robot = load_robot(name)

@@ -14,11 +14,12 @@ from sim.virtual_time.robot import VirtualRobot
 from sim.virtual_time.run import VirtualConfig, run_virtual
 
 ARM, BASE, TIP = "thesis_171_horizontal", "X-00009", "X-00010"
+SHORTER = Plan(dynamics=False, sine_centre_s=1.6, sine_sigma_s=0.7)
 
 
 @pytest.mark.parametrize("rate_hz", [50.0, 100.0, 500.0, 1000.0])
 def test_links_are_within_their_claim_at_any_rate_of_the_imus(rate_hz: float) -> None:
-    run = simulate("a2085_03", seed=1, dynamics=False, imu_rate_hz=rate_hz)
+    run = simulate(ARM, seed=1, plan=SHORTER, imu_rate_hz=rate_hz)
     result, links = run.identified.result, run.score().links
     for claimed, found in zip(result.links, links, strict=True):
         assert found.link_length_error_mm is not None
@@ -27,11 +28,11 @@ def test_links_are_within_their_claim_at_any_rate_of_the_imus(rate_hz: float) ->
     estimates = [e for of_pair in run.recording.estimates.values() for e in of_pair.values()]
     assert not [e.note for e in estimates if e.note]
     slow = [note for note in run.identified.kinematics.notes if "vibration" in note]
-    assert len(slow) == (3 if rate_hz == 50.0 else 0)
+    assert len(slow) == (2 if rate_hz == 50.0 else 0)
 
 
 # About the middle of a motion, after its beginning.
-MIDDLE_NS = {"constant": 700_000_000, "windowed_sine": 2_800_000_000}
+MIDDLE_NS = {"constant": 700_000_000, "windowed_sine": 1_600_000_000}
 
 
 def _without_rows(serial: str, kind: str) -> Callable[[VirtualRobot], None]:
@@ -57,7 +58,7 @@ def _without_rows(serial: str, kind: str) -> Callable[[VirtualRobot], None]:
 @pytest.mark.parametrize("kind", ["constant", "windowed_sine"])
 def test_a_hole_in_a_motion_costs_the_samples_around_it(tmp_path: Path, serial: str, kind: str) -> None:
     out = tmp_path / "run"
-    config = VirtualConfig(load_robot(ARM), out, seed=1, network="none", plan=Plan(dynamics=False))
+    config = VirtualConfig(load_robot(ARM), out, seed=1, network="none", plan=SHORTER)
     run_virtual(config, between=_without_rows(serial, kind))
     (link,) = score(out).links
     assert link.link_length_error_mm is not None
