@@ -30,6 +30,7 @@ from coordinator.arm_fit.cross_validation import (
 from coordinator.arm_fit.cutoff import CutoffPoint
 from coordinator.arm_fit.data_file import JointLog
 from coordinator.arm_fit.drive_choice import Trial
+from coordinator.arm_fit.payload import Baseline, added_payload, information_part
 from coordinator.arm_fit.predictions import Predictions, predictions
 from coordinator.arm_fit.problem import Problem, joined
 from coordinator.arm_fit.report import (
@@ -95,6 +96,7 @@ def fit_and_test(
     step: Step,
     trust: float = USUAL_TRUST,
     elsewhere: Elsewhere | None = None,
+    baseline: Baseline | None = None,
 ) -> FitResult:
     """Fit a recording, and test the fit on samples that were held out.
 
@@ -105,6 +107,7 @@ def fit_and_test(
         step: is called with a sentence before each of the steps.
         trust: weight of the URDF's inertias for the consistent bodies (`consistent_bodies`).
         elsewhere: another recording to predict, posed with the top speeds of this one.
+        baseline: an earlier fit of the arm without the payload that it carries in this recording.
 
     Raises:
         DataError: too few samples for the parameters.
@@ -136,6 +139,8 @@ def fit_and_test(
         gains=gains,
         fit=_fit_part(problem, fit, bodies, note),
         trials=[TrialPart(**trial._asdict()) for trial in trials],
+        information=information_part(problem, fit),
+        payload=None if baseline is None else added_payload(baseline, problem, fit),
     )
     return FitResult(report, bodies, named(problem, fit), predictions(problem, fit.parameters))
 

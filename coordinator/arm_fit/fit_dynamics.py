@@ -15,6 +15,7 @@ from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two
 from coordinator.arm_fit.drive_choice import Trial, candidates, choose_drives, pairs
 from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
+from coordinator.arm_fit.payload import read_baseline
 from coordinator.arm_fit.predictions import Predictions
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.recordings import Recordings, Source, read_other, read_recordings
@@ -83,6 +84,8 @@ def fit_dynamics(
     gravity: ArrayLike = STANDARD_GRAVITY,
     trust: float = USUAL_TRUST,
     checked: bool = True,
+    baseline: str | Path | FitReport | None = None,
+    payload_body: str | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> ArmFit:
     """Identify inertia, friction and motors of an arm, and test the result on held-out samples.
@@ -108,6 +111,9 @@ def fit_dynamics(
             robot, whose chain has its own.
         trust: weight of the URDF's inertias for the bodies.
         checked: refuse a recording whose units, signs, gravity or length are wrong (`checks`).
+        baseline: report of an earlier fit of the same arm without the payload that it carries in `data`, or
+            its JSON file; then `report.payload` is what was added.
+        payload_body: the link that carries the payload, the last body's by default.
         progress: is called with a sentence before every step (`STEPS`).
 
     Raises:
@@ -122,6 +128,7 @@ def fit_dynamics(
     progress(f"read {_name(urdf)} and {names}")
     robot = urdf if isinstance(urdf, UrdfRobot) else read_urdf(urdf, gravity)
     recordings = read_recordings(robot, sources, gains, checked)
+    known = read_baseline(baseline, recordings.robot, payload_body)
     robot, log = recordings.robot, recordings.log
     if choice.coupled is not None:
         places = {joint: i for i, joint in enumerate(recordings.moving)}
@@ -143,15 +150,16 @@ def fit_dynamics(
         step=progress,
         trust=trust,
         elsewhere=elsewhere,
+        baseline=known,
     )
-    known = (robot, result.report, result.base, result.torques)
+    parts = (robot, result.report, result.base, result.torques)
     if result.consistent is None:
-        return ArmFit(*known, bodies=None, phi=None, drives=None, urdf=None)
+        return ArmFit(*parts, bodies=None, phi=None, drives=None, urdf=None)
     fitted = result.consistent
     x = np.concatenate([fitted.phi, fitted.drives])
     drives = read_only(urdf_drives(posed, x, slice(0, len(posed.log.tau_nm))))
     text = fitted_urdf_text(robot, fitted.bodies, drives, lacking(posed))
-    return ArmFit(*known, bodies=fitted.bodies, phi=fitted.phi, drives=drives, urdf=text)
+    return ArmFit(*parts, bodies=fitted.bodies, phi=fitted.phi, drives=drives, urdf=text)
 
 
 def _chosen(

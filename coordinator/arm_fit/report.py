@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from coordinator.parameter_fit.identifiability import Precision
-from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part
+from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part, Triple
 from module_agent.model.files import write_json
 
 SCHEMA = 3
@@ -184,10 +184,63 @@ class FitPart(Part):
     residuals: list[JointNoisePart]
 
 
+class JointPlacePart(Part):
+    """A joint at q = 0 in the root frame: the link behind it, that link's origin, and the axis (unit)."""
+
+    joint: str
+    link: str
+    origin_m: Triple
+    axis: Triple
+
+
+class InformationPart(Part):
+    """What the torques say of bodies and rotors, as square-root information: rows @ x = target, whitened.
+
+    The drives' other parameters (friction, offsets) are marginalised. columns: p names, the bodies' in the
+    root frame. rows: r * p, target: r numbers, little-endian float64 in base64.
+    """
+
+    joints: list[JointPlacePart]
+    columns: list[str]
+    rows: str
+    target: str
+
+
+class PayloadPart(Part):
+    """What was added to a body between the baseline and this recording, in the frame of `link`, with sigmas.
+
+    By generalised least squares; sigmas are widened by the root of `misfit` where that is above 1. Null where
+    the torques do not determine it (`undetermined`), the centre and inertia also where the mass is within
+    three sigmas of zero. inertia_kg_m2: about the centre.
+    misfit: of what is left, variances per degree of freedom; far above 1 something else has changed.
+    consistent: whether the estimate is a physically consistent body. inconsistency_sigma: by how much the
+        nearest one explains the torques worse, its chi^2 of ten degrees of freedom as sigmas of one; up to 3
+        is noise. rigid_body: that body.
+    """
+
+    baseline: str
+    link: str
+    joint: str
+    mass_kg: float | None
+    mass_sigma_kg: float | None
+    com_m: list[float | None]
+    com_sigma_m: list[float | None]
+    inertia_kg_m2: list[list[float]] | None
+    inertia_sigma_kg_m2: list[list[float]] | None
+    undetermined: list[str]
+    misfit: float
+    consistent: bool
+    inconsistency_sigma: float
+    rigid_body: BodyPart
+
+
 class FitReport(Part):
     """Everything that `x5-coordinator fit-dynamics` reports; errors are fractions, SI units.
 
-    Schema 3 adds the choice of low-pass and drives, held joints and what a URDF cannot hold. Schema 2 names
+    information: for a later fit of the arm with a payload; `payload`, if this is such a fit.
+
+    Schema 3 adds the choice of low-pass and drives, held joints, what a URDF cannot hold, the information and
+    the payload; both may be null. Schema 2 names
     `summary`, `identifiability` and `rigid_body` (in schema 1 `words`, `verdict`, and the body's fields by
     themselves).
     """
@@ -202,6 +255,8 @@ class FitReport(Part):
     gains: list[TermGainPart]
     trials: list[TrialPart]
     fit: FitPart
+    information: InformationPart | None = None
+    payload: PayloadPart | None = None
 
     def errors(self, model: Model, torque: str = "filtered") -> list[ErrorPart]:
         """Return a model's errors, in the order of the report."""

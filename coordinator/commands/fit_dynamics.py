@@ -97,6 +97,13 @@ _Gravity = Annotated[
 ]
 _Mask = Annotated[float, typer.Option(help="Part of a joint's top speed below which samples are masked.")]
 _Slow = Annotated[float, typer.Option(help="Part of a joint's top speed below which Coulomb friction fades.")]
+_Baseline = Annotated[
+    Path | None,
+    typer.Option(help="JSON report of a fit of the arm without the payload that it carries in --data."),
+]
+_PayloadBody = Annotated[
+    str | None, typer.Option(help="Link that carries the payload; by default the last body's.")
+]
 _Unchecked = Annotated[
     bool,
     typer.Option("--unchecked", help="Fit even if units, signs, gravity or length of the data look wrong."),
@@ -123,6 +130,8 @@ def fit_dynamics(
     gravity: _Gravity = _UP,
     mask: _Mask = _USUAL.mask_part,
     slow: _Slow = _USUAL.slow_part,
+    baseline: _Baseline = None,
+    payload_body: _PayloadBody = None,
     unchecked: _Unchecked = False,
     quiet: Quiet = False,
 ) -> None:
@@ -145,6 +154,8 @@ def fit_dynamics(
                 cutoff_hz=cutoff,
                 trust=trust,
                 checked=not unchecked,
+                baseline=baseline,
+                payload_body=payload_body,
                 progress=lambda text: terminal.step(next(numbers), STEPS, text),
             )
         for line in notes(fit.report):

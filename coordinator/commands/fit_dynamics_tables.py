@@ -7,8 +7,10 @@ from io import StringIO
 from rich.console import Console
 from rich.table import Table
 
+from coordinator.arm_fit.payload import MAX_INCONSISTENCY_SIGMA
 from coordinator.arm_fit.predictions import Predictions, svg_plot
-from coordinator.arm_fit.report import ErrorPart, FitReport, Model, TermPart
+from coordinator.arm_fit.report import ErrorPart, FitReport, Model, PayloadPart, TermPart
+from coordinator.parameter_fit.payload import EXPLAINED_BELOW
 from coordinator.runtime.terminal import figure, new_table
 
 _MODEL_WORDS: dict[Model, str] = {
@@ -25,6 +27,8 @@ _KINDS = (("filtered", "all"), ("filtered", "masked"), ("raw", "all"), ("raw", "
 
 def tables(report: FitReport) -> Iterator[Table]:
     """Yield the tables, the most important first."""
+    if report.payload:
+        yield _payload(report.payload)
     yield _held_out(report)
     yield _joints(report)
     yield _lengths(report)
@@ -81,8 +85,54 @@ def notes(report: FitReport) -> Iterator[str]:
             )
     if fit.not_in_urdf:
         yield f"a URDF has no place for {', '.join(fit.not_in_urdf)}; the fitted URDF alone is without them"
+    if report.payload:
+        yield from _payload_notes(report.payload)
     if fit.bodies_note:
         yield f"no physically consistent bodies: {fit.bodies_note}"
+
+
+def _payload_notes(part: PayloadPart) -> Iterator[str]:
+    if part.undetermined:
+        yield f"payload: the torques do not determine {', '.join(part.undetermined)}"
+    if part.mass_kg is not None and part.com_m == [None, None, None]:
+        yield "payload: its mass is within three sigmas of zero; it has no centre"
+    if part.misfit > EXPLAINED_BELOW:
+        yield (
+            f"payload: {part.misfit:.3g} variances per degree of freedom are left; more than a payload on "
+            f"{part.link} has changed since {part.baseline}"
+        )
+    if part.inconsistency_sigma > MAX_INCONSISTENCY_SIGMA:
+        yield (
+            "payload: the estimate is no physically consistent body; the nearest one explains the torques "
+            f"worse by {part.inconsistency_sigma:.1f} sigmas"
+        )
+
+
+def _payload(part: PayloadPart) -> Table:
+    table = _table(
+        f"Payload since {part.baseline}, in the frame of {part.link}; the inertia about its centre",
+        ("",),
+        ("value", "+-", "unit", "consistent body"),
+    )
+    body = part.rigid_body
+    mass = figure(part.mass_kg, ".4g"), figure(part.mass_sigma_kg, ".2g")
+    table.add_row("mass", *mass, "kg", f"{body.mass_kg:.4g}")
+    for k, x in enumerate("xyz"):
+        value, sigma = (None if three is None else three[k] for three in (part.com_m, part.com_sigma_m))
+        table.add_row(f"centre {x}", figure(value, ".4g"), figure(sigma, ".2g"), "m", f"{body.com_m[k]:.4g}")
+    for i, k in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+        value, sigma = (
+            None if matrix is None else matrix[i][k]
+            for matrix in (part.inertia_kg_m2, part.inertia_sigma_kg_m2)
+        )
+        table.add_row(
+            f"inertia {'xyz'[i]}{'xyz'[k]}",
+            figure(value, ".4g"),
+            figure(sigma, ".2g"),
+            "kg m^2",
+            f"{body.inertia_kg_m2[i][k]:.4g}",
+        )
+    return table
 
 
 def _held_out(report: FitReport) -> Table:

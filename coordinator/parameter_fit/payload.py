@@ -126,12 +126,12 @@ def find_payload(
     candidates = range(len(before)) if carriers is None else carriers
     if not len(candidates):
         raise DataError("no body may carry the payload")
-    stacked = np.vstack([known, rows])
-    none, beyond = _complement(stacked, np.concatenate([known_target, target]))
+    change = change_between(known, known_target, rows, target, parameter_scale(len(before)))
+    none = change.target
     fits: dict[int, tuple[Solution, float]] = {}
     for b in candidates:
-        added = np.vstack([np.zeros((len(known), PER_BODY)), rows[:, PER_BODY * b : PER_BODY * (b + 1)]])
-        fits[b] = _on(beyond.T @ added, none, likely[b])
+        added = change.along(rows[:, PER_BODY * b : PER_BODY * (b + 1)])
+        fits[b] = consistent_payload(added, none, likely[b])
     gains = {b: float(none @ none) - misfit for b, (_, misfit) in fits.items()}
     best = max(gains, key=lambda b: gains[b])
     rival = max((b for b in gains if b != best), key=lambda b: gains[b], default=None)
@@ -150,25 +150,47 @@ def find_payload(
     )
 
 
-def _complement(rows: Array, target: Array) -> tuple[Array, Array]:
-    """Return an orthonormal basis (k, j) of the complement of the rows' range, and the target (j,) in it.
+class Change(NamedTuple):
+    """What two sets of whitened rows say that no parameters common to both explain.
 
-    It is what no parameters of the robot explain.
+    target: (j,) whitened, zero but for noise if nothing has changed. later: (k', j) orthonormal directions of
+    it, of the later rows.
     """
-    scale = parameter_scale(rows.shape[1] // PER_BODY)
-    left, values, _ = np.linalg.svd(rows * scale)
-    rank = int((values > RANK_TOLERANCE * values[0]).sum())
-    beyond = left[:, rank:]
-    return beyond.T @ target, beyond
+
+    target: Array
+    later: Array
+
+    def along(self, columns: ArrayLike) -> Array:
+        """Return the columns (j, c) of parameters that only the later rows have, of theirs (k', c)."""
+        return np.asarray(self.later.T @ np.asarray(columns, dtype=float))
 
 
-def _on(columns: Array, none: Array, place_m: Array) -> tuple[Solution, float]:
-    """Return the payload on one body, likely at a place, and the misfit with it."""
+def change_between(known: Array, known_target: Array, rows: Array, target: Array, scale: Array) -> Change:
+    """Project two sets of rows onto the complement of their common range.
+
+    Args:
+        known, known_target: (k, p) and (k,) whitened rows before. rows, target: (k', p) and (k',) later.
+        scale: (p,) by which parameters are counted (`base_parameters.Columns`).
+    """
+    left, values, _ = np.linalg.svd(np.vstack([known, rows]) * scale)
+    beyond = left[:, int((values > RANK_TOLERANCE * values[0]).sum()) :]
+    return Change(beyond.T @ np.concatenate([known_target, target]), beyond[len(known) :])
+
+
+def consistent_payload(
+    columns: Array, none: Array, place_m: Array, likely_kg: float = LIKELY_KG
+) -> tuple[Solution, float]:
+    """Return the physically consistent payload on one body, and the misfit with it.
+
+    Args:
+        columns: (j, 10) of the payload. none: (j,) what no parameters of the robot explain.
+        place_m: (3,) its likely centre, in the frame of the columns. likely_kg: its likely mass.
+    """
     triangle = qr(np.column_stack([columns, none]), mode="r", check_finite=False)[0][: PER_BODY + 1]
     rows, target = triangle[:, :-1], triangle[:, -1]
     centre = np.append(place_m, 1.0)
-    prior = LIKELY_KG * np.outer(centre, centre)
-    prior[:3, :3] += LIKELY_KG * LIKELY_SIZE_M**2 * np.eye(3)
+    prior = likely_kg * np.outer(centre, centre)
+    prior[:3, :3] += likely_kg * LIKELY_SIZE_M**2 * np.eye(3)
     solution = physically_consistent(rows, target, prior[None], PRIOR_WEIGHT)
     off = rows @ solution.x - target
     return solution, float(off @ off)

@@ -148,6 +148,23 @@ def test_another_recording_may_be_held_out(tmp_path: Path) -> None:
     assert "0 samples are no recording" in done.output
 
 
+def test_a_payload_is_measured_against_a_baseline(tmp_path: Path) -> None:
+    files, fit = write_files(tmp_path), str(tmp_path / "fit.json")
+    assert called(*files, "--json", fit).exit_code == 0
+    done = called(*files, "--baseline", fit, "--json", str(tmp_path / "payload.json"))
+    assert done.exit_code == 0, done.output
+    text = " ".join(done.output.split())
+    assert "Payload since" in text
+    # What swings in a plane shows nothing across it.
+    assert "payload: the torques do not determine centre y, inertia xx, inertia xy" in text
+    report = FitReport.model_validate_json((tmp_path / "payload.json").read_text())
+    assert report.payload is not None
+    assert report.payload.link == "lower"
+    refused = called(*files, "--payload-body", "lower")
+    assert refused.exit_code == 2
+    assert "a payload needs the --baseline" in " ".join(refused.output.split())
+
+
 def test_a_urdf_without_masses_is_fitted_in_sums_and_not_written(tmp_path: Path) -> None:
     files = write_files(tmp_path)
     urdf = tmp_path / "robot.urdf"
