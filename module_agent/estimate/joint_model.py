@@ -18,7 +18,8 @@ bend is away from the joint's axis by the share h of the distance d, the tangent
 
 The readings are late by a delay of their own in each motion, that of the clocks and of the IMU's low-pass. k
 is the axis as the gyro reads it, G the gyro's sensitivity to specific force, E (3 x 3, its columns across j)
-the accelerometer's scale and misalignment; their priors are in `ImuPrior`.
+the accelerometer's scale and misalignment; their priors are in `ImuPrior`. If the joint's base shakes, its
+motion is that of the joint's own IMU, whose axes and scale differ from those of this IMU by as much.
 """
 
 from typing import NamedTuple
@@ -38,15 +39,18 @@ ACCEL_BIAS, GYRO_BIAS, GYRO_AXIS = slice(7, 10), slice(10, 13), slice(13, 16)
 ACCEL_MATRIX, G_SENSITIVITY = slice(16, 22), slice(22, 28)
 COMPLIANCE, HINGE = 28, 29
 # Of the joint's base: the angle from e1 to the housing's x at q = 0, the delay of its IMU, the joint's axis
-# from that IMU across the axis, and the child's IMU from it along the axis.
+# from that IMU across the axis, and the child's IMU from it along the axis. What its IMU reads of the shake,
+# accelerometer and gyro each, is turned about two axes across the joint's, and scaled.
 BASE_HEADING, BASE_DELAY, PIVOT, HEIGHT = 30, 31, slice(32, 34), 34
-DELAY = 35
+BASE_FORCE, BASE_RATE = slice(35, 38), slice(38, 41)
+DELAY = 41
 GRAVITY_ALONG = 6
 
-_MIN_DISTANCE_M = 0.05  # bounds gravity's pull over the distance
+MIN_DISTANCE_M = 0.05  # bounds gravity's pull over the distance
 # Readings are polynomials in these parameters, so differences with these steps are exact enough.
 _STEPS = {COMPLIANCE: 1e-7, HINGE: 1e-2}
 _BASE_STEPS = {BASE_HEADING: 1e-4, PIVOT.start: 1e-2, PIVOT.start + 1: 1e-2, HEIGHT: 1e-2}
+_BASE_STEPS |= dict.fromkeys(range(BASE_FORCE.start, BASE_RATE.stop), 1e-3)
 _STEP_S = 1e-4
 
 
@@ -67,12 +71,13 @@ def predict(motion: Motion, t_s: Array, p: Array, delay: int) -> tuple[Array, Ar
         p: the parameters; `delay` is the place of this motion's delay among them.
     """
     at = t_s - p[delay]
-    values, shake = motion.joint.values(at), _shake(motion, at, p)
+    values, read = motion.joint.values(at), _base_reading(motion, at, p)
+    shake = _shake(read, p)
     predicted = readings(values, shake, p)
     jacobian = _linear(values, shake, p)
     slopes = motion.joint.slopes(at)
     later, sooner = values + _STEP_S * slopes, values - _STEP_S * slopes
-    before, after = _shake(motion, at - _STEP_S, p), _shake(motion, at + _STEP_S, p)
+    before, after = (_shake(_base_reading(motion, at + step, p), p) for step in (-_STEP_S, _STEP_S))
     jacobian[:, :, delay] = (readings(sooner, before, p) - readings(later, after, p)) / (2.0 * _STEP_S)
     steps = _STEPS
     if shake is not None:
@@ -83,7 +88,8 @@ def predict(motion: Motion, t_s: Array, p: Array, delay: int) -> tuple[Array, Ar
         up, down = p.copy(), p.copy()
         up[column] += step
         down[column] -= step
-        jacobian[:, :, column] = (readings(values, shake, up) - readings(values, shake, down)) / (2.0 * step)
+        change = readings(values, _shake(read, up), up) - readings(values, _shake(read, down), down)
+        jacobian[:, :, column] = change / (2.0 * step)
     for sensor in (slice(0, 3), slice(3, 6)):
         # Turning the frame about e1 and e2 turns what is in it: u x reading.
         x, y, z = predicted[:, sensor].T
@@ -115,8 +121,22 @@ def readings(values: Array, shake: Array | None, p: Array) -> Array:
     return np.asarray(predicted)
 
 
-def _shake(motion: Motion, at: Array, p: Array) -> Array | None:
+def _base_reading(motion: Motion, at: Array, p: Array) -> Array | None:
     return None if motion.base is None else motion.base.values(at + p[BASE_DELAY])
+
+
+def _shake(read: Array | None, p: Array) -> Array | None:
+    """Return the columns of `BaseMotion.values` without the errors of the base's IMU.
+
+    Those by which a link is loaded (SLOPE, CURVE) keep them: a share of a share of the load.
+    """
+    if read is None:
+        return None
+    shake = read.copy()
+    for part, errors in ((FORCE, BASE_FORCE), (RATE, BASE_RATE), (ACCELERATION, BASE_RATE)):
+        (u1, u2, scale), (x, y, z) = p[errors], read[:, part].T
+        shake[:, part] += scale * read[:, part] + np.stack([u2 * z, -u1 * z, u1 * y - u2 * x], axis=1)
+    return shake
 
 
 def _base_across(values: Array, shake: Array, p: Array) -> tuple[Array, Array, Array, Array]:
@@ -171,7 +191,7 @@ def _load(values: Array, shake: Array | None, p: Array) -> list[Array]:
     """
     rate, acceleration, jerk, snap, fifth, sixth, cosine, sine, squared = values.T
     (g1, g2, _), (r1, r2), c = p[GRAVITY], p[RADIAL], p[COMPLIANCE]
-    square = max(r1**2 + r2**2, _MIN_DISTANCE_M**2)
+    square = max(r1**2 + r2**2, MIN_DISTANCE_M**2)
     even, odd = (r1 * g2 - r2 * g1) / square, -(r1 * g1 + r2 * g2) / square
     pull, slope = even * cosine + odd * sine, odd * cosine - even * sine
     loads = [
@@ -257,6 +277,9 @@ def parameter_priors(knowledge: ImuPrior, motions: int) -> tuple[Array, Array]:
     sigma[COMPLIANCE], sigma[HINGE] = _COMPLIANCE_SIGMA_S2, HINGE_SHARE_SIGMA
     sigma[GYRO_BIAS] = knowledge.gyro_bias_rad_s
     sigma[BASE_DELAY], sigma[PIVOT], sigma[HEIGHT] = DELAY_SIGMA_S, _PIVOT_SIGMA_M, _HEIGHT_SIGMA_M
+    # Two IMUs are compared, each with errors of its own.
+    turned = np.sqrt(2.0) * np.hypot(turn, knowledge.mounting_rad)
+    sigma[BASE_FORCE] = sigma[BASE_RATE] = turned, turned, np.sqrt(2.0) * scale
     # Without shake the direction is irrelevant.
     sigma[BASE_HEADING] = np.pi
     sigma[DELAY:] = _DELAY_S

@@ -21,6 +21,7 @@ from module_agent.estimate.joint_model import (
     GRAVITY_ALONG,
     GYRO_BIAS,
     HINGE,
+    MIN_DISTANCE_M,
     RADIAL,
     TURN,
     Motion,
@@ -35,6 +36,7 @@ from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
 from module_agent.model.errors import DataError
 from module_agent.model.imu_prior import CALIBRATED, GYRO_BIAS_DRIFT_RAD_S, ImuPrior
 from module_agent.model.read_only import frozen
+from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.wire.messages import RegressionEstimate
 
 ITERATIONS = 12
@@ -42,6 +44,7 @@ SETTLED = 0.03  # of every parameter's deviation, were it the only one
 MIN_RATE_SHARE = 0.25
 # With less of gravity across the axis, two IMUs cannot agree on a direction across it.
 MIN_ACROSS_M_S2 = 1.0
+MAX_LAG = 50  # samples, a second and a half
 PINNED = 1e6  # the weight that fixes a parameter at its prior mean
 
 
@@ -90,6 +93,8 @@ class _Rows(NamedTuple):
 
     white: the variance of white noise in a sample of the IMU over that of `_slow` residuals. stride: the
     samples of the IMU for each of these: the low-pass makes neighbours alike, so that nothing is lost.
+    repeats: how many of these count as one independent sample if the noise is white. rate2_s2: the mean
+    square of the joint's acceleration over that of its rate, (2 pi f)^2 of a sine.
     """
 
     motion: Motion
@@ -97,6 +102,8 @@ class _Rows(NamedTuple):
     t_s: Array
     white: float
     stride: int
+    repeats: float
+    rate2_s2: float
     instrument: SmoothMotion | None
 
 
@@ -135,7 +142,8 @@ def regress_joint(
         DataError: no motion, too few samples of one, or an IMU that did not move with the joint.
     """
     problem, guess = _problem(motions, rest, knowledge)
-    return _result(*_minimise(problem, guess), problem)
+    state, covariance = _minimise(problem, guess)
+    return _result(state, covariance, problem, _systematic(state, covariance, problem))
 
 
 def distance_bound_m(
@@ -158,7 +166,7 @@ def distance_bound_m(
     known = np.arange(len(normal)) != HINGE
     covariance = np.zeros_like(normal)
     covariance[np.ix_(known, known)] = np.linalg.inv(normal[np.ix_(known, known)])
-    return _result(state, covariance, problem._replace(unresolved_m=0.0)).sigma_distance_m
+    return _result(state, covariance, problem, np.zeros((6, 6))).sigma_distance_m
 
 
 def _minimise(problem: _Problem, state: _State) -> tuple[_State, Array]:
@@ -215,7 +223,20 @@ def _rows(observed: ObservedMotion) -> _Rows:
         raise DataError(f"{inside.size} IMU samples fall into the joint's motion: at least 20 are needed")
     readings = np.hstack([observed.imu.gyro_rad_s[inside], observed.imu.accel_m_s2[inside]])
     white = white_ratio(observed.imu.t_ns, float(np.hypot(observed.imu.smooth_s, stride * step_s)))
-    return _Rows(Motion(observed.joint, None), readings, t_s[inside], white, stride, observed.instrument)
+    # The sum of the correlations exp(-(lag / 2 s)^2) of white noise behind a Gaussian of deviation s.
+    repeats = 2.0 * np.sqrt(np.pi) * observed.imu.smooth_s / (stride * step_s)
+    moved = observed.joint.values(t_s[inside])
+    rate2_s2 = float(np.mean(moved[:, 1] ** 2) / max(np.mean(moved[:, 0] ** 2), np.finfo(float).tiny))
+    return _Rows(
+        Motion(observed.joint, None),
+        readings,
+        t_s[inside],
+        white,
+        stride,
+        repeats,
+        rate2_s2,
+        observed.instrument,
+    )
 
 
 def _first_guess(rows: Sequence[_Rows], mean: Array) -> _State:
@@ -270,11 +291,13 @@ def _equations(problem: _Problem, state: _State, noise: Array) -> _Equations:
         for sensor in range(2):
             part = slice(3 * sensor, 3 * sensor + 3)
             weight = row.stride / noise[sensor] ** 2
-            square = row.white * np.mean(_slow(residual[:, part]) ** 2, axis=1)
+            squares = row.white * _slow(residual[:, part]) ** 2
+            square = squares.mean(axis=1)
+            alike = samples_per_independent(residual[:, part, None], MAX_LAG) / row.repeats
             by_weight, by_slope = _flat(weighing[:, part]), _flat(slopes[:, part])
             normal += weight * by_weight.T @ by_slope
             gradient += weight * by_weight.T @ residual[:, part].ravel()
-            uneven = by_weight * np.repeat(square / noise[sensor] ** 2, 3)[:, None]
+            uneven = by_weight * (squares * np.maximum(alike, 1.0) / noise[sensor] ** 2).reshape(-1, 1)
             scatter += weight * uneven.T @ by_weight
             power[sensor] += float(square.sum())
         count += len(residual)
@@ -330,7 +353,23 @@ def _moved(state: _State, step: Array) -> _State:
     return _State(state.frame @ Rotation.from_rotvec(turn).as_matrix(), values)
 
 
-def _result(state: _State, covariance: Array, problem: _Problem) -> JointRegression:
+def _systematic(state: _State, covariance: Array, problem: _Problem) -> Array:
+    """Return the covariance (6, 6) of axis and radial vector by what the model leaves out."""
+    p, frame = state.values, state.frame
+    across, radial = frame[:, :2] @ frame[:, :2].T, frame[:, :2] @ p[RADIAL]
+    compliance_s2 = abs(p[COMPLIANCE]) + float(np.sqrt(covariance[COMPLIANCE, COMPLIANCE]))
+    # A load off the plane of the motion bends and twists the link across it, which no motion tells: as
+    # much as gravity bends it within the plane. What bends moves the IMU by an unknown part of it: slope and
+    # place of a beam's end answer differently to forces and to moments.
+    bent_rad = compliance_s2 * GRAVITY_M_S2 / max(float(np.hypot(*p[RADIAL])), MIN_DISTANCE_M)
+    swung = 0.5 * compliance_s2 * max(row.rate2_s2 for row in problem.rows)
+    systematic = np.zeros((6, 6))
+    systematic[:3, :3] = bent_rad**2 * across
+    systematic[3:, 3:] = problem.unresolved_m**2 * across + swung**2 * np.outer(radial, radial)
+    return systematic
+
+
+def _result(state: _State, covariance: Array, problem: _Problem, systematic: Array) -> JointRegression:
     p, frame = state.values, state.frame
     r1, r2 = p[RADIAL]
     distance = float(np.hypot(r1, r2))
@@ -340,7 +379,7 @@ def _result(state: _State, covariance: Array, problem: _Problem) -> JointRegress
     gain[3:, :2] = np.outer(frame[:, 2], [r2, -r1])
     gain[3:, RADIAL] = frame[:, :2]
     six = gain @ covariance @ gain.T
-    six[3:, 3:] += problem.unresolved_m**2 * frame[:, :2] @ frame[:, :2].T
+    six += systematic
     radial = frame[:, :2] @ p[RADIAL]
     along = radial / max(distance, 1e-6)
     return JointRegression(
