@@ -134,16 +134,25 @@ class _Equations(NamedTuple):
 
 
 def regress_joint(
-    motions: Sequence[ObservedMotion], rest: RestReading | None, knowledge: ImuPrior = CALIBRATED
+    motions: Sequence[ObservedMotion],
+    rest: RestReading | None,
+    knowledge: ImuPrior = CALIBRATED,
+    symmetric_load: bool = False,
 ) -> JointRegression:
     """Fit the model of `joint_model` to all motions of one joint, and what the IMU read at rest.
+
+    Args:
+        motions, rest: what the IMU and the joint's module sampled.
+        knowledge: of the IMU.
+        symmetric_load: what the link carries lies in the plane of the motion, as in a trial of a single
+            joint. Else the covariance holds how much a load off that plane may bend and twist the link.
 
     Raises:
         DataError: no motion, too few samples of one, or an IMU that did not move with the joint.
     """
     problem, guess = _problem(motions, rest, knowledge)
     state, covariance = _minimise(problem, guess)
-    return _result(state, covariance, problem, _systematic(state, covariance, problem))
+    return _result(state, covariance, problem, _systematic(state, covariance, problem, symmetric_load))
 
 
 def distance_bound_m(
@@ -353,7 +362,7 @@ def _moved(state: _State, step: Array) -> _State:
     return _State(state.frame @ Rotation.from_rotvec(turn).as_matrix(), values)
 
 
-def _systematic(state: _State, covariance: Array, problem: _Problem) -> Array:
+def _systematic(state: _State, covariance: Array, problem: _Problem, symmetric_load: bool) -> Array:
     """Return the covariance (6, 6) of axis and radial vector by what the model leaves out."""
     p, frame = state.values, state.frame
     across, radial = frame[:, :2] @ frame[:, :2].T, frame[:, :2] @ p[RADIAL]
@@ -364,8 +373,10 @@ def _systematic(state: _State, covariance: Array, problem: _Problem) -> Array:
     bent_rad = compliance_s2 * GRAVITY_M_S2 / max(float(np.hypot(*p[RADIAL])), MIN_DISTANCE_M)
     swung = 0.5 * compliance_s2 * max(row.rate2_s2 for row in problem.rows)
     systematic = np.zeros((6, 6))
-    systematic[:3, :3] = bent_rad**2 * across
-    systematic[3:, 3:] = problem.unresolved_m**2 * across + swung**2 * np.outer(radial, radial)
+    systematic[3:, 3:] = problem.unresolved_m**2 * across
+    if not symmetric_load:
+        systematic[:3, :3] = bent_rad**2 * across
+        systematic[3:, 3:] += swung**2 * np.outer(radial, radial)
     return systematic
 
 

@@ -110,7 +110,8 @@ def regress(trial: TrialRows, knowledge: ImuPrior = CALIBRATED) -> JointRegressi
     Raises:
         ValueError: too little motion, with what would be enough.
     """
-    return regress_joint(observed_motions(windows(trial)), rest_reading(imu_window(trial.rest)), knowledge)
+    rest = rest_reading(imu_window(trial.rest))
+    return regress_joint(observed_motions(windows(trial)), rest, knowledge, symmetric_load=True)
 
 
 def windows(trial: TrialRows) -> list[MotionWindows]:

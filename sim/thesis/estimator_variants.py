@@ -113,7 +113,8 @@ VARIANTS: Mapping[str, Variant] = {
 
 
 def _regressed(trial: TrialRows, profile: NoiseProfile, motions: list[ObservedMotion]) -> JointRegression:
-    return regress_joint(motions, rest_reading(imu_window(trial.rest)), imu_knowledge(profile))
+    rest = rest_reading(imu_window(trial.rest))
+    return regress_joint(motions, rest, imu_knowledge(profile), symmetric_load=True)
 
 
 def _by_gyro(trial: TrialRows, window: MotionWindows, crossover_s: float | None) -> ObservedMotion:
