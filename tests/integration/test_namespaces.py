@@ -14,11 +14,11 @@ import pytest
 
 from coordinator.recording.run_folder import load_recording
 from sim.processes.launcher import Child, LaunchConfig, Launcher, stop_child
-from sim.processes.link_emulator import UP
-from sim.processes.network_namespace import NamespaceError, open_tun
 from sim.robot.robot_file import load_robot
 from sim.scoring.score import score
-from tests.network_namespace import NetworkNamespace
+from tests.emulated_network.interfaces import NamespaceError, open_tun
+from tests.emulated_network.link_emulator import UP
+from tests.emulated_network.network_namespace import NetworkNamespace
 
 ROBOT = "thesis_245_horizontal"
 HUB = "10.77.0.1"
@@ -71,7 +71,7 @@ def hosts(tmp_path: Path, programs) -> Iterator[Hosts]:
         options = ("--network", str(network), "--seed", "5", "--counts", str(counts))
         with open(log, "wb") as output:
             process = subprocess.Popen(
-                [sys.executable, "-m", "sim.processes.link_emulator", *named, *options],
+                [sys.executable, "-m", "tests.emulated_network.link_emulator", *named, *options],
                 stdout=output,
                 stderr=output,
             )

@@ -1,4 +1,4 @@
-"""`python -m sim.processes.link_emulator`: a network in user space between network namespaces.
+"""`python -m tests.emulated_network.link_emulator`: a network in user space between network namespaces.
 
 Every host is a namespace with a TUN interface. Its packets are read here and written to their destination
 with the delay, loss and reordering of the profile. So TCP itself is impaired, and no queueing discipline of
@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 from module_agent.model.errors import EXIT_LOST, EXIT_USAGE, RobotError, UsageError
 from module_agent.network_emulation.profile_file import network as network_named
-from sim.processes.network_namespace import open_tun
-from sim.processes.packet_switch import LinkCounts, PacketSwitch
+from tests.emulated_network.interfaces import open_tun
+from tests.emulated_network.packet_switch import LinkCounts, PacketSwitch
 
 # Printed when packets pass.
 UP = "the links are up"
@@ -84,7 +84,9 @@ def counts_by_address(
 
 def main() -> int:
     """Connect network namespaces by links that delay and lose packets, until a signal arrives."""
-    parser = argparse.ArgumentParser(prog="python -m sim.processes.link_emulator", description=main.__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.emulated_network.link_emulator", description=main.__doc__
+    )
     parser.add_argument(
         "hosts", nargs="+", metavar="NAMESPACE=ADDRESS/PREFIX", help="Hosts, the coordinator's first."
     )

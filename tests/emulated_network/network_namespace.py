@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from sim.processes.network_namespace import NamespaceError
+from tests.emulated_network.interfaces import NamespaceError
 
 OPEN_TIMEOUT_S = 10.0
 _TOOLS = ("ip", "nsenter", "unshare")

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from sim.processes.network_namespace import INTERFACE, NamespaceError, open_tun
-from tests.network_namespace import NetworkNamespace
+from tests.emulated_network.interfaces import INTERFACE, NamespaceError, open_tun
+from tests.emulated_network.network_namespace import NetworkNamespace
 
 ADDRESS = IPv4Interface("10.77.0.1/24")
 SEND = "import socket; socket.socket(type=socket.SOCK_DGRAM).sendto(b'hello', ('10.77.0.2', 9))"

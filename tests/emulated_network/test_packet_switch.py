@@ -8,8 +8,8 @@ import pytest
 
 from module_agent.model.errors import UsageError
 from module_agent.network_emulation.profile import PROFILES, NetworkProfile, PathProfile
-from sim.processes.link_emulator import counts_by_address, host
-from sim.processes.packet_switch import PacketSwitch
+from tests.emulated_network.link_emulator import counts_by_address, host
+from tests.emulated_network.packet_switch import PacketSwitch
 
 HOSTS = [IPv4Address(f"10.77.0.{i}") for i in (1, 2, 3)]
 HUB, ONE, TWO = range(3)
