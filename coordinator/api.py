@@ -263,7 +263,8 @@ def export_urdf(robot: SavedRun | Identified, path: Path | str) -> None:
         OSError: the file cannot be written.
     """
     chain, phi, types, name = _described(robot)
-    write_urdf(Path(path), chain, phi, name, [module_type(types[s]) for s in chain.serials])
+    kinds = [module_type(types[s]) for s in chain.serials]
+    write_urdf(Path(path), chain, phi, name, kinds, _undetermined(robot))
 
 
 def export_hrdf(robot: SavedRun | Identified, path: Path | str) -> None:
@@ -273,13 +274,18 @@ def export_hrdf(robot: SavedRun | Identified, path: Path | str) -> None:
         OSError: the file cannot be written.
     """
     chain, phi, types, name = _described(robot)
-    write_hrdf(Path(path), chain, [module_type(types[s]) for s in chain.serials], phi, name)
+    kinds = [module_type(types[s]) for s in chain.serials]
+    write_hrdf(Path(path), chain, kinds, phi, name, _undetermined(robot))
 
 
 def _described(robot: SavedRun | Identified) -> tuple[Chain, Array | None, Mapping[str, str], str]:
     if isinstance(robot, SavedRun):
         return robot.chain, robot.phi, robot.result.types, robot.result.robot
     return robot.kinematics.fit.chain, robot.real_phi, robot.result.types, robot.result.robot
+
+
+def _undetermined(robot: SavedRun | Identified) -> Mapping[str, Sequence[str]]:
+    return {} if robot.result.dynamics is None else robot.result.dynamics.undetermined
 
 
 # ---------------------------------------------------------------------- live robots

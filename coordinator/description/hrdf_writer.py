@@ -7,7 +7,7 @@ serial, every end of a branch with `tip_<serial>`. IMUs, limits and uncertainty 
 base frame has z up; the degrees of freedom are in the order of the file, which a comment in it repeats.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement
@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from coordinator.description.urdf_writer import (
+    ALL_DETERMINED,
     INERTIA,
     comment,
+    comment_undetermined,
     inertia_attributes,
     link_homes,
     numbers,
@@ -44,25 +46,37 @@ class _Robot(NamedTuple):
     actuator: tuple[str | None, ...]
     tip: Array
     bodies: Array | None
+    undetermined: Mapping[str, Sequence[str]]
 
 
 def write_hrdf(
-    path: Path, chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None = None, name: str = "robot"
+    path: Path,
+    chain: Chain,
+    types: Sequence[ModuleType],
+    phi: ArrayLike | None = None,
+    name: str = "robot",
+    undetermined: Mapping[str, Sequence[str]] = ALL_DETERMINED,
 ) -> None:
     """Write the robot of n joints, with a type each; the file is the complete old or the complete new one.
 
     phi: (10 n,) inertial parameters as in `torque_regressor`. They include the modules' own masses, so that
     the actuators get none; without them the actuators have their types' and links none.
+    undetermined: by the serial, parameters of its body that torques alone do not determine; a comment before
+        the body names them.
 
     Raises:
         ValueError: `phi` or `types` do not fit the chain.
         OSError: the file cannot be written.
     """
-    write_xml(path, hrdf_element(chain, types, phi, name))
+    write_xml(path, hrdf_element(chain, types, phi, name, undetermined))
 
 
 def hrdf_element(
-    chain: Chain, types: Sequence[ModuleType], phi: ArrayLike | None = None, name: str = "robot"
+    chain: Chain,
+    types: Sequence[ModuleType],
+    phi: ArrayLike | None = None,
+    name: str = "robot",
+    undetermined: Mapping[str, Sequence[str]] = ALL_DETERMINED,
 ) -> Element:
     """Return the `robot` element; for the arguments and errors see `write_hrdf`."""
     housing, tip, axes = housing_homes(chain, types), distal_homes(chain, types), link_homes(chain)
@@ -78,7 +92,7 @@ def hrdf_element(
     comment(
         robot, unidentified if phi is None else "The modules' own masses are part of the identified bodies."
     )
-    _follow(robot, _Robot(chain, entry, leave, made, tip, bodies), BASE, np.eye(4))
+    _follow(robot, _Robot(chain, entry, leave, made, tip, bodies, undetermined), BASE, np.eye(4))
     return robot
 
 
@@ -145,6 +159,7 @@ def _mass(parent: Element, robot: _Robot, carrier: int, frame: Array) -> dict[st
     """Return the mass attributes of a body in `frame`; a comment says where it had to be made a real one."""
     if robot.bodies is None or carrier == BASE:
         return {"mass": "0"}
+    comment_undetermined(parent, robot.undetermined.get(robot.chain.serials[carrier], ()))
     into = np.linalg.inv(frame)
     pseudo = into @ pseudo_inertia(robot.bodies[carrier]) @ into.T
     if not is_consistent(pseudo):

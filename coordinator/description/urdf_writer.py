@@ -5,8 +5,9 @@ root frame. Body i is the link `body_<serial>` with z on its joint's axis at q =
 `joint_<serial>`; `imu_<serial>` is a link fixed to the body that carries the IMU.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from xml.etree.ElementTree import Comment, Element, ElementTree, SubElement, indent
 
 import numpy as np
@@ -28,6 +29,7 @@ from module_agent.model.read_only import read_only
 from module_agent.model.regressor import PER_BODY, check_phi
 
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+ALL_DETERMINED: Mapping[str, Sequence[str]] = MappingProxyType({})
 
 
 def write_urdf(
@@ -36,22 +38,29 @@ def write_urdf(
     phi: ArrayLike | None,
     name: str = "robot",
     module_types: Sequence[ModuleType] | None = None,
+    undetermined: Mapping[str, Sequence[str]] = ALL_DETERMINED,
 ) -> None:
     """Write the robot of n joints; the file is the complete old or the complete new one.
 
     phi: (10 n,) inertial parameters as in `torque_regressor`, None to write no inertias. Parameters that are
     no real body's are replaced by the nearest real body (`nearest_consistent`), and a comment says so.
     module_types: per joint; their effort and speed limits are written.
+    undetermined: by the serial, parameters of its body that torques alone do not determine; a comment in the
+        link names them.
 
     Raises:
         ValueError: `phi` or `module_types` do not fit the chain.
         OSError: the file cannot be written.
     """
-    write_xml(path, robot_element(chain, phi, name, module_types))
+    write_xml(path, robot_element(chain, phi, name, module_types, undetermined))
 
 
 def robot_element(
-    chain: Chain, phi: ArrayLike | None, name: str = "robot", module_types: Sequence[ModuleType] | None = None
+    chain: Chain,
+    phi: ArrayLike | None,
+    name: str = "robot",
+    module_types: Sequence[ModuleType] | None = None,
+    undetermined: Mapping[str, Sequence[str]] = ALL_DETERMINED,
 ) -> Element:
     """Return the `robot` element; for the arguments and errors see `write_urdf`."""
     joints = len(chain.serials)
@@ -68,6 +77,7 @@ def robot_element(
     for i, serial in enumerate(chain.serials):
         link = SubElement(robot, "link", name=names[i])
         if bodies is not None:
+            comment_undetermined(link, undetermined.get(serial, ()))
             _inertial(link, bodies[i], homes[i])
         parent = chain.parent[i]
         pose = _relative(homes, parent, homes[i])
@@ -153,6 +163,16 @@ def inertia_attributes(real: Body, text: Callable[[ArrayLike], str]) -> dict[str
     """Return the six entries of a body's inertia about its centre by their names."""
     entries = zip(INERTIA, real.inertia_kg_m2[np.triu_indices(3)], strict=True)
     return {key: text(value) for key, value in entries}
+
+
+def comment_undetermined(parent: Element, names: Sequence[str]) -> None:
+    """Add a comment with the parameters of a body that torques alone do not determine, if there are any."""
+    if names:
+        comment(
+            parent,
+            f"Torques alone do not determine {', '.join(names)} of this body: the module types decide, and "
+            "the values may be far off. See identifiability in result.json.",
+        )
 
 
 def comment(parent: Element, text: str) -> None:

@@ -248,6 +248,20 @@ class DynamicsPart(Part):
     by_agents: list[str] = Field(default_factory=list)
     gathered_difference: float | None = None
 
+    @property
+    def undetermined(self) -> dict[str, tuple[str, ...]]:
+        """The parameters of every module's body that torques alone do not determine, by its serial."""
+        return undetermined(self.identifiability)
+
+
+def undetermined(parts: Sequence[IdentifiabilityPart]) -> dict[str, tuple[str, ...]]:
+    """Return the parameters that torques alone do not determine, by the serial of their body's module."""
+    names: dict[str, list[str]] = {}
+    for one in parts:
+        if one.identifiability != "identified":
+            names.setdefault(one.serial, []).append(one.parameter)
+    return {serial: tuple(own) for serial, own in names.items()}
+
 
 class SensorPart(Part):
     """A sensor that contradicts its catalogue or the others; measured and expected in `unit`."""

@@ -350,8 +350,14 @@ def write_outputs(out: Path, identified: Identified) -> None:
     write_result(out / RESULT, identified.result)
     phi = identified.real_phi
     types = [module_type(identified.result.types[s]) for s in identified.result.serials]
-    write_urdf(out / URDF, identified.kinematics.fit.chain, phi, identified.result.robot, types)
-    write_hrdf(out / HRDF, identified.kinematics.fit.chain, types, phi, identified.result.robot)
+    chain, name, dynamics = (
+        identified.kinematics.fit.chain,
+        identified.result.robot,
+        identified.result.dynamics,
+    )
+    undetermined = dynamics.undetermined if dynamics is not None else {}
+    write_urdf(out / URDF, chain, phi, name, types, undetermined)
+    write_hrdf(out / HRDF, chain, types, phi, name, undetermined)
     if identified.held_out is not None:
         write_held_out(out / HELD_OUT, identified.held_out)
     if identified.inertia is not None:
