@@ -1,9 +1,10 @@
 """What a coordinator's plan commands of a robot, joint after joint, and how the robot really moves.
 
-Shapes of motions are written out here (docs/theory.md: eqs 13 and 14), not taken from the firmware's code. A
-joint follows its command late and smoothed, and gives way under its load like a spring.
+Shapes of motions are written out here (eqs 13 and 14, table 6: docs/theory.md), not taken from the firmware's
+code. A joint follows its command late and smoothed, and gives way under its load like a spring.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from coordinator.excitation.plan import Plan
 from coordinator.recording.journal import Purpose
-from module_agent.model.catalogue import module_type
+from module_agent.model.catalogue import ModuleType, module_type
 from module_agent.wire.messages import ConstantMotion, DynamicPattern, GoTo, Pattern, Rest, WindowedSine
 from tests.second_simulator.robot import Array, Robot
 
@@ -103,6 +104,12 @@ def _moves(robot: Robot, plan: Plan) -> tuple[Move, ...]:
         go(joint, 0.0)
         add(joint, "windowed_sine", sine, 0.0)
         now_s += plan.settle_s
+    excitations: tuple[tuple[Purpose, Callable[[ModuleType], DynamicPattern]], ...]
+    excitations = (("dynamic", plan.dynamic), ("held_out", plan.held_out)) if plan.dynamics else ()
+    for purpose, pattern in excitations:
+        for joint, name in enumerate(robot.types):
+            add(joint, purpose, pattern(module_type(name)), 0.0)
+            now_s += plan.settle_s
     return tuple(moves)
 
 
@@ -136,6 +143,15 @@ def _shape(move: Move, t_s: Array) -> Array:
             window = np.exp(-0.5 * ((t_s - pattern.centre_s) / pattern.sigma_s) ** 2)
             wave = pattern.amplitude * np.sin(2.0 * np.pi * pattern.frequency_hz * t_s)
             return _raised_cosine(t_s, lasting_s) * window * wave
+        case DynamicPattern():
+            width_s = 2.0 * pattern.half_width_s
+            number = np.minimum(t_s // width_s, pattern.repeats - 1)
+            within_s = t_s - number * width_s
+            since_s = within_s - pattern.half_width_s
+            sign = np.where((number % 2 == 1) & pattern.alternate, -1.0, 1.0)
+            window = sign * np.exp(-0.5 * (since_s / pattern.sigma_s) ** 2)
+            wave = pattern.amplitude_rad * np.sin(2.0 * np.pi * pattern.frequency_hz * since_s)
+            return _raised_cosine(within_s, width_s) * window * wave
     return np.zeros_like(t_s)
 
 

@@ -208,9 +208,10 @@ class _Session:
             self._add("publication", Leaf.STATUS, t_s + self._back_s(k), status)
         if move.purpose != "other":
             serial = self._robot.serials[k]
-            step = "rest" if move.purpose == "rest" else f"explore/{serial}"
+            step = {"rest": "rest", "dynamic": f"excite/{serial}", "held_out": f"held_out/{serial}"}
             fields = {"serial": serial, "boot": self._boots[k], "purpose": move.purpose, "motion": record}
-            self._journal(move.end_s + 0.02, what="motion", step=step, **fields)
+            name = step.get(move.purpose, f"explore/{serial}")
+            self._journal(move.end_s + 0.02, what="motion", step=name, **fields)
 
     def _estimates(self, motion: Motion, records: list[MotionRecord]) -> None:
         """Publish every agent's estimate of every exploration motion."""
