@@ -5,6 +5,7 @@ from math import isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 # A range of per cent in which the share of 95 % intervals that cover must lie.
 COVERAGE = (92.0, 98.0)
@@ -77,6 +78,14 @@ def largest(values: Sequence[float | None]) -> float | None:
 def ratio(over: float | None, under: float | None) -> float | None:
     """Return a ratio, None where one of the two is not known or the lower one is 0."""
     return None if over is None or not under else over / under
+
+
+def widened(limit: float, terms: int) -> float:
+    """Return the bar of an rms error over its bound: `limit`, or what chance makes of 1 in 99 of 100 cases.
+
+    terms: how many independent normal errors it is of, three of every place.
+    """
+    return max(limit, float(np.sqrt(chi2.isf(0.01, terms) / terms))) if terms else limit
 
 
 def scaled(value: float | None, factor: float) -> float | None:

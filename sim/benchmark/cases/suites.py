@@ -20,13 +20,13 @@ from sim.benchmark.cases.regressor import regressor_cases
 from sim.benchmark.cases.staubli_tx40 import recorded_cases
 from sim.benchmark.cases.topology import topology_cases
 from sim.benchmark.cases.torque_assistance import assistance_cases
-from sim.benchmark.row import Row, coverage, rms
+from sim.benchmark.row import Row, coverage, rms, widened
 
 KINEMATIC_TRIALS = 13
 ALL = "all cases"
 # The rms of errors over the physical limit; `Summary.over_bound`.
 # A whole arm's bound knows how its links give, and uses travel too.
-OVER_BOUND = {LENGTH_OF_ONE: 1.2, LENGTHS: 3.0, TIP: 3.0}
+OVER_BOUND = {LENGTH_OF_ONE: 1.2, LENGTHS: 3.0, TIP: 1.5}
 
 
 class KinematicEffort(NamedTuple):
@@ -77,12 +77,12 @@ def over_all(results: Sequence[CaseResult]) -> list[Row]:
     for result in results:
         for what, values in result.summary.over_bound.items():
             over.setdefault(what, []).extend(values)
-    return rows + [
-        Row(
-            f"{what}, rms error over the bound, of {len(values)}", rms(values), OVER_BOUND[what], bound=1.0
-        )._replace(case=ALL)
-        for what, values in over.items()
-    ]
+    for what, values in over.items():
+        # Other bars have room for chance already.
+        limit = widened(OVER_BOUND[what], 3 * len(values)) if what == TIP else OVER_BOUND[what]
+        figure = f"{what}, rms error over the bound, of {len(values)}"
+        rows.append(Row(figure, rms(values), limit, bound=1.0)._replace(case=ALL))
+    return rows
 
 
 DYNAMIC_TRIALS = 5

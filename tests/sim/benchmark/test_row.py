@@ -16,6 +16,7 @@ from sim.benchmark.row import (
     mean_abs,
     ratio,
     rms,
+    widened,
 )
 
 
@@ -46,6 +47,15 @@ def test_a_row_in_json_has_the_agreed_fields_and_no_number_that_json_lacks() -> 
         *("case", "profile", "known", "figure", "thesis", "ours", "bound", "limit", "holds")
     ]
     assert (found["thesis"], found["ours"], found["bound"], found["holds"]) == (None, None, 0.1, False)
+
+
+def test_the_bar_of_few_errors_is_as_wide_as_chance_makes_it() -> None:
+    drawn = np.random.default_rng(0).normal(size=(20_000, 3))
+    beyond = np.sqrt(np.mean(drawn**2, axis=1)) > widened(1.5, 3)
+    # One of 100, as 20 000 draws tell it to 7 %.
+    assert np.mean(beyond) == pytest.approx(0.01, rel=0.3)
+    assert widened(1.5, 3) > widened(1.5, 6) > widened(1.5, 39) == 1.5
+    assert widened(1.5, 0) == 1.5
 
 
 def test_what_is_not_there_is_left_out_of_means() -> None:

@@ -1,14 +1,16 @@
 """From trials to rows: what a bar is about reaches the row with it, and nothing is dropped in silence."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
-from sim.benchmark.case import Case, Summary, concluded
+from sim.benchmark.case import Case, CaseResult, Summary, concluded
 from sim.benchmark.cases.arm import (
     ARMS,
     COST_ARM,
+    TIP,
     WHOLE_ARM,
     ArmLink,
     ArmTrial,
@@ -371,3 +373,15 @@ def test_coverage_is_counted_over_the_intervals_of_all_cases() -> None:
     assert (row.case, row.ours, row.holds) == (ALL, pytest.approx(93.0), True)
     assert over_all(results[:1])[0].holds is False
     assert over_all([]) == []
+
+
+def test_the_tips_of_many_arms_are_within_half_as_much_again_as_their_bound() -> None:
+    def held(errors: Sequence[float]) -> Row:
+        (row,) = over_all([CaseResult("arm", 1, Summary([], (), {TIP: errors}), ())])
+        return row
+
+    assert held([1.4] * 26).holds
+    assert held([1.6] * 26).holds is False
+    # One arm's tip may be twice as far off by chance, and not three times.
+    assert held([1.9]).holds
+    assert held([2.5]).holds is False
