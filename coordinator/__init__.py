@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from coordinator.batch_estimation.imu_prediction import imu_readings as imu_readings
     from coordinator.description.urdf_reader import read_urdf as read_urdf
     from coordinator.identification.identify import identify as identify
-    from coordinator.kinematics.imu_links import link_from_imus as link_from_imus
-    from coordinator.kinematics.imu_links import link_from_joint as link_from_joint
+    from coordinator.kinematics.encoder_joint import link_from_joint as link_from_joint
+    from coordinator.kinematics.imu_pair import link_from_imus as link_from_imus
     from module_agent.model.regressor import inverse_dynamics as inverse_dynamics
     from module_agent.model.regressor import torque_regressor as torque_regressor
 
@@ -35,8 +35,8 @@ _HOMES = {
     "identify": "coordinator.identification.identify",
     "imu_readings": "coordinator.batch_estimation.imu_prediction",
     "inverse_dynamics": "module_agent.model.regressor",
-    "link_from_imus": "coordinator.kinematics.imu_links",
-    "link_from_joint": "coordinator.kinematics.imu_links",
+    "link_from_imus": "coordinator.kinematics.imu_pair",
+    "link_from_joint": "coordinator.kinematics.encoder_joint",
     "load_recording": "coordinator.api",
     "load_run": "coordinator.api",
     "read_log": "coordinator.arm_fit.data_file",

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coordinator.kinematics.imu_links import ImuLink, link_from_imus, link_from_joint
+from coordinator.kinematics.encoder_joint import link_from_joint
+from coordinator.kinematics.imu_pair import ImuLink, link_from_imus
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 

@@ -1,4 +1,4 @@
-"""The axis of a joint and the lever arms of its two IMUs, without an encoder or with one.
+"""The axis of a joint and the lever arms of the IMUs on both sides of it, without an encoder.
 
 Two IMUs ride on the two sides of a revolute joint. In the frame of IMU i let j_i be the unit axis, r_i the
 lever arm from a point on the axis to the IMU, w_i the rate and f_i the specific force. The joint turns side
@@ -34,13 +34,9 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from module_agent.estimate.joint_regression import JointRegression, regress_joint
-from module_agent.estimate.observed_motion import MotionWindows, ObservedMotion, observed_motions
-from module_agent.estimate.smoothing import SmoothMotion, smooth_imu
-from module_agent.estimate.windows import ImuWindow, JointWindow
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
-from module_agent.model.imu_prior import ACCEL_BIAS_SIGMA_M_S2, CALIBRATED, GYRO_BIAS_SIGMA_RAD_S, ImuPrior
+from module_agent.model.imu_prior import ACCEL_BIAS_SIGMA_M_S2, GYRO_BIAS_SIGMA_RAD_S
 from module_agent.model.read_only import frozen
 from module_agent.signals.autocorrelation import samples_per_independent
 from module_agent.signals.filtering import differentiate, settling_samples, zero_phase_low_pass
@@ -156,43 +152,6 @@ def link_from_imus(
     signals = _signals(t_s, (gyro_1_rad_s, gyro_2_rad_s), (accel_1_m_s2, accel_2_m_s2), cutoff_hz)
     priors = np.repeat([gyro_bias_rad_s, accel_bias_m_s2], 6)
     return _described(signals, _best(signals, priors), priors)
-
-
-def link_from_joint(
-    t_s: ArrayLike,
-    position_rad: ArrayLike,
-    gyro_rad_s: ArrayLike,
-    accel_m_s2: ArrayLike,
-    carrier_gyro_rad_s: ArrayLike | None = None,
-    carrier_accel_m_s2: ArrayLike | None = None,
-    prior: ImuPrior = CALIBRATED,
-) -> JointRegression:
-    """Estimate axis and radial vector of a joint with an encoder from an IMU that it carries.
-
-    The circle point analysis of one joint as least squares (`module_agent.estimate.joint_regression`):
-    gravity, biases, delay and a bending link are estimated along. The place along the axis is not observable;
-    the covariance is zero along it.
-
-    Args:
-        t_s: (m,) uniform times [s] of encoder and IMUs alike.
-        position_rad: (m,) the joint's angle.
-        gyro_rad_s, accel_m_s2: (m, 3) of the IMU that the joint carries, in its frame.
-        carrier_gyro_rad_s, carrier_accel_m_s2: (m, 3) of an IMU on the other side of the joint: what it
-            measures of a shaking base is subtracted. None for a base at rest.
-        prior: how well the IMUs are known.
-
-    Raises:
-        ValueError: too few samples, uneven times, or an IMU that did not move with the joint.
-    """
-    t_ns = np.round(1e9 * np.asarray(t_s, dtype=float)).astype(np.int64)
-    q = np.asarray(position_rad, dtype=float)
-    joint = JointWindow(t_ns, q, np.gradient(q, 1e-9 * t_ns))
-    imu = ImuWindow(t_ns, np.asarray(gyro_rad_s, dtype=float), np.asarray(accel_m_s2, dtype=float))
-    if carrier_gyro_rad_s is None or carrier_accel_m_s2 is None:
-        return regress_joint([ObservedMotion(smooth_imu(imu), SmoothMotion(joint), 0)], None, prior)
-    gyro, accel = (np.asarray(a, dtype=float) for a in (carrier_gyro_rad_s, carrier_accel_m_s2))
-    windows = MotionWindows(imu, joint, ImuWindow(t_ns, gyro, accel), 0)
-    return regress_joint(observed_motions([windows]), None, prior)
 
 
 def _signals(
