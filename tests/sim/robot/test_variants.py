@@ -30,6 +30,9 @@ def test_modules_are_built_as_their_seed_has_them_and_as_catalogued_without_the_
     robot = load_robot("a2085_04")
     assert as_built(robot, 3, BUILD) == as_built(as_built(robot, 3, BUILD), 4, BUILD)
     assert as_built(robot, 3, BUILD) != as_built(robot, 4, BUILD)
+    # A module is the same in every assembly.
+    fewer = robot.model_copy(update={"modules": robot.modules[:2]})
+    assert as_built(fewer, 3, BUILD).modules == as_built(robot, 3, BUILD).modules[:2]
     plain, ideal = build_tree(robot), build_tree(as_built(robot, 3, "ideal"))
     np.testing.assert_array_equal(plain.imu_home, ideal.imu_home)
     np.testing.assert_array_equal(true_inertia(robot), true_inertia(as_built(robot, 3, "ideal")))
