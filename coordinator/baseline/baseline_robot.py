@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from coordinator.baseline.update import updated
+from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.excitation.plan import Plan
-from coordinator.identification.identified import IdentificationError, Kinematics
+from coordinator.identification.identified import IdentificationError, Kinematics, calibrations
 from coordinator.identification.identify import identify_kinematics
+from coordinator.merge.calibration_file import CalibrationFileError, each_once, read_calibration
 from coordinator.recording.recording import Recording
-from coordinator.recording.run_folder import SESSION, load_recording
+from coordinator.recording.run_folder import MEASURED, SESSION, load_recording
 from coordinator.recording.session_file import SessionFileError
 from module_agent.model.catalogue import ImuKind, UnknownModuleType
 from module_agent.model.chain import Chain
@@ -45,6 +47,15 @@ class BaselineRobot(NamedTuple):
         """The prior of its IMUs in the run."""
         return self.recording.imu
 
+    @property
+    def measured(self) -> tuple[CalibrationInformation, ...]:
+        """What the run, and those before it, tell of its modules' IMUs."""
+        return calibrations(self.kinematics, self.recording)
+
+    def updated(self, session: Kinematics) -> Kinematics:
+        """Return a session's kinematics with this robot's geometry wherever nothing has changed."""
+        return updated(self.kinematics, session)
+
 
 def load_baseline(folder: Path) -> BaselineRobot:
     """Read a run's folder, and identify its robot again from the recording.
@@ -59,30 +70,42 @@ def load_baseline(folder: Path) -> BaselineRobot:
     if not path.is_file():
         raise BaselineError(f"{folder} holds no {SESSION}: give the folder of a run that has finished")
     try:
-        recording = load_recording(path)
-        kinematics, before = identify_kinematics(recording), baseline_within(folder)
+        recording, before = load_recording(path), baseline_within(folder)
+        kinematics = identify_kinematics(recording, measured_before_run(folder, before))
         if before is not None:
-            kinematics = updated(before, kinematics)
+            kinematics = before.updated(kinematics)
         return BaselineRobot(folder, recording, kinematics)
-    except (SessionFileError, IdentificationError, UnknownModuleType) as error:
+    except (SessionFileError, IdentificationError, UnknownModuleType, CalibrationFileError) as error:
         raise BaselineError(f"{path} does not identify the robot: {error}") from error
 
 
-def baseline_within(folder: Path) -> Kinematics | None:
-    """Return the kinematics of the baseline that the run in a folder had; None if it had none.
+def baseline_within(folder: Path) -> BaselineRobot | None:
+    """Return the baseline that the run in a folder had; None if it had none.
 
     Raises:
         BaselineError: as `load_baseline`.
     """
-    return load_baseline(folder / BASELINE).kinematics if (folder / BASELINE).is_dir() else None
+    return load_baseline(folder / BASELINE) if (folder / BASELINE).is_dir() else None
+
+
+def measured_before_run(folder: Path, baseline: BaselineRobot | None) -> tuple[CalibrationInformation, ...]:
+    """Return the recordings from which the run in a folder takes the prior of its IMUs, each once.
+
+    Raises:
+        CalibrationFileError: what the folder has of them is damaged.
+    """
+    kept = read_calibration(folder / MEASURED) if (folder / MEASURED).is_file() else ()
+    return each_once((*(baseline.measured if baseline is not None else ()), *kept))
 
 
 def keep_baseline(baseline: BaselineRobot, folder: Path) -> None:
-    """Copy the recordings of a baseline into the folder of a run."""
+    """Copy the recordings of a baseline, and what they began with, into the folder of a run."""
     there, here = baseline.folder, folder / BASELINE
     while (there / SESSION).is_file():
         here.mkdir()
-        shutil.copyfile(there / SESSION, here / SESSION)
+        for name in (SESSION, MEASURED):
+            if (there / name).is_file():
+                shutil.copyfile(there / name, here / name)
         there, here = there / BASELINE, here / BASELINE
 
 

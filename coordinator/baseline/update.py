@@ -5,7 +5,8 @@ parts. With the perturbations of all modules d = B x + D e, where x are those of
 baseline's errors within them, and the session's information L, x = -(B' L B)^-1 B' L D e: least squares with
 considered parameters, which are not estimated again (Schmidt, 1966; Tapley, Schutz and Born, Statistical
 Orbit Determination, 6.2). The errors of the IMUs are common to both sessions, so that a second measurement
-would not make the lengths within a part more certain.
+would not make the lengths within a part more certain. The session begins with the IMUs as the baseline
+measured them; that their remaining errors are in x and in e alike is neglected.
 """
 
 from collections.abc import Sequence

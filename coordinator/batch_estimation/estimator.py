@@ -12,6 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from coordinator.batch_estimation.imu_calibration import (
+    CalibrationInformation,
+    ImuCalibration,
+    catalogued,
+    information_between,
+)
 from coordinator.batch_estimation.imu_intrinsics import SIZE, ImuIntrinsics, mixing, read, slopes
 from coordinator.batch_estimation.imu_jacobian import imu_jacobian
 from coordinator.batch_estimation.imu_prediction import BodyMotion, ImuReadings, body_motions, readings_on
@@ -50,8 +56,7 @@ class Refinement(NamedTuple):
         systematic errors, which two sessions with the same motions share.
     residual_gyro_rad_s, residual_accel_m_s2: (n,) rms per axis.
     intrinsics: the IMUs' own errors; the prior's mean where no observation resolves them.
-    placement, placement_sigma: (n, 6) every IMU's turn [rad] and displacement [m] against its place by the
-        catalogue, in its own axes, and their standard deviations.
+    calibration_prior, calibration: of the IMUs, before and by the samples; their errors are `intrinsics`.
     compliance, compliance_sigma: of the links, in the order and units of `ComplianceJacobian`.
     encoder_scale, encoder_scale_sigma: (n,) true motion over measured, less 1, as far as estimated; the
         chain takes the encoders as they are unless their scales were free.
@@ -63,8 +68,8 @@ class Refinement(NamedTuple):
     residual_gyro_rad_s: Array
     residual_accel_m_s2: Array
     intrinsics: ImuIntrinsics
-    placement: Array
-    placement_sigma: Array
+    calibration_prior: ImuCalibration
+    calibration: ImuCalibration
     compliance: Array
     compliance_sigma: Array
     encoder_scale: Array
@@ -76,28 +81,37 @@ class Refinement(NamedTuple):
         """The refined chain, with the IMUs where the catalogue has them in their housings."""
         return self.estimate.chain
 
+    @property
+    def placement(self) -> Array:
+        """Every IMU's turn [rad] and displacement [m], (n, 6), against its place by the catalogue."""
+        return self.calibration.placement
+
+    @property
+    def placement_sigma(self) -> Array:
+        """The standard deviations of `placement`, (n, 6)."""
+        return self.calibration.placement_sigma
+
+    @property
+    def calibration_information(self) -> CalibrationInformation:
+        """What the samples alone tell of the IMUs."""
+        return information_between(self.calibration_prior, self.calibration)
+
 
 class _Problem(NamedTuple):
-    """The samples, and what is known before of the IMUs' errors and placement and of the links' compliances.
+    """The samples, and what is known before of the IMUs and of the links' compliances.
 
-    placement: (n, 6) prior of the IMUs' placement.
+    known: information of the IMUs' prior, over what is free of them.
     """
 
     data: SensorData
-    prior: ImuPrior
     flex: ComplianceJacobian
-    placement: Array
-
-    @property
-    def sigmas(self) -> Array:
-        """The prior of every IMU's errors and of its placement, (n, SIZE + 6)."""
-        errors = np.tile(self.prior.sigmas, (len(self.placement), 1))
-        return np.concatenate([errors, self.placement], axis=1)
+    calibration: ImuCalibration
+    known: Array
 
     @property
     def free(self) -> Mask:
         """Which of an IMU's are estimated, (SIZE + 6,)."""
-        return np.asarray((self.sigmas > 0.0).all(axis=0))
+        return self.calibration.free
 
 
 class _State(NamedTuple):
@@ -140,16 +154,16 @@ def refine_chain(
     data: SensorData,
     prior: ImuPrior = BIASES_ONLY,
     flex: ComplianceJacobian | None = None,
-    placement: Array | None = None,
+    calibration: ImuCalibration | None = None,
 ) -> Refinement:
     """Refine a chain that is roughly right (within about 0.2 rad and 0.1 m).
 
     Args:
         chain: where to start.
         data: m samples of all sensors.
-        prior: of the IMUs' errors.
+        prior: of the IMUs.
         flex: how the readings change with the links' compliances; None for rigid links.
-        placement: (n, 6) prior of the IMUs' placement; None for that of `prior`.
+        calibration: prior of the IMUs where some were measured before, in the order of the chain.
 
     Raises:
         DataError: fewer samples than parameters.
@@ -160,9 +174,10 @@ def refine_chain(
     count = len(chain.serials)
     if 6 * data.q_rad.shape[0] < 12 * count:
         raise DataError(f"{data.q_rad.shape[0]} samples are too few to refine a chain of {count} modules")
-    placed = np.tile(prior.placement_sigmas, (count, 1)) if placement is None else placement
-    problem = _Problem(data, prior, flex if flex is not None else rigid(count, len(data.q_rad)), placed)
-    state = _State(chain, np.zeros((count, len(problem.free))), np.zeros(len(problem.flex.links)))
+    before = calibration if calibration is not None else catalogued(chain.serials, prior)
+    flex = flex if flex is not None else rigid(count, len(data.q_rad))
+    problem = _Problem(data, flex, before, before.information()[0])
+    state = _State(chain, before.mean, np.zeros(len(flex.links)))
     shape = (len(data.motions), count)
     sigmas = [np.full(shape, 0.01), np.full(shape, 0.1)]
     for used in range(1, ITERATIONS + 1):
@@ -187,14 +202,9 @@ def refine_chain(
     ]
     normal = _normal_equations(problem, state, expected, believed)
     spectrum = _solve(normal)[2]
-    sigma = _nuisance_sigma(normal, spectrum)
     by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
     rms = [_rms(residual) for residual in expected.residuals]
-    refined = _report(state, spectrum, by_noise, rms)
-    links = slice(3, 3 + len(state.compliance))
-    return refined._replace(
-        placement_sigma=frozen(_placement_sigma(problem, sigma)), compliance_sigma=frozen(sigma[links])
-    )
+    return _report(problem, state, spectrum, _nuisance_covariance(normal, spectrum), by_noise, rms)
 
 
 def with_placement(chain: Chain, placement: Array) -> Chain:
@@ -211,21 +221,22 @@ def with_placement(chain: Chain, placement: Array) -> Chain:
     return chain._replace(imu_home=frozen(chain.imu_home @ moved))
 
 
-def _nuisance_sigma(normal: _Normal, spectrum: "_Spectrum") -> Array:
-    """Return the standard deviations of the nuisance parameters."""
+def _nuisance_covariance(normal: _Normal, spectrum: "_Spectrum") -> Array:
+    """Return the covariance of the nuisance parameters."""
     inverse = np.linalg.inv(normal.nuisance)
     kept = spectrum.vectors[:, spectrum.known] * spectrum.sigmas[spectrum.known]
     by_poses = inverse @ (normal.cross.T @ kept)
-    return np.asarray(np.sqrt(np.diag(inverse) + (by_poses**2).sum(axis=1)))
+    return np.asarray(inverse + by_poses @ by_poses.T)
 
 
-def _placement_sigma(problem: _Problem, sigma: Array) -> Array:
-    """Return the standard deviations (n, 6) of the IMUs' placement; the prior's where it is not free."""
-    free, count = problem.free[SIZE:], len(problem.placement)
-    own = sigma[len(sigma) - count * int(problem.free.sum()) :].reshape(count, -1)
-    placed = problem.placement.copy()
-    placed[:, free] = own[:, own.shape[1] - int(free.sum()) :]
-    return placed
+def _posterior(problem: _Problem, state: _State, nuisance: Array) -> ImuCalibration:
+    """Return the IMUs as estimated; the prior's covariance, which is zero, where they are not free."""
+    before = problem.calibration
+    rows = np.flatnonzero(np.tile(problem.free, len(before.serials)))
+    own = len(nuisance) - len(rows)
+    covariance = np.zeros(before.covariance.shape)
+    covariance[np.ix_(rows, rows)] = nuisance[own:, own:]
+    return ImuCalibration(before.serials, frozen(state.own), frozen(covariance))
 
 
 def _expected(problem: _Problem, state: _State) -> _Expected:
@@ -291,11 +302,15 @@ def _before(problem: _Problem, state: _State) -> tuple[Array, Array]:
 
     Gravity's magnitude makes the accelerometers' scales observable.
     """
-    count, free, flex = len(state.chain.serials), problem.free, problem.flex
-    nothing = np.zeros(6 * count + 3)
-    known = np.concatenate([nothing, flex.sigmas**-2.0, (problem.sigmas[:, free] ** -2.0).ravel()])
-    held = np.concatenate([nothing, state.compliance + flex.taken, state.own[:, free].ravel()])
-    information, rhs = np.diag(known), -known * held
+    count, flex = len(state.chain.serials), problem.flex
+    first = 6 * count + 3
+    links, own = slice(first, first + len(flex.links)), first + len(flex.links)
+    information = np.zeros((own + len(problem.known), own + len(problem.known)))
+    rhs = np.zeros(len(information))
+    information[links, links] = np.diag(flex.sigmas**-2.0)
+    rhs[links] = -(flex.sigmas**-2.0) * (state.compliance + flex.taken)
+    information[own:, own:] = problem.known
+    rhs[own:] = problem.known @ (problem.calibration.mean - state.own)[:, problem.free].ravel()
     size = float(np.linalg.norm(state.chain.gravity))
     up, at = state.chain.gravity / size, slice(6 * count, 6 * count + 3)
     information[at, at] += np.outer(up, up) / GRAVITY_SIGMA_M_S2**2
@@ -368,7 +383,15 @@ def _moved(problem: _Problem, state: _State, step: Array, nuisance: Array) -> _S
     )
 
 
-def _report(state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[Array]) -> Refinement:
+def _report(
+    problem: _Problem,
+    state: _State,
+    spectrum: _Spectrum,
+    nuisance: Array,
+    by_noise: Array,
+    rms: Sequence[Array],
+) -> Refinement:
+    """Return the estimate; nuisance: the covariance of the nuisance parameters."""
     known = spectrum.known
     kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
@@ -378,6 +401,7 @@ def _report(state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[A
     unknown = np.zeros((size, int(np.count_nonzero(~known))))
     unknown[6:] = spectrum.vectors[:, ~known]
     sigmas = spectrum.sigmas[known]
+    links = slice(3, 3 + len(state.compliance))
     return Refinement(
         estimate=ChainEstimate(
             chain=state.chain,
@@ -390,10 +414,10 @@ def _report(state: _State, spectrum: _Spectrum, by_noise: Array, rms: Sequence[A
         residual_gyro_rad_s=frozen(rms[0]),
         residual_accel_m_s2=frozen(rms[1]),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
-        placement=frozen(state.placement),
-        placement_sigma=frozen(np.zeros_like(state.placement)),
+        calibration_prior=problem.calibration,
+        calibration=_posterior(problem, state, nuisance),
         compliance=frozen(state.compliance),
-        compliance_sigma=frozen(np.zeros_like(state.compliance)),
+        compliance_sigma=frozen(np.sqrt(np.diag(nuisance)[links])),
         encoder_scale=frozen(np.zeros(len(state.own))),
         encoder_scale_sigma=frozen(np.zeros(len(state.own))),
     )

@@ -18,6 +18,7 @@ from module_agent.model.imu_prior import ImuPrior
 # and the gyro's sensitivity to specific force row by row.
 SIZE = 34
 _GYRO, _ACCEL, DELAY, _FORCE = slice(0, 9), slice(9, 18), 24, slice(25, 34)
+GYRO_BIAS, ACCEL_BIAS = slice(18, 21), slice(21, 24)
 
 
 class ImuIntrinsics(NamedTuple):
@@ -28,12 +29,12 @@ class ImuIntrinsics(NamedTuple):
     @property
     def gyro_bias_rad_s(self) -> Array:
         """Biases of the gyros, (n, 3)."""
-        return self.errors[:, 18:21]
+        return self.errors[:, GYRO_BIAS]
 
     @property
     def accel_bias_m_s2(self) -> Array:
         """Biases of the accelerometers, (n, 3)."""
-        return self.errors[:, 21:24]
+        return self.errors[:, ACCEL_BIAS]
 
     @property
     def gyro_matrix(self) -> Array:

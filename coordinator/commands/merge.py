@@ -6,10 +6,12 @@ from typing import Annotated
 import typer
 
 from coordinator.commands.options import AsJson
+from coordinator.merge.calibration_file import each_once, read_calibration, write_calibration
 from coordinator.merge.information_file import read_information
+from coordinator.merge.merge_calibrations import merge_calibrations
 from coordinator.merge.merge_runs import merge_runs
 from coordinator.merge.report import MERGED, merge_report
-from coordinator.recording.run_folder import INFORMATION
+from coordinator.recording.run_folder import CALIBRATION, INFORMATION
 from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_json
@@ -20,18 +22,23 @@ INCONSISTENT_ABOVE = 5.0
 
 def merge(
     runs: Annotated[list[Path], typer.Argument(help="Folders of two or more runs, with dynamics.")],
-    out: Annotated[Path, typer.Option(help="Folder for merged.json.")],
+    out: Annotated[Path, typer.Option(help="Folder for merged.json and imu_calibration.npz.")],
     as_json: AsJson = False,
 ) -> None:
-    """Combine the torque measurements of several runs into inertial parameters of the modules' parts.
+    """Combine what several runs measured of the same modules: inertial parameters, and the places of IMUs.
 
     The robot may be assembled differently in every run: in another order, on another base, with further
-    modules. Each link must stay with the module that it leads to.
+    modules. Each link must stay with the module that it leads to. `run --measured OUT` begins with the IMUs.
     """
     if len(runs) < 2:
         raise UsageError("give two or more runs: the parameters of a single one are in its result.json")
-    report = merge_report(merge_runs([read_information(run / INFORMATION) for run in runs]))
+    files = [run / CALIBRATION for run in runs]
+    # Runs of earlier versions have none.
+    recordings = [read_calibration(file) if file.is_file() else () for file in files]
+    imus = merge_calibrations(recordings)
+    report = merge_report(merge_runs([read_information(run / INFORMATION) for run in runs]), imus)
     out.mkdir(parents=True, exist_ok=True)
+    write_calibration(out / CALIBRATION, each_once(one for run in recordings for one in run))
     write_json(out / MERGED, report)
     if as_json:
         typer.echo(report.model_dump_json(indent=1))
@@ -39,7 +46,7 @@ def merge(
     table = new_table(
         f"{report.rank} of {report.parameters} parameters of {len(report.parts)} parts",
         "run | modules | rank | below 10 % | below 10 %, merged | sigma merged / alone | "
-        "inconsistency [sigma]",
+        "inconsistency [sigma] | of IMUs [sigma]",
     )
     for run in report.runs:
         table.add_row(
@@ -50,8 +57,9 @@ def merge(
             str(run.identified_merged),
             f"{run.gain:.2f}",
             f"{run.inconsistency_sigma:.1f}",
+            "" if run.imu_inconsistency_sigma is None else f"{run.imu_inconsistency_sigma:.1f}",
         )
-    table.add_row("merged", "", str(report.rank), "", "", f"{report.gain:.2f}", "")
+    table.add_row("merged", "", str(report.rank), "", "", f"{report.gain:.2f}", "", "")
     print_table(table)
     for run in report.runs:
         if run.inconsistency_sigma > INCONSISTENT_ABOVE:

@@ -1,14 +1,12 @@
 """`x5-coordinator run` and `replay`: a robot identifies itself, and again from its recording."""
 
 import shlex
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within
-from coordinator.baseline.update import updated
+from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within, measured_before_run
 from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed
 from coordinator.identification.identify import identify
 from coordinator.identification.result import DynamicsPart, Result
@@ -34,6 +32,13 @@ def run(
         Path | None,
         typer.Option(
             help="Folder of an earlier run of this robot: only joints that differ are explored again."
+        ),
+    ] = None,
+    measured: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of an earlier run or merge with some of these modules, in any assembly: it gives "
+            "the prior of their IMUs; repeat for several."
         ),
     ] = None,
     viewer: Annotated[
@@ -62,6 +67,7 @@ def run(
         resume=resume,
         viewer=viewer_choice(viewer, serve_port),
         baseline=baseline,
+        measured=tuple(measured or ()),
     )
     advice = f"to resume: {resuming(context)}" if advise else ""
     with Terminal(at.quiet) as terminal:
@@ -78,7 +84,8 @@ def replay(
     folder = out if out is not None else session.parent
     recording = load_recording(session)
     before = baseline_within(session.parent)
-    identified = identify(recording, partial(updated, before) if before is not None else None)
+    revise = before.updated if before is not None else None
+    identified = identify(recording, revise, measured=measured_before_run(session.parent, before))
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, identified)
     print_result(identified.result, Terminal())

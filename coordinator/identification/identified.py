@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.batch_estimation.estimator import Refinement
+from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.dynamics.torque_prediction import TorqueError
 from coordinator.identification.inertia.inertia import Inertia
 from coordinator.identification.inertia.robot_bodies import RobotBodies
@@ -12,6 +13,7 @@ from coordinator.identification.result import Result
 from coordinator.identification.sensor_checks import Finding
 from coordinator.kinematics.assembly import ChainFit
 from coordinator.kinematics.chain_estimate import ChainEstimate
+from coordinator.recording.recording import Recording
 from coordinator.topology.topology import Topology
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
@@ -25,7 +27,8 @@ class IdentificationError(DataError):
 class Kinematics(NamedTuple):
     """Topology and chain: `first` as assembled from the circles, `refinement` by the batch estimator.
 
-    findings: sensors that contradict the catalogue or the others.
+    findings: sensors that contradict the catalogue or the others. measured: earlier recordings of some of the
+    modules, from which the refinement took the prior of their IMUs.
     """
 
     topology: Topology
@@ -34,6 +37,7 @@ class Kinematics(NamedTuple):
     clocks: dict[str, ClockMap]
     notes: tuple[str, ...]
     findings: tuple[Finding, ...] = ()
+    measured: tuple[CalibrationInformation, ...] = ()
 
     @property
     def fit(self) -> ChainEstimate:
@@ -55,6 +59,12 @@ class Kinematics(NamedTuple):
         return lines + [finding.summary for finding in self.findings]
 
 
+def calibrations(kinematics: Kinematics, recording: Recording) -> tuple[CalibrationInformation, ...]:
+    """Return what a recording tells of its IMUs, by its kinematics, and after it what earlier ones told."""
+    own = kinematics.refinement.calibration_information
+    return (own._replace(session=recording.trace_hash, imu=recording.imu), *kinematics.measured)
+
+
 class HeldOutMotion(NamedTuple):
     """Torques of the held-out motions, measured (low-passed) and predicted, columns in the chain's order.
 
@@ -71,13 +81,14 @@ class HeldOutMotion(NamedTuple):
 
 
 class Identified(NamedTuple):
-    """Everything that follows from a recording."""
+    """Everything that follows from a recording; calibrations: what it and earlier ones tell of the IMUs."""
 
     kinematics: Kinematics
     inertia: Inertia | None
     bodies: RobotBodies | None
     held_out: HeldOutMotion | None
     result: Result
+    calibrations: tuple[CalibrationInformation, ...]
 
     @property
     def real_phi(self) -> Array | None:

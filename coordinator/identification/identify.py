@@ -12,10 +12,17 @@ from typing import Any
 import numpy as np
 
 from coordinator.batch_estimation.estimator import Refinement
+from coordinator.batch_estimation.imu_calibration import CalibrationInformation, measured_before
 from coordinator.batch_estimation.imu_intrinsics import beyond
 from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.torque_prediction import check_held_out
-from coordinator.identification.identified import HeldOutMotion, IdentificationError, Identified, Kinematics
+from coordinator.identification.identified import (
+    HeldOutMotion,
+    IdentificationError,
+    Identified,
+    Kinematics,
+    calibrations,
+)
 from coordinator.identification.inertia.agent_information import answers
 from coordinator.identification.inertia.body_motion import Robot
 from coordinator.identification.inertia.inertia import find_inertia, without_terms
@@ -68,6 +75,7 @@ def identify(
     recording: Recording,
     revise: Callable[[Kinematics], Kinematics] | None = None,
     kinematics: Kinematics | None = None,
+    measured: Sequence[CalibrationInformation] = (),
 ) -> Identified:
     """Identify everything from a recording.
 
@@ -75,12 +83,13 @@ def identify(
         recording: of a whole session.
         revise: combines the kinematics with prior knowledge, such as a baseline.
         kinematics: the revised kinematics of this recording, if they are computed already.
+        measured: earlier recordings of some of the modules, each once.
 
     Raises:
         IdentificationError: data is missing or contradicts itself.
     """
     if kinematics is None:
-        kinematics = identify_kinematics(recording)
+        kinematics = identify_kinematics(recording, measured)
         kinematics = revise(kinematics) if revise is not None else kinematics
     inertia, bodies, held_out = None, None, None
     if recording.latest_motions("dynamic"):
@@ -104,11 +113,16 @@ def identify(
                 check = check_held_out(chain, bodies.fit.phi, motion, means)
                 bodies = bodies._replace(held_out_error=check.error.overall)
     result = build_result(recording, kinematics, inertia, held_out, bodies)
-    return Identified(kinematics, inertia, bodies, held_out, result)
+    return Identified(kinematics, inertia, bodies, held_out, result, calibrations(kinematics, recording))
 
 
-def identify_kinematics(recording: Recording) -> Kinematics:
+def identify_kinematics(recording: Recording, measured: Sequence[CalibrationInformation] = ()) -> Kinematics:
     """Identify topology and chain.
+
+    Args:
+        recording: of a session, at least up to the end of its exploration.
+        measured: earlier recordings of some of the modules, each once: their IMUs are known as well as these
+            tell, not only by the catalogue.
 
     Raises:
         IdentificationError: see `identify`.
@@ -135,7 +149,8 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         _, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
-        refined, suspects = refine_checked(first.chain, types, windows, prior, floor)
+        known = measured_before(topology.serials, prior, measured)
+        refined, suspects = refine_checked(first.chain, types, windows, prior, floor, known)
         refined = _settled(refined, first.chain)
         motion = joined_motions([filtered_window(one) for one in windows])
         opposed = effort_signs(refined.chain, types, motion)
@@ -151,7 +166,7 @@ def identify_kinematics(recording: Recording) -> Kinematics:
         if estimate.note
     )
     notes += (*search.notes, *sampling, *_imu_outliers(topology.serials, refined, prior))
-    return Kinematics(topology, first, refined, clocks, notes, findings)
+    return Kinematics(topology, first, refined, clocks, notes, findings, tuple(measured))
 
 
 def _imu_outliers(serials: Sequence[str], refined: Refinement, prior: ImuPrior) -> tuple[str, ...]:

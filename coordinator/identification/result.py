@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part
+from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, ImuPlacePart, Part
 from module_agent.model.chain import Chain
 from module_agent.model.files import write_json
 
@@ -303,6 +303,7 @@ class Result(Part):
     dynamics: DynamicsPart | None
     notes: list[str]
     sensors: list[SensorPart] = Field(default_factory=list)
+    imu_places: list[ImuPlacePart] = Field(default_factory=list)
     robot_time_s: float
     wall_time_s: float | None
     trace_hash: str

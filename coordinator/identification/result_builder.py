@@ -33,7 +33,7 @@ from coordinator.identification.result import (
 from coordinator.kinematics.chain_estimate import ChainEstimate
 from coordinator.kinematics.null_space import Unresolved
 from coordinator.parameter_fit.instrumental_variables import InstrumentalFit
-from coordinator.parameter_fit.report_parts import base_parameter_parts, finite
+from coordinator.parameter_fit.report_parts import base_parameter_parts, finite, imu_place_parts
 from coordinator.recording.recording import Recording
 from coordinator.topology.topology import Topology
 from module_agent.model.catalogue import ModuleType
@@ -81,6 +81,7 @@ def build_result(
         ],
         dynamics=_dynamics(inertia, held_out, bodies) if inertia is not None and bodies is not None else None,
         notes=[*kinematics.notes, *filter(None, notes)],
+        imu_places=imu_place_parts(kinematics.refinement.calibration),
         sensors=[SensorPart.of(one, summary=one.summary) for one in kinematics.findings],
         robot_time_s=(max(times) - min(times)) / 1e9 if times else 0.0,
         wall_time_s=finished[-1].wall_time_s if finished else None,

@@ -10,6 +10,7 @@ import numpy as np
 
 from coordinator.batch_estimation.encoder_scale import with_encoder_scales
 from coordinator.batch_estimation.estimator import Refinement, refine_chain
+from coordinator.batch_estimation.imu_calibration import ImuCalibration, catalogued
 from coordinator.batch_estimation.imu_intrinsics import DELAY, beyond
 from coordinator.batch_estimation.imu_prediction import body_motions, readings_on
 from coordinator.batch_estimation.link_compliance import (
@@ -41,6 +42,9 @@ MAX_IMU_SAMPLES = 40_000
 COARSE = 4
 # Errors in standard deviations: from the first on the catalogue is doubted, from the second on it is wrong.
 SUSPICIOUS, SIGNIFICANT = 3.0, 4.0
+# By how much base motion must reduce the mean log residual. On rigid bases the difference is up to 0.0015 of
+# either sign, and the IMU's noise as base motion biases accelerometers by two sigma; compliant bases make 2.
+MIN_SHAKING = 0.005
 # Prior of the place of an IMU whose module's type may be another; smallest difference in scale that counts.
 ANYWHERE_M, MIN_SCALE = 0.05, 5e-4
 
@@ -63,32 +67,36 @@ def refine_checked(
     windows: Sequence[Window],
     prior: ImuPrior,
     floor: NoiseFloor | None = None,
+    calibration: ImuCalibration | None = None,
 ) -> tuple[Refinement, Suspects]:
     """Refine as `refine_robot`; what contradicts the catalogue is free, so that the claim covers it.
 
     If errors of IMUs or scales of encoders are outliers, the chain is refined with all IMUs anywhere and all
     scales free. Those that are significant then stay free in the fit that is returned.
     """
-    refined = refine_robot(chain, kinds, windows, prior, floor)
+    known = calibration if calibration is not None else catalogued(chain.serials, prior)
+    refined = refine_robot(chain, kinds, windows, prior, floor, known)
     count = len(chain.serials)
     suspects = Suspects((), (), np.zeros(count))
-    if count == 1 or _outlier(refined, prior) < SUSPICIOUS:
+    if count == 1 or _outlier(refined, prior, known) < SUSPICIOUS:
         return refined, suspects
     everyone = tuple(range(count))
     freed = Suspects(everyone, everyone, suspects.scale)
-    free = refine_robot(refined.chain, kinds, windows, prior, floor, freed)
-    away = np.abs(free.placement / np.hypot(free.placement_sigma, prior.placement_sigmas))[:, 3:].max(axis=1)
+    free = refine_robot(refined.chain, kinds, windows, prior, floor, known, freed)
+    moved = free.placement - known.placement
+    away = np.abs(moved / np.hypot(free.placement_sigma, known.placement_sigma))[:, 3:].max(axis=1)
     off = _scale_sigmas(free) > SIGNIFICANT
     imus, encoders = (tuple(np.flatnonzero(some).tolist()) for some in (away > SIGNIFICANT, off))
     if not imus and not encoders:
         return refined, suspects
     suspects = Suspects(imus, encoders, np.where(off, free.encoder_scale, 0.0))
-    return refine_robot(free.chain, kinds, windows, prior, floor, suspects), suspects
+    return refine_robot(free.chain, kinds, windows, prior, floor, known, suspects), suspects
 
 
-def _outlier(refined: Refinement, prior: ImuPrior) -> float:
+def _outlier(refined: Refinement, prior: ImuPrior, known: ImuCalibration) -> float:
     """Return the largest error of an IMU, its place included, or of an encoder, in standard deviations."""
-    placed = np.abs(refined.placement[:, 3:] / prior.place_m).max() if prior.place_m else 0.0
+    moved = np.abs((refined.placement - known.placement)[:, 3:])
+    placed = (moved / known.placement_sigma[:, 3:]).max() if prior.place_m else 0.0
     return float(max(placed, beyond(refined.intrinsics, prior).max(), _scale_sigmas(refined).max()))
 
 
@@ -108,6 +116,7 @@ def refine_robot(
     windows: Sequence[Window],
     prior: ImuPrior,
     floor: NoiseFloor | None = None,
+    calibration: ImuCalibration | None = None,
     suspects: Suspects | None = None,
 ) -> Refinement:
     """Refine an approximate chain with all motions of its joints.
@@ -119,6 +128,7 @@ def refine_robot(
         prior: how well the IMUs are known.
         floor: the noise of the first module's IMU at rest, if that module is bolted to the base by its
             housing: its readings beyond this noise are the base's motion. None: the base rests.
+        calibration: prior of the IMUs where some were measured before; None for `prior`.
         suspects: what is free beyond the prior; None for nothing.
 
     Raises:
@@ -127,26 +137,26 @@ def refine_robot(
     count = len(chain.serials)
     suspects = suspects or Suspects((), (), np.zeros(count))
     windows = [_rescaled(one, suspects.scale) for one in windows]
-    placement = np.tile(prior.placement_sigmas, (count, 1))
-    placement[list(suspects.imus), 3:] = ANYWHERE_M
+    known = calibration if calibration is not None else catalogued(chain.serials, prior)
+    known = known.widened(suspects.imus, ANYWHERE_M)
     keep = max(KEEP_EVERY, -(-sum(w.q_rad.size for w in windows) // MAX_IMU_SAMPLES))
     parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor) for one in windows]
-    rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior, None, placement)
+    rigid = refine_chain(chain, thinned(parts, COARSE * keep), prior, None, known)
     # The first IMU may have no motion to determine its delay; all IMUs are of one type.
     late_s = float(np.median(rigid.intrinsics.errors[1:, DELAY])) if len(chain.serials) > 1 else 0.0
     steps = encoder_steps(windows)
     parts = [filtered(one, REFINEMENT_CUTOFF_HZ, floor, late_s, steps) for one in windows]
     loads = loads_of(rigid.chain, kinds, parts, RATE_HZ)
-    giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep, placement)
+    giving, parts = _giving(rigid, parts, joined(loads, COARSE * keep), prior, COARSE * keep, known)
     if not giving.compliance.size:
         fine = thinned(parts, keep)
         flex = without_links(count, len(fine.q_rad))
-        return _with_encoders(giving.chain, fine, prior, flex, placement, suspects)._replace(late_s=late_s)
+        return _with_encoders(giving.chain, fine, prior, flex, known, suspects)._replace(late_s=late_s)
     # The hinges' positions change the torques that turn them: first a coarse estimate, then the final one.
     coarse = thinned(parts, COARSE * keep)
     flex = hinge_slopes(giving.chain, coarse.smooth, joined(loads, COARSE * keep), giving.compliance)
     tested = Suspects((), tuple(range(count)), suspects.scale)
-    hinged = _with_encoders(giving.chain, coarse, prior, flex, placement, tested)
+    hinged = _with_encoders(giving.chain, coarse, prior, flex, known, tested)
     links = len(giving.compliance)
     moved, joints = hinged.compliance[links:], flex.links[:links:2]
     loads = with_hinges_moved(loads, joints, moved)
@@ -156,7 +166,7 @@ def refine_robot(
     fine = thinned(parts, keep)
     compliance = hinged.compliance[:links]
     flex = hinge_slopes(hinged.chain, fine.smooth, joined(loads, keep), compliance, moved)
-    refined = _with_encoders(hinged.chain, fine, prior, flex, placement, suspects)
+    refined = _with_encoders(hinged.chain, fine, prior, flex, known, suspects)
     if not suspects.encoders:
         refined = refined._replace(
             encoder_scale=hinged.encoder_scale, encoder_scale_sigma=hinged.encoder_scale_sigma
@@ -170,13 +180,13 @@ def _with_encoders(
     data: SensorData,
     prior: ImuPrior,
     flex: ComplianceJacobian,
-    placement: Array,
+    calibration: ImuCalibration,
     suspects: Suspects,
 ) -> Refinement:
     """Refine with the scales of suspected encoders free, which are taken out of the compliances."""
     links = len(flex.links)
     flex = with_encoder_scales(flex, chain, data.smooth, suspects.encoders)
-    refined = refine_chain(chain, data, prior, flex, placement)
+    refined = refine_chain(chain, data, prior, flex, calibration)
     scale, sigma = suspects.scale.copy(), np.zeros(len(suspects.scale))
     scale[list(suspects.encoders)] += refined.compliance[links:]
     sigma[list(suspects.encoders)] = refined.compliance_sigma[links:]
@@ -194,21 +204,21 @@ def _giving(
     loads: Sequence[LinkLoad | None],
     prior: ImuPrior,
     keep: int,
-    placement: Array,
+    calibration: ImuCalibration,
 ) -> tuple[Refinement, list[SensorData]]:
     """Refine with compliant links, and with base motion if that reduces the other IMUs' residuals: not if the
-    first module's own gears shake the IMU on the base.
+    base is rigid, or the first module's own gears shake the IMU on it.
     """
     still = [part._replace(base_motion=None) for part in parts]
     resting = thinned(still, keep)
     flex = compliance_jacobian(rigid.chain, resting.smooth, loads)
-    at_rest = refine_chain(rigid.chain, resting, prior, flex, placement)
+    at_rest = refine_chain(rigid.chain, resting, prior, flex, calibration)
     data = thinned(parts, keep)
     single_module = len(rigid.chain.serials) == 1
     if data.base_motion is None or not data.base_motion.any() or single_module:
         return at_rest, still
-    shaken = refine_chain(faced(rigid.chain, data, rigid.estimate.null_basis), data, prior, flex, placement)
-    return (shaken, parts) if _misfit(shaken) < _misfit(at_rest) else (at_rest, still)
+    shaken = refine_chain(faced(rigid.chain, data, rigid.estimate.null_basis), data, prior, flex, calibration)
+    return (shaken, parts) if _misfit(shaken) < _misfit(at_rest) - MIN_SHAKING else (at_rest, still)
 
 
 def _misfit(fit: Refinement) -> float:

@@ -2,9 +2,16 @@
 
 import numpy as np
 
+from coordinator.merge.merge_calibrations import MergedCalibration
 from coordinator.merge.merge_runs import MergedInformation, RunShare
 from coordinator.parameter_fit.identifiability import WEAK_ABOVE
-from coordinator.parameter_fit.report_parts import BaseParameterPart, Part, base_parameter_parts
+from coordinator.parameter_fit.report_parts import (
+    BaseParameterPart,
+    ImuPlacePart,
+    Part,
+    base_parameter_parts,
+    imu_place_parts,
+)
 
 SCHEMA = 2
 MERGED = "merged.json"
@@ -16,6 +23,8 @@ class RunPart(Part):
     identified: how many of its base parameters have a relative standard deviation below a tenth, by itself
     and merged. gain: median of sigma merged over sigma alone. inconsistency_sigma: the difference of the
     merged values from its own, in its own standard deviations, root mean square.
+    imu_inconsistency_sigma: largest difference of an IMU's merged place from its own, in standard deviations;
+    None of a run without `imu_calibration.npz`.
     """
 
     run: str
@@ -25,6 +34,7 @@ class RunPart(Part):
     identified_merged: int
     gain: float
     inconsistency_sigma: float
+    imu_inconsistency_sigma: float | None
 
 
 class MergeReport(Part):
@@ -40,9 +50,10 @@ class MergeReport(Part):
     gain: float
     runs: list[RunPart]
     base_parameters: list[BaseParameterPart]
+    imu_places: list[ImuPlacePart]
 
 
-def merge_report(merged: MergedInformation) -> MergeReport:
+def merge_report(merged: MergedInformation, imus: MergedCalibration) -> MergeReport:
     """Return the report of merged runs."""
     base = merged.base
     return MergeReport(
@@ -50,16 +61,18 @@ def merge_report(merged: MergedInformation) -> MergeReport:
         parameters=len(base.columns.names),
         rank=base.rank,
         gain=merged.gain,
-        runs=[_run(run) for run in merged.runs],
+        runs=[_run(*run) for run in zip(merged.runs, imus.inconsistency_sigma, strict=True)],
         base_parameters=base_parameter_parts(base),
+        imu_places=imu_place_parts(imus.calibration),
     )
 
 
-def _run(run: RunShare) -> RunPart:
+def _run(run: RunShare, imu_sigma: float | None) -> RunPart:
     size = np.abs(run.base.value) * WEAK_ABOVE
     return RunPart.of(
         run,
         run=run.name,
+        imu_inconsistency_sigma=imu_sigma,
         rank=run.base.rank,
         identified_alone=int(np.sum(run.sigma_alone < size)),
         identified_merged=int(np.sum(run.sigma_merged < size)),

@@ -5,6 +5,7 @@ from typing import Any, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from coordinator.batch_estimation.imu_calibration import ImuCalibration
 from coordinator.dynamics.pseudo_inertia import Body
 from coordinator.parameter_fit.base_parameters import BaseParameters
 from module_agent.model.chain import Array
@@ -46,6 +47,31 @@ class BodyPart(Part):
     mass_kg: float
     com_m: list[float]
     inertia_kg_m2: list[list[float]]
+
+
+class ImuPlacePart(Part):
+    """How a module's IMU is turned and displaced against its catalogued place, in its own axes.
+
+    covariance: (6, 6) of both, by all recordings that were used.
+    """
+
+    serial: str
+    turn_rad: Triple
+    displacement_m: Triple
+    covariance: list[list[float]]
+
+
+def imu_place_parts(calibration: ImuCalibration) -> list[ImuPlacePart]:
+    """Return the places of IMUs as parts, in their order."""
+    return [
+        ImuPlacePart(
+            serial=serial,
+            turn_rad=triple(calibration.placement[k, :3]),
+            displacement_m=triple(calibration.placement[k, 3:]),
+            covariance=calibration.placement_covariance(k).tolist(),
+        )
+        for k, serial in enumerate(calibration.serials)
+    ]
 
 
 def base_parameter_parts(base: BaseParameters) -> list[BaseParameterPart]:

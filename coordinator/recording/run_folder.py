@@ -12,7 +12,7 @@ from coordinator.recording.session_file import SessionFileError, read_session
 from module_agent.model.errors import UsageError
 from module_agent.wire.refusal import WireError
 
-SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION = (
+SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION, CALIBRATION, MEASURED = (
     "session.mcap",
     "session.rrd",
     "result.json",
@@ -20,6 +20,8 @@ SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION = (
     "robot.hrdf",
     "held_out.npz",
     "information.npz",
+    "imu_calibration.npz",
+    "measured.npz",
 )
 ASIDE = "session.crashed.mcap"
 
@@ -51,7 +53,7 @@ def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path 
     if not resume:
         check_free(path)
         path.mkdir(parents=True, exist_ok=True)
-        for name in (SESSION, ASIDE):
+        for name in (SESSION, ASIDE, MEASURED):
             (path / name).unlink(missing_ok=True)
         return None
     if (path / RESULT).exists():

@@ -10,9 +10,14 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within, keep_baseline, load_baseline
+from coordinator.baseline.baseline_robot import (
+    BaselineRobot,
+    baseline_within,
+    keep_baseline,
+    load_baseline,
+    measured_before_run,
+)
 from coordinator.baseline.difference import difference, joints_to_explore
-from coordinator.baseline.update import updated
 from coordinator.description.hrdf_writer import write_hrdf
 from coordinator.description.urdf_writer import write_urdf
 from coordinator.excitation.joint_limits import NoExcitation
@@ -29,6 +34,7 @@ from coordinator.identification.topology_search import doubtful_motions
 from coordinator.live_robot.errors import ModuleLost
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer, Post, Refused
 from coordinator.live_robot.module_group import ModuleGroup
+from coordinator.merge.calibration_file import each_once, read_calibration, write_calibration
 from coordinator.merge.information_file import RunInformation, write_information
 from coordinator.parameter_fit.module_parts import likely_parts
 from coordinator.parameter_fit.systematic_errors import error_directions
@@ -36,9 +42,11 @@ from coordinator.parameter_fit.torque_sensor_scale import SCALE_SIGMA
 from coordinator.recording.journal import JournalEvent, standstill
 from coordinator.recording.recording import JOURNAL_TOPIC, Entry, Recording
 from coordinator.recording.run_folder import (
+    CALIBRATION,
     HELD_OUT,
     HRDF,
     INFORMATION,
+    MEASURED,
     RESULT,
     SESSION,
     URDF,
@@ -70,6 +78,7 @@ class RunConfig(NamedTuple):
     refined_previews: modules up to which previews are refined, not only assembled; None for any number.
     baseline: the folder of an earlier run of this robot. Then all joints are moved at once, and one by one
     only those next to a difference from that run.
+    measured: folders of runs or merges with some of the modules, whose IMUs are known as well as they tell.
     """
 
     robot: str
@@ -82,6 +91,7 @@ class RunConfig(NamedTuple):
     inline: bool = False
     refined_previews: int | None = None
     baseline: Path | None = None
+    measured: tuple[Path, ...] = ()
 
 
 class Run:
@@ -108,10 +118,14 @@ class Run:
                 "too, and needs them: set it to false"
             )
         before = load_baseline(config.baseline) if config.baseline is not None and not config.resume else None
+        earlier = each_once(one for run in config.measured for one in read_calibration(run / CALIBRATION))
         crashed = open_run_folder(config.out, config.resume, config.robot)
+        if earlier:
+            write_calibration(config.out / MEASURED, earlier)
         if before is not None:
             keep_baseline(before, config.out)
-        self._baseline = before.kinematics if before is not None else baseline_within(config.out)
+        self._baseline = before if before is not None else baseline_within(config.out)
+        self._measured = measured_before_run(config.out, self._baseline)
         if self._baseline is not None:
             config = config._replace(plan=config.plan.model_copy(update={"mode": "simultaneous"}))
         self._config = config
@@ -235,19 +249,21 @@ class Run:
 
     async def _single_joints(self) -> Sequence[str]:
         """Return the joints to explore one by one: those next to a difference from the baseline."""
-        kinematics = await self._compute(lambda: identify_kinematics(self.recording))
+        kinematics = await self._compute(lambda: identify_kinematics(self.recording, self._measured))
         if self._baseline is None:
             return ()
-        changes = difference(self._baseline.topology, kinematics.topology)
+        changes = difference(self._baseline.kinematics.topology, kinematics.topology)
         for line in changes.summary():
             self._screen.note(line)
         return joints_to_explore(kinematics.topology, changes)
 
     async def _kinematics(self) -> Kinematics:
-        return await self._compute(lambda: self._with_baseline(identify_kinematics(self.recording)))
+        return await self._compute(
+            lambda: self._with_baseline(identify_kinematics(self.recording, self._measured))
+        )
 
     def _with_baseline(self, kinematics: Kinematics) -> Kinematics:
-        return updated(self._baseline, kinematics) if self._baseline is not None else kinematics
+        return self._baseline.updated(kinematics) if self._baseline is not None else kinematics
 
     # ------------------------------------------------------------------ the run
 
@@ -288,7 +304,7 @@ class Run:
             self._writer.close()
             self._screen.note("estimating")
             identified = await self._compute(
-                lambda: identify(self.recording, self._with_baseline, kinematics)
+                lambda: identify(self.recording, self._with_baseline, kinematics, self._measured)
             )
             write_outputs(config.out, identified)
             self._feed.chain(self._clock(), identified.kinematics.fit)
@@ -348,6 +364,7 @@ class Run:
 def write_outputs(out: Path, identified: Identified) -> None:
     """Write all files computed from a recording into a folder, each whole or not at all."""
     write_result(out / RESULT, identified.result)
+    write_calibration(out / CALIBRATION, identified.calibrations)
     phi = identified.real_phi
     types = [module_type(identified.result.types[s]) for s in identified.result.serials]
     chain, name, dynamics = (

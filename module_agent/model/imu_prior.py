@@ -21,6 +21,8 @@ GYRO_BIAS_DRIFT_RAD_S = 1e-4
 # IMU never turns, and with it all that hangs on that module.
 ACCEL_BIAS_SIGMA_M_S2 = 0.2
 CALIBRATED_ACCEL_BIAS_SIGMA_M_S2 = 0.02
+# From session to session: 0.15 mg/K in data sheets of the class, over 3 K.
+ACCEL_BIAS_CHANGE_M_S2 = 0.005
 # Data sheets of the class: 0.1 deg/s per g. Calibrating scale and axes leaves it as it is.
 G_SENSITIVITY_SIGMA_S_M = 1.8e-4
 # A second-order Butterworth low-pass delays by 0.225 over its corner: 2.4 ms at 92 Hz, the setting below

@@ -24,7 +24,7 @@ COORDINATOR = "coordinator"
 class VirtualConfig(NamedTuple):
     """Settings of a virtual run; all randomness follows from `seed`, and from `noise_seed` if given.
 
-    `baseline` and `refined_previews` as in `RunConfig`; by default there is no preview.
+    `baseline`, `measured` and `refined_previews` as in `RunConfig`; by default there is no preview.
     `pushes` act on the robot from outside.
     """
 
@@ -39,6 +39,7 @@ class VirtualConfig(NamedTuple):
     baseline: Path | None = None
     pushes: tuple[Push, ...] = ()
     imu_rate_hz: float = 250.0
+    measured: tuple[Path, ...] = ()
 
 
 class SilentScreen:
@@ -82,6 +83,7 @@ def run_virtual(
                 inline=True,
                 refined_previews=config.refined_previews,
                 baseline=config.baseline,
+                measured=config.measured,
             ),
             robot.endpoint(COORDINATOR),
             lambda: robot.loop.now_ns,
