@@ -145,7 +145,7 @@ class Rig(VirtualRobot):
     def session(self, out: Path, plan: Plan, resume: bool = False, sender: str = "coordinator") -> Result:
         """Run a whole identification and write its folder, truth included."""
         result = self.run(self.begin(out, plan, resume, sender).run())
-        write_truth(out / "truth.json", self.robot)
+        write_truth(out / "truth.json", self.world.robot)
         self.truth.save(out / "truth.npz")
         return result
 

@@ -25,7 +25,8 @@ from module_agent.wire.messages import (
     Status,
     WindowedSine,
 )
-from sim.robot.robot_tree import true_chain
+from sim.robot.robot_tree import sensing_chain, true_chain
+from sim.scoring.chain_score import link_length_m
 
 ARM = "thesis_171_horizontal"
 BASE, TIP = "X-00009", "X-00010"
@@ -95,7 +96,8 @@ def test_a_module_that_knows_its_imu_to_be_calibrated_claims_a_closer_distance(
         _, recording, group = rig.group()
         rig.run(_explore(group, BASE))
         fit = list(recording.estimates[BASE, TIP].values())[-1].regression
-        assert abs(fit.distance_m - 0.171) < 4.0 * fit.sigma_distance_m + 3e-4
+        true_m = link_length_m(sensing_chain(rig.world.robot), child=1)
+        assert abs(fit.distance_m - true_m) < 4.0 * fit.sigma_distance_m + 3e-4
         sigma_m.append(fit.sigma_distance_m)
     # One is left with 1 % of the scale of its accelerometer, the other with noise and bias.
     assert sigma_m[1] < 0.5 * sigma_m[0]
