@@ -12,7 +12,7 @@ from coordinator.commands.monitor_view import MonitorScreen
 from coordinator.commands.options import ConnectOptions, DynamicsFolder, Speed
 from coordinator.live_robot.connection import Place, open_connection, sender_name
 from coordinator.live_robot.messenger import Messenger
-from coordinator.monitoring.live import RETAINED_ROWS, UPDATE_S, LiveMonitor
+from coordinator.monitoring.live import UPDATE_S, LiveMonitor, retained_rows
 from coordinator.monitoring.monitor import Monitor
 from coordinator.monitoring.reference import ALARMS_PER_HOUR, build_reference
 from coordinator.recording.recording import Recording
@@ -92,7 +92,7 @@ def _monitor_file(monitor: Monitor, screen: MonitorScreen, path: Path) -> None:
             looked_ns = entry.t_ns
             screen.report(monitor.advance(recording, clocks))
             for module in recording.modules.values():
-                module.rows.forget_before(module.rows.end_row - RETAINED_ROWS)
+                module.rows.forget_before(module.rows.end_row - retained_rows(module))
     screen.report(monitor.advance(recording, clocks))
 
 

@@ -34,9 +34,10 @@ MIN_LEVEL_S = 0.1
 SIGMA_SHARE = 1.0 / 2.8
 MIN_PERIODS = 2.0
 MAX_SINE_S = 8.0
-# Samples that a prediction is made of; the noise of the sensors' 250 is averaged over as many.
+# Samples that a prediction is made of. `SensorNoise` is that of 250 readings a second, which is averaged over
+# as many; of other rates the density is the same.
 RATE_HZ = 50.0
-SENSOR_RATE_HZ = 250.0
+NOISE_RATE_HZ = 250.0
 
 
 class JointTask(NamedTuple):
@@ -114,7 +115,7 @@ def predicted_sigma_m(task: JointTask, patterns: Sequence[Pattern]) -> float:
     Where on its circle gravity finds the IMU is not known: the mean variance of two places a quarter apart.
     """
     paths = [_path(pattern) for pattern in patterns]
-    fewer = np.sqrt(RATE_HZ / SENSOR_RATE_HZ)
+    fewer = np.sqrt(RATE_HZ / NOISE_RATE_HZ)
     noise = SensorNoise(*(sigma * fewer for sigma in SensorNoise()))
     variances = [circle_covariance(s, paths, noise, task.prior)[0, 0] for s in _settings(task)]
     return float(np.sqrt(np.mean(variances)))

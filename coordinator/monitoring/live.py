@@ -6,9 +6,11 @@ The monitor itself is `monitoring.monitor`; here is its place on a network and o
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
+
 from coordinator.live_robot.messenger import Clock, Messenger, NoAnswer
 from coordinator.monitoring.monitor import Monitor, MonitorUpdate
-from coordinator.recording.recording import Entry, Recording
+from coordinator.recording.recording import Entry, ModuleRecord, Recording
 from coordinator.synchronisation.round_trips import map_clocks
 from module_agent.signals.clock_map import ClockMap
 from module_agent.wire.keys import Leaf
@@ -19,10 +21,20 @@ UPDATE_S = 0.02
 ASK_S, REMAP_S = 0.25, 5.0
 # Round trips for a clock map: those of the last minute; the first map needs fewer.
 MAX_TRIPS, MIN_TRIPS = 240, 6
-# Rows that are kept, at 250 a second; none is older than the cubic's and the filter's reach.
-RETAINED_ROWS = 2000
+# How long rows are kept; none that is needed is older than the cubic's and the filter's reach.
+RETAINED_S = 8.0
+# The newest rows, the time stamps of which tell their rate.
+RATED_ROWS = 100
 
 Report = Callable[[MonitorUpdate], None]
+
+
+def retained_rows(record: ModuleRecord) -> int:
+    """Return how many of the newest rows of a module are kept, by the rate of their time stamps."""
+    log = record.rows
+    t_ns = log.rows(max(log.first_row, log.end_row - RATED_ROWS), log.end_row)["t_ns"].astype(np.int64)
+    step_ns = float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else 0.0
+    return round(RETAINED_S * 1e9 / step_ns) if step_ns > 0.0 else log.end_row - log.first_row
 
 
 class LiveMonitor:
@@ -68,7 +80,7 @@ class LiveMonitor:
         if any(update):
             self._report(update)
         for record in self.recording.modules.values():
-            record.forget(RETAINED_ROWS, MAX_TRIPS)
+            record.forget(retained_rows(record), MAX_TRIPS)
         for found in self.recording.estimates.values():
             found.clear()
 
