@@ -1,1 +1,1 @@
-"""Starting a world and agents as processes, and emulating links between them."""
+"""Starting a world and agents as processes."""
