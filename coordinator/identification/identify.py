@@ -37,6 +37,7 @@ from coordinator.identification.sensor_checks import (
     effort_signs,
     encoder_signs,
     encoder_travels,
+    misfits,
 )
 from coordinator.identification.topology_observations import respond, simultaneous_motion
 from coordinator.identification.topology_search import search_topology
@@ -53,6 +54,7 @@ from coordinator.synchronisation.motion_windows import (
     dynamic_windows,
     filtered_window,
     joined_motions,
+    motion_noise,
     noise_floor,
     sampling_notes,
     unbroken_windows,
@@ -64,7 +66,7 @@ from module_agent.model.errors import DataError
 from module_agent.model.files import replacing
 from module_agent.model.imu_prior import IMU_PRIORS, ImuPrior
 from module_agent.signals.clock_map import ClockMap
-from module_agent.signals.filtering import REFINEMENT_CUTOFF_HZ, JointMotion
+from module_agent.signals.filtering import NS_PER_S, REFINEMENT_CUTOFF_HZ, JointMotion
 
 # The largest of some 30 IMU errors, in standard deviations, is below this for 99 of 100 IMUs.
 OUTLIER_ABOVE = 3.5
@@ -146,16 +148,23 @@ def identify_kinematics(recording: Recording, measured: Sequence[CalibrationInfo
             [rest],
         )
         clocks |= refine_clocks(first.chain, clocks, explored[1]).clocks
-        _, windows = _exploration(recording, clocks, topology.serials)
+        motions, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
         known = measured_before(topology.serials, prior, measured)
-        refined, suspects = refine_checked(first.chain, types, windows, prior, floor, known)
+        rest_window = _rest(recording, clocks, topology.serials)
+        imu_rate_hz = min(_imu_rate_hz(recording, serial) for serial in topology.serials)
+        noise = motion_noise(windows, rest_window, REFINEMENT_CUTOFF_HZ, imu_rate_hz)
+        refined, suspects = refine_checked(first.chain, types, windows, prior, floor, known, noise)
         refined = _settled(refined, first.chain)
         motion = joined_motions([filtered_window(one) for one in windows])
         opposed = effort_signs(refined.chain, types, motion)
         check_effort_signs(opposed, signs)
-        findings = (*opposed, *doubted_sensors(refined, prior, suspects.imus, suspects.encoders))
+        findings = (
+            *opposed,
+            *doubted_sensors(refined, prior, suspects.imus, suspects.encoders),
+            *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
+        )
     except (DataError, np.linalg.LinAlgError) as error:
         raise IdentificationError(str(error)) from error
     notes = tuple(
@@ -226,9 +235,20 @@ def base_floor(recording: Recording, clocks: dict[str, ClockMap], topology: Topo
     """Return the noise of the first module's IMU at rest; None if that IMU is not fixed to the base."""
     if topology.reversed[0]:
         return None
-    still = [e for e in recording.latest_motions("rest") if e.serial == topology.serials[0]]
-    parts = unbroken_windows(recording, clocks, topology.serials, still[0])
-    return noise_floor(max(parts, key=lambda part: len(part.t_ns)), REFINEMENT_CUTOFF_HZ)
+    return noise_floor(_rest(recording, clocks, topology.serials), REFINEMENT_CUTOFF_HZ)
+
+
+def _imu_rate_hz(recording: Recording, serial: str) -> float:
+    """Return how often a module's IMU is read, by its time stamps of rest."""
+    between = np.diff(np.unique(recording.rest_rows(serial)["imu_t_ns"].astype(np.int64)))
+    return NS_PER_S / float(np.median(between)) if len(between) else 0.0
+
+
+def _rest(recording: Recording, clocks: dict[str, ClockMap], serials: Sequence[str]) -> Window:
+    """Return the longest stretch of rest without holes."""
+    still = [e for e in recording.latest_motions("rest") if e.serial == serials[0]]
+    parts = unbroken_windows(recording, clocks, serials, still[0])
+    return max(parts, key=lambda part: len(part.t_ns))
 
 
 def _moving(recording: Recording) -> list[JournalEvent]:

@@ -68,6 +68,7 @@ def refine_checked(
     prior: ImuPrior,
     floor: NoiseFloor | None = None,
     calibration: ImuCalibration | None = None,
+    noise: Array | None = None,
 ) -> tuple[Refinement, Suspects]:
     """Refine as `refine_robot`; what contradicts the catalogue is free, so that the claim covers it.
 
@@ -75,14 +76,14 @@ def refine_checked(
     scales free. Those that are significant then stay free in the fit that is returned.
     """
     known = calibration if calibration is not None else catalogued(chain.serials, prior)
-    refined = refine_robot(chain, kinds, windows, prior, floor, known)
+    refined = refine_robot(chain, kinds, windows, prior, floor, known, noise=noise)
     count = len(chain.serials)
     suspects = Suspects((), (), np.zeros(count))
     if count == 1 or _outlier(refined, prior, known) < SUSPICIOUS:
         return refined, suspects
     everyone = tuple(range(count))
     freed = Suspects(everyone, everyone, suspects.scale)
-    free = refine_robot(refined.chain, kinds, windows, prior, floor, known, freed)
+    free = refine_robot(refined.chain, kinds, windows, prior, floor, known, freed, noise)
     moved = free.placement - known.placement
     away = np.abs(moved / np.hypot(free.placement_sigma, known.placement_sigma))[:, 3:].max(axis=1)
     off = _scale_sigmas(free) > SIGNIFICANT
@@ -90,7 +91,7 @@ def refine_checked(
     if not imus and not encoders:
         return refined, suspects
     suspects = Suspects(imus, encoders, np.where(off, free.encoder_scale, 0.0))
-    return refine_robot(free.chain, kinds, windows, prior, floor, known, suspects), suspects
+    return refine_robot(free.chain, kinds, windows, prior, floor, known, suspects, noise), suspects
 
 
 def _outlier(refined: Refinement, prior: ImuPrior, known: ImuCalibration) -> float:
@@ -118,6 +119,7 @@ def refine_robot(
     floor: NoiseFloor | None = None,
     calibration: ImuCalibration | None = None,
     suspects: Suspects | None = None,
+    noise: Array | None = None,
 ) -> Refinement:
     """Refine an approximate chain with all motions of its joints.
 
@@ -130,6 +132,7 @@ def refine_robot(
             housing: its readings beyond this noise are the base's motion. None: the base rests.
         calibration: prior of the IMUs where some were measured before; None for `prior`.
         suspects: what is free beyond the prior; None for nothing.
+        noise: of the IMUs in every motion, as for `refine_chain`.
 
     Raises:
         DataError: as `refine_chain`.
@@ -151,7 +154,8 @@ def refine_robot(
     if not giving.compliance.size:
         fine = thinned(parts, keep)
         flex = without_links(count, len(fine.q_rad))
-        return _with_encoders(giving.chain, fine, prior, flex, known, suspects)._replace(late_s=late_s)
+        rigid_links = _with_encoders(giving.chain, fine, prior, flex, known, suspects, noise)
+        return rigid_links._replace(late_s=late_s)
     # The hinges' positions change the torques that turn them: first a coarse estimate, then the final one.
     coarse = thinned(parts, COARSE * keep)
     flex = hinge_slopes(giving.chain, coarse.smooth, joined(loads, COARSE * keep), giving.compliance)
@@ -166,7 +170,7 @@ def refine_robot(
     fine = thinned(parts, keep)
     compliance = hinged.compliance[:links]
     flex = hinge_slopes(hinged.chain, fine.smooth, joined(loads, keep), compliance, moved)
-    refined = _with_encoders(hinged.chain, fine, prior, flex, known, suspects)
+    refined = _with_encoders(hinged.chain, fine, prior, flex, known, suspects, noise)
     if not suspects.encoders:
         refined = refined._replace(
             encoder_scale=hinged.encoder_scale, encoder_scale_sigma=hinged.encoder_scale_sigma
@@ -182,11 +186,12 @@ def _with_encoders(
     flex: ComplianceJacobian,
     calibration: ImuCalibration,
     suspects: Suspects,
+    noise: Array | None = None,
 ) -> Refinement:
     """Refine with the scales of suspected encoders free, which are taken out of the compliances."""
     links = len(flex.links)
     flex = with_encoder_scales(flex, chain, data.smooth, suspects.encoders)
-    refined = refine_chain(chain, data, prior, flex, calibration)
+    refined = refine_chain(chain, data, prior, flex, calibration, noise)
     scale, sigma = suspects.scale.copy(), np.zeros(len(suspects.scale))
     scale[list(suspects.encoders)] += refined.compliance[links:]
     sigma[list(suspects.encoders)] = refined.compliance_sigma[links:]

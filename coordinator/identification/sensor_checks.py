@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coordinator.batch_estimation.estimator import Refinement
+from coordinator.batch_estimation.estimator import SYSTEMATIC, Refinement
 from coordinator.dynamics.inertia_prior import module_prior
 from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.recording.recording import Recording
@@ -39,6 +39,8 @@ _BACKWARDS = "its encoder counts backwards, or the module is mounted the other w
 _EXPLORATION = "its exploration"
 _MISLABELLED = "it seems to be of another type than it reports; its place is estimated"
 _SCALED = "the scale is estimated; check its gear ratio and type"
+_SENSORS = (("the residual of its gyro", "rad/s"), ("the residual of its accelerometer", "m/s^2"))
+_UNMODELLED = "a link or the base gives more than the model has, or the sensor is sick; the claim is widened"
 _OPPOSED = "the sign of its effort or of its encoder is wrong"
 
 
@@ -267,6 +269,27 @@ def doubted_sensors(
             read = 1.0 / (1.0 + scale), 1.0, abs(scale) / max(sigma, 1e-9)
             findings.append(
                 Finding(serials[k], _EXPLORATION, "its encoder's scale against the gyros", *read, "", _SCALED)
+            )
+    return findings
+
+
+def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[Finding]:
+    """Return the IMUs whose residuals are far beyond their noise, each by the motion where they are most so.
+
+    Args:
+        refined: n modules by k motions.
+        noise: (2, k, n) of gyro and accelerometer, rms per axis.
+        motions: (k,) what to call them.
+    """
+    ratio, findings = refined.residuals / noise, []
+    for k, serial in enumerate(refined.chain.serials):
+        sensor, motion = np.unravel_index(int(ratio[:, :, k].argmax()), ratio.shape[:2])
+        if ratio[sensor, motion, k] > SYSTEMATIC:
+            measured, expected = float(refined.residuals[sensor, motion, k]), float(noise[sensor, motion, k])
+            what, unit = _SENSORS[sensor]
+            off = (measured - expected) / expected
+            findings.append(
+                Finding(serial, motions[motion], what, measured, expected, off, unit, _UNMODELLED)
             )
     return findings
 

@@ -1,7 +1,7 @@
 """Motions of a recording for the estimators: all modules resampled on one time base and filtered alike."""
 
 from collections.abc import Mapping, Sequence
-from itertools import product
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +34,9 @@ MOVING_STEPS = 20.0
 # Samples in a period of the cut-off: what lies above half their rate is folded into the motion, and with two
 # of them all that the low-pass lets through is; with six nothing below five times the cut-off.
 FEWEST, FEW = 3.0, 6.0
+# Bands as wide as the cut-off, from twice the cut-off on, in which noise is looked for, below the IMU's
+# own low-pass; and the share of its rate up to which its samples tell.
+BANDS, IMU_BAND = 5, 0.4
 
 
 class Window(NamedTuple):
@@ -215,6 +218,34 @@ def noise_floor(rest: Window, cutoff_hz: float) -> NoiseFloor:
         for signal in (rest.gyro_rad_s, rest.accel_m_s2)
     )
     return NoiseFloor(gyro, accel, cutoff_hz)
+
+
+def motion_noise(windows: Sequence[Window], rest: Window, cutoff_hz: float, imu_rate_hz: float) -> Array:
+    """Return the noise (2, k, n) of all gyros [rad/s] and accelerometers [m/s^2] in k motions, rms per axis.
+
+    That is the larger one of two, through the same low-pass as `filtered`: noise of the least density
+    beyond twice the cut-off, in the motion, where gears shake, and at rest. No motion reaches up there, but
+    in some bands links ring. Of IMUs that are too slow for such a band it is what is below the cut-off at
+    rest.
+    """
+    each = [
+        np.array([_above(signal, cutoff_hz, imu_rate_hz) for signal in (one.gyro_rad_s, one.accel_m_s2)])
+        for one in (rest, *windows)
+    ]
+    return np.asarray(np.sqrt(np.maximum(each[0], each[1:]).swapaxes(0, 1)))
+
+
+def _above(signal: Array, cutoff_hz: float, imu_rate_hz: float) -> Array:
+    """Return the variance (n,) below a cut-off of noise as dense as signals (m, n, 3) have beyond."""
+    edges = cutoff_hz * np.arange(2, BANDS + 3)
+    edges = edges[edges < IMU_BAND * imu_rate_hz]
+    if len(edges) < 2:
+        edges = np.array([0.0, cutoff_hz])
+    taper = np.hanning(len(signal))[:, None, None]
+    density = 2.0 * np.abs(np.fft.rfft((signal - signal.mean(axis=0)) * taper, axis=0)) ** 2
+    bands = np.searchsorted(np.fft.rfftfreq(len(signal), 1.0 / RATE_HZ), edges)
+    least = np.min([density[i:j].mean(axis=(0, 2)) for i, j in pairwise(bands)], axis=0)
+    return np.asarray(cutoff_hz * least / (RATE_HZ * float((taper**2).sum())))
 
 
 def encoder_steps(windows: Sequence[Window]) -> Array:

@@ -384,3 +384,27 @@ def test_results_cannot_be_written_to(robots: Any) -> None:
     assert not found.intrinsics.errors.flags.writeable
     for array in (found.chain.axis, found.chain.point, found.chain.imu_home, found.chain.gravity):
         assert not array.flags.writeable
+
+
+def test_residuals_far_beyond_the_noise_count_once_a_motion(robots: Any) -> None:
+    """A wave that the model lacks is no noise: the claim of what leans on that IMU's motion is widened."""
+    truth, _ = robots.random(4, joints=3, serial=True)
+    data = _sensed(truth, 1, noise=1.0)
+    motion = np.repeat([0, 1], len(data.q_rad) // 2)
+    wave = 30.0 * ACCEL_NOISE * np.sin(np.arange(len(motion)) / 3.0) * (motion == 1)
+    accel = data.accel_m_s2.copy()
+    accel[:, 2] += wave[:, None]
+    data = data._replace(accel_m_s2=accel, motion=motion)
+    noise = np.broadcast_to(np.array([GYRO_NOISE, ACCEL_NOISE])[:, None, None], (2, 2, 3))
+    unaware, known = refine_chain(truth, data), refine_chain(truth, data, noise=noise)
+    assert known.residuals.shape == (2, 2, 3)
+    ratio = known.residuals / noise
+    assert np.unravel_index(ratio.argmax(), ratio.shape) == (1, 1, 2)
+    assert np.sort(ratio.ravel())[-2] < 1.3
+    assert np.trace(known.estimate.covariance) > np.trace(unaware.estimate.covariance)
+    # That by noise alone stays: it is expressed along directions that differ in the last digits.
+    np.testing.assert_allclose(np.diag(known.noise_covariance), np.diag(unaware.noise_covariance), rtol=1e-6)
+    # Without systematic errors nothing changes.
+    healthy = _sensed(truth, 1, noise=1.0)._replace(motion=motion)
+    plain, checked = refine_chain(truth, healthy), refine_chain(truth, healthy, noise=noise)
+    np.testing.assert_array_equal(checked.estimate.covariance, plain.estimate.covariance)

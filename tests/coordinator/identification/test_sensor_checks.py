@@ -1,5 +1,6 @@
 """Sensors that contradict the catalogue or the others are named; healthy ones of random robots never are."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from coordinator.identification.sensor_checks import (
     check_encoder_travels,
     effort_signs,
     encoder_signs,
+    misfits,
 )
 from coordinator.topology.topology import MotionObservation
 from module_agent.model.catalogue import ModuleType
@@ -100,3 +102,16 @@ def test_an_encoder_that_runs_against_its_command_is_named() -> None:
         SensorError, match=r"B: its encoder turned by -0.5 rad in its slow motion, 0.6 rad were"
     ):
         check_encoder_travels(_travels(HEALTHY | {"B": {"A": 0.0, "B": -0.5, "C": 0.01}}))
+
+
+def test_residuals_far_beyond_the_noise_are_named_by_serial_and_motion() -> None:
+    noise = np.stack([np.full((2, 3), 2e-4), np.full((2, 3), 3e-3)])
+    factor = np.full((2, 2, 3), 6.0)
+    # The second IMU's gyro in the first motion, and less so its accelerometer; the third's is just not named.
+    factor[0, 0, 1], factor[1, 1, 1], factor[1, 0, 2] = 30.0, 20.0, 9.9
+    refined: Any = SimpleNamespace(chain=SimpleNamespace(serials=("A", "B", "C")), residuals=factor * noise)
+    (finding,) = misfits(refined, noise, ["the slow motion of A", "the fast motion of A"])
+    assert (finding.serial, finding.motion) == ("B", "the slow motion of A")
+    assert (finding.measured, finding.expected) == (pytest.approx(6e-3), pytest.approx(2e-4))
+    text = "B: the residual of its gyro is 0.006 rad/s in the slow motion of A, 0.0002 rad/s is expected (29 "
+    assert finding.summary.startswith(text)

@@ -13,6 +13,7 @@ from coordinator.synchronisation.motion_windows import (
     Window,
     encoder_steps,
     filtered,
+    motion_noise,
     sampling_notes,
     thinned,
     unbroken_windows,
@@ -226,3 +227,32 @@ def test_the_instrument_has_the_motion_and_not_the_encoders_noise() -> None:
 def test_without_a_known_step_the_instrument_is_what_was_measured() -> None:
     data = filtered(_noisy_window(1e-4), 12.0)
     assert data.smooth[2] is data.qdd_rad_s2
+
+
+def _noisy(seed: int, size: float, imu_rate_hz: float, motion: float) -> Window:
+    """Four seconds of two IMUs: a motion of the first at 2 Hz and its ringing, white noise of both."""
+    t_ns = np.arange(1000) * STEP_NS
+    read_ns = np.arange(0, int(t_ns[-1]) + 1, round(1e9 / imu_rate_hz))
+    white = np.random.default_rng(seed).normal(0.0, size, (len(read_ns), 2, 3))
+    noise = np.stack([[np.interp(t_ns, read_ns, axis) for axis in imu.T] for imu in white.swapaxes(0, 1)])
+    moved = np.zeros((len(t_ns), 2, 3))
+    moved[:, 0] = motion * (np.sin(4e-9 * np.pi * t_ns) + 0.01 * np.sin(70e-9 * np.pi * t_ns))[:, None]
+    gyro = moved + noise.transpose(2, 0, 1)
+    return Window(t_ns, np.zeros((1000, 2)), np.zeros((1000, 2)), gyro, 10.0 * gyro, np.zeros(2))
+
+
+def test_noise_of_a_motion_is_told_apart_from_motion_and_ringing() -> None:
+    rest, slow, fast = (_noisy(k, size, RATE_HZ, k) for k, size in enumerate((1e-3, 1e-3, 3e-3)))
+    noise = motion_noise([slow, fast], rest, 12.0, RATE_HZ)
+    assert noise.shape == (2, 2, 2)
+    # White noise up to 125 Hz, of which 12 Hz are left; the least of five bands is a little below their mean.
+    expected = np.sqrt(12.0 / 125.0) * np.array([1e-3, 3e-3])
+    np.testing.assert_allclose(noise[0], np.tile(expected[:, None], 2), rtol=0.15)
+    np.testing.assert_allclose(noise[1], 10.0 * noise[0])
+
+
+def test_noise_of_slow_imus_is_that_of_rest() -> None:
+    """At 50 Hz no band above the motion is left."""
+    rest, moving = _noisy(0, 1e-3, 50.0, 0.0), _noisy(1, 1e-3, 50.0, 0.0)
+    noise = motion_noise([moving], rest, 12.0, 50.0)
+    np.testing.assert_allclose(noise[0], 1e-3 * np.sqrt(12.0 / 25.0), rtol=0.3)
