@@ -283,7 +283,7 @@ def misfits(refined: Refinement, noise: Array, motions: Sequence[str]) -> list[F
     """
     ratio, findings = refined.residuals / noise, []
     for k, serial in enumerate(refined.chain.serials):
-        sensor, motion = np.unravel_index(int(ratio[:, :, k].argmax()), ratio.shape[:2])
+        sensor, motion = divmod(int(ratio[:, :, k].argmax()), len(motions))
         if ratio[sensor, motion, k] > SYSTEMATIC:
             measured, expected = float(refined.residuals[sensor, motion, k]), float(noise[sensor, motion, k])
             what, unit = _SENSORS[sensor]

@@ -23,17 +23,21 @@ from sim.virtual_time.run import COORDINATOR, SilentScreen
 
 
 def record_session(
-    settings: VirtualSettings, plan: Plan, at_end: Callable[[VirtualRobot], None] | None = None
+    settings: VirtualSettings,
+    plan: Plan,
+    at_end: Callable[[VirtualRobot], None] | None = None,
+    recording: Recording | None = None,
 ) -> Recording:
     """Run one session from discovery to its end and return what the coordinator has recorded of it.
 
     `at_end` is called with the robot when the session is over, to compare the recording with the truth.
+    `recording` is an empty one to record to; None for a new one.
 
     Raises:
         what `coordinator.session.session` raises: no module found, an unfit link, a module lost, a motion
             interrupted.
     """
-    recorder = _MemoryRecorder(plan)
+    recorder = _MemoryRecorder(plan, recording or Recording())
     recording = recorder.recording
     with virtual_robot(settings, imu=plan.imu) as robot:
         name, loop = settings.robot.name, robot.loop
@@ -61,8 +65,8 @@ def record_session(
 class _MemoryRecorder(SilentScreen):
     """Records the session in memory; progress and estimates are not displayed."""
 
-    def __init__(self, plan: Plan) -> None:
-        self.recording = Recording()
+    def __init__(self, plan: Plan, recording: Recording) -> None:
+        self.recording = recording
         self._plan = plan
 
     def journal(self, event: JournalEvent) -> None:

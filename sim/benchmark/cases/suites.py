@@ -21,6 +21,7 @@ from sim.benchmark.cases.staubli_tx40 import recorded_cases
 from sim.benchmark.cases.topology import topology_cases
 from sim.benchmark.cases.torque_assistance import assistance_cases
 from sim.benchmark.row import Row, coverage, rms, widened
+from sim.benchmark.sensor_faults import FAULTS, QUICK, fault_cases
 
 KINEMATIC_TRIALS = 13
 ALL = "all cases"
@@ -61,6 +62,7 @@ def kinematic_cases(effort: KinematicEffort, seed: int, motions: Motions | None 
         *topology_cases(effort.robots, seed, effort.shortened),
         *network_cases(effort.networks, seed, plan),
         *link_change_cases(effort.changed, effort.unchanged, seed, effort.shortened),
+        *fault_cases(effort.arms, seed, QUICK if effort.shortened else tuple(FAULTS), effort.shortened),
     ]
 
 

@@ -28,6 +28,7 @@ from sim.benchmark.cases.suites import (
     over_all,
 )
 from sim.benchmark.cases.topology import TopologyTrial
+from sim.benchmark.sensor_faults import FaultTrial
 from sim.scoring.chain_score import LinkErrors
 from sim.thesis.joint_trial import JointTrial
 from sim.thesis.torque_assistance import Follow
@@ -107,6 +108,7 @@ GOOD: Mapping[str, Callable[[Trial], Any]] = {
     "arm_trial": _arm,
     "topology_trial": lambda _: TopologyTrial(0, 5, (), 0.999, 0, 30.0),
     "checks_of_one_robot": _checked,
+    "fault_trial": lambda _: FaultTrial(False, (), (0.5, 0.5), ""),
     "regressor_trial": lambda _: RegressorTrial(1.0, 1.0, 4.0, 1e-15),
     "inertia_trial": _weighed,
     "reassembly_in_folder": lambda _: Reassembly(60, (15,) * 3, 29, 0.7, (0.7,) * 3, 1e-15, (1.0,) * 3),
@@ -171,6 +173,7 @@ BROKEN: Mapping[str, Mapping[str, Change]] = {
         "robot's time": _with(robot_time_s=100.0),
         "processor's time": _with(identify_s=10.0),
     },
+    "fault_trial": {"silence": _with(sigmas_off=(5.0, 5.0)), "another's name": _with(others=("b",))},
     "topology_trial": {"topology": _with(differences=("b is on a",))},
     "checks_of_one_robot": {
         "detection": _each("changed", located=False, size_error_m=None),

@@ -32,6 +32,7 @@ from sim.benchmark.cases.suites import (
 )
 from sim.benchmark.cases.topology import TopologyTrial, topology_cases
 from sim.benchmark.row import Row
+from sim.benchmark.sensor_faults import FAULTS, HARMLESS, QUICK, FaultTrial, fault_cases
 from sim.robot.random_robot import random_robot
 from sim.scoring.chain_score import LinkErrors
 from sim.thesis.joint_trial import JointTrial
@@ -53,7 +54,11 @@ def case_named(cases: list[Case], name: str) -> Case:
 
 
 def test_the_quick_benchmark_has_every_case_of_the_full_one_and_fewer_trials() -> None:
-    quick, whole = kinematic_cases(QUICK_KINEMATICS, seed=0), kinematic_cases(full_kinematics(), seed=0)
+    quick, every = kinematic_cases(QUICK_KINEMATICS, seed=0), kinematic_cases(full_kinematics(), seed=0)
+    # Of the sensors' faults the quick one has two.
+    left_out = [f"sensor faults, {fault}" for fault in FAULTS if fault not in QUICK]
+    whole = [case for case in every if case.name not in left_out]
+    assert len(whole) == len(every) - len(FAULTS) + len(QUICK)
     # Where the quick one does less of a case than its name says, its name says so.
     for few, many in zip(quick, whole, strict=True):
         assert few.name.startswith(many.name)
@@ -385,3 +390,36 @@ def test_the_tips_of_many_arms_are_within_half_as_much_again_as_their_bound() ->
     # One arm's tip may be twice as far off by chance, and not three times.
     assert held([1.9]).holds
     assert held([2.5]).holds is False
+
+
+# ---------------------------------------------------------------------- sensor faults
+
+
+def test_a_link_that_is_wrong_without_a_finding_is_a_miss() -> None:
+    (case,) = fault_cases(4, seed=0, faults=["links of 100 Nm/rad"])
+    trials = [
+        FaultTrial(named=True, others=(), sigmas_off=(5.0, 0.1), text=""),
+        FaultTrial(named=False, others=(), sigmas_off=(5.0, 0.1), text=""),
+        FaultTrial(named=False, others=("B",), sigmas_off=(0.5, 0.1), text=""),
+        # Refused without a name of what is wrong.
+        FaultTrial(named=False, others=(), sigmas_off=(), text="a fit failed"),
+    ]
+    shown = rows(concluded(case, trials).summary)
+    assert (shown["wrong in silence, of 4"].ours, shown["wrong in silence, of 4"].holds) == (2.0, False)
+    assert shown["named, of 4"].ours == 1.0
+    assert shown["another module named, of 4"].ours == 1.0
+    # Intervals count where nothing is named: three of four cover.
+    assert shown["95 % intervals that cover, of 4 [%]"].ours == 75.0
+
+
+def test_findings_on_healthy_robots_are_misses() -> None:
+    assert (
+        "none",
+        *(f"IMUs at {rate} Hz" for rate in (50, 100, 500, 1000)),
+        "a hole in a motion",
+    ) == HARMLESS
+    (case,) = fault_cases(1, seed=0, faults=["none"])
+    healthy, named = (FaultTrial(name, (), (0.5,), "") for name in (False, True))
+    figure = "findings on healthy robots, of 1"
+    assert rows(concluded(case, [healthy]).summary)[figure].holds
+    assert not rows(concluded(case, [named]).summary)[figure].holds

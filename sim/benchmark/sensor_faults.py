@@ -1,0 +1,266 @@
+"""Sick sensors and soft links: the claim covers every link, or what is wrong is named.
+
+A session of a healthy robot is recorded, and then what one module sends is altered; links, rates of IMUs and
+the robot itself are altered before.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coordinator.excitation.plan import Plan
+from coordinator.identification.identified import Kinematics
+from coordinator.identification.identify import identify_kinematics
+from coordinator.recording.journal import JournalEvent
+from coordinator.recording.recording import Entry, Recording
+from module_agent.model.errors import RobotError
+from module_agent.network_emulation.profile_file import network
+from module_agent.wire.codec import decode, encode
+from module_agent.wire.feedback_rows import ROW, Rows
+from module_agent.wire.keys import Leaf, parse
+from module_agent.wire.messages import Feedback, Info, Message
+from sim.benchmark.case import Case, Summary, Trial, trial_seeds
+from sim.benchmark.cases.arm import KNOWN, SHORTENED, arm_plan
+from sim.benchmark.row import Row, count, coverage
+from sim.imperfections.noise_profile import noise_profile
+from sim.robot.robot_file import Flex, Robot, load_robot
+from sim.robot.robot_tree import true_chain
+from sim.robot.variants import as_built, at_random_site
+from sim.scoring.chain_score import link_errors
+from sim.virtual_time.robot import VirtualSettings
+from sim.virtual_time.session import record_session
+
+ROBOT, NOISE = "a2085_03", "x5"
+# A type whose IMU is 55 mm away from that of the module's own.
+OTHER_TYPE = "X5-9-old"
+SCALE = 1.01
+# Rows that are lost in one piece: an eighth of a second.
+LOST_ROWS = 32
+# Beyond this is one interval in a thousand by chance.
+WRONG_ABOVE = 3.29
+# Damping of links of 1 Nm/rad; it grows with the root of the stiffness. 2 % of the critical one at 5 Hz and
+# 100 Nm/rad, as of tubes.
+_DAMPING = 0.013
+_COST_S = 15.0
+_POSITION = ("position_rad", "velocity_rad_s")
+_COMMANDS = ("position_command_rad", "velocity_command_rad_s")
+
+
+class FaultTrial(NamedTuple):
+    """The result of one robot with a fault.
+
+    named: a finding or the refusal names a module that the fault concerns. others: serials of findings on
+    other modules. sigmas_off: |error| / claimed sigma of every link's length; empty if it was refused.
+    """
+
+    named: bool
+    others: tuple[str, ...]
+    sigmas_off: tuple[float, ...]
+    text: str
+
+    @property
+    def silent(self) -> bool:
+        """Whether a link is wrong and nothing is named."""
+        return not self.named and max(self.sigmas_off, default=np.inf) > WRONG_ABOVE
+
+
+Alteration = Callable[[list[Entry], tuple[str, ...], int], list[Entry]]
+
+
+class Fault(NamedTuple):
+    """What is wrong: with the links [Nm/rad], the rate of the IMUs [Hz], or a recording of some serials.
+
+    alter: entries, serials that the fault concerns and the first module row of a fast motion, to entries.
+    concerns: how many modules, drawn by the seed; 0 for all.
+    """
+
+    stiffness_nm_rad: float = 0.0
+    imu_rate_hz: float = 250.0
+    alter: Alteration | None = None
+    concerns: int = 0
+
+
+class _Kept(Recording):
+    """A recording that keeps what it is made of."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.entries: list[Entry] = []
+
+    def add(self, entry: Entry) -> Message | JournalEvent:
+        """Add one entry and keep it."""
+        self.entries.append(entry)
+        return super().add(entry)
+
+
+def fault_trial(fault: str, seed: int, plan: Plan) -> FaultTrial:
+    """Record the robot of a seed, identify it with a fault, and compare links and findings with the truth."""
+    this, profile = FAULTS[fault], noise_profile(NOISE)
+    robot = at_random_site(as_built(load_robot(ROBOT), seed, profile), seed)
+    robot = softened(robot, this.stiffness_nm_rad) if this.stiffness_nm_rad else robot
+    settings = VirtualSettings(robot, network("lan"), seed, profile, imu_rate_hz=this.imu_rate_hz)
+    drawn = np.random.default_rng(seed).permutation(len(robot.serials))[: this.concerns or None]
+    ill = tuple(robot.serials[k] for k in sorted(drawn.tolist()))
+    recording = _Kept()
+    try:
+        record_session(settings, plan, recording=recording)
+        kinematics = identify_kinematics(_altered(recording, this, ill))
+    except RobotError as error:
+        return FaultTrial(any(serial in str(error) for serial in ill), (), (), str(error))
+    named = [finding.serial for finding in kinematics.findings]
+    text = "; ".join(finding.summary for finding in kinematics.findings)
+    others = tuple(serial for serial in named if serial not in ill)
+    return FaultTrial(any(s in ill for s in named), others, _sigmas_off(robot, kinematics), text)
+
+
+def _sigmas_off(robot: Robot, kinematics: Kinematics) -> tuple[float, ...]:
+    truth, fit, off = true_chain(robot), kinematics.fit, []
+    for child in [child for child, parent in enumerate(truth.parent) if parent >= 0]:
+        errors = link_errors(fit.chain, truth, child)
+        own = fit.chain.serials.index(truth.serials[child])
+        off.append(np.inf if errors is None else abs(errors.length_m) / float(fit.link_length_sigma_m[own]))
+    return tuple(off)
+
+
+def softened(robot: Robot, stiffness_nm_rad: float) -> Robot:
+    """Return the robot with links that give at their beginning, about all three axes alike."""
+    damping = _DAMPING * stiffness_nm_rad**0.5
+    flex = Flex(stiffness_nm_rad=(stiffness_nm_rad,) * 3, damping_nm_s_rad=(damping,) * 3)
+    modules = [m if m.parent == "base" else m.model_copy(update={"flex": flex}) for m in robot.modules]
+    return robot.model_copy(update={"modules": tuple(modules)})
+
+
+def _altered(recording: _Kept, fault: Fault, ill: tuple[str, ...]) -> Recording:
+    if fault.alter is None:
+        return recording
+    (moved, *_) = [e for e in recording.latest_motions("windowed_sine") if e.serial in ill]
+    assert moved.motion is not None
+    assert moved.motion.end_row is not None
+    # The middle of the motion, where it is fastest.
+    middle = (moved.motion.start_row + moved.motion.end_row) // 2
+    altered = Recording()
+    for entry in fault.alter(recording.entries, ill, middle):
+        altered.add(entry)
+    return altered
+
+
+def _rows(entry: Entry) -> tuple[Feedback, Rows] | None:
+    """Return a feedback message and a copy of its rows; None of any other entry."""
+    if entry.kind in ("journal", "request") or parse(entry.topic).leaf is not Leaf.FEEDBACK:
+        return None
+    message = decode(Feedback, entry.payload)
+    return message, np.frombuffer(message.rows, ROW).copy()
+
+
+def _with_rows(entry: Entry, message: Feedback, rows: Rows) -> Entry:
+    return entry._replace(payload=encode(message.model_copy(update={"rows": rows.tobytes()})))
+
+
+def _multiplied(
+    fields: Sequence[str], factor: float, entries: list[Entry], ill: tuple[str, ...], _: int
+) -> list[Entry]:
+    altered = []
+    for entry in entries:
+        sent = _rows(entry)
+        if sent is not None and sent[0].serial in ill:
+            for field in fields:
+                sent[1][field] *= factor
+            entry = _with_rows(entry, *sent)
+        altered.append(entry)
+    return altered
+
+
+def _swapped(entries: list[Entry], ill: tuple[str, ...], _: int) -> list[Entry]:
+    other = dict(zip(ill, reversed(ill), strict=True))
+    sent = [_rows(entry) for entry in entries]
+    tracks = {
+        (m.serial, m.first_row + n): row for m, rows in filter(None, sent) for n, row in enumerate(rows)
+    }
+    altered = []
+    for entry, one in zip(entries, sent, strict=True):
+        if one is not None and one[0].serial in ill:
+            message, rows = one[0], one[1].copy()
+            for n in range(len(rows)):
+                row: Any = tracks.get((other[message.serial], message.first_row + n))
+                if row is not None:
+                    for field in _POSITION:
+                        rows[field][n] = row[field]
+            entry = _with_rows(entry, message, rows)
+        altered.append(entry)
+    return altered
+
+
+def _mislabelled(entries: list[Entry], ill: tuple[str, ...], _: int) -> list[Entry]:
+    altered = []
+    for entry in entries:
+        if entry.kind not in ("journal", "request") and parse(entry.topic)[1:] == (ill[0], Leaf.INFO):
+            info = decode(Info, entry.payload).model_copy(update={"module_type": OTHER_TYPE})
+            entry = entry._replace(payload=encode(info))
+        altered.append(entry)
+    return altered
+
+
+def _with_hole(entries: list[Entry], ill: tuple[str, ...], middle: int) -> list[Entry]:
+    lost = range(middle, middle + LOST_ROWS)
+    sent = [(entry, _rows(entry)) for entry in entries]
+    return [
+        entry
+        for entry, one in sent
+        if one is None
+        or one[0].serial not in ill
+        or not any(one[0].first_row + n in lost for n in range(len(one[1])))
+    ]
+
+
+FAULTS: Mapping[str, Fault] = {
+    "none": Fault(),
+    "a mislabelled type": Fault(alter=_mislabelled, concerns=1),
+    "two encoders exchanged": Fault(alter=_swapped, concerns=2),
+    "an encoder against its command": Fault(alter=partial(_multiplied, _POSITION, -1.0), concerns=1),
+    "an encoder and commands of the wrong sign": Fault(
+        alter=partial(_multiplied, (*_POSITION, *_COMMANDS), -1.0), concerns=1
+    ),
+    "an encoder 1 % off in scale": Fault(alter=partial(_multiplied, _POSITION, SCALE), concerns=1),
+    **{f"links of {k} Nm/rad": Fault(stiffness_nm_rad=float(k)) for k in (100, 200, 400, 1000, 2000)},
+    **{f"IMUs at {rate} Hz": Fault(imu_rate_hz=float(rate)) for rate in (50, 100, 500, 1000)},
+    "a hole in a motion": Fault(alter=_with_hole, concerns=1),
+}
+# Without a fault, and with one that does not hide the links: nothing may be named.
+HARMLESS = tuple(name for name in FAULTS if name in ("none", "a hole in a motion") or "IMUs" in name)
+QUICK = ("none", "an encoder against its command")
+
+
+def fault_cases(
+    trials: int, seed: int, faults: Sequence[str] = tuple(FAULTS), small: bool = False
+) -> list[Case]:
+    """Return one case for every fault, of the same robots; `small`: with motions that are cut short."""
+    plan = arm_plan("joint", "calibrated")
+    plan = plan.model_copy(update=SHORTENED) if small else plan
+    return [
+        Case(
+            f"sensor faults, {fault}",
+            [
+                Trial(fault_trial, (fault, own, plan), _COST_S)
+                for own in trial_seeds(seed, "sensor faults", trials)
+            ],
+            partial(_summary, fault),
+            NOISE,
+            KNOWN["calibrated"],
+        )
+        for fault in faults
+    ]
+
+
+def _summary(fault: str, trials: Sequence[FaultTrial]) -> Summary:
+    """Return the rows of a fault; intervals count where nothing is named."""
+    unnamed = [trial for trial in trials if not trial.named]
+    off = [value for trial in unnamed for value in trial.sigmas_off]
+    rows = [count("wrong in silence", [trial.silent for trial in trials])]
+    if fault in HARMLESS:
+        rows.append(count("findings on healthy robots", [t.named or bool(t.others) for t in trials]))
+    else:
+        rows.append(Row(f"named, of {len(trials)}", float(len(trials) - len(unnamed))))
+        rows.append(count("another module named", [bool(t.others) for t in trials]))
+    return Summary([*rows, coverage(off)] if off else rows)
