@@ -97,8 +97,10 @@ class NoiseProfile(Strict):
 
 
 _BODY = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
+_BUILT = ("imu-place", "imu-mounting", "body-mass", "body-centre", "housing-axis")
 _X5 = (
     *_BODY,
+    *_BUILT,
     *("variation", "imu-white", "imu-bias", "imu-drift", "g-sensitivity", "imu-bandwidth", "imu-range"),
     *("imu-steps", "vibration", "encoder", "velocity-estimate", "torque-noise", "clock", "sampling-jitter"),
 )

@@ -169,7 +169,7 @@ BROKEN: Mapping[str, Mapping[str, Change]] = {
         "tip's place": _tip(position_m=5e-3),
         "tip's turn": _tip(orientation_deg=0.5),
         "links": _links(length_m=1e-3),
-        "axes": _links(axis_deg=0.5),
+        "axes": _links(axis_deg=0.6),
         "robot's time": _with(robot_time_s=100.0),
         "processor's time": _with(identify_s=10.0),
     },

@@ -172,13 +172,13 @@ def arm(tip_mm: float, **changed: Any) -> ArmTrial:
 
 def test_an_arms_tip_is_the_rms_over_its_trials_with_the_thesis_beside() -> None:
     case = case_named(arm_cases(13, 0), f"{COST_ARM}, x5, joint by joint")
-    summary = case.summarise([arm(0.6), arm(1.6)] * 6 + [arm(0.6)])
+    summary = case.summarise([arm(0.6), arm(4.6)] * 6 + [arm(0.6)])
     found = rows(summary)
     tip = found["tip position, rms [mm]"]
-    assert tip.ours == pytest.approx(((7 * 0.36 + 6 * 2.56) / 13) ** 0.5)
-    assert (tip.thesis, tip.limit, tip.holds) == (pytest.approx(30.0), 1.0, False)
+    assert tip.ours == pytest.approx(((7 * 0.36 + 6 * 21.16) / 13) ** 0.5)
+    assert (tip.thesis, tip.limit, tip.holds) == (pytest.approx(30.0), 2.6, False)
     assert tip.bound == pytest.approx(0.2)
-    assert found["tip orientation, rms [deg]"].limit == 0.1
+    assert found["tip orientation, rms [deg]"].limit == 0.4
     assert found["robot time a joint, longest [s]"].ours == pytest.approx(9.0)
     assert found["robot time a joint, longest [s]"].thesis == 18.0
     assert found["refinement and all before it, median [s of a core]"].limit == 5.0
