@@ -23,6 +23,8 @@ _UNITS = (
     ("_hz", "Hz", False),
     ("_ppm", "ppm", False),
     ("_s", "s", True),
+    ("_m", "m", True),
+    ("_mass", "%", False),
     ("_fraction", "% of the largest", False),
     ("_spread", "%", False),
     ("_scale", "%", False),
