@@ -75,7 +75,8 @@ def test_gravity_torques_are_printed_over_a_turn_of_a_joint(tmp_path: Path, fold
 def test_a_simulated_robot_is_identified_and_compared_with_the_truth(tmp_path: Path) -> None:
     printed = run(tmp_path, "identify_simulated.py", ROBOT)
     (error_mm,) = map(float, re.findall(r"off by ([+-]\d+\.\d\d) mm", printed))
-    assert abs(error_mm) < 1.0
+    # Modules as delivered: their IMUs are anywhere within a millimetre (one sigma) of their places.
+    assert abs(error_mm) < 3.0
 
 
 def test_ones_own_arm_is_fitted_from_urdf_and_log(tmp_path: Path, folder: Path) -> None:

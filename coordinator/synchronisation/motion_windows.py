@@ -37,6 +37,9 @@ FEWEST, FEW = 3.0, 6.0
 # Bands as wide as the cut-off, from twice the cut-off on, in which noise is looked for, below the IMU's
 # own low-pass; and the share of its rate up to which its samples tell.
 BANDS, IMU_BAND = 5, 0.4
+# No IMU of the class is quieter behind the low-pass, gyro [rad/s] and accelerometer [m/s^2]: a quarter of
+# what a real X5-1's log reads at rest.
+QUIETEST = (5e-5, 1e-3)
 
 
 class Window(NamedTuple):
@@ -223,16 +226,17 @@ def noise_floor(rest: Window, cutoff_hz: float) -> NoiseFloor:
 def motion_noise(windows: Sequence[Window], rest: Window, cutoff_hz: float, imu_rate_hz: float) -> Array:
     """Return the noise (2, k, n) of all gyros [rad/s] and accelerometers [m/s^2] in k motions, rms per axis.
 
-    That is the larger one of two, through the same low-pass as `filtered`: noise of the least density
-    beyond twice the cut-off, in the motion, where gears shake, and at rest. No motion reaches up there, but
-    in some bands links ring. Of IMUs that are too slow for such a band it is what is below the cut-off at
-    rest.
+    That is the larger one of two, through the same low-pass as `filtered`, and never less than `QUIETEST`:
+    noise of the least density beyond twice the cut-off, in the motion, where gears shake, and at rest. No
+    motion reaches up there, but in some bands links ring. Of IMUs that are too slow for such a band it is
+    what is below the cut-off at rest.
     """
     each = [
         np.array([_above(signal, cutoff_hz, imu_rate_hz) for signal in (one.gyro_rad_s, one.accel_m_s2)])
         for one in (rest, *windows)
     ]
-    return np.asarray(np.sqrt(np.maximum(each[0], each[1:]).swapaxes(0, 1)))
+    noise = np.sqrt(np.maximum(each[0], each[1:]).swapaxes(0, 1))
+    return np.asarray(np.maximum(noise, np.reshape(QUIETEST, (2, 1, 1))))
 
 
 def _above(signal: Array, cutoff_hz: float, imu_rate_hz: float) -> Array:

@@ -9,7 +9,12 @@ import pandas as pd
 import pytest
 from rerun.chunk import RrdReader
 
+from coordinator.kinematics.chain_estimate import link_lengths
 from coordinator.viewer.viewer_process import MergeFailed, merge_into
+from sim.imperfections.noise_profile import noise_profile
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
+from sim.robot.variants import as_built
 from sim.scoring.truth_recording import add_truth
 
 BASE, TIP = "X-00009", "X-00010"
@@ -47,7 +52,9 @@ def test_the_true_robot_turns_beside_the_identified_one(
     assert before < {chunk.entity_path for chunk in reader.stream()}
     length = table(file, f"/estimates/link_length/{TIP}/true")
     (values,) = [length[c].dropna() for c in length if c.endswith(":scalars")]
-    assert [v[0] for v in values] == pytest.approx([171.0, 171.0], abs=1e-3)
+    robot = as_built(load_robot("thesis_171_vertical"), 3, noise_profile("x5"))
+    true_mm = 1e3 * link_lengths(true_chain(robot), np.zeros((12, 12)))[0][1]
+    assert [v[0] for v in values] == pytest.approx([true_mm, true_mm], abs=1e-3)
     bodies = {w: f"/world/{w}/body/{BASE}" for w in ("est", "true")}
     shown = {w: turns(table(file, path), path) for w, path in bodies.items()}
     true = shown["true"]
