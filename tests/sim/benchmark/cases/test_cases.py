@@ -404,12 +404,16 @@ def test_a_link_that_is_wrong_without_a_finding_is_a_miss() -> None:
         # Refused without a name of what is wrong.
         FaultTrial(named=False, others=(), sigmas_off=(), text="a fit failed"),
     ]
-    shown = rows(concluded(case, trials).summary)
-    assert (shown["wrong in silence, of 4"].ours, shown["wrong in silence, of 4"].holds) == (2.0, False)
-    assert shown["named, of 4"].ours == 1.0
-    assert shown["another module named, of 4"].ours == 1.0
+    shown = rows(concluded(case, 5 * trials).summary)
+    assert (shown["wrong in silence, of 20"].ours, shown["wrong in silence, of 20"].holds) == (10.0, False)
+    assert shown["named, of 20"].ours == 5.0
+    assert shown["another module named, of 20"].ours == 5.0
     # Intervals count where nothing is named: three of four cover.
-    assert shown["95 % intervals that cover, of 4 [%]"].ours == 75.0
+    assert shown["95 % intervals that cover, of 20 [%]"].ours == 75.0
+    # Few of them count with those of all cases.
+    few = concluded(case, trials).summary
+    assert few.sigmas_off == [5.0, 0.1, 0.5, 0.1]
+    assert not [figure for figure in rows(few) if "cover" in figure]
 
 
 def test_findings_on_healthy_robots_are_misses() -> None:
