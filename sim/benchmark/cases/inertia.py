@@ -205,7 +205,8 @@ ARMS = ("a2085_04", "a2085_06")
 HELD_OUT_PERCENT = {"rigid": 1.0, "x5": 3.0, "x5-uncalibrated": 5.0}
 SIGMAS = 3.0
 # Four joints leave some of the largest unexcited: their errors are held against their sigmas alone.
-LARGEST_PERCENT = {"a2085_06": {"rigid": 1.5, "x5": 1.5, "x5-uncalibrated": 8.0}}
+# 1.5 times the bound by the torques' noise alone, 1.66 to 1.78 %.
+LARGEST_PERCENT = {"a2085_06": {"rigid": 2.6, "x5": 2.6, "x5-uncalibrated": 8.0}}
 # Errors of torque scales are in both.
 TRUE_CHAIN_RATIO = {"rigid": 1.2, "x5": 1.2, "x5-uncalibrated": 1.5}
 BODIES_POINTS = 0.1

@@ -22,9 +22,9 @@ def test_a_simulated_robot_is_identified_in_ten_lines() -> None:
     error = link_errors(chain, truth, child=1)
     assert error is not None
     # Of an IMU as delivered, anywhere within a millimetre of its place.
-    (link,) = run.identified.result.links
-    assert abs(error.length_m) < 3e-3 * link.link_length_sigma_mm
-    assert link.link_length_sigma_mm < 2.0
+    (claimed,) = run.identified.result.links
+    assert abs(error.length_m) < 3e-3 * claimed.link_length_sigma_mm
+    assert claimed.link_length_sigma_mm < 2.0
     assert run.identified.inertia is None
     (link,) = run.score().links
     assert link.link_length_error_mm == pytest.approx(1e3 * error.length_m)
