@@ -16,6 +16,8 @@ from module_agent.model.read_only import make_read_only
 
 # Width and heights of a plot [px]; so many samples are drawn.
 _WIDTH, _HEIGHT, _RESIDUAL_HEIGHT, _DRAWN = 1000.0, 220.0, 80.0, 2000
+# Room for the legend above a plot and for the times below it, and how many of these are written.
+_LEGEND, _TIMES = 24.0, 6
 
 
 class Predictions(NamedTuple):
@@ -97,7 +99,7 @@ def svg_plot(torques: Predictions, joint: int) -> str:
     measured, predicted = (signal[::step, joint] for signal in (torques.tau_nm, torques.held_out_nm))
     residual = measured - predicted
     top = float(np.nanmax(np.abs([measured, predicted]))) or 1.0
-    middle, below = 0.5 * _HEIGHT, _HEIGHT + 0.5 * _RESIDUAL_HEIGHT
+    middle, below = _LEGEND + 0.5 * _HEIGHT, _LEGEND + _HEIGHT + 0.5 * _RESIDUAL_HEIGHT
     scale = 0.5 * _HEIGHT / top
     lines = [
         (measured, middle, "black", "measured"),
@@ -113,10 +115,18 @@ def svg_plot(torques: Predictions, joint: int) -> str:
         f'<text x="{10 + 110 * k}" y="14" fill="{colour}">{name}</text>'
         for k, (*_, colour, name) in enumerate(lines)
     ]
+    bottom = _LEGEND + _HEIGHT + _RESIDUAL_HEIGHT
+    shares = np.linspace(0.0, 1.0, _TIMES)
+    times = [
+        f'<text x="{share * _WIDTH:.0f}" y="{bottom + 12:.0f}" text-anchor="{anchor}" fill="#666">'
+        f"{torques.t_s[round(share * (len(torques.t_s) - 1))]:.1f} s</text>"
+        for share, anchor in zip(shares, ["start", *["middle"] * (_TIMES - 2), "end"], strict=True)
+    ]
     return (
-        f'<svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT + _RESIDUAL_HEIGHT:.0f}" font-size="12">'
+        f'<svg viewBox="0 0 {_WIDTH:.0f} {bottom + _LEGEND:.0f}" font-size="12">'
         f'<text x="350" y="14">{torques.joints[joint]}: -{top:.3g} to {top:.3g} Nm</text>'
-        f'<path stroke="#bbb" d="M0 {middle}H{_WIDTH}M0 {below}H{_WIDTH}"/>{"".join([*legend, *drawn])}</svg>'
+        f'<path stroke="#bbb" d="M0 {middle}H{_WIDTH}M0 {below}H{_WIDTH}"/>'
+        f"{''.join([*legend, *times, *drawn])}</svg>"
     )
 
 

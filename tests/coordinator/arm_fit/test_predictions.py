@@ -59,5 +59,11 @@ def test_a_plot_has_three_curves_within_its_frame(fit: ArmFit) -> None:
     assert len(curves) == 5
     places = np.array([point.split(",") for curve in curves for point in curve], dtype=float)
     assert places.min() >= 0.0
-    assert places[:, 0].max() <= 1000.0
-    assert places[:, 1].max() <= 300.0
+    width, height = map(float, drawing.get("viewBox", "").split()[2:])
+    assert places[:, 0].max() <= width
+    # Neither the legend above nor the times below are drawn over.
+    words = {float(text.get("y", "nan")) for text in drawing.findall("text")}
+    assert min(words) < places[:, 1].min()
+    assert places[:, 1].max() < max(words) <= height
+    times = [text.text for text in drawing.findall("text") if (text.text or "").endswith(" s")]
+    assert (times[0], times[-1]) == (f"{fit.torques.t_s[0]:.1f} s", f"{fit.torques.t_s[-1]:.1f} s")
