@@ -219,8 +219,8 @@ def refine_chain(
     spectrum = _solve(normal)[2]
     by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
     rms = [_rms(residual) for residual in expected.residuals]
-    refined = _report(problem, state, spectrum, _nuisance_covariance(normal, spectrum), by_noise, rms)
-    return refined._replace(residuals=frozen(np.stack(white)))
+    nuisance = _nuisance_covariance(normal, spectrum)
+    return _report(problem, state, spectrum, nuisance, by_noise, rms, white)
 
 
 def with_placement(chain: Chain, placement: Array) -> Chain:
@@ -406,8 +406,13 @@ def _report(
     nuisance: Array,
     by_noise: Array,
     rms: Sequence[Array],
+    by_motion: Sequence[Array],
 ) -> Refinement:
-    """Return the estimate; nuisance: the covariance of the nuisance parameters."""
+    """Return the estimate.
+
+    nuisance: the covariance of the nuisance parameters. rms, by_motion: of the residuals, altogether (n,)
+    and in every motion (k, n), of gyro and accelerometer.
+    """
     known = spectrum.known
     kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
@@ -429,7 +434,7 @@ def _report(
         noise_covariance=frozen(noise),
         residual_gyro_rad_s=frozen(rms[0]),
         residual_accel_m_s2=frozen(rms[1]),
-        residuals=frozen(np.stack(rms)[:, None]),
+        residuals=frozen(np.stack(by_motion)),
         intrinsics=ImuIntrinsics(frozen(state.imus.errors)),
         calibration_prior=problem.calibration,
         calibration=_posterior(problem, state, nuisance),
