@@ -9,7 +9,8 @@ from coordinator.batch_estimation.imu_calibration import CalibrationInformation
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import IdentificationError, Kinematics, calibrations
 from coordinator.identification.identify import identify_kinematics
-from coordinator.merge.calibration_file import CalibrationFileError, each_once, read_calibration
+from coordinator.merge.calibration_file import each_once, read_calibration
+from coordinator.merge.run_arrays import RunArraysError
 from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import MEASURED, SESSION, load_recording
 from coordinator.recording.session_file import SessionFileError
@@ -75,7 +76,7 @@ def load_baseline(folder: Path) -> BaselineRobot:
         if before is not None:
             kinematics = before.updated(kinematics)
         return BaselineRobot(folder, recording, kinematics)
-    except (SessionFileError, IdentificationError, UnknownModuleType, CalibrationFileError) as error:
+    except (SessionFileError, IdentificationError, UnknownModuleType, RunArraysError) as error:
         raise BaselineError(f"{path} does not identify the robot: {error}") from error
 
 
@@ -92,7 +93,7 @@ def measured_before_run(folder: Path, baseline: BaselineRobot | None) -> tuple[C
     """Return the recordings from which the run in a folder takes the prior of its IMUs, each once.
 
     Raises:
-        CalibrationFileError: what the folder has of them is damaged.
+        RunArraysError: what the folder has of them is damaged.
     """
     kept = read_calibration(folder / MEASURED) if (folder / MEASURED).is_file() else ()
     return each_once((*(baseline.measured if baseline is not None else ()), *kept))

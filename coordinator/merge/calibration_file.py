@@ -1,6 +1,5 @@
 """`imu_calibration.npz`: what one or more recordings tell of their modules' IMUs; versioned."""
 
-import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,16 +7,12 @@ from typing import Any
 import numpy as np
 
 from coordinator.batch_estimation.imu_calibration import SIZE, CalibrationInformation
+from coordinator.merge.run_arrays import read_arrays, write_arrays
 from module_agent.model.catalogue import ImuKind
-from module_agent.model.errors import DataError, RobotError
-from module_agent.model.files import replacing
+from module_agent.model.errors import DataError
 from module_agent.model.read_only import frozen
 
 VERSION = 1
-
-
-class CalibrationFileError(RobotError):
-    """What runs tell of IMUs is missing or damaged; the message names the file."""
 
 
 def each_once(recordings: Iterable[CalibrationInformation]) -> tuple[CalibrationInformation, ...]:
@@ -27,34 +22,24 @@ def each_once(recordings: Iterable[CalibrationInformation]) -> tuple[Calibration
 
 def write_calibration(path: Path, recordings: Sequence[CalibrationInformation]) -> None:
     """Write what recordings tell of IMUs, whole or not at all."""
-    arrays: dict[str, Any] = {"version": VERSION, "sessions": np.array([one.session for one in recordings])}
+    arrays: dict[str, Any] = {"sessions": np.array([one.session for one in recordings])}
     for k, one in enumerate(recordings):
         arrays[f"serials{k}"] = np.array(one.serials)
         arrays[f"matrix{k}"], arrays[f"vector{k}"], arrays[f"imu{k}"] = one.matrix, one.vector, one.imu
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    write_arrays(path, VERSION, arrays)
 
 
 def read_calibration(path: Path) -> tuple[CalibrationInformation, ...]:
     """Read what recordings tell of IMUs.
 
     Raises:
-        CalibrationFileError: no such file, another version, or not what it should be.
+        RunArraysError: no such file, another version, or not what it should be.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if int(file["version"]) != VERSION:
-                raise CalibrationFileError(
-                    f"{path} is of version {file['version']}, {VERSION} is read here: replay the run's "
-                    "session.mcap, which writes it anew"
-                )
-            return tuple(_recording(dict(file), k) for k in range(len(file["sessions"])))
-    except OSError as error:
-        raise CalibrationFileError(
-            f"{path}: {error.strerror or error}; every run writes it, and so does replaying one"
-        ) from error
-    except (KeyError, ValueError, DataError, zipfile.BadZipFile) as error:  # ValueError: numpy's parser
-        raise CalibrationFileError(f"{path} is not what runs tell of IMUs: {error}") from error
+
+    def recordings(arrays: dict[str, Any]) -> tuple[CalibrationInformation, ...]:
+        return tuple(_recording(arrays, k) for k in range(len(arrays["sessions"])))
+
+    return read_arrays(path, VERSION, recordings, "what runs tell of IMUs", "every run")
 
 
 def _recording(arrays: dict[str, Any], k: int) -> CalibrationInformation:

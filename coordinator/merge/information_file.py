@@ -1,14 +1,14 @@
 """`information.npz`: the torque information of a run and the chain that it was computed with; versioned."""
 
-import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from coordinator.merge.run_arrays import read_arrays, write_arrays
 from module_agent.model.chain import Array, Chain
-from module_agent.model.errors import DataError, RobotError
-from module_agent.model.files import replacing
+from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
 from module_agent.model.read_only import make_read_only
 
@@ -43,14 +43,9 @@ class RunInformation(NamedTuple):
     scale_sigma: float
 
 
-class InformationFileError(RobotError):
-    """The information of a run is missing or damaged; the message names the file."""
-
-
 def write_information(path: Path, run: RunInformation) -> None:
     """Write the information of a run, whole or not at all."""
     arrays: dict[str, Any] = {
-        "version": VERSION,
         "session": run.session,
         **{name: np.array(values) for name, values in run.chain.to_dict().items()},
         **{name: getattr(run, name) for name in _ARRAYS},
@@ -59,30 +54,17 @@ def write_information(path: Path, run: RunInformation) -> None:
     }
     for k, joint in enumerate(run.joints):
         arrays[f"r{k}"], arrays[f"z{k}"], arrays[f"effects{k}"] = joint.r, joint.z, run.effects[k]
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+    write_arrays(path, VERSION, arrays)
 
 
 def read_information(path: Path) -> RunInformation:
     """Read the information of a run; its name is that of the folder.
 
     Raises:
-        InformationFileError: no such file, another version, or not what it should be.
+        RunArraysError: no such file, another version, or not what it should be.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if int(file["version"]) != VERSION:
-                raise InformationFileError(
-                    f"{path} is of version {file['version']}, {VERSION} is read here: replay the run's "
-                    f"session.mcap, which writes it anew"
-                )
-            return _run(path.parent.name, dict(file))
-    except OSError as error:
-        raise InformationFileError(
-            f"{path}: {error.strerror or error}; a run with dynamics writes it, and so does replaying one"
-        ) from error
-    except (KeyError, ValueError, DataError, zipfile.BadZipFile) as error:  # ValueError: numpy's parser
-        raise InformationFileError(f"{path} is not the information of a run: {error}") from error
+    run = partial(_run, path.parent.name)
+    return read_arrays(path, VERSION, run, "the information of a run", "a run with dynamics")
 
 
 def _run(name: str, arrays: dict[str, Any]) -> RunInformation:

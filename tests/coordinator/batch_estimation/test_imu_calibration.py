@@ -19,12 +19,12 @@ from coordinator.batch_estimation.imu_intrinsics import ACCEL_BIAS, DELAY, GYRO_
 from coordinator.batch_estimation.imu_prediction import imu_readings
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.merge.calibration_file import (
-    CalibrationFileError,
     each_once,
     read_calibration,
     write_calibration,
 )
 from coordinator.merge.merge_calibrations import merge_calibrations
+from coordinator.merge.run_arrays import RunArraysError
 from module_agent.model.chain import Array, Chain
 from module_agent.model.imu_prior import ACCEL_BIAS_CHANGE_M_S2, CALIBRATED, UNCALIBRATED
 
@@ -153,10 +153,10 @@ def test_what_is_written_is_read_again_and_damage_is_named(tmp_path: Path) -> No
         np.testing.assert_array_equal(again.vector, wrote.vector)
     assert len(each_once([*recordings, *recordings])) == 2
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(CalibrationFileError, match="not what runs tell of IMUs"):
+    with pytest.raises(RunArraysError, match="not what runs tell of IMUs"):
         read_calibration(path)
     write_calibration(path, [recordings[0]._replace(serials=("A",))])
-    with pytest.raises(CalibrationFileError, match="do not fit 1 modules"):
+    with pytest.raises(RunArraysError, match="do not fit 1 modules"):
         read_calibration(path)
-    with pytest.raises(CalibrationFileError, match="every run writes it"):
+    with pytest.raises(RunArraysError, match="every run writes it"):
         read_calibration(tmp_path / "none.npz")

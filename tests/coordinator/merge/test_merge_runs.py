@@ -14,12 +14,12 @@ from typer.testing import CliRunner
 
 from coordinator.main import app
 from coordinator.merge.information_file import (
-    InformationFileError,
     RunInformation,
     read_information,
     write_information,
 )
 from coordinator.merge.merge_runs import MergedInformation, MergeError, merge_runs
+from coordinator.merge.run_arrays import RunArraysError
 from coordinator.parameter_fit.module_parts import bodies_from_parts, parts_of
 from coordinator.parameter_fit.spectrum import RANK_TOLERANCE
 from coordinator.parameter_fit.systematic_errors import chain_effects, error_directions
@@ -314,7 +314,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, what: str, why: str
     path = tmp_path / INFORMATION
     if what == "junk":
         path.write_bytes(b"PK\x03\x04 no archive")
-    with pytest.raises(InformationFileError, match=why) as caught:
+    with pytest.raises(RunArraysError, match=why) as caught:
         read_information(path)
     assert str(path) in str(caught.value)
 
@@ -322,7 +322,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, what: str, why: str
 @pytest.mark.parametrize("version", [1, 99])
 def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int) -> None:
     np.savez(tmp_path / INFORMATION, version=version)
-    with pytest.raises(InformationFileError, match=f"version {version}, 2 is read here: replay"):
+    with pytest.raises(RunArraysError, match=f"version {version}, 2 is read here: replay"):
         read_information(tmp_path / INFORMATION)
 
 
