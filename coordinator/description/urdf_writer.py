@@ -170,8 +170,8 @@ def comment_undetermined(parent: Element, names: Sequence[str]) -> None:
     if names:
         comment(
             parent,
-            f"Torques alone do not determine {', '.join(names)} of this body: the module types decide, and "
-            "the values may be far off. See identifiability in result.json.",
+            f"Torques alone do not determine {', '.join(names)} of this body: the module types decide, "
+            "to a factor of two. See identifiability, and mass_sigma_kg of bodies, in result.json.",
         )
 
 

@@ -161,10 +161,11 @@ class HeldOutPart(Part):
 class ModuleBodyPart(BodyPart):
     """A physically consistent body: all that the joint of the module `serial` moves, as in `robot.urdf`.
 
-    It is in the frame of the link `body_<serial>`.
+    It is in the frame of the link `body_<serial>`. mass_sigma_kg: of torques, systematic errors and prior.
     """
 
     serial: str
+    mass_sigma_kg: float | None = None
 
 
 class BodiesPart(Part):

@@ -230,10 +230,13 @@ def _torque_terms(serials: tuple[str, ...], estimate: InstrumentalFit) -> list[T
 def _bodies(robot: RobotBodies) -> BodiesPart | None:
     if robot.fit is None:
         return None
-    pairs = zip(robot.serials, robot.bodies, strict=True)
+    sigma = np.sqrt(np.diagonal(robot.fit.covariance))[::PER_BODY].tolist()
     return BodiesPart.of(
         robot.fit,
-        bodies=[ModuleBodyPart.of(one, serial=serial) for serial, one in pairs],
+        bodies=[
+            ModuleBodyPart.of(one, serial=serial, mass_sigma_kg=own)
+            for serial, one, own in zip(robot.serials, robot.bodies, sigma, strict=True)
+        ],
         relative_error=robot.fit.error,
         prior_weight=robot.fit.weight,
         held_out_relative_error=robot.held_out_error,

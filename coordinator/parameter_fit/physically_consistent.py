@@ -12,6 +12,16 @@ which does not depend on frames or units and is unbounded at the boundary of the
 
 is convex, smooth and self-concordant, and needs no constraint: Newton's method with a line search solves it
 (Boyd and Vandenberghe 2004, Convex optimization, section 9.6).
+
+R and z have white noise. Systematic errors E (`systematic_errors`) are small shares of the torques, but many
+times the noise of thousands of samples: fitted as if they were signal, they move the directions that hardly
+show in torques by whole bodies. So bodies are fitted by generalised least squares, with the covariance
+I + E E^T, and the rows with white noise keep only the weight mu that prediction needs:
+
+    minimise |W (R x - z)|^2 / 2 + mu |R x - z|^2 / 2 + w sum_i d(J_i(x) | J0_i)
+             + w_m sum_i (m_i / m0_i - 1)^2 / 2,    W (I + E E^T) W = I,
+
+with the smallest mu whose raw torque error is within `MAX_COST` of that of mu = 1 without W.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +37,7 @@ from coordinator.dynamics.pseudo_inertia import parameter_transform, pseudo_iner
 from coordinator.parameter_fit.base_parameters import whitened
 from coordinator.parameter_fit.least_squares import InertialFit
 from coordinator.parameter_fit.spectrum import UndeterminedError
-from coordinator.parameter_fit.systematic_errors import whitened_effects
+from coordinator.parameter_fit.systematic_errors import decorrelation, whitened_effects
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
 from module_agent.model.information import JointInformation
@@ -42,6 +52,16 @@ WEIGHTS = (10.0, 1.0, 0.1, 0.01)
 # The prior may increase the relative torque error of least squares by this: half of the bound for motions
 # that were not fitted, because those are another sample of the same.
 MAX_COST = 5e-4
+# The same of a body's mass alone, where systematic errors are considered. They show as first moments, of a
+# body on a vertical axis above all, which without it a mass of several kilograms explains best.
+MASS_WEIGHT = 100.0
+# The claim does not lean on those weights: the prior's distributions of mass are a factor of two off (one
+# standard deviation, `inertia_prior`), 1 / log(2)^2.
+CLAIMED_WEIGHT = 2.0
+# Weights mu of the rows with white noise, falling; by steps of half an order the error hardly jumps.
+RAW_WEIGHTS = (1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4)
+# Of the error of a model that lacks most of the torque: by less no two bodies are told apart.
+_SAME_ERROR = 0.01
 # Smallest noise as a share of the torques' rms: simulated torques without noise are not fitted closer.
 _FINEST = 1e-5
 
@@ -101,8 +121,9 @@ def fit_physical(
     """Fit physically consistent bodies to the torques of all joints.
 
     The prior has the largest of `WEIGHTS` whose relative torque error exceeds that of least squares by at
-    most `max_cost`, or by no more than the noise that least squares fits. If there is none, because friction
-    is missing in the model for example, it is the largest within `max_cost` of the best of them.
+    most `max_cost`, or by no more than the noise that least squares fits or the systematic errors. If there
+    is none, because friction is missing in the model for example, it is the largest within `max_cost` of the
+    best of them.
 
     Args:
         information: per joint of n.
@@ -112,8 +133,9 @@ def fit_physical(
             compare.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
         max_cost: see above; a share of |tau|.
-        effects: (k_i, j) of every joint, of systematic errors (`systematic_errors`); they widen the
-            covariance.
+        effects: (k_i, j) of every joint, of systematic errors (`systematic_errors`). The bodies do not follow
+            them where the torques hardly show it, masses are near the prior's there (`MASS_WEIGHT`), and the
+            covariance contains them.
 
     Raises:
         UndeterminedError: torques that are all zero.
@@ -133,25 +155,98 @@ def fit_physical(
     rows, target = whitened(information, sigma, independent_fraction)
     own = least_squares.rank * common**2 / independent_fraction
     allowed = max(best + max_cost, float(np.hypot(best, np.sqrt(own) / size)))
-
+    if effects is not None:
+        # The true bodies themselves would miss the torques by the systematic errors.
+        likely = common * np.linalg.norm(whitened_effects(effects, sigma, 1.0))
+        allowed = max(allowed, float(np.hypot(best, likely / size)))
     solution, weight, error = _strongest_prior(
         rows=rows, target=target, prior=bodies, error_of=error_of, allowed=allowed, max_cost=max_cost
     )
-    covariance = solution.covariance
     if effects is not None:
-        shifts = covariance @ (rows.T @ whitened_effects(effects, sigma, independent_fraction))
-        covariance = covariance + shifts @ shifts.T
+        own_sigma = np.maximum(least_squares.torque_sigma_nm, finest)
+        own_rows = whitened(information, own_sigma, independent_fraction)
+        data = _Data(
+            *own_rows,
+            effects=whitened_effects(effects, own_sigma, independent_fraction),
+            alike=np.repeat(own_sigma / common, [len(piece.r) for piece in information]),
+        )
+        solution, error = _considered(data, bodies, weight, error_of, error + max_cost)
     pseudo = np.stack([pseudo_inertia(phi) for phi in solution.x.reshape(-1, PER_BODY)])
-    make_read_only((pseudo, solution.x, covariance, solution.divergence))
+    make_read_only((pseudo, *solution))
     return PhysicalFit(
         phi=solution.x,
-        covariance=covariance,
+        covariance=solution.covariance,
         pseudo=pseudo,
         divergence=solution.divergence,
         weight=weight,
         error=error,
         least_squares_error=best,
     )
+
+
+class _Data(NamedTuple):
+    """Rows (k, p), target (k,) and systematic errors (k, j), whitened by every joint's own noise.
+
+    alike: (k,) factors of the rows with which all joints count alike.
+    """
+
+    rows: Array
+    target: Array
+    effects: Array
+    alike: Array
+
+
+def _considered(
+    data: _Data, prior: Array, weight: float, error_of: Callable[[Array], float], allowed: float
+) -> tuple[Solution, float]:
+    """Return the solution with the smallest of `RAW_WEIGHTS` whose error is allowed, and the error."""
+    whitening = decorrelation(data.effects)
+    rows, target = whitening @ data.rows, whitening @ data.target
+    masses, expected = _mass_rows(prior, data.rows.shape[1])
+    tried: list[tuple[Solution, float, float]] = []
+    for raw in RAW_WEIGHTS:
+        part = np.sqrt(raw) * data.alike
+        stacked = np.vstack([rows, part[:, None] * data.rows, masses])
+        goal = np.concatenate([target, part * data.target, expected])
+        solution = physically_consistent(stacked, goal, prior, weight)
+        error = error_of(solution.x)
+        if tried and error > allowed:
+            break
+        tried.append((solution, error, raw))
+    solution, error, raw = tried[-1]
+    weights = whitening @ whitening + np.diag(raw * data.alike**2)
+    covariance = _covariance(data, weights, solution.x, prior, weight)
+    return solution._replace(covariance=covariance), error
+
+
+def _mass_rows(prior: Array, columns: int) -> tuple[Array, Array]:
+    """Return rows (n, columns) and target (n,) of masses that are the prior's, weighted."""
+    rows, bodies = np.zeros((len(prior), columns)), np.arange(len(prior))
+    rows[bodies, PER_BODY * bodies] = np.sqrt(MASS_WEIGHT) / prior[:, 3, 3]
+    return rows, np.full(len(prior), np.sqrt(MASS_WEIGHT))
+
+
+def _covariance(data: _Data, weights: Array, x: Array, prior: Array, weight: float) -> Array:
+    """Return the covariance (p, p) of x, which minimises (R x - z)^T G (R x - z) / 2 and the prior's terms.
+
+    z has noise e of covariance I + E E^T, the prior the error e_0 of covariance C_0 (`CLAIMED_WEIGHT`). With
+    G = `weights` (k, k) and P the curvature of the prior's terms, x errs by H^-1 (R^T G e + P e_0),
+    H = R^T G R + P. Curvatures are taken at the prior or at x, where the body is heavier: those at a body
+    that the data made too light would claim too much.
+    """
+    bodies = x.reshape(-1, PER_BODY)
+    at = [pseudo_inertia(one) if one[0] > own[3, 3] else own for one, own in zip(bodies, prior, strict=True)]
+    scale = block_diag(*(parameter_transform(np.linalg.cholesky(own)) for own in at))
+    masses = _mass_rows(prior, len(x))[0] @ scale
+    rows = data.rows @ scale
+    # Of the divergence along two units E and F of a body that is the identity: tr(E F).
+    unit = _UNITS.reshape(PER_BODY, 16) @ _UNITS.reshape(PER_BODY, 16).T
+    slope = weight * np.kron(np.eye(len(bodies)), unit) + masses.T @ masses
+    inverse = np.linalg.inv(rows.T @ weights @ rows + slope)
+    gain = inverse @ rows.T @ weights
+    likely = np.kron(np.eye(len(bodies)), np.linalg.cholesky(np.linalg.inv(CLAIMED_WEIGHT * unit)))
+    parts = scale @ np.hstack([gain, gain @ data.effects, inverse @ slope @ likely])
+    return np.asarray(parts @ parts.T)
 
 
 def _strongest_prior(
@@ -172,7 +267,7 @@ def _strongest_prior(
     # No consistent bodies do as well as least squares: the model lacks something. The cost is counted from
     # the best of them instead.
     cheapest = min(error for _, _, error in tried)
-    return next(one for one in tried if one[2] - cheapest <= max_cost)
+    return next(one for one in tried if one[2] - cheapest <= max(max_cost, _SAME_ERROR * cheapest))
 
 
 def physically_consistent(rows: ArrayLike, target: ArrayLike, prior: ArrayLike, weight: float) -> Solution:

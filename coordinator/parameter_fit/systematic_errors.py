@@ -93,3 +93,13 @@ def whitened_effects(
     """
     weight = np.sqrt(independent_fraction) / np.asarray(sigma_nm, dtype=float)
     return np.vstack([w * one for w, one in zip(weight, effects, strict=True)])
+
+
+def decorrelation(effects: ArrayLike) -> Array:
+    """Return the symmetric W (k, k), read-only, with W (I + E E^T) W = I for whitened effects E (k, j).
+
+    W times whitened rows and target are those of generalised least squares: what a systematic error can
+    imitate counts no more than that error is likely. By E = U s V^T, W = I - U (1 - (1 + s^2)^(-1/2)) U^T.
+    """
+    left, values, _ = np.linalg.svd(np.asarray(effects, dtype=float), full_matrices=False)
+    return read_only(np.eye(len(left)) - (left * (1.0 - (1.0 + values**2) ** -0.5)) @ left.T)
