@@ -1,0 +1,232 @@
+"""A document as a page: HTML in one file without references, Markdown with a folder of figures, or JSON.
+
+An HTML page follows the reader's choice of light or dark: figures are drawn in the colours of `PALETTE`,
+which the page replaces by variables that its style sets for both.
+"""
+
+import re
+from html import escape
+from pathlib import Path
+
+from coordinator.report.document import (
+    Block,
+    Bullets,
+    Conclusion,
+    Document,
+    Figure,
+    Outcome,
+    Paragraph,
+    Section,
+    Table,
+)
+from module_agent.model.errors import UsageError
+from module_agent.model.files import write_json, write_text
+
+# The colours of figures: on a light page, as drawn, and on a dark one.
+PALETTE = {
+    "ink": ("#1d2430", "#e4e8ee"),
+    "muted": ("#667080", "#9aa5b4"),
+    "grid": ("#d5dae1", "#353d49"),
+    "paper": ("#fdfdfe", "#15191f"),
+    "body": ("#b9c3d0", "#4a5666"),
+    "measured": ("#2b5fa8", "#7db2ff"),
+    "predicted": ("#c4441c", "#ff9466"),
+    "residual": ("#2c7d52", "#6fd19b"),
+    "axis": ("#b3246b", "#ff86bd"),
+}
+SUFFIXES = (".html", ".md", ".json")
+_OUTCOMES: dict[Outcome, str] = {"seen": "seen", "seen in part": "part", "not seen": "unseen"}
+_COLOUR = re.compile("|".join(light for light, _ in PALETTE.values()), re.IGNORECASE)
+_VARIABLES = {light: f"var(--{name})" for name, (light, _) in PALETTE.items()}
+
+
+def _variables(dark: bool) -> str:
+    return "".join(f"--{name}:{pair[dark]};" for name, pair in PALETTE.items())
+
+
+_STYLE = f"""
+:root {{ color-scheme: light dark; {_variables(False)} }}
+@media (prefers-color-scheme: dark) {{ :root {{ {_variables(True)} }} }}
+@media print {{ :root {{ color-scheme: light; {_variables(False)} }}
+  body {{ max-width: none; padding: 0; }} }}
+body {{ font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; color: var(--ink); background: var(--paper);
+  max-width: 62rem; margin: 0 auto; padding: 1.5rem 1.2rem 4rem; overflow-wrap: break-word; }}
+h1 {{ font-size: 1.7rem; line-height: 1.2; margin: 0 0 .3rem; }}
+h2 {{ font-size: 1.2rem; margin: 2.2rem 0 .6rem;
+  padding-bottom: .2rem; border-bottom: 1px solid var(--grid); }}
+p {{ margin: .5rem 0; }} .subtitle {{ color: var(--muted); margin: 0 0 1rem; }}
+nav {{ font-size: .9rem; }} nav a {{ color: var(--measured); margin-right: 1rem; white-space: nowrap; }}
+ul {{ margin: .5rem 0; padding-left: 1.3rem; }} li {{ margin: .15rem 0; }}
+.scroll {{ overflow-x: auto; margin: .9rem 0 1.2rem; break-inside: avoid; }}
+table {{ border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; }}
+caption {{ text-align: left; font-weight: 600; padding-bottom: .3rem;
+  white-space: nowrap; }}
+th, td {{ text-align: left; padding: .2rem .9rem .2rem 0; border-bottom: 1px solid var(--grid);
+  vertical-align: top; }}
+th {{ color: var(--muted); font-weight: 500; vertical-align: bottom; }}
+td:first-child {{ white-space: nowrap; }}
+.n {{ text-align: right; white-space: nowrap; }} th[colspan] {{ text-align: center; }}
+figure {{ margin: 1rem 0 1.4rem; break-inside: avoid; }}
+figure svg {{ width: 100%; height: auto; display: block; }}
+figcaption {{ font-size: .87rem; color: var(--muted); }}
+.conclusion {{ border-left: .3rem solid var(--residual); padding: .2rem .8rem; }}
+.part {{ border-color: var(--predicted); }} .unseen {{ border-color: var(--axis); }}
+"""
+
+
+def write_page(path: Path, document: Document) -> None:
+    """Write a document in the format of the file's suffix; Markdown has its figures in a folder next to it.
+
+    Raises:
+        UsageError: a suffix other than `SUFFIXES`.
+        OSError: the file cannot be written.
+    """
+    check_suffix(path)
+    if path.suffix == ".html":
+        write_text(path, html_page(document))
+    elif path.suffix == ".json":
+        write_json(path, document)
+    else:
+        folder = path.with_name(f"{path.stem}_figures")
+        text, drawings = markdown_page(document, folder.name)
+        if drawings:
+            folder.mkdir(exist_ok=True)
+        for name, svg in drawings.items():
+            write_text(folder / name, svg)
+        write_text(path, text)
+
+
+def check_suffix(path: Path) -> Path:
+    """Return the path if a page can be written to it.
+
+    Raises:
+        UsageError: a suffix other than `SUFFIXES`.
+    """
+    if path.suffix not in SUFFIXES:
+        raise UsageError(f"{path}: a report ends in {', '.join(SUFFIXES)}, not in {path.suffix or 'nothing'}")
+    return path
+
+
+# ---------------------------------------------------------------------- HTML
+
+
+def html_page(document: Document) -> str:
+    """Return the document as one HTML file, which needs no other file and no script."""
+    links = "".join(f'<a href="#{_anchor(s)}">{escape(s.title)}</a>' for s in document.sections)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(document.title)}</title><style>{_STYLE}</style></head>\n<body>"
+        f'<h1>{escape(document.title)}</h1><p class="subtitle">{escape(document.subtitle)}</p>'
+        f"<nav>{links}</nav>\n"
+        + "\n".join(_html_section(section) for section in document.sections)
+        + "\n</body></html>\n"
+    )
+
+
+def _anchor(section: Section) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
+
+
+def _html_section(section: Section) -> str:
+    blocks = "\n".join(map(_html_block, section.blocks))
+    return f'<section id="{_anchor(section)}"><h2>{escape(section.title)}</h2>\n{blocks}</section>'
+
+
+def _html_block(block: Block) -> str:
+    match block:
+        case Paragraph():
+            return f"<p>{escape(block.text)}</p>"
+        case Bullets():
+            return "<ul>" + "".join(f"<li>{escape(item)}</li>" for item in block.items) + "</ul>"
+        case Table():
+            return _html_table(block)
+        case Figure():
+            drawing = themed(block.svg)
+            return (
+                f'<figure role="img" aria-label="{escape(block.alt)}">{drawing}'
+                f"<figcaption>{escape(block.caption)}</figcaption></figure>"
+            )
+        case Conclusion():
+            return (
+                f'<p class="conclusion {_OUTCOMES[block.outcome]}"><strong>{block.outcome}</strong>: '
+                f"{escape(block.reason)}</p>"
+            )
+
+
+def _html_table(table: Table) -> str:
+    kinds = ["" if table.is_text(k) else ' class="n"' for k in range(len(table.columns))]
+    heads = "".join(f"<th{k}>{escape(c.heading)}</th>" for k, c in zip(kinds, table.columns, strict=True))
+    rows = "".join(
+        "<tr>"
+        + "".join(
+            f"<td{kind}>{escape(column.shown(cell))}</td>"
+            for kind, column, cell in zip(kinds, table.columns, row, strict=True)
+        )
+        + "</tr>"
+        for row in table.rows
+    )
+    return (
+        f'<div class="scroll"><table><caption>{escape(table.caption)}</caption><thead>{_groups(table)}'
+        f"<tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _groups(table: Table) -> str:
+    """Return the row of headings above neighbouring columns, empty if no column has one."""
+    spans: list[tuple[str, int]] = []
+    for column in table.columns:
+        if spans and spans[-1][0] == column.group:
+            spans[-1] = (column.group, spans[-1][1] + 1)
+        else:
+            spans.append((column.group, 1))
+    if not any(group for group, _ in spans):
+        return ""
+    return "<tr>" + "".join(f'<th colspan="{n}">{escape(group)}</th>' for group, n in spans) + "</tr>"
+
+
+def themed(svg: str) -> str:
+    """Return a drawing whose colours of `PALETTE` are the page's variables, to be put into an HTML page."""
+    drawing = svg[svg.index("<svg") :]
+    return _COLOUR.sub(lambda colour: _VARIABLES[colour.group().lower()], drawing)
+
+
+# ---------------------------------------------------------------------- Markdown
+
+
+def markdown_page(document: Document, folder: str) -> tuple[str, dict[str, str]]:
+    """Return the document as Markdown, and the drawings that it refers to in `folder`, by file name."""
+    drawings: dict[str, str] = {}
+    lines = [f"# {document.title}", "", document.subtitle, ""]
+    for section in document.sections:
+        lines += [f"## {section.title}", ""]
+        for block in section.blocks:
+            if isinstance(block, Figure):
+                name = f"{_anchor(section)}-{len(drawings) + 1}.svg"
+                drawings[name] = block.svg
+                lines += [f"![{block.alt}]({folder}/{name})", "", f"*{block.caption}*", ""]
+            else:
+                lines += [*_markdown_block(block), ""]
+    return "\n".join(lines), drawings
+
+
+def _markdown_block(block: Paragraph | Bullets | Table | Conclusion) -> list[str]:
+    match block:
+        case Paragraph():
+            return [block.text]
+        case Bullets():
+            return [f"- {item}" for item in block.items]
+        case Conclusion():
+            return [f"> **{block.outcome}**: {block.reason}"]
+        case Table():
+            heads = [f"{c.group}: {c.heading}" if c.group else c.heading for c in block.columns]
+            aligned = ["---" if block.is_text(k) else "---:" for k in range(len(block.columns))]
+            rows = [
+                [column.shown(cell) for column, cell in zip(block.columns, row, strict=True)]
+                for row in block.rows
+            ]
+            return [f"**{block.caption}**", "", *(_row(cells) for cells in (heads, aligned, *rows))]
+
+
+def _row(cells: list[str]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
