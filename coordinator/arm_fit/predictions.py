@@ -1,6 +1,5 @@
-"""Torques of a recording as measured and as predicted: as a file, and as plots."""
+"""Torques of a recording as measured and as predicted, and their file."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,11 +12,6 @@ from coordinator.parameter_fit.base_parameters import BaseParameters
 from module_agent.model.chain import Array
 from module_agent.model.files import replacing
 from module_agent.model.read_only import make_read_only
-
-# Width and heights of a plot [px]; so many samples are drawn.
-_WIDTH, _HEIGHT, _RESIDUAL_HEIGHT, _DRAWN = 1000.0, 220.0, 80.0, 2000
-# Room for the legend above a plot and for the times below it, and how many of these are written.
-_LEGEND, _TIMES = 24.0, 6
 
 
 class Predictions(NamedTuple):
@@ -91,51 +85,3 @@ def write_matrices(path: Path, base: BaseParameters) -> None:
             summary=np.array([base.summary(i) for i in range(base.rank)]),
             parameters=np.array(base.columns.names),
         )
-
-
-def svg_plot(torques: Predictions, joint: int) -> str:
-    """Return a drawing of a joint's torque, measured and held-out prediction, with the residual below."""
-    step = max(1, len(torques.t_s) // _DRAWN)
-    measured, predicted = (signal[::step, joint] for signal in (torques.tau_nm, torques.held_out_nm))
-    residual = measured - predicted
-    top = float(np.nanmax(np.abs([measured, predicted]))) or 1.0
-    middle, below = _LEGEND + 0.5 * _HEIGHT, _LEGEND + _HEIGHT + 0.5 * _RESIDUAL_HEIGHT
-    scale = 0.5 * _HEIGHT / top
-    lines = [
-        (measured, middle, "black", "measured"),
-        (predicted, middle, "#d62728", "predicted"),
-        (residual, below, "#1f77b4", "residual"),
-    ]
-    drawn = [
-        f'<polyline fill="none" stroke="{colour}" points="{points}"/>'
-        for signal, zero, colour, _ in lines
-        for points in _polylines(zero - scale * np.clip(signal, -top, top))
-    ]
-    legend = [
-        f'<text x="{10 + 110 * k}" y="14" fill="{colour}">{name}</text>'
-        for k, (*_, colour, name) in enumerate(lines)
-    ]
-    bottom = _LEGEND + _HEIGHT + _RESIDUAL_HEIGHT
-    shares = np.linspace(0.0, 1.0, _TIMES)
-    times = [
-        f'<text x="{share * _WIDTH:.0f}" y="{bottom + 12:.0f}" text-anchor="{anchor}" fill="#666">'
-        f"{torques.t_s[round(share * (len(torques.t_s) - 1))]:.1f} s</text>"
-        for share, anchor in zip(shares, ["start", *["middle"] * (_TIMES - 2), "end"], strict=True)
-    ]
-    return (
-        f'<svg viewBox="0 0 {_WIDTH:.0f} {bottom + _LEGEND:.0f}" font-size="12">'
-        f'<text x="350" y="14">{torques.joints[joint]}: -{top:.3g} to {top:.3g} Nm</text>'
-        f'<path stroke="#bbb" d="M0 {middle}H{_WIDTH}M0 {below}H{_WIDTH}"/>'
-        f"{''.join([*legend, *times, *drawn])}</svg>"
-    )
-
-
-def _polylines(heights: Array) -> Sequence[str]:
-    """Return the points of a curve in parts between samples that are not numbers."""
-    x = np.linspace(0.0, _WIDTH, len(heights))
-    parts = np.split(np.arange(len(heights)), np.flatnonzero(np.diff(np.isnan(heights))) + 1)
-    return [
-        " ".join(f"{x[i]:.1f},{heights[i]:.1f}" for i in part)
-        for part in parts
-        if not np.isnan(heights[part[0]])
-    ]

@@ -14,10 +14,12 @@ from coordinator.arm_fit.fit import STEPS
 from coordinator.arm_fit.predictions import write_matrices, write_predictions
 from coordinator.arm_fit.problem import ModelChoice
 from coordinator.arm_fit.report import write_report
-from coordinator.commands.fit_dynamics_tables import html, notes, tables
+from coordinator.commands.fit_dynamics_tables import notes, page, tables
 from coordinator.commands.options import Quiet
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
 from coordinator.dynamics.drive_model import USUAL_TERMS
+from coordinator.report.pages import html_page
+from coordinator.report.plots import check_plots
 from coordinator.runtime.terminal import Terminal, print_table
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
@@ -139,6 +141,8 @@ def fit_dynamics(
 
     Exit codes: 0 done, 1 the recording does not determine the parameters, 2 a file or an option is wrong.
     """
+    if html_file is not None:
+        check_plots()
     _check_folders(json_file, html_file, predictions, matrices, fitted_urdf)
     numbers = count(1)
     try:
@@ -165,7 +169,7 @@ def fit_dynamics(
         if json_file is not None:
             write_report(json_file, fit.report)
         if html_file is not None:
-            write_text(html_file, html(fit.report, fit.torques))
+            write_text(html_file, html_page(page(fit.report, fit.torques)))
         if predictions is not None:
             write_predictions(predictions, fit.torques)
         if matrices is not None:

@@ -1,16 +1,17 @@
-"""The report of a recording as tables for the terminal."""
+"""The report of a recording as tables for the terminal, and as a page."""
 
 from collections.abc import Iterator
-from html import escape
-from io import StringIO
 
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from coordinator.arm_fit.payload import MAX_INCONSISTENCY_SIGMA
-from coordinator.arm_fit.predictions import Predictions, svg_plot
+from coordinator.arm_fit.predictions import Predictions
 from coordinator.arm_fit.report import ErrorPart, FitReport, Model, PayloadPart, TermPart
 from coordinator.parameter_fit.payload import EXPLAINED_BELOW
+from coordinator.report import document
+from coordinator.report.document import Document, Figure, Section
+from coordinator.report.plots import torque_plot
 from coordinator.runtime.terminal import figure, new_table
 
 _MODEL_WORDS: dict[Model, str] = {
@@ -21,7 +22,6 @@ _MODEL_WORDS: dict[Model, str] = {
     "drives_only": "friction and motors only",
     "mean": "constant mean",
 }
-_PAGE_WIDTH = 170
 _KINDS = (("filtered", "all"), ("filtered", "masked"), ("raw", "all"), ("raw", "masked"))
 
 
@@ -39,16 +39,39 @@ def tables(report: FitReport) -> Iterator[Table]:
     yield _bodies(report)
 
 
-def html(report: FitReport, torques: Predictions) -> str:
-    """Return a page with the notes, a plot of each joint and the tables."""
-    console = Console(record=True, width=_PAGE_WIDTH, file=StringIO())
-    for line in notes(report):
-        console.print(line, markup=False)
-    for table in tables(report):
-        console.print(table)
-    plots = "".join(svg_plot(torques, i) for i in range(len(torques.joints)))
-    title = f"<h1>{escape(report.data)}</h1><p>Torques of the half that was not fitted to.</p>{plots}"
-    return console.export_html(inline_styles=True).replace("<body>", f"<body>{title}", 1)
+def page(report: FitReport, torques: Predictions) -> Document:
+    """Return a document with the notes, a plot of each joint's torque and the tables.
+
+    Raises:
+        MissingPlots: matplotlib is not installed.
+    """
+    plots = [
+        Figure(
+            caption=f"{joint}: torque, and its prediction by the half that was not fitted to.",
+            alt=f"Measured and predicted torque of {joint} over time, with the residual below",
+            svg=torque_plot(torques.t_s, torques.tau_nm[:, k], torques.held_out_nm[:, k]),
+        )
+        for k, joint in enumerate(torques.joints)
+    ]
+    return Document(
+        title=report.data,
+        subtitle="Dynamics of the arm, fitted to recorded torques",
+        sections=(
+            Section(title="Recording and fit", blocks=(document.Bullets(items=tuple(notes(report))),)),
+            Section(title="Torques", blocks=tuple(plots)),
+            Section(title="Results", blocks=tuple(map(_document_table, tables(report)))),
+        ),
+    )
+
+
+def _document_table(table: Table) -> document.Table:
+    """Return a table of the terminal as one of a document."""
+    heads = [Text.from_markup(str(column.header)).plain for column in table.columns]
+    cells = [[Text.from_markup(str(cell)).plain for cell in column.cells] for column in table.columns]
+    right = [column.justify == "right" for column in table.columns]
+    columns = [document.Column(name=head, right=end) for head, end in zip(heads, right, strict=True)]
+    caption = Text.from_markup(str(table.title or "")).plain
+    return document.Table.of(caption, columns, list(zip(*cells, strict=True)))
 
 
 def notes(report: FitReport) -> Iterator[str]:

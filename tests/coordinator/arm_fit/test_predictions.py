@@ -2,13 +2,12 @@
 
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from coordinator.arm_fit.fit_dynamics import ArmFit, fit_dynamics
-from coordinator.arm_fit.predictions import svg_plot, write_matrices, write_predictions
+from coordinator.arm_fit.predictions import write_matrices, write_predictions
 from coordinator.arm_fit.problem import ModelChoice
 
 
@@ -50,20 +49,3 @@ def test_the_matrices_are_those_of_the_report(fit: ArmFit, tmp_path: Path) -> No
         np.testing.assert_allclose(np.sqrt(np.diagonal(file["covariance"])), [part.sigma for part in parts])
         assert file["grouping"].shape == (fit.report.fit.rank, fit.report.fit.parameters)
         assert file["parameters"][-1] == "Fc2+3"
-
-
-def test_a_plot_has_three_curves_within_its_frame(fit: ArmFit) -> None:
-    drawing = ElementTree.fromstring(svg_plot(fit.torques, 1))
-    curves = [curve.get("points", "").split() for curve in drawing.findall("polyline")]
-    # The prediction and the residual have a gap between the halves.
-    assert len(curves) == 5
-    places = np.array([point.split(",") for curve in curves for point in curve], dtype=float)
-    assert places.min() >= 0.0
-    width, height = map(float, drawing.get("viewBox", "").split()[2:])
-    assert places[:, 0].max() <= width
-    # Neither the legend above nor the times below are drawn over.
-    words = {float(text.get("y", "nan")) for text in drawing.findall("text")}
-    assert min(words) < places[:, 1].min()
-    assert places[:, 1].max() < max(words) <= height
-    times = [text.text for text in drawing.findall("text") if (text.text or "").endswith(" s")]
-    assert (times[0], times[-1]) == (f"{fit.torques.t_s[0]:.1f} s", f"{fit.torques.t_s[-1]:.1f} s")
