@@ -41,7 +41,7 @@ demo: $(STAMP)
 	@rm -rf runs/demo
 	@echo "Four modules identify their arm in real time: about two minutes."
 	$(BIN)/x5-sim run a2085_04 --network lan --out runs/demo
-	@echo "Look at it: $(BIN)/rerun runs/demo/session.rrd"
+	@echo "Read it: runs/demo/report.html; look at it: $(BIN)/rerun runs/demo/session.rrd"
 
 kinematics: $(STAMP)
 	@mkdir -p runs

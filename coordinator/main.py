@@ -5,6 +5,7 @@ from coordinator.runtime.command_line import lazy_app
 COMMANDS = {
     "run": ("run.run", "Identify a robot: topology, kinematic chain and inertia."),
     "replay": ("run.replay", "Compute a run's result again from its recording."),
+    "report": ("report.report", "Write the report of a run for people."),
     "list": ("list_modules.list_modules", "List the modules on the network."),
     "stop": ("list_modules.stop", "Stop every module of a robot at once."),
     "screenshot": ("screenshot.screenshot", "Render a recording as a PNG file."),

@@ -30,6 +30,9 @@ Speed = Annotated[
     float, typer.Option(help="Speed of a simulated world, relative to real time.", callback=check_speed)
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+WithReport = Annotated[
+    bool, typer.Option("--report/--no-report", help="Write a page for people, report.html, into the folder.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress.")]
 
 

@@ -7,12 +7,14 @@ from typing import Annotated
 import typer
 
 from coordinator.baseline.baseline_robot import BaselineRobot, baseline_within, measured_before_run
-from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed
+from coordinator.commands.options import ConnectOptions, Expect, PlanOptions, Speed, WithReport
 from coordinator.identification.identify import identify
 from coordinator.identification.result import DynamicsPart, Result
 from coordinator.live_robot.connection import Place, open_connection, sender_name
-from coordinator.recording.run_folder import load_recording
+from coordinator.recording.run_folder import REPORT, load_recording
 from coordinator.recording.session_file import SessionFileError
+from coordinator.report.plots import MissingPlots
+from coordinator.report.run_report import write_report
 from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
 from coordinator.runtime.event_loop import ScaledLoop, attend
 from coordinator.runtime.terminal import Terminal, new_table
@@ -49,6 +51,7 @@ def run(
     ] = 9090,
     resume: Annotated[bool, typer.Option(help="Continue the crashed run in --out.")] = False,
     speed: Speed = 1.0,
+    report: WithReport = True,
     advise: Annotated[
         bool, typer.Option("--advise/--no-advise", hidden=True, help="Say how to resume a run that ended.")
     ] = True,
@@ -68,17 +71,19 @@ def run(
         viewer=viewer_choice(viewer, serve_port),
         baseline=baseline,
         measured=tuple(measured or ()),
+        report=report,
     )
     advice = f"to resume: {resuming(context)}" if advise else ""
     with Terminal(at.quiet) as terminal:
         result, _ = run_attended(config, place, speed, terminal, advice)
     print_result(result, terminal)
-    terminal.console.print(f"written to {out}", markup=False, soft_wrap=True)
+    terminal.console.print(f"written to {out}{report_at(out)}", markup=False, soft_wrap=True)
 
 
 def replay(
     session: Annotated[Path, typer.Argument(help="A session.mcap.")],
     out: Annotated[Path | None, typer.Option(help="Folder for result.json [folder of the session].")] = None,
+    report: WithReport = True,
 ) -> None:
     """Compute the result of a run again from its recording, without a robot."""
     folder = out if out is not None else session.parent
@@ -88,7 +93,14 @@ def replay(
     identified = identify(recording, revise, measured=measured_before_run(session.parent, before))
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, identified)
-    print_result(identified.result, Terminal())
+    terminal = Terminal()
+    print_result(identified.result, terminal)
+    if report:
+        try:
+            write_report(folder, recording, identified.result)
+        except MissingPlots as error:
+            terminal.note(f"no report: {error}")
+    terminal.console.print(f"written to {folder}{report_at(folder)}", markup=False, soft_wrap=True)
 
 
 def run_attended(
@@ -114,8 +126,13 @@ def run_attended(
         return attend(loop, work.run()), work.robot
     except ENDINGS as error:
         end = ending(error)
-        ended = f"{end}; {work.standstill}; recorded up to here: {config.out}"
+        ended = f"{end}; {work.standstill}; recorded up to here: {config.out}{report_at(config.out)}"
         fail("\n".join((ended, advice)).rstrip(), end.exit_code)
+
+
+def report_at(folder: Path) -> str:
+    """Return where the report of a run is, as the end of a line; nothing if it has none."""
+    return f"; report: {folder / REPORT}" if (folder / REPORT).is_file() else ""
 
 
 def resuming(context: typer.Context) -> str:

@@ -12,7 +12,7 @@ from coordinator.recording.session_file import SessionFileError, read_session
 from module_agent.model.errors import UsageError
 from module_agent.wire.refusal import WireError
 
-SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION, CALIBRATION, MEASURED = (
+SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION, CALIBRATION, MEASURED, REPORT = (
     "session.mcap",
     "session.rrd",
     "result.json",
@@ -22,6 +22,7 @@ SESSION, VIEW, RESULT, URDF, HRDF, HELD_OUT, INFORMATION, CALIBRATION, MEASURED 
     "information.npz",
     "imu_calibration.npz",
     "measured.npz",
+    "report.html",
 )
 ASIDE = "session.crashed.mcap"
 

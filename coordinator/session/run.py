@@ -54,6 +54,8 @@ from coordinator.recording.run_folder import (
     open_run_folder,
 )
 from coordinator.recording.session_file import SessionWriter, read_session
+from coordinator.report.plots import MissingPlots
+from coordinator.report.run_report import write_report
 from coordinator.session.information_requests import InformationRequests
 from coordinator.session.session import Session
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION
@@ -79,6 +81,7 @@ class RunConfig(NamedTuple):
     baseline: the folder of an earlier run of this robot. Then all joints are moved at once, and one by one
     only those next to a difference from that run.
     measured: folders of runs or merges with some of the modules, whose IMUs are known as well as they tell.
+    report: write a page for people into the folder, of a run that ends early too.
     """
 
     robot: str
@@ -92,6 +95,7 @@ class RunConfig(NamedTuple):
     refined_previews: int | None = None
     baseline: Path | None = None
     measured: tuple[Path, ...] = ()
+    report: bool = False
 
 
 class Run:
@@ -322,10 +326,23 @@ class Run:
             self._writer.close()
             await self._await_preview()
             self._feed.close()
+            self._write_report()
             if self._messenger.dropped:
                 self._screen.note(
                     f"{self._messenger.dropped} messages were dropped unread: this machine is too slow"
                 )
+
+    def _write_report(self) -> None:
+        """Write the report of what there is; a run does not fail for lack of one."""
+        if not self._config.report or not self.recording.modules:
+            return
+        result = self._identified.result if self._identified is not None else None
+        try:
+            write_report(self._config.out, self.recording, result)
+        except MissingPlots as error:
+            self.note(f"no report: {error}")
+        except Exception:
+            logger.exception("the report of the run failed")
 
     async def _request_information(self) -> Kinematics | None:
         """Request the agents' torque information for the identified kinematics; return these kinematics.

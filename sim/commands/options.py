@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from coordinator.commands.options import WithReport
 from coordinator.recording.run_folder import RunFolderError, check_free
 from coordinator.runtime.event_loop import check_speed
 from module_agent.model.errors import UsageError
@@ -82,6 +83,7 @@ class LaunchOptions:
         int | None, typer.Option(min=1, help="Agent processes that share the modules [one for each module].")
     ] = None
     endpoint: Annotated[str, typer.Option(help="Zenoh endpoint of the coordinator.")] = DEFAULT_ENDPOINT
+    report: WithReport = True
 
     def check(self) -> None:
         """Check what is wrong before anything is started.

@@ -3,12 +3,14 @@
 import signal
 import time
 from functools import partial
+from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
 import typer
 
 from coordinator.commands.options import PlanOptions, Quiet
+from coordinator.recording.run_folder import REPORT
 from coordinator.runtime.command_line import ENDINGS, ending, fail, with_options
 from coordinator.runtime.event_loop import SIGNALS, Interruption, ignore_signals
 from coordinator.runtime.terminal import Terminal
@@ -52,9 +54,11 @@ def run(
         plan=motions.chosen(),
         refined_previews=MAX_REFINED_MODULES,
         out=launched.new_folder(robot),
+        report=launched.report,
     )
     _run_virtual(config, quiet)
     score_run(config.out)
+    _print_report(config.out)
 
 
 @with_options
@@ -85,6 +89,7 @@ def _launch(
     settings.choice().of(robot)
     plan = motions.chosen()
     settings.pushes_on(robot)
+    reported = () if launched.report else ("--no-report",)
     config = LaunchConfig(
         robot_file=settings.robot,
         robot_name=robot.name,
@@ -99,12 +104,13 @@ def _launch(
         imu_rate_hz=settings.imu_rate_hz,
         agent_options=("--imu", plan.imu),
         # The robot ends with this run, so that there is nothing to resume.
-        coordinator_options=("--no-advise", *coordinator_options, *motions.arguments()),
+        coordinator_options=("--no-advise", *reported, *coordinator_options, *motions.arguments()),
         out=launched.new_folder(robot),
     )
     _run_processes(config)
     add_truth(config.out, viewer, _note)
     score_run(config.out)
+    _print_report(config.out)
 
 
 def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
@@ -130,6 +136,11 @@ def _run_virtual(config: VirtualConfig, quiet: bool) -> None:
     typer.echo(
         f"{result.robot_time_s:.1f} s of robot time in {wall_s:.1f} s: {result.robot_time_s / wall_s:.1f} x"
     )
+
+
+def _print_report(out: Path) -> None:
+    if (out / REPORT).is_file():
+        typer.echo(f"report: {out / REPORT}")
 
 
 def _run_processes(config: LaunchConfig) -> None:

@@ -24,7 +24,7 @@ COORDINATOR = "coordinator"
 class VirtualConfig(NamedTuple):
     """Settings of a virtual run; all randomness follows from `seed`, and from `noise_seed` if given.
 
-    `baseline`, `measured` and `refined_previews` as in `RunConfig`; by default there is no preview.
+    `baseline`, `measured`, `report` and `refined_previews` as in `RunConfig`; by default there is no preview.
     `pushes` act on the robot from outside.
     """
 
@@ -40,6 +40,7 @@ class VirtualConfig(NamedTuple):
     pushes: tuple[Push, ...] = ()
     imu_rate_hz: float = 250.0
     measured: tuple[Path, ...] = ()
+    report: bool = False
 
 
 class SilentScreen:
@@ -84,6 +85,7 @@ def run_virtual(
                 refined_previews=config.refined_previews,
                 baseline=config.baseline,
                 measured=config.measured,
+                report=config.report,
             ),
             robot.endpoint(COORDINATOR),
             lambda: robot.loop.now_ns,

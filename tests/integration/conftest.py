@@ -194,7 +194,7 @@ def launcher(tmp_path: Path, endpoint: str, plan: Path, nothing_is_left: Path) -
             network=network,
             endpoint=endpoint,
             agent_options=("--lifetime-ms", str(lifetime_ms)),
-            coordinator_options=("--plan", str(plan), "--no-dynamics"),
+            coordinator_options=("--plan", str(plan), "--no-dynamics", "--no-report"),
         )
         made.append(Launcher(config, lambda text: None))
         return made[-1]

@@ -31,7 +31,7 @@ def test_processes_over_zenoh_find_what_virtual_time_finds_and_a_replay_finds_it
     programs, endpoint: str, plan: Path, tmp_path: Path
 ) -> None:
     real, virtual, again = tmp_path / "real", tmp_path / "virtual", tmp_path / "again"
-    options = ("--plan", str(plan), "--network", "lan", "--quiet")
+    options = ("--plan", str(plan), "--network", "lan", "--quiet", "--no-report")
     done = programs.run("sim.main", "run", ROBOT, "--out", str(real), "--endpoint", endpoint, *options)
     assert done.returncode == 0, done.stderr
     assert [name for name in FILES if not (real / name).is_file()] == []
@@ -45,7 +45,9 @@ def test_processes_over_zenoh_find_what_virtual_time_finds_and_a_replay_finds_it
     assert dynamics["gathered_by"] == "agents"
     assert dynamics["gathered_difference"] <= AGREES_BELOW
 
-    done = programs.run("coordinator.main", "replay", str(real / "session.mcap"), "--out", str(again))
+    done = programs.run(
+        "coordinator.main", "replay", str(real / "session.mcap"), "--out", str(again), "--no-report"
+    )
     assert done.returncode == 0, done.stderr
     assert (again / "result.json").read_bytes() == (real / "result.json").read_bytes()
 

@@ -97,7 +97,7 @@ def test_a_robot_whose_modules_are_hosts_of_their_own_recognises_itself_over_lin
         endpoint=f"tcp/{HUB}:{PORT}",
         # As in the other tests, for a busy machine; and a segment lost twice waits for TCP's timer of 0.2 s.
         agent_options=("--lifetime-ms", "800"),
-        coordinator_options=("--plan", str(plan), "--no-dynamics"),
+        coordinator_options=("--plan", str(plan), "--no-dynamics", "--no-report"),
         # The world is on no network: its bus is a socket in the file system, which all hosts share.
         within=lambda process: prefix_of.get(process, ()),
     )

@@ -16,6 +16,7 @@ def test_ctrl_c_stops_everything_and_keeps_what_was_recorded(
 ) -> None:
     out, log = tmp_path / "run", tmp_path / "log"
     command = [sys.executable, "-m", "sim.main", "launch", ROBOT, "--viewer", "none", "--no-dynamics"]
+    command += ["--no-report"]
     with log.open("wb") as output:
         launch = subprocess.Popen(
             [*command, "--out", str(out), "--plan", str(plan), "--endpoint", endpoint],

@@ -24,6 +24,7 @@ def _run(out: Path, plan: Plan, seed: int, hash_seed: str) -> str:
     durations = plan.model_dump(exclude_defaults=True, exclude={"dynamics"})
     settings.write_text("".join(f"{name} = {value}\n" for name, value in durations.items()))
     command = [sys.executable, "-m", "sim.main", "run", "thesis_171_horizontal", "--virtual", "--no-dynamics"]
+    command += ["--no-report"]
     done = subprocess.run(
         [
             *(*command, "--network", "wifi", "--seed", str(seed)),
