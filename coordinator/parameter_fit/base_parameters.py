@@ -194,7 +194,8 @@ def base_parameters(
         max_sigma: directions with a larger standard deviation, in `columns.scale`, are not determined
             (`MAX_SIGMA_KG`); inf keeps all that rounding allows.
         common_errors: (k, j) systematic errors of the target, each column one of one standard deviation
-            (`systematic_errors`). They widen the covariance.
+            (`systematic_errors`). They widen the covariance, and count towards `max_sigma`: two axes nearly
+            parallel show parameters only by the angle between them, which may be no larger than its error.
         tolerance: singular values that are smaller shares of the largest count as zero.
 
     Raises:
@@ -205,7 +206,8 @@ def base_parameters(
     common = np.zeros((len(rows), 0)) if common_errors is None else np.asarray(common_errors, dtype=float)
     _check(rows, measured, common, len(columns.names), sigma)
     whole = spectrum(rows * columns.scale)
-    kept = whole.determined(tolerance) & (whole.values > sigma / max_sigma)
+    error = np.hypot(sigma, np.linalg.norm(whole.left.T @ common, axis=1))
+    kept = whole.determined(tolerance) & (whole.values > error / max_sigma)
     values, space = whole.values[kept], whole.directions[kept]
     chosen = _independent(space, columns.preferred)
     # x = scale * y and y = space^T (space y): beta in units of scale is (space[:, chosen])^-1 space y.

@@ -98,12 +98,17 @@ def solve_instrumental_variables(
         left = tuple(without_used(piece, size, one.used) for piece, one in zip(rigid, tests, strict=True))
         fit = solve_weighted(left, independent_fraction, ESTIMATED_CHAIN_TOLERANCE)
         sigma = np.maximum(fit.torque_sigma_nm, 1e-3 * max(float(fit.torque_sigma_nm.max()), _MIN_NM))
-        accuracy = {"independent_fraction": independent_fraction, "tolerance": ESTIMATED_CHAIN_TOLERANCE}
-        informed = solve_information(left, 1.0 / sigma, prior_phi, **accuracy)
+        informed = solve_information(
+            left,
+            1.0 / sigma,
+            prior_phi,
+            independent_fraction=independent_fraction,
+            tolerance=ESTIMATED_CHAIN_TOLERANCE,
+        )
         moved = np.abs((informed.phi - phi) / parameter_scale(len(information))).max()
         phi, before = informed.phi, scale
         if scale_sigma:
-            scale = refine_scale(left, fit.phi, sigma, scale_sigma, so_far=scale, **accuracy)
+            scale = refine_scale(left, fit, sigma, scale_sigma, scale, independent_fraction)
         if max(moved, np.abs(scale.value - before.value).max()) < _SETTLED:
             break
     return InstrumentalFit(fit, _terms(rigid, tests, fit, independent_fraction), scale, phi, left)

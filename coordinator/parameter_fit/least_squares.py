@@ -77,6 +77,7 @@ def solve_information(
     max_sigma_kg: float = MAX_SIGMA_KG,
     independent_fraction: float = 1.0,
     tolerance: float = RANK_TOLERANCE,
+    effects: Sequence[Array] | None = None,
 ) -> InertialFit:
     """Fit `phi` to torques: prior + pinv(Y) (tau - Y prior), thesis eq. 29 with the pseudo-inverse.
 
@@ -90,6 +91,8 @@ def solve_information(
         independent_fraction: independent samples per sample, below 1 after a low-pass (2 cut-off / rate). It
             widens the covariance.
         tolerance: singular values that are smaller shares of the largest count as zero.
+        effects: (k_i, j) of every joint: effects of systematic errors, each one standard deviation, on its
+            rows (`systematic_errors`). They count towards `max_sigma_kg`; the covariance is that of noise.
 
     Raises:
         DataError: torques that say nothing, fewer samples than parameters, or noise that is not positive.
@@ -105,6 +108,9 @@ def solve_information(
     left = [block @ inverse for block in system.blocks]
     sigma = _residual(information, system, inverse @ along[kept], left)[1]
     variance = np.diagonal(spread(left, (sigma * system.weights) ** 2)) / independent_fraction
+    if effects is not None:
+        systematic = (w * u.T @ one for w, u, one in zip(system.weights, left, effects, strict=True))
+        variance = variance + np.sum(sum(systematic, np.zeros(())) ** 2, axis=1)
     kept[kept] = variance < (max_sigma_kg * whole.values[kept]) ** 2
     inverse = whole.inverse(kept)
     deviation = inverse @ along[kept]

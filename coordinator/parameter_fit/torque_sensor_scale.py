@@ -19,7 +19,8 @@ from scipy.linalg import block_diag
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.parameter_fit.base_parameters import whitened
-from coordinator.parameter_fit.spectrum import without_range
+from coordinator.parameter_fit.least_squares import InertialFit
+from coordinator.parameter_fit.spectrum import RANK_TOLERANCE, without_range
 from module_agent.model.catalogue import TorqueKind
 from module_agent.model.chain import Array
 from module_agent.model.information import JointInformation
@@ -60,30 +61,32 @@ def known_scale(joints: int) -> TorqueScale:
 
 def refine_scale(
     information: Sequence[JointInformation],
-    phi: Array,
+    fit: InertialFit,
     noise_nm: ArrayLike,
     prior_sigma: float,
     so_far: TorqueScale,
     independent_fraction: float,
-    tolerance: float,
 ) -> TorqueScale:
     """Return the scales of n joints' torque sensors.
 
     Args:
         information: per joint, with torques that were multiplied by 1 + `so_far.value`.
-        phi: (10 n,) the bodies that fit them best. noise_nm: (n,) of the torques.
+        fit: of the bodies that fit them best, without a prior. noise_nm: (n,) of the torques.
         prior_sigma: standard deviation of the prior of each scale; above zero.
         so_far: the estimate to start from.
         independent_fraction: independent samples per sample, below 1 after a low-pass.
-        tolerance: singular values that are smaller shares of the largest count as zero.
     """
     joints = len(information)
     weights = np.sqrt(independent_fraction) / np.asarray(noise_nm, dtype=float)
     rows, readings = whitened(information, noise_nm, independent_fraction)
-    predicted = [w * (piece.r @ phi) for w, piece in zip(weights, information, strict=True)]
+    predicted = [w * (piece.r @ fit.phi) for w, piece in zip(weights, information, strict=True)]
     columns = block_diag(*(one[:, None] for one in predicted))
-    rows = rows * parameter_scale(joints)
-    (slopes, target), _ = without_range(rows, tolerance, (columns, readings))
+    # The bodies may move along the directions that were fitted, no more and no fewer: what the fit has along
+    # any other would be taken for an error of the scales.
+    size = parameter_scale(joints)
+    shares, directions = np.linalg.eigh(fit.projector * size / size[:, None])
+    rows = rows * size @ directions[:, shares > 0.5]
+    (slopes, target), _ = without_range(rows, RANK_TOLERANCE, (columns, readings))
     curvature = slopes.T @ slopes + np.eye(joints) / prior_sigma**2
     covariance = np.asarray(np.linalg.inv(curvature), dtype=np.float64)
     change = -covariance @ (slopes.T @ target + so_far.value / prior_sigma**2)

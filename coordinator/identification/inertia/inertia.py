@@ -28,6 +28,8 @@ from coordinator.parameter_fit.instrumental_variables import (
     solve_instrumental_variables,
     without_used,
 )
+from coordinator.parameter_fit.least_squares import solve_information
+from coordinator.parameter_fit.spectrum import ESTIMATED_CHAIN_TOLERANCE
 from coordinator.parameter_fit.systematic_errors import chain_effects, scale_effects
 from coordinator.parameter_fit.torque_sensor_scale import OFFSET_SHARE, SCALE_SIGMA, scaled
 from coordinator.synchronisation.motion_windows import INDEPENDENT_FRACTION, RATE_HZ, Window, filtered_window
@@ -42,6 +44,7 @@ MOTION_SOURCES: tuple[MotionSource, ...] = get_args(MotionSource)
 BETTER_BY = 0.01
 # Directions with a smaller share of the rows are rounding; no fit uses them.
 _ROUNDING = 1e-10
+_MIN_NM = 1e-9
 
 _SOURCE_NAMES: dict[MotionSource, str] = {
     "encoders": "the encoders",
@@ -120,6 +123,11 @@ def find_inertia(robot: Robot, windows: Sequence[Window], asked: Answers | None 
         if _level(noise[source]) < _level(noise[best]) - BETTER_BY:
             best = source
     chosen, effects = _considered(robot, windows, by_encoders, fits[best], best)
+    sure = _without_unsure(chosen, effects, prior)
+    if sure.fit.rank < chosen.fit.rank:
+        # The effects of the chain's errors were those on bodies that are not believed any more.
+        chosen, effects = _considered(robot, windows, by_encoders, sure, best)
+        chosen = _without_unsure(chosen, effects, prior)
     return Inertia(chosen, best, noise, effects, shared)
 
 
@@ -210,6 +218,30 @@ def _considered(
     scale = scale_effects(bodies, fit.scale)
     chain = [piece.r[:, size:] for piece in left]
     return fit._replace(information=bodies), tuple(map(np.hstack, zip(scale, chain, strict=True)))
+
+
+def _without_unsure(fit: InstrumentalFit, effects: Sequence[Array], prior_phi: Array) -> InstrumentalFit:
+    """Return the fit without the combinations that the chain's or the sensors' errors hide.
+
+    Two axes that are nearly parallel show a parameter by the angle between them alone. The noise of the
+    torques may be small enough for it where the angle is not known.
+    """
+    noise = fit.fit.torque_sigma_nm
+    weights = 1.0 / np.maximum(noise, 1e-3 * max(float(noise.max()), _MIN_NM))
+    by_torques, informed = (
+        solve_information(
+            fit.information,
+            weights,
+            prior,
+            independent_fraction=INDEPENDENT_FRACTION,
+            tolerance=ESTIMATED_CHAIN_TOLERANCE,
+            effects=effects,
+        )
+        for prior in (None, prior_phi)
+    )
+    if by_torques.rank == fit.fit.rank:
+        return fit
+    return fit._replace(fit=by_torques, informed_phi=informed.phi)
 
 
 def _offsets_nm(robot: Robot, fit: InstrumentalFit) -> Array:

@@ -180,6 +180,24 @@ def test_a_direction_in_the_noise_is_none_of_the_base_parameters(rng: Generator)
     assert base_parameters(*rows, inertial_columns(2), max_sigma=0.3).rank == 6
 
 
+def test_a_direction_that_the_errors_of_axes_hide_is_none_of_the_base_parameters(rng: Generator) -> None:
+    # Axes 1 mrad from parallel, and known no better than that: quiet torques do not make up for it.
+    almost = np.array([0.0, 1.0, 1e-3])
+    axis = np.array([[0.0, 1.0, 0.0], almost / np.linalg.norm(almost)])
+    chain = chain_of((-1, 0), axis, rng.uniform(-0.3, 0.3, (2, 3)))
+    phi, signals = bodies(rng, 2), motion(rng, 200, 2)
+    parallel = chain._replace(axis=np.array([[0.0, 1.0, 0.0]] * 2))
+    tau = inverse_dynamics(chain, phi, *signals)
+    change = inverse_dynamics(parallel, phi, *signals) - tau
+    pieces = gather(chain, *signals, tau + 1e-4 * rng.normal(size=tau.shape))
+    effects = [gather(chain, *signals, change)[i].z[:, None] for i in range(2)]
+    rows, noise = whitened(pieces, np.full(2, 1e-4)), whitened_effects(effects, np.full(2, 1e-4))
+    quiet = base_parameters(*rows, inertial_columns(2), max_sigma=0.3)
+    assert quiet.rank == 8
+    # One direction of errors hides one direction of parameters.
+    assert base_parameters(*rows, inertial_columns(2), max_sigma=0.3, common_errors=noise).rank == 7
+
+
 def test_noise_may_leave_no_base_parameter_at_all(rng: Generator) -> None:
     signals = motion(rng, 200, 1)
     pieces = gather(random_tree(rng, 1), *signals, rng.normal(size=(200, 1)))

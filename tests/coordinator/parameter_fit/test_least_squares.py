@@ -168,6 +168,23 @@ def test_a_direction_that_the_noise_hides_is_not_called_identified(rng: Generato
     assert np.linalg.norm(other @ (hidden.phi - truth)) < 0.05 * np.linalg.norm(other @ truth)
 
 
+def test_a_direction_that_systematic_errors_hide_is_not_called_identified(rng: Generator) -> None:
+    """Noise averages out over the samples; an effect of a chain's error, common to all of them, does not."""
+    chain = one_joint([0.0, 1.0, 0.0])
+    y = torque_regressor(chain, *motion(rng, 500, 1))
+    information = compress(y, y @ bodies(rng, 1) + 1e-3 * rng.normal(size=(500, 1)))
+    plain = solve_information(information)
+    weakest = plain.singular_values[plain.rank - 1]
+    left = information[0].r * SCALE @ np.linalg.svd(information[0].r * SCALE)[2][plain.rank - 1] / weakest
+    for size_kg, rank in ((0.2, plain.rank), (0.4, plain.rank - 1)):
+        effect = size_kg * weakest * left[:, None]
+        found = solve_information(information, max_sigma_kg=0.3, effects=[effect])
+        assert found.rank == rank
+        # The claim is that of the noise alone: systematic errors are added to base parameters.
+        if rank == plain.rank:
+            np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-9, atol=1e-15)
+
+
 def test_information_merges_exactly_in_any_order_and_does_not_grow(rng: Generator) -> None:
     chain = tree(rng, (-1, 0, 1))
     parts = [motion(rng, samples, 3) for samples in (7, 150, 90)]

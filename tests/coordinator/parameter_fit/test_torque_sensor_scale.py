@@ -5,7 +5,8 @@ import pytest
 from numpy.random import Generator
 
 from coordinator.parameter_fit.instrumental_variables import InstrumentalFit, solve_instrumental_variables
-from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, scaled
+from coordinator.parameter_fit.least_squares import solve_information
+from coordinator.parameter_fit.torque_sensor_scale import TorqueScale, known_scale, refine_scale, scaled
 from module_agent.model.chain import Array
 from module_agent.model.information import compress
 from module_agent.model.regressor import torque_regressor
@@ -79,3 +80,19 @@ def test_the_root_of_a_covariance_is_one(rng: Generator) -> None:
     half = rng.normal(size=(3, 3))
     scale = TorqueScale(np.zeros(3), half @ half.T)
     np.testing.assert_allclose(scale.root @ scale.root.T, scale.covariance, rtol=1e-10, atol=1e-12)
+
+
+def test_bodies_that_torques_hardly_show_are_not_taken_for_scales(rng: Generator) -> None:
+    """Axes 3 mrad off parallel show further parameters; their torques are no evidence about the scales."""
+    robot = load_robot("a2085_06")
+    chain, phi = true_chain(robot), true_inertia(robot).ravel()
+    joints, noise = 6, 1e-4 * np.array([30.0, 30.0, 20.0, 3.0, 2.0, 2.0])
+    axis = chain.axis + 3e-3 * rng.normal(size=(joints, 3))
+    chain = chain._replace(axis=axis / np.linalg.norm(axis, axis=1, keepdims=True))
+    signals = rng.normal(size=(3, 2000, joints)) * np.array([1.0, 1.0, 4.0])[:, None, None]
+    rigid = torque_regressor(chain, *signals)
+    rows = compress(rigid, rigid @ phi + noise * rng.normal(size=(2000, joints)))
+    fit = solve_information(rows, 1.0 / noise, max_sigma_kg=np.inf)
+    assert fit.rank == 38
+    scale = refine_scale(rows, fit, noise, PRIOR, known_scale(joints), 1.0)
+    assert (np.abs(scale.value) < 3.0 * scale.sigma).all()
