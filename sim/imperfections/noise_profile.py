@@ -97,9 +97,7 @@ class NoiseProfile(Strict):
 
 
 _BODY = ("friction", "gear-loss", "heat", "base-shake", "link-flex")
-# Without "housing-axis": axes that are parallel but for 1 mrad leave inertial parameters between known and
-# unknown, which the inertia's cases are not ready for.
-_BUILT = ("imu-place", "imu-mounting", "body-mass", "body-centre")
+_BUILT = ("imu-place", "imu-mounting", "body-mass", "body-centre", "housing-axis")
 _X5 = (
     *_BODY,
     *_BUILT,

@@ -90,7 +90,7 @@ def _weighed(trial: Trial) -> InertiaTrial:
         seed,
         "",
         rank=20,
-        max_rank=20,
+        designed_rank=20,
         sigmas_off=(0.5,) * 20,
         largest=(0.001,) * 10,
         largest_sigma=(0.002,) * 10,

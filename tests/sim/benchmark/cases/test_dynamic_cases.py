@@ -51,7 +51,7 @@ def test_the_full_benchmark_monitors_for_an_hour_and_tries_everything_several_ti
 def inertia(**changed: Any) -> InertiaTrial:
     good: dict[str, Any] = {
         "rank": 36,
-        "max_rank": 36,
+        "designed_rank": 36,
         "sigmas_off": (0.5, -1.0, 2.0),
         "largest": (0.001, 0.002),
         "largest_sigma": (0.001, 0.002),
