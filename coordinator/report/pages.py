@@ -65,7 +65,8 @@ th, td {{ text-align: left; padding: .2rem .9rem .2rem 0; border-bottom: 1px sol
   vertical-align: top; }}
 th {{ color: var(--muted); font-weight: 500; vertical-align: bottom; }}
 td:first-child {{ white-space: nowrap; }}
-.n {{ text-align: right; white-space: nowrap; }} th[colspan] {{ text-align: center; }}
+.n {{ text-align: right; white-space: nowrap; }} th.n {{ white-space: normal; }}
+th[colspan] {{ text-align: center; }}
 figure {{ margin: 1rem 0 1.4rem; break-inside: avoid; }}
 figure svg {{ width: 100%; height: auto; display: block; }}
 figcaption {{ font-size: .87rem; color: var(--muted); }}

@@ -226,7 +226,9 @@ def _findings(run: RunData) -> Section:
     if notes:
         blocks.append(Bullets(items=tuple(notes)))
     if not blocks:
-        blocks.append(Paragraph(text="No sensor and no link contradicts the model; there are no notes."))
+        none = "No sensor and no link contradicts the model; there are no notes."
+        unchecked = "The run ended before sensors and links were checked against a model."
+        blocks.append(Paragraph(text=unchecked if run.result is None else none))
     return Section(title="Findings", blocks=tuple(blocks))
 
 

@@ -218,6 +218,8 @@ def test_a_run_that_ended_early_is_reported_as_far_as_it_came(folder: Path, tmp_
     assert "ended before it had a result" in document.subtitle
     titles = [section.title for section in document.sections]
     assert titles == ["Summary", "Joints so far", "Findings", "Network and clocks", "Events"]
+    # Nothing is claimed about what was not computed.
+    assert "contradicts" not in html_page(document)
     (estimates,) = tables(document.section("Joints so far"))
     pairs = list(zip(column(estimates, "joint that moved"), column(estimates, "module"), strict=True))
     assert pairs == sorted(run.recording.estimates)
