@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import ValidationError
 from scipy.linalg import null_space
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from coordinator.arm_fit.problem import Problem
 from coordinator.arm_fit.report import FitReport, InformationPart, JointPlacePart, PayloadPart
@@ -188,7 +188,7 @@ def _payload_part(
         undetermined=[name for name, one in zip(_NAMES, known, strict=True) if not one],
         misfit=estimate.misfit / estimate.freedom,
         consistent=is_consistent(pseudo_inertia(psi)),
-        inconsistency_sigma=float(norm.isf(0.5 * max(chi2.sf(worse, PER_BODY), _SMALLEST_CHANCE))),
+        inconsistency_sigma=float(-ndtri(0.5 * max(chdtrc(PER_BODY, worse), _SMALLEST_CHANCE))),
         rigid_body=body_part(body(pseudo_inertia(solution.x))),
     )
 

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import UNKNOWN_ABOVE, Refinement, refine_chain, with_placement
@@ -120,7 +120,7 @@ class LinkChange(NamedTuple):
     @property
     def chance(self) -> float:
         """The probability that chance alone gains as much for this one link."""
-        return float(chi2.sf(self.gain, self.seen)) if self.seen else 1.0
+        return float(chdtrc(self.seen, max(self.gain, 0.0))) if self.seen else 1.0
 
     @property
     def length_m(self) -> float:
@@ -263,5 +263,5 @@ def _would_find(change: LinkChange, chance: float) -> float:
     if not change.seen:
         return float("nan")
     # Noise takes away as often as it adds: two sigmas more are found in 98 of 100.
-    needed = float(np.sqrt(chi2.isf(chance, change.seen))) + 2.0
+    needed = float(np.sqrt(chdtri(change.seen, chance))) + 2.0
     return needed * float(np.sqrt(np.linalg.eigvalsh(change.covariance[3:, 3:]).max()))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from coordinator.baseline.baseline_robot import BaselineRobot, shortened_settings
 from coordinator.baseline.change_detection import Findings, find_changes, tied_fits
@@ -170,7 +170,7 @@ def _links(chain: Chain, findings: Findings) -> list[LinkCheck]:
                 rotation_deg=triple(np.degrees(change.rotation_rad)),
                 rotation_sigma_deg=triple(np.degrees(sigma[:3])),
                 false_alarm_probability=alarm,
-                sigmas=float(norm.isf(0.5 * max(alarm, 1e-300))),
+                sigmas=float(-ndtri(0.5 * max(alarm, 1e-300))),
                 unseen=[_direction(row) for row in change.unseen],
                 would_find_mm=1e3 * limit_m if np.isfinite(limit_m) else None,
             )

@@ -9,7 +9,7 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from coordinator.dynamics.pseudo_inertia import parameter_scale
 from coordinator.monitoring.contact import Contact
@@ -170,7 +170,7 @@ def _load(
 def explains(reference: Reference, load: LoadShift) -> bool:
     """Return whether a payload on one body is all that has changed of the torques."""
     freedom = PER_BODY * max(len(reference.chain.serials) - 1, 1)
-    return load.left < float(chi2.isf(1.0 / ONE_IN, freedom)) + 0.1 * load.gain
+    return load.left < float(chdtri(freedom, 1.0 / ONE_IN)) + 0.1 * load.gain
 
 
 def weighed(

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import qr
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from module_agent.model.chain import Array
 from module_agent.model.read_only import make_read_only, read_only
@@ -131,7 +131,7 @@ def gain_above(freedom: int, tests_per_hour: float, alarms_per_hour: float) -> f
 
     Tests that overlap in time are counted as if they did not: alarms are rarer than asked for, not more.
     """
-    return float(chi2.isf(min(alarms_per_hour / tests_per_hour, 1.0), freedom))
+    return float(chdtri(freedom, min(alarms_per_hour / tests_per_hour, 1.0)))
 
 
 def _explained(columns: Array, target: Array) -> Change:

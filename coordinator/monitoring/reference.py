@@ -10,7 +10,7 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.batch_estimation.estimator import with_placement
@@ -215,7 +215,7 @@ def _calibrated(
 ) -> BaselineTest:
     """Return what all windows say, and by how much the tests of each against the others exceed chance."""
     # The median of the largest gain that chance makes in as many tests.
-    expected = [chi2.isf(0.5 / (len(windows) * len(changes)), change.shape[1]) for change in changes]
+    expected = [chdtri(change.shape[1], 0.5 / (len(windows) * len(changes))) for change in changes]
     largest = 1.0
     for k, window in enumerate(windows):
         found = find_change(joined([*windows[:k], *windows[k + 1 :]]), window, prior_sigma, changes)

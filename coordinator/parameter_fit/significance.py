@@ -6,7 +6,7 @@ freedom) if the parameter is zero (Draper and Smith 1998, Applied regression ana
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from module_agent.model.chain import Array
 
@@ -37,4 +37,4 @@ def chance_of(f: float, freedom: float) -> float:
         f: of `f_statistic`.
         freedom: independent samples less fitted parameters; below 1 counts as 1.
     """
-    return float(f_distribution.sf(f, 1, max(1.0, freedom)))
+    return float(fdtrc(1, max(1.0, freedom), f))

@@ -2,7 +2,6 @@
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import convolve1d
 
 from module_agent.model.errors import DataError
 from module_agent.model.read_only import read_only
@@ -42,4 +41,5 @@ def gaussian_filter(
         raise DataError(f"{values.shape[0]} samples: a filter of {taps} taps needs at least {half + 1}")
     widths = [(half, half)] + [(0, 0)] * (values.ndim - 1)
     padded = np.pad(values, widths, mode="reflect", reflect_type="odd")
-    return read_only(convolve1d(padded, weights, axis=0)[half : half + len(values)])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, taps, axis=0)
+    return read_only(np.asarray(windows @ weights))

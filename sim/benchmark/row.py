@@ -5,7 +5,7 @@ from math import isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 # A range of per cent in which the share of 95 % intervals that cover must lie.
 COVERAGE = (92.0, 98.0)
@@ -85,7 +85,7 @@ def widened(limit: float, terms: int) -> float:
 
     terms: how many independent normal errors it is of, three of every place.
     """
-    return max(limit, float(np.sqrt(chi2.isf(0.01, terms) / terms))) if terms else limit
+    return max(limit, float(np.sqrt(chdtri(terms, 0.01) / terms))) if terms else limit
 
 
 def scaled(value: float | None, factor: float) -> float | None:

@@ -10,7 +10,7 @@ from statistics import median
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammainccinv, gammaincinv
 
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.segment import RobotMotion
@@ -83,8 +83,8 @@ class Alarms(NamedTuple):
     def interval_per_hour(self, confidence: float = 0.95) -> tuple[float, float]:
         """Return the confidence interval of the rate, for Poisson counts (Garwood 1936)."""
         tail = 0.5 * (1.0 - confidence)
-        low = 0.5 * chi2.ppf(tail, 2 * self.alarms) if self.alarms else 0.0
-        high = 0.5 * chi2.isf(tail, 2 * self.alarms + 2)
+        low = gammaincinv(self.alarms, tail) if self.alarms else 0.0
+        high = gammainccinv(self.alarms + 1, tail)
         return 3600.0 * float(low) / self.monitored_s, 3600.0 * float(high) / self.monitored_s
 
 
