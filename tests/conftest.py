@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from _pytest.nodeid import NodeId
 from numpy.random import Generator
 
 from coordinator.excitation.plan import Plan
@@ -19,28 +18,12 @@ from tests import random_chains
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Begin with the processes in real time: they stay on one worker and take longest."""
-    # An option of workers only.
-    if getattr(config.option, "loadgroup", False):
-        for item in items:
-            name_group(item)
 
     def later(item: pytest.Item) -> bool:
         group = item.get_closest_marker("xdist_group")
         return group is None or group.args != ("integration",)
 
     items.sort(key=later)
-
-
-def name_group(item: pytest.Item) -> None:
-    """Append a test's group to its id, by which `--dist loadgroup` keeps the group on one worker.
-
-    xdist 3.8 does so in a field that pytest 9.2 no longer reads: without this every worker would make all
-    recordings that a group shares (pytest-xdist issue 1386).
-    """
-    groups = {str(mark.args[0]) for mark in item.iter_markers("xdist_group")}
-    suffix = "@" + "_".join(sorted(groups))
-    if groups and not item.nodeid.endswith(suffix):
-        item._id = NodeId.parse(item.nodeid + suffix)
 
 
 @pytest.fixture
@@ -132,7 +115,7 @@ def known_folder(tmp_path: Path) -> Callable[..., Path]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def quick_plan() -> Plan:
     """Half the thesis' durations: enough for topology, kinematics and every fault."""
     return Plan(
