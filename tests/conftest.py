@@ -17,11 +17,13 @@ from tests import random_chains
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with the processes in real time: they stay on one worker and take longest."""
+    """Begin with what takes longest: processes in real time, which stay on one worker, and whole sessions."""
 
-    def later(item: pytest.Item) -> bool:
+    def later(item: pytest.Item) -> int:
         group = item.get_closest_marker("xdist_group")
-        return group is None or group.args != ("integration",)
+        if group is not None and group.args == ("integration",):
+            return 0
+        return 1 if item.path.parent.name == "simulation" or item.path.name == "test_examples.py" else 2
 
     items.sort(key=later)
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from coordinator.monitoring.momentum_observer import MomentumObserver
 from coordinator.monitoring.segments import Block
 from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.chain import Array, Chain
+from module_agent.signals.filtering import leaky_sum
 
 # What lasts longer than that is no blow.
 LASTING_S = 0.8
@@ -81,8 +81,8 @@ class FastPart:
         """Return the fast part of the next samples."""
         if self._slow is None:
             self._slow = signal[0].copy()
-        slow, end = lfilter([1.0 - _KEEP], [1.0, -_KEEP], signal, axis=0, zi=(_KEEP * self._slow)[None])
-        self._slow = end[0] / _KEEP
+        slow = leaky_sum((1.0 - _KEEP) * signal, _KEEP, self._slow)
+        self._slow = slow[-1]
         return np.asarray(signal - slow)
 
 

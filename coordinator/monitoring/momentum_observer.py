@@ -14,12 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.signal import lfilter
 
 from coordinator.synchronisation.motion_windows import RATE_HZ
 from module_agent.model.chain import Array, Chain
-from module_agent.model.read_only import read_only
 from module_agent.model.regressor import inverse_dynamics
+from module_agent.signals.filtering import leaky_sum
 
 # Of 8 Hz: two thirds of a blow's torque are there after 20 ms.
 GAIN_HZ = 50.0
@@ -31,7 +30,7 @@ _AHEAD_S = 1e-3
 class _State(NamedTuple):
     momentum: Array
     drive: Array
-    filtered: Array
+    outside: Array
 
 
 class MomentumObserver:
@@ -60,11 +59,9 @@ class MomentumObserver:
         pushed = moved - 0.5 * _STEP_S * (drives[1:] + drives[:-1])
         if begins:
             pushed[0] = 0.0
-        outside, filtered = lfilter(
-            [1.0], [1.0, -(1.0 - GAIN_HZ * _STEP_S)], GAIN_HZ * pushed, axis=0, zi=before.filtered[None]
-        )
-        self._state = _State(momentum[-1], drive[-1], filtered[0])
-        return read_only(np.asarray(outside))
+        outside = leaky_sum(GAIN_HZ * pushed, 1.0 - GAIN_HZ * _STEP_S, before.outside)
+        self._state = _State(momentum[-1], drive[-1], outside[-1])
+        return outside
 
     def _carried(self, q: Array, qd: Array) -> Array:
         """Return C^T qd - g."""

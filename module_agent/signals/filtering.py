@@ -166,6 +166,15 @@ def _second_order(numerator: Array, denominator: Array, signal: Array) -> Array:
     return np.asarray(solved)
 
 
+def leaky_sum(signal: ArrayLike, keep: float, before: ArrayLike) -> Array:
+    """Return y_k = x_k + keep y_(k-1) of (m, n) samples, m > 0, where y_(-1) is `before` (n,); read-only."""
+    driven = np.array(signal, dtype=float)
+    driven[0] += keep * np.asarray(before, dtype=float)
+    bands = np.repeat([[1.0], [-keep]], len(driven), axis=1)
+    solved, _ = dtbtrs(bands, driven, uplo="L", diag="U")
+    return read_only(np.asarray(solved))
+
+
 def settling_samples(rate_hz: float, cutoff_hz: float) -> int:
     """Return how many samples at either end the low-pass has not settled: its response is then below 1 %."""
     # The slowest poles of the fourth-order filter decay as exp(-0.38 * 2 pi fc t): 2 periods leave 0.8 %.

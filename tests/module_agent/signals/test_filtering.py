@@ -6,13 +6,14 @@ import sys
 import numpy as np
 import pytest
 from numpy.random import Generator
-from scipy.signal import butter, sosfiltfilt
+from scipy.signal import butter, lfilter, sosfiltfilt
 
 from module_agent.model.errors import DataError
 from module_agent.signals.filtering import (
     FILTER_ORDER,
     differentiate,
     filtered_motion,
+    leaky_sum,
     resample,
     settling_samples,
     zero_phase_low_pass,
@@ -135,9 +136,16 @@ def test_the_low_pass_is_the_one_of_scipy(rng: Generator, samples: tuple[int, ..
     np.testing.assert_allclose(zero_phase_low_pass(signal, RATE_HZ, cutoff_hz), expected, rtol=1e-11)
 
 
+@pytest.mark.parametrize("samples", [1, 2, 500])
+def test_a_leaky_sum_goes_on_from_what_was_before(rng: Generator, samples: int) -> None:
+    signal, before = rng.normal(size=(samples, 3)), rng.normal(size=3)
+    expected, _ = lfilter([1.0], [1.0, -0.8], signal, axis=0, zi=0.8 * before[None])
+    np.testing.assert_allclose(leaky_sum(signal, 0.8, before), expected, rtol=1e-13, atol=1e-14)
+
+
 def test_agents_start_without_what_takes_scipy_longest_to_load() -> None:
-    """`scipy.signal` and `scipy.stats` take 0.3 to 0.4 s of 1.1 s, in every process of a robot."""
-    code = "import sys, module_agent.host, coordinator.session.session; print(*sys.modules)"
+    """`scipy.signal` and `scipy.stats` take 0.3 to 0.4 s of 1.1 s in every process."""
+    code = "import sys, module_agent.host, sim.commands.run, sim.commands.benchmark; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "module_agent.host" in loaded.split()
     assert not {"scipy.signal", "scipy.stats"} & set(loaded.split())
