@@ -8,7 +8,9 @@ import numpy as np
 
 from module_agent.wire.codec import MAX_MESSAGE_BYTES
 from module_agent.wire.keys import ROOT, Leaf, key
+from module_agent.wire.messages import Status
 from module_agent.wire.topics import PUBLISHED_TO_MODULE, SERVED, TOPICS
+from sim.processes.launcher import Child
 from sim.scoring.score import score
 from sim.world.truth import read_motion
 
@@ -47,14 +49,41 @@ def grown(commander, serials: tuple[str, ...], before: dict[str, Counter[str]]) 
 
 def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, client, programs) -> None:
     robot = launcher()
-    serials, name = robot.config.serials, robot.config.robot_name
-    commander = client(name, hub=True)
+    commander = client(robot.config.robot_name, hub=True)
     robot.start_world()
     agents = robot.start_agents()
+    serials = robot.config.serials
     commander.meet(serials, *agents)
     for serial in serials:
         commander.acquire(serial)
     began = {s: commander.status(s) for s in serials}
+    throw_all(robot.config.robot_name, commander, serials, agents, began)
+    now = {s: commander.status(s) for s in serials}
+    for serial in serials:
+        assert now[serial].state == "armed"
+        assert now[serial].expiries == 0
+        assert now[serial].motion is None
+        assert now[serial].boot == began[serial].boot
+    for serial in serials:
+        release = commander.ask(serial, Leaf.LEASE, commander.lease_message(serial, "release"), commander.Ack)
+        assert release.accepted
+
+    code, said = programs.ended(robot.start_coordinator(quiet=True))
+    assert code == 0, said
+    robot.stop()
+    truth = read_motion(robot.config.out / "truth.npz")
+    for index, serial in enumerate(truth.serials):
+        clock = truth.clock_ns[:, index]
+        during = (clock >= began[serial].t_ns) & (clock <= now[serial].t_ns)
+        # Held still: what is left is the hold's own noise.
+        assert np.ptp(truth.q_rad[during, index]) < 1e-3
+    assert score(robot.config.out).topology_correct
+
+
+def throw_all(
+    name: str, commander, serials: tuple[str, ...], agents: list[Child], began: dict[str, Status]
+) -> None:
+    """Send all kinds of garbage while the robot is held; each is counted by its reason."""
 
     def hold() -> None:
         for serial in serials:
@@ -97,24 +126,3 @@ def test_garbage_on_every_key_is_counted_by_reason_and_moves_nothing(launcher, c
     for size in (MAX_MESSAGE_BYTES + 1, 2 << 20):
         throw(key(name, serials[0], Leaf.FEEDBACK), bytes(size))
         throw(key(name, serials[1], Leaf.SETPOINT), bytes(size))
-
-    now = {s: commander.status(s) for s in serials}
-    for serial in serials:
-        assert now[serial].state == "armed"
-        assert now[serial].expiries == 0
-        assert now[serial].motion is None
-        assert now[serial].boot == began[serial].boot
-    for serial in serials:
-        release = commander.ask(serial, Leaf.LEASE, commander.lease_message(serial, "release"), commander.Ack)
-        assert release.accepted
-
-    code, said = programs.ended(robot.start_coordinator(quiet=True))
-    assert code == 0, said
-    robot.stop()
-    truth = read_motion(robot.config.out / "truth.npz")
-    for index, serial in enumerate(truth.serials):
-        clock = truth.clock_ns[:, index]
-        during = (clock >= began[serial].t_ns) & (clock <= now[serial].t_ns)
-        # Held still: what is left is the hold's own noise.
-        assert np.ptp(truth.q_rad[during, index]) < 1e-3
-    assert score(robot.config.out).topology_correct

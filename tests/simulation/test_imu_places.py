@@ -46,19 +46,6 @@ class Session(NamedTuple):
     alone: Kinematics
 
 
-PLAN = Plan(
-    imu="calibrated",
-    dynamics=False,
-    discover_s=0.3,
-    link_s=0.3,
-    settle_s=0.3,
-    rest_s=1.0,
-    travel_speed_rad_s=1.5,
-    sine_centre_s=1.2,
-    sine_sigma_s=0.5,
-)
-
-
 def _robot() -> Robot:
     """The kit arm with modules unlike their catalogue, the elbow's IMU 2 mm off its place."""
     robot = load_robot("a2085_03")
@@ -67,12 +54,17 @@ def _robot() -> Robot:
     return as_built(robot.model_copy(update={"modules": (*others, displaced)}), SEED, NOISE)
 
 
-def _recorded(robot: Robot, day: int) -> Recording:
-    return record_session(VirtualSettings(robot, PROFILES["lan"], SEED, NOISE, noise_seed=day), PLAN)
+@pytest.fixture(scope="module")
+def plan(quick_plan: Plan) -> Plan:
+    return quick_plan.model_copy(update={"imu": "calibrated"})
+
+
+def _recorded(robot: Robot, day: int, plan: Plan) -> Recording:
+    return record_session(VirtualSettings(robot, PROFILES["lan"], SEED, NOISE, noise_seed=day), plan)
 
 
 @pytest.fixture(scope="module")
-def assemblies() -> dict[str, Session]:
+def assemblies(plan: Plan) -> dict[str, Session]:
     """The elbow as the last module, mounted the other way round, and in the middle."""
     robot = _robot()
     *others, elbow = robot.modules
@@ -84,7 +76,7 @@ def assemblies() -> dict[str, Session]:
     }
     sessions = {}
     for day, (name, one) in enumerate(robots.items()):
-        recording = _recorded(one, day)
+        recording = _recorded(one, day, plan)
         sessions[name] = Session(one, recording, identify_kinematics(recording))
     return sessions
 
@@ -142,10 +134,12 @@ def test_in_either_order_the_truth_is_covered_and_a_session_adds_what_it_does_al
     np.testing.assert_allclose(within, alone, rtol=0.3, atol=0.1 * PLACE_SIGMA_M**-2)
 
 
-def test_a_run_that_began_with_earlier_ones_is_complete_and_a_replay_the_same(tmp_path: Path) -> None:
+def test_a_run_that_began_with_earlier_ones_is_complete_and_a_replay_the_same(
+    plan: Plan, tmp_path: Path
+) -> None:
     robot = load_robot("thesis_171_vertical")
     for day, (name, measured) in enumerate({"first": (), "second": (tmp_path / "first",)}.items()):
-        config = VirtualConfig(robot, tmp_path / name, SEED, noise=NOISE, plan=PLAN, noise_seed=day)
+        config = VirtualConfig(robot, tmp_path / name, SEED, noise=NOISE, plan=plan, noise_seed=day)
         run_virtual(config._replace(measured=measured))
     first, second = (
         json.loads((tmp_path / name / RESULT).read_text())["imu_places"] for name in ("first", "second")
@@ -163,14 +157,14 @@ def test_a_run_that_began_with_earlier_ones_is_complete_and_a_replay_the_same(tm
 
 
 def test_displaced_imus_are_no_change_and_a_displaced_link_is_one(
-    assemblies: dict[str, Session],
+    assemblies: dict[str, Session], plan: Plan
 ) -> None:
     distal = assemblies["distal"]
     known = BaselineRobot(Path("known"), distal.recording, distal.alone)
     change = LinkChange(ELBOW, np.array([0.0, 2e-3, 0.0]))
     reports = []
     for day, robot in enumerate((distal.robot, with_link_change(distal.robot, change)), start=10):
-        recording = _recorded(robot, day)
+        recording = _recorded(robot, day, plan)
         later = BaselineRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
         reports.append(check(known, later))
     unchanged, displaced = reports
