@@ -209,7 +209,10 @@ def refine_chain(
     believed = [
         spread * _repeats(data, residual) for spread, residual in zip(white, expected.residuals, strict=True)
     ]
+    scale = 1.0
     if noise is not None:
+        if any((spread > SYSTEMATIC * size).any() for spread, size in zip(white, noise, strict=True)):
+            scale = max(_pull(problem, state), 1.0)
         whole = np.sqrt([samples.stop - samples.start for samples in data.motions])[:, None]
         believed = [
             np.where(spread > SYSTEMATIC * size, spread * whole, wide)
@@ -220,7 +223,7 @@ def refine_chain(
     by_noise = _reduced(_normal_equations(problem, state, expected, white))[0]
     rms = [_rms(residual) for residual in expected.residuals]
     nuisance = _nuisance_covariance(normal, spectrum)
-    return _report(problem, state, spectrum, nuisance, by_noise, rms, white)
+    return _report(problem, state, spectrum, nuisance, by_noise, rms, white, scale)
 
 
 def with_placement(chain: Chain, placement: Array) -> Chain:
@@ -235,6 +238,18 @@ def with_placement(chain: Chain, placement: Array) -> Chain:
     moved[:, :3, :3] = Rotation.from_rotvec(np.array(placement[:, :3])).as_matrix()
     moved[:, :3, 3] = placement[:, 3:]
     return chain._replace(imu_home=frozen(chain.imu_home @ moved))
+
+
+def _pull(problem: _Problem, state: _State) -> float:
+    """Return the rms of the links' estimates, in standard deviations of their priors.
+
+    Where residuals are systematic, what the model lacks goes also into lengths and compliances, and the
+    residuals do not show that part. Estimates that contradict their priors do: this is the Birge ratio
+    (Birge 1932, Physical Review 40, 207) of the priors, by which the standard deviations are scaled.
+    """
+    flex = problem.flex
+    pulls = (state.compliance + flex.taken) / flex.sigmas
+    return float(np.sqrt(np.mean(pulls**2))) if pulls.size else 0.0
 
 
 def _nuisance_covariance(normal: _Normal, spectrum: "_Spectrum") -> Array:
@@ -407,17 +422,19 @@ def _report(
     by_noise: Array,
     rms: Sequence[Array],
     by_motion: Sequence[Array],
+    scale: float,
 ) -> Refinement:
     """Return the estimate.
 
     nuisance: the covariance of the nuisance parameters. rms, by_motion: of the residuals, altogether (n,)
-    and in every motion (k, n), of gyro and accelerometer.
+    and in every motion (k, n), of gyro and accelerometer. scale: of the standard deviations of poses and
+    links.
     """
     known = spectrum.known
     kept = spectrum.vectors[:, known]
     size = 6 * len(state.chain.serials)
     covariance, noise = np.zeros((size, size)), np.zeros((size, size))
-    covariance[6:, 6:] = (kept * spectrum.sigmas[known] ** 2) @ kept.T
+    covariance[6:, 6:] = (kept * (scale * spectrum.sigmas[known]) ** 2) @ kept.T
     noise[6:, 6:] = kept @ np.linalg.solve(kept.T @ by_noise @ kept, kept.T)
     unknown = np.zeros((size, int(np.count_nonzero(~known))))
     unknown[6:] = spectrum.vectors[:, ~known]
@@ -439,7 +456,7 @@ def _report(
         calibration_prior=problem.calibration,
         calibration=_posterior(problem, state, nuisance),
         compliance=frozen(state.compliance),
-        compliance_sigma=frozen(np.sqrt(np.diag(nuisance)[links])),
+        compliance_sigma=frozen(scale * np.sqrt(np.diag(nuisance)[links])),
         encoder_scale=frozen(np.zeros(len(state.own))),
         encoder_scale_sigma=frozen(np.zeros(len(state.own))),
     )

@@ -20,6 +20,7 @@ from coordinator.batch_estimation.imu_intrinsics import (
     slopes,
 )
 from coordinator.batch_estimation.imu_prediction import imu_readings
+from coordinator.batch_estimation.link_compliance import ComplianceJacobian
 from coordinator.batch_estimation.sensor_data import SensorData
 from coordinator.kinematics.null_space import name_null_space
 from module_agent.model.catalogue import GRAVITY_M_S2, GRAVITY_SIGMA_M_S2
@@ -408,3 +409,35 @@ def test_residuals_far_beyond_the_noise_count_once_a_motion(robots: Any) -> None
     healthy = _sensed(truth, 1, noise=1.0)._replace(motion=motion)
     plain, checked = refine_chain(truth, healthy), refine_chain(truth, healthy, noise=noise)
     np.testing.assert_array_equal(checked.estimate.covariance, plain.estimate.covariance)
+
+
+def test_links_that_contradict_their_prior_widen_the_claim_where_residuals_are_systematic(
+    robots: Any,
+) -> None:
+    truth, _ = robots.random(4, joints=3, serial=True)
+    data = _sensed(truth, 1, noise=1.0)
+    samples = len(data.q_rad)
+    # One compliance shows as a slow wave in the last gyro, as large as five sigmas of its prior.
+    seen = 20.0 * GYRO_NOISE * np.sin(np.arange(samples) / 40.0)
+    slopes = np.zeros((1, 6, samples, 3))
+    slopes[0, 0, :, 2] = seen
+    flex = ComplianceJacobian((2,), np.array([1.0]), slopes, np.zeros(1))
+    gyro, accel = data.gyro_rad_s.copy(), data.accel_m_s2.copy()
+    gyro[:, 2, 0] += 5.0 * seen
+    data = data._replace(gyro_rad_s=gyro)
+    noise = np.array([GYRO_NOISE, ACCEL_NOISE])[:, None, None] * np.ones((2, 1, 3))
+    modelled = refine_chain(truth, data, flex=flex, noise=noise)
+    unaware = refine_chain(truth, data, flex=flex)
+    # The estimate contradicts its prior, but leaves no systematic residual: nothing is scaled.
+    assert modelled.compliance[0] == pytest.approx(5.0, rel=0.02)
+    np.testing.assert_array_equal(modelled.estimate.covariance, unaware.estimate.covariance)
+    accel[:, 2] += (30.0 * ACCEL_NOISE * np.sin(np.arange(samples) / 3.0))[:, None]
+    data = data._replace(accel_m_s2=accel)
+    contradicted = refine_chain(truth, data, flex=flex, noise=noise)
+    agreeing = refine_chain(truth, data, flex=flex._replace(sigmas=np.array([10.0])), noise=noise)
+    pull = float(contradicted.compliance[0])
+    assert pull == pytest.approx(5.0, rel=0.02)
+    sigma, plain = (np.sqrt(np.diag(one.estimate.covariance)[6:]) for one in (contradicted, agreeing))
+    np.testing.assert_allclose(sigma, pull * plain, rtol=0.02)
+    by_noise = (np.diag(one.noise_covariance)[6:] for one in (contradicted, agreeing))
+    np.testing.assert_allclose(*by_noise, rtol=0.02)
