@@ -439,5 +439,5 @@ def test_links_that_contradict_their_prior_widen_the_claim_where_residuals_are_s
     assert pull == pytest.approx(5.0, rel=0.02)
     sigma, plain = (np.sqrt(np.diag(one.estimate.covariance)[6:]) for one in (contradicted, agreeing))
     np.testing.assert_allclose(sigma, pull * plain, rtol=0.02)
-    by_noise = (np.diag(one.noise_covariance)[6:] for one in (contradicted, agreeing))
-    np.testing.assert_allclose(*by_noise, rtol=0.02)
+    mine, others = (np.diag(one.noise_covariance)[6:] for one in (contradicted, agreeing))
+    np.testing.assert_allclose(mine, others, rtol=0.02)
