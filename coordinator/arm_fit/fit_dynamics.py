@@ -15,15 +15,16 @@ from coordinator.arm_fit.data_file import DataFileError, JointLog, in_two
 from coordinator.arm_fit.drive_choice import Trial, candidates, choose_drives, pairs
 from coordinator.arm_fit.filtered_log import filtered_log, max_samples
 from coordinator.arm_fit.fit import Elsewhere, fit_and_test
-from coordinator.arm_fit.payload import read_baseline
+from coordinator.arm_fit.payload import KnownPayload, factors_by_payload, read_baseline
 from coordinator.arm_fit.predictions import Predictions
 from coordinator.arm_fit.problem import ModelChoice, Problem, problem
 from coordinator.arm_fit.recordings import Recordings, Source, read_other, read_recordings
-from coordinator.arm_fit.report import FitReport
+from coordinator.arm_fit.report import FitReport, TorqueFactorPart
 from coordinator.description.urdf_reader import STANDARD_GRAVITY, UrdfRobot, read_urdf
 from coordinator.description.urdf_update import fitted_urdf_text
 from coordinator.dynamics.pseudo_inertia import Body
 from coordinator.parameter_fit.base_parameters import BaseParameters
+from coordinator.parameter_fit.torque_constants import TorqueFactors
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError, UsageError
 from module_agent.model.files import write_text
@@ -86,6 +87,8 @@ def fit_dynamics(
     checked: bool = True,
     baseline: str | Path | FitReport | None = None,
     payload_body: str | None = None,
+    loaded: Source | None = None,
+    known_payload: KnownPayload | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> ArmFit:
     """Identify inertia, friction and motors of an arm, and test the result on held-out samples.
@@ -114,6 +117,8 @@ def fit_dynamics(
         baseline: report of an earlier fit of the same arm without the payload that it carries in `data`, or
             its JSON file; then `report.payload` is what was added.
         payload_body: the link that carries the payload, the last body's by default.
+        loaded: another recording of the arm, with `known_payload`, which `data` is without. The two tell
+            the scale of the joints' readings, and with it torque constants; the fit is to `data` in Nm.
         progress: is called with a sentence before every step (`STEPS`).
 
     Raises:
@@ -129,6 +134,13 @@ def fit_dynamics(
     robot = urdf if isinstance(urdf, UrdfRobot) else read_urdf(urdf, gravity)
     recordings = read_recordings(robot, sources, gains, checked)
     known = read_baseline(baseline, recordings.robot, payload_body)
+    factors: list[TorqueFactorPart] = []
+    if (loaded is None) != (known_payload is None):
+        raise UsageError("a known payload needs a recording with it (loaded), and the other way round")
+    if loaded is not None and known_payload is not None:
+        fitted_factors = _factors(recordings, loaded, known_payload, choice, cutoff_hz)
+        factors = _factor_parts(recordings, fitted_factors)
+        recordings = recordings.scaled(fitted_factors.value)
     robot, log = recordings.robot, recordings.log
     if choice.coupled is not None:
         places = {joint: i for i, joint in enumerate(recordings.moving)}
@@ -152,7 +164,8 @@ def fit_dynamics(
         elsewhere=elsewhere,
         baseline=known,
     )
-    parts = (robot, result.report, result.base, result.torques)
+    report = result.report.model_copy(update={"torque_factors": factors})
+    parts = (robot, report, result.base, result.torques)
     if result.consistent is None:
         return ArmFit(*parts, bodies=None, phi=None, drives=None, urdf=None)
     fitted = result.consistent
@@ -160,6 +173,31 @@ def fit_dynamics(
     drives = read_only(urdf_drives(posed, x, slice(0, len(posed.log.tau_nm))))
     text = fitted_urdf_text(robot, fitted.bodies, drives, lacking(posed))
     return ArmFit(*parts, bodies=fitted.bodies, phi=fitted.phi, drives=drives, urdf=text)
+
+
+def _factors(
+    recordings: Recordings,
+    loaded: Source,
+    payload: KnownPayload,
+    choice: ModelChoice,
+    cutoff_hz: float | None,
+) -> TorqueFactors:
+    """Return the factors of the joints' readings by a recording with a known payload."""
+    robot, log, plain = recordings.robot, recordings.log, choice._replace(coupled=(), tried=())
+    cutoff = cutoff_hz or chosen_cutoff_hz(cutoff_curve(robot, log, plain))
+    unloaded = _posed(robot, log, plain, cutoff, instruments=False)
+    return factors_by_payload(unloaded, _posed_like(unloaded, recordings, loaded), payload)
+
+
+def _factor_parts(recordings: Recordings, factors: TorqueFactors) -> list[TorqueFactorPart]:
+    return [
+        TorqueFactorPart(
+            joint=joint, factor=value if known else None, sigma=sigma if np.isfinite(sigma) else None
+        )
+        for joint, value, sigma, known in zip(
+            recordings.robot.chain.serials, *(part.tolist() for part in factors), strict=True
+        )
+    ]
 
 
 def _chosen(

@@ -29,11 +29,13 @@ from coordinator.dynamics.pseudo_inertia import (
     is_consistent,
     parameter_scale,
     parameter_transform,
+    parameters,
     pseudo_inertia,
 )
 from coordinator.parameter_fit.payload import LIKELY_KG, change_between, consistent_payload
 from coordinator.parameter_fit.report_parts import body_part, triple
 from coordinator.parameter_fit.robust_least_squares import WeightedFit
+from coordinator.parameter_fit.torque_constants import TorqueFactors, torque_factors
 from module_agent.model.chain import Array
 from module_agent.model.errors import UsageError
 from module_agent.model.regressor import PER_BODY
@@ -65,6 +67,14 @@ class Baseline(NamedTuple):
     rows: Array
     target: Array
     link: str
+
+
+class KnownPayload(NamedTuple):
+    """A payload of known mass [kg] and centre (3,) [m] in the frame of `link`, None for the last body's."""
+
+    mass_kg: float
+    com_m: tuple[float, float, float]
+    link: str | None = None
 
 
 class _Estimate(NamedTuple):
@@ -120,15 +130,49 @@ def read_baseline(
         raise UsageError(f"{name}: it was written without the information of its fit; fit it again")
     _check_same_arm(name, part, robot)
     link = robot.bodies[-1] if link is None else link
-    if link not in robot.carried:
-        raise UsageError(
-            f"payload body {link!r}: no joint moves a link of this name; {', '.join(sorted(robot.carried))}"
-        )
+    _check_carried(robot, link)
     target = _decoded(name, part.target)
     rows = _decoded(name, part.rows)
     if rows.size != len(target) * len(part.columns):
         raise UsageError(f"{name}: {rows.size} numbers of information for {len(part.columns)} columns")
     return Baseline(name, tuple(part.columns), rows.reshape(len(target), -1), target, link)
+
+
+def factors_by_payload(unloaded: Problem, loaded: Problem, payload: KnownPayload) -> TorqueFactors:
+    """Return the factors of the joints' readings by a payload that only `loaded` carries.
+
+    Bodies and rotors are the same in both recordings, all other terms of the drives are free in each.
+
+    Raises:
+        UsageError: a link that does not move, or a mass that is not positive.
+    """
+    robot = unloaded.robot
+    link = robot.bodies[-1] if payload.link is None else payload.link
+    _check_carried(robot, link)
+    if not (payload.mass_kg > 0.0 and np.isfinite([payload.mass_kg, *payload.com_m]).all()):
+        raise UsageError(f"known payload {payload.mass_kg:g} kg at {payload.com_m}: the mass must be above 0")
+    carrier, centre = robot.links[link].body, np.array(payload.com_m)
+    own = slice(PER_BODY * carrier, PER_BODY * (carrier + 1))
+    added = loaded.regressor[:, :, own] @ parameter_transform(robot.links[link].pose)
+    point = np.zeros((4, 4))
+    point[:3, :3], point[:3, 3], point[3, :3] = np.outer(centre, centre), centre, centre
+    point[3, 3] = 1.0
+    known = payload.mass_kg * (added @ parameters(point))
+    shared = np.array([True] * unloaded.inertial + [d.term == "inertia" for d in unloaded.drives])
+    parts = [one.regressor for one in (unloaded, loaded)]
+    nothing = [np.zeros((*one.shape[:2], int((~shared).sum()) + 6)) for one in parts]
+    drives = nothing[0].shape[2] - 6
+    columns = [
+        np.concatenate([parts[0], nothing[0]], axis=2),
+        np.concatenate([np.where(shared, parts[1], 0.0), nothing[1][..., :drives], added[..., 4:]], axis=2),
+    ]
+    columns[1][..., len(shared) : len(shared) + drives] = parts[1][..., ~shared]
+    return torque_factors(
+        np.concatenate(columns),
+        np.concatenate([np.zeros(parts[0].shape[:2]), known]),
+        np.concatenate([unloaded.log.tau_nm, loaded.log.tau_nm]),
+        np.concatenate([unloaded.moving, loaded.moving]),
+    )
 
 
 def added_payload(baseline: Baseline, problem: Problem, fit: WeightedFit) -> PayloadPart:
@@ -249,6 +293,13 @@ def _places(robot: UrdfRobot) -> list[JointPlacePart]:
             robot.chain.serials, robot.bodies, robot.homes, robot.chain.axis, strict=True
         )
     ]
+
+
+def _check_carried(robot: UrdfRobot, link: str) -> None:
+    if link not in robot.carried:
+        raise UsageError(
+            f"payload body {link!r}: no joint moves a link of this name; {', '.join(sorted(robot.carried))}"
+        )
 
 
 def _check_same_arm(name: str, part: InformationPart, robot: UrdfRobot) -> None:

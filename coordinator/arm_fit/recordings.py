@@ -9,7 +9,9 @@ import numpy as np
 from coordinator.arm_fit.checks import wrong_motion
 from coordinator.arm_fit.data_file import DataFileError, JointLog, at_rate, joined, read_log
 from coordinator.description.urdf_reader import UrdfRobot, read_urdf
+from module_agent.model.chain import Array
 from module_agent.model.errors import UsageError
+from module_agent.model.read_only import read_only
 
 Source = str | Path | JointLog
 
@@ -21,7 +23,7 @@ class Recordings(NamedTuple):
     """An arm whose joints all move, and its recordings as one, of those joints.
 
     joints: the arm's joints before those that stand still were fixed; `moving` are the others' places there.
-    gains: torque constants of joints whose currents were recorded.
+    gains: torque constants of joints whose currents were recorded. factors: (n,) of the readings of `log`.
     """
 
     robot: UrdfRobot
@@ -29,6 +31,12 @@ class Recordings(NamedTuple):
     joints: tuple[str, ...]
     moving: tuple[int, ...]
     gains: Mapping[str, float]
+    factors: Array
+
+    def scaled(self, factors: Array) -> "Recordings":
+        """Return the recordings with the readings of every joint multiplied (n,)."""
+        log = self.log._replace(tau_nm=read_only(self.log.tau_nm * factors))
+        return self._replace(log=log, factors=self.factors * factors)
 
 
 def read_recordings(
@@ -62,7 +70,7 @@ def read_recordings(
         held = {joints[i]: float(log.q_rad[:, i].mean()) for i in np.flatnonzero(still)}
         robot = read_urdf(robot.path, robot.chain.gravity, robot.held | held)
     moving = tuple(np.flatnonzero(~still).tolist())
-    return Recordings(robot, _columns(log, moving), joints, moving, gains)
+    return Recordings(robot, _columns(log, moving), joints, moving, gains, np.ones(len(moving)))
 
 
 def read_other(recordings: Recordings, source: Source) -> JointLog:
@@ -82,7 +90,8 @@ def read_other(recordings: Recordings, source: Source) -> JointLog:
                     f"{log.column('q', name)}: {off:.3g} rad from the {position:.3g} rad at which it stood "
                     "still in the other recording; give both as --data"
                 )
-    return _columns(log, recordings.moving)
+    other = _columns(log, recordings.moving)
+    return other._replace(tau_nm=read_only(other.tau_nm * recordings.factors))
 
 
 def _read(source: Source, robot: UrdfRobot, gains: Mapping[str, float]) -> JointLog:

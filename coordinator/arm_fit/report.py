@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
+from pydantic import Field
+
 from coordinator.parameter_fit.identifiability import Precision
 from coordinator.parameter_fit.report_parts import BaseParameterPart, BodyPart, Part, Triple
 from module_agent.model.files import write_json
@@ -234,10 +236,22 @@ class PayloadPart(Part):
     rigid_body: BodyPart
 
 
+class TorqueFactorPart(Part):
+    """The factor from a joint's readings to torques by a known payload; null where it is not determined.
+
+    `sigma` is null where the payload shows nothing of the joint.
+    """
+
+    joint: str
+    factor: float | None
+    sigma: float | None
+
+
 class FitReport(Part):
     """Everything that `x5-coordinator fit-dynamics` reports; errors are fractions, SI units.
 
-    information: for a later fit of the arm with a payload; `payload`, if this is such a fit.
+    information: for a later fit of the arm with a payload; `payload`, if this is such a fit. torque_factors:
+    of all joints, if a known payload was given; the readings were multiplied by them.
 
     Schema 3 adds the choice of low-pass and drives, held joints, what a URDF cannot hold, the information and
     the payload; both may be null. Schema 2 names
@@ -257,6 +271,7 @@ class FitReport(Part):
     fit: FitPart
     information: InformationPart | None = None
     payload: PayloadPart | None = None
+    torque_factors: list[TorqueFactorPart] = Field(default_factory=list)
 
     def errors(self, model: Model, torque: str = "filtered") -> list[ErrorPart]:
         """Return a model's errors, in the order of the report."""

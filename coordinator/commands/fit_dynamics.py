@@ -11,6 +11,7 @@ import typer
 from coordinator.arm_fit import fit_dynamics as arm_fit
 from coordinator.arm_fit.consistent_bodies import USUAL_TRUST
 from coordinator.arm_fit.fit import STEPS
+from coordinator.arm_fit.payload import KnownPayload
 from coordinator.arm_fit.predictions import write_matrices, write_predictions
 from coordinator.arm_fit.problem import ModelChoice
 from coordinator.arm_fit.report import write_report
@@ -106,6 +107,19 @@ _Baseline = Annotated[
 _PayloadBody = Annotated[
     str | None, typer.Option(help="Link that carries the payload; by default the last body's.")
 ]
+_Loaded = Annotated[
+    Path | None,
+    typer.Option(
+        help="Recording with the --known-payload, which --data is without: the two tell torque constants."
+    ),
+]
+_KnownPayload = Annotated[
+    str | None,
+    typer.Option(
+        help="MASS,X,Y,Z: what the arm carries in --loaded [kg], and its centre in the frame of the "
+        "--payload-body [m]."
+    ),
+]
 _Unchecked = Annotated[
     bool,
     typer.Option("--unchecked", help="Fit even if units, signs, gravity or length of the data look wrong."),
@@ -134,6 +148,8 @@ def fit_dynamics(
     slow: _Slow = _USUAL.slow_part,
     baseline: _Baseline = None,
     payload_body: _PayloadBody = None,
+    loaded: _Loaded = None,
+    known_payload: _KnownPayload = None,
     unchecked: _Unchecked = False,
     quiet: Quiet = False,
 ) -> None:
@@ -159,7 +175,9 @@ def fit_dynamics(
                 trust=trust,
                 checked=not unchecked,
                 baseline=baseline,
-                payload_body=payload_body,
+                payload_body=payload_body if known_payload is None else None,
+                loaded=loaded,
+                known_payload=_known_payload(known_payload, payload_body),
                 progress=lambda text: terminal.step(next(numbers), STEPS, text),
             )
         for line in notes(fit.report):
@@ -195,6 +213,18 @@ def _gravity(text: str) -> list[float]:
     if len(gravity) != 3 or not all(abs(part) < 100.0 for part in gravity):
         raise UsageError(f"gravity {text!r}: it must be three numbers below 100, like {_UP}")
     return gravity
+
+
+def _known_payload(text: str | None, link: str | None) -> KnownPayload | None:
+    if text is None:
+        return None
+    try:
+        mass, x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise UsageError(
+            f"known payload {text!r}: it must be its mass [kg] and its centre [m], like 0.8,0.03,0,0.09"
+        ) from None
+    return KnownPayload(mass, (x, y, z), link)
 
 
 def _gains(texts: Sequence[str]) -> dict[str, float]:

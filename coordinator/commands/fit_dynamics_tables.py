@@ -110,6 +110,17 @@ def notes(report: FitReport) -> Iterator[str]:
         yield f"a URDF has no place for {', '.join(fit.not_in_urdf)}; the fitted URDF alone is without them"
     if report.payload:
         yield from _payload_notes(report.payload)
+    for part in report.torque_factors:
+        if part.factor is not None and part.sigma is not None:
+            by = f"{part.factor:.4g} +- {part.sigma:.2g}"
+            yield f"readings of {part.joint} were multiplied by {by}, which the known payload determines"
+        else:
+            why = (
+                "does not load it"
+                if part.sigma is None
+                else f"determines its factor to {part.sigma:.2g} only"
+            )
+            yield f"readings of {part.joint} are as recorded: the known payload {why}"
     if fit.bodies_note:
         yield f"no physically consistent bodies: {fit.bodies_note}"
 
