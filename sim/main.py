@@ -12,6 +12,7 @@ COMMANDS = {
     "effects": ("effects_page.effects", "List the imperfections of a simulated module."),
     "score": ("score.score_run", "Compare a run's result with the simulator's truth."),
     "benchmark": ("benchmark.app", "Measure the whole system against its bars."),
+    "thesis": ("thesis.thesis", "Repeat the thesis' experiments and compare with what it printed."),
     "amplitudes": ("amplitudes.amplitudes", "Repeat the thesis' estimates of link length over amplitudes."),
     "estimators": ("estimators.estimators", "Compare estimators of a joint's radial distance."),
     "assistance": ("assistance.assistance", "Measure tracking errors with and without feed-forward torque."),

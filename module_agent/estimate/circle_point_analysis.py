@@ -6,7 +6,8 @@ The estimator is that of the thesis, with its known biases (docs/theory.md), but
     r   points from the joint's axis to the IMU (the thesis' points back to the joint)
     n   j x r / |r|, so that the tangential acceleration is + alpha d, with d >= 0
 
-For these, eq. 24 reads r = d (n x j) as in the thesis.
+For these, eq. 24 reads r = d (n x j) as in the thesis. Eq. 16 does not: as seen from a body that turns by
++phi about j, gravity turns by -phi, where the thesis prints +phi.
 """
 
 from typing import Any, NamedTuple

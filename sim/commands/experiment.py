@@ -48,8 +48,11 @@ class ModuleOptions(NoiseOptions):
 
 
 @contextmanager
-def experiment() -> Iterator[Terminal]:
-    """Show progress while processes work; a signal ends them, and the command with `EXIT_INTERRUPTED`."""
+def experiment(kept: str = "nothing is written") -> Iterator[Terminal]:
+    """Show progress while processes work; a signal ends them, and the command with `EXIT_INTERRUPTED`.
+
+    `kept` says what remains then.
+    """
     # Processes that share the cores already must not each start as many threads; they inherit this.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -59,7 +62,7 @@ def experiment() -> Iterator[Terminal]:
         with Terminal() as terminal:
             yield terminal
     except KeyboardInterrupt:
-        fail("interrupted; nothing is written", EXIT_INTERRUPTED)
+        fail(f"interrupted; {kept}", EXIT_INTERRUPTED)
 
 
 def trial_results(

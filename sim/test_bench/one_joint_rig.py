@@ -13,7 +13,7 @@ from module_agent.estimate.gaussian_filter import TAPS
 from module_agent.estimate.joint_regression import JointRegression, regress_joint
 from module_agent.estimate.observed_motion import MotionWindows, observed_motions
 from module_agent.estimate.observer import MARGIN_NS
-from module_agent.estimate.windows import align, imu_window, joint_window
+from module_agent.estimate.windows import AlignedMotion, align, imu_window, joint_window
 from module_agent.model.imu_prior import CALIBRATED, ImuPrior
 from module_agent.wire.feedback_rows import Rows
 from module_agent.wire.messages import GoTo, MotionRecord, Pattern, Rest
@@ -100,8 +100,18 @@ def analyse(trial: TrialRows, taps: int = TAPS) -> CircleFit:
     Raises:
         ValueError: too little motion, with what would be enough.
     """
-    constant, sine = (align(one.imu, one.joint, one.offset_ns) for one in windows(trial))
+    constant, sine = aligned(trial)
     return circle_point_analysis(imu_window(trial.rest), constant, sine, taps=taps)
+
+
+def aligned(trial: TrialRows) -> tuple[AlignedMotion, AlignedMotion]:
+    """Return constant and windowed sine motion, each on one time axis.
+
+    Raises:
+        ValueError: too few samples to estimate the offset of the clocks.
+    """
+    constant, sine = (align(one.imu, one.joint, one.offset_ns) for one in windows(trial))
+    return constant, sine
 
 
 def regress(trial: TrialRows, knowledge: ImuPrior = CALIBRATED) -> JointRegression:

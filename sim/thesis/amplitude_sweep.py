@@ -10,14 +10,23 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from coordinator.excitation.plan import Plan
-from module_agent.estimate.circle_point_analysis import CircleFit
+from module_agent.estimate.circle_point_analysis import (
+    REST_S,
+    CircleFit,
+    angular_acceleration,
+    circle_point_analysis,
+)
 from module_agent.estimate.gaussian_filter import TAPS, gaussian_filter
+from module_agent.estimate.joint_regression import JointRegression
+from module_agent.estimate.windows import imu_window
 from module_agent.model.errors import DataError
+from module_agent.model.imu_prior import IMU_PRIORS
+from sim.imperfections.noise_profile import NoiseProfile, imu_kind
 from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import Robot, load_robot
 from sim.robot.robot_tree import sensing_chain
 from sim.scoring.chain_score import link_length_m
-from sim.test_bench.one_joint_rig import JOINT, OneJointRig, TrialRows, analyse
+from sim.test_bench.one_joint_rig import JOINT, OneJointRig, TrialRows, aligned, analyse, regress
 from sim.thesis.published import ALIGNMENTS, Alignment, thesis_length
 
 Purpose = Literal["sweep", "repeats"]
@@ -49,6 +58,9 @@ class AmplitudeTrial(NamedTuple):
     commanded_rad_s, reached_rad_s: peak speeds of the windowed sine; the latter as measured and smoothed.
     saturated: the commanded speed is beyond what the module's velocity loop takes.
     stroke: size of the motion over that of the commanded one, both rms.
+    printed_mm: by the thesis' analysis with eq. 16 as printed (`as_printed`).
+    printed_by_algebra_mm: what that should give (`turned_wrongly_mm`).
+    ours_mm, ours_sigma_mm: by the agents' joint regression.
     """
 
     purpose: Purpose
@@ -66,6 +78,10 @@ class AmplitudeTrial(NamedTuple):
     saturated: bool
     stroke: float
     note: str
+    printed_mm: float | None = None
+    printed_by_algebra_mm: float | None = None
+    ours_mm: float | None = None
+    ours_sigma_mm: float | None = None
 
     def error(self, filtered: bool = True) -> float | None:
         """Return the relative error of the estimate, with the thesis' filter or without."""
@@ -114,14 +130,16 @@ def run_series(series: Series) -> list[AmplitudeTrial]:
         KeyError, ValueError: no such noise profile or effect, no such robot.
     """
     robot = series.robot
+    profile = series.noise.of(robot)
     trials = []
-    with OneJointRig(robot, series.seed, series.noise.of(robot)) as rig:
+    with OneJointRig(robot, series.seed, profile) as rig:
         true_mm = 1e3 * link_length_m(sensing_chain(rig.world.robot), child=1)
         clamp_rad_s = rig.modules[JOINT].firmware.config.kind.velocity_clamp_rad_s
         for number, amplitude_rad in enumerate(series.amplitudes_rad):
             rows = rig.trial(Plan(sine_amplitude_rad=amplitude_rad))
             filtered, note = _fit(rows, TAPS)
             unfiltered, _ = _fit(rows, taps=1)
+            ours = _regressed(rows, profile)
             joint = rows.sine.joint
             # The sag under a load counts neither for the motion nor for the commanded one.
             moving = joint[np.isfinite(joint["position_command_rad"])]
@@ -144,9 +162,54 @@ def run_series(series: Series) -> list[AmplitudeTrial]:
                     saturated=commanded_rad_s > clamp_rad_s,
                     stroke=float(stroke),
                     note=note,
+                    printed_mm=filtered and 1e3 * as_printed(rows).distance_m,
+                    printed_by_algebra_mm=filtered and turned_wrongly_mm(rows, filtered),
+                    ours_mm=ours and 1e3 * ours.distance_m,
+                    ours_sigma_mm=ours and 1e3 * ours.sigma_distance_m,
                 )
             )
     return trials
+
+
+def as_printed(rows: TrialRows) -> CircleFit:
+    """Run the thesis' analysis with eq. 16 as printed: gravity is turned by +phi.
+
+    The world turns by -phi as seen from a body that turns by +phi (`circle_point_analysis`). Of the windowed
+    sine, eq. 16 alone uses the position: its sign is that of eq. 16.
+
+    Raises:
+        DataError: too little motion, with what would be enough.
+    """
+    constant, sine = aligned(rows)
+    turned = sine._replace(position_rad=-sine.position_rad)
+    return circle_point_analysis(imu_window(rows.rest), constant, turned)
+
+
+def turned_wrongly_mm(rows: TrialRows, fit: CircleFit) -> float:
+    """Return the distance that eq. 16 as printed should give, by algebra from the right one's fit [mm].
+
+    With (R(-phi) - R(+phi)) g = -2 sin(phi) j x g and phi = -alpha / w^2 of a small sine, eq. 17 leaves
+    alpha (d n + (2 / w^2) j x g): the first singular vector has the length of the bracket. That is
+    sqrt(d^2 + (2 g / w^2)^2) where gravity is along the tangent, d +- 2 g / w^2 where it is along the radius,
+    and d about a vertical axis. 1 / w^2 is the regression of -phi on alpha, since the window widens the line.
+
+    Raises:
+        DataError: too little motion, with what would be enough.
+    """
+    _, sine = aligned(rows)
+    alpha = angular_acceleration(sine)
+    phi = sine.position_rad - sine.position_rad.mean()
+    per_w2 = -float(alpha @ phi) / float(alpha @ alpha)
+    gravity = sine.accel_m_s2[sine.t_s <= REST_S].mean(axis=0)
+    bracket = fit.distance_m * fit.tangent + 2.0 * per_w2 * np.cross(fit.axis, gravity)
+    return 1e3 * float(np.linalg.norm(bracket))
+
+
+def _regressed(rows: TrialRows, profile: NoiseProfile) -> JointRegression | None:
+    try:
+        return regress(rows, IMU_PRIORS[imu_kind(profile)])
+    except DataError:
+        return None
 
 
 def _fit(rows: TrialRows, taps: int) -> tuple[CircleFit | None, str]:

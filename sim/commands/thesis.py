@@ -1,0 +1,102 @@
+"""`x5-sim thesis`: the thesis' experiments on simulated modules, against what it printed."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from coordinator.runtime.command_line import fail, with_options
+from coordinator.runtime.terminal import Terminal, new_table, print_table
+from module_agent.model.errors import EXIT_FAILED
+from sim.benchmark.case import Failed, Trial
+from sim.benchmark.workers import run_trials
+from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, worker_count
+from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
+from sim.thesis.study import Store, code_version, experiments, results, units_of
+from sim.thesis.study_report import write_results
+
+
+@with_options
+def thesis(
+    modules: ModuleOptions,
+    out: Annotated[
+        Path, typer.Option(help="Folder for thesis.json, report.md, its pictures, and what is measured.")
+    ] = Path("runs/thesis"),
+    only: Annotated[
+        str, typer.Option(help="Experiments, separated by commas: table4,figure23,... [all].")
+    ] = "",
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer amplitudes and trials.")] = False,
+    processes: WorkerCount = None,
+) -> None:
+    """Repeat the thesis' experiments; what was measured before by the same code is not measured again."""
+    modules.profile()
+    choice = modules.choice()
+    chosen = experiments([name.strip() for name in only.split(",") if name.strip()])
+    scope = Scope(modules.seed, choice, quick)
+    measured = _measured(chosen, scope, Store(out / "measured"), processes)
+    settings: dict[str, int | str | bool | tuple[str, ...]] = {
+        "seed": modules.seed,
+        "noise": modules.noise,
+        "with": choice.on,
+        "without": choice.off,
+        "quick": quick,
+        "code": code_version(),
+    }
+    outcome = ThesisResults(settings=settings, experiments=results(chosen, scope, measured))
+    write_results(out, outcome)
+    print_table(outcome_table(outcome.experiments))
+    typer.echo(str(out / "report.md"))
+
+
+def _measured(
+    chosen: Sequence[Experiment], scope: Scope, store: Store, processes: int | None
+) -> dict[str, Any]:
+    """Measure what the store does not have, keep each result as it comes, and return all by key.
+
+    The first unit that fails ends the command with `EXIT_FAILED`; what is measured stays in the store.
+    """
+    units = units_of(chosen, scope)
+    measured = {key: known for key, unit in units.items() if (known := store.load(key, unit)) is not None}
+    missing = [(key, unit) for key, unit in units.items() if key not in measured]
+    with experiment("what is measured is kept: the same command continues") as terminal:
+        progress = _Progress(terminal, [unit for _, unit in missing], len(units))
+
+        def done(index: int, result: Any) -> None:
+            key, unit = missing[index]
+            if isinstance(result, Failed):
+                fail(result.text, EXIT_FAILED)
+            store.keep(key, unit, result)
+            measured[key] = result
+            progress.step(unit)
+
+        trials = [Trial(unit.work, unit.arguments, unit.cost_s) for _, unit in missing]
+        run_trials(trials, worker_count(processes), done)
+    return measured
+
+
+class _Progress:
+    """Shows how many units are done, and the time left by their costs and the time so far."""
+
+    def __init__(self, terminal: Terminal, missing: Sequence[Unit], total: int):
+        self._terminal, self._total = terminal, total
+        self._done = total - len(missing)
+        self._cost_s, self._over_s = sum(unit.cost_s for unit in missing), 0.0
+        self._start_s = time.monotonic()
+
+    def step(self, unit: Unit) -> None:
+        """Show that a unit is done."""
+        self._done += 1
+        self._over_s += unit.cost_s
+        left_s = (time.monotonic() - self._start_s) * (self._cost_s / self._over_s - 1.0)
+        self._terminal.step(self._done, self._total, f"{unit.name}; about {left_s:.0f} s left")
+
+
+def outcome_table(experiments: Sequence[ExperimentResult]) -> Table:
+    """Return the experiments with their outcomes and reasons."""
+    shown = new_table("The thesis' experiments on simulated modules", "experiment | outcome | reason")
+    for one in experiments:
+        shown.add_row(one.title, one.outcome, one.reason)
+    return shown
