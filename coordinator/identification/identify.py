@@ -45,7 +45,7 @@ from coordinator.kinematics.assembly import assemble
 from coordinator.kinematics.chain_observations import PairObservation, joint_observation
 from coordinator.kinematics.gauge_fixing import gauge_fixed
 from coordinator.kinematics.simultaneous_motion import circle_observations
-from coordinator.recording.journal import JournalEvent, excluded_modules
+from coordinator.recording.journal import JournalEvent, Purpose, excluded_modules
 from coordinator.recording.recording import Recording
 from coordinator.synchronisation.clock_refinement import refine_clocks
 from coordinator.synchronisation.motion_windows import (
@@ -71,6 +71,8 @@ from module_agent.signals.filtering import NS_PER_S, REFINEMENT_CUTOFF_HZ, Joint
 # The largest of some 30 IMU errors, in standard deviations, is below this for 99 of 100 IMUs.
 OUTLIER_ABOVE = 3.5
 MIN_REST_ROWS = 10
+# Motions that topology and chain are identified from.
+EXPLORING: tuple[Purpose, ...] = ("rest", "constant", "windowed_sine", "repeat", "whole")
 
 
 def identify(
@@ -78,6 +80,7 @@ def identify(
     revise: Callable[[Kinematics], Kinematics] | None = None,
     kinematics: Kinematics | None = None,
     measured: Sequence[CalibrationInformation] = (),
+    explored: Kinematics | None = None,
 ) -> Identified:
     """Identify everything from a recording.
 
@@ -86,12 +89,13 @@ def identify(
         revise: combines the kinematics with prior knowledge, such as a baseline.
         kinematics: the revised kinematics of this recording, if they are computed already.
         measured: earlier recordings of some of the modules, each once.
+        explored: see `identify_kinematics`.
 
     Raises:
         IdentificationError: data is missing or contradicts itself.
     """
     if kinematics is None:
-        kinematics = identify_kinematics(recording, measured)
+        kinematics = identify_kinematics(recording, measured, explored)
         kinematics = revise(kinematics) if revise is not None else kinematics
     inertia, bodies, held_out = None, None, None
     if recording.latest_motions("dynamic"):
@@ -118,17 +122,58 @@ def identify(
     return Identified(kinematics, inertia, bodies, held_out, result, calibrations(kinematics, recording))
 
 
-def identify_kinematics(recording: Recording, measured: Sequence[CalibrationInformation] = ()) -> Kinematics:
-    """Identify topology and chain.
+def identify_kinematics(
+    recording: Recording,
+    measured: Sequence[CalibrationInformation] = (),
+    explored: Kinematics | None = None,
+) -> Kinematics:
+    """Identify topology and chain, from what had been recorded at the end of the exploration.
+
+    Later round trips refresh the clocks. Topology and chain are identified from the whole recording if there
+    is no `explored` event, or if motions of the exploration differ since: a module has booted.
 
     Args:
         recording: of a session, at least up to the end of its exploration.
+        explored: identified from `recording.explored` and `measured`, if that is computed already.
         measured: earlier recordings of some of the modules, each once: their IMUs are known as well as these
             tell, not only by the catalogue.
 
     Raises:
         IdentificationError: see `identify`.
     """
+    so_far = recording.explored
+    if so_far is None or not _same_motions(so_far, recording):
+        return _identify_kinematics(recording, measured)
+    kept = explored if explored is not None else _identify_kinematics(so_far, measured)
+    return _refreshed(kept, recording)
+
+
+def _same_motions(so_far: Recording, recording: Recording) -> bool:
+    """Return whether no motion of the exploration was added, or is void since its module has booted."""
+    before, now = (one.motions(*EXPLORING) for one in (so_far, recording))
+    return before == now
+
+
+def _refreshed(kept: Kinematics, recording: Recording) -> Kinematics:
+    """Return kinematics with the clocks by all round trips and notes on later motions.
+
+    Raises:
+        IdentificationError: later motions have too few samples.
+    """
+    try:
+        everyone = _explored(recording)
+        clocks = map_clocks({s: recording.modules[s].trips for s in everyone})
+        _, windows = _exploration(recording, clocks, kept.topology.serials)
+        clocks |= refine_clocks(kept.first.chain, clocks, windows).clocks
+        later = recording.motions("dynamic", "held_out")
+        sampling = sampling_notes(recording, clocks, everyone, later, REFINEMENT_CUTOFF_HZ)
+    except (DataError, np.linalg.LinAlgError) as error:
+        raise IdentificationError(str(error)) from error
+    return kept._replace(clocks=clocks, notes=tuple(dict.fromkeys((*kept.notes, *sampling))))
+
+
+def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInformation]) -> Kinematics:
+    """Identify topology and chain from everything that was recorded."""
     serials = _explored(recording)
     try:
         clocks = map_clocks({s: recording.modules[s].trips for s in serials})

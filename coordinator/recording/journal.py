@@ -20,15 +20,16 @@ Purpose = Literal["rest", "constant", "windowed_sine", "repeat", "whole", "dynam
 class JournalEvent(BaseModel):
     """One line of the journal; `what` says which of the other fields are set.
 
-    `settled`: the clocks are mapped by the round trips before this event; later requests to the modules do
-    not change them. `deaf`: modules that did not confirm the stop of a failed session; None in an older
-    journal, which names them in its text.
+    `explored`: topology and chain are identified from what was recorded before this event. `settled`: the
+    clocks are mapped by the round trips before this event; later requests to the modules do not change them.
+    `deaf`: modules that did not confirm the stop of a failed session; None in an older journal, which names
+    them in its text.
     """
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
     t_ns: int
-    what: Literal["session", "begin", "done", "motion", "note", "settled", "failed", "finished"]
+    what: Literal["session", "begin", "done", "motion", "note", "explored", "settled", "failed", "finished"]
     step: str = ""
     serial: str = ""
     boot: Annotated[int, Field(ge=0)] = 0

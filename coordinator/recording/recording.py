@@ -4,6 +4,7 @@ The live session and a replay add the same entries to the same `Recording`, so t
 results. The recording's hash is the trace hash of the run.
 """
 
+import copy
 import hashlib
 import struct
 from collections.abc import Sequence
@@ -74,6 +75,12 @@ class ModuleRecord:
         """The round trips for mapping clocks: all up to the journal's `settled` event."""
         return self.round_trips[: self.settled_trips]
 
+    def copied(self) -> "ModuleRecord":
+        """Return a record of the rows and round trips so far, to which later ones are not added."""
+        record = copy.copy(self)
+        record.rows, record.round_trips = self.rows.copied(), list(self.round_trips)
+        return record
+
     def forget(self, rows: int, round_trips: int) -> None:
         """Drop all but the newest rows and round trips, for sessions that go on for long."""
         self.rows.forget_before(self.rows.end_row - rows)
@@ -81,13 +88,18 @@ class ModuleRecord:
 
 
 class Recording:
-    """The messages of one session and their indices. `modules` holds the latest boot of every serial."""
+    """The messages of one session and their indices. `modules` holds the latest boot of every serial.
+
+    explored: what had been recorded at the journal's `explored` event; None before it, and in older
+    recordings, which do not have it.
+    """
 
     def __init__(self) -> None:
         self.modules: dict[str, ModuleRecord] = {}
         self.past: dict[tuple[str, int], ModuleRecord] = {}
         self.estimates: dict[tuple[str, str], dict[tuple[int, ...], Estimate]] = {}
         self.journal: list[JournalEvent] = []
+        self.explored: Recording | None = None
         self.questions: dict[bytes, InformationRequest] = {}
         self.refused: dict[str, int] = {}
         self._hash = hashlib.sha256()
@@ -115,6 +127,8 @@ class Recording:
         if entry.kind == "journal":
             event = JournalEvent.model_validate_json(entry.payload)
             self.journal.append(event)
+            if event.what in ("session", "explored"):
+                self.explored = self._so_far() if event.what == "explored" else None
             if event.what in ("session", "settled"):
                 for module in self.modules.values():
                     module.settled_trips = len(module.round_trips) if event.what == "settled" else None
@@ -134,6 +148,16 @@ class Recording:
         except RobotError:
             return None
         return message if isinstance(message, Message) else None
+
+    def _so_far(self) -> "Recording":
+        """Return a recording of what has been recorded, to which later entries are not added."""
+        so_far = Recording()
+        so_far.modules = {serial: module.copied() for serial, module in self.modules.items()}
+        so_far.past = {(serial, module.boot): module for serial, module in so_far.modules.items()}
+        so_far.estimates = {pair: dict(estimates) for pair, estimates in self.estimates.items()}
+        so_far.journal = list(self.journal)
+        so_far._hash = self._hash.copy()
+        return so_far
 
     def _index(self, entry: Entry, exchange: Exchange) -> Message:
         parts = parse(entry.topic)

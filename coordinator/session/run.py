@@ -145,6 +145,7 @@ class Run:
         self._previewer = Previewer(self.recording, config.refined_previews)
         self._preview_task: asyncio.Task[None] | None = None
         self._chain: Chain | None = None
+        self._explored: Kinematics | None = None
         self._identified: Identified | None = None
         if crashed is not None:
             self._take_over(crashed)
@@ -234,7 +235,12 @@ class Run:
     async def explored(self) -> None:
         """Identify topology and chain, and show them."""
         await self._await_preview()
-        kinematics = await self._kinematics()
+        self._journal(JournalEvent(t_ns=self._clock(), what="explored"))
+        so_far = self.recording.explored
+        assert so_far is not None, "the recording has the event that was just added"
+        explored = await self._compute(lambda: identify_kinematics(so_far, self._measured))
+        self._explored = explored
+        kinematics = await self._compute(lambda: self._with_baseline(explored))
         self._chain = kinematics.fit.chain
         self._feed.chain(self._clock(), kinematics.fit)
         for line in kinematics.summary():
@@ -263,7 +269,7 @@ class Run:
 
     async def _kinematics(self) -> Kinematics:
         return await self._compute(
-            lambda: self._with_baseline(identify_kinematics(self.recording, self._measured))
+            lambda: self._with_baseline(identify_kinematics(self.recording, self._measured, self._explored))
         )
 
     def _with_baseline(self, kinematics: Kinematics) -> Kinematics:
@@ -308,7 +314,9 @@ class Run:
             self._writer.close()
             self._screen.note("estimating")
             identified = await self._compute(
-                lambda: identify(self.recording, self._with_baseline, kinematics, self._measured)
+                lambda: identify(
+                    self.recording, self._with_baseline, kinematics, self._measured, self._explored
+                )
             )
             write_outputs(config.out, identified)
             self._feed.chain(self._clock(), identified.kinematics.fit)

@@ -25,6 +25,13 @@ class RowLog:
         self._rows = np.zeros(0, dtype=ROW)
         self._have = np.zeros(0, dtype=bool)
 
+    def copied(self) -> "RowLog":
+        """Return a log with the rows so far, to which later rows are not added."""
+        log = RowLog(self.boot)
+        log._base, log._end = self._base, self._end
+        log._rows, log._have = self._rows.copy(), self._have.copy()
+        return log
+
     @property
     def first_row(self) -> int:
         """The oldest row number so far, 0 before any."""

@@ -58,6 +58,10 @@ def _on(entry: Entry, leaf: Leaf, serial: str) -> bool:
     return entry.kind != "journal" and parse(entry.topic)[1:] == (serial, leaf)
 
 
+def _explored_at(entries: list[Entry]) -> int:
+    return next(i for i, e in enumerate(entries) if (event := _event(e)) and event.what == "explored")
+
+
 def test_the_arm_is_identified_and_predicts_held_out_torques(run: list[Entry], tmp_path: Path) -> None:
     identified = identify(_recorded(run))
     topology, fit = identified.kinematics.topology, identified.kinematics.fit
@@ -133,10 +137,13 @@ def test_the_same_recording_gives_the_same_result_to_the_last_bit(run: list[Entr
 
 
 def test_the_order_in_which_feedback_arrived_does_not_matter(run: list[Entry]) -> None:
-    places = [i for i, e in enumerate(run) if _on(e, Leaf.FEEDBACK, BASE) or _on(e, Leaf.FEEDBACK, TIP)]
+    feedback = [i for i, e in enumerate(run) if _on(e, Leaf.FEEDBACK, BASE) or _on(e, Leaf.FEEDBACK, TIP)]
+    # Topology and chain are identified from what has arrived until then.
+    decided = _explored_at(run)
     shuffled = list(run)
-    for place, taken in zip(places, np.random.default_rng(1).permutation(places).tolist(), strict=True):
-        shuffled[place] = run[taken]
+    for places in ([i for i in feedback if i < decided], [i for i in feedback if i > decided]):
+        for place, taken in zip(places, np.random.default_rng(1).permutation(places).tolist(), strict=True):
+            shuffled[place] = run[taken]
     one, two = (identify(_recorded(each)).result for each in (run, shuffled))
     assert one.trace_hash != two.trace_hash
     same = {"trace_hash": "", "wall_time_s": None}
@@ -257,3 +264,56 @@ def test_without_dynamic_motions_there_is_no_inertia_and_no_guess_at_it(run: lis
     assert identified.inertia is None
     assert identified.held_out is None
     assert identified.result.dynamics is None
+
+
+def test_topology_and_chain_are_those_of_the_exploration(run: list[Entry]) -> None:
+    """What is recorded after it, the dynamic motions and further round trips, moves the clocks alone."""
+    place = _explored_at(run)
+    then, now = identify_kinematics(_recorded(run[: place + 1])), identify_kinematics(_recorded(run))
+    assert now.topology == then.topology
+    np.testing.assert_array_equal(now.fit.chain.imu_home, then.fit.chain.imu_home)
+    # The session went on for seconds: the later round trips count.
+    assert any(now.clocks[serial] != then.clocks[serial] for serial in (BASE, TIP))
+
+
+def test_a_chain_that_is_known_already_is_not_computed_again(run: list[Entry]) -> None:
+    recording = _recorded(run)
+    assert recording.explored is not None
+    explored = identify_kinematics(recording.explored)
+    result = identify(recording, explored=explored)
+    assert result.kinematics.refinement is explored.refinement
+    assert result.result.model_dump_json() == identify(_recorded(run)).result.model_dump_json()
+
+
+def test_a_copy_of_the_exploration_does_not_grow_with_the_recording(run: list[Entry]) -> None:
+    place = _explored_at(run)
+    recording = _recorded(run[: place + 1])
+    so_far = recording.explored
+    assert so_far is not None
+    before = (so_far.trace_hash, {s: (m.rows.end_row, len(m.round_trips)) for s, m in so_far.modules.items()})
+    for entry in run[place + 1 :]:
+        recording.add(entry)
+    after = (so_far.trace_hash, {s: (m.rows.end_row, len(m.round_trips)) for s, m in so_far.modules.items()})
+    assert before == after
+    assert recording.trace_hash != so_far.trace_hash
+
+
+def test_a_recording_without_the_event_is_identified_whole(run: list[Entry]) -> None:
+    """Recordings of earlier versions do not have it; the results differ by the later round trips alone."""
+    older = identify_kinematics(_recorded(_without(run, lambda e: e.what == "explored"))).fit
+    newer = identify_kinematics(_recorded(run)).fit
+    assert not np.array_equal(older.chain.imu_home, newer.chain.imu_home)
+    apart = np.abs(older.link_length_m - newer.link_length_m)[1:]
+    assert (apart < 0.1 * newer.link_length_sigma_m[1:]).all()
+
+
+def test_a_session_that_is_resumed_explores_anew(run: list[Entry]) -> None:
+    session = next(e for e in run if (event := _event(e)) is not None and event.what == "session")
+    assert _recorded([*run, session]).explored is None
+
+
+def test_an_exploration_whose_motions_changed_since_is_identified_again(run: list[Entry]) -> None:
+    event = next(e for e in map(_event, run) if e is not None and e.purpose == "windowed_sine")
+    again = Entry("journal", JOURNAL_TOPIC, 0, event.model_copy(update={"purpose": "repeat"}).encode())
+    with_more, once = (identify_kinematics(_recorded(each)).fit.chain for each in ([*run, again], run))
+    assert not np.array_equal(with_more.imu_home, once.imu_home)
