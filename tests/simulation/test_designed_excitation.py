@@ -42,7 +42,7 @@ def found(recording: Recording) -> Identified:
 
 
 def base_parameter_count(chain: Chain) -> int:
-    """What any motion at all could tell: the rank at random positions, rates and accelerations."""
+    """Return what any motion could tell: the rank at random positions, rates and accelerations."""
     motion = np.random.default_rng(0).uniform(-3.0, 3.0, (3, 300, len(chain.serials)))
     regressor = torque_regressor(chain, *motion).reshape(-1, 10 * len(chain.serials))
     return int(np.linalg.matrix_rank(regressor, tol=1e-9 * np.linalg.norm(regressor, 2)))
@@ -60,8 +60,10 @@ def test_all_joints_moved_at_the_same_time_and_one_motion_was_held_out(recording
 
 def test_every_parameter_that_any_motion_could_tell_is_identified(found: Identified) -> None:
     assert found.inertia is not None
-    # Of the true chain. Joint after joint leaves some of them open.
-    assert found.inertia.instrumental.fit.rank == base_parameter_count(true_chain(BUILT))
+    # Joint after joint leaves some of them open. Axes that are parallel by design show further parameters by
+    # the 1 mrad that they are off in their housings: those are in the noise.
+    by_design = base_parameter_count(true_chain(load_robot(ARM)))
+    assert found.inertia.instrumental.fit.rank == by_design < base_parameter_count(true_chain(BUILT))
 
 
 def test_the_held_out_motion_of_all_joints_is_predicted(found: Identified) -> None:
