@@ -54,8 +54,12 @@ class Column(_Part):
         """Return a cell as text: numbers in the column's form, a dash where there is none."""
         if cell is None:
             return "–"
-        # The sign of a zero that was rounded says nothing.
-        return cell if isinstance(cell, str) else f"{cell:z{self.form}}"
+        if isinstance(cell, str):
+            return cell
+        # The sign of a zero that was rounded says nothing; whole numbers have none.
+        sign = self.form[:1] if self.form[:1] in ("+", " ") else ""
+        zero = "" if self.form.endswith("d") else "z"
+        return f"{cell:{sign}{zero}{self.form.removeprefix(sign)}}"
 
 
 class Table(_Part):

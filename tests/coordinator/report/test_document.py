@@ -98,6 +98,22 @@ def test_the_same_document_gives_the_same_bytes() -> None:
     assert html_page(study()) == html_page(study())
 
 
+@pytest.mark.parametrize(
+    ("form", "cell", "shown"),
+    [
+        (".1f", -0.04, "0.0"),
+        ("+.1f", 2.7, "+2.7"),
+        ("+.1f", -0.04, "+0.0"),
+        ("d", 3, "3"),
+        (".4g", None, "–"),
+    ],
+)
+def test_numbers_are_shown_in_any_form_and_zeros_without_a_minus(
+    form: str, cell: float | None, shown: str
+) -> None:
+    assert Column(name="length", form=form).shown(cell) == shown
+
+
 def test_a_row_without_a_cell_for_every_column_is_refused() -> None:
     with pytest.raises(ValueError, match="Error: a row of 1 cells, 2 columns"):
         Table.of("Error", (Column(name="a"), Column(name="b")), [(1.0,)])
