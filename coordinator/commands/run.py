@@ -90,7 +90,7 @@ def replay(
     recording = load_recording(session)
     before = baseline_within(session.parent)
     revise = before.updated if before is not None else None
-    identified = identify(recording, revise, measured=measured_before_run(session.parent, before))
+    identified = identify(recording, revise=revise, measured=measured_before_run(session.parent, before))
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, identified)
     terminal = Terminal()

@@ -77,6 +77,7 @@ EXPLORING: tuple[Purpose, ...] = ("rest", "constant", "windowed_sine", "repeat",
 
 def identify(
     recording: Recording,
+    *,
     revise: Callable[[Kinematics], Kinematics] | None = None,
     kinematics: Kinematics | None = None,
     measured: Sequence[CalibrationInformation] = (),
@@ -89,7 +90,7 @@ def identify(
         revise: combines the kinematics with prior knowledge, such as a baseline.
         kinematics: the revised kinematics of this recording, if they are computed already.
         measured: earlier recordings of some of the modules, each once.
-        explored: see `identify_kinematics`.
+        explored: the kinematics of `recording.explored`, if they are computed already.
 
     Raises:
         IdentificationError: data is missing or contradicts itself.
@@ -120,6 +121,18 @@ def identify(
                 bodies = bodies._replace(held_out_error=check.error.overall)
     result = build_result(recording, kinematics, inertia, held_out, bodies)
     return Identified(kinematics, inertia, bodies, held_out, result, calibrations(kinematics, recording))
+
+
+def identify_topology(recording: Recording) -> Topology:
+    """Return which module is mounted on which, from motions of all joints at once or one by one.
+
+    Raises:
+        IdentificationError: a module was not explored, or data contradicts itself.
+    """
+    try:
+        return search_topology(recording, _explored(recording)).topology
+    except (DataError, np.linalg.LinAlgError) as error:
+        raise IdentificationError(str(error)) from error
 
 
 def identify_kinematics(

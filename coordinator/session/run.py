@@ -25,7 +25,12 @@ from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
 from coordinator.identification.identified import IdentificationError, Identified, Kinematics
-from coordinator.identification.identify import identify, identify_kinematics, write_held_out
+from coordinator.identification.identify import (
+    identify,
+    identify_kinematics,
+    identify_topology,
+    write_held_out,
+)
 from coordinator.identification.inertia.agent_information import dynamic_steps
 from coordinator.identification.inertia.inertia import Inertia
 from coordinator.identification.preview import Preview, Previewer
@@ -259,13 +264,13 @@ class Run:
 
     async def _single_joints(self) -> Sequence[str]:
         """Return the joints to explore one by one: those next to a difference from the baseline."""
-        kinematics = await self._compute(lambda: identify_kinematics(self.recording, self._measured))
+        topology = await self._compute(lambda: identify_topology(self.recording))
         if self._baseline is None:
             return ()
-        changes = difference(self._baseline.kinematics.topology, kinematics.topology)
+        changes = difference(self._baseline.kinematics.topology, topology)
         for line in changes.summary():
             self._screen.note(line)
-        return joints_to_explore(kinematics.topology, changes)
+        return joints_to_explore(topology, changes)
 
     async def _kinematics(self) -> Kinematics:
         return await self._compute(
@@ -315,7 +320,11 @@ class Run:
             self._screen.note("estimating")
             identified = await self._compute(
                 lambda: identify(
-                    self.recording, self._with_baseline, kinematics, self._measured, self._explored
+                    self.recording,
+                    revise=self._with_baseline,
+                    kinematics=kinematics,
+                    measured=self._measured,
+                    explored=self._explored,
                 )
             )
             write_outputs(config.out, identified)

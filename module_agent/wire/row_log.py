@@ -29,7 +29,8 @@ class RowLog:
         """Return a log with the rows so far, to which later rows are not added."""
         log = RowLog(self.boot)
         log._base, log._end = self._base, self._end
-        log._rows, log._have = self._rows.copy(), self._have.copy()
+        used = slice(self._end - self.first_row)
+        log._rows, log._have = self._rows[used].copy(), self._have[used].copy()
         return log
 
     @property

@@ -37,10 +37,10 @@ def record_session(
         what `coordinator.session.session` raises: no module found, an unfit link, a module lost, a motion
             interrupted.
     """
-    recorder = _MemoryRecorder(plan, recording or Recording())
-    recording = recorder.recording
+    recording = recording or Recording()
     with virtual_robot(settings, imu=plan.imu) as robot:
         name, loop = settings.robot.name, robot.loop
+        recorder = _MemoryRecorder(plan, recording, lambda: loop.now_ns)
         endpoint = robot.endpoint(COORDINATOR)
         messenger = Messenger(endpoint, name, lambda: loop.now_ns, loop.call_soon, recording.accept)
         group = ModuleGroup(messenger, recording, lambda: loop.now_ns, COORDINATOR)
@@ -65,9 +65,10 @@ def record_session(
 class _MemoryRecorder(SilentScreen):
     """Records the session in memory; progress and estimates are not displayed."""
 
-    def __init__(self, plan: Plan, recording: Recording) -> None:
+    def __init__(self, plan: Plan, recording: Recording, clock: Callable[[], int]) -> None:
         self.recording = recording
         self._plan = plan
+        self._clock = clock
 
     def journal(self, event: JournalEvent) -> None:
         self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
@@ -80,7 +81,8 @@ class _MemoryRecorder(SilentScreen):
         return doubtful_motions(self.recording)
 
     async def explored(self) -> None:
-        """What follows from the recording is computed from it afterwards."""
+        """Record where the exploration ended; what follows from it is computed afterwards."""
+        self.journal(JournalEvent(t_ns=self._clock(), what="explored"))
 
     async def excitation(self) -> tuple[RobotMotion, ...]:
         """Design motions of all joints at once, as a run does; none if the robot could run none."""

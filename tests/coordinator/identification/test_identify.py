@@ -59,7 +59,8 @@ def _on(entry: Entry, leaf: Leaf, serial: str) -> bool:
 
 
 def _explored_at(entries: list[Entry]) -> int:
-    return next(i for i, e in enumerate(entries) if (event := _event(e)) and event.what == "explored")
+    (place,) = (i for i, e in enumerate(entries) if (event := _event(e)) and event.what == "explored")
+    return place
 
 
 def test_the_arm_is_identified_and_predicts_held_out_torques(run: list[Entry], tmp_path: Path) -> None:
