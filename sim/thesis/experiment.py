@@ -9,41 +9,19 @@ from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict
 
+from coordinator.report.document import Column as DocumentColumn
+from coordinator.report.document import Outcome, Table
 from sim.robot.noise_choice import NoiseChoice
-
-Cell = float | int | str | None
-Outcome = Literal["seen", "seen in part", "not seen"]
 
 
 class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Column(_Part):
-    """A column: its heading, the unit of its numbers, and the form that they are shown in."""
+class Column(DocumentColumn):
+    """A column of a report's table whose numbers are shown with one decimal unless it says otherwise."""
 
-    name: str
-    unit: str = ""
     form: str = ".1f"
-
-    @property
-    def heading(self) -> str:
-        """The name with the unit in brackets."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
-
-    def shown(self, cell: Cell) -> str:
-        """Return a cell as text: numbers in the column's form, a dash where there is none."""
-        if cell is None:
-            return "–"
-        return cell if isinstance(cell, str) else f"{cell:{self.form}}"
-
-
-class Table(_Part):
-    """Rows of cells, one for each column."""
-
-    caption: str
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[Cell, ...], ...]
 
 
 class Curve(_Part):

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.report.document import Cell, Table
 from sim.thesis.amplitude_sweep import AmplitudeTrial, repeat_series, run_series, sweep_series
 from sim.thesis.experiment import (
-    Cell,
     Check,
     Column,
     Curve,
@@ -21,7 +21,6 @@ from sim.thesis.experiment import (
     Panel,
     Plot,
     Scope,
-    Table,
     Unit,
 )
 from sim.thesis.published import (

@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from coordinator.report.document import Table
 from module_agent.estimate.windows import Array
 from sim.thesis.experiment import (
     Check,
@@ -15,7 +16,6 @@ from sim.thesis.experiment import (
     Panel,
     Plot,
     Scope,
-    Table,
     Unit,
 )
 from sim.thesis.motion_signals import ImuSignals, JointSignals, TrialSignals, Vector, trial_signals

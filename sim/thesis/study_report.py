@@ -4,8 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from coordinator.report.document import Table
 from module_agent.model.files import replacing, write_json, write_text
-from sim.thesis.experiment import Curve, ExperimentResult, Plot, Table, ThesisResults
+from sim.thesis.experiment import Curve, ExperimentResult, Plot, ThesisResults
 
 # Distinct for colour-blind readers too (Okabe and Ito), in the order of the curves.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#404040", "#cc79a7")
