@@ -12,8 +12,14 @@ from coordinator.runtime.terminal import new_table, print_table
 from module_agent.model.errors import UsageError
 from sim.benchmark.case import Trial
 from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, trial_results
-from sim.thesis.amplitude_report import Repeats, plot, repeats, write_results
-from sim.thesis.amplitude_sweep import AmplitudeTrial, Series, repeat_series, run_series, sweep_series
+from sim.thesis.kinematics.amplitude_report import Repeats, plot, repeats, write_results
+from sim.thesis.kinematics.amplitude_sweep import (
+    AmplitudeTrial,
+    Series,
+    repeat_series,
+    run_series,
+    sweep_series,
+)
 from sim.thesis.published import AMPLITUDES_RAD, LENGTHS_MM, TRIALS
 
 T = TypeVar("T", int, float)

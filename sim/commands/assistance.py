@@ -13,9 +13,15 @@ from coordinator.runtime.terminal import new_table, print_table
 from sim.benchmark.case import Trial
 from sim.commands.experiment import JsonFile, ModuleOptions, WorkerCount, experiment, trial_results
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.thesis.torque_assistance import MODES, Follow, Model, identified_model, standing_robot
-from sim.thesis.torque_assistance_cases import Case, Combination, cases, robots_of, try_case
-from sim.thesis.torque_assistance_report import Bar, bars, plot_assistance, robot_and_pose, write_assistance
+from sim.thesis.dynamics.torque_assistance import MODES, Follow, Model, identified_model, standing_robot
+from sim.thesis.dynamics.torque_assistance_cases import Case, Combination, cases, robots_of, try_case
+from sim.thesis.dynamics.torque_assistance_report import (
+    Bar,
+    bars,
+    plot_assistance,
+    robot_and_pose,
+    write_assistance,
+)
 
 _IDENTIFY_S = 15.0
 _CASE_S = 1.2 * len(MODES)

@@ -12,7 +12,7 @@ from module_agent.model.files import write_json
 from sim.benchmark.case import Trial
 from sim.commands.experiment import JsonFile, ModuleOptions, WorkerCount, experiment, trial_results
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.thesis.estimator_variants import Arm, EstimatorRow, compare, estimator_rows
+from sim.thesis.kinematics.estimator_variants import Arm, EstimatorRow, compare, estimator_rows
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM, TRIALS
 
 ARMS = tuple(Arm(alignment, length_mm) for alignment in ALIGNMENTS for length_mm in LENGTHS_MM)

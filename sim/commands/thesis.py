@@ -15,8 +15,13 @@ from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trials
 from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, worker_count
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
-from sim.thesis.study import Store, code_version, experiments, results, units_of
+from sim.thesis.kinematics.length_experiments import LENGTH_EXPERIMENTS
+from sim.thesis.kinematics.motion_experiments import MOTION_EXPERIMENTS
+from sim.thesis.study import Store, code_version, results, selected, units_of
 from sim.thesis.study_report import write_results
+
+# In the order of the thesis.
+EXPERIMENTS: tuple[Experiment, ...] = (*MOTION_EXPERIMENTS, *LENGTH_EXPERIMENTS)
 
 
 @with_options
@@ -34,7 +39,7 @@ def thesis(
     """Repeat the thesis' experiments; what was measured before by the same code is not measured again."""
     modules.profile()
     choice = modules.choice()
-    chosen = experiments([name.strip() for name in only.split(",") if name.strip()])
+    chosen = selected(EXPERIMENTS, [name.strip() for name in only.split(",") if name.strip()])
     scope = Scope(modules.seed, choice, quick)
     measured = _measured(chosen, scope, Store(out / "measured"), processes)
     settings: dict[str, int | str | bool | tuple[str, ...]] = {

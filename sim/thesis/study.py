@@ -1,4 +1,4 @@
-"""All experiments of the thesis together: the registry, what is to be done, and what has been done before."""
+"""Experiments of the thesis together: what is to be done, and what has been done before."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,25 +14,22 @@ import sim
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_text
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, Unit
-from sim.thesis.length_experiments import LENGTH_EXPERIMENTS
-from sim.thesis.motion_experiments import MOTION_EXPERIMENTS
 
-EXPERIMENTS: tuple[Experiment, ...] = (*MOTION_EXPERIMENTS, *LENGTH_EXPERIMENTS)
 _SOURCES = (".py", ".toml")
 _KEY_LENGTH = 24
 
 
-def experiments(only: Sequence[str] = ()) -> tuple[Experiment, ...]:
-    """Return the experiments of some identifiers in the order of the registry; all if none is given.
+def selected(known: Sequence[Experiment], only: Sequence[str] = ()) -> tuple[Experiment, ...]:
+    """Return the known experiments of some identifiers in their order; all if none is given.
 
     Raises:
         UsageError: there is no such experiment; the message lists those that there are.
     """
-    known = [each.id for each in EXPERIMENTS]
+    names = [each.id for each in known]
     for name in only:
-        if name not in known:
-            raise UsageError(f"no experiment {name!r}; there are {', '.join(known)}")
-    return tuple(each for each in EXPERIMENTS if not only or each.id in only)
+        if name not in names:
+            raise UsageError(f"no experiment {name!r}; there are {', '.join(names)}")
+    return tuple(each for each in known if not only or each.id in only)
 
 
 def units_of(chosen: Sequence[Experiment], scope: Scope) -> dict[str, Unit]:

@@ -32,7 +32,7 @@ from sim.robot.robot_tree import sensing_chain, true_chain
 from sim.robot.variants import as_built, at_random_site
 from sim.scoring.chain_score import LinkErrors, link_errors, tip_errors, topology_differences
 from sim.sensors.module_clock import ModuleClock, module_time
-from sim.thesis.circle_chain import thesis_chain
+from sim.thesis.kinematics.circle_chain import thesis_chain
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
 from sim.virtual_time.session import record_session
 from sim.world.truth import Motion

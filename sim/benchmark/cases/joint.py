@@ -8,7 +8,7 @@ from sim.benchmark.case import Case, Summary, Trial, trial_seeds
 from sim.benchmark.cases.arm import KNOWN
 from sim.benchmark.row import SIGMAS_95, Row, largest, mean_abs, ratio, rms, scaled
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile, switched
-from sim.thesis.joint_trial import JointTrial, joint_trial
+from sim.thesis.kinematics.joint_trial import JointTrial, joint_trial
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM, Alignment
 
 LENGTH_OF_ONE = "length, one joint, x5 on a solid base"

@@ -9,13 +9,14 @@ import pytest
 from matplotlib.image import imread
 from typer.testing import CliRunner
 
+from sim.commands.thesis import EXPERIMENTS
 from sim.main import app
 from sim.robot.noise_choice import NoiseChoice
-from sim.thesis.amplitude_sweep import AmplitudeTrial, Series
 from sim.thesis.experiment import Check, Experiment, Scope, Unit, concluded
-from sim.thesis.motion_signals import ImuSignals, JointSignals, TrialSignals, Vector
+from sim.thesis.kinematics.amplitude_sweep import AmplitudeTrial, Series
+from sim.thesis.kinematics.motion_signals import ImuSignals, JointSignals, TrialSignals, Vector
 from sim.thesis.published import thesis_length
-from sim.thesis.study import EXPERIMENTS, Store, key, results, units_of
+from sim.thesis.study import Store, key, results, units_of
 
 SCOPE = Scope(seed=0, noise=NoiseChoice("x5"), quick=True)
 FIGURES = (15, 16, 19, 20, 21, 22, *range(23, 44))

@@ -15,7 +15,7 @@ from sim.robot.robot_tree import true_chain
 from sim.robot.variants import at_random_site
 from sim.scoring.chain_score import link_length_m
 from sim.scoring.score import score
-from sim.thesis.circle_chain import thesis_chain
+from sim.thesis.kinematics.circle_chain import thesis_chain
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.run import VirtualConfig, run_virtual
 from sim.virtual_time.session import record_session

@@ -30,9 +30,9 @@ from sim.benchmark.cases.suites import (
 from sim.benchmark.cases.topology import TopologyTrial
 from sim.benchmark.sensor_faults import FaultTrial
 from sim.scoring.chain_score import LinkErrors
-from sim.thesis.joint_trial import JointTrial
-from sim.thesis.torque_assistance import Follow
-from sim.thesis.torque_assistance_cases import Combination
+from sim.thesis.dynamics.torque_assistance import Follow
+from sim.thesis.dynamics.torque_assistance_cases import Combination
+from sim.thesis.kinematics.joint_trial import JointTrial
 
 Change = Callable[[Any], Any]
 

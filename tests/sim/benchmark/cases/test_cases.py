@@ -35,7 +35,7 @@ from sim.benchmark.row import Row
 from sim.benchmark.sensor_faults import FAULTS, HARMLESS, QUICK, FaultTrial, fault_cases
 from sim.robot.random_robot import random_robot
 from sim.scoring.chain_score import LinkErrors
-from sim.thesis.joint_trial import JointTrial
+from sim.thesis.kinematics.joint_trial import JointTrial
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM
 
 

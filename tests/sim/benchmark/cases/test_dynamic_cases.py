@@ -12,9 +12,9 @@ from sim.benchmark.cases.payload import PayloadTrial
 from sim.benchmark.cases.regressor import RegressorTrial
 from sim.benchmark.cases.suites import DYNAMIC_TRIALS, QUICK_DYNAMICS, dynamic_cases, full_dynamics
 from sim.benchmark.row import Row
-from sim.thesis.torque_assistance import ON_MODULE, Follow, Gains
-from sim.thesis.torque_assistance_cases import Case as Combined
-from sim.thesis.torque_assistance_cases import Combination
+from sim.thesis.dynamics.torque_assistance import ON_MODULE, Follow, Gains
+from sim.thesis.dynamics.torque_assistance_cases import Case as Combined
+from sim.thesis.dynamics.torque_assistance_cases import Combination
 
 CASES = {case.name: case for case in dynamic_cases(full_dynamics(), seed=0)}
 

@@ -21,8 +21,7 @@ from sim.commands.assistance import assistance_table
 from sim.imperfections.noise_profile import NOISE_PROFILES, NoiseProfile
 from sim.main import app
 from sim.test_bench.robot_bench import Track
-from sim.thesis.published import setting, thesis_gains, without_velocity
-from sim.thesis.torque_assistance import (
+from sim.thesis.dynamics.torque_assistance import (
     MAX_RINGING_RAD,
     MAX_SATURATED,
     ON_MODULE,
@@ -34,7 +33,7 @@ from sim.thesis.torque_assistance import (
     standing_robot,
     tracking,
 )
-from sim.thesis.torque_assistance_cases import (
+from sim.thesis.dynamics.torque_assistance_cases import (
     HOSTS,
     Case,
     Combination,
@@ -45,7 +44,8 @@ from sim.thesis.torque_assistance_cases import (
     thesis_robot,
     try_case,
 )
-from sim.thesis.torque_assistance_report import bars, true_model, write_assistance
+from sim.thesis.dynamics.torque_assistance_report import bars, true_model, write_assistance
+from sim.thesis.published import setting, thesis_gains, without_velocity
 
 # Tests of this file share recorded runs: they stay in one process.
 pytestmark = pytest.mark.xdist_group("torque_assistance")

@@ -13,7 +13,7 @@ from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import load_robot
 from sim.test_bench.module_bench import ExperimentFailed
 from sim.test_bench.one_joint_rig import IMU, JOINT, MotionRows, OneJointRig, analyse
-from sim.thesis.amplitude_sweep import (
+from sim.thesis.kinematics.amplitude_sweep import (
     AmplitudeTrial,
     Series,
     repeat_series,

@@ -12,7 +12,7 @@ import numpy as np
 
 from module_agent.model.errors import UsageError
 from module_agent.model.files import replacing, write_json
-from sim.thesis.amplitude_sweep import AmplitudeTrial
+from sim.thesis.kinematics.amplitude_sweep import AmplitudeTrial
 from sim.thesis.published import ALIGNMENTS, Alignment, ThesisLength, thesis_length
 
 

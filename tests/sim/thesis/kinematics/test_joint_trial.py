@@ -9,7 +9,14 @@ from module_agent.model.imu_prior import CALIBRATED, UNCALIBRATED
 from sim.imperfections.noise_profile import NOISE_PROFILES, switched
 from sim.robot.robot_file import load_robot
 from sim.test_bench.one_joint_rig import OneJointRig, TrialRows, regress, windows
-from sim.thesis.joint_trial import JointTrial, bound_m, imu_knowledge, joint_trial, trial_plan, white_noise
+from sim.thesis.kinematics.joint_trial import (
+    JointTrial,
+    bound_m,
+    imu_knowledge,
+    joint_trial,
+    trial_plan,
+    white_noise,
+)
 from sim.thesis.published import Alignment, thesis_length
 
 SOLID = switched(NOISE_PROFILES["x5"], off=("base-shake",))

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from module_agent.model.errors import UsageError
 from sim.commands.amplitudes import table
 from sim.main import app
-from sim.thesis.amplitude_report import plot, repeats, write_results
-from sim.thesis.amplitude_sweep import AmplitudeTrial, Purpose
+from sim.thesis.kinematics.amplitude_report import plot, repeats, write_results
+from sim.thesis.kinematics.amplitude_sweep import AmplitudeTrial, Purpose
 from sim.thesis.published import Alignment, thesis_length
 
 

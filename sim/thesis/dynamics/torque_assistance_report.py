@@ -16,9 +16,9 @@ from module_agent.model.read_only import read_only
 from sim.imperfections.noise_profile import NoiseProfile
 from sim.robot.robot_tree import true_chain, true_inertia
 from sim.robot.variants import as_built
+from sim.thesis.dynamics.torque_assistance import MODES, ON_MODULE, Model, standing_robot
+from sim.thesis.dynamics.torque_assistance_cases import ABOUT_AS_WELL, Combination
 from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS
-from sim.thesis.torque_assistance import MODES, ON_MODULE, Model, standing_robot
-from sim.thesis.torque_assistance_cases import ABOUT_AS_WELL, Combination
 
 # The required gain of an arm of six joints under torque control.
 MIN_GAIN = 3.0

@@ -18,7 +18,7 @@ from sim.thesis.experiment import (
     Scope,
     Unit,
 )
-from sim.thesis.motion_signals import ImuSignals, JointSignals, TrialSignals, Vector, trial_signals
+from sim.thesis.kinematics.motion_signals import ImuSignals, JointSignals, TrialSignals, Vector, trial_signals
 from sim.thesis.published import Alignment, thesis_length
 
 _TRIAL_S = 2.0

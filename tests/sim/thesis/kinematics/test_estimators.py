@@ -16,7 +16,7 @@ from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import sensing_chain
 from sim.scoring.chain_score import link_length_m
 from sim.test_bench.one_joint_rig import OneJointRig
-from sim.thesis.estimator_variants import (
+from sim.thesis.kinematics.estimator_variants import (
     VARIANTS,
     Arm,
     Comparison,

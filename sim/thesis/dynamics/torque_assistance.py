@@ -33,7 +33,7 @@ from sim.robot.robot_file import Robot, load_robot
 from sim.robot.variants import at_random_site
 from sim.test_bench.module_bench import ExperimentFailed
 from sim.test_bench.robot_bench import BenchRobot, Streaming, Track
-from sim.thesis.joint_trial import rms
+from sim.thesis.kinematics.joint_trial import rms
 from sim.thesis.published import Reading, setting, thesis_gains, without_velocity
 from sim.virtual_time.robot import VirtualSettings
 from sim.virtual_time.session import record_session

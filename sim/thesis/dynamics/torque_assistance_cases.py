@@ -7,8 +7,7 @@ from typing import Literal, NamedTuple
 from module_agent.model.errors import UsageError
 from module_agent.wire.messages import DynamicPattern, MultiSine, Pattern, Sine, WindowedSine
 from sim.imperfections.noise_profile import NoiseProfile
-from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS, Alignment, Reading, thesis_length
-from sim.thesis.torque_assistance import (
+from sim.thesis.dynamics.torque_assistance import (
     MODES,
     ON_MODULE,
     Delivery,
@@ -19,6 +18,7 @@ from sim.thesis.torque_assistance import (
     follow,
     standing_robot,
 )
+from sim.thesis.published import ALIGNMENTS, READINGS, SETTINGS, Alignment, Reading, thesis_length
 
 Motion = Literal["windowed sine", "sine", "pattern", "all joints"]
 

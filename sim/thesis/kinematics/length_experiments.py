@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from coordinator.report.document import Cell, Table
-from sim.thesis.amplitude_sweep import AmplitudeTrial, repeat_series, run_series, sweep_series
 from sim.thesis.experiment import (
     Check,
     Column,
@@ -23,6 +22,7 @@ from sim.thesis.experiment import (
     Scope,
     Unit,
 )
+from sim.thesis.kinematics.amplitude_sweep import AmplitudeTrial, repeat_series, run_series, sweep_series
 from sim.thesis.published import (
     ALIGNMENTS,
     AMPLITUDES_RAD,

@@ -30,7 +30,7 @@ from sim.robot.robot_file import load_robot
 from sim.robot.robot_tree import sensing_chain
 from sim.scoring.chain_score import link_length_m
 from sim.test_bench.one_joint_rig import IMU, OneJointRig, TrialRows, analyse, regress, windows
-from sim.thesis.joint_trial import bound_m, imu_knowledge, rms, trial_plan
+from sim.thesis.kinematics.joint_trial import bound_m, imu_knowledge, rms, trial_plan
 from sim.thesis.published import Alignment, thesis_length
 
 # Below this Gaussian low-pass the encoder is used, above it the gyro: it has 96 % of 2 Hz, so that the angle

@@ -1,0 +1,1 @@
+"""The thesis' inertial parameters and torque assistance on simulated modules."""

@@ -1,0 +1,1 @@
+"""The thesis' motions, signals and lengths of a link on simulated modules."""
