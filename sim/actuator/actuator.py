@@ -95,14 +95,14 @@ class Actuators:
         mass: Array,
         bias: Array,
         resistance_factor: Array | None = None,
-    ) -> Array:
-        """Advance the motors by one step; return the forces on the joints (m,) [Nm, N] for that step.
+    ) -> tuple[Array, Array]:
+        """Advance the motors by one step; return the joints' forces (m,) [Nm, N] and accelerations for it.
 
         `mass` (m, m) and `bias` (m,) are the multibody's at (q, qd); `resistance_factor` (n,) is the
-        resistance of the warm windings over that of cold ones. The acceleration that results from the forces
-        belongs to the instant of q.
+        resistance of the warm windings over that of cold ones. The accelerations (m,) [rad/s^2, m/s^2], which
+        solve M qdd = force - bias, belong to the instant of q.
         """
-        force, self._rows = kernel.advance(
+        force, qdd, self._rows = kernel.advance(
             self._modules,
             self._passives,
             self._rows,
@@ -117,7 +117,7 @@ class Actuators:
             qd,
         )
         self.state = kernel.ActuatorState(*self._rows)
-        return force
+        return force, qdd
 
 
 def _module_records(

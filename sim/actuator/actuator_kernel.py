@@ -110,8 +110,8 @@ def advance(
     bias: Array,
     q: Array,
     qd: Array,
-) -> tuple[Array, Array]:
-    """Return the joints' forces (m,) for one step, and the next state (ROWS, n)."""
+) -> tuple[Array, Array, Array]:
+    """Return the joints' forces (m,) for one step, their accelerations (m,), and the next state (ROWS, n)."""
     m, n = len(q), len(modules)
     pull, added, after = np.empty(m), np.empty(m), np.zeros((ROWS, n))
     momentum, inertia = np.empty(n), np.empty(n)
@@ -155,7 +155,7 @@ def advance(
         ohm = own.resistance_ohm * resistance_factor[i]
         stretch, rate = state[MOTOR_RAD, i] - q[j], qd[j] + dt_s / 2.0 * qdd[j]
         _account(own, ohm, voltage_v, friction, share, stretch, rate, after[:, i])
-    return whole, after
+    return whole, qdd, after
 
 
 @compiled

@@ -14,6 +14,7 @@ from module_agent.network_emulation.profile import PROFILES
 from module_agent.network_emulation.profile_file import network as network_named
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from sim.imperfections.noise_profile import NOISE_PROFILES
+from sim.physics.engine import Physics
 from sim.robot.noise_choice import NoiseChoice
 from sim.robot.robot_file import Robot, load_robot
 from sim.world.external_force import Push, check_pushed, parse_push
@@ -58,6 +59,10 @@ class WorldOptions(NoiseOptions):
     imu_rate_hz: Annotated[
         float, typer.Option(help="Readings of an IMU per second.", callback=check_imu_rate)
     ] = 250.0
+    physics: Annotated[
+        Physics | None,
+        typer.Option(help="What moves the bodies [pybullet in real time, compiled in virtual time]."),
+    ] = None
 
     def pushes_on(self, robot: Robot) -> tuple[Push, ...]:
         """Return the external forces that were chosen.

@@ -51,6 +51,7 @@ def run(
         noise=settings.choice().of(robot),
         pushes=settings.pushes_on(robot),
         imu_rate_hz=settings.imu_rate_hz,
+        physics=settings.physics or "compiled",
         plan=motions.chosen(),
         refined_previews=MAX_REFINED_MODULES,
         out=launched.new_folder(robot),
@@ -102,6 +103,7 @@ def _launch(
         processes=launched.processes,
         pushes=tuple(settings.push or ()),
         imu_rate_hz=settings.imu_rate_hz,
+        physics=settings.physics or "pybullet",
         agent_options=("--imu", plan.imu),
         # The robot ends with this run, so that there is nothing to resume.
         coordinator_options=("--no-advise", *reported, *coordinator_options, *motions.arguments()),

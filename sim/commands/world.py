@@ -35,7 +35,14 @@ def world(
     for each in SIGNALS:
         signal.signal(each, lambda number, _: stopping.append(number))
     try:
-        plant = World(robot, settings.seed, noise, pushes=pushes, imu_rate_hz=settings.imu_rate_hz)
+        plant = World(
+            robot,
+            settings.seed,
+            noise,
+            pushes=pushes,
+            imu_rate_hz=settings.imu_rate_hz,
+            physics=settings.physics or "pybullet",
+        )
         log = TruthLog(plant)
         server = BusServer(bus, log, PATIENCE_S, report=lambda line: typer.echo(line, err=True))
     except OSError as error:

@@ -9,7 +9,6 @@ import importlib
 import os
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,10 @@ pybullet: Any = _imported_quietly()
 
 
 class Multibody:
-    """A robot's joints in one private physics client; joint order is that of the skeleton."""
+    """A robot's joints in one private physics client: an `Engine` of `sim.physics.engine`."""
+
+    # PyBullet takes the velocity forces at qd, which is half a step before q; those at q are put instead.
+    rates = 2
 
     def __init__(self, name: str, skeleton: Skeleton, dt_s: float):
         n = len(skeleton.names)
@@ -53,21 +55,21 @@ class Multibody:
         _configure(self._client, self._body, skeleton, dt_s)
         _check(self._client, self._body, skeleton)
 
-    def place(self, q_rad: Array, qd_rad_s: Array | None = None) -> None:
-        """Put the joints to the given positions (m,), at rest or with the given velocities (m,)."""
-        rates = np.zeros_like(q_rad) if qd_rad_s is None else qd_rad_s
+    def place(self, q: Array, qd: Array | None = None) -> None:
+        """See `Engine.place`."""
+        rates = np.zeros_like(q) if qd is None else qd
         for i in self._indices:
             pybullet.resetJointState(
-                self._body, i, float(q_rad[i]), float(rates[i]), physicsClientId=self._client
+                self._body, i, float(q[i]), float(rates[i]), physicsClientId=self._client
             )
 
-    def step(self, torque_nm: Sequence[float]) -> tuple[Array, Array]:
-        """Apply joint torques (m,) for one step; return the new positions and velocities (m,)."""
+    def step(self, force: Array, qdd: Array, biases: Array) -> tuple[Array, Array]:
+        """See `Engine.step`."""
         pybullet.setJointMotorControlArray(
             self._body,
             self._indices,
             pybullet.TORQUE_CONTROL,
-            forces=torque_nm,
+            forces=(force - biases[0] + biases[1]).tolist(),
             physicsClientId=self._client,
         )
         pybullet.stepSimulation(physicsClientId=self._client)
@@ -76,7 +78,7 @@ class Multibody:
         return np.array(positions), np.array(velocities)
 
     def close(self) -> None:
-        """Disconnect the physics client. May be called twice."""
+        """See `Engine.close`."""
         if not self.closed:
             self.closed = True
             pybullet.disconnect(physicsClientId=self._client)

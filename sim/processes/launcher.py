@@ -14,6 +14,7 @@ from typing import NamedTuple
 from module_agent.main import ATTACHED
 from module_agent.model.errors import RobotError
 from module_agent.transport.endpoint import DEFAULT_ENDPOINT
+from sim.physics.engine import Physics
 from sim.robot.noise_choice import NoiseChoice
 
 START_TIMEOUT_S = 30.0
@@ -52,6 +53,7 @@ class LaunchConfig(NamedTuple):
     within: Callable[[str], tuple[str, ...]] = lambda process: ()
     pushes: tuple[str, ...] = ()
     imu_rate_hz: float = 250.0
+    physics: Physics = "pybullet"
 
 
 class Child(NamedTuple):
@@ -97,7 +99,7 @@ class Launcher:
         config = self.config
         arguments = ["sim.main", "world", config.robot_file, "--bus", self.bus, "--seed", str(config.seed)]
         arguments += ["--speed", str(config.speed), "--truth", str(config.out)]
-        arguments += ["--imu-rate-hz", str(config.imu_rate_hz)]
+        arguments += ["--imu-rate-hz", str(config.imu_rate_hz), "--physics", config.physics]
         arguments += config.noise.arguments
         for push in config.pushes:
             arguments += ["--push", push]

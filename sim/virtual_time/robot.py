@@ -16,6 +16,7 @@ from module_agent.network_emulation.impaired_transport import ImpairedTransport
 from module_agent.network_emulation.profile import NetworkProfile
 from module_agent.transport.transport import Transport
 from sim.imperfections.noise_profile import NoiseProfile
+from sim.physics.engine import Physics
 from sim.robot.robot_file import Robot
 from sim.virtual_time.loop import LoopScheduler, VirtualLoop
 from sim.virtual_time.network import VirtualNetwork
@@ -30,7 +31,7 @@ class VirtualSettings(NamedTuple):
     """The settings of a virtual robot; every seed in it follows from `seed`.
 
     `noise_seed` makes it another day of the same robot: other noise and network, the same modules.
-    `pushes` act on the world from outside.
+    `pushes` act on the world from outside; `physics` is the engine that moves its bodies.
     """
 
     robot: Robot
@@ -40,6 +41,7 @@ class VirtualSettings(NamedTuple):
     noise_seed: int | None = None
     pushes: tuple[Push, ...] = ()
     imu_rate_hz: float = 250.0
+    physics: Physics = "compiled"
 
 
 class _Wires:
@@ -95,7 +97,9 @@ class VirtualRobot:
         self.robot = settings.robot
         self.serials = settings.robot.serials
         self._index = {serial: index for index, serial in enumerate(self.serials)}
-        options = {name: getattr(settings, name) for name in ("noise_seed", "pushes", "imu_rate_hz")}
+        options = {
+            name: getattr(settings, name) for name in ("noise_seed", "pushes", "imu_rate_hz", "physics")
+        }
         self.world = World(settings.robot, settings.seed, settings.noise, **options)
         self.network = VirtualNetwork(loop) if network is None else network
         self.truth = TruthLog(self.world)

@@ -11,6 +11,7 @@ from coordinator.session.run import Run, RunConfig
 from coordinator.viewer.feed import Screen
 from module_agent.network_emulation.profile_file import network
 from sim.imperfections.noise_profile import NoiseProfile
+from sim.physics.engine import Physics
 from sim.robot.robot_file import Robot
 from sim.robot.robot_tree import true_chain
 from sim.scoring.truth_view import TruthView
@@ -39,6 +40,7 @@ class VirtualConfig(NamedTuple):
     baseline: Path | None = None
     pushes: tuple[Push, ...] = ()
     imu_rate_hz: float = 250.0
+    physics: Physics = "compiled"
     measured: tuple[Path, ...] = ()
     report: bool = False
 
@@ -72,6 +74,7 @@ def run_virtual(
         noise_seed=config.noise_seed,
         pushes=config.pushes,
         imu_rate_hz=config.imu_rate_hz,
+        physics=config.physics,
     )
     with virtual_robot(settings, imu=config.plan.imu) as robot:
         run = Run(

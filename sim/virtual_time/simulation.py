@@ -10,6 +10,7 @@ from coordinator.recording.recording import Recording
 from coordinator.recording.run_folder import SESSION, check_free, load_recording
 from module_agent.network_emulation.profile_file import network as network_profile
 from sim.imperfections.noise_profile import NoiseProfile, imu_kind, noise_profile
+from sim.physics.engine import Physics
 from sim.robot.robot_file import Robot, load_robot
 from sim.scoring.score import Score, score_identified
 from sim.virtual_time.robot import VirtualRobot, VirtualSettings
@@ -61,6 +62,7 @@ def simulate(
     dynamics: bool | None = None,
     pushes: tuple[Push, ...] = (),
     imu_rate_hz: float = 250.0,
+    physics: Physics = "compiled",
     out: Path | str | None = None,
 ) -> Simulation:
     """Simulate a robot, identify it in virtual time, and return result and truth.
@@ -74,6 +76,7 @@ def simulate(
         dynamics: whether to identify inertial parameters [kg, kg m, kg m^2] too; by default as planned.
         pushes: external forces [N] and torques [Nm] on modules.
         imu_rate_hz: how often the IMUs are read, 1000 Hz by a whole number.
+        physics: engine that moves the bodies, compiled or pybullet.
         out: folder to write the run to (`session.mcap`, `result.json`, `truth.json`, ...), as
             `x5-sim run --virtual` does; nothing is written when None.
 
@@ -97,6 +100,7 @@ def simulate(
                 *(described, folder, seed, network, profile, planned),
                 pushes=pushes,
                 imu_rate_hz=imu_rate_hz,
+                physics=physics,
             )
         )
         truth, motion = read_truth(folder / "truth.json"), read_motion(folder / "truth.npz")
@@ -106,7 +110,9 @@ def simulate(
     def keep_truth(simulated: VirtualRobot) -> None:
         ended.append((truth_of(described, simulated.world), simulated.truth.motion()))
 
-    settings = VirtualSettings(described, network_profile(network), seed, profile, None, pushes, imu_rate_hz)
+    settings = VirtualSettings(
+        described, network_profile(network), seed, profile, None, pushes, imu_rate_hz, physics
+    )
     recording = record_session(settings, planned, keep_truth)
     simulation = Simulation(described, None, recording, *ended[0])
     # Compute at once, so that an identification error is raised by this call.

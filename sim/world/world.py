@@ -16,10 +16,10 @@ from sim.actuator.thermal import Windings
 from sim.geometry.pose import Array
 from sim.imperfections.module_errors import draw_variation
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
+from sim.physics.engine import CompiledEngine, Engine, Physics
 from sim.physics.equilibrium import equilibrium
-from sim.physics.multibody import Multibody
 from sim.physics.rigid_tree import RigidTree
-from sim.physics.skeleton import build_skeleton
+from sim.physics.skeleton import Skeleton, build_skeleton
 from sim.robot.robot_file import Robot
 from sim.robot.variants import as_built
 from sim.sensors.sensors import Instant, Sensors
@@ -72,7 +72,8 @@ class World:
 
     The world begins at rest, the modules' joints where the robot file has them and all compliant joints at
     their static deflection. `noise_seed` draws the sensors' noise and drift anew for the same modules, as on
-    another day; the modules' parameters depend on `seed` alone. `pushes` are external wrenches.
+    another day; the modules' parameters depend on `seed` alone. `pushes` are external wrenches. `physics` is
+    the engine that moves the bodies.
 
     Raises:
         UsageError: a push is on no module, the robot's base or links are too soft to carry it, there is no
@@ -88,6 +89,7 @@ class World:
         noise_seed: int | None = None,
         pushes: Sequence[Push] = (),
         imu_rate_hz: float = 250.0,
+        physics: Physics = "compiled",
     ):
         imu_ticks = round(1.0 / (TICK_S * check_imu_rate(imu_rate_hz)))
         self.profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or robot.noise)
@@ -106,14 +108,15 @@ class World:
         self._tick = 0
         self._q, load = equilibrium(robot.name, self._tree, self._skeleton, robot.start_rad)
         self._qd, self._ahead = np.zeros_like(self._q), np.zeros_like(self._q)
-        self._rates = np.zeros((2, len(self._q)))
         self._pushes: list[Push] = []
         for one in pushes:
             self.push(one)
         self._actuators.reset(robot.start_rad, load)
-        self._rehearse(Sensors(*drawn))
-        self._body = Multibody(robot.name, self._skeleton, TICK_S)
+        self._physics: Physics = physics
+        self._body = _engine(physics, robot.name, self._skeleton)
         self._body.place(self._q)
+        self._rates = np.zeros((self._body.rates, len(self._q)))
+        self._rehearse(Sensors(*drawn))
         zero = np.zeros_like(robot.start_rad)
         q, structure, motor = self._q[self._joints], self._q[self._passive], self._actuators.state.motor_rad
         self._plant = (0, zero, zero, q, zero, zero, motor, zero, self._actuators.state.torque_nm, structure)
@@ -160,7 +163,7 @@ class World:
                 f"robot {robot.name} has joints {', '.join(skeleton.names)}; those of {self.robot.name} are "
                 f"{', '.join(self._skeleton.names)}, and a world keeps its joints"
             )
-        body = Multibody(robot.name, skeleton, TICK_S)
+        body = _engine(self._physics, robot.name, skeleton)
         body.place(self._q, self._qd)
         self._body.close()
         self.robot, self._skeleton, self._body, self._tree = robot, skeleton, body, RigidTree(skeleton)
@@ -187,16 +190,16 @@ class World:
         u, t_ns = self._checked(pwm), self._tick * TICK_NS
         actuators, q, qd = self._actuators, self._q, self._qd
         motor = actuators.state.motor_rad
-        # The integrator is a leapfrog: its velocities live half a tick before its positions, but it takes
-        # velocity forces as if they were of the same instant. The difference to the velocity forces at the
-        # velocity that the last acceleration predicts for this instant is added.
-        self._rates[0], self._rates[1] = qd + self._ahead, qd
+        # The integrator is a leapfrog: its velocities live half a tick before its positions. Velocity forces
+        # are those of the velocity that the last acceleration predicts for the instant of the positions.
+        self._rates[:] = qd
+        self._rates[0] += self._ahead
         mass, biases = self._tree.mass_and_biases(q, self._rates)
         if self._pushes:
             biases[0] -= self._pushed(q)
-        force = actuators.step(u, q, qd, mass, biases[0], self._windings.resistance_factor)
+        force, qdd = actuators.step(u, q, qd, mass, biases[0], self._windings.resistance_factor)
         drives = actuators.state
-        self._q, self._qd = self._body.step((force - biases[0] + biases[1]).tolist())
+        self._q, self._qd = self._body.step(force, qdd, biases)
         # The velocity at this instant is the mean of the two around it, the acceleration their difference.
         rate = (qd + self._qd) * 0.5
         self._ahead = rate - qd
@@ -265,3 +268,12 @@ class World:
             gyro_rad_s=self._imu_readings[0],
             specific_force_m_s2=self._imu_readings[1],
         )
+
+
+def _engine(physics: Physics, name: str, skeleton: Skeleton) -> Engine:
+    if physics == "compiled":
+        return CompiledEngine(skeleton, TICK_S)
+    # Loading PyBullet takes a quarter of a second, which worlds without it need not wait for.
+    from sim.physics.multibody import Multibody
+
+    return Multibody(name, skeleton, TICK_S)

@@ -38,7 +38,7 @@ class Bench:
     def run(self, pwm: float, seconds: float) -> None:
         for _ in range(round(seconds / self.dt)):
             mass, bias = np.array([[self.inertia]]), np.array([self.load])
-            torque = self.actuator.step(np.array([pwm]), self.q, self.qd, mass, bias)
+            torque, _ = self.actuator.step(np.array([pwm]), self.q, self.qd, mass, bias)
             self.qd = self.qd + self.dt * (torque - self.load) / self.inertia
             self.q = self.q + self.dt * self.qd
 

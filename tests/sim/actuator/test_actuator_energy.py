@@ -34,7 +34,7 @@ class Pendulum:
         load = self.weight_nm * np.sin(self.q) + self.fan_nm_s_rad * self.qd
         mass = np.array([[self.inertia]])
         factor = self.windings.resistance_factor
-        torque = self.actuator.step(np.array([pwm]), self.q, self.qd, mass, load, factor)
+        torque, _ = self.actuator.step(np.array([pwm]), self.q, self.qd, mass, load, factor)
         before = self.qd
         self.qd = self.qd + DT * (torque - load) / self.inertia
         self.fanned_j += float(DT * self.fan_nm_s_rad * before[0] * (before[0] + self.qd[0]) / 2)

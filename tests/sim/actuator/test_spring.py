@@ -65,7 +65,7 @@ def test_within_the_gap_nothing_is_transmitted_and_beyond_it_the_sensor_sees_the
     # Slowly, a hundredth of the way to full load, against an output that does not move.
     for pwm in np.linspace(0.0, 0.12, 1500):
         stretches.append(float(actuator.state.motor_rad[0]))
-        torque = actuator.step(np.array([pwm]), still, still, heavy, still)
+        torque, _ = actuator.step(np.array([pwm]), still, still, heavy, still)
         torques.append(float(torque[0]))
         deflections.append(float(actuator.state.deflection_rad[0]))
     inside = np.abs(stretches) <= gap / 2

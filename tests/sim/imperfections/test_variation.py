@@ -42,7 +42,7 @@ def _free_speed(profile: NoiseProfile, pwm: float = 0.5) -> float:
     actuator = Actuators([X5_4], 1e-3, profile)
     q, qd, mass, none = np.zeros(1), np.zeros(1), np.array([[1e-3]]), np.zeros(1)
     for _ in range(800):
-        qd = qd + 1e-3 * actuator.step(np.array([pwm]), q, qd, mass, none) / 1e-3
+        qd = qd + 1e-3 * actuator.step(np.array([pwm]), q, qd, mass, none)[0] / 1e-3
         q = q + 1e-3 * qd
     return float(qd[0])
 

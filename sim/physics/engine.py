@@ -1,0 +1,70 @@
+"""What moves the bodies by one step, semi-implicit Euler: compiled here, or PyBullet.
+
+    qd+ = qd + dt M(q)^-1 (force - bias(q, v)),        q+ = q + dt qd+
+
+with v the velocity at the instant of q (see `sim.world.world`). The accelerations are known when an engine is
+asked: motors and springs need them, so they come with the forces. The compiled engine has nothing left
+to do but to integrate. PyBullet computes everything again, from bodies of its own: it judges the other one.
+"""
+
+from typing import Literal, Protocol
+
+import numpy as np
+
+from sim.geometry.pose import Array
+from sim.physics.skeleton import Skeleton
+
+Physics = Literal["compiled", "pybullet"]
+
+
+class Engine(Protocol):
+    """A robot's bodies in motion; joint order is that of the skeleton.
+
+    rates: how many rows of bias forces `step` needs: one for v, and a second one for qd.
+    """
+
+    closed: bool
+    rates: int
+
+    def place(self, q: Array, qd: Array | None = None) -> None:
+        """Put the joints to the given positions (m,), at rest or with the given velocities (m,)."""
+        ...
+
+    def step(self, force: Array, qdd: Array, biases: Array) -> tuple[Array, Array]:
+        """Return the new positions and velocities (m,).
+
+        Args:
+            force: (m,) of motors and springs on the joints [Nm, N].
+            qdd: (m,) the accelerations M^-1 (force - biases[0]).
+            biases: (rates, m) bias forces at v and qd, without external wrenches in the second row.
+        """
+        ...
+
+    def close(self) -> None:
+        """End the engine. May be called twice."""
+        ...
+
+
+class CompiledEngine:
+    """Integrates the accelerations that come with the forces."""
+
+    rates = 1
+
+    def __init__(self, skeleton: Skeleton, dt_s: float):
+        self._dt_s = dt_s
+        self.closed = False
+        self.place(np.zeros(len(skeleton.names)))
+
+    def place(self, q: Array, qd: Array | None = None) -> None:
+        """See `Engine.place`."""
+        self._q, self._qd = q, np.zeros_like(q) if qd is None else qd
+
+    def step(self, force: Array, qdd: Array, biases: Array) -> tuple[Array, Array]:
+        """See `Engine.step`."""
+        self._qd = self._qd + self._dt_s * qdd
+        self._q = self._q + self._dt_s * self._qd
+        return self._q, self._qd
+
+    def close(self) -> None:
+        """See `Engine.close`."""
+        self.closed = True
