@@ -16,6 +16,7 @@ from coordinator.batch_estimation.imu_calibration import CalibrationInformation,
 from coordinator.batch_estimation.imu_intrinsics import beyond
 from coordinator.batch_estimation.sensor_data import NoiseFloor
 from coordinator.dynamics.torque_prediction import check_held_out
+from coordinator.identification.gear_trains import gear_trains
 from coordinator.identification.identified import (
     HeldOutMotion,
     IdentificationError,
@@ -28,7 +29,7 @@ from coordinator.identification.inertia.body_motion import Robot
 from coordinator.identification.inertia.inertia import find_inertia, without_terms
 from coordinator.identification.inertia.robot_bodies import robot_bodies
 from coordinator.identification.result_builder import build_result
-from coordinator.identification.robot_refinement import refine_checked
+from coordinator.identification.robot_refinement import ANYWHERE_M, refine_checked
 from coordinator.identification.sensor_checks import (
     check_effort_signs,
     check_encoder_signs,
@@ -209,7 +210,9 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         motions, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
-        known = measured_before(topology.serials, prior, measured)
+        geared = gear_trains(recording, topology.serials)
+        other_type = [topology.serials.index(one.serial) for one in geared if one.measured > 0.0]
+        known = measured_before(topology.serials, prior, measured).widened(other_type, ANYWHERE_M)
         rest_window = _rest(recording, clocks, topology.serials)
         imu_rate_hz = min(_imu_rate_hz(recording, serial) for serial in topology.serials)
         noise = motion_noise(windows, rest_window, REFINEMENT_CUTOFF_HZ, imu_rate_hz)
@@ -220,6 +223,7 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         check_effort_signs(opposed, signs)
         findings = (
             *opposed,
+            *geared,
             *doubted_sensors(refined, prior, suspects.imus, suspects.encoders),
             *misfits(refined, noise, [f"the {e.purpose} motion of {e.serial}" for e in motions]),
         )

@@ -36,7 +36,7 @@ LOAD_SIGMA = 0.3
 # Efforts are compared with loads that vary by more than this, and must follow them this closely.
 LOAD_NM, ALIKE_ABOVE = 0.05, 0.8
 _BACKWARDS = "its encoder counts backwards, or the module is mounted the other way round"
-_EXPLORATION = "its exploration"
+EXPLORATION = "its exploration"
 _MISLABELLED = "it seems to be of another type than it reports; its place is estimated"
 _SCALED = "the scale is estimated; check its gear ratio and type"
 _SENSORS = (("the residual of its gyro", "rad/s"), ("the residual of its accelerometer", "m/s^2"))
@@ -224,7 +224,7 @@ def effort_signs(chain: Chain, kinds: Sequence[ModuleType], motion: JointMotion)
     return [
         Finding(
             serial,
-            "its exploration",
+            EXPLORATION,
             "effort over load",
             float(s),
             1.0,
@@ -262,13 +262,13 @@ def doubted_sensors(
         what = f"the place of its IMU along {'xyz'[worst]} against its catalogued place"
         if away[worst] > NAMED_ABOVE:
             off = 1e3 * float(off_m[worst]), 0.0, float(away[worst])
-            findings.append(Finding(serials[k], _EXPLORATION, what, *off, "mm", _MISLABELLED))
+            findings.append(Finding(serials[k], EXPLORATION, what, *off, "mm", _MISLABELLED))
     for k in encoders:
         scale, sigma = float(refined.encoder_scale[k]), float(refined.encoder_scale_sigma[k])
         if abs(scale) > NAMED_ABOVE * sigma:
             read = 1.0 / (1.0 + scale), 1.0, abs(scale) / max(sigma, 1e-9)
             findings.append(
-                Finding(serials[k], _EXPLORATION, "its encoder's scale against the gyros", *read, "", _SCALED)
+                Finding(serials[k], EXPLORATION, "its encoder's scale against the gyros", *read, "", _SCALED)
             )
     return findings
 

@@ -10,11 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coordinator.batch_estimation.estimator import with_placement
 from coordinator.excitation.plan import Plan
 from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Entry, Recording
+from module_agent.model.catalogue import CATALOGUE, ModuleType
+from module_agent.model.chain import Chain
 from module_agent.model.errors import RobotError
 from module_agent.network_emulation.profile_file import network
 from module_agent.wire.codec import decode, encode
@@ -108,22 +111,35 @@ def fault_trial(fault: str, seed: int, plan: Plan) -> FaultTrial:
     recording = _Kept()
     try:
         record_session(settings, plan, recording=recording)
-        kinematics = identify_kinematics(_altered(recording, this, ill))
+        altered = _altered(recording, this, ill)
+        kinematics = identify_kinematics(altered)
     except RobotError as error:
         return FaultTrial(any(serial in str(error) for serial in ill), (), (), str(error))
     named = [finding.serial for finding in kinematics.findings]
     text = "; ".join(finding.summary for finding in kinematics.findings)
     others = tuple(serial for serial in named if serial not in ill)
-    return FaultTrial(any(s in ill for s in named), others, _sigmas_off(robot, kinematics), text)
+    return FaultTrial(any(s in ill for s in named), others, _sigmas_off(robot, kinematics, altered), text)
 
 
-def _sigmas_off(robot: Robot, kinematics: Kinematics) -> tuple[float, ...]:
+def _sigmas_off(robot: Robot, kinematics: Kinematics, recording: Recording) -> tuple[float, ...]:
     truth, fit, off = true_chain(robot), kinematics.fit, []
+    reported = {serial: recording.module_type(serial) for serial in fit.chain.serials}
+    built = {module.serial: CATALOGUE[module.type] for module in robot.modules}
+    chain = relabelled(fit.chain, reported, built)
     for child in [child for child, parent in enumerate(truth.parent) if parent >= 0]:
-        errors = link_errors(fit.chain, truth, child)
+        errors = link_errors(chain, truth, child)
         own = fit.chain.serials.index(truth.serials[child])
         off.append(np.inf if errors is None else abs(errors.length_m) / float(fit.link_length_sigma_m[own]))
     return tuple(off)
+
+
+def relabelled(chain: Chain, reported: Mapping[str, ModuleType], built: Mapping[str, ModuleType]) -> Chain:
+    """Return a chain of modules of the reported types as one of the types that they are, housings in place.
+
+    An IMU stands for the housing around it, and in that of another type it is elsewhere.
+    """
+    away = [np.subtract(built[serial].imu_xyz, reported[serial].imu_xyz) for serial in chain.serials]
+    return with_placement(chain, np.pad(away, ((0, 0), (3, 0))))
 
 
 def softened(robot: Robot, stiffness_nm_rad: float) -> Robot:

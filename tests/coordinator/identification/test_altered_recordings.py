@@ -128,19 +128,39 @@ def test_an_encoder_with_a_wrong_scale_is_named_and_its_scale_estimated(run: lis
     _covered(kinematics)
 
 
-def test_a_module_that_reports_another_type_is_named_by_the_place_of_its_imu(run: list[Entry]) -> None:
-    mislabelled = []
+def _relabelled(run: list[Entry], serial: str, label: str) -> list[Entry]:
+    entries = []
     for entry in run:
         if (
             entry.kind != "journal"
             and entry.kind != "request"
-            and parse(entry.topic)[1:] == (LIFT, Leaf.INFO)
+            and parse(entry.topic)[1:] == (serial, Leaf.INFO)
         ):
-            info = decode(Info, entry.payload).model_copy(update={"module_type": "X5-9-old"})
+            info = decode(Info, entry.payload).model_copy(update={"module_type": label})
             entry = entry._replace(payload=encode(info))
-        mislabelled.append(entry)
-    kinematics = identify_kinematics(_altered(mislabelled, lambda *_: None))
+        entries.append(entry)
+    return entries
+
+
+def test_a_module_that_reports_another_type_is_named_by_the_place_of_its_imu(run: list[Entry]) -> None:
+    kinematics = identify_kinematics(_altered(_relabelled(run, LIFT, "X5-9-old"), lambda *_: None))
     (finding,) = kinematics.findings
     # The IMU is at x = 25 mm, and by the other type at -30 mm.
     assert (finding.serial, finding.measured) == (LIFT, pytest.approx(55.0, abs=5.0))
     _covered(kinematics)
+
+
+def test_a_leaf_that_reports_another_type_is_named_by_its_gear_train(run: list[Entry]) -> None:
+    # Where its IMU sits in the housing shows in no motion: the claim holds 50 mm for it.
+    kinematics = identify_kinematics(_altered(_relabelled(run, ELBOW, "X5-9-old"), lambda *_: None))
+    (finding,) = kinematics.findings
+    assert (finding.serial, finding.measured) == (ELBOW, pytest.approx(762.0, rel=0.1))
+    length_sigma_m = kinematics.fit.link_length_sigma_m[kinematics.topology.serials.index(ELBOW)]
+    assert length_sigma_m > 0.04
+
+
+def test_a_leaf_that_counts_backwards_is_named_by_its_motor(run: list[Entry]) -> None:
+    # Nothing is beyond it that would show the sign.
+    kinematics = identify_kinematics(_altered(run, _backwards(ELBOW, ENCODER)))
+    (finding,) = kinematics.findings
+    assert (finding.serial, finding.measured) == (ELBOW, pytest.approx(-762.0, rel=0.1))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from module_agent.model.catalogue import CATALOGUE
 from sim.benchmark.case import Case, CaseResult, Summary, concluded
 from sim.benchmark.cases.arm import (
     ARMS,
@@ -32,9 +33,11 @@ from sim.benchmark.cases.suites import (
 )
 from sim.benchmark.cases.topology import TopologyTrial, topology_cases
 from sim.benchmark.row import Row
-from sim.benchmark.sensor_faults import FAULTS, HARMLESS, QUICK, FaultTrial, fault_cases
+from sim.benchmark.sensor_faults import FAULTS, HARMLESS, QUICK, FaultTrial, fault_cases, relabelled
 from sim.robot.random_robot import random_robot
-from sim.scoring.chain_score import LinkErrors
+from sim.robot.robot_file import load_robot
+from sim.robot.robot_tree import true_chain
+from sim.scoring.chain_score import LinkErrors, link_errors
 from sim.thesis.kinematics.joint_trial import JointTrial
 from sim.thesis.published import ALIGNMENTS, LENGTHS_MM
 
@@ -427,3 +430,17 @@ def test_findings_on_healthy_robots_are_misses() -> None:
     figure = "findings on healthy robots, of 1"
     assert rows(concluded(case, [healthy]).summary)[figure].holds
     assert not rows(concluded(case, [named]).summary)[figure].holds
+
+
+def test_a_wrong_type_puts_the_housing_where_it_is_not() -> None:
+    robot = load_robot("a2085_03")
+    truth, built = true_chain(robot), {m.serial: CATALOGUE[m.type] for m in robot.modules}
+    same = relabelled(truth, built, built)
+    np.testing.assert_allclose(same.imu_home, truth.imu_home, atol=1e-15)
+    # The elbow's IMU is seen where it is, 55 mm along its housing from where the other type has it.
+    wrong = relabelled(truth, built | {"elbow": CATALOGUE["X5-9-old"]}, built)
+    errors = link_errors(wrong, truth, truth.serials.index("elbow"))
+    assert errors is not None
+    away_m = np.linalg.norm(np.subtract(CATALOGUE["X5-9-old"].imu_xyz, CATALOGUE["X5-4"].imu_xyz))
+    # The distance from the axis has no part along the axis.
+    assert 0.05 < errors.vector_m <= away_m
