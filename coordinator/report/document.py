@@ -36,7 +36,7 @@ class Column(_Part):
     """A column of a table: its heading, the unit of its numbers, and the form that they are shown in.
 
     group: a heading above this and the neighbouring columns of the same group. right: aligned to the right
-    even if the cells are text.
+    even if the cells are text. link: the cells are titles of sections, and lead there.
     """
 
     name: str
@@ -44,6 +44,7 @@ class Column(_Part):
     form: str = ".4g"
     group: str = ""
     right: bool = False
+    link: bool = False
 
     @property
     def heading(self) -> str:
@@ -87,6 +88,31 @@ class Table(_Part):
         return not self.columns[column].right and all(
             isinstance(row[column], str | None) for row in self.rows
         )
+
+
+class Curve(_Part):
+    """Values over x; `style` is a line, points, or levels: dashed lines right across."""
+
+    label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    style: Literal["line", "points", "level"] = "line"
+
+
+class Panel(_Part):
+    """Curves over one x axis; `title` is shown above it."""
+
+    y_label: str
+    curves: tuple[Curve, ...]
+    title: str = ""
+
+
+class Plot(_Part):
+    """Panels one below the other that share their x axis; `plots.panel_figure` draws it."""
+
+    caption: str
+    x_label: str
+    panels: tuple[Panel, ...]
 
 
 class Figure(_Part):
@@ -141,6 +167,18 @@ class Document(_Part):
 def tables(section: Section) -> list[Table]:
     """Return the tables of a section."""
     return [block for block in section.blocks if isinstance(block, Table)]
+
+
+def linked(document: Document) -> set[str]:
+    """Return the titles of sections that a table leads to."""
+    return {
+        str(row[k])
+        for section in document.sections
+        for table in tables(section)
+        for k, column in enumerate(table.columns)
+        if column.link
+        for row in table.rows
+    }
 
 
 def figures(section: Section) -> list[Figure]:

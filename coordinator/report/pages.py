@@ -11,13 +11,15 @@ from pathlib import Path
 from coordinator.report.document import (
     Block,
     Bullets,
+    Cell,
+    Column,
     Conclusion,
     Document,
     Figure,
-    Outcome,
     Paragraph,
     Section,
     Table,
+    linked,
 )
 from module_agent.model.errors import UsageError
 from module_agent.model.files import write_json, write_text
@@ -35,7 +37,8 @@ PALETTE = {
     "axis": ("#b3246b", "#ff86bd"),
 }
 SUFFIXES = (".html", ".md", ".json")
-_OUTCOMES: dict[Outcome, str] = {"seen": "seen", "seen in part": "part", "not seen": "unseen"}
+_OUTCOMES: dict[str, str] = {"seen": "seen", "seen in part": "part", "not seen": "unseen"}
+_ROWS_A_PAGE = 24
 _COLOUR = re.compile("|".join(light for light, _ in PALETTE.values()), re.IGNORECASE)
 _VARIABLES = {light: f"var(--{name})" for name, (light, _) in PALETTE.items()}
 
@@ -52,12 +55,14 @@ _STYLE = f"""
 body {{ font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; color: var(--ink); background: var(--paper);
   max-width: 62rem; margin: 0 auto; padding: 1.5rem 1.2rem 4rem; overflow-wrap: break-word; }}
 h1 {{ font-size: 1.7rem; line-height: 1.2; margin: 0 0 .3rem; }}
-h2 {{ font-size: 1.2rem; margin: 2.2rem 0 .6rem;
+h2 {{ font-size: 1.2rem; margin: 2.2rem 0 .6rem; break-after: avoid;
   padding-bottom: .2rem; border-bottom: 1px solid var(--grid); }}
 p {{ margin: .5rem 0; }} .subtitle {{ color: var(--muted); margin: 0 0 1rem; }}
-nav {{ font-size: .9rem; }} nav a {{ color: var(--measured); margin-right: 1rem; white-space: nowrap; }}
+a {{ color: var(--measured); }}
+nav {{ font-size: .9rem; }} nav a {{ margin-right: 1rem; white-space: nowrap; }}
 ul {{ margin: .5rem 0; padding-left: 1.3rem; }} li {{ margin: .15rem 0; }}
 .scroll {{ overflow-x: auto; margin: .9rem 0 1.2rem; break-inside: avoid; }}
+.long {{ break-inside: auto; }} tr {{ break-inside: avoid; }}
 table {{ border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; }}
 caption {{ text-align: left; font-weight: 600; padding-bottom: .3rem;
   white-space: nowrap; }}
@@ -70,8 +75,11 @@ th[colspan] {{ text-align: center; }}
 figure {{ margin: 1rem 0 1.4rem; break-inside: avoid; }}
 figure svg {{ width: 100%; height: auto; display: block; }}
 figcaption {{ font-size: .87rem; color: var(--muted); }}
-.conclusion {{ border-left: .3rem solid var(--residual); padding: .2rem .8rem; }}
-.part {{ border-color: var(--predicted); }} .unseen {{ border-color: var(--axis); }}
+.conclusion {{ border-left: .3rem solid; padding: .2rem .8rem; break-inside: avoid; }}
+.conclusion.seen {{ border-color: var(--residual); }} .conclusion.part {{ border-color: var(--predicted); }}
+.conclusion.unseen {{ border-color: var(--axis); }}
+.outcome {{ white-space: nowrap; }} .outcome.seen {{ color: var(--residual); }}
+.outcome.part {{ color: var(--predicted); }} .outcome.unseen {{ color: var(--axis); }}
 """
 
 
@@ -113,25 +121,32 @@ def check_suffix(path: Path) -> Path:
 
 def html_page(document: Document) -> str:
     """Return the document as one HTML file, which needs no other file and no script."""
-    links = "".join(f'<a href="#{_anchor(s)}">{escape(s.title)}</a>' for s in document.sections)
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{escape(document.title)}</title><style>{_STYLE}</style></head>\n<body>"
         f'<h1>{escape(document.title)}</h1><p class="subtitle">{escape(document.subtitle)}</p>'
-        f"<nav>{links}</nav>\n"
+        f"{_navigation(document)}\n"
         + "\n".join(_html_section(section) for section in document.sections)
         + "\n</body></html>\n"
     )
 
 
-def _anchor(section: Section) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", section.title.lower()).strip("-")
+def _navigation(document: Document) -> str:
+    """Return links to all sections; none if a table has them."""
+    if linked(document):
+        return ""
+    links = "".join(f'<a href="#{_anchor(s.title)}">{escape(s.title)}</a>' for s in document.sections)
+    return f"<nav>{links}</nav>"
+
+
+def _anchor(title: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def _html_section(section: Section) -> str:
     blocks = "\n".join(map(_html_block, section.blocks))
-    return f'<section id="{_anchor(section)}"><h2>{escape(section.title)}</h2>\n{blocks}</section>'
+    return f'<section id="{_anchor(section.title)}"><h2>{escape(section.title)}</h2>\n{blocks}</section>'
 
 
 def _html_block(block: Block) -> str:
@@ -161,16 +176,26 @@ def _html_table(table: Table) -> str:
     rows = "".join(
         "<tr>"
         + "".join(
-            f"<td{kind}>{escape(column.shown(cell))}</td>"
+            f"<td{kind}>{_html_cell(column, cell)}</td>"
             for kind, column, cell in zip(kinds, table.columns, row, strict=True)
         )
         + "</tr>"
         for row in table.rows
     )
+    # A table that is longer than a page begins where it stands, and goes on over the next ones.
+    long = " long" if len(table.rows) > _ROWS_A_PAGE else ""
     return (
-        f'<div class="scroll"><table><caption>{escape(table.caption)}</caption><thead>{_groups(table)}'
+        f'<div class="scroll{long}"><table><caption>{escape(table.caption)}</caption><thead>{_groups(table)}'
         f"<tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
     )
+
+
+def _html_cell(column: Column, cell: Cell) -> str:
+    shown = escape(column.shown(cell))
+    if column.link:
+        return f'<a href="#{_anchor(str(cell))}">{shown}</a>'
+    outcome = _OUTCOMES.get(cell) if isinstance(cell, str) else None
+    return f'<span class="outcome {outcome}">{shown}</span>' if outcome else shown
 
 
 def _groups(table: Table) -> str:
@@ -192,6 +217,12 @@ def themed(svg: str) -> str:
     return _COLOUR.sub(lambda colour: _VARIABLES[colour.group().lower()], drawing)
 
 
+def on_paper(svg: str) -> str:
+    """Return a drawing with the ground of a light page, to be read as a file of its own anywhere."""
+    begins = svg.index(">", svg.index("<svg")) + 1
+    return f"{svg[:begins]}<style>svg {{ background: {PALETTE['paper'][0]} }}</style>{svg[begins:]}"
+
+
 # ---------------------------------------------------------------------- Markdown
 
 
@@ -199,12 +230,14 @@ def markdown_page(document: Document, folder: str) -> tuple[str, dict[str, str]]
     """Return the document as Markdown, and the drawings that it refers to in `folder`, by file name."""
     drawings: dict[str, str] = {}
     lines = [f"# {document.title}", "", document.subtitle, ""]
+    targets = linked(document)
     for section in document.sections:
+        lines += [f'<a id="{_anchor(section.title)}"></a>', ""] if section.title in targets else []
         lines += [f"## {section.title}", ""]
         for block in section.blocks:
             if isinstance(block, Figure):
-                name = f"{_anchor(section)}-{len(drawings) + 1}.svg"
-                drawings[name] = block.svg
+                name = f"{_anchor(section.title)}-{len(drawings) + 1}.svg"
+                drawings[name] = on_paper(block.svg)
                 lines += [f"![{block.alt}]({folder}/{name})", "", f"*{block.caption}*", ""]
             else:
                 lines += [*_markdown_block(block), ""]
@@ -223,10 +256,15 @@ def _markdown_block(block: Paragraph | Bullets | Table | Conclusion) -> list[str
             heads = [f"{c.group}: {c.heading}" if c.group else c.heading for c in block.columns]
             aligned = ["---" if block.is_text(k) else "---:" for k in range(len(block.columns))]
             rows = [
-                [column.shown(cell) for column, cell in zip(block.columns, row, strict=True)]
+                [_markdown_cell(column, cell) for column, cell in zip(block.columns, row, strict=True)]
                 for row in block.rows
             ]
             return [f"**{block.caption}**", "", *(_row(cells) for cells in (heads, aligned, *rows))]
+
+
+def _markdown_cell(column: Column, cell: Cell) -> str:
+    shown = column.shown(cell)
+    return f"[{shown}](#{_anchor(str(cell))})" if column.link else shown
 
 
 def _row(cells: list[str]) -> str:

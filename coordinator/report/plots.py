@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from coordinator.report.document import Curve, Figure, Plot
 from coordinator.report.pages import PALETTE
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.model.errors import UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
 WIDTH_IN = 9.6
 # More points than this are not told apart at the width of a page.
@@ -80,17 +81,17 @@ def check_plots() -> None:
 
 
 @contextmanager
-def _drawing(height_in: float) -> Iterator[tuple["Figure", StringIO]]:
+def _drawing(height_in: float) -> Iterator[tuple["Canvas", StringIO]]:
     """Yield an empty figure, and the text that holds it as SVG after the block."""
     check_plots()
     # Imported on use: half a second, which a program without a report does not pay.
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Canvas
 
     out = StringIO()
     with rc_context(_STYLE):
-        figure = Figure(figsize=(WIDTH_IN, height_in))
+        figure = Canvas(figsize=(WIDTH_IN, height_in))
         FigureCanvasSVG(figure)
         yield figure, out
         figure.savefig(out, format="svg", metadata=_NO_METADATA, transparent=True)
@@ -258,7 +259,7 @@ def _short(name: str, longest: int = 16) -> str:
     return name if len(name) <= longest else f"{name[: longest - 1]}…"
 
 
-def _robot_legend(figure: "Figure") -> None:
+def _robot_legend(figure: "Canvas") -> None:
     from matplotlib.lines import Line2D
 
     entries = [
@@ -312,3 +313,96 @@ def delay_plot(trips_ms: Mapping[str, Array]) -> str:
         panel.set_xlabel("round trip [ms]")
         figure.legend(loc="upper left", ncols=3, bbox_to_anchor=(0.15, 1.0), fontsize=8)
     return out.getvalue()
+
+
+# ---------------------------------------------------------------------- panels
+
+# Colours and marks of curves in their order. Larger marks first: they show under equal values of later ones.
+_CURVE_COLOURS = ("measured", "predicted", "residual", "ink", "axis", "muted")
+_MARKS = (("o", 8.0), ("s", 6.0), ("^", 5.0), ("D", 4.0), ("P", 7.0), ("v", 6.0))
+# Curves of fewer points show them.
+_FEW_POINTS = 50
+_PANEL_IN, _SINGLE_IN, _LABELS_IN, _TITLE_IN = 1.9, 2.7, 0.55, 0.25
+_LEGEND_ROW_IN, _LEGEND_COLUMNS = 0.22, 3
+
+
+def panel_figure(plot: Plot) -> Figure:
+    """Return a plot as a figure of its caption.
+
+    Raises:
+        MissingPlots: matplotlib is not installed.
+        ValueError: a panel or a curve without data.
+    """
+    alt = f"{plot.caption.removesuffix('.')}: {', '.join(labels(plot))} over {plot.x_label}"
+    return Figure(caption=plot.caption, alt=alt, svg=panel_plot(plot))
+
+
+def labels(plot: Plot) -> list[str]:
+    """Return the labels of all curves, each once."""
+    return list(dict.fromkeys(curve.label for panel in plot.panels for curve in panel.curves))
+
+
+def panel_plot(plot: Plot) -> str:
+    """Draw panels below each other over one x axis, with one legend: a label looks the same in all of them.
+
+    Raises:
+        MissingPlots: matplotlib is not installed.
+        ValueError: a panel or a curve without data.
+    """
+    for panel in plot.panels:
+        if not panel.curves or not all(len(curve.x) == len(curve.y) > 0 for curve in panel.curves):
+            raise ValueError(f"{plot.caption} The panel {panel.y_label} has a curve without data.")
+    names, count = labels(plot), len(plot.panels)
+    titles_in = _TITLE_IN * sum(bool(panel.title) for panel in plot.panels)
+    legend_in = _LEGEND_ROW_IN * -(-len(names) // _LEGEND_COLUMNS) + 0.1
+    height = (_SINGLE_IN if count == 1 else _PANEL_IN * count) + titles_in + legend_in + _LABELS_IN
+    with _drawing(height) as (figure, out):
+        grid: Any = figure.subplots(count, 1, sharex=True, squeeze=False, gridspec_kw={"hspace": 0.2})
+        figure.subplots_adjust(
+            left=0.09, right=0.985, top=1.0 - (legend_in + titles_in / count) / height, bottom=0.5 / height
+        )
+        for axes, panel in zip(grid[:, 0], plot.panels, strict=True):
+            for curve in panel.curves:
+                _curve(axes, curve, names.index(curve.label))
+            axes.set_ylabel(panel.y_label)
+            if panel.title:
+                axes.set_title(panel.title, loc="left", color=_MUTED, fontsize=9)
+        _few_ticks(grid[:, 0], plot)
+        grid[-1, 0].set_xlabel(plot.x_label)
+        drawn = [pair for axes in grid[:, 0] for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+        handles = {label: handle for handle, label in drawn}
+        figure.legend(
+            [handles[name] for name in names],
+            names,
+            loc="upper left",
+            ncols=min(_LEGEND_COLUMNS, len(names)),
+            bbox_to_anchor=(0.075, 1.0),
+        )
+        figure.align_ylabels()
+    return out.getvalue()
+
+
+def _few_ticks(panels: Sequence["Axes"], plot: Plot) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    places = [at for panel in plot.panels for curve in panel.curves for at in curve.x]
+    if all(float(at).is_integer() for at in places):
+        panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    for axes in panels:
+        axes.yaxis.set_major_locator(MaxNLocator(5))
+        axes.ticklabel_format(axis="y", useOffset=False)
+
+
+def _curve(axes: "Axes", curve: Curve, number: int) -> None:
+    """Draw a curve with the look of its number in the legend."""
+    look: dict[str, Any] = {"color": _COLOURS[_CURVE_COLOURS[number % len(_CURVE_COLOURS)]]}
+    if curve.style == "level":
+        look |= {"linewidth": 1.2, "linestyle": "--" if number % 2 else ":"}
+    else:
+        marked = curve.style == "points" or len(curve.x) < _FEW_POINTS
+        mark, size = _MARKS[number % len(_MARKS)]
+        look |= {"marker": mark, "markersize": size} if marked else {}
+        look |= {"linewidth": max(2.0 - 0.5 * number, 1.0) if marked else 1.1}
+        look |= {"linestyle": "none"} if curve.style == "points" else {}
+    thin = slice(None, None, max(1, len(curve.x) // MAX_DRAWN))
+    axes.plot(curve.x[thin], curve.y[thin], label=curve.label, **look)

@@ -12,16 +12,26 @@ from coordinator.report.document import (
     Bullets,
     Column,
     Conclusion,
+    Curve,
     Document,
     Figure,
+    Panel,
     Paragraph,
+    Plot,
     Section,
     Table,
     figures,
     tables,
 )
 from coordinator.report.pages import PALETTE, html_page, markdown_page, themed, write_page
-from coordinator.report.plots import PAUSE_S, MissingPlots, check_plots, torque_plot, without_pauses
+from coordinator.report.plots import (
+    PAUSE_S,
+    MissingPlots,
+    check_plots,
+    panel_figure,
+    torque_plot,
+    without_pauses,
+)
 from module_agent.model.errors import UsageError
 
 
@@ -92,6 +102,66 @@ def test_markdown_refers_to_the_figures_that_are_written(tmp_path: Path) -> None
     write_page(tmp_path / "study.md", study())
     (name,) = re.findall(r"!\[a sine\]\((.*?)\)", (tmp_path / "study.md").read_text())
     assert ElementTree.parse(tmp_path / name).getroot().tag.endswith("svg")
+
+
+def panels() -> Plot:
+    """Two panels: a signal with many points, and a few points with their level."""
+    t_s = tuple(np.linspace(0.0, 1.0, 2000))
+    few = (0.0, 1.0)
+    return Plot(
+        caption="A signal & its level.",
+        x_label="time [s]",
+        panels=(
+            Panel(y_label="velocity [rad/s]", curves=(Curve(label="measured", x=t_s, y=t_s),)),
+            Panel(
+                y_label="length [mm]",
+                title="one arm",
+                curves=(
+                    Curve(label="points", x=few, y=(484.0, 484.1), style="points"),
+                    Curve(label="truth", x=few, y=(484.0, 484.0), style="level"),
+                ),
+            ),
+        ),
+    )
+
+
+def test_a_plot_shows_every_label_once_and_every_panel_with_its_units() -> None:
+    figure = panel_figure(panels())
+    texts = [
+        "".join(one.itertext())
+        for one in ElementTree.fromstring(figure.svg).iter()
+        if one.tag.endswith("text")
+    ]
+    for text in ("measured", "points", "truth", "velocity [rad/s]", "length [mm]", "time [s]", "one arm"):
+        assert texts.count(text) == 1, text
+    assert figure.alt == "A signal & its level: measured, points, truth over time [s]"
+    # No offset that is written elsewhere.
+    assert any(text.startswith("484.0") for text in texts)
+    assert not re.search(r"(fill|stroke): ?#(000000|ffffff)", themed(figure.svg))
+
+
+def test_a_plot_without_data_is_refused() -> None:
+    empty = Panel(y_label="length [mm]", curves=(Curve(label="measured", x=(), y=()),))
+    for none in (empty, Panel(y_label="length [mm]", curves=())):
+        with pytest.raises(ValueError, match=r"A signal & its level\. The panel length \[mm\]"):
+            panel_figure(panels().model_copy(update={"panels": (none,)}))
+
+
+def test_a_table_of_contents_leads_to_sections_in_place_of_the_row_of_links(tmp_path: Path) -> None:
+    columns = (Column(name="experiment", link=True), Column(name="outcome"))
+    rows = [("Link length & <axis>", "seen in part")]
+    contents = Section(title="Summary", blocks=(Table.of("All", columns, rows),))
+    document = study().model_copy(update={"sections": (contents, *study().sections)})
+    page = html_page(document)
+    assert "<nav>" not in page
+    assert '<a href="#link-length-axis">Link length &amp; &lt;axis&gt;</a>' in page
+    assert '<section id="link-length-axis">' in page
+    assert '<span class="outcome part">seen in part</span>' in page
+    text, drawings = markdown_page(document, "figures")
+    assert "[Link length & <axis>](#link-length-axis)" in text
+    assert '<a id="link-length-axis"></a>' in text
+    # A drawing in a file of its own is legible on a dark ground too.
+    assert all(f"background: {PALETTE['paper'][0]}" in drawing for drawing in drawings.values())
 
 
 def test_the_same_document_gives_the_same_bytes() -> None:
