@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from coordinator.report.plots import check_plots
 from coordinator.runtime.command_line import fail, with_options
 from coordinator.runtime.terminal import Terminal, new_table, print_table
 from module_agent.model.errors import EXIT_FAILED
@@ -15,20 +16,27 @@ from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trials
 from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, worker_count
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
-from sim.thesis.kinematics.length_experiments import LENGTH_EXPERIMENTS
+from sim.thesis.kinematics.equation16 import EQUATION_16
 from sim.thesis.kinematics.motion_experiments import MOTION_EXPERIMENTS
+from sim.thesis.kinematics.repeat_experiments import REPEAT_EXPERIMENTS
+from sim.thesis.kinematics.sweep_experiments import SWEEP_EXPERIMENTS
 from sim.thesis.study import Store, code_version, results, selected, units_of
-from sim.thesis.study_report import write_results
+from sim.thesis.study_report import HTML, counted, write_results
 
 # In the order of the thesis.
-EXPERIMENTS: tuple[Experiment, ...] = (*MOTION_EXPERIMENTS, *LENGTH_EXPERIMENTS)
+EXPERIMENTS: tuple[Experiment, ...] = (
+    *MOTION_EXPERIMENTS,
+    *SWEEP_EXPERIMENTS,
+    *REPEAT_EXPERIMENTS,
+    EQUATION_16,
+)
 
 
 @with_options
 def thesis(
     modules: ModuleOptions,
     out: Annotated[
-        Path, typer.Option(help="Folder for thesis.json, report.md, its pictures, and what is measured.")
+        Path, typer.Option(help="Folder for report.html, report.md, thesis.json, and what is measured.")
     ] = Path("runs/thesis"),
     only: Annotated[
         str, typer.Option(help="Experiments, separated by commas: table4,figure23,... [all].")
@@ -38,6 +46,7 @@ def thesis(
 ) -> None:
     """Repeat the thesis' experiments; what was measured before by the same code is not measured again."""
     modules.profile()
+    check_plots()
     choice = modules.choice()
     chosen = selected(EXPERIMENTS, [name.strip() for name in only.split(",") if name.strip()])
     scope = Scope(modules.seed, choice, quick)
@@ -53,7 +62,7 @@ def thesis(
     outcome = ThesisResults(settings=settings, experiments=results(chosen, scope, measured))
     write_results(out, outcome)
     print_table(outcome_table(outcome.experiments))
-    typer.echo(str(out / "report.md"))
+    typer.echo(f"{counted(outcome)} Report: {out / HTML}")
 
 
 def _measured(

@@ -5,12 +5,15 @@ share units. What a unit measures depends on its arguments and the code alone.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ConfigDict
 
 from coordinator.report.document import Column as DocumentColumn
+from coordinator.report.document import Curve as Curve
 from coordinator.report.document import Outcome, Table
+from coordinator.report.document import Panel as Panel
+from coordinator.report.document import Plot as Plot
 from sim.robot.noise_choice import NoiseChoice
 
 
@@ -22,30 +25,6 @@ class Column(DocumentColumn):
     """A column of a report's table whose numbers are shown with one decimal unless it says otherwise."""
 
     form: str = ".1f"
-
-
-class Curve(_Part):
-    """Values over x; `style` is a line, points, or levels: dashed lines right across."""
-
-    label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    style: Literal["line", "points", "level"] = "line"
-
-
-class Panel(_Part):
-    """Curves over one x axis."""
-
-    y_label: str
-    curves: tuple[Curve, ...]
-
-
-class Plot(_Part):
-    """Panels one below the other that share their x axis."""
-
-    caption: str
-    x_label: str
-    panels: tuple[Panel, ...]
 
 
 class ExperimentResult(_Part):

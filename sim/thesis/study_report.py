@@ -1,123 +1,95 @@
-"""Results of the thesis' experiments as files: `thesis.json`, and `report.md` with a picture of each plot."""
+"""Results of the thesis' experiments as files: `report.html`, `report.md` with figures, `thesis.json`."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-from coordinator.report.document import Table
-from module_agent.model.files import replacing, write_json, write_text
-from sim.thesis.experiment import Curve, ExperimentResult, Plot, ThesisResults
+from coordinator.report.document import (
+    Block,
+    Bullets,
+    Column,
+    Conclusion,
+    Document,
+    Outcome,
+    Paragraph,
+    Section,
+    Table,
+)
+from coordinator.report.pages import write_page
+from coordinator.report.plots import panel_figure
+from module_agent.model.files import write_json
+from sim.thesis.experiment import ExperimentResult, ThesisResults
 
-# Distinct for colour-blind readers too (Okabe and Ito), in the order of the curves.
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#404040", "#cc79a7")
-# Larger ones first: they are seen under equal values of later ones.
-_MARKERS = (("o", 8.5), ("s", 6.5), ("^", 5.5), ("D", 4.0), ("*", 12.0))
-_FEW_POINTS = 50
-_WIDTH_IN, _PANEL_IN, _MARGIN_IN = 8.0, 2.4, 1.0
+HTML, MARKDOWN, DATA = "report.html", "report.md", "thesis.json"
+_OUTCOMES: tuple[Outcome, ...] = ("seen", "seen in part", "not seen")
 
 
-def write_results(folder: Path, outcome: ThesisResults) -> None:
-    """Write `thesis.json`, `report.md` and the pictures into a folder.
+def write_results(folder: Path, results: ThesisResults) -> None:
+    """Write `report.html`, `report.md` with a folder of figures, and `thesis.json` into a folder.
 
     Raises:
+        MissingPlots: matplotlib is not installed.
         OSError: a file cannot be written.
     """
-    pictures = folder / "pictures"
-    pictures.mkdir(parents=True, exist_ok=True)
-    for one in outcome.experiments:
-        for path, plot in zip(_pictures(one), one.plots, strict=True):
-            draw(plot, folder / path)
-    write_text(folder / "report.md", markdown(outcome))
-    write_json(folder / "thesis.json", outcome)
+    folder.mkdir(parents=True, exist_ok=True)
+    document = study_document(results)
+    for name in (HTML, MARKDOWN):
+        write_page(folder / name, document)
+    write_json(folder / DATA, results)
 
 
-def markdown(outcome: ThesisResults) -> str:
-    """Return the report as Markdown; pictures are linked by their path in the report's folder."""
-    settings = ", ".join(f"{name} {_setting(value)}" for name, value in outcome.settings.items())
-    lines = ["# The thesis' experiments on simulated modules", "", f"Settings: {settings}.", ""]
-    lines += ["| experiment | outcome |", "| --- | --- |"]
-    lines += [f"| {one.title} | {one.outcome} |" for one in outcome.experiments]
-    for one in outcome.experiments:
-        lines += ["", *_section(one)]
-    return "\n".join(lines) + "\n"
+def study_document(results: ThesisResults) -> Document:
+    """Return the report: a summary that leads to a section for each experiment.
+
+    Raises:
+        MissingPlots: matplotlib is not installed.
+        ValueError: a plot without data.
+    """
+    settings = ", ".join(f"{name} {_setting(value)}" for name, value in results.settings.items())
+    return Document(
+        title="The thesis' experiments on simulated modules",
+        subtitle=settings,
+        sections=(_summary(results), *map(_section, results.experiments)),
+    )
 
 
 def _setting(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return " ".join(value) or "none" if isinstance(value, tuple) else str(value)
 
 
-def _section(one: ExperimentResult) -> list[str]:
-    lines = [f"## {one.title}", "", one.finding, ""]
-    for table in one.tables:
-        lines += [*_table(table), ""]
-    for path, plot in zip(_pictures(one), one.plots, strict=True):
-        lines += [f"![{plot.caption}]({path})", ""]
-    lines += [f"- {text}" for text in one.reading]
-    return [*lines, *([""] if one.reading else []), f"**{one.outcome.capitalize()}.** {one.reason}"]
+def counted(results: ThesisResults) -> str:
+    """Return how many experiments have which outcome, as a sentence."""
+    counts = Counter(one.outcome for one in results.experiments)
+    total = len(results.experiments)
+    parts = ", ".join(f"{counts[outcome]} {outcome}" for outcome in _OUTCOMES)
+    return f"{total} experiment{'s' * (total != 1)}: {parts}."
 
 
-def _table(table: Table) -> list[str]:
-    def line(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(cells) + " |"
-
-    columns = table.columns
-    rows = [[column.shown(cell) for column, cell in zip(columns, row, strict=True)] for row in table.rows]
-    heads = [line([column.heading for column in columns]), line(["---"] * len(columns))]
-    return [table.caption, "", *heads, *map(line, rows)]
-
-
-def _pictures(one: ExperimentResult) -> list[str]:
-    return [f"pictures/{one.id}_{number}.png" for number in range(1, len(one.plots) + 1)]
-
-
-def draw(plot: Plot, path: Path) -> None:
-    """Draw a plot and save it as PNG.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
-
-    height_in = _PANEL_IN * len(plot.panels) + _MARGIN_IN + (0.8 if len(plot.panels) == 1 else 0.0)
-    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=110, layout="constrained")
-    grid: Any = figure.subplots(len(plot.panels), 1, sharex=True, squeeze=False)
-    # A label has the same look in all panels, as they share a legend.
-    labels = list(dict.fromkeys(curve.label for panel in plot.panels for curve in panel.curves))
-    for axes, panel in zip(grid[:, 0], plot.panels, strict=True):
-        for curve in panel.curves:
-            _draw_curve(axes, curve, labels.index(curve.label))
-        axes.grid(True, linewidth=0.4, color="#d5d5d5")
-        axes.set_axisbelow(True)
-        axes.set_ylabel(panel.y_label)
-    places = [at for panel in plot.panels for curve in panel.curves for at in curve.x]
-    if all(at.is_integer() for at in places):
-        grid[-1, 0].xaxis.set_major_locator(MaxNLocator(integer=True))
-    grid[-1, 0].set_xlabel(plot.x_label)
-    drawn = [pair for axes in grid[:, 0] for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    handles = {label: handle for handle, label in drawn}
-    columns = 2 if len(handles) > 3 else 3
-    figure.legend(
-        list(handles.values()),
-        list(handles),
-        loc="outside lower center",
-        ncol=columns,
-        fontsize=9,
-        frameon=False,
+def _summary(results: ThesisResults) -> Section:
+    columns = (Column(name="experiment", link=True), Column(name="outcome"))
+    rows = [(one.title, one.outcome) for one in results.experiments]
+    blocks = (
+        Paragraph(
+            text="Tables and figures of the thesis that show data, repeated on simulated modules: what was "
+            "printed, what the thesis' method gives here, and what ours gives on the same recordings. The "
+            "outcome of an experiment is whether what the thesis describes is seen here too."
+        ),
+        Paragraph(text=counted(results)),
+        Table.of("Experiments and their outcomes", columns, rows),
     )
-    figure.suptitle(plot.caption.removesuffix("."), fontsize=11)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")
+    return Section(title="Summary", blocks=blocks)
 
 
-def _draw_curve(axes: Any, curve: Curve, number: int) -> None:
-    look: dict[str, Any] = {"color": _COLOURS[number % len(_COLOURS)], "label": curve.label}
-    if curve.style == "level":
-        look |= {"linewidth": 1.0, "linestyle": "--" if number % 2 else ":"}
-    else:
-        marked = curve.style == "points" or len(curve.x) < _FEW_POINTS
-        marker, size = _MARKERS[number % len(_MARKERS)]
-        look |= {"marker": marker, "markersize": size} if marked else {}
-        look |= {"linewidth": max(2.2 - 0.6 * number, 1.0) if marked else 1.1}
-        look |= {"linestyle": "none"} if curve.style == "points" else {}
-    axes.plot(curve.x, curve.y, **look)
+def _section(one: ExperimentResult) -> Section:
+    return Section(title=one.title, blocks=tuple(_blocks(one)))
+
+
+def _blocks(one: ExperimentResult) -> Iterator[Block]:
+    yield Paragraph(text=one.finding)
+    yield from one.tables
+    yield from map(panel_figure, one.plots)
+    if one.reading:
+        yield Bullets(items=one.reading)
+    yield Conclusion(outcome=one.outcome, reason=one.reason)
