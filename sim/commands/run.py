@@ -51,7 +51,7 @@ def run(
         noise=settings.choice().of(robot),
         pushes=settings.pushes_on(robot),
         imu_rate_hz=settings.imu_rate_hz,
-        physics=settings.physics or "compiled",
+        physics=settings.physics,
         plan=motions.chosen(),
         refined_previews=MAX_REFINED_MODULES,
         out=launched.new_folder(robot),

@@ -14,15 +14,18 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from module_agent.model.read_only import read_only
 from sim.geometry.pose import Array, pose
 from sim.geometry.rigid_body import RigidBody, joined, tensor
+from sim.geometry.shape import Shape, box_between
 
 Length = Annotated[float, Field(ge=-10.0, le=10.0)]
 Xyz = tuple[Length, Length, Length]
+Edge = Annotated[float, Field(gt=0.0, le=10.0)]
 Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
 Moment = Annotated[float, Field(ge=-100.0, le=100.0)]
 
 _TUBE_RADIUS_M = 0.016
 # 0.4 kg/m of aluminium (2700 kg/m^3) at that outer radius makes a wall of 1.6 mm.
 _TUBE_INNER_RADIUS_M = sqrt(_TUBE_RADIUS_M**2 - 0.4 / 2700.0 / pi)
+_PLATE_M = 0.006
 _ALUMINIUM_E_PA, _ALUMINIUM_G_PA = 69e9, 26e9
 # Bolted and clamped aluminium structures lose 1-3 % of critical; this is 2 % at 40 Hz: c = 2 zeta k / omega.
 STRUCTURE_LOSS_S = 2.0 * 0.02 / (2.0 * pi * 40.0)
@@ -43,11 +46,12 @@ class Hinge(NamedTuple):
 
 
 class PlacedPart(NamedTuple):
-    """A part in its input frame: pose of its output frame (4, 4), its body, and its hinge if compliant."""
+    """A part in its input frame: pose of its output frame (4, 4), its body, hinge if compliant, shapes."""
 
     output: Array
     body: RigidBody
     hinge: Hinge | None = None
+    shapes: tuple[Shape, ...] = ()
 
 
 class Strict(BaseModel):
@@ -92,10 +96,19 @@ class Solid(Strict):
 
 
 class FreePose(Solid):
-    """Any rigid part: the pose of its output and its body, in its input frame; massless, a transform only."""
+    """Any rigid part: the pose of its output and its body, in its input frame; massless, a transform only.
+
+    `box_m` are the edges of what it touches with, about its centre of mass; without them it touches nothing.
+    """
 
     xyz_m: Xyz = (0.0, 0.0, 0.0)
     rpy_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    box_m: tuple[Edge, Edge, Edge] | None = None
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """What it touches with, in its input frame."""
+        return () if self.box_m is None else (Shape("box", pose(self.com_xyz_m), self.box_m),)
 
 
 class Part(Strict):
@@ -126,7 +139,7 @@ def placed(part: Part) -> PlacedPart:
     if part.bracket is not None:
         return BRACKETS[part.bracket]
     free = part.pose or FreePose()
-    return PlacedPart(pose(free.xyz_m, np.radians(free.rpy_deg)), free.body)
+    return PlacedPart(pose(free.xyz_m, np.radians(free.rpy_deg)), free.body, None, free.shapes)
 
 
 def _body(mass_kg: float, com: Sequence[float], inertia: Array) -> RigidBody:
@@ -142,7 +155,8 @@ def _tube(tube: Tube) -> PlacedPart:
     along = walls * _TUBE_RADIUS_M**2 + ends * _TUBE_RADIUS_M**2
     across = walls * (length**2 / 12 + _TUBE_RADIUS_M**2 / 2) + ends * (length / 2) ** 2
     body = _body(walls + ends, (length / 2, 0.0, 0.02), tensor(along, across, across, 0.0, 0.0, 0.0))
-    return PlacedPart(output, body, _tube_hinge(length))
+    wall = Shape("cylinder", pose((length / 2, 0.0, 0.02), (0.0, pi / 2, 0.0)), (_TUBE_RADIUS_M, length))
+    return PlacedPart(output, body, _tube_hinge(length), (wall,))
 
 
 def _tube_hinge(length_m: float) -> Hinge:
@@ -162,7 +176,10 @@ def _bracket(mass_kg: float, y: float, z: float, turn_rad: float) -> PlacedPart:
     foot = tensor(half * side**2 / 12, half * side**2 / 12, half * side**2 / 6, 0.0, 0.0, 0.0)
     wall = tensor(half * side**2 / 12, half * side**2 / 6, half * side**2 / 12, 0.0, 0.0, 0.0)
     plates = (_body(half, (0.0, y / 2, 0.003), foot), _body(half, (0.0, y, z * 0.7), wall))
-    return PlacedPart(pose((0.0, y, z), (turn_rad, 0.0, 0.0)), joined(plates))
+    far = y + np.sign(y) * _PLATE_M
+    low, high = sorted((0.0, float(far)))
+    plate = box_between(np.array([-side / 2, low, 0.0]), np.array([side / 2, high, z]))
+    return PlacedPart(pose((0.0, y, z), (turn_rad, 0.0, 0.0)), joined(plates), None, (plate,))
 
 
 BRACKETS: dict[str, PlacedPart] = {

@@ -3,8 +3,9 @@
     qd+ = qd + dt M(q)^-1 (force - bias(q, v)),        q+ = q + dt qd+
 
 with v the velocity at the instant of q (see `sim.world.world`). The accelerations are known when an engine is
-asked: motors and springs need them, so they come with the forces. The compiled engine has nothing left
-to do but to integrate. PyBullet computes everything again, from bodies of its own: it judges the other one.
+asked: motors and springs need them, so they come with the forces. The compiled engine has nothing left to do
+but to integrate. PyBullet computes everything again, from bodies of its own: it judges the other one, and it
+knows contact.
 """
 
 from typing import Literal, Protocol
@@ -30,6 +31,19 @@ class Engine(Protocol):
         """Put the joints to the given positions (m,), at rest or with the given velocities (m,)."""
         ...
 
+    def begin(self, q: Array) -> None:
+        """Put the joints to where the robot starts, (m,), at rest.
+
+        Raises:
+            UsageError: the robot overlaps an obstacle there.
+        """
+        ...
+
+    @property
+    def contact_n(self) -> Array:
+        """The sum of the normal forces of contact on every body in the last step, (m,) [N]."""
+        ...
+
     def step(self, force: Array, qdd: Array, biases: Array) -> tuple[Array, Array]:
         """Return the new positions and velocities (m,).
 
@@ -46,7 +60,7 @@ class Engine(Protocol):
 
 
 class CompiledEngine:
-    """Integrates the accelerations that come with the forces."""
+    """Integrates the accelerations that come with the forces; it knows no contact."""
 
     rates = 1
 
@@ -54,6 +68,15 @@ class CompiledEngine:
         self._dt_s = dt_s
         self.closed = False
         self.place(np.zeros(len(skeleton.names)))
+
+    def begin(self, q: Array) -> None:
+        """See `Engine.begin`."""
+        self.place(q)
+
+    @property
+    def contact_n(self) -> Array:
+        """See `Engine.contact_n`."""
+        return np.zeros_like(self._q)
 
     def place(self, q: Array, qd: Array | None = None) -> None:
         """See `Engine.place`."""

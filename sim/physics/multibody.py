@@ -9,14 +9,17 @@ import importlib
 import os
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sim.geometry.pose import Array
+from sim.physics.contact import Contacts
 from sim.physics.skeleton import Skeleton
 from sim.physics.skeleton_urdf import joint_name, urdf_text
+from sim.robot.robot_file import Obstacle
 
 
 def _imported_quietly() -> Any:
@@ -46,14 +49,28 @@ class Multibody:
     # PyBullet takes the velocity forces at qd, which is half a step before q; those at q are put instead.
     rates = 2
 
-    def __init__(self, name: str, skeleton: Skeleton, dt_s: float):
+    def __init__(self, name: str, skeleton: Skeleton, dt_s: float, obstacles: Sequence[Obstacle] = ()):
         n = len(skeleton.names)
         self._indices = list(range(n))
         self.closed = False
         self._client: int = pybullet.connect(pybullet.DIRECT)
-        self._body = _load(self._client, urdf_text(name, skeleton))
+        self._body = _load(self._client, urdf_text(name, skeleton, bool(obstacles)), bool(obstacles))
         _configure(self._client, self._body, skeleton, dt_s)
         _check(self._client, self._body, skeleton)
+        self._contacts = None
+        if obstacles:
+            self._contacts = Contacts(pybullet, self._client, self._body, skeleton, obstacles)
+
+    def begin(self, q: Array) -> None:
+        """See `Engine.begin`."""
+        self.place(q)
+        if self._contacts is not None:
+            self._contacts.check_start()
+
+    @property
+    def contact_n(self) -> Array:
+        """See `Engine.contact_n`."""
+        return np.zeros(len(self._indices)) if self._contacts is None else self._contacts.force_n()
 
     def place(self, q: Array, qd: Array | None = None) -> None:
         """See `Engine.place`."""
@@ -84,13 +101,14 @@ class Multibody:
             pybullet.disconnect(physicsClientId=self._client)
 
 
-def _load(client: int, urdf: str) -> int:
+def _load(client: int, urdf: str, touches_itself: bool) -> int:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.urdf"
         path.write_text(urdf)
-        body: int = pybullet.loadURDF(
-            str(path), useFixedBase=True, flags=pybullet.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
-        )
+        flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+        if touches_itself:
+            flags |= pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
+        body: int = pybullet.loadURDF(str(path), useFixedBase=True, flags=flags, physicsClientId=client)
     return body
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from module_agent.model.read_only import read_only
 from sim.geometry.pose import Array, inverse, pose
 from sim.geometry.rigid_body import RigidBody, joined, moved
+from sim.geometry.shape import Shape
 from sim.robot.robot_file import BASE, BaseCompliance, Robot
 from sim.robot.robot_tree import Segment, build_tree
 
@@ -32,6 +33,8 @@ class Skeleton(NamedTuple):
     stiffness, damping: (p,) of the passive joints [N/m, N s/m] or [Nm/rad, Nm s/rad].
     imu_body: (n,) the body that carries a module's IMU, -1 for the world. imu_pose: (n, 4, 4) its pose there.
     gravity_m_s2: along -z of the world.
+    shapes: of every body, in its frame; they count where there is something to touch. fixed_shapes: of what
+        does not move at all, in the world.
     """
 
     names: tuple[str, ...]
@@ -47,15 +50,18 @@ class Skeleton(NamedTuple):
     imu_body: tuple[int, ...]
     imu_pose: Array
     gravity_m_s2: float
+    shapes: tuple[tuple[Shape, ...], ...]
+    fixed_shapes: tuple[Shape, ...]
 
 
 class _Joint(NamedTuple):
-    """A joint and its bodies; frame and bodies in the world, with all joints at 0."""
+    """A joint, its bodies and their shapes; frame, bodies and shapes in the world, with all joints at 0."""
 
     name: str
     parent: int
     home: Array
     bodies: list[RigidBody]
+    shapes: list[Shape]
     sign: float = 1.0
     prismatic: bool = False
     spring: tuple[float, float] | None = None
@@ -68,6 +74,7 @@ def build_skeleton(robot: Robot, base_shake: float = 0.0, link_flex: float = 0.0
     """
     tree = build_tree(robot)
     joints: list[_Joint] = []
+    fixed: list[Shape] = []
     ground = -1
     if robot.base.compliance is not None and base_shake > 0.0:
         ground = _hang_base(joints, robot.base.compliance, robot.base.world_pose, base_shake)
@@ -77,10 +84,12 @@ def build_skeleton(robot: Robot, base_shake: float = 0.0, link_flex: float = 0.0
         held = ground if p < 0 else module[p]
         for number, segment in enumerate(tree.segments[i]):
             held = _hang_segment(joints, held, f"{tree.serials[i]}/flex{number}", segment, link_flex)
+            (joints[held].shapes if held >= 0 else fixed).extend(segment.shapes)
         carrier.append(held)
         module.append(len(joints))
+        own, sign = [tree.moved[i]], float(tree.axis_sign[i])
         joints.append(
-            _Joint(tree.serials[i], held, tree.output[i], [tree.moved[i]], sign=float(tree.axis_sign[i]))
+            _Joint(tree.serials[i], held, tree.output[i], own, list(tree.moved_shapes[i]), sign=sign)
         )
     imu_body = [own if back else c for own, c, back in zip(module, carrier, tree.reversed, strict=True)]
     springs = [joint.spring for joint in joints if joint.spring is not None]
@@ -106,6 +115,8 @@ def build_skeleton(robot: Robot, base_shake: float = 0.0, link_flex: float = 0.0
             np.array([relative_to(b, h) for b, h in zip(imu_body, tree.imu_home, strict=True)])
         ),
         gravity_m_s2=tree.gravity_m_s2,
+        shapes=tuple(tuple(one.seen_from(inverse(joint.home)) for one in joint.shapes) for joint in joints),
+        fixed_shapes=tuple(fixed),
     )
 
 
@@ -120,7 +131,7 @@ def _hang_base(joints: list[_Joint], given: BaseCompliance, base: Array, factor:
         for axis in np.flatnonzero(stiffness):
             name, spring = f"{BASE}/{prefix}{_AXES[axis]}", _softened(stiffness[axis], damping[axis], factor)
             home = place @ _Z_ALONG[axis]
-            joints.append(_Joint(name, len(joints) - 1, home, [], prismatic=prismatic, spring=spring))
+            joints.append(_Joint(name, len(joints) - 1, home, [], [], prismatic=prismatic, spring=spring))
     joints[-1].bodies.append(moved(given.body, base))
     return len(joints) - 1
 
@@ -132,7 +143,7 @@ def _hang_segment(joints: list[_Joint], held: int, name: str, segment: Segment, 
         for axis in np.flatnonzero(hinge.stiffness_nm_rad):
             spring = _softened(hinge.stiffness_nm_rad[axis], hinge.damping_nm_s_rad[axis], factor)
             joints.append(
-                _Joint(f"{name}-{_AXES[axis]}", held, hinge.pose @ _Z_ALONG[axis], [], spring=spring)
+                _Joint(f"{name}-{_AXES[axis]}", held, hinge.pose @ _Z_ALONG[axis], [], [], spring=spring)
             )
             held = len(joints) - 1
     if held >= 0:

@@ -1,27 +1,32 @@
-"""A skeleton as URDF text, for physics engines: joints and inertia, no shapes."""
+"""A skeleton as URDF text, for physics engines: joints and inertia, and shapes where they may touch."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sim.geometry.pose import Array
 from sim.geometry.rigid_body import RigidBody
+from sim.geometry.shape import Shape
+from sim.physics.contact import collision_text
 from sim.physics.skeleton import Skeleton
 
 # Physics engines take lower > upper for "no limits", which a sliding joint cannot leave out.
 _NO_LIMIT = '<limit lower="1" upper="-1" effort="1e9" velocity="1e9"/>'
 
 
-def urdf_text(name: str, skeleton: Skeleton) -> str:
+def urdf_text(name: str, skeleton: Skeleton, shapes: bool = False) -> str:
     """Return the robot with all joints at 0 as URDF; link i is called after body i, the fixed base `world`.
 
-    Floats are written by `repr`, so nothing is lost, and a joint's coordinate is the skeleton's.
+    Floats are written by `repr`, so nothing is lost, and a joint's coordinate is the skeleton's. `shapes`
+    adds what the bodies touch with.
     """
-    rows = [f'<robot name="{name}">', '<link name="world"/>']
+    fixed = _collisions(skeleton.fixed_shapes) if shapes else ""
+    rows = [f'<robot name="{name}">', f'<link name="world">{fixed}</link>']
     for i, body in enumerate(skeleton.names):
         parent = "world" if skeleton.parent[i] < 0 else skeleton.names[skeleton.parent[i]]
+        touching = _collisions(skeleton.shapes[i]) if shapes else ""
         kind, limit = ("prismatic", _NO_LIMIT) if skeleton.prismatic[i] else ("continuous", "")
         rows += [
-            f'<link name="{body}">{_inertial(skeleton.bodies[i])}</link>',
+            f'<link name="{body}">{_inertial(skeleton.bodies[i])}{touching}</link>',
             f'<joint name="{joint_name(body)}" type="{kind}">',
             f'<parent link="{parent}"/><child link="{body}"/>{_origin(skeleton.origin[i])}{limit}',
             f'<axis xyz="0 0 {float(skeleton.axis_sign[i])!r}"/></joint>',
@@ -32,6 +37,10 @@ def urdf_text(name: str, skeleton: Skeleton) -> str:
 def joint_name(body: str) -> str:
     """Return the name of the joint that moves a body."""
     return f"joint-{body}"
+
+
+def _collisions(shapes: tuple[Shape, ...]) -> str:
+    return "".join(collision_text(shape, _origin(shape.pose)) for shape in shapes)
 
 
 def _numbers(values: Array) -> str:

@@ -18,8 +18,9 @@ from module_agent.network_emulation.profile_file import network as network_profi
 from module_agent.network_emulation.profile_file import network_relative_to
 from module_agent.network_emulation.toml_location import Location, fault_lines, faults_of, parse_toml
 from module_agent.wire.keys import check_chunk
-from sim.geometry.link_parts import Angle, FreePose, Part, Solid, Strict, Xyz
+from sim.geometry.link_parts import Angle, Edge, FreePose, Part, Solid, Strict, Xyz
 from sim.geometry.pose import Array, pose
+from sim.geometry.shape import Shape
 from sim.imperfections.noise_profile import DEFAULT_PROFILE, noise_profile
 
 ROBOTS = Path(__file__).parents[1] / "robots"
@@ -175,6 +176,40 @@ class Module(Strict):
     build: Build | None = None
 
 
+class Obstacle(Strict):
+    """What stands around the robot and does not move, in a world with z up and the base frame's origin.
+
+    Exactly one of: `box_m` (edges), `cylinder_m` (radius, and length along its z), `sphere_m` (radius), and
+    `floor`, a half-space below its own z = 0. `xyz_m` and `rpy_deg` are the pose of its centre.
+    """
+
+    name: str
+    box_m: tuple[Edge, Edge, Edge] | None = None
+    cylinder_m: tuple[Edge, Edge] | None = None
+    sphere_m: Edge | None = None
+    floor: Literal[True] | None = None
+    xyz_m: Xyz = (0.0, 0.0, 0.0)
+    rpy_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    friction: Annotated[float, Field(ge=0.0, le=10.0)] = 0.5
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> "Obstacle":
+        shapes = (self.box_m, self.cylinder_m, self.sphere_m, self.floor)
+        if sum(one is not None for one in shapes) != 1:
+            raise ValueError("an obstacle is exactly one of: box_m, cylinder_m, sphere_m, floor")
+        return self
+
+    @property
+    def shape(self) -> Shape:
+        """Its shape in the world."""
+        place = pose(self.xyz_m, np.radians(self.rpy_deg))
+        if self.box_m is not None:
+            return Shape("box", place, self.box_m)
+        if self.cylinder_m is not None:
+            return Shape("cylinder", place, self.cylinder_m)
+        return Shape("plane", place) if self.sphere_m is None else Shape("sphere", place, (self.sphere_m,))
+
+
 def _resolved(name: str, info: ValidationInfo) -> str:
     return network_relative_to(name, (info.context or {}).get("folder", Path()))
 
@@ -183,12 +218,14 @@ class Robot(Strict):
     """A robot as its file describes it; `modules` is ordered depth first, so parents precede children.
 
     `network` is a profile's name, or the path of a network file, in the robot's file from its own folder.
+    Where there are obstacles the robot touches them and itself: see `sim.physics.contact`.
     """
 
     name: Annotated[str, _known(partial(check_chunk, "robot"))]
     network: Annotated[str, AfterValidator(_resolved), _known(network_profile)] = "none"
     noise: Annotated[str, _known(noise_profile)] = DEFAULT_PROFILE
     base: Base = Base()
+    obstacles: Annotated[tuple[Obstacle, ...], Field(alias="obstacle")] = ()
     modules: Annotated[tuple[Module, ...], Field(alias="module", min_length=1, max_length=64)]
 
     @property

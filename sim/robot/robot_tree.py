@@ -15,6 +15,7 @@ from module_agent.model.read_only import read_only
 from sim.geometry.link_parts import Hinge, placed
 from sim.geometry.pose import Array, inverse, pose
 from sim.geometry.rigid_body import RigidBody, joined, moved, negative, parameters, tensor
+from sim.geometry.shape import Shape, box_between
 from sim.robot.robot_file import Build, Module, Robot
 
 AS_CATALOGUED = Build()
@@ -32,12 +33,13 @@ FLANGE = _disc(0.030, 0.018, 0.006)
 
 
 class Segment(NamedTuple):
-    """A rigid segment of a link, in the world at q = 0: its body, and the hinge at its proximal end.
+    """A rigid segment of a link, in the world at q = 0: its body, its shapes, the hinge at its proximal end.
 
     Without a hinge it is fixed to the segment before it, or to the parent's body.
     """
 
     body: RigidBody
+    shapes: tuple[Shape, ...]
     hinge: Hinge | None
 
 
@@ -54,6 +56,7 @@ class RobotTree(NamedTuple):
     imu_home: (n, 4, 4) the IMUs.
     way: for every module the corners of its link, (k, 3), from the parent's distal frame to its own.
     moved: for every module what its joint alone turns (flange, or housing if reversed), in the world.
+    moved_shapes: for every module the shapes of that, in the world.
     segments: for every module the segments of its link, its own held part in the last of them.
     gravity_m_s2: gravity along -z of the world.
     """
@@ -69,6 +72,7 @@ class RobotTree(NamedTuple):
     imu_home: Array
     way: tuple[Array, ...]
     moved: tuple[RigidBody, ...]
+    moved_shapes: tuple[tuple[Shape, ...], ...]
     segments: tuple[tuple[Segment, ...], ...]
     gravity_m_s2: float
 
@@ -89,6 +93,7 @@ def build_tree(robot: Robot) -> RobotTree:
     outputs: list[Array] = []
     links: list[_Link] = []
     own: list[RigidBody] = []
+    own_shapes: list[tuple[Shape, ...]] = []
     for module, p, kind, build, back in zip(robot.modules, parent, types, builds, backwards, strict=True):
         start = robot.base.world_pose
         if p >= 0:
@@ -99,9 +104,13 @@ def build_tree(robot: Robot) -> RobotTree:
         outputs.append(link.end if back else link.end @ across)
         both = moved(housing(kind, build), housings[-1]), moved(FLANGE, outputs[-1])
         held, turned = reversed(both) if back else both
-        link.add(held)
+        # A flange is within its housing's envelope.
+        case = (_envelope(kind).seen_from(housings[-1]),)
+        link.add(held, () if back else case)
         end = housings[-1] if back else outputs[-1]
         carried = [] if module.payload is None else [moved(module.payload.body, end)]
+        shapes = () if module.payload is None else module.payload.shapes
+        own_shapes.append((*(case if back else ()), *(one.seen_from(end) for one in shapes)))
         own.append(joined([turned, *carried]))
         links.append(link)
     imus = [
@@ -125,6 +134,7 @@ def build_tree(robot: Robot) -> RobotTree:
         imu_home=read_only(np.array(imus)),
         way=tuple(read_only(np.array(link.way)) for link in links),
         moved=tuple(own),
+        moved_shapes=tuple(own_shapes),
         segments=segments,
         gravity_m_s2=robot.base.gravity_m_s2,
     )
@@ -136,26 +146,31 @@ class _Link:
     def __init__(self, start: Array, module: Module):
         self.end = start
         self.way = [start[:3, 3]]
-        self._pieces: list[tuple[list[RigidBody], Hinge | None]] = [([], None)]
+        self._pieces: list[tuple[list[RigidBody], list[Shape], Hinge | None]] = [([], [], None)]
         if module.flex is not None:
             stiffness, damping = module.flex.stiffness_nm_rad, module.flex.damping_nm_s_rad
             self._hang(Hinge(start, np.array(stiffness), np.array(damping)))
         for part in map(placed, module.link):
             if module.flex is None and part.hinge is not None:
                 self._hang(part.hinge._replace(pose=self.end @ part.hinge.pose))
-            self.add(moved(part.body, self.end))
+            self.add(moved(part.body, self.end), tuple(one.seen_from(self.end) for one in part.shapes))
             self.end = self.end @ part.output
             self.way.append(self.end[:3, 3])
 
     def _hang(self, hinge: Hinge) -> None:
         if hinge.stiffness_nm_rad.any():
-            self._pieces.append(([], hinge))
+            self._pieces.append(([], [], hinge))
 
-    def add(self, body: RigidBody) -> None:
+    def add(self, body: RigidBody, shapes: tuple[Shape, ...]) -> None:
         self._pieces[-1][0].append(body)
+        self._pieces[-1][1].extend(shapes)
 
     def segments(self) -> tuple[Segment, ...]:
-        return tuple(Segment(joined(bodies), hinge) for bodies, hinge in self._pieces)
+        return tuple(Segment(joined(bodies), tuple(shapes), hinge) for bodies, shapes, hinge in self._pieces)
+
+
+def _envelope(kind: ModuleType) -> Shape:
+    return box_between(np.array(kind.housing_min_xyz), np.array(kind.housing_max_xyz))
 
 
 def _displaced(xyz_m: tuple[float, float, float], turn_rad: tuple[float, float, float]) -> Array:

@@ -41,7 +41,7 @@ class VirtualSettings(NamedTuple):
     noise_seed: int | None = None
     pushes: tuple[Push, ...] = ()
     imu_rate_hz: float = 250.0
-    physics: Physics = "compiled"
+    physics: Physics | None = None
 
 
 class _Wires:

@@ -40,7 +40,7 @@ class VirtualConfig(NamedTuple):
     baseline: Path | None = None
     pushes: tuple[Push, ...] = ()
     imu_rate_hz: float = 250.0
-    physics: Physics = "compiled"
+    physics: Physics | None = None
     measured: tuple[Path, ...] = ()
     report: bool = False
 

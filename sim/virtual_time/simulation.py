@@ -62,7 +62,7 @@ def simulate(
     dynamics: bool | None = None,
     pushes: tuple[Push, ...] = (),
     imu_rate_hz: float = 250.0,
-    physics: Physics = "compiled",
+    physics: Physics | None = None,
     out: Path | str | None = None,
 ) -> Simulation:
     """Simulate a robot, identify it in virtual time, and return result and truth.
@@ -76,7 +76,7 @@ def simulate(
         dynamics: whether to identify inertial parameters [kg, kg m, kg m^2] too; by default as planned.
         pushes: external forces [N] and torques [Nm] on modules.
         imu_rate_hz: how often the IMUs are read, 1000 Hz by a whole number.
-        physics: engine that moves the bodies, compiled or pybullet.
+        physics: engine that moves the bodies; by default compiled, pybullet where there are obstacles.
         out: folder to write the run to (`session.mcap`, `result.json`, `truth.json`, ...), as
             `x5-sim run --virtual` does; nothing is written when None.
 

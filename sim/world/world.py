@@ -73,11 +73,12 @@ class World:
     The world begins at rest, the modules' joints where the robot file has them and all compliant joints at
     their static deflection. `noise_seed` draws the sensors' noise and drift anew for the same modules, as on
     another day; the modules' parameters depend on `seed` alone. `pushes` are external wrenches. `physics` is
-    the engine that moves the bodies.
+    the engine that moves the bodies; by default compiled, PyBullet where there are obstacles to touch.
 
     Raises:
         UsageError: a push is on no module, the robot's base or links are too soft to carry it, there is no
-            such noise profile, or the IMU's rate is not a whole fraction of the ticks'.
+            such noise profile, the IMU's rate is not a whole fraction of the ticks', the robot overlaps an
+            obstacle where it starts, or the engine knows no contact.
     """
 
     def __init__(
@@ -89,7 +90,7 @@ class World:
         noise_seed: int | None = None,
         pushes: Sequence[Push] = (),
         imu_rate_hz: float = 250.0,
-        physics: Physics = "compiled",
+        physics: Physics | None = None,
     ):
         imu_ticks = round(1.0 / (TICK_S * check_imu_rate(imu_rate_hz)))
         self.profile = noise if isinstance(noise, NoiseProfile) else noise_profile(noise or robot.noise)
@@ -112,9 +113,9 @@ class World:
         for one in pushes:
             self.push(one)
         self._actuators.reset(robot.start_rad, load)
-        self._physics: Physics = physics
-        self._body = _engine(physics, robot.name, self._skeleton)
-        self._body.place(self._q)
+        self._physics = _checked_physics(physics, robot)
+        self._body = _engine(self._physics, robot, self._skeleton)
+        self._body.begin(self._q)
         self._rates = np.zeros((self._body.rates, len(self._q)))
         self._rehearse(Sensors(*drawn))
         zero = np.zeros_like(robot.start_rad)
@@ -128,6 +129,18 @@ class World:
     def t_ns(self) -> int:
         """The world's time [ns]: the end of the last tick."""
         return self._tick * TICK_NS
+
+    @property
+    def contact_n(self) -> Array:
+        """The normal forces of contact on what each module's joint moves up to the next joint, (n,) [N]."""
+        total = np.zeros(len(self._joints))
+        for body, force_n in enumerate(self._body.contact_n):
+            carrier = body
+            while carrier >= 0 and carrier not in self._skeleton.module:
+                carrier = self._skeleton.parent[carrier]
+            if carrier >= 0:
+                total[self._skeleton.module.index(carrier)] += force_n
+        return read_only(total)
 
     @property
     def plant(self) -> Plant:
@@ -163,7 +176,7 @@ class World:
                 f"robot {robot.name} has joints {', '.join(skeleton.names)}; those of {self.robot.name} are "
                 f"{', '.join(self._skeleton.names)}, and a world keeps its joints"
             )
-        body = _engine(self._physics, robot.name, skeleton)
+        body = _engine(self._physics, robot, skeleton)
         body.place(self._q, self._qd)
         self._body.close()
         self.robot, self._skeleton, self._body, self._tree = robot, skeleton, body, RigidTree(skeleton)
@@ -270,10 +283,20 @@ class World:
         )
 
 
-def _engine(physics: Physics, name: str, skeleton: Skeleton) -> Engine:
+def _checked_physics(physics: Physics | None, robot: Robot) -> Physics:
+    if not robot.obstacles:
+        return physics or "compiled"
+    if physics == "compiled":
+        raise UsageError(
+            f"robot {robot.name} has obstacles, and compiled physics knows no contact: choose pybullet"
+        )
+    return "pybullet"
+
+
+def _engine(physics: Physics, robot: Robot, skeleton: Skeleton) -> Engine:
     if physics == "compiled":
         return CompiledEngine(skeleton, TICK_S)
     # Loading PyBullet takes a quarter of a second, which worlds without it need not wait for.
     from sim.physics.multibody import Multibody
 
-    return Multibody(name, skeleton, TICK_S)
+    return Multibody(robot.name, skeleton, TICK_S, robot.obstacles)
