@@ -202,11 +202,11 @@ def test_the_readme_fits_on_a_first_screen_and_a_bit() -> None:
 
 
 def test_the_robot_file_of_the_guide_is_a_robot(tmp_path: Path) -> None:
-    (text,) = blocks("toml")
     path = tmp_path / "my_arm.toml"
-    path.write_text(text)
+    path.write_text("\n".join(blocks("toml")))
     robot = load_robot(path)
     assert [module.serial for module in robot.modules] == ["shoulder", "elbow"]
+    assert [obstacle.name for obstacle in robot.obstacles] == ["table"]
 
 
 def test_the_wire_page_has_every_topic_with_its_messages() -> None:
