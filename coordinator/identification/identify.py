@@ -31,9 +31,9 @@ from coordinator.identification.inertia.robot_bodies import robot_bodies
 from coordinator.identification.result_builder import build_result
 from coordinator.identification.robot_refinement import ANYWHERE_M, refine_checked
 from coordinator.identification.sensor_checks import (
-    check_effort_signs,
     check_encoder_signs,
     check_encoder_travels,
+    check_opposed,
     doubted_sensors,
     effort_signs,
     encoder_signs,
@@ -198,6 +198,8 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         rest = recording.rest_observation(topology.serials, MIN_REST_ROWS)
         signs = encoder_signs(topology, search.observations, rest.specific_force_m_s2)
         check_encoder_signs(signs)
+        geared = gear_trains(recording, topology.serials)
+        check_opposed([one for one in geared if one.measured < 0.0], signs)
         types = [recording.module_type(s) for s in topology.serials]
         explored = _exploration(recording, clocks, topology.serials)
         first = assemble(
@@ -210,7 +212,6 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         motions, windows = _exploration(recording, clocks, topology.serials)
         prior = IMU_PRIORS[recording.imu]
         floor = base_floor(recording, clocks, topology)
-        geared = gear_trains(recording, topology.serials)
         other_type = [topology.serials.index(one.serial) for one in geared if one.measured > 0.0]
         known = measured_before(topology.serials, prior, measured).widened(other_type, ANYWHERE_M)
         rest_window = _rest(recording, clocks, topology.serials)
@@ -220,7 +221,7 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
         refined = _settled(refined, first.chain)
         motion = joined_motions([filtered_window(one) for one in windows])
         opposed = effort_signs(refined.chain, types, motion)
-        check_effort_signs(opposed, signs)
+        check_opposed(opposed, signs)
         findings = (
             *opposed,
             *geared,

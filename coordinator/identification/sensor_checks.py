@@ -237,7 +237,7 @@ def effort_signs(chain: Chain, kinds: Sequence[ModuleType], motion: JointMotion)
     ]
 
 
-def check_effort_signs(findings: Sequence[Finding], signs: Mapping[str, tuple[float, float]]) -> None:
+def check_opposed(findings: Sequence[Finding], signs: Mapping[str, tuple[float, float]]) -> None:
     """Raise a SensorError with the findings on joints whose encoder's sign no other IMU observes."""
     open_ = [f for f in findings if signs.get(f.serial, (1.0, np.inf))[1] * NAMED_ABOVE > 1.0]
     if open_:

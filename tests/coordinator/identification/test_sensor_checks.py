@@ -11,9 +11,9 @@ from coordinator.dynamics.pseudo_inertia import parameters
 from coordinator.identification.sensor_checks import (
     SensorError,
     Travel,
-    check_effort_signs,
     check_encoder_signs,
     check_encoder_travels,
+    check_opposed,
     effort_signs,
     encoder_signs,
     misfits,
@@ -70,9 +70,9 @@ def test_an_effort_that_opposes_its_load_is_named(robots: Any) -> None:
     (finding,) = effort_signs(chain, types, motion._replace(tau_nm=motion.tau_nm * [-1.0, 1.0, 1.0]))
     assert (finding.serial, finding.measured) == ("M00", pytest.approx(-1.3))
     # Where gyros tell the encoder's sign it is the effort's, and the chain holds.
-    check_effort_signs([finding], {"M00": (1.0, 0.05)})
+    check_opposed([finding], {"M00": (1.0, 0.05)})
     with pytest.raises(SensorError, match=r"M00: effort over load is -1.3"):
-        check_effort_signs([finding], {})
+        check_opposed([finding], {})
 
 
 def _travels(turned: dict[str, dict[str, float]]) -> list[Travel]:
