@@ -2,6 +2,10 @@
 
 from module_agent.model.catalogue import ModuleType
 from module_agent.wire.messages import GainSet, Limits, PidGains
+from module_agent.wire.refusal import Refusal, WireError
+
+# Factory gains are up to 30; the thesis' integral gains, if meant per tick of 1 ms, are up to 1000 1/s.
+MAX_GAIN, MAX_INTEGRAL_GAIN = 1e3, 1e4
 
 
 def default_gains(kind: ModuleType, strategy: int) -> GainSet:
@@ -36,6 +40,23 @@ def default_gains(kind: ModuleType, strategy: int) -> GainSet:
             d_on_error=False,
         ),
     )
+
+
+def check_gains(gains: GainSet) -> None:
+    """Check that gains are of a size that some controller of a module could have.
+
+    Raises:
+        WireError: LIMIT, with the loop, the gain and its range.
+    """
+    for name in ("position", "velocity", "effort"):
+        loop: PidGains = getattr(gains, name)
+        for field in ("kp", "ki", "kd", "feed_forward", "punch", "i_clamp", "min_output", "max_output"):
+            value: float = getattr(loop, field)
+            most = MAX_INTEGRAL_GAIN if field == "ki" else MAX_GAIN
+            if abs(value) > most:
+                raise WireError(
+                    Refusal.LIMIT, f"{field} {value:g} of the {name} loop; possible are -{most:g} .. {most:g}"
+                )
 
 
 def catalogue_limits(kind: ModuleType) -> Limits:

@@ -17,6 +17,10 @@ from module_agent.wire.refusal import Refusal, WireError
 MAX_MOTION_S = 60.0
 # The thesis commands up to 9 times the maximum speed, to show how the module saturates.
 ABSURD_SPEED = 10.0
+# The effort loop clamps its target at 1.6 times the type's effort.
+ABSURD_EFFORT = 10.0
+# A setpoint is followed at once: one turn away and more it is a mistake, or meant to do harm.
+MAX_STEP_RAD = 2.0 * math.pi
 # How finely a motion is sampled. Its command holds from one sample to the next, in the module's time and
 # however far apart the ticks are.
 STEP_NS = 1_000_000
@@ -103,6 +107,11 @@ class Motion:
         return max(max(self._velocity), -min(self._velocity))
 
     @property
+    def top_effort_nm(self) -> float:
+        """The largest effort that is fed forward, 0 without any."""
+        return 0.0 if self._effort is None else max(max(self._effort), -min(self._effort))
+
+    @property
     def range_rad(self) -> tuple[float, float]:
         """The lowest and the highest position of the motion."""
         return min(self._position), max(self._position)
@@ -129,14 +138,21 @@ def check_duration(pattern: Pattern, origin_rad: float) -> None:
         )
 
 
-def check_setpoint(setpoint: Setpoint, limits: Limits) -> None:
-    """Check that a setpoint is within the position limits and is not absurdly fast.
+def check_setpoint(setpoint: Setpoint, measured_rad: float, limits: Limits) -> None:
+    """Check that a setpoint is within the position limits, and no absurd step, speed or effort.
 
     Raises:
-        WireError: LIMIT, with the position and the range that is allowed, or the speed.
+        WireError: LIMIT, with what the setpoint asks and what is allowed.
     """
     _check_speed(abs(setpoint.velocity_rad_s or 0.0), limits)
+    _check_effort(abs(setpoint.effort_nm or 0.0), limits)
     position = setpoint.position_rad
+    if position is not None and abs(position - measured_rad) > MAX_STEP_RAD:
+        raise WireError(
+            Refusal.LIMIT,
+            f"position {position:.1f} rad is {abs(position - measured_rad):.1f} rad from where the joint is, "
+            f"at most {MAX_STEP_RAD:.1f} rad are taken: a motion leads farther",
+        )
     if position is not None and not _within(position, position, limits):
         allowed = f"{limits.min_position_rad} .. {limits.max_position_rad} rad"
         raise WireError(Refusal.LIMIT, f"position {position:.3f} rad is outside {allowed}")
@@ -146,9 +162,11 @@ def check_motion(motion: Motion, limits: Limits) -> None:
     """Check that a motion stays within the position limits and is not absurdly fast.
 
     Raises:
-        WireError: LIMIT, with the range that the motion needs and the one that is allowed, or its speed.
+        WireError: LIMIT, with the range that the motion needs and the one that is allowed, its speed or its
+            effort.
     """
     _check_speed(motion.top_speed_rad_s, limits)
+    _check_effort(motion.top_effort_nm, limits)
     low, high = motion.range_rad
     if not _within(low, high, limits):
         allowed = f"{limits.min_position_rad} .. {limits.max_position_rad} rad"
@@ -162,6 +180,15 @@ def _check_speed(speed_rad_s: float, limits: Limits) -> None:
             Refusal.LIMIT,
             f"{speed_rad_s:.1f} rad/s is over {ABSURD_SPEED:.0f} times what this module can do, "
             f"{limits.max_speed_rad_s:.2f} rad/s",
+        )
+
+
+def _check_effort(effort_nm: float, limits: Limits) -> None:
+    if effort_nm > ABSURD_EFFORT * limits.max_effort_nm:
+        raise WireError(
+            Refusal.LIMIT,
+            f"{effort_nm:.1f} Nm is over {ABSURD_EFFORT:.0f} times what this module can do, "
+            f"{limits.max_effort_nm:.2f} Nm",
         )
 
 

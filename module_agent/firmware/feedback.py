@@ -84,6 +84,10 @@ class FeedbackStream:
         self._last_imu_ns = -1
         self._sent_row = 0
 
+    def begin_anew(self) -> None:
+        """Let a row be due at once, after a clock that went back: the next one would be long in coming."""
+        self._due_ns, self._last_imu_ns = 0, -1
+
     def due(self, now_ns: int, imu_t_ns: int) -> bool:
         """Return whether this tick, asked for once and with its IMU's time, is to make a row."""
         new_imu = imu_t_ns != self._last_imu_ns

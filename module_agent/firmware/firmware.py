@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from module_agent.control.controller import BRAKE, MOTOR_OFF, Command
-from module_agent.control.gains import default_gains
+from module_agent.control.gains import check_gains, default_gains
 from module_agent.control.motion import Motion, check_duration, check_motion, check_setpoint
 from module_agent.firmware.admission import Admission, Lease
 from module_agent.firmware.config import FirmwareConfig, check_config
@@ -114,7 +114,10 @@ class Firmware:
         """Begin a tick: expire what is stale, read the inbox; return the command for the module."""
         self._sample = sample
         sensors = sample.sensors
-        now_ns = self._now_ns = sensors.t_ns
+        now_ns, before_ns = sensors.t_ns, self._now_ns
+        self._now_ns = now_ns
+        if now_ns <= before_ns:
+            self._begin_time_anew(before_ns)
         if self.state in COMMANDED and now_ns - self._fresh_ns > self.config.lifetime_ns:
             self._expire()
         if self.lease.lapsed(now_ns):
@@ -124,6 +127,9 @@ class Firmware:
         if sensors.winding_temperature_c >= WINDING_LIMIT_C and self.state != "fault":
             self._finish_motion("fault")
             self._enter("fault", f"winding at {sensors.winding_temperature_c:.0f} C")
+        if sample.fault and self.state != "fault":
+            self._finish_motion("fault")
+            self._enter("fault", sample.fault)
         if sample.m_stop and self.state not in ("stopped", "fault"):
             self._stop("M-stop pressed")
         return self._commands[self.state]()
@@ -211,6 +217,15 @@ class Firmware:
         assert self._sample is not None
         self._command = Command(self._sample.sensors.position_rad, 0.0, math.nan)
 
+    def _begin_time_anew(self, before_ns: int) -> None:
+        """Let nothing that was granted by the clock before it went back be valid: no command, no lease."""
+        if self.state in COMMANDED:
+            self._expire()
+            self._note = f"the module's clock went back by {(before_ns - self._now_ns) / 1e6:.0f} ms"
+        self._end_lease()
+        self._fresh_ns = self._stopped_ns = 0
+        self._rows.begin_anew()
+
     def _finish_motion(self, outcome: str) -> None:
         if self._motion is None or self._record is None:
             return
@@ -276,6 +291,8 @@ class Firmware:
             raise WireError(
                 Refusal.NOT_ARMED, f"winding at {winding_c:.0f} C, re-arms below {WINDING_REARM_C:.0f} C"
             )
+        if self._sample.fault:
+            raise WireError(Refusal.NOT_ARMED, self._sample.fault)
         if self._sample.m_stop:
             raise WireError(Refusal.NOT_ARMED, "the M-stop is pressed: release it, then acquire again")
         if self.state == "stopped" and request.echo_ns <= self._stopped_ns:
@@ -328,7 +345,8 @@ class Firmware:
     def _stream(self, setpoint: Setpoint) -> None:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "a motion is running; setpoints are taken when it has ended")
-        check_setpoint(setpoint, self.config.limits)
+        assert self._sample is not None
+        check_setpoint(setpoint, self._sample.sensors.position_rad, self.config.limits)
         if self.state != "streaming":
             self._enter("setpoint")
         targets = (setpoint.position_rad, setpoint.velocity_rad_s, setpoint.effort_nm)
@@ -339,6 +357,7 @@ class Firmware:
     def _set_gains(self, command: GainsCommand) -> None:
         if self.state == "moving":
             raise WireError(Refusal.BUSY, "gains are taken when no motion is running")
+        check_gains(command.gains)
         self._apply_gains(command.gains)
         self._refresh(command.echo_ns)
 

@@ -60,6 +60,7 @@ class ModuleSample(NamedTuple):
 
     pwm is the PWM in [-1, 1] at 48 V that was in force when the sensors were read, `limits` what acted on it.
     sequence counts the module's samples: a gap is a loss. m_stop: the emergency stop holds the motor off.
+    fault says which sensor cannot be believed, "" for none; a value of `sensors` is then its last good one.
     """
 
     sensors: SensorSample
@@ -67,6 +68,7 @@ class ModuleSample(NamedTuple):
     sequence: int
     limits: LimitState
     m_stop: bool
+    fault: str = ""
 
 
 class ModuleInformation(NamedTuple):
@@ -108,6 +110,7 @@ class Modules(Protocol):
         """Wait for the next tick and return one sample per module.
 
         Modules that are sent no command between two of these go on under their last one for their lifetime.
+        What a working module cannot read never comes out of here: see `sample_check`.
 
         HEBI: `get_next_feedback`. Specific force is what an accelerometer reads: the driver checks that
         `accel_includes_gravity` is set.

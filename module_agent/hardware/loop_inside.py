@@ -17,6 +17,7 @@ from module_agent.hardware.hardware import (
     Wires,
 )
 from module_agent.hardware.motor_guard import MotorGuard
+from module_agent.hardware.sample_check import SampleCheck
 from module_agent.model.catalogue import module_type
 from module_agent.wire.messages import GainSet
 
@@ -33,6 +34,7 @@ class _Drive:
         self._dt_s = module.tick_ns / 1e9
         self._running = False
         self.module = module
+        self.check = SampleCheck(self._kind)
         self.guard = MotorGuard(self._kind, catalogue_limits(self._kind))
         self.lifetime_ns = DEFAULT_LIFETIME_NS
         self.identified = False
@@ -104,10 +106,13 @@ class LoopInside:
         """
         if self._answered is not self._sensors:
             self._go_on()
-        pwm, self._sensors = self.pwm, self._wires.exchange(self.pwm)
+        pwm, read = self.pwm, self._wires.exchange(self.pwm)
+        self._sensors = [
+            drive.check.checked(sensors) for drive, sensors in zip(self._drives, read, strict=True)
+        ]
         self._sequence += 1
         return [
-            ModuleSample(sensors, u, self._sequence, drive.guard.state, False)
+            ModuleSample(sensors, u, self._sequence, drive.guard.state, False, drive.check.fault)
             for drive, sensors, u in zip(self._drives, self._sensors, pwm, strict=True)
         ]
 
@@ -132,7 +137,7 @@ class LoopInside:
         answered = self._answered or self._sensors
         each = zip(self._drives, self._commands, self._sensors, answered, strict=True)
         self.pwm = [
-            drive.run(command if sensors.t_ns - last.t_ns <= drive.lifetime_ns else MOTOR_OFF, sensors)
+            drive.run(command if 0 <= sensors.t_ns - last.t_ns <= drive.lifetime_ns else MOTOR_OFF, sensors)
             for drive, command, sensors, last in each
         ]
 

@@ -33,6 +33,9 @@ class MotorGuard:
         max_pwm = ceiling * sample.voltage_v / NOMINAL_VOLTAGE_V
         if -max_pwm <= pwm <= max_pwm:
             return pwm
+        if pwm != pwm:
+            # No law makes a NaN of finite numbers; if one did, it would be no command to a motor.
+            return 0.0
         self.state = LimitState.TEMPERATURE if ceiling else LimitState.OVER_TEMPERATURE
         return max_pwm if pwm > 0.0 else -max_pwm
 

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from module_agent.control.gains import catalogue_limits
+from module_agent.control.motion import effort_profile
 from module_agent.firmware.config import FirmwareConfig, check_config
 from module_agent.firmware.firmware import Answer, Incoming, Publication
 from module_agent.firmware.state import COMMANDED, TRANSITIONS
@@ -58,6 +59,8 @@ class Bench:
         self.position = 0.2
         self.winding_c = 40.0
         self.pwm = 0.0
+        # What sensors read instead of what they should.
+        self.wrong: dict[str, float] = {}
         self.seq = 0
         self.published: list[Publication] = []
         self.tick()
@@ -68,6 +71,7 @@ class Bench:
         sample = SensorSample(
             self.now, imu, self.position, 0.0, 0.5, 0.0, 0.0, 0.1, self.winding_c, 24.0, 0, 0, 0, 0, 0, 9.8
         )
+        sample = sample._replace(**self.wrong)  # type: ignore[arg-type]
         self.pwm, out = self._wired.tick(sample, incoming, self.m_stop)
         self.published += [o for o in out if isinstance(o, Publication)]
         return [o.payload for o in out if isinstance(o, Answer)]
@@ -328,7 +332,7 @@ def test_the_duty_stays_below_the_winding_s_ceiling() -> None:
     bench.acquire()
     bench.winding_c = 127.58
     for _ in range(5):
-        bench.setpoint(50.0)
+        bench.setpoint(6.0)
     assert bench.pwm * 48.0 / 24.0 == pytest.approx(0.96353, abs=1e-4)
 
 
@@ -597,3 +601,111 @@ def test_a_configuration_that_cannot_be_run_is_refused(settings: dict[str, Any])
     kind = CATALOGUE["X5-1"]
     with pytest.raises(UsageError, match="must be"):
         check_config(FirmwareConfig("A", kind, 1, catalogue_limits(kind), **settings))
+
+
+# ------------------------------------------------------------------ sensors and clocks that fail
+
+READINGS = [name for name in SensorSample._fields if not name.endswith("t_ns")]
+
+
+def test_one_bad_sample_costs_a_driven_motor_nothing() -> None:
+    bench, healthy = Bench(), Bench()
+    for one in (bench, healthy):
+        one.acquire()
+        for _ in range(5):
+            one.setpoint(0.3)
+    bench.wrong = {"velocity_rad_s": math.nan, "effort_nm": math.inf}
+    bench.setpoint(0.3)
+    bench.wrong = {}
+    healthy.setpoint(0.3)
+    assert bench.pwm == healthy.pwm != 0.0
+    assert bench.firmware.state == "streaming"
+
+
+@pytest.mark.parametrize("name", READINGS)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e12])
+def test_a_sensor_that_stays_bad_is_a_fault_with_its_name_until_it_is_good_again(
+    name: str, value: float
+) -> None:
+    bench = Bench()
+    bench.acquire()
+    bench.setpoint(0.3)
+    bench.wrong = {name: value}
+    bench.ticks(8)
+    assert bench.firmware.state == "fault"
+    assert bench.pwm == 0.0
+    assert name in bench.status().note
+    answer = bench.acquire()
+    assert refused(answer, Refusal.NOT_ARMED)
+    assert name in answer.detail
+    bench.wrong = {}
+    bench.tick()
+    assert bench.acquire().accepted
+
+
+def test_a_module_whose_first_samples_are_bad_does_not_arm() -> None:
+    fresh = WiredFirmware(FirmwareConfig("A", CATALOGUE["X5-9"], BOOT, catalogue_limits(CATALOGUE["X5-9"])))
+    sample = SensorSample(MS, MS, math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 40.0, 24.0, 0, 0, 0, 0, 0, 9.8)
+    pwm, _ = fresh.tick(sample)
+    assert (pwm, fresh.firmware.state) == (0.0, "fault")
+
+
+@given(
+    st.lists(
+        st.dictionaries(st.sampled_from(READINGS), st.floats(allow_nan=True, allow_infinity=True)),
+        max_size=30,
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_whatever_sensors_read_the_pwm_is_finite_and_within_its_range(ticks: list[dict[str, float]]) -> None:
+    bench = Bench()
+    bench.acquire()
+    for wrong in ticks:
+        bench.wrong = wrong
+        bench.setpoint(0.3)
+        assert -1.0 <= bench.pwm <= 1.0
+
+
+@pytest.mark.parametrize("back_ms", [0, 1, 700, 4_000])
+def test_a_clock_that_goes_back_expires_the_command_and_the_lease_at_once(back_ms: int) -> None:
+    bench = Bench()
+    bench.acquire(duration_ns=10_000 * MS)
+    bench.move()
+    bench.ticks(200)
+    bench.renew()
+    assert bench.pwm != 0.0
+    # A tick is 1 ms: with 0 the clock stands still.
+    bench.now -= (1 + back_ms) * MS
+    bench.tick()
+    assert bench.pwm == 0.0
+    assert bench.firmware.state == "expired"
+    assert bench.firmware.lease.holder is None
+    bench.published.clear()
+    assert bench.acquire().accepted
+    assert bench.setpoint().accepted
+    bench.ticks(40)
+    # Rows go on, and do not wait for the clock to be where it was.
+    assert [o.leaf for o in bench.published].count(Leaf.FEEDBACK) >= 2
+
+
+def test_a_holder_cannot_command_what_no_module_should_do() -> None:
+    bench = Bench()
+    bench.acquire()
+    for values in (
+        {"position": 10_000.0},
+        {"position": 0.3, "effort_nm": 1e6},
+        {"position": None, "velocity_rad_s": 1e3},
+    ):
+        position = values.pop("position")
+        wanted = {"position_rad": position, "velocity_rad_s": None, "effort_nm": None, **values}
+        answer = bench.ask(Leaf.SETPOINT, Setpoint(**bench.head(**wanted)))
+        assert refused(answer, Refusal.LIMIT), wanted
+    efforts = effort_profile([0.0, 1e4], 10 * MS)
+    assert refused(bench.move(effort=efforts), Refusal.LIMIT)
+    for field in ("kp", "ki", "kd", "feed_forward", "punch", "max_output"):
+        wild = bench.gains.velocity.model_copy(update={field: 1e6})
+        gains = bench.gains.model_copy(update={"velocity": wild})
+        answer = bench.ask(Leaf.GAINS, GainsCommand(**bench.head(gains=gains)))
+        assert refused(answer, Refusal.LIMIT)
+        assert field in answer.detail
+    assert bench.firmware.state == "armed"

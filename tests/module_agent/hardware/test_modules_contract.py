@@ -111,7 +111,7 @@ def test_samples_are_finite_and_in_the_order_of_their_fields(modules: Modules) -
         assert isinstance(sensors.t_ns, int)
         assert isinstance(sensors.imu_t_ns, int)
         assert all(math.isfinite(value) for value in sensors)
-        assert drive_state == [0.0, drive_state[1], LimitState.NONE, False]
+        assert drive_state == [0.0, drive_state[1], LimitState.NONE, False, ""]
 
 
 def test_an_imu_at_rest_reads_specific_force(modules: Modules) -> None:

@@ -1,0 +1,65 @@
+"""What a module reads is checked before any loop acts on it.
+
+A value that is no number, or that no working module of the type can read, is replaced by the last good one:
+a single bad sample then costs nothing. When it goes on for `MAX_HELD` samples it is a fault, which names the
+sensor, its value and what is possible; it lasts as long as the sensor is bad.
+"""
+
+from operator import le
+
+from module_agent.hardware.hardware import SensorSample
+from module_agent.model.catalogue import AMBIENT_C, ModuleType
+
+# Consecutive samples that are held over: 5 ms at 1 kHz.
+MAX_HELD = 5
+# Wide bounds: in an impact a joint is faster than its motor, and an accelerometer without a range of its own
+# reads 100 g. What is beyond them is a broken wire or a flipped bit.
+_OVER_SPEED, _OVER_EFFORT = 50.0, 50.0
+_TURNS_RAD, _DEFLECTION_RAD, _CURRENT_A, _VOLTAGE_V = 1e4, 10.0, 200.0, 100.0
+_GYRO_RAD_S, _ACCELERATION_M_S2 = 500.0, 5e4
+_HOT_C = 400.0
+_TIMES = 2
+
+
+class SampleCheck:
+    """Checks the samples of one module; `fault` says what is wrong with its sensors now, "" for nothing."""
+
+    def __init__(self, kind: ModuleType):
+        speed, effort = _OVER_SPEED * kind.max_speed_rad_s, _OVER_EFFORT * kind.max_effort_nm
+        motor = speed * kind.gear_ratio
+        # In the order of a sample's fields from the position on.
+        self._most = (
+            *(_TURNS_RAD, speed, effort, _DEFLECTION_RAD, motor, _CURRENT_A, _HOT_C, _VOLTAGE_V),
+            *(_GYRO_RAD_S,) * 3,
+            *(_ACCELERATION_M_S2,) * 3,
+            speed,
+        )
+        self._last = SensorSample(0, 0, *_at_rest())
+        self._held = MAX_HELD
+        self.fault = ""
+
+    def checked(self, sample: SensorSample) -> SensorSample:
+        """Return the sample, with the last good value in place of each bad one."""
+        # A comparison with NaN is false.
+        if all(map(le, map(abs, sample[_TIMES:]), self._most)):
+            self._last, self._held, self.fault = sample, 0, ""
+            return sample
+        return self._replaced(sample)
+
+    def _replaced(self, sample: SensorSample) -> SensorSample:
+        values = list(sample)
+        for index, most in enumerate(self._most, start=_TIMES):
+            if not abs(sample[index]) <= most:
+                values[index] = self._last[index]
+                if self._held >= MAX_HELD:
+                    name = SensorSample._fields[index]
+                    self.fault = f"{name} reads {sample[index]:g}, possible are -{most:g} .. {most:g}"
+        self._held += 1
+        self._last = SensorSample(*values)  # type: ignore[arg-type]
+        return self._last
+
+
+def _at_rest() -> tuple[float, ...]:
+    """Return the values, from the position on, that stand in for bad ones before there was a good sample."""
+    winding = SensorSample._fields.index("winding_temperature_c") - _TIMES
+    return tuple(AMBIENT_C if k == winding else 0.0 for k in range(len(SensorSample._fields) - _TIMES))
