@@ -9,6 +9,7 @@ from coordinator.excitation.joint_limits import NoExcitation
 from coordinator.excitation.plan import Plan
 from coordinator.excitation.robot_excitation import RobotModule, robot_excitation
 from coordinator.excitation.segment import RobotMotion
+from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
 from coordinator.identification.topology_search import doubtful_motions
 from coordinator.live_robot.messenger import Messenger
@@ -27,11 +28,13 @@ def record_session(
     plan: Plan,
     at_end: Callable[[VirtualRobot], None] | None = None,
     recording: Recording | None = None,
+    on_explored: Callable[[Kinematics], None] | None = None,
 ) -> Recording:
     """Run one session from discovery to its end and return what the coordinator has recorded of it.
 
     `at_end` is called with the robot when the session is over, to compare the recording with the truth.
-    `recording` is an empty one to record to; None for a new one.
+    `recording` is an empty one to record to; None for a new one. `on_explored` receives the kinematics that
+    motions of all joints are designed with, for `explored` of `identify`; in other sessions it is not called.
 
     Raises:
         what `coordinator.session.session` raises: no module found, an unfit link, a module lost, a motion
@@ -40,7 +43,7 @@ def record_session(
     recording = recording or Recording()
     with virtual_robot(settings, imu=plan.imu) as robot:
         name, loop = settings.robot.name, robot.loop
-        recorder = _MemoryRecorder(plan, recording, lambda: loop.now_ns)
+        recorder = _MemoryRecorder(plan, recording, lambda: loop.now_ns, on_explored)
         endpoint = robot.endpoint(COORDINATOR)
         messenger = Messenger(endpoint, name, lambda: loop.now_ns, loop.call_soon, recording.accept)
         group = ModuleGroup(messenger, recording, lambda: loop.now_ns, COORDINATOR)
@@ -65,10 +68,17 @@ def record_session(
 class _MemoryRecorder(SilentScreen):
     """Records the session in memory; progress and estimates are not displayed."""
 
-    def __init__(self, plan: Plan, recording: Recording, clock: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        recording: Recording,
+        clock: Callable[[], int],
+        on_explored: Callable[[Kinematics], None] | None,
+    ) -> None:
         self.recording = recording
         self._plan = plan
         self._clock = clock
+        self._on_explored = on_explored
 
     def journal(self, event: JournalEvent) -> None:
         self.recording.add(Entry("journal", JOURNAL_TOPIC, event.t_ns, event.encode()))
@@ -86,7 +96,12 @@ class _MemoryRecorder(SilentScreen):
 
     async def excitation(self) -> tuple[RobotMotion, ...]:
         """Design motions of all joints at once, as a run does; none if the robot could run none."""
-        chain = identify_kinematics(self.recording).fit.chain
+        so_far = self.recording.explored
+        assert so_far is not None, "all joints are explored before any is excited"
+        explored = identify_kinematics(so_far)
+        if self._on_explored is not None:
+            self._on_explored(explored)
+        chain = identify_kinematics(self.recording, explored=explored).fit.chain
         infos = [self.recording.modules[serial].info for serial in chain.serials]
         modules = [RobotModule(module_type(one.module_type), one.limits) for one in infos if one is not None]
         try:

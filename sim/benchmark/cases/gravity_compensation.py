@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify
 from coordinator.torque_control.gravity_model import GravityModel, gravity_model_of_result
 from coordinator.torque_control.session import CompensationPlan, CompensationSession, Moment
@@ -235,7 +236,9 @@ def compensated(seed: int, noise: NoiseProfile, shortened: bool) -> Compensation
     """Identify a robot, and compensate its gravity by the result on another day."""
     robot = at_random_site(load_robot(ROBOT), seed)
     settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
-    weight = gravity_model_of_result(identify(record_session(settings, plan_of(noise, shortened))).result)
+    explored: list[Kinematics] = []
+    recording = record_session(settings, plan_of(noise, shortened), on_explored=explored.append)
+    weight = gravity_model_of_result(identify(recording, explored=explored[0] if explored else None).result)
     drift_s, poses = (QUICK_DRIFT_S, POSES[1:2]) if shortened else (DRIFT_S, POSES)
     return compensation_trial(seed, robot, weight, noise, drift_s, poses)
 

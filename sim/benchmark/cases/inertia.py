@@ -4,7 +4,6 @@ The thesis' estimate on the same recording is the pseudo-inverse solution of raw
 (eq. 29).
 """
 
-import time
 from collections.abc import Sequence
 from functools import partial
 from statistics import median
@@ -85,7 +84,6 @@ class InertiaTrial(NamedTuple):
     motion_source: MotionSource = "encoders"
     gain: float = 1.0
     robot_time_s: float = 0.0
-    identify_s: float = 0.0
 
 
 def rigid_profile() -> NoiseProfile:
@@ -109,11 +107,12 @@ def inertia_trial(
     trial = InertiaTrial(robot, label, seed, "")
     settings = VirtualSettings(described, network("lan"), seed, noise)
     motions: list[Motion] = []
+    explored: list[Kinematics] = []
     try:
-        recording = record_session(settings, plan, lambda robot: motions.append(robot.truth.motion()))
-        start_s = time.process_time()
-        identified = identify(recording)
-        trial = trial._replace(identify_s=time.process_time() - start_s)
+        recording = record_session(
+            settings, plan, lambda robot: motions.append(robot.truth.motion()), on_explored=explored.append
+        )
+        identified = identify(recording, explored=explored[0] if explored else None)
         designed = true_chain(at_random_site(load_robot(robot), seed))
         return _compared(trial, identified, recording, described, designed, motions[0], poses)
     except RobotError as error:

@@ -14,6 +14,7 @@ import numpy as np
 from coordinator.baseline.baseline_robot import BaselineRobot
 from coordinator.baseline.check import check, check_plan
 from coordinator.excitation.plan import Plan
+from coordinator.identification.identified import Kinematics
 from coordinator.identification.identify import identify_kinematics
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.network_emulation.profile_file import network
@@ -137,8 +138,10 @@ def _recorded(seed: int, day: int, plan: Plan, change: LinkChange | None) -> Bas
 
 def known_robot(settings: VirtualSettings, plan: Plan, day: int) -> BaselineRobot:
     """Record a robot on one of its days and identify its chain: what other days are compared with."""
-    recording = record_session(settings, plan)
-    return BaselineRobot(Path(f"day {day}"), recording, identify_kinematics(recording))
+    explored: list[Kinematics] = []
+    recording = record_session(settings, plan, on_explored=explored.append)
+    kinematics = identify_kinematics(recording, explored=explored[0] if explored else None)
+    return BaselineRobot(Path(f"day {day}"), recording, kinematics)
 
 
 SIZE_MM = 0.5
