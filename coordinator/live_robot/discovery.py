@@ -71,8 +71,9 @@ def _present(transport: Transport, robot: str, search: Search) -> list[str]:
         except queue.Empty:
             break
         if isinstance(event, Liveness):
-            alive[parse(event.key).serial] = event.alive
-            changed = time.monotonic()
+            with suppress(WireError):  # the token of something that is no module
+                alive[parse(event.key).serial] = event.alive
+                changed = time.monotonic()
     declared.undeclare()
     return sorted(serial for serial, present in alive.items() if present)
 

@@ -21,6 +21,7 @@ from module_agent.transport.transport import (
 from module_agent.wire.codec import encode
 from module_agent.wire.keys import Leaf, every, key, parse
 from module_agent.wire.messages import Ack, Message
+from module_agent.wire.refusal import WireError
 from module_agent.wire.topics import PUBLISHED_BY_MODULE
 
 Clock = Callable[[], int]
@@ -106,11 +107,12 @@ class Messenger:
             # A closed recording must not change any more; pending requests end with an error.
             if isinstance(event, Reply):
                 self._answer(event._replace(payload=None, error=CLOSED))
+        elif isinstance(event, Sample | Liveness) and not _is_of_a_module(event.key):
+            return
         elif isinstance(event, Sample):
             self._record(Entry("publication", event.key, self._clock(), event.payload))
         elif isinstance(event, Liveness):
-            serial = parse(event.key).serial
-            (self.alive.add if event.alive else self.alive.discard)(serial)
+            (self.alive.add if event.alive else self.alive.discard)(parse(event.key).serial)
         elif isinstance(event, Reply):
             self._answer(event)
 
@@ -175,3 +177,12 @@ async def gather_all(work: Iterable[Coroutine[None, None, object]]) -> None:
     for outcome in await asyncio.gather(*work, return_exceptions=True):
         if isinstance(outcome, BaseException):
             raise outcome
+
+
+def _is_of_a_module(text: str) -> bool:
+    """Return whether a key is one of this system: anybody may publish what matches an expression of it."""
+    try:
+        parse(text)
+    except WireError:
+        return False
+    return True

@@ -6,18 +6,23 @@ import hashlib
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from module_agent.wire.codec import encode
-from module_agent.wire.messages import Counter, Message, Name, Part, Vector3
+from module_agent.wire.messages import (
+    MAX_ROWS_PER_MOTION,
+    Counter,
+    Message,
+    Name,
+    Part,
+    Vector3,
+    out_of_range,
+)
 
 MAX_MODULES = 64
 MAX_PART_BYTES = 65_536
 # A module's part in `ChainPart.geometry`: axis, point and IMU's pose, row by row.
 GEOMETRY_BYTES = 8 * (3 + 3 + 16)
 
-# Of a module in one motion: 400 s at 250 Hz.
-MAX_ROWS_PER_MOTION = 100_000
 # Samples of all motions together, times modules squared, to which the time of computing goes: under a minute.
 MAX_WORK = 200_000_000
 # 85 years, of Unix time until 2055: sums of three such times, and a tenth for the drift, fit in 64 bits.
@@ -25,11 +30,6 @@ MAX_TIME_NS = 2_700_000_000_000_000_000
 MAX_OFFSET_NS = 2.7e18
 
 Instant = Annotated[int, Field(ge=-MAX_TIME_NS, le=MAX_TIME_NS)]
-
-
-def out_of_range(detail: str) -> PydanticCustomError:
-    """Return the error of fields that contradict each other, which `codec` reports as one of range."""
-    return PydanticCustomError("less_than_equal", "{detail}", {"detail": detail})
 
 
 class RowRange(Part):

@@ -8,7 +8,8 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import NamedTuple
 
-from module_agent.model.errors import DataError, UsageError
+from module_agent.model.errors import UsageError
+from module_agent.wire.refusal import Refusal, WireError
 
 ROOT = "x5"
 _CHUNK = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}\Z")
@@ -69,9 +70,11 @@ def parse(text: str) -> KeyParts:
     """Take a key apart.
 
     Raises:
-        DataError: not a key of this system.
+        WireError: MALFORMED, not a key of this system.
     """
     chunks = text.split("/")
-    if len(chunks) != 4 or chunks[0] != ROOT or chunks[3] not in Leaf._value2member_map_:
-        raise DataError(f"{text!r} is not a key of the form {ROOT}/robot/serial/leaf")
+    named = len(chunks) == 4 and all(map(_CHUNK.match, chunks[1:3]))
+    if not named or chunks[0] != ROOT or chunks[3] not in Leaf._value2member_map_:
+        detail = f"{text[:200]!r} is not a key of the form {ROOT}/robot/serial/leaf"
+        raise WireError(Refusal.MALFORMED, detail)
     return KeyParts(chunks[1], chunks[2], Leaf(chunks[3]))

@@ -5,9 +5,10 @@ boot id; a command carries the boot id of the module it is meant for, so that it
 Unknown fields are ignored; another schema version is refused by name.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 SCHEMA_VERSION = 1
 
@@ -18,6 +19,9 @@ Text = Annotated[str, Field(max_length=512)]
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Vector3 = tuple[Finite, Finite, Finite]
+
+# Of a module in one motion: 400 s at 250 Hz.
+MAX_ROWS_PER_MOTION = 100_000
 
 State = Literal["idle", "armed", "moving", "streaming", "expired", "stopped", "fault"]
 ExpiryAction = Literal["motor_off", "hold", "damping"]
@@ -36,6 +40,11 @@ class Message(Part):
     serial: Name
     boot: Annotated[int, Field(ge=0, lt=2**64)]
     seq: Counter
+
+
+def out_of_range(detail: str) -> PydanticCustomError:
+    """Return the error of fields that contradict each other, which `codec` reports as one of range."""
+    return PydanticCustomError("less_than_equal", "{detail}", {"detail": detail})
 
 
 class Rest(Part):
@@ -162,6 +171,15 @@ class MotionRecord(Part):
     start_row: Counter
     end_row: Counter | None
     origin_rad: Finite
+
+    @model_validator(mode="after")
+    def _check_length(self) -> Self:
+        if self.end_row is not None and not 0 <= self.end_row - self.start_row <= MAX_ROWS_PER_MOTION:
+            raise out_of_range(
+                f"motion {self.motion_id} of rows {self.start_row} to {self.end_row}: a motion has at most "
+                f"{MAX_ROWS_PER_MOTION}"
+            )
+        return self
 
 
 class Limits(Part):

@@ -21,6 +21,7 @@ from module_agent.wire.messages import (
     GoTo,
     HistoryRequest,
     Info,
+    MotionRecord,
     Rest,
     Status,
     WindowedSine,
@@ -185,6 +186,33 @@ def test_noise_on_a_neighbours_keys_is_counted_and_does_no_harm(rigs: Callable[.
     refused = rig.hosts[TIP].modules[0].firmware.admission.refusals
     assert sum(refused.values()) == 4
     assert refused["wrong_serial"] == 1
+
+
+@pytest.mark.parametrize(
+    ("serial", "rows", "reason"),
+    [("-bad", (0, 10), "malformed"), ("a b", (0, 10), "malformed"), ("X-66666", (0, 2**62), "range")],
+)
+def test_one_message_of_an_intruder_does_not_end_an_agent(
+    rigs: Callable[..., Any], serial: str, rows: tuple[int, int], reason: str
+) -> None:
+    rig = rigs(ARM)
+    intruder = rig.network.endpoint("intruder")
+    record = MotionRecord.model_construct(
+        motion_id=1,
+        pattern=ConstantMotion(velocity_rad_s=1.0, duration_s=0.5),
+        outcome="done",
+        start_ns=0,
+        start_row=rows[0],
+        end_row=rows[1],
+        origin_rad=0.0,
+    )
+    head = {"serial": serial, "boot": 1, "seq": 1, "t_ns": 0, "state": "moving", "holder": None}
+    rest = {"lease_left_ns": 0, "token": 0, "next_row": 0, "refusals": {}, "expiries": 0, "dropped_events": 0}
+    status = Status.model_construct(**head, **rest, motion=record)
+    intruder.publish(f"x5/{rig.robot.name}/{serial}/status", encode(status))
+    rig.run(asyncio.sleep(0.1))
+    for host in rig.hosts.values():
+        assert host.modules[0].firmware.admission.refusals == {reason: 1}
 
 
 def test_a_token_stands_for_a_module_that_serves_and_falls_with_it(rigs: Callable[..., Any]) -> None:

@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from module_agent.firmware.feedback import History
 from module_agent.peers.motion_listener import ANSWER_TIMEOUT_NS, AskHistory
 from module_agent.peers.row_collection import GIVE_UP_NS, MAX_MOTIONS, MotionCollection, OwnRows
-from module_agent.wire.information_messages import MAX_ROWS_PER_MOTION, CollectRequest, RowRange
-from module_agent.wire.messages import Feedback
+from module_agent.wire.information_messages import CollectRequest, RowRange
+from module_agent.wire.messages import MAX_ROWS_PER_MOTION, Feedback
 from module_agent.wire.refusal import Refusal, WireError
 
 OWN, OTHER = "J1", "J2"

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from module_agent.control.motion import MAX_SAMPLES, effort_profile
-from module_agent.model.errors import DataError, UsageError
+from module_agent.model.errors import UsageError
 from module_agent.wire import keys
 from module_agent.wire.codec import MAX_COMMAND_BYTES, MAX_MESSAGE_BYTES, decode, encode
 from module_agent.wire.feedback_rows import ROW, unpack
@@ -411,7 +411,17 @@ def test_a_name_that_cannot_stand_in_a_key_is_refused(name: str) -> None:
         keys.key("arm", name, keys.Leaf.STATUS)
 
 
-@pytest.mark.parametrize("text", ["x5/arm/J1", "x5/arm/J1/other", "y/arm/J1/status", "x5/a/b/c/status"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x5/arm/J1",
+        "x5/arm/-bad/status",
+        "x5/a b/J1/status",
+        "x5/arm/J1/other",
+        "y/arm/J1/status",
+        "x5/a/b/c/status",
+    ],
+)
 def test_a_foreign_key_is_refused(text: str) -> None:
-    with pytest.raises(DataError, match="not a key"):
+    with pytest.raises(WireError, match="not a key"):
         keys.parse(text)
