@@ -15,6 +15,7 @@ from module_agent.model.errors import EXIT_FAILED
 from sim.benchmark.case import Failed, Trial
 from sim.benchmark.workers import run_trials
 from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, worker_count
+from sim.thesis.dynamics.parameter_experiments import PARAMETER_EXPERIMENTS
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
 from sim.thesis.kinematics.equation16 import EQUATION_16
 from sim.thesis.kinematics.motion_experiments import MOTION_EXPERIMENTS
@@ -29,6 +30,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     *SWEEP_EXPERIMENTS,
     *REPEAT_EXPERIMENTS,
     EQUATION_16,
+    *PARAMETER_EXPERIMENTS,
 )
 
 

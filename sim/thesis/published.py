@@ -1,7 +1,7 @@
 """Published figures of the thesis.
 
-One-joint arms and the lengths measured on them: chapter 6.2, tables 4 and 5. PID settings of the torque
-assistance: tables 7, 8 and 9 (8 and 9 are alike).
+One-joint arms and the lengths measured on them: chapter 6.2, tables 4 and 5. Dynamic identification: table 6,
+sections 6.3.1 to 6.3.3. PID settings of the torque assistance: tables 7, 8 and 9 (8 and 9 are alike).
 """
 
 from typing import Literal, NamedTuple
@@ -54,6 +54,47 @@ def thesis_length(alignment: Alignment, length_mm: int) -> ThesisLength:
         f"the thesis had no {alignment} arm of {length_mm} mm; its lengths are "
         f"{', '.join(map(str, LENGTHS_MM))} mm"
     )
+
+
+# Section 6.3 has one arm.
+DYNAMIC_LENGTH_MM = 484
+# Table 2 [kg].
+MODULE_KG = 0.306
+
+
+class DynamicMotion(NamedTuple):
+    """The windowed sine that the dynamic pattern is cut out of."""
+
+    frequency_hz: float
+    centre_s: float
+    sigma_s: float
+
+
+# Table 6.
+DYNAMIC_MOTION = DynamicMotion(frequency_hz=1.0, centre_s=2.5, sigma_s=0.1)
+
+
+class DynamicSearch(NamedTuple):
+    """The amplitudes of an alignment in section 6.3.1, and the parameters identified at the chosen one.
+
+    squared_error_nm2: the least-squares error by amplitude where it is printed. mcx_kg_m, izz_kg_m2: of the
+    vector of section 6.3.2 or 6.3.3.
+    """
+
+    alignment: Alignment
+    amplitudes_rad: tuple[float, ...]
+    chosen_rad: float
+    squared_error_nm2: dict[float, float]
+    mcx_kg_m: float
+    izz_kg_m2: float
+
+
+DYNAMIC_SEARCHES: dict[Alignment, DynamicSearch] = {
+    "vertical": DynamicSearch(
+        "vertical", (0.1, 0.2, 0.3, 0.4, 0.9), 0.2, {0.9: 107.0, 0.4: 12.4, 0.2: 2.0}, 0.2249, 0.0725
+    ),
+    "horizontal": DynamicSearch("horizontal", (0.6, 1.4, 2.0), 2.0, {}, -0.0083, 0.1680),
+}
 
 
 # The thesis gives numbers without units. Integral and derivative gains are either per second, as in this
