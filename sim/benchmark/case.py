@@ -13,11 +13,14 @@ class Trial(NamedTuple):
     """One piece of work for a worker process: a function of a module and its arguments, both picklable.
 
     cost_s: approximate duration; long trials start first, so that all processes end together.
+    shares: trials of the same name run one after the other in one process, which keeps what they have in
+        common; none by default.
     """
 
     work: Callable[..., Any]
     arguments: tuple[Any, ...]
     cost_s: float = 1.0
+    shares: str = ""
 
 
 class Failed(NamedTuple):

@@ -5,7 +5,7 @@ the robot itself are altered before.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,7 +46,7 @@ WRONG_ABOVE = 3.29
 # Damping of links of 1 Nm/rad; it grows with the root of the stiffness. 2 % of the critical one at 5 Hz and
 # 100 Nm/rad, as of tubes.
 _DAMPING = 0.013
-_COST_S = 15.0
+_COST_S, _SMALL_COST_S = 15.0, 2.0
 # As many intervals make a row of their own: of fewer, one that does not cover would be a miss.
 _OWN_COVERAGE = 20
 _POSITION = ("position_rad", "velocity_rad_s")
@@ -119,6 +119,21 @@ def fault_trial(fault: str, seed: int, plan: Plan) -> FaultTrial:
     text = "; ".join(finding.summary for finding in kinematics.findings)
     others = tuple(serial for serial in named if serial not in ill)
     return FaultTrial(any(s in ill for s in named), others, _sigmas_off(robot, kinematics, altered), text)
+
+
+def _robot(seed: int, stiffness_nm_rad: float) -> Robot:
+    robot = at_random_site(as_built(load_robot(ROBOT), seed, noise_profile(NOISE)), seed)
+    return softened(robot, stiffness_nm_rad) if stiffness_nm_rad else robot
+
+
+@lru_cache(maxsize=1)
+def _recorded(seed: int, plan: Plan, stiffness_nm_rad: float, imu_rate_hz: float) -> _Kept:
+    """Record a session; the faults that alter recordings have the same one."""
+    robot, profile = _robot(seed, stiffness_nm_rad), noise_profile(NOISE)
+    settings = VirtualSettings(robot, network("lan"), seed, profile, imu_rate_hz=imu_rate_hz)
+    recording = _Kept()
+    record_session(settings, plan, recording=recording)
+    return recording
 
 
 def _sigmas_off(robot: Robot, kinematics: Kinematics, recording: Recording) -> tuple[float, ...]:
@@ -250,17 +265,25 @@ HARMLESS = tuple(name for name in FAULTS if name in ("none", "a hole in a motion
 QUICK = ("none", "an encoder against its command")
 
 
+def _shares(fault: str, seed: int) -> str:
+    """Return the name of the recording of a healthy robot; nothing where the robot itself is altered."""
+    this = FAULTS[fault]
+    own = this.stiffness_nm_rad or this.imu_rate_hz != Fault().imu_rate_hz
+    return "" if own else f"healthy {ROBOT}, {seed}"
+
+
 def fault_cases(
     trials: int, seed: int, faults: Sequence[str] = tuple(FAULTS), small: bool = False
 ) -> list[Case]:
     """Return one case for every fault, of the same robots; `small`: with motions that are cut short."""
     plan = arm_plan("joint", "calibrated")
     plan = plan.model_copy(update=SHORTENED) if small else plan
+    cost_s = _SMALL_COST_S if small else _COST_S
     return [
         Case(
             f"sensor faults, {fault}",
             [
-                Trial(fault_trial, (fault, own, plan), _COST_S)
+                Trial(fault_trial, (fault, own, plan), cost_s, _shares(fault, own))
                 for own in trial_seeds(seed, "sensor faults", trials)
             ],
             partial(_summary, fault),

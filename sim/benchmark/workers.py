@@ -39,17 +39,27 @@ def run_trials(
     result of each trial as it ends.
     """
     done: dict[int, Done] = {}
-    waiting = sorted(range(len(trials)), key=lambda index: -trials[index].cost_s)
-    with _team(min(processes, len(trials))) as team:
-        while waiting or any(worker.busy for worker in team):
+    waiting = _in_turn(trials)
+    with _team(min(processes, len(waiting))) as team:
+        while waiting or any(worker.busy or worker.next for worker in team):
             for worker in team:
-                if waiting and not worker.busy:
-                    index = waiting.pop(0)
+                if waiting and not worker.busy and not worker.next:
+                    worker.next = waiting.pop(0)
+                if worker.next and not worker.busy:
+                    index = worker.next.pop(0)
                     worker.begin(index, trials[index])
             for index, ended in _finished(team):
                 done[index] = ended
                 on_done(index, ended.result)
     return [done[index] for index in range(len(trials))]
+
+
+def _in_turn(trials: Sequence[Trial]) -> list[list[int]]:
+    """Return the trials' indices, those that share something together, the longest first."""
+    groups: dict[object, list[int]] = {}
+    for index, trial in enumerate(trials):
+        groups.setdefault(trial.shares or index, []).append(index)
+    return sorted(groups.values(), key=lambda group: -sum(trials[index].cost_s for index in group))
 
 
 @contextmanager
@@ -72,9 +82,10 @@ def _finished(team: Sequence["_Worker"]) -> Iterator[tuple[int, Done]]:
 
 
 class _Worker:
-    """One process at a time, and the pipe to it."""
+    """One process at a time, the pipe to it, and the trials that must be its next ones."""
 
     def __init__(self, folder: str):
+        self.next: list[int] = []
         self._folder = folder
         self._left_s = 0.0
         self._index: int | None = None
@@ -103,7 +114,7 @@ class _Worker:
         except (EOFError, OSError):
             found = Done(Failed(f"the worker process died with exit code {self._exit_code()}"), 0.0)
             self.end()
-        if self._left_s <= 0.0:
+        if self._left_s <= 0.0 and not self.next:
             self.end()
         return index, found
 

@@ -19,7 +19,7 @@ from module_agent.model.forward_kinematics import body_displacements
 from module_agent.model.read_only import read_only
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
-from sim.benchmark.cases.inertia import known_of, plan_of
+from sim.benchmark.cases.inertia import identified_session, known_of, plan_of, shared_session
 from sim.benchmark.row import Row, largest, ratio
 from sim.imperfections.noise_profile import NoiseProfile, noise_profile
 from sim.robot.robot_file import Robot, load_robot
@@ -214,18 +214,26 @@ DRIFT_DEG, LIGHT = 2.0, 0.25
 # Seeds follow from this name, so that results stay comparable.
 _SEED_NAME = f"{ROBOT}, x5, floating, known without error"
 PROFILES = ("x5", "x5-uncalibrated")
-_COST_S, _QUICK_COST_S = 20.0, 10.0
+_COST_S, _QUICK_COST_S = 20.0, 7.0
 
 
 def compensation_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return a case for each profile; `shortened`: of one pose, and for some seconds."""
+    """Return a case for each profile.
+
+    `shortened`: of one pose, for some seconds, and by the session in which the robot's inertia is measured.
+    """
     cost_s = _QUICK_COST_S if shortened else _COST_S
     cases = []
     for profile in PROFILES:
         noise = noise_profile(profile)
         work = [
-            Trial(compensated, (own, noise, shortened), cost_s)
-            for own in trial_seeds(seed, _SEED_NAME, trials)
+            Trial(
+                compensated,
+                (own, noise, shortened),
+                cost_s,
+                shared_session(ROBOT, profile, own) if shortened else "",
+            )
+            for own in trial_seeds(seed, ROBOT if shortened else _SEED_NAME, trials)
         ]
         name, known = f"{ROBOT}, {profile}, gravity compensation", f"a run, {known_of(noise)}"
         cases.append(Case(name, work, _summary, profile, known))
@@ -234,13 +242,17 @@ def compensation_cases(trials: int, seed: int, shortened: bool = False) -> list[
 
 def compensated(seed: int, noise: NoiseProfile, shortened: bool) -> CompensationTrial:
     """Identify a robot, and compensate its gravity by the result on another day."""
+    plan = plan_of(noise, shortened)
+    if shortened:
+        session = identified_session(ROBOT, noise, seed, plan)
+        weight = gravity_model_of_result(session.identified.result)
+        return compensation_trial(seed, session.robot, weight, noise, QUICK_DRIFT_S, POSES[1:2])
     robot = at_random_site(load_robot(ROBOT), seed)
-    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
     explored: list[Kinematics] = []
-    recording = record_session(settings, plan_of(noise, shortened), on_explored=explored.append)
-    weight = gravity_model_of_result(identify(recording, explored=explored[0] if explored else None).result)
-    drift_s, poses = (QUICK_DRIFT_S, POSES[1:2]) if shortened else (DRIFT_S, POSES)
-    return compensation_trial(seed, robot, weight, noise, drift_s, poses)
+    settings = VirtualSettings(robot, network("lan"), seed, noise, noise_seed=0)
+    recording = record_session(settings, plan, on_explored=explored.append)
+    weight = gravity_model_of_result(identify(recording, explored=explored[0]).result)
+    return compensation_trial(seed, robot, weight, noise, DRIFT_S)
 
 
 def _summary(trials: Sequence[CompensationTrial]) -> Summary:

@@ -5,7 +5,7 @@ The thesis' estimate on the same recording is the pseudo-inverse solution of raw
 """
 
 from collections.abc import Sequence
-from functools import partial
+from functools import lru_cache, partial
 from statistics import median
 from typing import NamedTuple
 
@@ -86,6 +86,15 @@ class InertiaTrial(NamedTuple):
     robot_time_s: float = 0.0
 
 
+class IdentifiedSession(NamedTuple):
+    """A recorded session: the robot as built, its true motion, and what was identified."""
+
+    robot: Robot
+    recording: Recording
+    motion: Motion
+    identified: Identified
+
+
 def rigid_profile() -> NoiseProfile:
     """Return the x5 profile of a rigid robot without friction."""
     return switched(noise_profile("x5"), off=NON_RIGID)
@@ -103,31 +112,36 @@ def inertia_trial(
         plan: of the session.
         poses: number of random poses in which the mass matrix is checked.
     """
-    described = at_random_site(as_built(load_robot(robot), seed, noise), seed)
     trial = InertiaTrial(robot, label, seed, "")
-    settings = VirtualSettings(described, network("lan"), seed, noise)
-    motions: list[Motion] = []
-    explored: list[Kinematics] = []
+    designed = true_chain(at_random_site(load_robot(robot), seed))
     try:
-        recording = record_session(
-            settings, plan, lambda robot: motions.append(robot.truth.motion()), on_explored=explored.append
-        )
-        identified = identify(recording, explored=explored[0] if explored else None)
-        designed = true_chain(at_random_site(load_robot(robot), seed))
-        return _compared(trial, identified, recording, described, designed, motions[0], poses)
+        return _compared(trial, identified_session(robot, noise, seed, plan), designed, poses)
     except RobotError as error:
         return trial._replace(why=str(error))
 
 
-def _compared(
-    trial: InertiaTrial,
-    found: Identified,
-    recording: Recording,
-    robot: Robot,
-    designed: Chain,
-    truth: Motion,
-    poses: int,
-) -> InertiaTrial:
+@lru_cache(maxsize=1)
+def identified_session(robot: str, noise: str | NoiseProfile, seed: int, plan: Plan) -> IdentifiedSession:
+    """Record a robot at a random site and identify it; once for successive trials of a process.
+
+    Raises:
+        what `record_session` and `identify` raise.
+    """
+    described = at_random_site(as_built(load_robot(robot), seed, noise), seed)
+    motions: list[Motion] = []
+    explored: list[Kinematics] = []
+    recording = record_session(
+        VirtualSettings(described, network("lan"), seed, noise),
+        plan,
+        lambda simulated: motions.append(simulated.truth.motion()),
+        on_explored=explored.append,
+    )
+    identified = identify(recording, explored=explored[0] if explored else None)
+    return IdentifiedSession(described, recording, motions[0], identified)
+
+
+def _compared(trial: InertiaTrial, session: IdentifiedSession, designed: Chain, poses: int) -> InertiaTrial:
+    robot, recording, truth, found = session
     kinematics, inertia, bodies = found.kinematics, found.inertia, found.bodies
     serials, chain = kinematics.topology.serials, true_chain(robot)
     if inertia is None or bodies is None or serials != chain.serials:
@@ -239,7 +253,7 @@ BODIES_POINTS = 0.1
 _QUICK = SHORTENED | {"mode": "simultaneous", "excitation_motions": 3, "excitation_s": 4.0}
 _CALIBRATED = "scales of IMUs and torque sensors"
 POSES, QUICK_POSES = 10_000, 1_000
-_COST_S = {"a2085_04": 10.0, "a2085_06": 18.0}
+_COST_S = {"a2085_04": 14.0, "a2085_06": 22.0}
 
 
 def plan_of(noise: NoiseProfile, shortened: bool = False) -> Plan:
@@ -256,6 +270,11 @@ def known_of(noise: NoiseProfile) -> str:
     return "nothing" if noise.effort_scale else _CALIBRATED
 
 
+def shared_session(arm: str, label: str, seed: int) -> str:
+    """Return the name of the session that shortened trials share."""
+    return f"{arm}, {label}, {seed}"
+
+
 def inertia_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
     """Return one case for every arm, rigid, with all effects of a real one, and not calibrated.
 
@@ -268,7 +287,12 @@ def inertia_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]
         cost_s = (0.5 if shortened else 1.0) * _COST_S[arm]
         for label, noise in profiles.items():
             work = [
-                Trial(inertia_trial, (arm, noise, own, plan_of(noise, shortened), poses, label), cost_s)
+                Trial(
+                    inertia_trial,
+                    (arm, noise, own, plan_of(noise, shortened), poses, label),
+                    cost_s,
+                    shared_session(arm, label, own) if shortened else "",
+                )
                 for own in trial_seeds(seed, arm, trials)
             ]
             name, summarise = f"{arm}, {label}, inertia", partial(_summary, arm, label)

@@ -1,6 +1,7 @@
 """Payloads: one is detected on the right body, with its mass and centre; without one none is detected."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from coordinator.excitation.plan import Plan
 from module_agent.model.chain import BASE, Array, Chain
 from module_agent.network_emulation.profile_file import network
 from sim.benchmark.case import Case, Summary, Trial, trial_seeds
-from sim.benchmark.cases.inertia import known_of, plan_of
+from sim.benchmark.cases.inertia import identified_session, known_of, plan_of, shared_session
 from sim.benchmark.cases.link_change import known_robot
 from sim.benchmark.row import Row, count, largest, scaled
 from sim.geometry.link_parts import FreePose
@@ -44,9 +45,16 @@ class PayloadTrial(NamedTuple):
 
 
 def payload_trial(
-    robot: str, noise: str | NoiseProfile, seed: int, plan: Plan, carries: bool = True
+    robot: str,
+    noise: str | NoiseProfile,
+    seed: int,
+    plan: Plan,
+    carries: bool = True,
+    shared: bool = False,
 ) -> PayloadTrial:
     """Identify a robot, add a payload or none, and search for it.
+
+    shared: the robot is known from the session of `inertia_trial`.
 
     Raises:
         PayloadError: the runs do not suffice for a search.
@@ -54,7 +62,7 @@ def payload_trial(
     unloaded = at_random_site(as_built(load_robot(robot), seed, noise), seed)
     carrier = unloaded.serials[-1]
     full = loaded(unloaded, carrier, HELD)
-    known = _recorded(unloaded, noise, seed, 0, plan)
+    known = _known(robot, noise, seed, plan) if shared else _recorded(unloaded, noise, seed, 0, plan)
     later = _recorded(full if carries else unloaded, noise, seed, 1, payload_plan(known, Plan()))
     report = search_payload(known, later)
     if not report.found or not carries:
@@ -73,6 +81,11 @@ def payload_trial(
         float(np.linalg.norm(offset)),
         report.motion_s,
     )
+
+
+def _known(robot: str, noise: str | NoiseProfile, seed: int, plan: Plan) -> BaselineRobot:
+    session = identified_session(robot, noise, seed, plan)
+    return BaselineRobot(Path("day 0"), session.recording, session.identified.kinematics)
 
 
 def _recorded(robot: Robot, noise: str | NoiseProfile, seed: int, day: int, plan: Plan) -> BaselineRobot:
@@ -101,11 +114,14 @@ def _from_axis(chain: Chain, point_m: Array) -> Array:
 ROBOT = "a2085_06"
 PROFILES = ("x5", "x5-uncalibrated")
 MASS_PERCENT, COM_MM, MOTION_S = 3.0, 5.0, 15.0
-_COST_S, _QUICK_COST_S = 26.0, 15.0
+_COST_S, _QUICK_COST_S = 26.0, 4.0
 
 
 def payload_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return the case of a payload under each profile, and with more than one trial that of none."""
+    """Return the case of a payload under each profile, and with more than one trial that of none.
+
+    `shortened`: of the robots whose inertia is measured, known from the same session.
+    """
     cost_s = _QUICK_COST_S if shortened else _COST_S
 
     def case(
@@ -113,8 +129,13 @@ def payload_cases(trials: int, seed: int, shortened: bool = False) -> list[Case]
     ) -> Case:
         noise = noise_profile(profile)
         work = [
-            Trial(payload_trial, (ROBOT, noise, own, plan_of(noise, shortened), carries), cost_s)
-            for own in trial_seeds(seed, name, trials)
+            Trial(
+                payload_trial,
+                (ROBOT, noise, own, plan_of(noise, shortened), carries, shortened),
+                cost_s,
+                shared_session(ROBOT, profile, own) if shortened else "",
+            )
+            for own in trial_seeds(seed, ROBOT if shortened else name, trials)
         ]
         label = name if profile == "x5" else f"{name}, {profile}"
         return Case(label, work, rows, profile, f"a run without it, {known_of(noise)}")

@@ -106,7 +106,7 @@ def reordered(robot: Robot, order: "np.ndarray[tuple[int], np.dtype[np.int64]]")
 
 
 AGREES_BELOW = 1e-10
-_COST_S = 10.0
+_COST_S = 15.0
 
 
 def reassembly_cases(trials: int, seed: int) -> list[Case]:

@@ -59,6 +59,16 @@ def test_a_worker_is_renewed_before_it_has_grown_too_large() -> None:
     assert len(set(long)) == 3
 
 
+def test_trials_that_share_something_run_in_one_process_however_long_they_are() -> None:
+    def shared(what: str) -> list[Trial]:
+        return [Trial(os.getpid, (), SECONDS_PER_PROCESS, what)] * 2
+
+    first, other, second, third = results([*shared("a")[1:], Trial(os.getpid, ()), *shared("a")], 2)
+    assert first == second == third != other
+    one, another, again, too = results([*shared("a"), *shared("b")], 1)
+    assert one == another != again == too
+
+
 def test_an_interruption_ends_the_workers_at_once_and_removes_their_folders() -> None:
     # The first trial leaves a folder behind; the second would sleep for ten minutes.
     trials = [Trial(tempfile.mkdtemp, (), cost_s=9.0), Trial(time.sleep, (600.0,), cost_s=5.0)]

@@ -98,6 +98,15 @@ def test_the_same_modules_are_measured_in_all_profiles_and_other_ones_with_anoth
     assert calibrated == uncalibrated
 
 
+def test_faults_that_alter_recordings_share_one_and_faults_of_robots_do_not() -> None:
+    cases = {case.name: case for case in fault_cases(2, seed=0)}
+    healthy = [trial.shares for trial in cases["sensor faults, none"].trials]
+    assert len(set(healthy)) == 2
+    assert [trial.shares for trial in cases["sensor faults, two encoders exchanged"].trials] == healthy
+    for other in ("links of 100 Nm/rad", "IMUs at 50 Hz"):
+        assert [trial.shares for trial in cases[f"sensor faults, {other}"].trials] == ["", ""]
+
+
 def test_cases_are_chosen_by_a_part_of_their_name_or_a_pattern() -> None:
     cases = kinematic_cases(QUICK_KINEMATICS, seed=0)
     assert chosen(cases, "") == cases

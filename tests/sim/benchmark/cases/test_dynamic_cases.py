@@ -38,6 +38,24 @@ def test_the_quick_benchmark_has_every_case_and_says_where_it_does_less() -> Non
     assert all(name in CASES or name.endswith(", true model") for name in quick)
 
 
+def test_the_quick_payloads_and_gravity_compensation_are_of_sessions_that_inertia_is_measured_in() -> None:
+    quick = {case.name: case.trials[0] for case in dynamic_cases(QUICK_DYNAMICS, seed=0)}
+    for profile, suffix in (("x5", ""), ("x5-uncalibrated", ", x5-uncalibrated")):
+        inertia, payload = (
+            quick[f"a2085_06, {name}"] for name in (f"{profile}, inertia", f"payload of 0.2 kg{suffix}")
+        )
+        assert payload.shares == inertia.shares != ""
+        assert payload.arguments[:4] == inertia.arguments[:4]
+        assert payload.arguments[-1] is True
+        inertia, compensation = (
+            quick[f"a2085_04, {profile}, {name}"] for name in ("inertia", "gravity compensation")
+        )
+        assert compensation.shares == inertia.shares != ""
+        assert compensation.arguments[:2] == (inertia.arguments[2], inertia.arguments[1])
+    assert len({trial.shares for trial in quick.values()} - {""}) == 6
+    assert {trial.shares for case in CASES.values() for trial in case.trials} == {""}
+
+
 def test_the_full_benchmark_monitors_for_an_hour_and_tries_everything_several_times() -> None:
     (monitored,) = (case for case in CASES.values() if case.name.endswith("monitored"))
     drawn = [one for trial in monitored.trials for one in trial.arguments[0]]
