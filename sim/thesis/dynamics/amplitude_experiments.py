@@ -313,7 +313,7 @@ def _search_table(alignment: Alignment, recorded: Recorded) -> Table:
             Column(name="Izz", unit="kg m²", form=".4f", group=group),
         ]
     caption = (
-        f"Amplitude search, {alignment}, mean of {len(recorded.arms)} arms; "
+        f"Amplitude search, {alignment}, mean of {recorded.arms_text}; "
         f"true mcx {truth[0]:.4f} kg m, Izz {truth[1]:.4f} kg m²."
     )
     return Table(caption=caption, columns=tuple(columns), rows=tuple(rows))

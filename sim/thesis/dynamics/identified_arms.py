@@ -33,9 +33,10 @@ class Recorded(NamedTuple):
     arms: tuple[PatternSeries, ...]
     rigid: PatternSeries | None = None
 
-    def first(self, amplitude_rad: float) -> PatternRun:
-        """Return the first arm's run with an amplitude."""
-        return run_of(self.arms[0], amplitude_rad)
+    @property
+    def arms_text(self) -> str:
+        """How many arms they are, as text."""
+        return f"{len(self.arms)} arm{'s' * (len(self.arms) != 1)}"
 
     def mean(self, amplitude_rad: float, value: Callable[[PatternRun], float]) -> float:
         """Return the mean of a value over all arms."""

@@ -20,7 +20,7 @@ from sim.thesis.dynamics.identified_arms import (
     run_of,
     torque_plot,
 )
-from sim.thesis.dynamics.load_identification import IZZ, MCX
+from sim.thesis.dynamics.load_identification import IZZ, MCX, least_mass_kg
 from sim.thesis.dynamics.pattern_recording import CheckRun, Estimate, PatternSeries, Torques, dynamic_pattern
 from sim.thesis.experiment import Check, Column, Curve, Experiment, Findings, Panel, Plot, Scope, Unit
 from sim.thesis.published import DYNAMIC_SEARCHES, Alignment
@@ -109,7 +109,8 @@ _MOTION_READING = (
 )
 _NOT_SHOWN = (
     "The torque about z shows mcx, mcy and Izz; on a rocking base ours has a little of Ixz and Iyz, too. A 0 "
-    "of a method means that it does not identify the parameter."
+    "of a method means that it does not identify the parameter. Sigma is that of an arm, by noise alone: the "
+    "link's bending, which adds a percent to Izz, is not in the model of one joint."
 )
 _NO_MASS = (
     "The printed mass of ±0.0001 is no estimate: the torque about the axis does not depend on it, and the "
@@ -139,7 +140,8 @@ _VECTORS = (
             _MOTION_READING,
             _NOT_SHOWN,
             "About a vertical axis mcx has a torque by the axis' tilt alone: the printed -0.0083 kg m is "
-            "then the torque's mean over that tilt, and says nothing of the arm.",
+            "then the torque's mean over that tilt, and says nothing of the arm. Here the tilt is smaller "
+            "than the accelerometer's bias, and mcx by ours is as little the arm's.",
             "6.3.4 has smaller parameters in the horizontal for lack of gravity; Izz is printed 2.3 times as "
             "large there as for the same arm in the vertical, which no body can do.",
             "A = 2 asks for 12.6 rad/s: the motor saturates, and the joint does what it can.",
@@ -165,9 +167,9 @@ def _torques_of(vector: _Vector, measured: list[PatternSeries]) -> Findings:
     )
     tables = [_vector_table(vector, recorded), _motion_table(recorded)]
     reading = vector.reading
-    if upright:
-        tables.append(_make_table(recorded))
-        reading = (*reading, *_make_reading())
+    if recorded.rigid is not None:
+        tables.append(_make_table(recorded.rigid))
+        reading = (*reading, *_make_reading(recorded.rigid))
     return Findings(
         checks, tuple(tables), (torque_plot(first.whole.torques, first.whole.our_torques, caption),), reading
     )
@@ -236,14 +238,16 @@ def _chosen_rad(recorded: Recorded) -> float:
 def _vector_table(vector: _Vector, recorded: Recorded) -> Table:
     names = ("thesis", "six_rows", "unfiltered", "ours")
     columns = [_means(recorded, name) for name in names]
+    chosen = _chosen_rad(recorded)
+    sigma = np.mean([run_of(arm, chosen).our_sigma for arm in recorded.arms], axis=0)
     truth = _truth(recorded)
     rows: list[tuple[Cell, ...]] = [
-        (parameter, vector.numbers[k], *(column[k] for column in columns), truth[k])
+        (parameter, vector.numbers[k], *(column[k] for column in columns), float(sigma[k]) or None, truth[k])
         for k, parameter in enumerate(BODY_PARAMETERS)
     ]
-    headings = ("printed", "the thesis' method", "six rows", "unfiltered", "ours", "truth")
+    headings = ("printed", "the thesis' method", "six rows", "unfiltered", "ours", "sigma of ours", "truth")
     return Table(
-        caption=f"Parameters about the joint, mean of {len(recorded.arms)} arms [kg, kg m, kg m²].",
+        caption=f"Parameters about the joint, mean of {recorded.arms_text} [kg, kg m, kg m²].",
         columns=(Column(name="parameter"), *(Column(name=name, form=".4f") for name in headings)),
         rows=tuple(rows),
     )
@@ -271,17 +275,14 @@ def _motion_table(recorded: Recorded) -> Table:
     )
 
 
-def _make_table(recorded: Recorded) -> Table:
+def _make_table(rigid: PatternSeries) -> Table:
     makes = (printed("6.3.2"), printed("6.3.3"), as_designed(), with_printed_module(), module_alone())
     rows: list[tuple[Cell, ...]] = [
         (make.name, make.mass_kg, make.mcx_kg_m, make.izz_kg_m2, make.least_kg if make.mcx_kg_m > 0 else None)
         for make in makes
     ]
-    rigid = recorded.rigid
-    if rigid is not None:
-        phi = run_of(rigid, _chosen_rad(recorded)).thesis.phi
-        least = phi[MCX] ** 2 / phi[IZZ]
-        rows.insert(2, ("the thesis' method, rigid base", None, phi[MCX], phi[IZZ], least))
+    phi = run_of(rigid, DYNAMIC_SEARCHES["vertical"].chosen_rad).thesis.phi
+    rows.insert(2, ("the thesis' method, rigid base", None, phi[MCX], phi[IZZ], least_mass_kg(phi)))
     return Table(
         caption="What the joint carries by the arm's make, and mcx² / Izz, the least mass of a body with "
         "these moments.",
@@ -296,8 +297,9 @@ def _make_table(recorded: Recorded) -> Table:
     )
 
 
-def _make_reading() -> tuple[str, ...]:
+def _make_reading(rigid: PatternSeries) -> tuple[str, ...]:
     own, design, module, link = printed("6.3.2"), as_designed(), module_alone(), link_left()
+    unfiltered = run_of(rigid, DYNAMIC_SEARCHES["vertical"].chosen_rad).unfiltered
     return (
         f"By the arm's make mcx is {design.mcx_kg_m:.4f} kg m, printed {own.mcx_kg_m:.4f}; Izz is "
         f"{design.izz_kg_m2:.4f} kg m², printed {own.izz_kg_m2:.4f}. The link's mass is that of the robot "
@@ -307,9 +309,11 @@ def _make_reading() -> tuple[str, ...]:
         f"of it. That leaves {link.izz_kg_m2:.4f} kg m² with {link.mcx_kg_m:.4f} kg m for the link: "
         f"{link.least_kg:.2f} kg or more, centred {1e3 * link.farthest_m:.0f} mm from the axis or nearer, "
         "where a uniform link that reaches the module is centred at 230 mm.",
-        "Inferred: noise of the differentiated velocity makes an estimated inertia small. Unfiltered, the "
-        "thesis' method errs towards the printed Izz; filtered, it errs the other way, as the filter makes "
-        "accelerations smaller, but not torques, and as the post rocks.",
+        "Not explained by noise: unfiltered accelerations make Izz small, "
+        f"{unfiltered.phi[IZZ]:.4f} kg m² on a rigid base, but leave an error of "
+        f"{unfiltered.squared_error_nm2:.0f} Nm², printed 2.0. A factor on all accelerations would do both, "
+        f"as of samples {4.0 * design.izz_kg_m2 / own.izz_kg_m2:.1f} ms apart that are taken for 4 ms; that "
+        "is a guess, and the horizontal Izz is too large.",
     )
 
 

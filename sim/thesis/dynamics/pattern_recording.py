@@ -66,7 +66,7 @@ class OurTorques(_Data):
 
 
 class Estimate(_Data):
-    """Inertial parameters (10,), and the sum of the squared torque errors [Nm^2] over how many samples.
+    """Inertial parameters (10,), and the sum of the squared torque errors [Nm^2].
 
     relative_error: rms of the error over that of the torque about its mean.
     """
@@ -74,14 +74,14 @@ class Estimate(_Data):
     phi: Values
     squared_error_nm2: float
     relative_error: float
-    samples: int
 
 
 class PatternRun(_Data):
     """What one amplitude gives.
 
     thesis: gravity at rest in the frame (section 5.1). turning: gravity turns against the link. unfiltered:
-    the acceleration not filtered. six_rows: all six rows of eq. 25. ours: the coordinator's estimator.
+    the acceleration not filtered. six_rows: all six rows of eq. 25. ours: the coordinator's estimator;
+    our_sigma: (10,) its standard deviations, of the noise alone.
     """
 
     amplitude_rad: float
@@ -276,7 +276,6 @@ def _estimate(phi: Array, calculated_nm: Array, measured_nm: Array) -> Estimate:
         phi=_values(phi),
         squared_error_nm2=float(error @ error),
         relative_error=_relative(error, measured_nm),
-        samples=len(error),
     )
 
 

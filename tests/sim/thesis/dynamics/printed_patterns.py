@@ -49,7 +49,6 @@ def _run(phi: np.ndarray, amplitude_rad: float, start_nm: float, squared_error_n
         phi=tuple(phi),
         squared_error_nm2=squared_error_nm2,
         relative_error=_RELATIVE.get(amplitude_rad, 0.1),
-        samples=1000,
     )
     return PatternRun(
         amplitude_rad=amplitude_rad,
