@@ -87,13 +87,15 @@ def replay(
 ) -> None:
     """Compute the result of a run again from its recording, without a robot."""
     folder = out if out is not None else session.parent
-    recording = load_recording(session)
+    recording, terminal = load_recording(session), Terminal()
+    # Before anything is identified: where that fails this may be why.
+    for damage in recording.damage:
+        terminal.note(damage)
     before = baseline_within(session.parent)
     revise = before.updated if before is not None else None
     identified = identify(recording, revise=revise, measured=measured_before_run(session.parent, before))
     folder.mkdir(parents=True, exist_ok=True)
     write_outputs(folder, identified)
-    terminal = Terminal()
     print_result(identified.result, terminal)
     if report:
         try:

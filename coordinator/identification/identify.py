@@ -180,7 +180,10 @@ def _refreshed(kept: Kinematics, recording: Recording) -> Kinematics:
         _, windows = _exploration(recording, clocks, kept.topology.serials)
         clocks |= refine_clocks(kept.first.chain, clocks, windows).clocks
         later = recording.motions("dynamic", "held_out")
-        sampling = sampling_notes(recording, clocks, everyone, later, REFINEMENT_CUTOFF_HZ)
+        sampling = (
+            *recording.damage,
+            *sampling_notes(recording, clocks, everyone, later, REFINEMENT_CUTOFF_HZ),
+        )
     except (DataError, np.linalg.LinAlgError) as error:
         raise IdentificationError(str(error)) from error
     return kept._replace(clocks=clocks, notes=tuple(dict.fromkeys((*kept.notes, *sampling))))
@@ -192,7 +195,10 @@ def _identify_kinematics(recording: Recording, measured: Sequence[CalibrationInf
     try:
         clocks = map_clocks({s: recording.modules[s].trips for s in serials})
         check_encoder_travels(encoder_travels(recording, clocks, serials))
-        sampling = sampling_notes(recording, clocks, serials, _moving(recording), REFINEMENT_CUTOFF_HZ)
+        sampling = (
+            *recording.damage,
+            *sampling_notes(recording, clocks, serials, _moving(recording), REFINEMENT_CUTOFF_HZ),
+        )
         search = search_topology(recording, serials)
         topology = search.topology
         rest = recording.rest_observation(topology.serials, MIN_REST_ROWS)
@@ -263,10 +269,13 @@ def _settled(refined: Refinement, reference: Chain) -> Refinement:
 def _explored(recording: Recording) -> list[str]:
     rested = sorted({e.serial for e in recording.latest_motions("rest")})
     explored = {e.serial for e in recording.latest_motions("windowed_sine", "whole")}
-    missing = [s for s in rested if s not in explored and s not in excluded_modules(recording.journal)]
-    if not rested or missing:
-        what = f"exploration of {', '.join(missing)}" if rested else "rest"
-        raise IdentificationError(f"no {what} was recorded")
+    excluded = excluded_modules(recording.journal)
+    if not rested:
+        raise IdentificationError("no rest was recorded")
+    for what, lacking in (("exploration", set(rested) - explored), ("rest", explored - set(rested))):
+        missing = sorted(lacking - set(excluded))
+        if missing:
+            raise IdentificationError(f"no {what} of {', '.join(missing)} was recorded")
     return rested
 
 

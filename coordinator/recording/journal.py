@@ -4,12 +4,13 @@ A crashed run resumes from it, and a replay reads from it the purpose of every m
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from module_agent.model.catalogue import ImuKind, TorqueKind
 from module_agent.wire.messages import MotionRecord
+from module_agent.wire.refusal import Refusal, WireError
 
 # Prefix of the steps of notes on excluded modules.
 STEP = "left_out/"
@@ -41,6 +42,22 @@ class JournalEvent(BaseModel):
     imu: ImuKind = "uncalibrated"
     torque: TorqueKind = "uncalibrated"
     wall_time_s: float | None = None
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Self:
+        """Return the event of some JSON.
+
+        Raises:
+            WireError: MALFORMED, it is none, or one of another version of this program.
+        """
+        try:
+            return cls.model_validate_json(payload)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = ".".join(map(str, first["loc"])) or "it"
+            raise WireError(
+                Refusal.MALFORMED, f"no event of a journal that this version knows: {place}: {first['msg']}"
+            ) from error
 
     def encode(self) -> bytes:
         """Return the event as JSON."""

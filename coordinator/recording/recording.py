@@ -7,8 +7,8 @@ results. The recording's hash is the trace hash of the run.
 import copy
 import hashlib
 import struct
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from module_agent.wire.refusal import Refusal, WireError
 from module_agent.wire.row_log import RowLog
 from module_agent.wire.topics import TOPICS, Exchange
 
+P = ParamSpec("P")
+T = TypeVar("T")
 Kind = Exchange | Literal["journal"]
 JOURNAL_TOPIC = "journal"
 # Requests that wait for an answer; an answer comes within seconds, if it comes.
@@ -91,7 +93,7 @@ class Recording:
     """The messages of one session and their indices. `modules` holds the latest boot of every serial.
 
     explored: what had been recorded at the journal's `explored` event; None before it, and in older
-    recordings, which do not have it.
+    recordings, which do not have it. damage: sentences on places of a file that could not be read.
     """
 
     def __init__(self) -> None:
@@ -102,6 +104,7 @@ class Recording:
         self.explored: Recording | None = None
         self.questions: dict[bytes, InformationRequest] = {}
         self.refused: dict[str, int] = {}
+        self.damage: list[str] = []
         self._hash = hashlib.sha256()
         self._sent: dict[tuple[str, int], int] = {}
 
@@ -122,10 +125,11 @@ class Recording:
         """Add one entry; return its message.
 
         Raises:
-            WireError: the bytes are not a message of their key; counted in `refused` by reason.
+            WireError: the bytes are no message of their key, or no event of the journal; counted in
+                `refused` by reason.
         """
         if entry.kind == "journal":
-            event = JournalEvent.model_validate_json(entry.payload)
+            event = self._counted(JournalEvent.decode, entry.payload)
             self.journal.append(event)
             if event.what in ("session", "explored"):
                 self.explored = self._so_far() if event.what == "explored" else None
@@ -135,8 +139,12 @@ class Recording:
             return event
         head = f"{entry.kind} {entry.topic} {len(entry.payload)} ".encode()
         self._hash.update(head + struct.pack("<q", entry.t_ns) + entry.payload)
+        return self._counted(self._index, entry, entry.kind)
+
+    def _counted(self, read: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> T:
+        """Return what is read; count it by reason where it is refused."""
         try:
-            return self._index(entry, entry.kind)
+            return read(*arguments, **options)
         except WireError as error:
             self.refused[error.reason.value] = self.refused.get(error.reason.value, 0) + 1
             raise

@@ -4,8 +4,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from coordinator.recording.journal import JournalEvent
 from coordinator.recording.recording import Recording
 from coordinator.recording.session_file import SessionFileError, read_session
@@ -80,23 +78,34 @@ def open_run_folder(path: Path, resume: bool, robot: str | None = None) -> Path 
 def _journal(session: Path) -> Iterator[JournalEvent]:
     for entry in read_session(session):
         if entry.kind == "journal":
-            yield JournalEvent.model_validate_json(entry.payload)
+            with suppress(WireError):  # an event of another version
+                yield JournalEvent.decode(entry.payload)
 
 
 def _has_begun(session: Path) -> bool:
     if not session.exists():
         return False
+    # An unreadable file, or part of one, is not overwritten.
+    damage: list[str] = []
     try:
-        return any(event.what == "begin" for event in _journal(session))
-    except (SessionFileError, ValidationError):
-        # An unreadable file is not overwritten.
+        for entry in read_session(session, damage.append):
+            if entry.kind == "journal" and JournalEvent.decode(entry.payload).what == "begin":
+                return True
+    except (SessionFileError, WireError):
         return True
+    return bool(damage)
 
 
 def load_recording(path: Path) -> Recording:
-    """Read a recording; messages that could not be decoded are left out, as in the live session."""
+    """Read a recording; messages that could not be decoded are left out, as in the live session.
+
+    Damaged places are in `Recording.damage`.
+
+    Raises:
+        SessionFileError: as `read_session`.
+    """
     recording = Recording()
-    for entry in read_session(path):
+    for entry in read_session(path, recording.damage.append):
         with suppress(WireError):  # counted in `recording.refused`
             recording.add(entry)
     return recording

@@ -4,15 +4,27 @@ Topics are the keys; the kind (publication, request, reply) is in the channel's 
 msgpack with a JSON schema for each message type; the journal is JSON. Chunks are flushed five times a second,
 because a crash loses the last one: the library's default of 1 MiB lost 11.8 s. They are compressed
 with zstd (measured: 6.9 MB instead of 15.4 MB for 97 s of four modules, 0.27 s of CPU time).
+
+Every chunk has a checksum. A chunk that fails it is left out, and reading goes on with the next one: whatever
+a bad disk did to a file, what comes out is what was recorded, and what does not is reported. Indices are not
+read, as the order of the file is that of the recording; the summary serves for channels whose first chunk is
+damaged, if its own checksum holds.
 """
 
+import io
 import json
+import mmap
 import struct
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
-from mcap.reader import NonSeekingReader
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 from zstandard import ZstdError
 
@@ -26,6 +38,16 @@ from module_agent.wire.topics import TOPICS
 CHUNK_BYTES = 64 * 1024
 FLUSH_NS = 200_000_000
 MCAP0_MAGIC = b"\x89MCAP0\r\n"
+# A record: its opcode, its length, its content. A chunk's content has 28 bytes before its compression.
+_HEAD = struct.Struct("<BQ")
+_CHUNK_HEAD_BYTES = 28
+_CHUNK_MARK = b"\x04\x00\x00\x00zstd"
+_MARK_AT = _HEAD.size + _CHUNK_HEAD_BYTES
+_FOOTER = struct.Struct("<QQI")
+_MAX_CHUNK_BYTES = 1 << 30
+_OPCODES = frozenset(map(int, Opcode))
+_UNREADABLE = (McapError, ZstdError, EndOfFile, struct.error, ValueError, MemoryError)
+
 KINDS: tuple[Kind, ...] = ("publication", "request", "reply", "journal")
 
 
@@ -81,33 +103,132 @@ class SessionWriter:
             self._file.close()
 
 
-def read_session(path: Path) -> Iterator[Entry]:
+class _Record(NamedTuple):
+    """A record's opcode and its place in the file, or a damaged place, whose opcode is None."""
+
+    opcode: int | None
+    start: int
+    end: int
+
+
+def read_session(path: Path, report: Callable[[str], None] = lambda damage: None) -> Iterator[Entry]:
     """Yield the entries of a recording in the order of writing; a file cut short by a crash ends early.
+
+    `report` receives a sentence about every damaged place, whose entries are left out.
 
     Raises:
         SessionFileError: there is no such file, or it is no recording of a session.
     """
     try:
         file = path.open("rb")
+        size = path.stat().st_size
     except OSError as error:
         raise SessionFileError(f"{path}: {error.strerror or error}") from error
     with file:
         # A file cut within its first bytes is an empty recording, of a run that crashed at its start.
-        head = file.read(len(MCAP0_MAGIC))
-        if not MCAP0_MAGIC.startswith(head):
+        if not MCAP0_MAGIC.startswith(file.read(len(MCAP0_MAGIC))):
             raise SessionFileError(f"{path}: not an MCAP file; give the session.mcap of a run")
-        file.seek(0)
-        reader = NonSeekingReader(file)
-        try:
-            for _, channel, message in reader.iter_messages(log_time_order=False):
-                kind = channel.metadata.get("kind")
-                if kind not in KINDS:
-                    raise SessionFileError(
-                        f"{path}: topic {channel.topic} is not of a session of this project"
-                    )
-                yield Entry(kind, channel.topic, message.log_time, bytes(message.data))
-        except (EndOfFile, struct.error):
-            # A recording that was cut short by a crash is read up to the cut.
+        if size > len(MCAP0_MAGIC):
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                yield from _entries(path, data, report)
+
+
+def _entries(path: Path, data: mmap.mmap, report: Callable[[str], None]) -> Iterator[Entry]:
+    channels = _summarised_channels(data)
+    last_ns: int | None = None
+    lost = 0
+    for record in _records(data):
+        messages: list[Message] = []
+        if record.opcode == Opcode.CHUNK:
+            try:
+                messages = _messages(data, record, channels)
+            except _UNREADABLE:
+                record = record._replace(opcode=None)
+        if record.opcode is None:
+            after = "" if last_ns is None else f" after {last_ns * 1e-9:.2f} s"
+            place = f"from byte {record.start} to {record.end}"
+            report(f"{path.name} is damaged {place}: messages{after} may be missing")
+        for message in messages:
+            channel = channels.get(message.channel_id)
+            if channel is None:
+                lost += 1
+                continue
+            kind = channel.metadata.get("kind")
+            if kind not in KINDS:
+                raise SessionFileError(f"{path}: topic {channel.topic} is not of a session of this project")
+            last_ns = message.log_time
+            yield Entry(kind, channel.topic, message.log_time, bytes(message.data))
+    if lost:
+        report(f"{path.name}: {lost} messages are left out, as it is lost what they are")
+
+
+def _records(data: mmap.mmap) -> Iterator[_Record]:
+    """Yield the records up to the end of the data; where they cannot be made out, the next chunk is next."""
+    at, size = len(MCAP0_MAGIC), len(data)
+    complete = data[-len(MCAP0_MAGIC) :] == MCAP0_MAGIC
+    while at + _HEAD.size <= size:
+        opcode, length = _HEAD.unpack_from(data, at)
+        end = at + _HEAD.size + length
+        if opcode in _OPCODES and end <= size and _is_one_record(data, opcode, at, end):
+            yield _Record(opcode, at, end)
+            if opcode == Opcode.DATA_END:
+                return
+            at = end
+            continue
+        following = _next_chunk(data, at + 1)
+        if following is None and not complete:
+            # Cut short by a crash.
             return
-        except (McapError, ZstdError) as error:
-            raise SessionFileError(f"{path}: damaged: {error}") from error
+        yield _Record(None, at, following or size)
+        at = following or size
+
+
+def _next_chunk(data: mmap.mmap, start: int) -> int | None:
+    mark = data.find(_CHUNK_MARK, start + _MARK_AT)
+    # The summary has such marks too, in records of another kind.
+    while mark >= 0 and data[mark - _MARK_AT] != Opcode.CHUNK:
+        mark = data.find(_CHUNK_MARK, mark + 1)
+    return mark - _MARK_AT if mark >= 0 else None
+
+
+def _is_one_record(data: mmap.mmap, opcode: int, start: int, end: int) -> bool:
+    """Return whether a record's length is believable: a damaged one would swallow the chunks after it."""
+    if opcode != Opcode.CHUNK:
+        return data.find(_CHUNK_MARK, start, end) < 0
+    mark = start + _MARK_AT
+    held_at = mark + len(_CHUNK_MARK)
+    if data[mark:held_at] != _CHUNK_MARK:
+        # Another tool's file.
+        return True
+    held = int.from_bytes(data[held_at : held_at + 8], "little")
+    return held_at + 8 + held == end
+
+
+def _messages(data: mmap.mmap, record: _Record, channels: dict[int, Channel]) -> list[Message]:
+    """Return the messages of a chunk, and add its channels to those that are known."""
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(data[record.start + _HEAD.size : record.end])))
+    if chunk.uncompressed_size > _MAX_CHUNK_BYTES:
+        raise McapError(f"a chunk of {chunk.uncompressed_size} bytes")
+    records = breakup_chunk(chunk, validate_crc=True)
+    channels.update({each.id: each for each in records if isinstance(each, Channel)})
+    return [each for each in records if isinstance(each, Message)]
+
+
+def _summarised_channels(data: mmap.mmap) -> dict[int, Channel]:
+    """Return the channels of the summary; none where there is no summary, or it is damaged."""
+    footer_at = len(data) - len(MCAP0_MAGIC) - _FOOTER.size - _HEAD.size
+    if footer_at < len(MCAP0_MAGIC) or data[footer_at] != Opcode.FOOTER:
+        return {}
+    start, _, checksum = _FOOTER.unpack_from(data, footer_at + _HEAD.size)
+    # The checksum is over all before itself.
+    if not 0 < start < footer_at or zlib.crc32(data[start : footer_at + _HEAD.size + 16]) != checksum:
+        return {}
+    channels, at = {}, start
+    while at < footer_at:
+        opcode, length = _HEAD.unpack_from(data, at)
+        at += _HEAD.size
+        if opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(io.BytesIO(data[at : at + length])))
+            channels[channel.id] = channel
+        at += length
+    return channels

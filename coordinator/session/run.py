@@ -160,8 +160,10 @@ class Run:
 
     def _take_over(self, crashed: Path) -> None:
         try:
-            for entry in read_session(crashed):
+            for entry in read_session(crashed, self.recording.damage.append):
                 self._record(entry)
+            for damage in self.recording.damage:
+                self.note(damage)
             self._writer.flush()
         except BaseException:
             self._writer.close()

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from coordinator.recording.journal import JournalEvent, standstill
+from module_agent.wire.refusal import WireError
 
 
 def _event(what: str, **fields: Any) -> JournalEvent:
@@ -33,6 +34,13 @@ def test_a_robot_whose_modules_all_confirmed_is_stopped() -> None:
 def test_unconfirmed_modules_are_named() -> None:
     text = standstill([_event("failed", text="stopped: A is lost", deaf=("A", "B"))])
     assert text == "A, B did not confirm to have stopped: see that the robot stands still"
+
+
+def test_an_event_of_another_version_is_refused_in_words_of_the_field() -> None:
+    with pytest.raises(WireError, match=r"no event of a journal that this version knows: what: Input should"):
+        JournalEvent.decode(b'{"t_ns":5,"what":"teleported"}')
+    with pytest.raises(WireError, match="no event of a journal"):
+        JournalEvent.decode(b"{")
 
 
 def test_an_older_journal_is_cited() -> None:

@@ -1,5 +1,6 @@
 """A recording comes back as it was written, up to wherever a crash has cut it."""
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,7 +11,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from coordinator.recording.recording import Entry
-from coordinator.recording.session_file import SessionFileError, SessionWriter, read_session
+from coordinator.recording.run_folder import load_recording
+from coordinator.recording.session_file import MCAP0_MAGIC, SessionFileError, SessionWriter, read_session
 from module_agent.wire.keys import Leaf
 
 PERIOD_NS = 20_000_000
@@ -132,14 +134,53 @@ def test_an_mcap_file_of_something_else_is_refused_by_its_topic(tmp_path: Path) 
         list(read_session(path))
 
 
-def test_a_damaged_file_is_called_damaged(tmp_path: Path, wire: SimpleNamespace) -> None:
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_what_comes_out_of_a_damaged_file_was_recorded_and_what_does_not_is_reported(
+    tmp_path: Path, wire: SimpleNamespace, data: st.DataObject
+) -> None:
+    whole = tmp_path / "session.mcap"
+    entries = _entries(wire, 400)
+    if not whole.exists():
+        _write(whole, entries).close()
+    content = bytearray(whole.read_bytes())
+    first = data.draw(st.integers(len(MCAP0_MAGIC), len(content) - 1))
+    count = data.draw(st.sampled_from([1, 8, 512]))
+    noise = data.draw(st.binary(min_size=count, max_size=count))
+    content[first : first + count] = noise[: len(content) - first]
+    (tmp_path / "damaged.mcap").write_bytes(content)
+    reports: list[str] = []
+    read = list(read_session(tmp_path / "damaged.mcap", reports.append))
+    remaining = iter(entries)
+    assert all(entry in remaining for entry in read), "in their order, none invented"
+    if len(read) < len(entries):
+        assert reports
+        assert all("damaged.mcap" in report for report in reports)
+    # A place is damaged, not the file: a chunk is a fifth of a second, here 10 entries.
+    assert len(read) >= len(entries) - 40
+
+
+def test_a_whole_file_has_no_damage(tmp_path: Path, wire: SimpleNamespace) -> None:
+    reports: list[str] = []
+    _write(tmp_path / "session.mcap", _entries(wire, 400)).close()
+    assert len(list(read_session(tmp_path / "session.mcap", reports.append))) == 400
+    assert reports == []
+
+
+def test_damage_names_the_place_and_the_time(tmp_path: Path, wire: SimpleNamespace) -> None:
     path = tmp_path / "session.mcap"
-    _write(path, _entries(wire, 30)).close()
+    _write(path, _entries(wire, 400)).close()
     content = bytearray(path.read_bytes())
-    content[8:20] = b"\xff" * 12  # the first record's kind and length
+    middle = len(content) // 2
+    content[middle : middle + 4] = b"\xff" * 4
     path.write_bytes(content)
-    with pytest.raises(SessionFileError, match=r"session\.mcap: damaged"):
-        list(read_session(path))
+    recording = load_recording(path)
+    (sentence,) = recording.damage
+    start, end, after_s = map(
+        float, re.findall(r"from byte (\d+) to (\d+): messages after (\S+) s", sentence)[0]
+    )
+    assert start <= middle < end
+    assert 2.0 < after_s < 6.0
 
 
 def test_closing_twice_is_once(tmp_path: Path, wire: SimpleNamespace) -> None:
