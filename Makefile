@@ -9,12 +9,13 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 export OMP_NUM_THREADS := 1
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo kinematics dynamics test coverage check bench clean
+.PHONY: help demo kinematics dynamics thesis test coverage check bench clean
 
 help:
 	@echo "make demo    a simulated arm identifies itself over Zenoh, one process per module, and is scored"
 	@echo "make kinematics  the thesis' estimator, ours and the physical limit, every row in about a minute"
 	@echo "make dynamics    inertia, payloads, torque control and monitoring, every row in about a minute"
+	@echo "make thesis  the thesis' experiments side by side with what was printed, few trials, under three minutes"
 	@echo "make test    all tests"
 	@echo "make coverage  branch coverage of what runs in one process"
 	@echo "make check   format, lint, types, floors and doors"
@@ -50,6 +51,10 @@ kinematics: $(STAMP)
 dynamics: $(DEV)
 	@mkdir -p runs
 	$(BIN)/x5-sim benchmark dynamics --quick --json runs/dynamics.json $(if $(TX40),--tx40 $(TX40))
+
+thesis: $(STAMP)
+	$(BIN)/x5-sim thesis --quick --out runs/thesis
+	@echo "Read it: runs/thesis/report.html"
 
 test: $(DEV)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup

@@ -37,6 +37,7 @@ class Column(_Part):
 
     group: a heading above this and the neighbouring columns of the same group. right: aligned to the right
     even if the cells are text. link: the cells are titles of sections, and lead there.
+    spans: an empty cell is part of the one above.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Column(_Part):
     group: str = ""
     right: bool = False
     link: bool = False
+    spans: bool = False
 
     @property
     def heading(self) -> str:
@@ -100,11 +102,12 @@ class Curve(_Part):
 
 
 class Panel(_Part):
-    """Curves over one x axis; `title` is shown above it."""
+    """Curves over one x axis; `title` is shown above it. log: for values of several orders of magnitude."""
 
     y_label: str
     curves: tuple[Curve, ...]
     title: str = ""
+    log: bool = False
 
 
 class Plot(_Part):

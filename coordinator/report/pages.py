@@ -39,6 +39,8 @@ PALETTE = {
 SUFFIXES = (".html", ".md", ".json")
 _OUTCOMES: dict[str, str] = {"seen": "seen", "seen in part": "part", "not seen": "unseen"}
 _ROWS_A_PAGE = 24
+# A longer text is prose.
+_NAME = 40
 _COLOUR = re.compile("|".join(light for light, _ in PALETTE.values()), re.IGNORECASE)
 _VARIABLES = {light: f"var(--{name})" for name, (light, _) in PALETTE.items()}
 
@@ -50,14 +52,13 @@ def _variables(dark: bool) -> str:
 _STYLE = f"""
 :root {{ color-scheme: light dark; {_variables(False)} }}
 @media (prefers-color-scheme: dark) {{ :root {{ {_variables(True)} }} }}
-@media print {{ :root {{ color-scheme: light; {_variables(False)} }}
-  body {{ max-width: none; padding: 0; }} }}
-body {{ font: 15px/1.5 system-ui, "DejaVu Sans", sans-serif; color: var(--ink); background: var(--paper);
+body {{ font: .94rem/1.5 system-ui, "DejaVu Sans", sans-serif; color: var(--ink); background: var(--paper);
   max-width: 62rem; margin: 0 auto; padding: 1.5rem 1.2rem 4rem; overflow-wrap: break-word; }}
 h1 {{ font-size: 1.7rem; line-height: 1.2; margin: 0 0 .3rem; }}
 h2 {{ font-size: 1.2rem; margin: 2.2rem 0 .6rem; break-after: avoid;
   padding-bottom: .2rem; border-bottom: 1px solid var(--grid); }}
-p {{ margin: .5rem 0; }} .subtitle {{ color: var(--muted); margin: 0 0 1rem; }}
+p {{ margin: .5rem 0; }} h2 + p {{ break-after: avoid; }}
+.subtitle {{ color: var(--muted); margin: 0 0 1rem; }}
 a {{ color: var(--measured); }}
 nav {{ font-size: .9rem; }} nav a {{ margin-right: 1rem; white-space: nowrap; }}
 ul {{ margin: .5rem 0; padding-left: 1.3rem; }} li {{ margin: .15rem 0; }}
@@ -69,7 +70,7 @@ caption {{ text-align: left; font-weight: 600; padding-bottom: .3rem;
 th, td {{ text-align: left; padding: .2rem .9rem .2rem 0; border-bottom: 1px solid var(--grid);
   vertical-align: top; }}
 th {{ color: var(--muted); font-weight: 500; vertical-align: bottom; }}
-td:first-child {{ white-space: nowrap; }}
+td.name {{ white-space: nowrap; }} td.prose {{ min-width: 8rem; }}
 .n {{ text-align: right; white-space: nowrap; }} th.n {{ white-space: normal; }}
 th[colspan] {{ text-align: center; }}
 figure {{ margin: 1rem 0 1.4rem; break-inside: avoid; }}
@@ -80,6 +81,9 @@ figcaption {{ font-size: .87rem; color: var(--muted); }}
 .conclusion.unseen {{ border-color: var(--axis); }}
 .outcome {{ white-space: nowrap; }} .outcome.seen {{ color: var(--residual); }}
 .outcome.part {{ color: var(--predicted); }} .outcome.unseen {{ color: var(--axis); }}
+@page {{ margin: 14mm; }}
+@media print {{ :root {{ color-scheme: light; font-size: 12px; {_variables(False)} }}
+  body {{ max-width: none; padding: 0; background: none; }} }}
 """
 
 
@@ -171,16 +175,19 @@ def _html_block(block: Block) -> str:
 
 
 def _html_table(table: Table) -> str:
-    kinds = ["" if table.is_text(k) else ' class="n"' for k in range(len(table.columns))]
-    heads = "".join(f"<th{k}>{escape(c.heading)}</th>" for k, c in zip(kinds, table.columns, strict=True))
+    kinds = [_kind(table, k) for k in range(len(table.columns))]
+    heads = "".join(
+        f"<th{kind}>{escape(c.heading)}</th>" for kind, c in zip(kinds, table.columns, strict=True)
+    )
     rows = "".join(
         "<tr>"
         + "".join(
-            f"<td{kind}>{_html_cell(column, cell)}</td>"
-            for kind, column, cell in zip(kinds, table.columns, row, strict=True)
+            f"<td{kind}{_span(table, at, k)}>{_html_cell(column, cell)}</td>"
+            for k, (kind, column, cell) in enumerate(zip(kinds, table.columns, row, strict=True))
+            if not (column.spans and at and cell == "")
         )
         + "</tr>"
-        for row in table.rows
+        for at, row in enumerate(table.rows)
     )
     # A table that is longer than a page begins where it stands, and goes on over the next ones.
     long = " long" if len(table.rows) > _ROWS_A_PAGE else ""
@@ -188,6 +195,24 @@ def _html_table(table: Table) -> str:
         f'<div class="scroll{long}"><table><caption>{escape(table.caption)}</caption><thead>{_groups(table)}'
         f"<tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
     )
+
+
+def _kind(table: Table, column: int) -> str:
+    """Return the class of a column's cells: numbers, prose, or names that do not wrap."""
+    if not table.is_text(column):
+        return ' class="n"'
+    if any(len(str(row[column] or "")) > _NAME for row in table.rows):
+        return ' class="prose"'
+    return "" if column else ' class="name"'
+
+
+def _span(table: Table, row: int, column: int) -> str:
+    """Return how many rows a cell spans, as the attribute; empty for one."""
+    if not table.columns[column].spans:
+        return ""
+    below = [other[column] == "" for other in table.rows[row + 1 :]]
+    count = 1 + (below.index(False) if False in below else len(below))
+    return f' rowspan="{count}"' if count > 1 else ""
 
 
 def _html_cell(column: Column, cell: Cell) -> str:

@@ -333,7 +333,7 @@ def panel_figure(plot: Plot) -> Figure:
         MissingPlots: matplotlib is not installed.
         ValueError: a panel or a curve without data.
     """
-    alt = f"{plot.caption.removesuffix('.')}: {', '.join(labels(plot))} over {plot.x_label}"
+    alt = f"{plot.caption.removesuffix('.')}: {'; '.join(labels(plot))}, over {plot.x_label}"
     return Figure(caption=plot.caption, alt=alt, svg=panel_plot(plot))
 
 
@@ -365,6 +365,8 @@ def panel_plot(plot: Plot) -> str:
             for curve in panel.curves:
                 _curve(axes, curve, names.index(curve.label))
             axes.set_ylabel(panel.y_label)
+            if panel.log:
+                axes.set_yscale("log")
             if panel.title:
                 axes.set_title(panel.title, loc="left", color=_MUTED, fontsize=9)
         _few_ticks(grid[:, 0], plot)
@@ -383,14 +385,17 @@ def panel_plot(plot: Plot) -> str:
 
 
 def _few_ticks(panels: Sequence["Axes"], plot: Plot) -> None:
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
     places = [at for panel in plot.panels for curve in panel.curves for at in curve.x]
     if all(float(at).is_integer() for at in places):
         panels[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    for axes in panels:
-        axes.yaxis.set_major_locator(MaxNLocator(5))
-        axes.ticklabel_format(axis="y", useOffset=False)
+    for axes, panel in zip(panels, plot.panels, strict=True):
+        if panel.log:
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        else:
+            axes.yaxis.set_major_locator(MaxNLocator(5))
+            axes.ticklabel_format(axis="y", useOffset=False)
 
 
 def _curve(axes: "Axes", curve: Curve, number: int) -> None:

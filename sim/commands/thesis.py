@@ -1,5 +1,6 @@
 """`x5-sim thesis`: the thesis' experiments on simulated modules, against what it printed."""
 
+import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from sim.benchmark.workers import run_trials
 from sim.commands.experiment import ModuleOptions, WorkerCount, experiment, worker_count
 from sim.thesis.dynamics.parameter_experiments import PARAMETER_EXPERIMENTS
 from sim.thesis.experiment import Experiment, ExperimentResult, Scope, ThesisResults, Unit
+from sim.thesis.future_work.experiment import FUTURE_WORK
 from sim.thesis.kinematics.equation16 import EQUATION_16
 from sim.thesis.kinematics.motion_experiments import MOTION_EXPERIMENTS
 from sim.thesis.kinematics.repeat_experiments import REPEAT_EXPERIMENTS
@@ -24,14 +26,22 @@ from sim.thesis.kinematics.sweep_experiments import SWEEP_EXPERIMENTS
 from sim.thesis.study import Store, code_version, results, selected, units_of
 from sim.thesis.study_report import HTML, counted, write_results
 
-# In the order of the thesis.
-EXPERIMENTS: tuple[Experiment, ...] = (
-    *MOTION_EXPERIMENTS,
-    *SWEEP_EXPERIMENTS,
-    *REPEAT_EXPERIMENTS,
-    EQUATION_16,
-    *PARAMETER_EXPERIMENTS,
+
+def _place(one: Experiment) -> tuple[int, int]:
+    """Return where an experiment stands in the report: figures, then tables by number, then the rest."""
+    named = re.fullmatch(r"(figure|table)(\d+)", one.id)
+    return (2, 0) if named is None else (("figure", "table").index(named[1]), int(named[2]))
+
+
+_GROUPS = (
+    MOTION_EXPERIMENTS,
+    SWEEP_EXPERIMENTS,
+    REPEAT_EXPERIMENTS,
+    (EQUATION_16,),
+    PARAMETER_EXPERIMENTS,
+    (FUTURE_WORK,),
 )
+EXPERIMENTS: tuple[Experiment, ...] = tuple(sorted((one for own in _GROUPS for one in own), key=_place))
 
 
 @with_options

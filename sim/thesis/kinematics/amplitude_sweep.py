@@ -59,7 +59,8 @@ class AmplitudeTrial(NamedTuple):
     saturated: the commanded speed is beyond what the module's velocity loop takes.
     stroke: size of the motion over that of the commanded one, both rms.
     printed_mm: by the thesis' analysis with eq. 16 as printed (`as_printed`).
-    printed_by_algebra_mm: what that should give (`turned_wrongly_mm`).
+    printed_by_algebra_mm, twice_gravity_mm: what that should give, and how much gravity adds across the axis
+        (`turned_wrongly`).
     ours_mm, ours_sigma_mm: by the agents' joint regression.
     """
 
@@ -80,6 +81,7 @@ class AmplitudeTrial(NamedTuple):
     note: str
     printed_mm: float | None = None
     printed_by_algebra_mm: float | None = None
+    twice_gravity_mm: float | None = None
     ours_mm: float | None = None
     ours_sigma_mm: float | None = None
 
@@ -139,6 +141,7 @@ def run_series(series: Series) -> list[AmplitudeTrial]:
             rows = rig.trial(Plan(sine_amplitude_rad=amplitude_rad))
             filtered, note = _fit(rows, TAPS)
             unfiltered, _ = _fit(rows, taps=1)
+            wrong = filtered and turned_wrongly(rows, filtered)
             ours = _regressed(rows, profile)
             joint = rows.sine.joint
             # The sag under a load counts neither for the motion nor for the commanded one.
@@ -163,7 +166,8 @@ def run_series(series: Series) -> list[AmplitudeTrial]:
                     stroke=float(stroke),
                     note=note,
                     printed_mm=filtered and 1e3 * as_printed(rows).distance_m,
-                    printed_by_algebra_mm=filtered and turned_wrongly_mm(rows, filtered),
+                    printed_by_algebra_mm=wrong and wrong.distance_mm,
+                    twice_gravity_mm=wrong and wrong.twice_gravity_mm,
                     ours_mm=ours and 1e3 * ours.distance_m,
                     ours_sigma_mm=ours and 1e3 * ours.sigma_distance_m,
                 )
@@ -185,8 +189,15 @@ def as_printed(rows: TrialRows) -> CircleFit:
     return circle_point_analysis(imu_window(rows.rest), constant, turned)
 
 
-def turned_wrongly_mm(rows: TrialRows, fit: CircleFit) -> float:
-    """Return the distance that eq. 16 as printed should give, by algebra from the right one's fit [mm].
+class WrongTurn(NamedTuple):
+    """What eq. 16 as printed should give [mm]: the distance, and 2 |j x g| / w^2, which it adds to d n."""
+
+    distance_mm: float
+    twice_gravity_mm: float
+
+
+def turned_wrongly(rows: TrialRows, fit: CircleFit) -> WrongTurn:
+    """Return the distance that eq. 16 as printed should give, by algebra from the right one's fit.
 
     With (R(-phi) - R(+phi)) g = -2 sin(phi) j x g and phi = -alpha / w^2 of a small sine, eq. 17 leaves
     alpha (d n + (2 / w^2) j x g): the first singular vector has the length of the bracket. That is
@@ -201,8 +212,9 @@ def turned_wrongly_mm(rows: TrialRows, fit: CircleFit) -> float:
     phi = sine.position_rad - sine.position_rad.mean()
     per_w2 = -float(alpha @ phi) / float(alpha @ alpha)
     gravity = sine.accel_m_s2[sine.t_s <= REST_S].mean(axis=0)
-    bracket = fit.distance_m * fit.tangent + 2.0 * per_w2 * np.cross(fit.axis, gravity)
-    return 1e3 * float(np.linalg.norm(bracket))
+    added = 2.0 * per_w2 * np.cross(fit.axis, gravity)
+    distance_m = float(np.linalg.norm(fit.distance_m * fit.tangent + added))
+    return WrongTurn(1e3 * distance_m, 1e3 * float(np.linalg.norm(added)))
 
 
 def _regressed(rows: TrialRows, profile: NoiseProfile) -> JointRegression | None:

@@ -1,10 +1,11 @@
 """Assemble a chain by the thesis' method: from circle point analyses only.
 
 Inputs are the agents' circle fits of every joint's fast motion, during which all other joints stand still
-(chapter 4.3), and gravity as the IMUs measure it at rest.
+(chapter 4.3), and gravity as the IMUs measure it at rest. For comparisons the agents' regressions can take
+the circles' place, and only the IMU next to each joint can be used.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from coordinator.kinematics.assembly import AssemblyError, assemble
 from coordinator.kinematics.chain_estimate import ChainEstimate
@@ -13,6 +14,10 @@ from coordinator.recording.recording import Recording
 from coordinator.topology.topology import Topology
 from module_agent.model.chain import Array
 from module_agent.model.errors import DataError
+from module_agent.wire.messages import Estimate
+
+# The circle of a joint in an agent's estimate, with the mean positions of all joints (n,) meanwhile.
+Observation = Callable[[Estimate, Array], PairObservation | None]
 
 
 def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | None:
@@ -23,9 +28,28 @@ def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | No
     Raises:
         DataError: the type of a module is not recorded, or no rest.
     """
+    return chain_of_pairs(recording, topology, circle_observation)
+
+
+def chain_of_pairs(
+    recording: Recording, topology: Topology, observation: Observation, distal: bool = True
+) -> ChainEstimate | None:
+    """Return the chain that follows from single joints' motions; None as for `thesis_chain`.
+
+    Args:
+        recording, topology: of a robot whose joints moved one by one.
+        observation: what is taken of an agent's estimate: its circle or its regression.
+        distal: whether every module beyond a joint observes it, or only those mounted on it.
+
+    Raises:
+        DataError: the type of a module is not recorded, or no rest.
+    """
     types = [recording.module_type(serial) for serial in topology.serials]
     rest = recording.rest_observation(topology.serials)
-    pairs = _pairs(recording, topology.serials, rest.q_rad)
+    pairs = _pairs(recording, topology.serials, rest.q_rad, observation)
+    if not distal:
+        on = {serial: topology.parent[k] for k, serial in enumerate(topology.serials)}
+        pairs = [one for one in pairs if on[one.observer] == topology.serials.index(one.joint)]
     if not pairs:
         return None
     try:
@@ -35,7 +59,9 @@ def thesis_chain(recording: Recording, topology: Topology) -> ChainEstimate | No
         return None
 
 
-def _pairs(recording: Recording, serials: Sequence[str], still_rad: Array) -> list[PairObservation]:
+def _pairs(
+    recording: Recording, serials: Sequence[str], still_rad: Array, observation: Observation
+) -> list[PairObservation]:
     motions = {event.serial: event for event in recording.latest_motions("windowed_sine")}
     pairs = []
     for k, joint in enumerate(serials):
@@ -51,6 +77,6 @@ def _pairs(recording: Recording, serials: Sequence[str], still_rad: Array) -> li
             estimates = [one for ids, one in known.items() if ids[-1] == motion.motion_id]
             if observer == joint or not estimates:
                 continue
-            pair = circle_observation(estimates[0], q_rad)
+            pair = observation(estimates[0], q_rad)
             pairs += [] if pair is None else [pair]
     return pairs

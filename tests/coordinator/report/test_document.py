@@ -134,7 +134,7 @@ def test_a_plot_shows_every_label_once_and_every_panel_with_its_units() -> None:
     ]
     for text in ("measured", "points", "truth", "velocity [rad/s]", "length [mm]", "time [s]", "one arm"):
         assert texts.count(text) == 1, text
-    assert figure.alt == "A signal & its level: measured, points, truth over time [s]"
+    assert figure.alt == "A signal & its level: measured; points; truth, over time [s]"
     # No offset that is written elsewhere.
     assert any(text.startswith("484.0") for text in texts)
     assert not re.search(r"(fill|stroke): ?#(000000|ffffff)", themed(figure.svg))
@@ -182,6 +182,23 @@ def test_numbers_are_shown_in_any_form_and_zeros_without_a_minus(
     form: str, cell: float | None, shown: str
 ) -> None:
     assert Column(name="length", form=form).shown(cell) == shown
+
+
+def test_an_empty_cell_of_a_spanning_column_is_part_of_the_one_above() -> None:
+    columns = (Column(name="item", spans=True), Column(name="by"), Column(name="error", unit="mm"))
+    rows = [
+        ("one", "thesis", 4.0),
+        ("", "ours", 1.0),
+        ("two", "thesis", 3.0),
+        ("", "ours", 2.0),
+        ("", "", 1.0),
+    ]
+    section = Section(title="Items", blocks=(Table.of("Items", columns, rows),))
+    page = html_page(Document(title="A study", sections=(section,)))
+    assert re.findall(r'<td class="name" rowspan="(\d)">(\w+)</td>', page) == [("2", "one"), ("3", "two")]
+    counts = [len(re.findall("<td", row)) for row in re.findall(r"<tr>(.*?)</tr>", page)[1:]]
+    # The last row has its own cell without a text: only columns that span merge.
+    assert counts == [3, 2, 3, 2, 2]
 
 
 def test_a_row_without_a_cell_for_every_column_is_refused() -> None:

@@ -10,15 +10,20 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from coordinator.report.document import Conclusion, Paragraph, figures, linked, tables
+from coordinator.report.plots import panel_figure
 from sim.commands.thesis import EXPERIMENTS
 from sim.main import app
 from sim.robot.noise_choice import NoiseChoice
 from sim.thesis.dynamics.pattern_recording import PatternSeries
-from sim.thesis.experiment import Check, Experiment, Scope, Unit, concluded
+from sim.thesis.experiment import Check, Experiment, Scope, ThesisResults, Unit, concluded
+from sim.thesis.future_work.arm_sessions import ArmSessions, ChainErrors
+from sim.thesis.future_work.joint_trials import AlignedTrial
 from sim.thesis.kinematics.amplitude_sweep import AmplitudeTrial, Series
 from sim.thesis.kinematics.motion_signals import ImuSignals, JointSignals, TrialSignals, Vector
 from sim.thesis.published import thesis_length
 from sim.thesis.study import Store, key, results, units_of
+from sim.thesis.study_report import counted, study_document
 from tests.sim.thesis.dynamics.printed_patterns import as_printed
 
 SCOPE = Scope(seed=0, noise=NoiseChoice("x5"), quick=True)
@@ -27,7 +32,7 @@ FIGURES = (15, 16, 19, 20, 21, 22, *range(23, 44))
 DYNAMIC_FIGURES = (*range(44, 52), 58)
 IDS = {
     *(f"figure{number}" for number in (*FIGURES, *DYNAMIC_FIGURES)),
-    *("table4", "table5", "table6", "equation16"),
+    *("table4", "table5", "table6", "equation16", "chapter7.2"),
 }
 
 
@@ -90,8 +95,9 @@ def lengths(series: Series, shift_mm: float | None = None) -> list[AmplitudeTria
                 "",
                 estimate,
                 estimate,
-                float(series.length_mm),
-                0.1,
+                twice_gravity_mm=120.0,
+                ours_mm=float(series.length_mm),
+                ours_sigma_mm=0.1,
             )
         )
     return trials
@@ -100,7 +106,14 @@ def lengths(series: Series, shift_mm: float | None = None) -> list[AmplitudeTria
 def measured(unit: Unit) -> Any:
     if unit.kind is PatternSeries:
         return as_printed(*unit.arguments[:3])
-    return signals(unit.arguments[2]) if unit.kind is TrialSignals else lengths(unit.arguments[0])
+    if unit.kind is TrialSignals:
+        return signals(unit.arguments[2])
+    if unit.kind is AlignedTrial:
+        return AlignedTrial(unit.arguments[0], unit.arguments[1], 45.0, 10.0, 0.1, 5.0)
+    if unit.kind is ArmSessions:
+        errors = ChainErrors(1.0, 2.0)
+        return ArmSessions(errors, errors, errors, None, errors, errors, 40.0, 10.0, 0.1, 0.02, 0.01)
+    return lengths(unit.arguments[0])
 
 
 def explained(measured: list[list[AmplitudeTrial]]) -> list[list[AmplitudeTrial]]:
@@ -135,6 +148,8 @@ def test_each_experiment_has_an_outcome_with_its_reason_and_plots_with_data(each
         for panel in plot.panels:
             assert panel.curves
             assert all(len(curve.x) == len(curve.y) > 0 for curve in panel.curves), plot.caption
+        # Each is drawn: a curve without data would be refused here.
+        assert panel_figure(plot).svg
     for table in result.tables:
         assert table.rows
         assert all(len(row) == len(table.columns) for row in table.rows)
@@ -235,6 +250,29 @@ def test_the_outcome_follows_from_the_checks() -> None:
     assert concluded([yes, yes]) == ("seen", "Holds: a; a.")
     assert concluded([yes, no]) == ("seen in part", "Holds: a. Does not hold: b.")
     assert concluded([no]) == ("not seen", "Does not hold: b.")
+
+
+def test_the_report_counts_outcomes_and_leads_to_every_experiment() -> None:
+    chosen = [experiment(name) for name in ("figure27", "figure35", "table5")]
+    outcomes = tuple(each.result([measured(unit) for unit in each.units(SCOPE)]) for each in chosen)
+    study = ThesisResults(settings={"seed": 0, "with": (), "quick": True}, experiments=outcomes)
+    assert counted(study) == "3 experiments: 3 seen, 0 seen in part, 0 not seen."
+    document = study_document(study)
+    assert document.subtitle == "seed 0, with none, quick yes"
+    assert linked(document) == {one.title for one in outcomes}
+    for one in outcomes:
+        blocks = document.section(one.title).blocks
+        # It opens with what the thesis found, and closes with whether that is seen and why.
+        assert blocks[0] == Paragraph(text=one.finding)
+        assert blocks[-1] == Conclusion(outcome=one.outcome, reason=one.reason)
+        section = document.section(one.title)
+        assert tables(section) == list(one.tables)
+        assert len(figures(section)) == len(one.plots)
+
+
+def test_experiments_stand_in_the_order_of_the_thesis() -> None:
+    numbers = [int(each.id.removeprefix("figure")) for each in EXPERIMENTS if each.id.startswith("figure")]
+    assert numbers == sorted(numbers)
 
 
 def test_units_that_experiments_share_are_measured_once() -> None:
