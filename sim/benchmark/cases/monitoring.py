@@ -283,6 +283,8 @@ ADDITIONAL_SHARE = 0.1
 # Length of a trial without event: with longer ones processes would idle at the end.
 SEGMENT_S = 300.0
 QUICK_AFTER_S, QUICK_SEGMENT_S = 5.0, 8.0
+# What is known beforehand under a noise profile.
+KNOWN_BY_NOISE = {ARM.noise: "a baseline run, IMU scale and axes", "x5-uncalibrated": "a baseline run"}
 # Trials of unchanged robots are days of their own.
 UNCHANGED_DAY = 500
 _KNOWN_COST_S, COST_PER_S = 8.0, 0.2
@@ -296,21 +298,27 @@ class MonitoredSegments(NamedTuple):
 
 
 def monitoring_cases(trials: int, segments: int, seed: int, shortened: bool = False) -> list[Case]:
-    """Return the one case: every kind of event so many times, and segments without change.
+    """Return a case for each noise profile: every kind of event so many times, and segments without change.
 
-    `shortened`: trials and segments are short, all in one process, which records the robot once.
+    `shortened`: trials and segments are short, all in one process, which records the robot once, and only
+    with calibrated IMUs.
     """
     after_s, segment_s = (QUICK_AFTER_S, QUICK_SEGMENT_S) if shortened else (AFTER_S, SEGMENT_S)
     drawn = [(kind, seed * 100 + number) for number in range(trials) for kind in KINDS]
     days = [UNCHANGED_DAY + number for number in range(segments)]
     # Pieces of work of some minutes each.
     count = 1 if shortened else max(1, -(-len(drawn) // 12), len(days))
-    work = []
-    for k in range(count):
-        own, still = tuple(drawn[k::count]), tuple(days[k::count])
-        cost_s = _KNOWN_COST_S + COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * segment_s)
-        work.append(Trial(monitor_one_robot, (own, still, after_s, segment_s, shortened), cost_s))
-    return [Case(f"{ARM.robot}, monitored", work, _summary, ARM.noise, "a baseline run, IMU scale and axes")]
+    cases = []
+    for noise, known in KNOWN_BY_NOISE.items() if not shortened else [(ARM.noise, KNOWN_BY_NOISE[ARM.noise])]:
+        subject = ARM._replace(noise=noise, brief=shortened)
+        work = []
+        for k in range(count):
+            own, still = tuple(drawn[k::count]), tuple(days[k::count])
+            cost_s = _KNOWN_COST_S + COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * segment_s)
+            work.append(Trial(monitor_one_robot, (own, still, after_s, segment_s, subject), cost_s))
+        name = f"{subject.robot}, monitored" + ("" if noise == ARM.noise else ", default profile")
+        cases.append(Case(name, work, _summary, noise, known))
+    return cases
 
 
 def monitor_one_robot(
@@ -318,10 +326,9 @@ def monitor_one_robot(
     quiet: Sequence[int],
     after_s: float,
     segment_s: float,
-    shortened: bool,
+    subject: Subject,
 ) -> MonitoredSegments:
     """Record a robot once, and monitor it in all of its trials."""
-    subject = ARM._replace(brief=shortened)
     return MonitoredSegments(
         tuple(monitoring_trial(kind, seed, subject, after_s) for kind, seed in drawn),
         tuple(false_alarms(day, segment_s, subject) for day in quiet),
