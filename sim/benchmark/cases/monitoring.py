@@ -316,7 +316,7 @@ def monitoring_cases(trials: int, segments: int, seed: int, shortened: bool = Fa
             own, still = tuple(drawn[k::count]), tuple(days[k::count])
             cost_s = _KNOWN_COST_S + COST_PER_S * (len(own) * (12.0 + after_s) + len(still) * segment_s)
             work.append(Trial(monitor_one_robot, (own, still, after_s, segment_s, subject), cost_s))
-        name = f"{subject.robot}, monitored" + ("" if noise == ARM.noise else ", default profile")
+        name = f"{subject.robot}, monitored" if noise == ARM.noise else f"{subject.robot}, {noise}, monitored"
         cases.append(Case(name, work, _summary, noise, known))
     return cases
 

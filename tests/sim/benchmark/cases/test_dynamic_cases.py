@@ -34,7 +34,7 @@ def test_the_quick_benchmark_has_every_case_and_says_where_it_does_less() -> Non
     quick = [case.name for case in dynamic_cases(QUICK_DYNAMICS, seed=0)]
     left = [name for name in CASES if not any(one.startswith(name) for one in quick)]
     # That nothing is taken for something is tried where there is time for it.
-    assert left == ["a2085_06, no payload"]
+    assert left == ["a2085_06, no payload", "a2085_03, x5-uncalibrated, monitored"]
     assert all(name in CASES or name.endswith(", true model") for name in quick)
 
 
@@ -57,12 +57,13 @@ def test_the_quick_payloads_and_gravity_compensation_are_of_sessions_that_inerti
 
 
 def test_the_full_benchmark_monitors_for_an_hour_and_tries_everything_several_times() -> None:
-    (monitored,) = (case for case in CASES.values() if case.name.endswith("monitored"))
-    drawn = [one for trial in monitored.trials for one in trial.arguments[0]]
-    unchanged = [day for trial in monitored.trials for day in trial.arguments[1]]
-    segment_s = {trial.arguments[3] for trial in monitored.trials}
-    assert len(set(drawn)) == len(drawn) == 4 * 2 * DYNAMIC_TRIALS
-    assert len(set(unchanged)) * segment_s.pop() == 3600.0
+    for profile in ("", "x5-uncalibrated, "):
+        monitored = CASES[f"a2085_03, {profile}monitored"]
+        drawn = [one for trial in monitored.trials for one in trial.arguments[0]]
+        unchanged = [day for trial in monitored.trials for day in trial.arguments[1]]
+        segment_s = {trial.arguments[3] for trial in monitored.trials}
+        assert len(set(drawn)) == len(drawn) == 4 * 2 * DYNAMIC_TRIALS
+        assert len(set(unchanged)) * segment_s.pop() == 3600.0
     assert len(CASES["a2085_06, x5, inertia"].trials) == DYNAMIC_TRIALS
 
 
